@@ -1,0 +1,75 @@
+"""Addresses of vehicles: ``scheme://place?option=value``. Pure."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, field
+from urllib.parse import parse_qsl, unquote
+
+from skyloop.errors import UsageError
+
+_SCHEME = re.compile(r"[a-z][a-z0-9+.-]*\Z")
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleUri:
+    """A parsed address. ``place`` is what stands between ``://`` and ``?``: a host, a path, or nothing."""
+
+    scheme: str
+    place: str = ""
+    options: dict[str, str] = field(default_factory=dict)
+    text: str = ""
+
+    def __str__(self) -> str:
+        return self.text or f"{self.scheme}://{self.place}"
+
+    def number(self, option: str, default: float, *, minimum: float = -math.inf, maximum: float = math.inf) -> float:
+        """An option as a finite number within a range. Raises :class:`UsageError`."""
+        given = self.options.get(option)
+        if given is None:
+            return default
+        try:
+            value = float(given)
+        except ValueError:
+            value = math.nan
+        if not (math.isfinite(value) and minimum <= value <= maximum):
+            raise UsageError(
+                f"{self}: option {option} is {given!r} and must be a number from {minimum:g} to {maximum:g}"
+            )
+        return value
+
+    def whole(self, option: str, default: int, *, minimum: int = 0, maximum: int = 2**31 - 1) -> int:
+        """An option as a whole number within a range. Raises :class:`UsageError`."""
+        value = self.number(option, default, minimum=minimum, maximum=maximum)
+        if value != int(value):
+            raise UsageError(f"{self}: option {option} is {value:g} and must be a whole number")
+        return int(value)
+
+    def flag(self, option: str, default: bool = False) -> bool:
+        """An option as yes or no. Raises :class:`UsageError`."""
+        given = self.options.get(option)
+        if given is None:
+            return default
+        meanings = {"1": True, "true": True, "yes": True, "": True, "0": False, "false": False, "no": False}
+        if given.lower() not in meanings:
+            raise UsageError(f"{self}: option {option} is {given!r} and must be true or false")
+        return meanings[given.lower()]
+
+
+def is_uri(text: str) -> bool:
+    """Whether this looks like a vehicle's address rather than a proxy's name."""
+    return "://" in text
+
+
+def parse_uri(text: str) -> VehicleUri:
+    """Parse a vehicle's address. Raises :class:`UsageError`."""
+    scheme, separator, rest = text.partition("://")
+    if not separator or not _SCHEME.match(scheme):
+        raise UsageError(f"{text!r} is not a vehicle's address: it looks like sim:// or ardrone://192.168.1.1")
+    place, _, query = rest.partition("?")
+    pairs = parse_qsl(query, keep_blank_values=True)
+    options = dict(pairs)
+    if len(options) != len(pairs):
+        raise UsageError(f"{text!r} gives an option twice")
+    return VehicleUri(scheme, unquote(place), options, text)

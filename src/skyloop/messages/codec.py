@@ -1,0 +1,103 @@
+"""Samples to bytes and back. Pure; the byte tables are in ``docs/wire-format.md``.
+
+A packet is a 12-byte header (signature, version, kind, reserved, length of the body) and a body: the sample's fields
+in order as one MessagePack array. msgspec encodes, decodes and checks types, lengths and ranges in C; fields added
+at the end of a sample by a later version are skipped by an older reader.
+"""
+
+from __future__ import annotations
+
+import struct
+from enum import IntEnum
+from typing import Final
+
+import msgspec
+
+from skyloop.errors import DecodeError
+from skyloop.messages.annotation import Annotation
+from skyloop.messages.command import Applied, Command
+from skyloop.messages.config import Reply, Request
+from skyloop.messages.event import Event
+from skyloop.messages.feedback import Feedback
+from skyloop.messages.frame import FrameHeader
+
+SIGNATURE: Final = b"SKYL"
+VERSION: Final = 1
+HEADER: Final = struct.Struct("<4sBBHI")
+HEADER_SIZE: Final = HEADER.size
+MAX_BODY: Final = 60_000  #: of a sample, so that a packet fits one datagram; pixels travel apart
+
+Sample = Command | Applied | Feedback | FrameHeader | Event | Request | Reply | Annotation
+
+
+class Kind(IntEnum):
+    """The kinds of packet. 0x40 and above belong to the transports and never reach this codec."""
+
+    COMMAND = 1
+    FEEDBACK = 2
+    FRAME = 3
+    EVENT = 4
+    REQUEST = 5
+    REPLY = 6
+    ANNOTATION = 7
+    APPLIED = 8
+
+
+KINDS: Final[dict[type[Sample], Kind]] = {
+    Command: Kind.COMMAND,
+    Feedback: Kind.FEEDBACK,
+    FrameHeader: Kind.FRAME,
+    Event: Kind.EVENT,
+    Request: Kind.REQUEST,
+    Reply: Kind.REPLY,
+    Annotation: Kind.ANNOTATION,
+    Applied: Kind.APPLIED,
+}
+
+_encode_body = msgspec.msgpack.Encoder().encode
+_KIND_NUMBERS: Final = {sample: int(kind) for sample, kind in KINDS.items()}
+_DECODERS: Final = {int(kind): msgspec.msgpack.Decoder(sample).decode for sample, kind in KINDS.items()}
+_pack_header = HEADER.pack
+_unpack_header = HEADER.unpack_from
+
+
+def encode(sample: Sample) -> bytes:
+    """The packet of a sample.
+
+    Raises ``ValueError`` if it is larger than :data:`MAX_BODY`, which only free text or native telemetry can cause.
+    """
+    body = _encode_body(sample)
+    if len(body) > MAX_BODY:
+        raise ValueError(f"{type(sample).__name__} is {len(body)} bytes, over the {MAX_BODY} that a packet may carry")
+    return _pack_header(SIGNATURE, VERSION, _KIND_NUMBERS[type(sample)], 0, len(body)) + body
+
+
+def decode(packet: bytes | memoryview) -> Sample:
+    """The sample in a packet. Raises :class:`DecodeError` for anything else, in bounded time and memory."""
+    kind = packet_kind(packet)
+    decoder = _DECODERS.get(kind)
+    if decoder is None:
+        raise DecodeError(f"unknown kind {kind}: known are {', '.join(f'{k.value} {k.name}' for k in Kind)}")
+    try:
+        sample: Sample = decoder(memoryview(packet)[HEADER_SIZE:])
+    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+        raise DecodeError(f"bad {Kind(kind).name.lower()} packet: {error}") from None
+    return sample
+
+
+def packet_kind(packet: bytes | memoryview) -> int:
+    """The kind of a packet after checking its header against its length. Raises :class:`DecodeError`."""
+    if len(packet) < HEADER_SIZE:
+        raise DecodeError(f"{len(packet)} bytes are less than the header of {HEADER_SIZE}")
+    signature, version, kind, reserved, length = _unpack_header(packet)
+    if signature != SIGNATURE:
+        raise DecodeError(f"signature {bytes(signature)!r} is not {SIGNATURE!r}")
+    if version != VERSION:
+        raise DecodeError(f"version {version} is not {VERSION}: one of the two ends needs an update")
+    if reserved:
+        raise DecodeError(f"reserved bytes hold {reserved:#06x} and must be 0")
+    if length != len(packet) - HEADER_SIZE:
+        raise DecodeError(f"header announces {length} bytes of body, {len(packet) - HEADER_SIZE} came")
+    if length > MAX_BODY:
+        raise DecodeError(f"{length} bytes of body are over the {MAX_BODY} that a packet may carry")
+    return int(kind)

@@ -1,0 +1,151 @@
+"""The configuration channel: one typed request, one typed answer, in one transaction."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+
+from skyloop.messages.command import Count
+from skyloop.messages.feedback import Value
+from skyloop.messages.frame import CameraInfo, Name
+from skyloop.messages.kinds import Refusal, Role
+from skyloop.messages.parameter import Parameter, ParameterName
+
+Priority = Annotated[int, msgspec.Meta(ge=0, le=31)]
+
+HIGHEST_PRIORITY = 0
+DEFAULT_PRIORITY = 16
+LOWEST_PRIORITY = 31
+
+
+class Capabilities(msgspec.Struct, frozen=True, array_like=True):
+    """What a vehicle can do, known before it is opened."""
+
+    vehicle: str  #: the family, e.g. ``sim`` or ``ardrone2``
+    actions: frozenset[str] = frozenset()  #: names of the actions that the vehicle itself takes; empty: can't fly
+    cameras: tuple[CameraInfo, ...] = ()
+    description: str = ""
+    why_not: str = ""  #: for a vehicle that can't fly: why, in words for a person
+
+
+# Requests ------------------------------------------------------------------------------------------------------
+
+
+class Hello(msgspec.Struct, frozen=True, array_like=True, tag=1):
+    """First request on a connection."""
+
+    name: Name  #: of the application, for people
+    role: Role = Role.PILOT
+
+
+class RequestAuthority(msgspec.Struct, frozen=True, array_like=True, tag=2):
+    priority: Priority = DEFAULT_PRIORITY
+    queue: bool = True  #: wait in line when somebody else holds it; else be refused at once
+
+
+class ReleaseAuthority(msgspec.Struct, frozen=True, array_like=True, tag=3):
+    """Give the authority back, or leave the queue."""
+
+
+class GetParameter(msgspec.Struct, frozen=True, array_like=True, tag=4):
+    name: ParameterName
+
+
+class SetParameter(msgspec.Struct, frozen=True, array_like=True, tag=5):
+    name: ParameterName
+    value: Value
+    lease: Count  #: writing needs the authority
+
+
+class ListParameters(msgspec.Struct, frozen=True, array_like=True, tag=6):
+    """A page of the parameters, sorted by name."""
+
+    first: Count = 0
+
+
+class Ping(msgspec.Struct, frozen=True, array_like=True, tag=7):
+    """Asks for the proxy's time, to estimate the offset between the clocks and to see that it lives."""
+
+    sent_ns: int  #: on the asker's clock
+
+
+class GetStatistics(msgspec.Struct, frozen=True, array_like=True, tag=8):
+    """Asks for the proxy's counters."""
+
+
+AnyRequest = (
+    Hello | RequestAuthority | ReleaseAuthority | GetParameter | SetParameter | ListParameters | Ping | GetStatistics
+)
+
+
+class Request(msgspec.Struct, frozen=True, array_like=True):
+    id: Count  #: chosen by the asker; comes back in the answer
+    body: AnyRequest
+
+
+# Answers -------------------------------------------------------------------------------------------------------
+
+
+class Welcome(msgspec.Struct, frozen=True, array_like=True, tag=1):
+    """Answer to Hello."""
+
+    app_id: Count  #: the application's number in this run of the proxy, from 1
+    proxy: Name
+    run_id: Count  #: random; another number means that the proxy was restarted
+    pid: Count
+    uri: str  #: of the vehicle
+    now_ns: int  #: the proxy's clock
+    capabilities: Capabilities
+
+
+class AuthorityGranted(msgspec.Struct, frozen=True, array_like=True, tag=2):
+    lease: Count
+
+
+class AuthorityQueued(msgspec.Struct, frozen=True, array_like=True, tag=3):
+    """Waiting in line: the grant comes as an event and shows in feedback (``owner_id``, ``lease``)."""
+
+    position: Count  #: 1 is next
+    holder: str
+    holder_priority: int
+
+
+class ParameterValue(msgspec.Struct, frozen=True, array_like=True, tag=4):
+    parameter: Parameter
+
+
+class ParameterPage(msgspec.Struct, frozen=True, array_like=True, tag=5):
+    total: Count
+    first: Count
+    parameters: tuple[Parameter, ...]
+
+
+class Pong(msgspec.Struct, frozen=True, array_like=True, tag=6):
+    sent_ns: int
+    now_ns: int
+
+
+class Done(msgspec.Struct, frozen=True, array_like=True, tag=7):
+    """It was done; there is nothing else to say."""
+
+
+class Refused(msgspec.Struct, frozen=True, array_like=True, tag=8):
+    code: Refusal
+    message: str
+
+
+class Statistics(msgspec.Struct, frozen=True, array_like=True, tag=9):
+    """The proxy's counters, by dotted name."""
+
+    counters: dict[str, float]
+
+
+AnyReply = (
+    Welcome | AuthorityGranted | AuthorityQueued | ParameterValue | ParameterPage | Pong | Done | Refused | Statistics
+)
+
+
+class Reply(msgspec.Struct, frozen=True, array_like=True):
+    id: Count
+    body: AnyReply

@@ -1,0 +1,21 @@
+"""Events: the thin stream that says what happened and why."""
+
+from __future__ import annotations
+
+import msgspec
+
+from skyloop.messages.command import Count
+from skyloop.messages.feedback import Value
+from skyloop.messages.kinds import EventKind, Severity
+
+
+class Event(msgspec.Struct, frozen=True, array_like=True):
+    """One thing that happened. ``text`` is for people, ``kind`` and ``data`` for programs."""
+
+    kind: EventKind
+    text: str
+    at_ns: int  #: on the proxy's clock
+    severity: Severity = Severity.INFO
+    seq: Count = 0  #: grows by one per proxy's run; 0 for events made by the client itself
+    app: str | None = None  #: the application it concerns
+    data: dict[str, Value] = msgspec.field(default_factory=dict)

@@ -1,0 +1,35 @@
+"""The few rotations that everybody needs, as NumPy matrices. ROS REP 103 axes and signs."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def rotation_from_euler(roll: float, pitch: float, yaw: float) -> NDArray[np.float64]:
+    """Body-to-world rotation, shape (3, 3): ``Rz(yaw) @ Ry(pitch) @ Rx(roll)``, angles in rad."""
+    cr, sr = math.cos(roll), math.sin(roll)
+    cp, sp = math.cos(pitch), math.sin(pitch)
+    cy, sy = math.cos(yaw), math.sin(yaw)
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def euler_from_rotation(rotation: NDArray[np.float64]) -> tuple[float, float, float]:
+    """(roll, pitch, yaw) in rad of a body-to-world rotation, shape (3, 3); pitch within ±π/2."""
+    pitch = math.asin(max(-1.0, min(1.0, -float(rotation[2, 0]))))
+    roll = math.atan2(float(rotation[2, 1]), float(rotation[2, 2]))
+    yaw = math.atan2(float(rotation[1, 0]), float(rotation[0, 0]))
+    return roll, pitch, yaw
+
+
+def wrap_angle(angle: float) -> float:
+    """The same angle within [-π, π)."""
+    return (angle + math.pi) % (2 * math.pi) - math.pi

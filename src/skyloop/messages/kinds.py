@@ -1,0 +1,113 @@
+"""The closed vocabularies of the messages: each member is its own string, so ``state == "hovering"`` reads well."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+
+class FlightState(StrEnum):
+    """What the vehicle is doing, as the vehicle (or the software autopilot for it) says."""
+
+    UNKNOWN = "unknown"  #: nothing heard yet
+    LANDED = "landed"
+    TAKING_OFF = "taking_off"
+    HOVERING = "hovering"  #: airborne, holding its place by itself
+    FLYING = "flying"  #: airborne, following a set-point
+    LANDING = "landing"
+    EMERGENCY = "emergency"  #: motors cut; left only by an explicit reset
+
+    @property
+    def airborne(self) -> bool:
+        """Whether the vehicle is off the ground under its own power."""
+        return self in _AIRBORNE
+
+
+_AIRBORNE = frozenset({FlightState.TAKING_OFF, FlightState.HOVERING, FlightState.FLYING, FlightState.LANDING})
+
+
+class LinkState(StrEnum):
+    """State of one hop (application–proxy, or proxy–vehicle)."""
+
+    CONNECTING = "connecting"  #: first attempt under way, nothing heard yet
+    UP = "up"
+    DEGRADED = "degraded"  #: up, but samples are missing, late or malformed
+    LOST = "lost"  #: nothing heard past the threshold; recovery goes on by itself
+    CLOSED = "closed"  #: ended on purpose; nothing more will come
+
+
+class Failsafe(StrEnum):
+    """The step of the failsafe ladder that is in force."""
+
+    NONE = "none"
+    HOVER = "hover"  #: the pilot is silent or gone: holding the place
+    LAND = "land"  #: still no pilot, or the battery is low: landing
+
+
+class Encoding(StrEnum):
+    """How the bytes of a frame are to be read."""
+
+    BGR8 = "bgr8"  #: height × width × 3 bytes, blue first (OpenCV's order), rows without padding
+    RGB8 = "rgb8"  #: the same, red first
+    MONO8 = "mono8"  #: height × width bytes
+    JPEG = "jpeg"  #: one JPEG file
+
+
+class Role(StrEnum):
+    """What an application asks to be when it connects."""
+
+    PILOT = "pilot"  #: may request the authority, and may stop the motors in an emergency
+    OBSERVER = "observer"  #: read-only for as long as it is connected
+
+
+class Severity(StrEnum):
+    INFO = "info"
+    WARNING = "warning"
+    ERROR = "error"
+
+
+class EventKind(StrEnum):
+    """What an event tells. ``Event.data`` holds the particulars named here."""
+
+    APPLICATION_LINK = "application_link"  #: hop application–proxy changed; data: state, reason
+    VEHICLE_LINK = "vehicle_link"  #: hop proxy–vehicle changed; data: state, reason
+    AUTHORITY_GRANTED = "authority_granted"  #: data: app_id, priority, lease
+    AUTHORITY_QUEUED = "authority_queued"  #: an application waits; data: app_id, priority, position
+    AUTHORITY_LOST = "authority_lost"  #: data: app_id, lease, reason (released, silent, gone), by (app name)
+    AUTHORITY_PREEMPTED = "authority_preempted"  #: data: app_id, lease, by, by_id, by_priority
+    FAILSAFE = "failsafe"  #: a step of the ladder was taken or left; data: step, reason
+    COMMAND_REFUSED = "command_refused"  #: data: reason (a Refusal), seq, count
+    COMMAND_CLAMPED = "command_clamped"  #: a set-point was beyond a limit; data: limit, asked, applied
+    PACKET_MALFORMED = "packet_malformed"  #: data: reason, count
+    STATE_CHANGED = "state_changed"  #: flight state; data: before, after
+    BATTERY_LOW = "battery_low"  #: data: battery
+    EMERGENCY = "emergency"  #: motors cut; data: reason
+    PARAMETER_CHANGED = "parameter_changed"  #: data: name, value
+    DRIVER_ERROR = "driver_error"  #: the driver failed in some call; data: where
+    COLLISION = "collision"  #: simulated vehicles: touched something; data: speed_m_s
+    VEHICLE_MESSAGE = "vehicle_message"  #: text from the vehicle itself
+    SAMPLES_LOST = "samples_lost"  #: events that a slow application did not get; data: count
+    CALLBACK_ERROR = "callback_error"  #: an application's own listener or processor raised; data: where
+    PROXY_CLOSING = "proxy_closing"  #: the proxy ends on purpose
+
+
+class Refusal(StrEnum):
+    """Why a command or a request was refused."""
+
+    MALFORMED = "malformed"
+    OUT_OF_SEQUENCE = "out_of_sequence"  #: not newer than the last one received
+    STALE = "stale"  #: sent too long ago (or in the future)
+    NO_AUTHORITY = "no_authority"  #: the sender holds no lease
+    FOREIGN_LEASE = "foreign_lease"  #: the lease named is not the one in force
+    NON_FINITE = "non_finite"  #: NaN or infinite
+    NOT_FRESH = "not_fresh"  #: repeats an intent from before a failsafe or a loss of the vehicle's link
+    VEHICLE_LINK_LOST = "vehicle_link_lost"
+    UNSUPPORTED = "unsupported"  #: neither the vehicle nor the software autopilot can do it
+    WRONG_STATE = "wrong_state"  #: not possible in the present flight state
+    OBSERVER = "observer"  #: the application connected as an observer
+    UNKNOWN_PARAMETER = "unknown_parameter"
+    WRONG_TYPE = "wrong_type"
+    OUT_OF_RANGE = "out_of_range"
+    READ_ONLY = "read_only"
+    DRIVER_FAILED = "driver_failed"
+    BUSY = "busy"  #: somebody of at least the same priority holds the authority
+    PROTOCOL = "protocol"  #: a request out of place, or of another protocol version
