@@ -40,6 +40,8 @@ def video(camera: str) -> str:
     return f"video/{camera}"
 
 
+_UINT8 = np.dtype(np.uint8)
+
 #: Bytes of a frame: shape (size,), uint8, not writeable. They stay as they are for as long as any view of them lives.
 Pixels = NDArray[np.uint8]
 
@@ -162,7 +164,7 @@ def check_topic(topic: str) -> None:
 
 def check_frame(header: FrameHeader, pixels: Pixels) -> None:
     """Raise :class:`skyloop.errors.UsageError` for pixels that are not what their header says."""
-    if pixels.dtype != np.uint8 or pixels.nbytes != header.size or not pixels.flags.c_contiguous:
+    if pixels.nbytes != header.size or pixels.dtype != _UINT8 or not pixels.flags.c_contiguous:
         order = "" if pixels.flags.c_contiguous else ", not C-contiguous"
         raise UsageError(
             f"a frame of camera {header.camera!r} announces {header.size} bytes, but its pixels are {pixels.nbytes} "

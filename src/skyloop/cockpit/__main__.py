@@ -1,0 +1,49 @@
+"""``python -m skyloop.cockpit NAME``: the cockpit as a process of its own. Prints its address as the first line."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import threading
+
+from skyloop.cockpit.server import serve_cockpit
+from skyloop.errors import SkyloopError
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Exit code 0; 2 with a line of explanation when it could not start."""
+    parser = argparse.ArgumentParser(prog="python -m skyloop.cockpit", description="A page that shows a drone live.")
+    parser.add_argument("name", help="of a running proxy")
+    parser.add_argument("--host", default="127.0.0.1", help="loopback address to listen on (default: %(default)s)")
+    parser.add_argument("--port", type=int, default=0, help="0 takes a free one (default)")
+    parser.add_argument("--parent-fd", type=int, help="end when this descriptor (the reading end of a pipe) ends")
+    given = parser.parse_args(arguments)
+    stop = threading.Event()
+    if given.parent_fd is not None:
+        watcher = threading.Thread(target=_wait_for_end, args=(given.parent_fd, stop), name="parent", daemon=True)
+        watcher.start()
+    try:
+        serve_cockpit(
+            given.name, given.host, given.port, on_ready=lambda address: print(address, flush=True), stop=stop
+        )
+    except SkyloopError as error:
+        print(f"cockpit: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        pass
+    return 0
+
+
+def _wait_for_end(descriptor: int, stop: threading.Event) -> None:
+    """A pipe whose writing end is gone gives the end of file, however its owner ended."""
+    try:
+        while os.read(descriptor, 64):
+            pass
+    except OSError as error:
+        print(f"cockpit: descriptor {descriptor} of the parent can't be read: {error}", file=sys.stderr)
+    stop.set()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

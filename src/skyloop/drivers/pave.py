@@ -1,0 +1,191 @@
+"""Parrot's PaVE video encapsulation (AR.Drone 2): bytes in, frames out. Pure.
+
+Each frame is a little-endian header that starts with ``PaVE`` and one payload, on TCP port 5555 of the drone one after
+the other. Layout: ``video_encapsulation.h`` of the AR.Drone SDK 2.0.1, checked against two captures of real drones.
+Early firmware writes headers of 64 bytes, later one 68: the header's own field counts.
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final
+
+SIGNATURE: Final = b"PaVE"
+MIN_HEADER: Final = 64
+MAX_HEADER: Final = 128
+MAX_SIDE: Final = 4096
+DEFAULT_MAX_PAYLOAD: Final = 1 << 20  #: a 720p key frame of the drone is under 100 kB
+
+_HEADER: Final = struct.Struct("<4sBBHI4HIIBBBBIIHBBBBHI")  # up to and with advertised_size, 52 bytes
+_ADVERTISEMENT: Final = 1
+
+
+class Codec(IntEnum):
+    """Values of the header's codec field."""
+
+    VLIB = 1
+    P264 = 2
+    MPEG4_VISUAL = 3
+    MPEG4_AVC = 4  #: H.264, in Annex B form
+
+
+class FrameType(IntEnum):
+    """Values of the header's frame type field."""
+
+    UNKNOWN = 0
+    IDR = 1  #: needs no earlier frame, and carries the stream's parameters
+    I = 2  # noqa: E741  the name of the format's own documentation
+    P = 3
+    HEADERS = 4  #: parameters only, no picture
+
+
+@dataclass(frozen=True, slots=True)
+class PaveFrame:
+    """One frame of the stream as the drone sent it."""
+
+    codec: int  #: one of :class:`Codec`, or another number
+    type: int  #: one of :class:`FrameType`, or another number
+    number: int  #: counts the drone's frames
+    timestamp_ms: int  #: of the drone's own clock
+    width: int  #: of the picture to show [px]
+    height: int
+    stream_id: int
+    payload: bytes
+    after_damage: bool  #: bytes were skipped between the frame before and this one
+
+    @property
+    def is_key(self) -> bool:
+        """Whether decoding can begin here."""
+        return self.type == FrameType.IDR
+
+
+@dataclass(frozen=True, slots=True)
+class _Header:
+    size: int
+    payload_size: int
+    codec: int
+    type: int
+    number: int
+    timestamp_ms: int
+    width: int
+    height: int
+    stream_id: int
+
+
+class PaveParser:
+    """Cuts a stream of bytes into frames, whatever the pieces it comes in and whatever is wrong with it.
+
+    Finds its way back on the next header after damage: bytes that belong to no frame are counted in
+    ``skipped_bytes``, frames that were begun and broken off in ``broken_frames``. Holds at most one frame
+    (``max_payload`` and a header) beside the bytes fed last.
+    """
+
+    def __init__(self, max_payload: int = DEFAULT_MAX_PAYLOAD) -> None:
+        self.max_payload = max_payload
+        self.frames = 0
+        self.skipped_bytes = 0
+        self.broken_frames = 0
+        self._buffer = bytearray()
+        self._header: _Header | None = None  # of the frame that the buffer starts with
+        self._searched = 0  # the buffer was searched for a header up to here
+        self._damaged = False
+
+    @property
+    def buffered(self) -> int:
+        """Bytes held back because their frame is not complete."""
+        return len(self._buffer)
+
+    def feed(self, data: bytes | bytearray | memoryview) -> list[PaveFrame]:
+        """Take more of the stream; returns the frames that are now complete. Never raises for what it is fed."""
+        self._buffer += data
+        frames: list[PaveFrame] = []
+        while (header := self._header or self._find_header()) is not None:
+            if self._break_off(header):
+                continue
+            if len(self._buffer) < header.size + header.payload_size:
+                break
+            frame = self._take_frame(header)
+            if frame.payload:
+                frames.append(frame)
+        return frames
+
+    def end(self) -> None:
+        """The stream has ended: what is left belongs to no whole frame."""
+        if self._header is not None:
+            self.broken_frames += 1
+        self._skip(len(self._buffer))
+
+    def _find_header(self) -> _Header | None:
+        """Move the buffer's start to the next header that makes sense; None if more bytes are needed for that."""
+        while (start := self._buffer.find(SIGNATURE)) >= 0:
+            self._skip(start)
+            if len(self._buffer) < MIN_HEADER:
+                return None
+            header = _read_header(self._buffer, 0, self.max_payload)
+            if header is not None:
+                self._header, self._searched = header, header.size
+                return header
+            self._skip(len(SIGNATURE))
+        self._skip(max(0, len(self._buffer) - len(SIGNATURE) + 1))
+        return None
+
+    def _break_off(self, header: _Header) -> bool:
+        """Whether another frame begins where this one's payload should be: a wrong length, or bytes that went missing.
+
+        Without this look-out one flipped bit of a length would cost all the frames that it swallows.
+        """
+        limit = min(header.size + header.payload_size, len(self._buffer))
+        while (inner := self._buffer.find(SIGNATURE, self._searched, limit)) >= 0:
+            self._searched = inner
+            if inner + MIN_HEADER > len(self._buffer):
+                return False  # cannot be told yet
+            if _read_header(self._buffer, inner, self.max_payload) is not None:
+                self.broken_frames += 1
+                self._skip(inner)
+                return True
+            self._searched = inner + 1
+        self._searched = max(self._searched, limit - len(SIGNATURE) + 1)
+        return False
+
+    def _take_frame(self, header: _Header) -> PaveFrame:
+        end = header.size + header.payload_size
+        payload = bytes(memoryview(self._buffer)[header.size : end])
+        del self._buffer[:end]
+        damaged, self._damaged, self._header = self._damaged, False, None
+        self.frames += 1
+        return PaveFrame(
+            codec=header.codec,
+            type=header.type,
+            number=header.number,
+            timestamp_ms=header.timestamp_ms,
+            width=header.width,
+            height=header.height,
+            stream_id=header.stream_id,
+            payload=payload,
+            after_damage=damaged,
+        )
+
+    def _skip(self, count: int) -> None:
+        if count:
+            self.skipped_bytes += count
+            self._damaged = True
+            del self._buffer[:count]
+            self._header = None
+
+
+def _read_header(buffer: bytearray, at: int, max_payload: int) -> _Header | None:
+    """The header at a place that holds at least MIN_HEADER bytes, or None if it makes no sense."""
+    fields = _HEADER.unpack_from(buffer, at)
+    _, version, codec, size, payload_size, encoded_width, encoded_height, width, height, number, timestamp_ms = fields[
+        :11
+    ]
+    frame_type, control, stream_id = fields[13], fields[14], fields[17]
+    if not (1 <= version <= 15 and 1 <= codec <= 15 and frame_type <= 15 and MIN_HEADER <= size <= MAX_HEADER):
+        return None
+    if payload_size > max_payload or not (width <= encoded_width <= MAX_SIDE and height <= encoded_height <= MAX_SIDE):
+        return None
+    if control & _ADVERTISEMENT:
+        payload_size = 0  # an advertisement announces a size and carries nothing
+    return _Header(size, payload_size, codec, frame_type, number, timestamp_ms, width, height, stream_id)

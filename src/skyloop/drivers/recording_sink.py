@@ -1,0 +1,194 @@
+"""A sink that keeps what a driver tells and checks each piece as it comes."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.clock import monotonic_ns
+from skyloop.messages import Encoding, EventKind, Feedback, Intrinsics, LinkState, Severity, Value
+
+_CHANNELS = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
+
+
+@dataclass(frozen=True, slots=True)
+class SeenFrame:
+    """A frame as it was handed over; ``pixels`` is a copy, shape (h, w, 3), (h, w) or (bytes,) for JPEG."""
+
+    camera: str
+    pixels: NDArray[np.uint8]
+    captured_ns: int
+    arrived_ns: int
+    width: int
+    height: int
+    encoding: Encoding
+    intrinsics: Intrinsics | None
+
+
+@dataclass(frozen=True, slots=True)
+class SeenEvent:
+    kind: EventKind
+    text: str
+    severity: Severity
+    data: dict[str, Value] = field(default_factory=dict)
+
+
+class RecordingSink:
+    """Keeps the newest ``keep`` feedback samples and frames, every link state and event, and counts all.
+
+    ``problems`` holds, in words, whatever broke the contract of :class:`skyloop.drivers.base.Sink`. Looks at every
+    camera unless ``watch`` names the ones to look at.
+    """
+
+    def __init__(self, *, watch: set[str] | None = None, keep: int = 512, keep_pixels: bool = True) -> None:
+        self.watch = watch
+        self.feedbacks: deque[Feedback] = deque(maxlen=keep)
+        self.frames: deque[SeenFrame] = deque(maxlen=keep if not keep_pixels else min(keep, 64))
+        self.links: list[tuple[LinkState, str]] = []
+        self.events: deque[SeenEvent] = deque(maxlen=keep)
+        self.problems: list[str] = []
+        self.calls = 0
+        self.feedback_count = 0
+        self.frame_counts: Counter[str] = Counter()
+        self._keep_pixels = keep_pixels
+        self._newest_ns: dict[str, int] = {}
+        self._changed = threading.Condition()
+
+    # What a driver calls ---------------------------------------------------------------------------------------
+
+    def feedback(self, feedback: Feedback) -> None:
+        now_ns = monotonic_ns()
+        with self._changed:
+            self._check_time("feedback", feedback.captured_ns, now_ns)
+            self.feedbacks.append(feedback)
+            self.feedback_count += 1
+            self._tell()
+
+    def frame(
+        self,
+        camera: str,
+        pixels: NDArray[np.uint8],
+        captured_ns: int,
+        *,
+        width: int,
+        height: int,
+        encoding: Encoding = Encoding.BGR8,
+        intrinsics: Intrinsics | None = None,
+    ) -> None:
+        now_ns = monotonic_ns()
+        with self._changed:
+            self._check_time(f"frame of {camera}", captured_ns, now_ns)
+            shaped = self._shaped(camera, pixels, width, height, encoding)
+            seen = SeenFrame(camera, shaped, captured_ns, now_ns, width, height, encoding, intrinsics)
+            self.frames.append(seen)
+            self.frame_counts[camera] += 1
+            self._tell()
+
+    def wants(self, camera: str) -> bool:
+        return self.watch is None or camera in self.watch
+
+    def link(self, state: LinkState, reason: str = "") -> None:
+        with self._changed:
+            self.links.append((LinkState(state), reason))
+            self._tell()
+
+    def event(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: Value) -> None:
+        with self._changed:
+            self.events.append(SeenEvent(EventKind(kind), text, Severity(severity), data))
+            self._tell()
+
+    # What a test calls -----------------------------------------------------------------------------------------
+
+    @property
+    def newest(self) -> Feedback | None:
+        """The newest feedback."""
+        return self.feedbacks[-1] if self.feedbacks else None
+
+    @property
+    def link_state(self) -> LinkState | None:
+        """The newest state of the link, None while nothing was told."""
+        return self.links[-1][0] if self.links else None
+
+    def wait(self, condition: Callable[[], bool], timeout_s: float) -> bool:
+        """Wait until the condition holds; looked at whenever the driver told something. False on time-out."""
+        end = time.monotonic() + timeout_s
+        with self._changed:
+            while not condition():
+                left = end - time.monotonic()
+                if left <= 0 or not self._changed.wait(left):
+                    return condition()
+        return True
+
+    def _tell(self) -> None:
+        self.calls += 1
+        self._changed.notify_all()
+
+    def _check_time(self, what: str, captured_ns: int, now_ns: int) -> None:
+        if type(captured_ns) is not int:
+            self.problems.append(f"{what}: captured_ns is a {type(captured_ns).__name__} and must be an int")
+            return
+        if captured_ns > now_ns:
+            self.problems.append(f"{what}: captured {(captured_ns - now_ns) / 1e6:.1f} ms in the future")
+        before_ns = self._newest_ns.get(what)
+        if before_ns is not None and captured_ns < before_ns:
+            self.problems.append(f"{what}: captured {(before_ns - captured_ns) / 1e6:.1f} ms before the one before it")
+        self._newest_ns[what] = captured_ns
+
+    def _shaped(
+        self, camera: str, pixels: NDArray[np.uint8], width: int, height: int, encoding: Encoding
+    ) -> NDArray[np.uint8]:
+        empty = np.zeros(0, np.uint8)
+        if not isinstance(pixels, np.ndarray) or pixels.dtype != np.uint8 or not pixels.flags.c_contiguous:
+            self.problems.append(f"frame of {camera}: pixels must be a C-contiguous array of uint8")
+            return empty
+        channels = _CHANNELS.get(encoding)
+        if channels is None:
+            if bytes(pixels.reshape(-1)[:2]) != b"\xff\xd8":
+                self.problems.append(f"frame of {camera}: not a JPEG file")
+            return pixels.copy() if self._keep_pixels else empty
+        if pixels.size != height * width * channels:
+            self.problems.append(f"frame of {camera}: {pixels.size} bytes for {width}×{height}×{channels}")
+            return empty
+        if not self._keep_pixels:
+            return empty
+        return pixels.reshape((height, width, 3) if channels == 3 else (height, width)).copy()
+
+
+#: What a number of feedback may be at most, in its unit: beyond it, it is most likely in another unit.
+PLAUSIBLE: dict[str, tuple[float, float]] = {
+    "battery": (0.0, 1.0),
+    "battery_v": (0.0, 60.0),
+    "roll": (-math.pi, math.pi),
+    "pitch": (-math.pi, math.pi),
+    "yaw": (-math.pi - 1e-9, math.pi + 1e-9),
+    "altitude": (-50.0, 500.0),
+    "velocity": (-60.0, 60.0),
+    "angular_velocity": (-50.0, 50.0),
+    "acceleration": (-500.0, 500.0),
+    "position": (-1e5, 1e5),
+}
+
+
+def implausible(feedback: Feedback) -> list[str]:
+    """What is not finite, or so large that it must be in another unit, in words."""
+    problems = []
+    for name, (low, high) in PLAUSIBLE.items():
+        value = getattr(feedback, name)
+        numbers = value if isinstance(value, tuple) else () if value is None else (value,)
+        if isinstance(value, tuple) and len(value) != 3:
+            problems.append(f"{name} has {len(value)} numbers and must have 3")
+        for number in numbers:
+            if isinstance(number, bool) or not isinstance(number, (int, float)):
+                problems.append(f"{name} is a {type(number).__name__} and must be a float")
+            elif not math.isfinite(number):
+                problems.append(f"{name} is {number} and must be finite, or None if it is not known")
+            elif not low <= number <= high:
+                problems.append(f"{name} is {number:g}, outside {low:g} to {high:g}: is it in SI units?")
+    return problems

@@ -1,0 +1,173 @@
+"""The cameras of simulated drones: when they expose, and the thread that draws and hands out their pictures."""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import threading
+from dataclasses import dataclass, field
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.clock import monotonic_ns, nanoseconds, seconds
+from skyloop.sim.camera import CameraModel, CameraPose
+from skyloop.sim.render import PlanarRenderer, Quality, Scene, SceneState, SensorEffects
+from skyloop.sim.world import World
+
+_LONGEST_WAIT_S: Final = 0.5
+
+
+class Screen(Protocol):
+    """Where a drone's pictures go."""
+
+    def show(self, model: CameraModel, pixels: NDArray[np.uint8], captured_ns: int) -> None: ...
+
+    def failed(self, error: Exception) -> None: ...
+
+
+class Shutter:
+    """Says when a camera exposes, by absolute times of the simulation. Pure."""
+
+    def __init__(self, offset_s: float = 0.0) -> None:
+        self._next_s = offset_s
+        self.count = 0  #: exposures so far, those that nobody wanted included
+
+    def due(self, now_s: float, fps: float) -> bool:
+        """Whether it exposes now. After a pause it goes on from here, and does not make up for what it missed."""
+        if now_s < self._next_s:
+            return False
+        self._next_s = max(self._next_s + 1.0 / fps, now_s + 0.5 / fps)
+        self.count += 1
+        return True
+
+
+@dataclass(eq=False, slots=True)
+class Camera:
+    """One camera of one drone."""
+
+    model: CameraModel
+    drone: int
+    screen: Screen
+    seed: int
+    shutter: Shutter
+    dropped: int = 0  #: exposures that were overtaken by a newer one before they could be drawn
+    gone: bool = False  #: nobody is there any more to show its pictures to
+    _effects: tuple[CameraModel, SensorEffects] | None = field(default=None, init=False)
+
+    def finish(self, picture: NDArray[np.uint8], number: int, rates_rad_s: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """What the sensor makes of an ideal picture."""
+        if self._effects is None or self._effects[0] is not self.model:
+            self._effects = self.model, SensorEffects(self.model, self.seed)
+        return self._effects[1].apply(picture, number, rates_rad_s)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Exposure:
+    """What a camera saw at an instant, to be drawn."""
+
+    camera: Camera
+    model: CameraModel
+    state: SceneState
+    pose: CameraPose
+    rates_rad_s: NDArray[np.float64]
+    number: int
+    captured_ns: int
+    due_ns: int  #: when the picture may be handed out
+
+
+class Studio:
+    """Draws exposures on a thread of its own, the newest of each camera, and hands each out when it is due.
+
+    The scene is made at the start, which costs some tenths of a second: start it when the first picture is wanted.
+    """
+
+    def __init__(self, world: World, drones: int, quality: str) -> None:
+        self._world = world
+        self._drones = drones
+        self._quality = Quality(quality)
+        self._changed = threading.Condition()
+        self._waiting: dict[Camera, Exposure] = {}  # oldest camera first
+        self._finished: list[tuple[int, int, Exposure, NDArray[np.uint8]]] = []  # a heap by due time
+        self._order = itertools.count()
+        self._handing = threading.Lock()
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, name="skyloop-sim-cameras", daemon=True)
+
+    def start(self) -> None:
+        """Begin; the scene is made first, and what is exposed meanwhile is overtaken by newer exposures."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Pictures that were not handed out yet are lost."""
+        with self._changed:
+            self._stopping = True
+            self._changed.notify()
+        if self._thread is not threading.current_thread():
+            self._thread.join()
+
+    def expose(self, exposures: list[Exposure]) -> None:
+        """Have these drawn. One of the same camera that is still waiting is overtaken."""
+        with self._changed:
+            for exposure in exposures:
+                if exposure.camera in self._waiting:
+                    exposure.camera.dropped += 1
+                self._waiting[exposure.camera] = exposure
+            self._changed.notify()
+
+    def forget(self, cameras: tuple[Camera, ...]) -> None:
+        """When this returns, no picture of these is handed out any more."""
+        with self._handing:
+            for camera in cameras:
+                camera.gone = True
+
+    def _run(self) -> None:
+        try:
+            renderer = PlanarRenderer(Scene(self._world, self._drones), self._quality)
+        except Exception as error:  # noqa: BLE001  told to the drivers: there will be no pictures
+            with self._changed:
+                screens = {camera.screen for camera in self._waiting}
+            for screen in screens:
+                screen.failed(error)
+            return
+        while (exposure := self._next()) is not None:
+            try:
+                picture = renderer.render(exposure.state, exposure.pose, exposure.model)
+                picture = exposure.camera.finish(picture, exposure.number, exposure.rates_rad_s)
+            except Exception as error:  # noqa: BLE001  told to the driver; the next picture may be better
+                exposure.camera.screen.failed(error)
+            else:
+                heapq.heappush(self._finished, (exposure.due_ns, next(self._order), exposure, picture))
+
+    def _next(self) -> Exposure | None:
+        """The next exposure to draw, handing out meanwhile what is due; None to stop."""
+        while True:
+            self._hand_out()
+            with self._changed:
+                if self._stopping:
+                    return None
+                if self._waiting:
+                    return self._waiting.pop(next(iter(self._waiting)))
+                wait_s = _LONGEST_WAIT_S
+                if self._finished:
+                    wait_s = min(wait_s, seconds(self._finished[0][0] - monotonic_ns()))
+                if wait_s > 0:
+                    self._changed.wait(wait_s)
+
+    def _hand_out(self) -> None:
+        while self._finished and self._finished[0][0] <= monotonic_ns():
+            _, _, exposure, picture = heapq.heappop(self._finished)
+            with self._handing:
+                if not exposure.camera.gone:
+                    exposure.camera.screen.show(exposure.model, picture, exposure.captured_ns)
+
+
+def expose(
+    camera: Camera, state: SceneState, rates_rad_s: NDArray[np.float64], captured_ns: int, speed: float
+) -> Exposure:
+    """What this camera sees of a state, to be handed out after its delay."""
+    model, drone = camera.model, camera.drone
+    pose = model.pose(state.drone_positions_m[drone], state.drone_rotations[drone], drone)
+    due_ns = captured_ns + nanoseconds(model.latency_s / speed)
+    return Exposure(camera, model, state, pose, rates_rad_s, camera.shutter.count, captured_ns, due_ns)

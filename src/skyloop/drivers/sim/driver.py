@@ -1,0 +1,265 @@
+"""The driver of one simulated drone."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.drivers.base import Driver, Sink
+from skyloop.drivers.sim import parameters as table
+from skyloop.drivers.sim.host import Report, SimHost
+from skyloop.drivers.sim.options import SimOptions
+from skyloop.drivers.sim.set_points import SetPointFlight
+from skyloop.drivers.uri import VehicleUri
+from skyloop.errors import SkyloopError
+from skyloop.messages import (
+    AnyAction,
+    Capabilities,
+    EventKind,
+    Feedback,
+    Hover,
+    LinkState,
+    Parameter,
+    Severity,
+    Value,
+)
+from skyloop.sim.camera import CameraModel
+from skyloop.sim.parameters import LIMIT_RANGES, Limits
+from skyloop.sim.reports import Occurrence, OccurrenceKind
+from skyloop.sim.world import Wind
+
+if TYPE_CHECKING:
+    from skyloop.drivers.sim.cameras import Camera
+
+_OCCURRENCES: Final = {
+    OccurrenceKind.COLLISION: (EventKind.COLLISION, Severity.WARNING),
+    OccurrenceKind.EMERGENCY: (EventKind.EMERGENCY, Severity.ERROR),
+    OccurrenceKind.BATTERY_LOW: (EventKind.VEHICLE_MESSAGE, Severity.WARNING),
+}
+
+
+class SimDriver(Driver):
+    """A drone of a world of its own, or of a ``host`` that several drivers share.
+
+    Feedback carries the truth besides, in ``native``: ``truth.x``, ``.y``, ``.z`` [m], ``.roll``, ``.pitch``, ``.yaw``
+    [rad], ``.vx``, ``.vy``, ``.vz`` [m/s], and of each moving target ``truth.target.x``, ``.y``, ``.z``, ``.yaw`` (a
+    second one is ``truth.target2``), all in world axes. ``sim.time_s`` is the simulation's own time.
+    """
+
+    def __init__(
+        self, uri: VehicleUri, *, host: SimHost | None = None, drone: int = 0, options: SimOptions | None = None
+    ) -> None:
+        super().__init__(uri)
+        self.options = options or SimOptions.of(uri)
+        self.drone = drone
+        self.host = host  #: the world; None until a driver with a world of its own is opened
+        self._shared = host is not None
+        self._changing = threading.Lock()
+        self._limits = Limits()
+        self._models = self.options.cameras
+        self._wind: Wind | None = None  # as written before it was opened
+        self._battery = self.options.battery
+        self._link = True
+        self._set_points: SetPointFlight | None = None
+        self._cameras: tuple[Camera, ...] = ()
+        self._world_wind: Wind | None = None
+
+    def capabilities(self) -> Capabilities:
+        return Capabilities(
+            vehicle="sim",
+            actions=self.options.native,
+            cameras=tuple(model.info() for model in self._models),
+            description=f"a simulated drone in the world {self.options.world!r}, seed {self.options.seed}",
+        )
+
+    # Life cycle ------------------------------------------------------------------------------------------------
+
+    def _open(self, sink: Sink) -> None:
+        host = self.host if self._shared else SimHost(self.options)
+        assert host is not None
+        self.host = host
+        self._link = True
+        if self._wind is not None:
+            host.set_wind(self._wind)
+        simulation = host.simulation
+        if self._battery != self.options.battery:
+            simulation.set_charge(self.drone, self._battery)
+        self._set_points = None if "takeoff" in self.options.native else SetPointFlight(simulation, self.drone)
+        simulation.set_limits(self.drone, self._in_force(self._limits))
+        self._cameras = host.board(self.drone, self, self, list(self._models))
+        sink.link(LinkState.UP)
+
+    def _close(self) -> None:
+        if self.host is not None:
+            self.host.leave(self.drone, self)
+        self._battery = self.options.battery
+
+    def _in_force(self, limits: Limits) -> Limits:
+        """Without a take-off of its own the vehicle only lifts off, and the set-points do the rest."""
+        if self._set_points is None:
+            return limits
+        return replace(limits, takeoff_altitude_m=LIMIT_RANGES["takeoff_altitude_m"][0])
+
+    # Flying ----------------------------------------------------------------------------------------------------
+
+    def _apply(self, action: AnyAction) -> AnyAction:
+        if action.name not in self.options.native:
+            return super()._apply(action)
+        host = self.host
+        if host is None or self._sink is None or not self._link:
+            return action  # said into the dark
+        return self._command(host, action)
+
+    def _command(self, host: SimHost, action: AnyAction) -> AnyAction:
+        if self._set_points is not None:
+            return self._set_points.command(action)
+        return host.simulation.command(self.drone, action)
+
+    # Parameters ------------------------------------------------------------------------------------------------
+
+    def parameters(self) -> list[Parameter]:
+        return table.describe(self._present(), self._standard())
+
+    def set_parameter(self, name: str, value: Value) -> Value:
+        with self._changing:
+            before, standard = self._present(), self._standard()
+            after = table.written(before, standard, name, value)
+            self._write(before, after)
+            return next(p.value for p in table.describe(after, standard) if p.name == name)
+
+    def _present(self) -> table.State:
+        wind = self._wind or (self.host.wind if self.host is not None else self._usual_wind())
+        return table.State(self._limits, self._models, wind, self._battery, self._link)
+
+    def _standard(self) -> table.State:
+        return table.State(Limits(), self.options.cameras, self._usual_wind(), self.options.battery)
+
+    def _usual_wind(self) -> Wind:
+        if self._world_wind is None:
+            try:
+                world = self.host.simulation.world if self.host is not None else self.options.load_world()
+            except SkyloopError:
+                return Wind()  # open() will say what is wrong with the world
+            self._world_wind = self.options.blowing(world.wind)
+        return self._world_wind
+
+    def _write(self, before: table.State, after: table.State) -> None:
+        host = self.host if self._sink is not None else None
+        self._limits, self._models, self._battery = after.limits, after.cameras, after.battery
+        for camera, model in zip(self._cameras, after.cameras, strict=False):
+            camera.model = model
+        if after.wind != before.wind:
+            if host is None or not self._shared:
+                self._wind = after.wind
+            if host is not None:
+                host.set_wind(after.wind)
+        if host is None:
+            return
+        if after.limits != before.limits:
+            host.simulation.set_limits(self.drone, self._in_force(after.limits))
+        if after.battery != before.battery:
+            host.simulation.set_charge(self.drone, after.battery)
+        if after.link != before.link:
+            self._switch_link(host, after.link)
+
+    def _switch_link(self, host: SimHost, on: bool) -> None:
+        """The radio fails or works again. A drone that hears nothing holds its place, as real ones do."""
+        sink = self._sink
+        if sink is None:
+            return
+        if on:
+            self._link = True
+            sink.link(LinkState.UP)
+        else:
+            self._link = False
+            sink.link(LinkState.LOST, "the simulated radio is switched off (parameter sim.link)")
+            self._command(host, Hover())
+
+    # Called by the host, on its threads ------------------------------------------------------------------------
+
+    def report(self, report: Report) -> None:
+        """The drone's state, as it believes and as it is."""
+        believed, sink = report.believed, self._sink
+        self._battery = believed.battery
+        state = believed.state
+        if self._set_points is not None:
+            self._set_points.supervise(believed)
+            state = self._set_points.told_state(state)
+        if sink is None or not self._link:
+            return
+        sink.feedback(
+            Feedback(
+                captured_ns=report.captured_ns,
+                state=state,
+                battery=believed.battery,
+                battery_v=believed.battery_v,
+                roll=believed.roll_rad,
+                pitch=believed.pitch_rad,
+                yaw=believed.yaw_rad,
+                altitude=believed.altitude_m,
+                velocity=believed.velocity_m_s,
+                angular_velocity=believed.angular_velocity_rad_s,
+                acceleration=believed.acceleration_m_s2,
+                position=report.truth.position_m if self.options.position else None,
+                native=self._native(report),
+            )
+        )
+
+    def happened(self, occurrence: Occurrence) -> None:
+        """A collision, a crash, a battery that is low."""
+        sink = self._sink
+        if sink is None or not self._link:
+            return
+        kind, severity = _OCCURRENCES[occurrence.kind]
+        if occurrence.kind is OccurrenceKind.COLLISION:
+            sink.event(kind, occurrence.text, severity, speed_m_s=occurrence.speed_m_s)
+        else:
+            sink.event(kind, occurrence.text, severity, reason=occurrence.text)
+
+    def wants(self, camera: str) -> bool:
+        """Whether a picture of this camera would be seen by anybody."""
+        sink = self._sink
+        return sink is not None and self._link and sink.wants(camera)
+
+    def show(self, model: CameraModel, pixels: NDArray[np.uint8], captured_ns: int) -> None:
+        """A picture is due."""
+        sink = self._sink
+        if sink is not None and self._link:
+            sink.frame(
+                model.name,
+                pixels,
+                captured_ns,
+                width=model.width,
+                height=model.height,
+                intrinsics=model.intrinsics(),
+            )
+
+    def failed(self, error: Exception) -> None:
+        """The simulation or the drawing raised."""
+        sink = self._sink
+        if sink is not None:
+            sink.event(EventKind.DRIVER_ERROR, f"the simulation failed: {error!r}", Severity.ERROR, where="simulation")
+
+    def _native(self, report: Report) -> dict[str, Value]:
+        native: dict[str, Value] = {"sim.time_s": report.truth.time_s}
+        if report.believed.emergency_reason:
+            native["emergency_reason"] = report.believed.emergency_reason
+        if not self.options.truth:
+            return native
+        truth = report.truth
+        native["truth.x"], native["truth.y"], native["truth.z"] = truth.position_m
+        native["truth.vx"], native["truth.vy"], native["truth.vz"] = truth.velocity_m_s
+        native["truth.roll"], native["truth.pitch"], native["truth.yaw"] = (
+            truth.roll_rad,
+            truth.pitch_rad,
+            truth.yaw_rad,
+        )
+        for number, target in enumerate(report.targets, 1):
+            name = "truth.target" if number == 1 else f"truth.target{number}"
+            native[f"{name}.x"], native[f"{name}.y"], native[f"{name}.z"] = target.position_m
+            native[f"{name}.yaw"] = target.yaw_rad
+        return native

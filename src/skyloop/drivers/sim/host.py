@@ -1,0 +1,216 @@
+"""A world with its drones that keeps time, and the drivers of those drones."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Protocol
+
+import numpy as np
+
+from skyloop.clock import nanoseconds
+from skyloop.drivers.sim.options import SimOptions
+from skyloop.drivers.uri import VehicleUri
+from skyloop.errors import UsageError
+from skyloop.sim.pacing import Pacer
+from skyloop.sim.reports import Occurrence, VehicleFeedback, VehicleTruth
+from skyloop.sim.simulation import Simulation
+from skyloop.sim.world import TargetState, Wind
+
+if TYPE_CHECKING:
+    from skyloop.drivers.sim.cameras import Camera, Screen, Studio
+    from skyloop.drivers.sim.driver import SimDriver
+    from skyloop.sim.camera import CameraModel
+
+TICK_S: Final = 0.008  #: of the clock: steps are done in bunches of so much
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """A drone at one instant."""
+
+    believed: VehicleFeedback
+    truth: VehicleTruth
+    targets: tuple[TargetState, ...]
+    captured_ns: int
+
+
+class Passenger(Protocol):
+    """What a host calls, on the thread that steps the world. Must return quickly and never raise."""
+
+    def report(self, report: Report) -> None: ...
+
+    def happened(self, occurrence: Occurrence) -> None: ...
+
+    def wants(self, camera: str) -> bool: ...
+
+    def failed(self, error: Exception) -> None:
+        """The simulation broke: nothing more will come."""
+
+
+class SimHost:
+    """Several drones in one world, each to be had as a driver by :meth:`driver`.
+
+    The world is stepped while at least one of its drivers is open. Raises :class:`UsageError` for a world that does
+    not exist, can't be read, or has no place for so many drones.
+    """
+
+    def __init__(self, options: SimOptions | None = None, drones: int = 1) -> None:
+        self.options = options or SimOptions()
+        world = self.options.load_world()
+        self.wind = self.options.blowing(world.wind)  #: what blows at present
+        self.simulation = Simulation(
+            world,
+            drones,
+            seed=self.options.seed,
+            parameters=self.options.vehicle(),
+            charge=self.options.battery,
+            wind=self.wind,
+        )
+        self._lock = threading.Lock()
+        self._passengers: dict[int, tuple[Passenger, tuple[Camera, ...]]] = {}  # replaced as a whole, never changed
+        self._runner: _Runner | None = None
+
+    @property
+    def drones(self) -> int:
+        """How many there are; they are numbered from 0."""
+        return self.simulation.drones
+
+    def driver(self, drone: int = 0, uri: VehicleUri | None = None) -> SimDriver:
+        """The driver of one of the drones, not opened. ``uri`` is what it is called by."""
+        from skyloop.drivers.sim.driver import SimDriver
+
+        if not 0 <= drone < self.drones:
+            raise UsageError(f"no drone {drone}: they are numbered from 0 to {self.drones - 1}")
+        return SimDriver(uri or VehicleUri("sim"), host=self, drone=drone, options=self.options)
+
+    def set_wind(self, wind: Wind) -> None:
+        """Another wind from now on, for all drones."""
+        self.wind = wind
+        self.simulation.set_wind(wind)
+
+    def board(self, drone: int, passenger: Passenger, screen: Screen, models: list[CameraModel]) -> tuple[Camera, ...]:
+        """Begin to tell a passenger about a drone and to draw its cameras; the first one starts the world.
+
+        Raises :class:`UsageError` if somebody else has this drone, :class:`skyloop.errors.MissingExtraError` if
+        cameras are wanted and what draws is not installed.
+        """
+        with self._lock:
+            if drone in self._passengers:
+                raise UsageError(f"drone {drone} of this world has a driver already")
+            cameras = self._cameras(drone, screen, models)
+            self._passengers = {**self._passengers, drone: (passenger, cameras)}
+            if self._runner is None:
+                self._runner = _Runner(self)
+            return cameras
+
+    def leave(self, drone: int, passenger: Passenger) -> None:
+        """Nothing more is told to this passenger when this returns; the last one to leave stops the world."""
+        with self._lock:
+            entry = self._passengers.get(drone)
+            runner = self._runner
+            if entry is None or entry[0] is not passenger or runner is None:
+                return
+            self._passengers = {n: other for n, other in self._passengers.items() if n != drone}
+            last = not self._passengers
+            if last:
+                self._runner = None
+        if last:
+            runner.stop()
+        else:
+            runner.forget(entry[1])
+
+    @property
+    def passengers(self) -> dict[int, tuple[Passenger, tuple[Camera, ...]]]:
+        """Who is told about which drone, and its cameras."""
+        return self._passengers
+
+    def _cameras(self, drone: int, screen: Screen, models: list[CameraModel]) -> tuple[Camera, ...]:
+        if not models:
+            return ()
+        from skyloop.drivers.sim.cameras import Camera, Shutter
+
+        cameras = []
+        for n, model in enumerate(models):
+            place = drone * len(models) + n
+            offset_s = self.simulation.time_s + place / (self.drones * len(models)) / model.fps
+            seed = self.options.seed * 1000 + place
+            cameras.append(Camera(model, drone, screen, seed, Shutter(offset_s)))
+        return tuple(cameras)
+
+
+class _Runner:
+    """The threads of a host: one steps the world and tells, one draws."""
+
+    def __init__(self, host: SimHost) -> None:
+        self._host = host
+        self._simulation = host.simulation
+        self._speed = host.options.speed
+        self._pacer = Pacer(self._simulation.step, speed=self._speed)
+        self._begun_s = self._simulation.time_s
+        self._period_ns = nanoseconds(1.0 / host.options.rate_hz)
+        self._report_ns = 0
+        self._studio: Studio | None = None
+        self._stop = threading.Event()
+        self._telling = threading.Lock()
+        self._thread = threading.Thread(target=self._run, name="skyloop-sim", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._stop.set()
+        if self._thread is not threading.current_thread():
+            self._thread.join()
+        if self._studio is not None:
+            self._studio.stop()
+
+    def forget(self, cameras: tuple[Camera, ...]) -> None:
+        """When this returns the round of telling that was under way is over, and no picture of these cameras comes."""
+        if self._thread is not threading.current_thread():
+            with self._telling:
+                pass
+        if self._studio is not None:
+            self._studio.forget(cameras)
+
+    def _run(self) -> None:
+        try:
+            while not self._stop.wait(max(self._pacer.run_due(), TICK_S)):
+                with self._telling:
+                    self._tell()
+        except Exception as error:  # noqa: BLE001  told to every driver; a thread that dies in silence helps nobody
+            for passenger, _ in self._host.passengers.values():
+                passenger.failed(error)
+
+    def _tell(self) -> None:
+        simulation, passengers = self._simulation, self._host.passengers
+        now_s = simulation.time_s
+        captured_ns = self._pacer.clock_ns(now_s - self._begun_s)
+        for occurrence in simulation.take_occurrences():
+            if occurrence.drone in passengers:
+                passengers[occurrence.drone][0].happened(occurrence)
+        if captured_ns >= self._report_ns:
+            self._report_ns = max(self._report_ns + self._period_ns, captured_ns)
+            targets = simulation.target_states()
+            for drone, (passenger, _) in passengers.items():
+                report = Report(simulation.feedback(drone), simulation.truth(drone), targets, captured_ns)
+                passenger.report(report)
+        self._expose(now_s, captured_ns)
+
+    def _expose(self, now_s: float, captured_ns: int) -> None:
+        due = [
+            camera
+            for passenger, cameras in self._host.passengers.values()
+            for camera in cameras
+            if camera.shutter.due(now_s, camera.model.fps) and passenger.wants(camera.model.name)
+        ]
+        if not due:
+            return
+        from skyloop.drivers.sim.cameras import Studio, expose
+        from skyloop.sim.render import SceneState
+
+        if self._studio is None:
+            self._studio = Studio(self._simulation.world, self._host.drones, self._host.options.quality)
+            self._studio.start()
+        positions, rotations = self._simulation.poses()
+        state = SceneState(positions, rotations, self._simulation.target_states())
+        rates = {camera.drone: np.array(self._simulation.truth(camera.drone).angular_velocity_rad_s) for camera in due}
+        self._studio.expose([expose(camera, state, rates[camera.drone], captured_ns, self._speed) for camera in due])

@@ -1,0 +1,136 @@
+"""What a ``sim://`` address asks for. Pure, but for the reading of a world file when the world is made.
+
+Options: ``world`` its name or file (``room``); ``seed`` (0); ``speed`` seconds of simulation a second (1); ``cameras``
+(``front,bottom``, or ``none``); ``width``, ``height``, ``fps`` of all cameras; ``latency`` of all cameras [s];
+``noise`` a factor on every sensor's and camera's noise (1); ``wind`` a factor on the world's wind (1); ``battery``
+charge at the start, 0 to 1 (1); ``quality`` of the pictures, ``fast``, ``smooth`` or ``best``; ``native`` the actions
+that the vehicle itself takes, the others being left to the proxy (all); ``position`` whether the vehicle knows its
+place, as with an indoor positioning system (0); ``truth`` whether feedback carries the true state besides (1);
+``rate`` of feedback [1/s] (40).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Final
+
+from skyloop.drivers.base import reject_unknown_options
+from skyloop.drivers.uri import VehicleUri
+from skyloop.errors import UnknownNameError, UsageError
+from skyloop.messages import ACTION_NAMES
+from skyloop.sim.camera import BOTTOM_CAMERA, FRONT_CAMERA, CameraModel
+from skyloop.sim.parameters import VehicleParameters
+from skyloop.sim.world import Wind, World
+from skyloop.sim.world_file import load_world
+
+CAMERAS: Final = {camera.name: camera for camera in (FRONT_CAMERA, BOTTOM_CAMERA)}
+QUALITIES: Final = ("fast", "smooth", "best")
+EVERY_ACTION: Final = frozenset(ACTION_NAMES.values())
+ALWAYS_NATIVE: Final = frozenset({"idle", "emergency_stop", "reset_emergency"})
+_KNOWN: Final = {
+    *("world", "seed", "speed", "cameras", "width", "height", "fps", "latency", "noise", "wind", "battery"),
+    *("quality", "native", "position", "truth", "rate"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class SimOptions:
+    """A simulated world and how its drones are made."""
+
+    world: str = "room"
+    seed: int = 0
+    speed: float = 1.0
+    cameras: tuple[CameraModel, ...] = (FRONT_CAMERA, BOTTOM_CAMERA)
+    noise: float = 1.0
+    wind: float = 1.0
+    battery: float = 1.0
+    quality: str = "smooth"
+    native: frozenset[str] = EVERY_ACTION
+    position: bool = False
+    truth: bool = True
+    rate_hz: float = 40.0
+
+    @classmethod
+    def of(cls, uri: VehicleUri) -> SimOptions:
+        """From an address. Raises :class:`UsageError` for what makes no sense."""
+        reject_unknown_options(uri, _KNOWN)
+        if uri.place:
+            raise UsageError(f"{uri}: a simulated drone has no place; did you mean sim://?world={uri.place}")
+        options = uri.options
+        quality = options.get("quality", "smooth")
+        if quality not in QUALITIES:
+            raise UnknownNameError("quality of pictures", quality, QUALITIES)
+        noise = uri.number("noise", 1.0, minimum=0.0, maximum=20.0)
+        return cls(
+            world=options.get("world", "room"),
+            seed=uri.whole("seed", 0),
+            speed=uri.number("speed", 1.0, minimum=0.01, maximum=100.0),
+            cameras=tuple(_camera(uri, model, noise) for model in _models(options.get("cameras", "front,bottom"))),
+            noise=noise,
+            wind=uri.number("wind", 1.0, minimum=0.0, maximum=20.0),
+            battery=uri.number("battery", 1.0, minimum=0.001, maximum=1.0),
+            quality=quality,
+            native=_native(options.get("native")),
+            position=uri.flag("position"),
+            truth=uri.flag("truth", default=True),
+            rate_hz=uri.number("rate", 40.0, minimum=1.0, maximum=200.0),
+        )
+
+    def load_world(self) -> World:
+        """Raises :class:`UnknownNameError` or :class:`skyloop.errors.FileFormatError`."""
+        return load_world(self.world, self.seed)
+
+    def blowing(self, wind: Wind) -> Wind:
+        """The world's wind by this factor."""
+        x, y, z = wind.mean_m_s
+        mean = (x * self.wind, y * self.wind, z * self.wind)
+        return replace(wind, mean_m_s=mean, gust_m_s=wind.gust_m_s * self.wind)
+
+    def vehicle(self) -> VehicleParameters:
+        """The vehicle, with its sensors' noise and biases by this factor."""
+        standard = VehicleParameters()
+        flaws = {
+            field.name: getattr(standard, field.name) * self.noise
+            for field in fields(standard)
+            if ("_noise_" in field.name or "_bias_" in field.name) and "time_constant" not in field.name
+        }
+        return replace(standard, **flaws)
+
+
+def _models(text: str) -> list[CameraModel]:
+    names = [] if text in ("none", "") else text.split(",")
+    for name in names:
+        if name not in CAMERAS:
+            raise UnknownNameError("simulated camera", name, CAMERAS)
+    if len(set(names)) != len(names):
+        raise UsageError(f"cameras={text} names one twice")
+    return [CAMERAS[name] for name in names]
+
+
+def _camera(uri: VehicleUri, standard: CameraModel, noise: float) -> CameraModel:
+    """The standard camera over a picture of another size: the field of view across stays, rows are cut or added."""
+    width = uri.whole("width", 0, minimum=16, maximum=4096)
+    height = uri.whole("height", 0, minimum=16, maximum=4096)
+    width = width or (round(height * standard.width / standard.height) if height else standard.width)
+    model = standard.scaled(width / standard.width)
+    if height and height != model.height:
+        model = replace(model, height=height, cy=model.cy + (height - model.height) / 2)
+    return replace(
+        model,
+        fps=uri.number("fps", standard.fps, minimum=0.1, maximum=240.0),
+        latency_s=uri.number("latency", standard.latency_s, minimum=0.0, maximum=5.0),
+        noise_sigma=standard.noise_sigma * noise,
+    )
+
+
+def _native(text: str | None) -> frozenset[str]:
+    if text is None:
+        return EVERY_ACTION
+    names = set(text.split(","))
+    for name in names - EVERY_ACTION:
+        raise UnknownNameError("action", name, EVERY_ACTION)
+    if not names & {"velocity", "attitude"}:
+        raise UsageError(f"native={text} leaves no set-point to fly by: name velocity or attitude as well")
+    if ("takeoff" in names) != ("land" in names):
+        raise UsageError(f"native={text}: takeoff and land go together")
+    return frozenset(names) | ALWAYS_NATIVE

@@ -1,0 +1,382 @@
+"""The contract of :mod:`skyloop.drivers.base` as tests: subclass, name the vehicle, run with pytest.
+
+::
+
+    from skyloop.drivers.suite import DriverSuite
+
+    class TestMyDriver(DriverSuite):
+        uri = "mydrone://127.0.0.1?port=5556"
+
+The vehicle of that address must be there and, if it can fly, stand on the ground with room around it: the suite takes
+off, moves about a metre along each axis, turns, and lands. **Never run it against a real vehicle that is not tied
+down or netted in.** A vehicle that can't fly is not asked to.
+
+Tests of what a vehicle does not have are skipped. Nothing here needs pytest to be imported.
+"""
+
+from __future__ import annotations
+
+import gc
+import re
+import statistics
+import sys
+import threading
+import time
+import unittest
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import ClassVar, Final
+
+from skyloop.drivers.base import Driver
+from skyloop.drivers.recording_sink import RecordingSink, implausible
+from skyloop.drivers.registry import make_driver
+from skyloop.drivers.suite_flight import Flight
+from skyloop.drivers.suite_parameters import another_value, mismatch, same
+from skyloop.drivers.uri import VehicleUri, parse_uri
+from skyloop.errors import ParameterError, UnknownNameError, UsageError
+from skyloop.messages import (
+    ACTION_NAMES,
+    AnyAction,
+    Attitude,
+    EmergencyStop,
+    Encoding,
+    FlightState,
+    Hover,
+    Idle,
+    Land,
+    LinkState,
+    ResetEmergency,
+    Takeoff,
+    Value,
+    Velocity,
+)
+
+__all__ = ["DriverSuite", "RecordingSink"]
+
+APPLY_S: Final = 0.05
+_PARAMETER_NAME: Final = re.compile(r"[a-z0-9_]+(\.[a-z0-9_]+)*\Z")
+
+
+class DriverSuite:
+    """Base class of a driver's tests. Set :attr:`uri`, or write :meth:`make`; the rest has sensible defaults."""
+
+    #: The address of the vehicle to test with.
+    uri: ClassVar[str] = ""
+
+    #: How long things may take [s].
+    connect_timeout_s: ClassVar[float] = 5.0
+    feedback_timeout_s: ClassVar[float] = 2.0
+    frame_timeout_s: ClassVar[float] = 5.0
+    takeoff_timeout_s: ClassVar[float] = 15.0
+    land_timeout_s: ClassVar[float] = 20.0
+    motion_timeout_s: ClassVar[float] = 6.0
+    emergency_timeout_s: ClassVar[float] = 3.0
+    lost_timeout_s: ClassVar[float] = 5.0
+    close_grace_s: ClassVar[float] = 2.0  #: for threads that were joined to vanish from the system's tables
+
+    #: What the flight test asks for: speeds [m/s], tilt [rad], turn [rad/s]; how far the vehicle must go [m], [rad].
+    speed: ClassVar[float] = 0.4
+    climb: ClassVar[float] = 0.4
+    tilt: ClassVar[float] = 0.08
+    yaw_rate: ClassVar[float] = 0.6
+    distance: ClassVar[float] = 0.15
+    turn: ClassVar[float] = 0.2
+
+    #: A sample or frame may be this old when it comes [s].
+    feedback_age_s: ClassVar[float] = 0.5
+    frame_age_s: ClassVar[float] = 1.0
+
+    #: Parameters that the suite must not write.
+    untouched_parameters: ClassVar[frozenset[str]] = frozenset()
+
+    # To be written or overridden by whoever tests a driver ---------------------------------------------------------
+
+    def make(self, uri: VehicleUri) -> Driver:
+        """A new driver, not opened. The default finds it by its entry point."""
+        return make_driver(uri)
+
+    def vehicle_disappears(self) -> None:
+        """Take the vehicle away from the driver that is open (switch off its radio, kill its emulator)."""
+        raise unittest.SkipTest("this suite does not know how to make the vehicle disappear")
+
+    def vehicle_appears(self) -> None:
+        """Bring it back."""
+        raise unittest.SkipTest("this suite does not know how to make the vehicle appear")
+
+    # Helpers -------------------------------------------------------------------------------------------------------
+
+    def new_driver(self) -> Driver:
+        return self.make(parse_uri(self.uri))
+
+    @contextmanager
+    def opened(self, *, watch: set[str] | None = None) -> Iterator[tuple[Driver, RecordingSink]]:
+        """A driver whose link is up and its sink; closed at the end, and its sink's complaints raised."""
+        driver, sink = self.new_driver(), RecordingSink(watch=watch)
+        driver.open(sink)
+        try:
+            up = sink.wait(lambda: sink.link_state is LinkState.UP, self.connect_timeout_s)
+            assert up, f"the link was not told UP within {self.connect_timeout_s} s; told: {sink.links}"
+            yield driver, sink
+        finally:
+            driver.close()
+        assert not sink.problems, "; ".join(sink.problems[:5])
+
+    # Before it is opened -------------------------------------------------------------------------------------------
+
+    def test_constructor_does_no_io(self) -> None:
+        self.new_driver()  # imports and caches of the first time are no resource of the driver
+        before = _resources()
+        drivers = [self.new_driver() for _ in range(3)]
+        assert _resources() == before, "a constructor started a thread or opened a descriptor"
+        for driver in drivers:
+            driver.close()  # closing what was never opened does nothing
+
+    def test_capabilities_before_open(self) -> None:
+        capabilities = self.new_driver().capabilities()
+        assert capabilities.vehicle, "capabilities need the vehicle's family name"
+        unknown = capabilities.actions - set(ACTION_NAMES.values())
+        assert not unknown, f"actions {sorted(unknown)} are none of {sorted(ACTION_NAMES.values())}"
+        if not capabilities.actions:
+            assert capabilities.why_not, "a vehicle that takes no actions must say why in why_not"
+        names = [camera.name for camera in capabilities.cameras]
+        assert len(names) == len(set(names)), f"two cameras have one name: {names}"
+        for camera in capabilities.cameras:
+            assert camera.fps > 0, f"{camera.name}: fps must be positive"
+            assert camera.width > 0, f"{camera.name}: width must be positive"
+            assert camera.height > 0, f"{camera.name}: height must be positive"
+            if camera.rotation is not None:
+                _check_rotation(camera.name, camera.rotation)
+
+    def test_unknown_option_is_refused(self) -> None:
+        good = parse_uri(self.uri)
+        options = {**good.options, "no_such_option_at_all": "1"}
+        try:
+            self.make(VehicleUri(good.scheme, good.place, options))
+        except UsageError as error:
+            told = str(error)
+        else:
+            raise AssertionError("an option that the driver does not know must raise UsageError in the constructor")
+        assert "no_such_option_at_all" in told, f"the error must name the option: {told}"
+
+    # Life cycle ----------------------------------------------------------------------------------------------------
+
+    def test_close_is_idempotent_and_final(self) -> None:
+        with self.opened() as (driver, sink):
+            sink.wait(lambda: sink.feedback_count > 0, self.feedback_timeout_s)
+            driver.close()
+            calls = sink.calls
+            driver.close()
+            time.sleep(0.2)
+            assert sink.calls == calls, "the driver called its sink after close()"
+
+    def test_open_twice_is_refused(self) -> None:
+        with self.opened() as (driver, _):
+            try:
+                driver.open(RecordingSink())
+            except UsageError:
+                return
+            raise AssertionError("opening a driver that is open must raise UsageError")
+
+    def test_can_be_opened_again(self) -> None:
+        driver = self.new_driver()
+        for _ in range(2):
+            sink = RecordingSink()
+            driver.open(sink)
+            up = sink.wait(lambda s=sink: s.link_state is LinkState.UP, self.connect_timeout_s)  # type: ignore[misc]
+            driver.close()
+            assert up, f"the link was not told UP; told: {sink.links}"
+
+    def test_gives_threads_and_descriptors_back(self) -> None:
+        with self.opened() as (_, sink):  # what libraries keep for themselves is kept from here on
+            self.hear(sink)
+        gc.collect()
+        before = _resources()
+        for _ in range(3):
+            with self.opened() as (_, sink):
+                self.hear(sink)
+        gc.collect()
+        end = time.monotonic() + self.close_grace_s
+        while _exceeds(_resources(), before) and time.monotonic() < end:
+            time.sleep(0.02)
+        assert not _exceeds(_resources(), before), f"threads and descriptors: {before} before, {_resources()} after"
+
+    # What it tells -------------------------------------------------------------------------------------------------
+
+    def test_feedback(self) -> None:
+        with self.opened() as (_, sink):
+            arrived = sink.wait(lambda: sink.feedback_count >= 10, self.feedback_timeout_s + 5.0)
+            assert arrived, f"{sink.feedback_count} samples of feedback in {self.feedback_timeout_s + 5.0} s"
+            samples = list(sink.feedbacks)
+            now_ns = time.monotonic_ns()
+        for feedback in samples:
+            problems = implausible(feedback)
+            assert not problems, "; ".join(problems)
+            assert FlightState(feedback.state) is feedback.state
+            assert (feedback.seq, feedback.published_ns, feedback.lease) == (0, 0, 0), "those fields are the proxy's"
+            assert feedback.owner is None, "the owner is the proxy's to fill"
+        age_s = (now_ns - samples[-1].captured_ns) / 1e9
+        assert age_s <= self.feedback_age_s + 1.0, f"the newest feedback is {age_s:.2f} s old"
+
+    def test_frames(self) -> None:
+        cameras = {camera.name: camera for camera in self.new_driver().capabilities().cameras}
+        if not cameras:
+            raise unittest.SkipTest("the vehicle has no camera")
+        with self.opened() as (_, sink):
+            some = sink.wait(lambda: sum(sink.frame_counts.values()) >= 5, self.frame_timeout_s)
+            assert some, f"frames of {dict(sink.frame_counts)} within {self.frame_timeout_s} s"
+            frames = list(sink.frames)
+        ages_s = []
+        for frame in frames:
+            camera = cameras.get(frame.camera)
+            assert camera is not None, f"frames of camera {frame.camera!r}, which capabilities() does not name"
+            assert frame.encoding in set(Encoding), f"{frame.encoding!r} is no encoding"
+            assert (frame.width, frame.height) == (camera.width, camera.height), (
+                f"{frame.camera}: {frame.width}×{frame.height} came, {camera.width}×{camera.height} is announced"
+            )
+            ages_s.append((frame.arrived_ns - frame.captured_ns) / 1e9)
+        assert statistics.median(ages_s) <= self.frame_age_s, f"frames are {statistics.median(ages_s):.2f} s old"
+
+    def test_link_lost_and_found(self) -> None:
+        with self.opened() as (_, sink):
+            self.hear(sink)
+            self.vehicle_disappears()
+            try:
+                lost = sink.wait(lambda: sink.link_state is LinkState.LOST, self.lost_timeout_s)
+                assert lost, f"the link was not told LOST; told: {sink.links}"
+                assert sink.links[-1][1], "LOST needs a reason"
+            finally:
+                self.vehicle_appears()
+            found = sink.wait(lambda: sink.link_state is LinkState.UP, self.connect_timeout_s)
+            assert found, f"the link was not told UP again; told: {sink.links}"
+
+    # What it is told -----------------------------------------------------------------------------------------------
+
+    def test_apply_returns_what_was_applied_at_once(self) -> None:
+        """On the ground, with actions that do not take off; a flight follows in its own test."""
+        with self.opened() as (driver, sink):
+            self.hear(sink)
+            actions = driver.capabilities().actions
+            harmless: list[AnyAction] = [Idle(), Land(), Hover(), Attitude(climb=-0.1), Velocity(up=-0.1)]
+            announced = [action for action in harmless if action.name in actions]
+            if not announced:
+                raise unittest.SkipTest("the vehicle takes no actions")
+            for action in announced:
+                times_s = []
+                for _ in range(5):
+                    begun = time.perf_counter()
+                    applied = driver.apply(action)
+                    times_s.append(time.perf_counter() - begun)
+                    assert type(applied).__name__ in {type(known).__name__ for known in (*harmless, Takeoff())}
+                    assert applied.finite, f"apply({action.name}) returned {applied}"
+                # The median: on a busy machine any single call may be held up.
+                middle_s = statistics.median(times_s)
+                assert middle_s <= APPLY_S, f"apply({action.name}) took {middle_s * 1e3:.0f} ms"
+
+    def test_failsafe_never_raises(self) -> None:
+        driver = self.new_driver()
+        assert isinstance(driver.failsafe(Hover()), bool), "failsafe before open() must return a bool"
+        with self.opened() as (driver, sink):
+            self.hear(sink)
+            assert isinstance(driver.failsafe(Hover()), bool)
+            assert isinstance(driver.failsafe(Land()), bool)
+        assert isinstance(driver.failsafe(Land()), bool), "failsafe after close() must return a bool"
+
+    # Parameters ----------------------------------------------------------------------------------------------------
+
+    def test_parameters_are_well_formed(self) -> None:
+        with self.opened() as (driver, sink):
+            self.hear(sink)
+            parameters = driver.parameters()
+        names = [parameter.name for parameter in parameters]
+        assert len(names) == len(set(names)), "two parameters have one name"
+        for parameter in parameters:
+            assert _PARAMETER_NAME.match(parameter.name), f"{parameter.name!r} is not dotted lower case"
+            for what in ("value", "default"):
+                value = getattr(parameter, what)
+                if value is not None:
+                    problem = mismatch(parameter, value)
+                    assert not problem, f"{parameter.name}: its {what} {value!r} {problem}"
+
+    def test_parameters_round_trip(self) -> None:
+        with self.opened() as (driver, sink):
+            self.hear(sink)
+            writable = [p for p in driver.parameters() if not p.read_only and p.name not in self.untouched_parameters]
+            if not writable:
+                raise unittest.SkipTest("the vehicle has no parameter to write")
+            for parameter in writable:
+                try:
+                    for value in (another_value(parameter), parameter.value):
+                        in_force = driver.set_parameter(parameter.name, value)
+                        assert same(in_force, value), f"{parameter.name}: wrote {value!r}, {in_force!r} is in force"
+                        told = next(p.value for p in driver.parameters() if p.name == parameter.name)
+                        assert same(told, in_force), f"{parameter.name}: {in_force!r} in force, {told!r} listed"
+                finally:
+                    driver.set_parameter(parameter.name, parameter.value)
+
+    def test_bad_parameters_are_refused(self) -> None:
+        with self.opened() as (driver, sink):
+            self.hear(sink)
+            read_only = [parameter for parameter in driver.parameters() if parameter.read_only]
+            tries: list[tuple[str, Value]] = [("no.such.parameter", 1.0)]
+            for name, value in tries + [(p.name, p.value) for p in read_only]:
+                try:
+                    driver.set_parameter(name, value)
+                except (ParameterError, UnknownNameError):
+                    continue
+                raise AssertionError(f"writing {name} must raise ParameterError")
+
+    # Flight --------------------------------------------------------------------------------------------------------
+
+    def test_flight(self) -> None:
+        """Take-off, each axis with its sign, landing."""
+        with self.opened(watch=set()) as (driver, sink):
+            flight = Flight(self, driver, sink)
+            flight.take_off()
+            try:
+                flight.moves_along_axes()
+                if "hover" in driver.capabilities().actions:
+                    driver.apply(Hover())
+                    flight.until(lambda f: f.state is FlightState.HOVERING, self.motion_timeout_s, "hovering")
+            finally:
+                flight.land()
+
+    def test_emergency_stop_and_reset(self) -> None:
+        """On the ground: the state is told, and left only by the reset."""
+        with self.opened(watch=set()) as (driver, sink):
+            actions = driver.capabilities().actions
+            if not {"emergency_stop", "reset_emergency"} <= actions:
+                raise unittest.SkipTest("the vehicle takes no emergency stop with reset")
+            flight = Flight(self, driver, sink)
+            driver.apply(EmergencyStop())
+            flight.until(lambda f: f.state is FlightState.EMERGENCY, self.emergency_timeout_s, "in emergency")
+            if "hover" in actions:
+                driver.apply(Hover())
+                time.sleep(0.2)
+                flight.until(lambda f: f.state is FlightState.EMERGENCY, 1.0, "still in emergency after hover")
+            driver.apply(ResetEmergency())
+            flight.until(lambda f: f.state is FlightState.LANDED, self.emergency_timeout_s, "landed after the reset")
+
+    def hear(self, sink: RecordingSink) -> None:
+        """Wait for the first feedback."""
+        heard = sink.wait(lambda: sink.feedback_count > 0, self.feedback_timeout_s)
+        assert heard, f"no feedback within {self.feedback_timeout_s} s of the link being up"
+
+
+def _resources() -> tuple[int, int]:
+    """Threads and open descriptors of this process; no descriptors counted where /proc is missing."""
+    descriptors = Path("/proc/self/fd") if sys.platform == "linux" else Path("/dev/fd")
+    count = len(list(descriptors.iterdir())) if descriptors.exists() else 0
+    return threading.active_count(), count
+
+
+def _exceeds(now: tuple[int, int], before: tuple[int, int]) -> bool:
+    return now[0] > before[0] or now[1] > before[1]
+
+
+def _check_rotation(name: str, rotation: tuple[float, ...]) -> None:
+    rows = [rotation[0:3], rotation[3:6], rotation[6:9]]
+    for i in range(3):
+        for j in range(3):
+            dot = sum(a * b for a, b in zip(rows[i], rows[j], strict=True))
+            assert abs(dot - (i == j)) < 1e-6, f"{name}: its rotation is no rotation matrix"

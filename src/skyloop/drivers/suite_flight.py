@@ -1,0 +1,143 @@
+"""The driver suite's flight: take-off, both ways along each axis, landing; judged by what the vehicle tells."""
+
+from __future__ import annotations
+
+import math
+import unittest
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from skyloop.drivers.base import Driver
+from skyloop.drivers.recording_sink import RecordingSink
+from skyloop.messages import Attitude, Feedback, FlightState, Hover, Land, Takeoff, Velocity
+from skyloop.messages.geometry import wrap_angle
+
+if TYPE_CHECKING:
+    from skyloop.drivers.suite import DriverSuite
+
+#: How far the vehicle went from one sample to another, with sign; None if it does not tell.
+Measure = Callable[[Feedback, Feedback], float | None]
+
+
+class Flight:
+    """One flight of the suite, on native actions where the vehicle has them and on set-points where it has not."""
+
+    def __init__(self, suite: DriverSuite, driver: Driver, sink: RecordingSink) -> None:
+        self.suite = suite
+        self.driver = driver
+        self.sink = sink
+        self.actions = driver.capabilities().actions
+        if not self.actions & {"velocity", "attitude"}:
+            raise unittest.SkipTest("the vehicle takes no set-points")
+        suite.hear(sink)
+
+    def until(self, condition: Callable[[Feedback], bool], timeout_s: float, what: str) -> Feedback:
+        sink = self.sink
+
+        def holds() -> bool:
+            return sink.newest is not None and condition(sink.newest)
+
+        assert sink.wait(holds, timeout_s), f"not {what} within {timeout_s} s; newest feedback: {sink.newest}"
+        assert sink.newest is not None
+        return sink.newest
+
+    def take_off(self) -> None:
+        if "takeoff" in self.actions:
+            self.driver.apply(Takeoff())
+            settled = (FlightState.HOVERING, FlightState.FLYING)
+            self.until(lambda f: f.state in settled, self.suite.takeoff_timeout_s, "hovering after take-off")
+            return
+        self.set_point(up=self.suite.climb)
+        self.until(lambda f: f.altitude is None or f.altitude > 0.6, self.suite.takeoff_timeout_s, "0.6 m high")
+        self.set_point()
+
+    def land(self) -> None:
+        if "land" in self.actions:
+            self.driver.apply(Land())
+            self.until(lambda f: f.state is FlightState.LANDED, self.suite.land_timeout_s, "landed")
+            return
+        self.set_point(up=-self.suite.climb)
+        low = FlightState.LANDED
+        self.until(
+            lambda f: f.state is low or (f.altitude is not None and f.altitude < 0.1), self.suite.land_timeout_s, "down"
+        )
+
+    def set_point(self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, turn: float = 0.0) -> None:
+        """Velocity if the vehicle takes it; else the attitude that accelerates that way. One call: it must last."""
+        if "velocity" in self.actions:
+            self.driver.apply(Velocity(forward=forward, left=left, up=up, yaw_rate=turn))
+            return
+        tilt = self.suite.tilt
+        pitch, roll = math.copysign(tilt, forward) * bool(forward), -math.copysign(tilt, left) * bool(left)
+        self.driver.apply(Attitude(roll=roll, pitch=pitch, climb=up, yaw_rate=turn))
+
+    def moves_along_axes(self) -> None:
+        """Both ways along each axis: the sign is right only if both are."""
+        suite = self.suite
+        for sign in (1.0, -1.0):
+            self._goes("up", _height, sign * suite.distance, up=sign * suite.climb)
+            self._goes("yaw", _turned, sign * suite.turn, turn=sign * suite.yaw_rate)
+            self._goes("forward", _ahead, sign * suite.distance, forward=sign * suite.speed)
+            self._goes("left", _aside, sign * suite.distance, left=sign * suite.speed)
+
+    def _goes(self, axis: str, measure: Measure, goal: float, **set_point: float) -> None:
+        """Command, wait until the vehicle has gone as far as the goal on its side, then stop."""
+        start = self.sink.newest
+        assert start is not None
+        if measure(start, start) is None:
+            return  # the vehicle does not tell what this axis would be judged by
+        self.set_point(**set_point)
+
+        def far_enough(feedback: Feedback) -> bool:
+            gone = measure(start, feedback)
+            return gone is not None and gone * math.copysign(1.0, goal) >= abs(goal)
+
+        self.until(far_enough, self.suite.motion_timeout_s, f"{goal:+g} along {axis} from {start}")
+        self.set_point()
+        self._settle()
+
+    def _settle(self) -> None:
+        """Until it is slow again, where it tells its speed; a drone that takes only attitudes coasts."""
+        brake = "hover" in self.actions
+        if brake:
+            self.driver.apply(Hover())
+        self.sink.wait(lambda: _speed(self.sink.newest) < 0.25, 2.0 if brake else 0.3)
+
+
+def _height(start: Feedback, now: Feedback) -> float | None:
+    if start.altitude is not None and now.altitude is not None:
+        return now.altitude - start.altitude
+    return _speed_sign(now, 2)
+
+
+def _turned(start: Feedback, now: Feedback) -> float | None:
+    if start.yaw is None or now.yaw is None:
+        return None
+    return wrap_angle(now.yaw - start.yaw)
+
+
+def _ahead(start: Feedback, now: Feedback) -> float | None:
+    return _along(start, now, 0)
+
+
+def _aside(start: Feedback, now: Feedback) -> float | None:
+    return _along(start, now, 1)
+
+
+def _along(start: Feedback, now: Feedback, axis: int) -> float | None:
+    """How far it went along the heading (axis 0) or to the left of it (1), or its speed there if that is all."""
+    if start.position is None or now.position is None or start.yaw is None:
+        return _speed_sign(now, axis)
+    east, north = now.position[0] - start.position[0], now.position[1] - start.position[1]
+    heading = start.yaw + axis * math.pi / 2
+    return east * math.cos(heading) + north * math.sin(heading)
+
+
+def _speed_sign(now: Feedback, axis: int) -> float | None:
+    return None if now.velocity is None else now.velocity[axis]
+
+
+def _speed(feedback: Feedback | None) -> float:
+    if feedback is None or feedback.velocity is None:
+        return math.inf
+    return math.hypot(*feedback.velocity)

@@ -1,0 +1,182 @@
+"""Where a video vehicle's pictures come from: files and devices that PyAV opens, and files of PaVE streams.
+
+All open at construction, and raise :class:`skyloop.errors.UsageError` or :class:`FileFormatError` that name the file.
+"""
+
+from __future__ import annotations
+
+import stat
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Protocol
+
+from skyloop.drivers.pave import PaveFrame, PaveParser
+from skyloop.drivers.video.decoder import PaveDecoder, av, limit_memory
+from skyloop.errors import DriverError, FileFormatError, UsageError
+
+if TYPE_CHECKING:
+    from av.container import InputContainer
+
+FFmpegError = av.error.FFmpegError
+
+CHUNK: Final = 1 << 16
+SNIFF: Final = 1 << 18  #: a PaVE stream that was torn open somewhere shows its next header well within this
+DEFAULT_FPS: Final = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A decoded picture and its stamp on the stream's own clock [s]; not yet converted to BGR."""
+
+    stamp_s: float
+    image: av.VideoFrame
+
+
+Late = Callable[[float], bool]
+
+
+class Source(Protocol):
+    """One pass over a recording or a device's stream."""
+
+    width: int
+    height: int
+    fps: float
+    damaged: int  #: pieces that could not be decoded so far
+
+    def pictures(self, late: Late | None = None) -> Iterator[Picture]:
+        """The pictures in order, until the stream ends. Raises :class:`DriverError` when a device fails.
+
+        A picture whose stamp is ``late`` is left undecoded, where no other picture depends on it.
+        """
+
+    def close(self) -> None: ...
+
+
+def is_device(path: Path) -> bool:
+    """Whether the path names a device, there or not, rather than a file."""
+    if path.is_relative_to("/dev"):
+        return True
+    try:
+        return stat.S_ISCHR(path.stat().st_mode)
+    except OSError:
+        return False
+
+
+def open_file(path: Path) -> Source:
+    """Open a recording, whatever its format."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(SNIFF)
+    except OSError as error:
+        if "%" in path.name:  # a numbered sequence of pictures: PyAV understands the pattern
+            return ContainerSource(str(path))
+        raise UsageError(f"video://{path}: {error.strerror}") from error
+    if path.suffix == ".pave" or PaveParser().feed(head):
+        return PaveSource(path)
+    return ContainerSource(str(path))
+
+
+def open_device(path: Path, options: dict[str, str]) -> Source:
+    """Open a camera of this machine (Video4Linux). Raises :class:`DriverError` if it is not there or busy."""
+    return ContainerSource(str(path), "v4l2", options, live=True)
+
+
+class ContainerSource:
+    """Anything that PyAV opens."""
+
+    def __init__(
+        self, name: str, format_name: str | None = None, options: dict[str, str] | None = None, *, live: bool = False
+    ) -> None:
+        self._name = name
+        self._live = live
+        self.damaged = 0
+        try:
+            self._container: InputContainer = av.open(name, format=format_name, options=options or {})
+        except (FFmpegError, OSError, ValueError) as error:
+            raise self._error("cannot be opened", error) from error
+        videos = self._container.streams.video
+        if not videos:
+            self._container.close()
+            raise FileFormatError(f"{name} holds no video stream")
+        self._stream = videos[0]
+        limit_memory(self._stream.codec_context)
+        if not live:
+            self._stream.thread_type = "AUTO"
+        self.width, self.height = self._stream.codec_context.width, self._stream.codec_context.height
+        self.fps = float(self._stream.average_rate or self._stream.guessed_rate or DEFAULT_FPS)
+        if not (self.width and self.height):
+            self._container.close()
+            raise FileFormatError(f"{name}: the size of its pictures is not told: it is damaged or cut off")
+
+    def pictures(self, late: Late | None = None) -> Iterator[Picture]:
+        independent = self._stream.codec_context.codec.intra_only
+        stamp_s = -1.0 / self.fps
+        for packet in self._packets():
+            if late and independent and packet.pts is not None and late(float(packet.pts * packet.time_base)):
+                continue
+            try:
+                images = packet.decode()
+            except (FFmpegError, ValueError):  # a damaged packet; the decoder goes on with the next one
+                self.damaged += 1
+                continue
+            for image in images:
+                if image.is_corrupt:
+                    self.damaged += 1
+                    continue
+                stamp_s = image.time if image.time is not None else stamp_s + 1.0 / self.fps
+                yield Picture(stamp_s, image)
+
+    def _packets(self) -> Iterator[av.Packet[av.VideoStream]]:
+        try:
+            yield from self._container.demux(self._stream)
+        except (FFmpegError, OSError, ValueError) as error:
+            if self._live:
+                raise self._error("stopped", error) from error
+            self.damaged += 1  # a file that was cut off: what came so far was good
+
+    def close(self) -> None:
+        self._container.close()
+
+    def _error(self, what: str, error: Exception) -> Exception:
+        cause = getattr(error, "strerror", None) or str(error)
+        if self._live:
+            return DriverError(f"{self._name} {what}: {cause}")
+        return FileFormatError(f"{self._name} {what} as a video: {cause}")
+
+
+class PaveSource:
+    """A file of the raw bytes of an AR.Drone 2's video port.
+
+    Pictures before the first key frame (a stream torn open, or the drone's stale first frame) and after damage up to
+    the next key frame are left out: they would be smeared.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._name = str(path)
+        self.damaged = 0
+        self._parser = PaveParser()
+        self._file = path.open("rb")
+        first = next(iter(self._parser_frames()), None)
+        if first is None:
+            self._file.close()
+            raise FileFormatError(f"{path} holds no frame of a PaVE stream")
+        self._file.seek(0)
+        self._parser = PaveParser()
+        self.width, self.height, self.fps = first.width, first.height, DEFAULT_FPS
+
+    def pictures(self, late: Late | None = None) -> Iterator[Picture]:  # noqa: ARG002  every frame needs the one before
+        decoder = PaveDecoder()
+        for frame in self._parser_frames():
+            image = decoder.decode(frame)
+            self.damaged = decoder.damaged + self._parser.broken_frames
+            if image is not None:
+                yield Picture(frame.timestamp_ms / 1000.0, image)
+
+    def close(self) -> None:
+        self._file.close()
+
+    def _parser_frames(self) -> Iterator[PaveFrame]:
+        while chunk := self._file.read(CHUNK):
+            yield from self._parser.feed(chunk)
+        self._parser.end()

@@ -1,0 +1,31 @@
+"""The simulator: worlds from text files, quadrotors with the logic of real firmware, stepped by their owner.
+
+Nothing here knows of proxies or networks, and nothing reads a wall clock but :class:`Pacer`.
+"""
+
+from skyloop.sim.dynamics import STEP_S
+from skyloop.sim.pacing import Pacer
+from skyloop.sim.parameters import LIMIT_RANGES, Limits, VehicleParameters
+from skyloop.sim.reports import Occurrence, OccurrenceKind, VehicleFeedback, VehicleTruth
+from skyloop.sim.simulation import Simulation
+from skyloop.sim.world import TargetState, Wind, World
+from skyloop.sim.world_file import load_world, parse_world, shipped_worlds
+
+__all__ = [
+    "LIMIT_RANGES",
+    "STEP_S",
+    "Limits",
+    "Occurrence",
+    "OccurrenceKind",
+    "Pacer",
+    "Simulation",
+    "TargetState",
+    "VehicleFeedback",
+    "VehicleParameters",
+    "VehicleTruth",
+    "Wind",
+    "World",
+    "load_world",
+    "parse_world",
+    "shipped_worlds",
+]

@@ -1,0 +1,224 @@
+"""Cameras of simulated drones: geometry of lens and mounting, rate, delay and the flaws of the sensor.
+
+Pixels follow OpenCV: x right, y down, the centre of the top left pixel at (0, 0). Optical axes: x right, y down, z
+forward. Body axes: x forward, y left, z up. A rotation "body from optical" turns optical into body vectors.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.errors import UsageError
+from skyloop.messages.frame import CameraInfo, Intrinsics
+
+Vec3 = tuple[float, float, float]
+Rotation9 = tuple[float, float, float, float, float, float, float, float, float]
+Distortion = tuple[float, float, float, float, float]
+
+#: Body from optical of a camera that looks forward, level, with the picture's top up.
+LOOKING_FORWARD: Rotation9 = (0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0)
+#: Body from optical of a camera that looks straight down, with the picture's top forward.
+LOOKING_DOWN: Rotation9 = (0.0, -1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class CameraPose:
+    """Where a camera is in the world.
+
+    ``position_m``: optical centre, shape (3,). ``rotation``: world from optical axes, shape (3, 3). ``drone``: number
+    of the drone that carries it, whose own body the picture leaves out; None for a camera of its own.
+    """
+
+    position_m: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+    drone: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class CameraModel:
+    """A camera as it is mounted on a drone.
+
+    Raises :class:`~skyloop.errors.UsageError` for values that no camera has.
+    """
+
+    name: str
+    width: int  #: pixels
+    height: int  #: pixels
+    fps: float
+    fx: float  #: focal lengths and principal point, pixels
+    fy: float
+    cx: float
+    cy: float
+    distortion: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)  #: k1, k2, p1, p2, k3 as OpenCV orders them
+    position_m: Vec3 = (0.0, 0.0, 0.0)  #: of the optical centre in body axes
+    rotation: Rotation9 = LOOKING_FORWARD  #: body from optical, row by row
+    latency_s: float = 0.0  #: from the middle of the exposure until the picture is handed out
+    noise_sigma: float = 0.0  #: of each channel of each pixel, in steps of 0 … 255
+    exposure_s: float = 0.0  #: how long the shutter is open, which is what blurs a turning drone's picture
+    exposure_gain: float = 1.0  #: brightness relative to the scene's own
+    vignetting: float = 0.0  #: share of the light that is lost in the corners, 0 … 1
+
+    def __post_init__(self) -> None:
+        if not (1 <= self.width <= 8192 and 1 <= self.height <= 8192):
+            raise UsageError(f"camera {self.name!r}: {self.width}x{self.height} pixels; sides must be 1 to 8192")
+        positive = {"fps": self.fps, "fx": self.fx, "fy": self.fy, "exposure_gain": self.exposure_gain}
+        for what, value in positive.items():
+            if not (math.isfinite(value) and value > 0.0):
+                raise UsageError(f"camera {self.name!r}: {what} is {value}; it must be finite and above 0")
+        not_negative = {"latency_s": self.latency_s, "noise_sigma": self.noise_sigma, "exposure_s": self.exposure_s}
+        for what, value in not_negative.items():
+            if not (math.isfinite(value) and value >= 0.0):
+                raise UsageError(f"camera {self.name!r}: {what} is {value}; it must be finite and not negative")
+        if not 0.0 <= self.vignetting <= 1.0:
+            raise UsageError(f"camera {self.name!r}: vignetting is {self.vignetting}; it must be from 0 to 1")
+        if not np.isfinite([self.cx, self.cy, *self.distortion, *self.position_m]).all():
+            raise UsageError(f"camera {self.name!r}: principal point, distortion and position must be finite")
+        turn = self.rotation_matrix
+        if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-6) or np.linalg.det(turn) < 0.0:
+            raise UsageError(f"camera {self.name!r}: rotation is not a rotation matrix (nine numbers, row by row)")
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """The camera matrix K, shape (3, 3)."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def rotation_matrix(self) -> NDArray[np.float64]:
+        """Body from optical, shape (3, 3)."""
+        return np.array(self.rotation, dtype=np.float64).reshape(3, 3)
+
+    @property
+    def distorted(self) -> bool:
+        """Whether the lens bends straight lines."""
+        return any(k != 0.0 for k in self.distortion)
+
+    def intrinsics(self) -> Intrinsics:
+        """As it travels with each frame."""
+        distortion = self.distortion if self.distorted else ()
+        return Intrinsics(fx=self.fx, fy=self.fy, cx=self.cx, cy=self.cy, distortion=distortion)
+
+    def info(self) -> CameraInfo:
+        """As a driver describes it before the first frame."""
+        return CameraInfo(
+            name=self.name,
+            width=self.width,
+            height=self.height,
+            fps=self.fps,
+            intrinsics=self.intrinsics(),
+            rotation=self.rotation,
+            position=self.position_m,
+        )
+
+    def pose(
+        self, body_position_m: NDArray[np.float64], body_rotation: NDArray[np.float64], drone: int | None = None
+    ) -> CameraPose:
+        """Where the camera is when its drone's body is at a position (3,) with a world-from-body rotation (3, 3)."""
+        position = np.asarray(body_position_m, dtype=np.float64) + body_rotation @ np.asarray(self.position_m)
+        return CameraPose(position, body_rotation @ self.rotation_matrix, drone)
+
+    def scaled(self, factor: float) -> CameraModel:
+        """The same lens over a picture of another size: factor 2 turns 320×240 into 640×480."""
+        if not (math.isfinite(factor) and factor > 0.0):
+            raise UsageError(f"a camera can't be scaled by {factor}; the factor must be finite and above 0")
+        return replace(
+            self,
+            width=round(self.width * factor),
+            height=round(self.height * factor),
+            fx=self.fx * factor,
+            fy=self.fy * factor,
+            cx=(self.cx + 0.5) * factor - 0.5,
+            cy=(self.cy + 0.5) * factor - 0.5,
+        )
+
+    def project(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Pixels, shape (n, 2), of points in optical axes [m], shape (n, 3), all in front of the camera (z > 0)."""
+        points = np.asarray(points, dtype=np.float64)
+        bent = distort(points[:, :2] / points[:, 2:], self.distortion)
+        return bent * (self.fx, self.fy) + (self.cx, self.cy)
+
+    def rays(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+        """x/z and y/z in optical axes of what pixels see, both of shape (n, 2).
+
+        Raises :class:`~skyloop.errors.UsageError` where the distortion folds the picture over itself.
+        """
+        bent = (np.asarray(pixels, dtype=np.float64) - (self.cx, self.cy)) / (self.fx, self.fy)
+        straight = undistort(bent, self.distortion) if self.distorted else bent
+        if straight is None:
+            raise UsageError(f"camera {self.name!r}: distortion {self.distortion} folds the picture before its edge")
+        return straight
+
+
+def distort(points: NDArray[np.float64], distortion: Distortion) -> NDArray[np.float64]:
+    """Where a lens puts x/z, y/z, shape (n, 2). Source: the Brown-Conrady model as in OpenCV's ``calib3d``."""
+    k1, k2, p1, p2, k3 = distortion
+    x, y = points[:, 0], points[:, 1]
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    bent_x = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+    bent_y = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+    return np.column_stack([bent_x, bent_y])
+
+
+def undistort(points: NDArray[np.float64], distortion: Distortion) -> NDArray[np.float64] | None:
+    """The inverse of :func:`distort` by Newton's method; None where there is no inverse near the optical axis."""
+    k1, k2, p1, p2, k3 = distortion
+    guess = points.copy()
+    for _ in range(25):
+        x, y = guess[:, 0], guess[:, 1]
+        r2 = x * x + y * y
+        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))
+        xx = radial + x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x
+        yy = radial + y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x
+        xy = x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y
+        det = xx * yy - xy * xy
+        if (det <= 1e-6).any():
+            return None
+        error = distort(guess, distortion) - points
+        guess -= (
+            np.column_stack([yy * error[:, 0] - xy * error[:, 1], xx * error[:, 1] - xy * error[:, 0]]) / det[:, None]
+        )
+        if np.abs(error).max(initial=0.0) < 1e-12:
+            return guess
+    return guess if np.abs(distort(guess, distortion) - points).max(initial=0.0) < 1e-9 else None
+
+
+# Pictures of 320×240 with the diagonal fields of view that Parrot gives for its AR.Drone: 92° forward and 64° down.
+# The forward lens is a wide one: with this barrel distortion its focal length comes out as calibrations have it.
+FRONT_CAMERA = CameraModel(
+    name="front",
+    width=320,
+    height=240,
+    fps=30.0,
+    fx=244.0,
+    fy=244.0,
+    cx=159.5,
+    cy=119.5,
+    distortion=(-0.28, 0.08, 0.0, 0.0, 0.0),
+    position_m=(0.12, 0.0, 0.0),
+    rotation=LOOKING_FORWARD,
+    latency_s=0.03,
+    noise_sigma=2.5,
+    exposure_s=0.006,
+    vignetting=0.25,
+)
+BOTTOM_CAMERA = CameraModel(
+    name="bottom",
+    width=320,
+    height=240,
+    fps=30.0,
+    fx=320.0,
+    fy=320.0,
+    cx=159.5,
+    cy=119.5,
+    position_m=(0.0, 0.0, -0.03),
+    rotation=LOOKING_DOWN,
+    latency_s=0.02,
+    noise_sigma=3.0,
+    exposure_s=0.006,
+    vignetting=0.15,
+)

@@ -1,0 +1,185 @@
+"""The drones' own flight logic: takes commands, follows the table of states, sets the loops' set-points."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+
+from skyloop.messages import (
+    AnyAction,
+    Attitude,
+    EmergencyStop,
+    FlightState,
+    Hover,
+    Idle,
+    Land,
+    ResetEmergency,
+    Takeoff,
+    Velocity,
+)
+from skyloop.sim.battery import Batteries
+from skyloop.sim.collisions import Contacts
+from skyloop.sim.control_loops import ControlLoops
+from skyloop.sim.flight_logic import Happening, next_state
+from skyloop.sim.parameters import Limits, VehicleParameters
+from skyloop.sim.reports import Occurrence, OccurrenceKind
+from skyloop.sim.sensors import Sensors
+
+LOW_BATTERY = 0.03  # share of the charge at which the vehicle lands by itself
+_HEIGHT_TOLERANCE_M = 0.08
+_STANDING_S = 0.05  # a drone that touched the ground no longer ago than this stands on it
+_KEPT_OCCURRENCES = 1000
+
+
+class Firmware:
+    """Flight states and set-points of all drones. Times are of the simulation."""
+
+    def __init__(
+        self,
+        parameters: Sequence[VehicleParameters],
+        limits: Sequence[Limits],
+        loops: ControlLoops,
+        sensors: Sensors,
+        batteries: Batteries,
+    ) -> None:
+        self._parameters = parameters
+        self.limits = list(limits)
+        self._loops = loops
+        self._sensors = sensors
+        self._batteries = batteries
+        self.states = [FlightState.LANDED for _ in parameters]
+        self.reasons = ["" for _ in parameters]
+        self.occurrences: deque[Occurrence] = deque(maxlen=_KEPT_OCCURRENCES)
+        self._stood_s = [0.0 for _ in parameters]  # when each last had something under its feet
+        self._rising: dict[int, float] = {}  # drones that are taking off, and the altitude that ends it
+        self._warned: set[int] = set()
+
+    def set_limits(self, drone: int, limits: Limits) -> None:
+        """From here on. A set-point in force is clamped only when it is given anew; the tilt, climb and altitude that
+        the loops themselves ask for follow at once."""
+        self.limits[drone] = limits
+        self._loops.set_limits(drone, limits)
+        if drone not in self._rising:
+            self._loops.set_ceiling(drone, limits.altitude_m)
+
+    def command(self, drone: int, action: AnyAction, time_s: float) -> AnyAction:
+        """Take a command; returns what was applied, :class:`Idle` where it was ignored."""
+        if isinstance(action, Takeoff):
+            if self._batteries.charge[drone] <= LOW_BATTERY:
+                return Idle()
+            return self._advance(drone, Happening.TAKEOFF, action, time_s)
+        if isinstance(action, Land):
+            return self._advance(drone, Happening.LAND, action, time_s)
+        if isinstance(action, Hover):
+            return self._advance(drone, Happening.HOVER, action, time_s)
+        if isinstance(action, EmergencyStop):
+            return self._advance(drone, Happening.STOP, action, time_s, "stopped by command")
+        if isinstance(action, ResetEmergency):
+            if time_s - self._stood_s[drone] > _STANDING_S:
+                return Idle()
+            return self._advance(drone, Happening.RESET, action, time_s)
+        if isinstance(action, Attitude | Velocity):
+            clamped = clamp(action, self.limits[drone])
+            return self._advance(drone, Happening.SET_POINT, clamped, time_s)
+        return Idle()
+
+    def supervise(self, time_s: float) -> None:
+        """Once a period of the loops: see who has reached the height of take-off."""
+        for drone, height in list(self._rising.items()):
+            if self._sensors.altitude[drone] >= height - _HEIGHT_TOLERANCE_M:
+                self._advance(drone, Happening.HEIGHT_REACHED, Hover(), time_s)
+
+    def watch_batteries(self, time_s: float) -> None:
+        """Now and then: land with a low battery, and fall with an empty one."""
+        self._loops.set_strength(self._batteries.strength())
+        low = (self._batteries.charge <= LOW_BATTERY).nonzero()[0].tolist()
+        self._warned.intersection_update(low)  # who was given a fresh battery will be told anew
+        for drone in low:
+            if drone not in self._warned:
+                self._warned.add(drone)
+                left = self._batteries.charge[drone]
+                self._note(OccurrenceKind.BATTERY_LOW, drone, time_s, f"battery at {left:.0%}")
+            if self._batteries.charge[drone] <= 0:
+                self._advance(drone, Happening.BATTERY_EMPTY, Idle(), time_s, "battery empty")
+            else:
+                self._advance(drone, Happening.BATTERY_LOW, Land(), time_s)
+
+    def feel(self, contacts: Contacts | None, time_s: float) -> None:
+        """Once a step: what was touched."""
+        if contacts is None:
+            return
+        for drone, speed, what in contacts.impacts:
+            text = f"hit {what} at {speed:.1f} m/s"
+            self._note(OccurrenceKind.COLLISION, drone, time_s, text, speed)
+            if speed > self._parameters[drone].crash_speed_m_s:
+                self._advance(drone, Happening.CRASHED, Idle(), time_s, text)
+        for drone in contacts.standing:
+            self._stood_s[drone] = time_s
+            state = self.states[drone]
+            if state is FlightState.LANDING:
+                self._advance(drone, Happening.TOUCHED_GROUND, Idle(), time_s)
+            elif state is FlightState.EMERGENCY:
+                self._loops.rest(drone)
+
+    def _advance(
+        self, drone: int, happening: Happening, action: AnyAction, time_s: float, reason: str = ""
+    ) -> AnyAction:
+        state = next_state(self.states[drone], happening)
+        if state is None:
+            return Idle()
+        before, self.states[drone] = self.states[drone], state
+        if state is not before or not state.airborne or isinstance(action, Attitude | Velocity):
+            self._enter(drone, state, before, action)
+        self.reasons[drone] = reason if state is FlightState.EMERGENCY else ""
+        if state is FlightState.EMERGENCY and before is not state:
+            self._note(OccurrenceKind.EMERGENCY, drone, time_s, reason)
+        return action
+
+    def _enter(self, drone: int, state: FlightState, before: FlightState, action: AnyAction) -> None:
+        """Set the loops for a state."""
+        parameters, loops = self._parameters[drone], self._loops
+        if state is not FlightState.TAKING_OFF and self._rising.pop(drone, None) is not None:
+            loops.set_ceiling(drone, self.limits[drone].altitude_m)
+        if state is FlightState.TAKING_OFF:
+            self._start(drone, before)
+        elif state is FlightState.HOVERING:
+            loops.follow_velocity(drone, 0.0, 0.0, 0.0, 0.0)
+        elif state is FlightState.LANDING:
+            loops.follow_velocity(drone, 0.0, 0.0, -parameters.landing_descent_m_s, 0.0)
+        elif isinstance(action, Attitude):
+            loops.follow_attitude(drone, action.roll, action.pitch, action.climb, action.yaw_rate)
+        elif isinstance(action, Velocity):
+            loops.follow_velocity(drone, action.forward, action.left, action.up, action.yaw_rate)
+        elif state is FlightState.EMERGENCY:
+            loops.stop(drone)
+        else:  # landed
+            loops.stop(drone)
+            loops.rest(drone)
+
+    def _start(self, drone: int, before: FlightState) -> None:
+        limits, altitude = self.limits[drone], float(self._sensors.altitude[drone])
+        ground = altitude if before is FlightState.LANDED else 0.0
+        height = min(ground + limits.takeoff_altitude_m, max(limits.altitude_m, altitude))
+        self._rising[drone] = height
+        self._loops.set_ceiling(drone, height)
+        self._loops.follow_velocity(drone, 0.0, 0.0, self._parameters[drone].takeoff_climb_m_s, 0.0)
+        if before is FlightState.LANDED:
+            self._loops.start(drone, altitude)
+
+    def _note(self, kind: OccurrenceKind, drone: int, time_s: float, text: str, speed: float = 0.0) -> None:
+        self.occurrences.append(Occurrence(kind, drone, time_s, text, speed))
+
+
+def clamp(action: Attitude | Velocity, limits: Limits) -> Attitude | Velocity:
+    """The set-point within the limits. The horizontal velocity keeps its direction."""
+    yaw_rate = _within(action.yaw_rate, limits.yaw_rate_rad_s)
+    if isinstance(action, Attitude):
+        roll, pitch = _within(action.roll, limits.tilt_rad), _within(action.pitch, limits.tilt_rad)
+        return Attitude(roll, pitch, _within(action.climb, limits.climb_m_s), yaw_rate)
+    speed = (action.forward**2 + action.left**2) ** 0.5
+    share = min(1.0, limits.speed_m_s / speed) if speed > 0 else 1.0
+    return Velocity(action.forward * share, action.left * share, _within(action.up, limits.climb_m_s), yaw_rate)
+
+
+def _within(value: float, limit: float) -> float:
+    return max(-limit, min(limit, value))

@@ -1,0 +1,61 @@
+"""Making a simulation keep time with a clock."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from skyloop.clock import NS_PER_S, Clock, monotonic_ns
+from skyloop.errors import UsageError
+from skyloop.sim.dynamics import STEP_S
+
+MOST_LAG_S = 0.25
+_LONGEST_RUN_STEPS = 25
+
+
+class Pacer:
+    """Runs the steps that are due, by absolute deadlines: step k is due at start + k · STEP_S / speed.
+
+    Small delays are caught up; when more than :data:`MOST_LAG_S` of the clock is behind, what is beyond is given up,
+    counted in ``lost_s``, and the deadlines move. Not thread-safe: one thread owns it::
+
+        while not stop.wait(pacer.run_due()):
+            publish()
+    """
+
+    def __init__(self, step: Callable[[int], None], *, speed: float = 1.0, clock: Clock = monotonic_ns) -> None:
+        """``step(n)`` does n steps. ``speed`` is how many seconds of simulation a second of the clock is worth."""
+        if not (math.isfinite(speed) and 0 < speed <= 1000):
+            raise UsageError(f"speed must be greater than 0 and at most 1000, not {speed!r}")
+        self._step = step
+        self._clock = clock
+        self._ns_per_step = STEP_S / speed * NS_PER_S
+        self._speed = speed
+        self._start_ns = clock()
+        self._done = 0
+        self.lost_s = 0.0  # of the clock, given up so far
+
+    def run_due(self) -> float:
+        """Do the steps that are due, some at a time; returns how long to wait until the next is [s], 0 if one is."""
+        behind = self._clock() - self._due_ns(self._done + 1)
+        if behind < 0:
+            return -behind / NS_PER_S
+        excess = behind - MOST_LAG_S * NS_PER_S
+        if excess > 0:
+            self._start_ns += round(excess)
+            self.lost_s += excess / NS_PER_S
+            behind -= round(excess)
+        # At high speeds a run is longer, so that the caller isn't asked for every step.
+        most = max(_LONGEST_RUN_STEPS, int(_LONGEST_RUN_STEPS * self._speed))
+        steps = min(int(behind / self._ns_per_step) + 1, most)
+        self._step(steps)
+        self._done += steps
+        return max(0.0, (self._due_ns(self._done + 1) - self._clock()) / NS_PER_S)
+
+    def clock_ns(self, time_s: float) -> int:
+        """When, on the clock, the simulation was (or will be) at its time ``time_s``, counted from this pacer's start
+        and by the present deadlines."""
+        return self._due_ns(time_s / STEP_S)
+
+    def _due_ns(self, step: float) -> int:
+        return self._start_ns + round(step * self._ns_per_step)

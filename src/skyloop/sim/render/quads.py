@@ -1,0 +1,161 @@
+"""Textured convex quadrilaterals as arrays, and the shapes made of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from skyloop.sim.render.atlas import Texture
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Quads:
+    """``n`` flat convex quadrilaterals; a triangle repeats a corner. Texel u of a point X of the plane is
+    ``u_slope · X + u_start`` (v likewise), u to the right and v down, both from the texture's top left edge."""
+
+    corners: Floats  #: (n, 4, 3) [m], counter-clockwise seen from the front
+    normals: Floats  #: (n, 3) unit, towards the front
+    u_slope: Floats  #: (n, 3) [texel/m]
+    v_slope: Floats  #: (n, 3) [texel/m]
+    u_start: Floats  #: (n,) [texel]
+    v_start: Floats  #: (n,) [texel]
+    texture: NDArray[np.intp]  #: (n,) number in the atlas
+    two_sided: NDArray[np.bool_]  #: (n,) seen from behind as well
+    priority: NDArray[np.intp]  #: (n,) of things in one plane the highest is seen
+    lit: NDArray[np.bool_]  #: (n,) brighter where it faces the light; the sky is not
+
+    def __len__(self) -> int:
+        return len(self.corners)
+
+    def joined(self, other: Quads) -> Quads:
+        """These quads, and then the others."""
+        return concatenate([self, other])
+
+    def moved(self, position_m: Floats, rotation: Floats) -> Quads:
+        """The same quads after a rotation (3, 3) and a shift (3,)."""
+        u_slope = self.u_slope @ rotation.T
+        v_slope = self.v_slope @ rotation.T
+        return replace(
+            self,
+            corners=self.corners @ rotation.T + position_m,
+            normals=self.normals @ rotation.T,
+            u_slope=u_slope,
+            v_slope=v_slope,
+            u_start=self.u_start - u_slope @ position_m,
+            v_start=self.v_start - v_slope @ position_m,
+        )
+
+
+def concatenate(parts: list[Quads]) -> Quads:
+    """All quads of several batches, in order."""
+    return Quads(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Quads)))
+
+
+class QuadBuilder:
+    """Collects quads one by one."""
+
+    def __init__(self) -> None:
+        self._rows: list[tuple[Floats, Floats, Floats, Floats, float, float, int, bool, int, bool]] = []
+
+    def rectangle(
+        self,
+        lower_left: ArrayLike,
+        right: ArrayLike,
+        up: ArrayLike,
+        texture: Texture,
+        *,
+        two_sided: bool = False,
+        priority: int = 0,
+        lit: bool = True,
+        uv: tuple[float, float, float, float] | None = None,
+    ) -> None:
+        """A rectangle from a corner and its two edges [m], as seen from its front. ``uv`` is the part of the texture
+        on it (left, top, right, bottom in texels), else the whole."""
+        origin, e_right, e_up = (np.asarray(v, dtype=np.float64) for v in (lower_left, right, up))
+        corners = np.array([origin, origin + e_right, origin + e_right + e_up, origin + e_up])
+        self.polygon(corners, origin, e_right, e_up, texture, two_sided=two_sided, priority=priority, lit=lit, uv=uv)
+
+    def polygon(
+        self,
+        corners: ArrayLike,
+        lower_left: Floats,
+        right: Floats,
+        up: Floats,
+        texture: Texture,
+        *,
+        two_sided: bool = False,
+        priority: int = 0,
+        lit: bool = True,
+        uv: tuple[float, float, float, float] | None = None,
+    ) -> None:
+        """A quad (4, 3) cut from the textured rectangle that the corner and the two edges make."""
+        left, top, u_end, bottom = uv or (0.0, 0.0, float(texture.width), float(texture.height))
+        normal = np.cross(right, up)
+        u_slope = right * ((u_end - left) / (right @ right))
+        v_slope = up * ((top - bottom) / (up @ up))
+        self._rows.append(
+            (
+                np.asarray(corners, dtype=np.float64),
+                normal / np.linalg.norm(normal),
+                u_slope,
+                v_slope,
+                left - float(u_slope @ lower_left),
+                bottom - float(v_slope @ lower_left),
+                texture.index,
+                two_sided,
+                priority,
+                lit,
+            )
+        )
+
+    def box(
+        self,
+        low: ArrayLike,
+        high: ArrayLike,
+        sides: Texture | tuple[Texture, Texture],
+        ends: Texture | None = None,
+    ) -> None:
+        """An upright box between two corners [m], seen from outside: four sides (those that face along x and those that
+        face along y may differ), a top and a bottom (``ends``)."""
+        (x0, y0, z0), (x1, y1, z1) = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
+        dx, dy, dz = x1 - x0, y1 - y0, z1 - z0
+        for_x, for_y = sides if isinstance(sides, tuple) else (sides, sides)
+        ends = ends or for_x
+        self.rectangle((x1, y0, z0), (0, dy, 0), (0, 0, dz), for_x)
+        self.rectangle((x0, y1, z0), (0, -dy, 0), (0, 0, dz), for_x)
+        self.rectangle((x1, y1, z0), (-dx, 0, 0), (0, 0, dz), for_y)
+        self.rectangle((x0, y0, z0), (dx, 0, 0), (0, 0, dz), for_y)
+        self.rectangle((x0, y0, z1), (dx, 0, 0), (0, dy, 0), ends)
+        self.rectangle((x0, y1, z0), (dx, 0, 0), (0, -dy, 0), ends)
+
+    def disc(self, centre: ArrayLike, radius_m: float, texture: Texture) -> None:
+        """A level regular octagon with the whole texture on the square around it, seen from both sides."""
+        middle = np.asarray(centre, dtype=np.float64)
+        angle = np.pi / 8 + np.arange(8) * (np.pi / 4)
+        rim = middle + radius_m * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(8)])
+        start = middle - (radius_m, radius_m, 0.0)
+        right, up = np.array([2 * radius_m, 0.0, 0.0]), np.array([0.0, 2 * radius_m, 0.0])
+        for a, b, c, d in ((0, 1, 2, 3), (0, 3, 4, 7), (4, 5, 6, 7)):
+            self.polygon(rim[[a, b, c, d]], start, right, up, texture, two_sided=True)
+
+    def build(self) -> Quads:
+        """What was collected."""
+        corners, normals, u_slope, v_slope, u_start, v_start, texture, two_sided, priority, lit = zip(
+            *self._rows, strict=True
+        )
+        return Quads(
+            np.array(corners, dtype=np.float64),
+            np.array(normals, dtype=np.float64),
+            np.array(u_slope, dtype=np.float64),
+            np.array(v_slope, dtype=np.float64),
+            np.array(u_start, dtype=np.float64),
+            np.array(v_start, dtype=np.float64),
+            np.array(texture, dtype=np.intp),
+            np.array(two_sided, dtype=np.bool_),
+            np.array(priority, dtype=np.intp),
+            np.array(lit, dtype=np.bool_),
+        )

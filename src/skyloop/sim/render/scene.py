@@ -1,0 +1,110 @@
+"""A world made ready to be drawn: its textures in one atlas, its still parts as quads, and what moves as templates."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.errors import UsageError
+from skyloop.sim.render import models
+from skyloop.sim.render.atlas import AtlasBuilder
+from skyloop.sim.render.base import SceneState
+from skyloop.sim.render.quads import Quads, concatenate
+from skyloop.sim.render.room import static_quads
+from skyloop.sim.render.shadows import Shadow
+from skyloop.sim.world import BoardTarget, PlatformTarget, World
+
+_FADES_AT_M = 4.0  # a drone this high above a surface leaves no visible shadow on it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Posed:
+    """Everything of a scene at one instant. ``drone``: whose body a quad belongs to, -1 for none, (n,)."""
+
+    quads: Quads
+    drone: NDArray[np.intp]
+    shadows: tuple[Shadow, ...]
+
+
+class Scene:
+    """What can be drawn of a world with a number of drones. Building it draws all textures (some tenths of a second);
+    after that it never changes, so renderers in several threads may share it.
+
+    Raises :class:`~skyloop.errors.UsageError` where a texture, a marker dictionary or an id does not exist.
+    """
+
+    def __init__(self, world: World, drones: int = 1) -> None:
+        atlas = AtlasBuilder()
+        self.world = world
+        self.drones = drones
+        self._static = static_quads(world, atlas)
+        self._targets = [_target(target, atlas) for target in world.targets]
+        self._stand = models.stand(atlas)
+        hulls = [models.drone(atlas, hull) for hull in models.HULLS[: max(1, drones)]]
+        self._hulls = [hulls[k % len(hulls)] for k in range(drones)]
+        self.atlas = atlas.pack()
+        # Where shadows can fall: upright solids, as yaw, centre and half size.
+        self._tops = [(box.yaw_rad, np.array(box.position_m), np.array(box.size_m) / 2) for box in world.solids()]
+
+    def posed(self, state: SceneState) -> Posed:
+        """Everything where the state says it is.
+
+        Raises :class:`~skyloop.errors.UsageError` for a state of another number of drones or targets.
+        """
+        shape = np.shape(state.drone_positions_m), np.shape(state.drone_rotations)
+        if shape != ((self.drones, 3), (self.drones, 3, 3)):
+            raise UsageError(
+                f"the scene has {self.drones} drones: positions must be ({self.drones}, 3) and rotations "
+                f"({self.drones}, 3, 3), not {shape[0]} and {shape[1]}"
+            )
+        if len(state.targets) != len(self._targets):
+            raise UsageError(f"the world has {len(self._targets)} moving targets, the state {len(state.targets)}")
+        parts = [self._static]
+        shadows: list[Shadow] = []
+        for template, target, now in zip(self._targets, self.world.targets, state.targets, strict=True):
+            position, turn = np.array(now.position_m), _yaw(now.yaw_rad)
+            parts.append(template.moved(position, turn))
+            on_floor = np.array([position[0], position[1], 0.0])
+            if isinstance(target, BoardTarget):
+                parts.append(self._stand.moved(on_floor, turn))
+                shadows.append(Shadow(on_floor, 0.32, 0.45))
+            else:
+                shadows.append(Shadow(on_floor, 0.75 * math.hypot(*target.size_m[:2]), 0.45))
+        still = sum(len(part) for part in parts)
+        owner = [np.full(still, -1, np.intp)]
+        for k, hull in enumerate(self._hulls):
+            parts.append(hull.moved(state.drone_positions_m[k], state.drone_rotations[k]))
+            owner.append(np.full(len(hull), k, np.intp))
+            shadow = self._drone_shadow(state.drone_positions_m[k])
+            if shadow is not None:
+                shadows.append(shadow)
+        return Posed(concatenate(parts), np.concatenate(owner), tuple(shadows))
+
+    def _drone_shadow(self, position_m: NDArray[np.float64]) -> Shadow | None:
+        """The soft spot on whatever surface is below a drone; None if it is too high above it."""
+        surface = 0.0
+        for yaw, centre, half in self._tops:
+            c, s = math.cos(yaw), math.sin(yaw)
+            dx, dy = position_m[0] - centre[0], position_m[1] - centre[1]
+            top = float(centre[2] + half[2])
+            over = abs(c * dx + s * dy) < half[0] and abs(c * dy - s * dx) < half[1]
+            if over and surface < top <= position_m[2]:
+                surface = top
+        above = float(position_m[2]) - surface
+        fade = 1.0 - above / _FADES_AT_M
+        if fade <= 0.0:
+            return None
+        centre_m = np.array([position_m[0], position_m[1], surface])
+        return Shadow(centre_m, models.DRONE_RADIUS_M * (1.1 + 0.35 * above), 0.6 * fade**1.5)
+
+
+def _yaw(angle: float) -> NDArray[np.float64]:
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _target(target: BoardTarget | PlatformTarget, atlas: AtlasBuilder) -> Quads:
+    return models.board(atlas, target) if isinstance(target, BoardTarget) else models.platform(atlas, target)

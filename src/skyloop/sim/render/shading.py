@@ -1,0 +1,137 @@
+"""The colour of samples, once it is known which quad each of them shows.
+
+For a ray r = (x, y, 1) a quad's texel is u = (a · r)/(c · r), v = (b · r)/(c · r), and c · r = 1/z. The size of a pixel
+on the texture, in texels², is |det (a, b, c)| z³ / (fx fy); half its binary logarithm is the mip level, which the
+exponent of the floating-point number gives without computing one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.sim.camera import CameraPose
+from skyloop.sim.render.atlas import GAP, LEVELS, Atlas
+from skyloop.sim.render.opencv import cv2
+from skyloop.sim.render.quads import Floats, Quads
+from skyloop.sim.render.visibility import View
+
+CHUNK = 16384  # samples worked on at a time: few enough for the working arrays to stay in the cache
+
+# Light from high up, a little from the east and the south, over an even one; calm differences between faces.
+_SUN = np.array([0.33, -0.42, 0.85])
+_AMBIENT, _DIRECT = 0.74, 0.30
+_UNIT = 128.0  # light 1.0 in the eight-bit gain
+_SHARPER = 0.6  # pixels count as this much smaller when a level is chosen: a little shimmer for crisper textures
+_FARTHEST = np.float32(1e-6)  # 1/z that a ray past a quad's horizon is taken to have [1/m]
+_ONE = 0x3F800000  # 1.0 as the bits of a float32
+
+
+def light_on(normals: Floats) -> Floats:
+    """Brightness of faces by their normals, shape (n,), around 1."""
+    direct = np.clip(normals @ (_SUN / np.linalg.norm(_SUN)), 0.0, None)
+    return np.asarray(_AMBIENT + _DIRECT * direct)
+
+
+def sampling_table(quads: Quads, view: View, pose: CameraPose, atlas: Atlas, pixel_area: float) -> NDArray[np.float32]:
+    """A column for each quad of the view, after a column 0 for "nothing": a', b', c (three rows each), footprint, atlas
+    x and y, and light; float32, shape (13, m + 1). ``pixel_area``: 1/(fx fy) of the picture."""
+    k = view.index
+    c = view.inverse_depth
+    u_slope, v_slope = quads.u_slope[k], quads.v_slope[k]
+    texture = quads.texture[k]
+    # a = (slope in optical axes) + (texel under the eye) c; the span is the atlas's shift of level 0, see ``atlas``.
+    under_u = u_slope @ pose.position_m + quads.u_start[k] - atlas.span[texture]
+    under_v = v_slope @ pose.position_m + quads.v_start[k]
+    table = np.zeros((13, len(k) + 1))
+    table[0:3, 1:] = (u_slope @ pose.rotation + under_u[:, None] * c).T
+    table[3:6, 1:] = (v_slope @ pose.rotation + under_v[:, None] * c).T
+    table[6:9, 1:] = c.T
+    density = np.abs(np.einsum("ij,ij->i", np.cross(u_slope, v_slope), quads.normals[k]))
+    table[9, 1:] = density / np.abs(view.height_m) * (pixel_area * 2.0 * _SHARPER)
+    table[10, 1:] = atlas.x0[texture] + atlas.span[texture] - 0.5
+    table[11, 1:] = atlas.y0[texture] - 0.5
+    facing = np.where(view.height_m > 0.0, 1.0, -1.0)[:, None]
+    table[12, 1:] = np.where(quads.lit[k], light_on(quads.normals[k] * facing), 1.0) * _UNIT
+    table[8, 0] = 1.0  # any finite depth will do for what is not there; its light is 0
+    return table.astype(np.float32)
+
+
+class Shader:
+    """Colours samples from an atlas. Keeps working arrays: one thread at a time."""
+
+    def __init__(self, atlas: Atlas) -> None:
+        self._image = atlas.image
+        self._floats = np.empty((5, CHUNK), np.float32)
+        self._levels = np.empty(CHUNK, np.int32)
+        self._light = np.empty((1, CHUNK), np.uint8)
+        self._light4 = np.empty((1, CHUNK, 4), np.uint8)
+
+    def shade(
+        self,
+        table: NDArray[np.float32],
+        seen: NDArray[np.intp],
+        ray_x: NDArray[np.float32],
+        ray_y: NDArray[np.float32],
+        colours: NDArray[np.uint8],
+        inverse_depth: NDArray[np.float32],
+    ) -> None:
+        """Fills ``colours``, BGRA, shape (n, 4), and ``inverse_depth`` [1/m], (n,), for the columns ``seen`` of a table
+        and the rays (ray_x, ray_y, 1), all (n,)."""
+        for start in range(0, len(seen), CHUNK):
+            part = slice(start, min(start + CHUNK, len(seen)))
+            self._shade_chunk(table, seen[part], ray_x[part], ray_y[part], colours[None, part], inverse_depth[part])
+
+    def _shade_chunk(
+        self,
+        table: NDArray[np.float32],
+        seen: NDArray[np.intp],
+        ray_x: NDArray[np.float32],
+        ray_y: NDArray[np.float32],
+        colours: NDArray[np.uint8],
+        w: NDArray[np.float32],
+    ) -> None:
+        n = len(seen)
+        u, v, got, inverse, scale = self._floats[:, :n]
+        levels = self._levels[:n]
+
+        def dot(row: int, into: NDArray[np.float32]) -> None:
+            np.take(table[row], seen, out=into, mode="clip")
+            np.multiply(into, ray_x, out=into)
+            np.take(table[row + 1], seen, out=got, mode="clip")
+            np.multiply(got, ray_y, out=got)
+            np.add(into, got, out=into)
+            np.take(table[row + 2], seen, out=got, mode="clip")
+            np.add(into, got, out=into)
+
+        dot(6, w)
+        np.maximum(w, _FARTHEST, out=w)
+        dot(0, u)
+        dot(3, v)
+        np.divide(1.0, w, out=inverse)
+        # level = floor((floor(log2(footprint)) + 1) / 2), from the exponent bits; scale = 2^-level made of such bits
+        np.take(table[9], seen, out=scale, mode="clip")
+        for _ in range(3):
+            np.multiply(scale, inverse, out=scale)
+        np.subtract(scale.view(np.int32), _ONE, out=levels)
+        np.right_shift(levels, 24, out=levels)
+        np.clip(levels, 0, LEVELS - 1, out=levels)
+        bits = scale.view(np.int32)
+        np.left_shift(levels, 23, out=bits)
+        np.subtract(_ONE, bits, out=bits)
+        np.multiply(inverse, scale, out=inverse)
+        np.multiply(u, inverse, out=u)
+        np.multiply(v, inverse, out=v)
+        np.multiply(levels, GAP, out=levels)
+        np.copyto(got, levels)
+        np.add(u, got, out=u)
+        np.take(table[10], seen, out=got, mode="clip")
+        np.add(u, got, out=u)
+        np.take(table[11], seen, out=got, mode="clip")
+        np.add(v, got, out=v)
+        cv2.remap(self._image, u[None], v[None], cv2.INTER_LINEAR, dst=colours, borderMode=cv2.BORDER_REPLICATE)
+        np.take(table[12], seen, out=got, mode="clip")
+        light, light4 = self._light[:, :n], self._light4[:, :n]
+        np.copyto(light[0], got, casting="unsafe")
+        cv2.cvtColor(light, cv2.COLOR_GRAY2BGRA, dst=light4)
+        cv2.multiply(colours, light4, dst=colours, scale=1.0 / _UNIT)

@@ -1,0 +1,63 @@
+"""What a simulation tells about its drones: their own beliefs, the truth, and what happened."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from skyloop.messages import FlightState
+from skyloop.sim.world import Vec3
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleFeedback:
+    """What a drone believes, with the noise and biases of its sensors. Angles: roll right side down, pitch nose down,
+    yaw counter-clockwise from east, within ±π."""
+
+    time_s: float  #: of the simulation
+    state: FlightState
+    emergency_reason: str  #: why the motors were cut; empty in other states
+    battery: float  #: charge left, 0 to 1
+    battery_v: float
+    roll_rad: float
+    pitch_rad: float
+    yaw_rad: float
+    altitude_m: float  #: of the feet above the floor
+    velocity_m_s: Vec3  #: forward, left, up, in the levelled axes
+    angular_velocity_rad_s: Vec3  #: about the body's axes
+    acceleration_m_s2: Vec3  #: specific force along the body's axes: +g along z at rest
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleTruth:
+    """What is really so. World axes east, north, up."""
+
+    time_s: float
+    state: FlightState
+    position_m: Vec3  #: of the body's centre
+    velocity_m_s: Vec3
+    roll_rad: float
+    pitch_rad: float
+    yaw_rad: float
+    quaternion: tuple[float, float, float, float]  #: w, x, y, z, world from body
+    angular_velocity_rad_s: Vec3  #: about the body's axes
+    thrust: float  #: of the weight, before ground effect
+    wind_m_s: Vec3
+    battery: float  #: charge left, 0 to 1
+
+
+class OccurrenceKind(StrEnum):
+    COLLISION = "collision"
+    EMERGENCY = "emergency"
+    BATTERY_LOW = "battery_low"
+
+
+@dataclass(frozen=True, slots=True)
+class Occurrence:
+    """Something that happened to a drone. ``speed_m_s`` is the speed of a collision along its normal, else 0."""
+
+    kind: OccurrenceKind
+    drone: int
+    time_s: float
+    text: str
+    speed_m_s: float = 0.0

@@ -1,0 +1,107 @@
+"""What the vehicles believe about themselves: truth with noise, and with biases that wander slowly.
+
+Altitude and velocity are worked out at the rate of the firmware's loops, which fly by them. Inertial values and
+attitude are worked out when somebody looks, from noise that belongs to the step: same step, same value.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from skyloop.sim.dynamics import Bodies, body_rates, column, specific_force
+from skyloop.sim.parameters import VehicleParameters
+from skyloop.sim.streams import Floats, NormalBlocks, Purpose, stream
+
+_Value = Callable[[VehicleParameters], float]
+
+# Rows of the biases: gyro 0-2, accelerometer 3-5, roll, pitch, yaw 6-8, altitude 9, velocity 10-12.
+_BIASES: tuple[_Value, ...] = (
+    *[lambda p: p.gyro_bias_rad_s] * 3,
+    *[lambda p: p.accelerometer_bias_m_s2] * 3,
+    *[lambda p: p.tilt_bias_rad] * 2,
+    lambda p: p.yaw_bias_rad,
+    lambda p: p.altitude_bias_m,
+    *[lambda p: p.velocity_bias_m_s] * 3,
+)
+_INERTIAL_NOISE: tuple[_Value, ...] = (
+    *[lambda p: p.gyro_noise_rad_s] * 3,
+    *[lambda p: p.accelerometer_noise_m_s2] * 3,
+    *[lambda p: p.tilt_noise_rad] * 2,
+    lambda p: p.yaw_noise_rad,
+)
+_ESTIMATE_NOISE: tuple[_Value, ...] = (lambda p: p.altitude_noise_m, *[lambda p: p.velocity_noise_m_s] * 3)
+
+
+class Sensors:
+    """``altitude``: of the feet above the floor, (n,) [m]. ``velocity``: forward, left, up, levelled axes, (3, n)."""
+
+    def __init__(
+        self, parameters: Sequence[VehicleParameters], bodies: Bodies, seed: int, bias_period_s: float
+    ) -> None:
+        n = len(parameters)
+        self._bodies = bodies
+        self._seed = seed
+        self._half_height = column(parameters, lambda p: p.half_height_m)
+        self._inertial_noise = _rows(parameters, _INERTIAL_NOISE)
+        self._estimate_noise = _rows(parameters, _ESTIMATE_NOISE)
+        self._normals = NormalBlocks(seed, Purpose.ESTIMATES, 4, n)
+        deviation = _rows(parameters, _BIASES)
+        self._bias_normals = NormalBlocks(seed, Purpose.BIASES, len(_BIASES), n, ahead=16)
+        self._bias_keep = np.exp(-bias_period_s / column(parameters, lambda p: p.bias_time_constant_s))
+        self._bias_fresh = deviation * np.sqrt(1.0 - self._bias_keep**2)
+        self._bias: Floats = deviation * self._bias_normals.take()
+        self._inertial = np.empty((9, n))
+        self._inertial_step = -1
+        self._estimate = np.empty((4, n))
+        self.altitude: Floats = self._estimate[0]
+        self.velocity: Floats = self._estimate[1:]
+        self.estimate()
+
+    def wander(self) -> None:
+        """Let the biases go on by one period."""
+        np.multiply(self._bias, self._bias_keep, out=self._bias)
+        np.add(self._bias, self._bias_fresh * self._bias_normals.take(), out=self._bias)
+
+    def estimate(self) -> None:
+        """Measure altitude and velocity now."""
+        vx, vy, vz = self._bodies.velocity
+        sin_yaw, cos_yaw = self._bodies.sin[2], self._bodies.cos[2]
+        altitude, forward, left, up = self._estimate
+        np.subtract(self._bodies.position[2], self._half_height, out=altitude)
+        np.add(cos_yaw * vx, sin_yaw * vy, out=forward)
+        np.subtract(cos_yaw * vy, sin_yaw * vx, out=left)
+        np.copyto(up, vz)
+        np.add(self._estimate, self._bias[9:], out=self._estimate)
+        np.add(self._estimate, self._estimate_noise * self._normals.take(), out=self._estimate)
+
+    def inertial(self, step: int) -> Floats:
+        """Gyro [rad/s] and accelerometer [m/s²] about and along the bodies' axes, and roll, pitch, yaw [rad] (yaw not
+        wrapped), shape (9, n), at the end of a step. Worked out once a step, for all drones."""
+        if step != self._inertial_step:
+            bodies = self._bodies
+            # Drone after drone from one stream of the step, so that the first ones' noise isn't changed by more drones.
+            normals = stream(self._seed, Purpose.INERTIAL, step).standard_normal(self._inertial_noise.shape[::-1]).T
+            truth = np.concatenate([body_rates(bodies), specific_force(bodies), bodies.angles])
+            self._inertial = truth + self._bias[:9] + self._inertial_noise * normals
+            self._inertial_step = step
+        return self._inertial
+
+
+def _rows(parameters: Sequence[VehicleParameters], values: Sequence[_Value]) -> Floats:
+    return np.array([column(parameters, value) for value in values])
+
+
+def quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
+    """The attitude as a unit quaternion (w, x, y, z), world from body."""
+    cr, sr = math.cos(roll / 2), math.sin(roll / 2)
+    cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
+    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )

@@ -1,0 +1,244 @@
+"""A world with drones in it, stepped by its owner.
+
+Deterministic: the same world, seed, drones and commands at the same steps give the same bits. There is no wall clock in
+here: :class:`~skyloop.sim.pacing.Pacer` makes it keep time.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from typing import TypeVar
+
+import numpy as np
+
+from skyloop.errors import UsageError
+from skyloop.messages import Action, AnyAction, FlightState
+from skyloop.messages.geometry import wrap_angle
+from skyloop.sim.battery import Batteries
+from skyloop.sim.collisions import Collisions
+from skyloop.sim.control_loops import ControlLoops
+from skyloop.sim.dynamics import STEP_S, Bodies, body_rates, rotations
+from skyloop.sim.firmware import Firmware
+from skyloop.sim.parameters import GRAVITY_M_S2, Limits, VehicleParameters
+from skyloop.sim.placement import place
+from skyloop.sim.reports import Occurrence, VehicleFeedback, VehicleTruth
+from skyloop.sim.sensors import Sensors, quaternion
+from skyloop.sim.solids import Solids
+from skyloop.sim.streams import Floats
+from skyloop.sim.targets import TargetTrack
+from skyloop.sim.wind import WindField
+from skyloop.sim.world import TargetState, Vec3, Wind, World
+
+LOOP_STEPS = 4  # the firmware's outer loops, altimeter and velocity: 62.5 Hz
+SLOW_STEPS = 25  # battery and the wandering of biases: 10 Hz
+
+T = TypeVar("T")
+
+_STANDARD_VEHICLE = VehicleParameters()
+_STANDARD_LIMITS = Limits()
+
+
+class Simulation:
+    """All methods may be called from any thread: a lock is held for one step, or one question, at a time.
+
+    ``parameters`` and ``limits`` are one for all drones or one each. ``charge`` is the batteries' at the start, 0 to 1.
+    ``wind`` replaces the world's. ``seed`` decides all noise and gusts, and with the world's own seed, which it
+    defaults to, everything. Raises :class:`UsageError` for arguments that can't be.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        drones: int = 1,
+        *,
+        seed: int | None = None,
+        parameters: VehicleParameters | Sequence[VehicleParameters] = _STANDARD_VEHICLE,
+        limits: Limits | Sequence[Limits] = _STANDARD_LIMITS,
+        charge: float = 1.0,
+        wind: Wind | None = None,
+    ) -> None:
+        if isinstance(drones, bool) or not isinstance(drones, int) or not 1 <= drones <= 1000:
+            raise UsageError(f"drones must be a whole number from 1 to 1000, not {drones!r}")
+        if not 0 < charge <= 1:
+            raise UsageError(f"charge must be greater than 0 and at most 1, not {charge!r}")
+        self.world = world
+        self.parameters = _one_each(parameters, drones, "parameters")
+        self.seed = world.seed if seed is None else seed
+        if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
+            raise UsageError(f"seed must be a whole number of at least 0, not {seed!r}")
+        self._lock = threading.RLock()
+        self._step = 0
+        self._tracks = tuple(TargetTrack(target, world.seed, n) for n, target in enumerate(world.targets))
+        solids = Solids(world, self._tracks)
+        spawns = place(world, self.parameters, solids)
+        starts = np.array([spawn.position_m for spawn in spawns]).T
+        starts[2] += [p.half_height_m for p in self.parameters]
+        self._bodies = Bodies(self.parameters, starts, np.array([spawn.yaw_rad for spawn in spawns]))
+        self._collisions = Collisions(self.parameters, self._bodies, solids)
+        self._wind = WindField(world.wind if wind is None else wind, self.seed, drones, LOOP_STEPS * STEP_S)
+        self._sensors = Sensors(self.parameters, self._bodies, self.seed, SLOW_STEPS * STEP_S)
+        self._batteries = Batteries(self.parameters, np.full(drones, float(charge)))
+        all_limits = _one_each(limits, drones, "limits")
+        loops = ControlLoops(self.parameters, all_limits, self._bodies, LOOP_STEPS * STEP_S)
+        self._loops = loops
+        self._firmware = Firmware(self.parameters, all_limits, loops, self._sensors, self._batteries)
+
+    # Time ------------------------------------------------------------------------------------------------------
+
+    @property
+    def drones(self) -> int:
+        """How many drones there are; they are numbered from 0."""
+        return len(self.parameters)
+
+    @property
+    def step_count(self) -> int:
+        """Steps done."""
+        return self._step
+
+    @property
+    def time_s(self) -> float:
+        """Time of the simulation: steps done, times :data:`~skyloop.sim.dynamics.STEP_S`."""
+        return self._step * STEP_S
+
+    def step(self, n: int = 1) -> None:
+        """Go on by ``n`` steps of :data:`~skyloop.sim.dynamics.STEP_S`."""
+        for _ in range(n):
+            with self._lock:
+                self._step_once()
+
+    def _step_once(self) -> None:
+        if self._step % LOOP_STEPS == 0:
+            self._wind.blow(self._bodies.air)
+            self._sensors.estimate()
+            self._firmware.supervise(self.time_s)
+            self._loops.update(self._sensors)
+        if self._step % SLOW_STEPS == 0:
+            self._sensors.wander()
+            self._batteries.drain(self._bodies.thrust, SLOW_STEPS * STEP_S)
+            self._firmware.watch_batteries(self.time_s)
+        self._bodies.step()
+        contacts = self._collisions.resolve(self._step)
+        self._step += 1
+        self._firmware.feel(contacts, self.time_s)
+
+    # Flying ----------------------------------------------------------------------------------------------------
+
+    def command(self, drone: int, action: AnyAction) -> AnyAction:
+        """Tell a drone what to do; it stays in force until the next command.
+
+        Returns what was applied: the action, a set-point within the limits, or :class:`~skyloop.messages.Idle` when
+        the drone ignores it in its present state (as firmware does): set-points before it hovers, a reset in the air.
+        Raises :class:`UsageError` for a number that isn't finite.
+        """
+        if not isinstance(action, Action):
+            raise UsageError(f"an action from skyloop.messages is wanted, not {action!r}")
+        if not action.finite:
+            raise UsageError(f"a set-point must be finite: {action!r}")
+        with self._lock:
+            return self._firmware.command(self._number(drone), action, self.time_s)
+
+    def limits(self, drone: int) -> Limits:
+        """The limits in force."""
+        return self._firmware.limits[self._number(drone)]
+
+    def set_limits(self, drone: int, limits: Limits) -> None:
+        """Change what the drone lets its pilot ask for, from the next command on; the ceiling holds at once."""
+        with self._lock:
+            self._firmware.set_limits(self._number(drone), limits)
+
+    # Conditions ------------------------------------------------------------------------------------------------
+
+    def set_wind(self, wind: Wind) -> None:
+        """Another wind from now on. Its gusts begin a stream of their own."""
+        with self._lock:
+            self._wind = WindField(wind, self.seed, self.drones, LOOP_STEPS * STEP_S)
+
+    def set_charge(self, drone: int, charge: float) -> None:
+        """Set what a drone's battery has left, 0 to 1. Raises :class:`UsageError` for any other number."""
+        if not 0 <= charge <= 1:
+            raise UsageError(f"charge must be from 0 to 1, not {charge!r}")
+        with self._lock:
+            self._batteries.charge[self._number(drone)] = charge
+
+    # Looking ---------------------------------------------------------------------------------------------------
+
+    def state(self, drone: int) -> FlightState:
+        """The drone's flight state."""
+        return self._firmware.states[self._number(drone)]
+
+    def feedback(self, drone: int) -> VehicleFeedback:
+        """What the drone believes now. Altitude and velocity are up to 12 ms older: their sensors run at 62.5 Hz."""
+        with self._lock:
+            i, sensors = self._number(drone), self._sensors
+            inertial = sensors.inertial(self._step)[:, i].tolist()
+            return VehicleFeedback(
+                time_s=self.time_s,
+                state=self._firmware.states[i],
+                emergency_reason=self._firmware.reasons[i],
+                battery=float(self._batteries.charge[i]),
+                battery_v=float(self._batteries.voltage[i]),
+                roll_rad=inertial[6],
+                pitch_rad=inertial[7],
+                yaw_rad=wrap_angle(inertial[8]),
+                altitude_m=float(sensors.altitude[i]),
+                velocity_m_s=_vec3(sensors.velocity[:, i]),
+                angular_velocity_rad_s=(inertial[0], inertial[1], inertial[2]),
+                acceleration_m_s2=(inertial[3], inertial[4], inertial[5]),
+            )
+
+    def truth(self, drone: int) -> VehicleTruth:
+        """What is really so now."""
+        with self._lock:
+            i, bodies = self._number(drone), self._bodies
+            roll, pitch, yaw = bodies.angles[:, i].tolist()
+            return VehicleTruth(
+                time_s=self.time_s,
+                state=self._firmware.states[i],
+                position_m=_vec3(bodies.position[:, i]),
+                velocity_m_s=_vec3(bodies.velocity[:, i]),
+                roll_rad=roll,
+                pitch_rad=pitch,
+                yaw_rad=wrap_angle(yaw),
+                quaternion=quaternion(roll, pitch, yaw),
+                angular_velocity_rad_s=_vec3(body_rates(bodies)[:, i]),
+                thrust=float(bodies.thrust[i]) / GRAVITY_M_S2,
+                wind_m_s=_vec3(bodies.air[:, i]),
+                battery=float(self._batteries.charge[i]),
+            )
+
+    def poses(self) -> tuple[Floats, Floats]:
+        """Positions of all bodies, world axes, shape (n, 3) [m], and world-from-body rotations, shape (n, 3, 3): new
+        arrays, true values, for a renderer or motion capture."""
+        with self._lock:
+            return self._bodies.position.T.copy(), rotations(self._bodies.sin, self._bodies.cos)
+
+    def target_states(self, time_s: float | None = None) -> tuple[TargetState, ...]:
+        """Where the moving targets are at a time of the simulation (now by default), in the world's order."""
+        time = self.time_s if time_s is None else time_s
+        return tuple(track.at(time) for track in self._tracks)
+
+    def take_occurrences(self) -> list[Occurrence]:
+        """What happened since the last call, oldest first; the newest 1000 are kept."""
+        with self._lock:
+            taken = list(self._firmware.occurrences)
+            self._firmware.occurrences.clear()
+            return taken
+
+    def _number(self, drone: int) -> int:
+        if not 0 <= drone < self.drones:
+            raise UsageError(f"no drone {drone!r}: they are numbered from 0 to {self.drones - 1}")
+        return drone
+
+
+def _one_each(given: T | Sequence[T], drones: int, what: str) -> list[T]:
+    if not isinstance(given, Sequence):
+        return [given] * drones
+    if len(given) != drones:
+        raise UsageError(f"{what}: {len(given)} given for {drones} drones; give one for all or one for each")
+    return list(given)
+
+
+def _vec3(values: Floats) -> Vec3:
+    x, y, z = values.tolist()
+    return (x, y, z)

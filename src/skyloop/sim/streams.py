@@ -1,0 +1,51 @@
+"""Independent streams of random numbers, one for each purpose and drone, all grown from one seed: switching one
+thing on, or adding a drone, leaves the numbers of all others as they were."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+class Purpose(IntEnum):
+    """What a stream is for. The numbers are part of what a seed means: never change or reuse one."""
+
+    TARGETS = 1
+    WIND = 2
+    ESTIMATES = 3
+    BIASES = 4
+    INERTIAL = 5
+    CAMERA = 6
+
+
+def stream(seed: int, purpose: Purpose, index: int = 0) -> np.random.Generator:
+    """The stream of a purpose and a number (of a drone, a target, a camera, a step): the same for the same arguments,
+    for ever. Costs some 15 µs."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(int(purpose), index)))
+
+
+class NormalBlocks:
+    """Standard normal numbers for many drones, ``rows`` each at a time, drawn in blocks because one call to a
+    generator costs as much as a hundred numbers. Each drone has a stream of its own."""
+
+    def __init__(self, seed: int, purpose: Purpose, rows: int, drones: int, ahead: int = 64) -> None:
+        generators = [stream(seed, purpose, drone) for drone in range(drones)]
+        self._draws: list[Callable[[tuple[int, int]], Floats]] = [g.standard_normal for g in generators]
+        self._rows = rows
+        self._block = np.empty((ahead, rows, drones))
+        self._next = ahead
+
+    def take(self) -> Floats:
+        """The next numbers, shape (rows, drones). Valid until the block is used up: copy what must last."""
+        if self._next == len(self._block):
+            for drone, draw in enumerate(self._draws):
+                self._block[:, :, drone] = draw((len(self._block), self._rows))
+            self._next = 0
+        numbers: Floats = self._block[self._next]
+        self._next += 1
+        return numbers

@@ -1,0 +1,352 @@
+"""What a simulated world is made of: frozen descriptions, no behaviour in time (that is ``targets``) and no file
+reading (that is ``world_file``).
+
+World axes: x east, y north, z up, metres, radians; yaw 0 faces east, positive yaw is counter-clockwise from above.
+The room's floor is centred on the origin: x in ±size/2, y in ±size/2, z from 0 to the height.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Vec2 = tuple[float, float]
+Vec3 = tuple[float, float, float]
+Rgb = tuple[int, int, int]
+
+# The surfaces a renderer must be able to draw, by name. A world file that names another one is refused.
+TEXTURES: tuple[str, ...] = (
+    "asphalt",
+    "books",
+    "brick",
+    "carpet",
+    "checker",
+    "concrete",
+    "crate",
+    "door",
+    "fabric",
+    "grass",
+    "metal",
+    "parquet",
+    "plaster",
+    "poster_chart",
+    "poster_landscape",
+    "poster_pattern",
+    "tiles",
+    "window",
+    "wood",
+)
+
+# ArUco and AprilTag dictionaries by their OpenCV names, with how many markers each holds (ids 0 … n-1).
+# Source: cv::aruco::PredefinedDictionaryType, OpenCV 4.x reference.
+MARKER_DICTIONARIES: dict[str, int] = {
+    **{f"DICT_{bits}X{bits}_{count}": count for bits in (4, 5, 6, 7) for count in (50, 100, 250, 1000)},
+    "DICT_ARUCO_ORIGINAL": 1024,
+    "DICT_APRILTAG_16h5": 30,
+    "DICT_APRILTAG_25h9": 35,
+    "DICT_APRILTAG_36h10": 2320,
+    "DICT_APRILTAG_36h11": 587,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class FacePose:
+    """Where a flat thing (poster, marker, board) is and where its face looks.
+
+    ``yaw_rad`` and ``elevation_rad`` give the direction of the outward normal: its heading, and its angle above the
+    horizon (π/2 looks straight up, as a marker on the floor does). ``turn_rad`` turns the picture in its own plane,
+    counter-clockwise for someone looking at it.
+    """
+
+    position_m: Vec3
+    yaw_rad: float = 0.0
+    elevation_rad: float = 0.0
+    turn_rad: float = 0.0
+
+    def rotation(self) -> NDArray[np.float64]:
+        """World-from-face rotation, shape (3, 3): columns are the picture's right, its up, and the outward normal."""
+        cy, sy = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        ce, se = math.cos(self.elevation_rad), math.sin(self.elevation_rad)
+        right = np.array([-sy, cy, 0.0])
+        up = np.array([-se * cy, -se * sy, ce])
+        normal = np.array([ce * cy, ce * sy, se])
+        ct, st = math.cos(self.turn_rad), math.sin(self.turn_rad)
+        return np.column_stack([ct * right + st * up, ct * up - st * right, normal])
+
+
+@dataclass(frozen=True, slots=True)
+class Room:
+    """The bounds of the world. Drones never leave them.
+
+    With ``enclosed`` false there is a ground and a sky but no walls or ceiling to see; the bounds then act as a net.
+    """
+
+    size_m: Vec3  # x, y, z extents
+    floor: str = "parquet"
+    walls: str = "plaster"
+    ceiling: str = "plaster"
+    enclosed: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """A solid box standing upright: ``position_m`` is its centre, ``size_m`` its extents along its own x, y, z."""
+
+    name: str
+    position_m: Vec3
+    size_m: Vec3
+    yaw_rad: float = 0.0
+    texture: str = "crate"
+    colour: Rgb | None = None  # a plain colour instead of the texture
+
+    def corners(self) -> NDArray[np.float64]:
+        """The eight corners in world axes, shape (8, 3); bit 0, 1, 2 of the row number choose +x, +y, +z."""
+        bits = (np.arange(8)[:, None] >> np.arange(3)) & 1
+        local = (bits - 0.5) * np.asarray(self.size_m)
+        c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        world = np.column_stack([c * local[:, 0] - s * local[:, 1], s * local[:, 0] + c * local[:, 1], local[:, 2]])
+        corners: NDArray[np.float64] = world + np.asarray(self.position_m)
+        return corners
+
+
+@dataclass(frozen=True, slots=True)
+class Gate:
+    """A rectangular frame to fly through: ``position_m`` is the centre of the opening, ``yaw_rad`` the heading of
+    the way through, ``inner_size_m`` the opening's width and height, ``frame_m`` the thickness of its bars."""
+
+    name: str
+    position_m: Vec3
+    inner_size_m: Vec2
+    yaw_rad: float = 0.0
+    frame_m: float = 0.08
+    colour: Rgb = (235, 110, 20)
+
+    def bars(self) -> tuple[Box, ...]:
+        """The solid parts: top, bottom, left and right bars, and two legs where the opening is off the floor."""
+        width, height = self.inner_size_m
+        bar, x, y, z = self.frame_m, *self.position_m
+        side = (width + bar) / 2
+        parts = [
+            ("top", 0.0, z + (height + bar) / 2, width + 2 * bar, bar),
+            ("bottom", 0.0, z - (height + bar) / 2, width + 2 * bar, bar),
+            ("left", side, z, bar, height),
+            ("right", -side, z, bar, height),
+        ]
+        leg = z - height / 2 - bar
+        if leg > 0.01:
+            parts += [("left leg", side, leg / 2, bar, leg), ("right leg", -side, leg / 2, bar, leg)]
+        c, s = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
+        return tuple(
+            Box(
+                name=f"{self.name} {part}",
+                position_m=(x - s * left, y + c * left, centre_z),
+                size_m=(bar, across, up),
+                yaw_rad=self.yaw_rad,
+                colour=self.colour,
+            )
+            for part, left, centre_z, across, up in parts
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    """A flat textured rectangle with no thickness: a poster, a window, a door. Drones don't collide with it."""
+
+    name: str
+    pose: FacePose
+    size_m: Vec2  # width, height
+    texture: str
+
+
+@dataclass(frozen=True, slots=True)
+class MarkerPattern:
+    """What is printed: a marker of ``size_m`` (edge of the black square) with a white margin of ``margin_m`` around."""
+
+    dictionary: str
+    marker_id: int
+    size_m: float
+    margin_m: float
+
+    @property
+    def card_size_m(self) -> float:
+        """Edge of the square card: the black square and the margin on both sides."""
+        return self.size_m + 2 * self.margin_m
+
+
+@dataclass(frozen=True, slots=True)
+class Marker:
+    """A printed marker that stays where it is. ``pose`` is of its centre; the picture's up is the marker's own."""
+
+    name: str
+    pose: FacePose
+    pattern: MarkerPattern
+
+
+@dataclass(frozen=True, slots=True)
+class WaypointPath:
+    """Straight legs between points at a constant speed; ``closed`` goes round, otherwise there and back."""
+
+    points_m: tuple[Vec3, ...]
+    speed_m_s: float
+    closed: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class CirclePath:
+    """A level circle at a constant speed, starting at ``start_rad`` from east, counter-clockwise from above."""
+
+    centre_m: Vec3
+    radius_m: float
+    speed_m_s: float
+    start_rad: float = 0.0
+    clockwise: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class LissajousPath:
+    """position = centre + amplitude · sin(2π · cycles · t / period + phase), axis by axis."""
+
+    centre_m: Vec3
+    amplitude_m: Vec3
+    cycles: Vec3
+    phase_rad: Vec3
+    period_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class WalkPath:
+    """A seeded random walk between points of a box (``low_m`` to ``high_m``), each leg at a speed drawn from a range,
+    with rounded corners (acceleration at most ``acceleration_m_s2``) that may lead some 0.1 m out of the box."""
+
+    low_m: Vec3
+    high_m: Vec3
+    speed_m_s: Vec2  # least, greatest
+    acceleration_m_s2: float = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class RingWalkPath:
+    """A seeded random walk around a centre, within a ring; now and then it turns back. Rounded as ``WalkPath``."""
+
+    centre_m: Vec2
+    radius_m: Vec2  # least, greatest
+    height_m: Vec2  # least, greatest
+    speed_m_s: Vec2  # least, greatest
+    acceleration_m_s2: float = 0.5
+
+
+Path = WaypointPath | CirclePath | LissajousPath | WalkPath | RingWalkPath
+
+
+@dataclass(frozen=True, slots=True)
+class FixedYaw:
+    """Always the same heading."""
+
+    yaw_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class AlongYaw:
+    """The heading of the motion plus an offset, turning no faster than the limit."""
+
+    offset_rad: float
+    turn_rate_rad_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class TowardsYaw:
+    """Looking at a point of the floor plan, turning no faster than the limit."""
+
+    point_m: Vec2
+    turn_rate_rad_s: float
+
+
+Yaw = FixedYaw | AlongYaw | TowardsYaw
+
+
+@dataclass(frozen=True, slots=True)
+class BoardTarget:
+    """An upright card with a marker that is carried along a path. The path is of the card's centre, and the yaw is the
+    heading its face looks to. Drones pass through it: it is there to be seen."""
+
+    name: str
+    pattern: MarkerPattern
+    path: Path
+    yaw: Yaw
+
+
+@dataclass(frozen=True, slots=True)
+class PlatformTarget:
+    """A solid slab that moves along a path, with a marker on its top. The path is of the centre of the top face, and
+    the marker's up is the platform's heading. Drones can land on it."""
+
+    name: str
+    pattern: MarkerPattern
+    path: Path
+    yaw: Yaw
+    size_m: Vec3
+    texture: str = "wood"
+
+
+Target = BoardTarget | PlatformTarget
+
+
+@dataclass(frozen=True, slots=True)
+class TargetState:
+    """Where a moving target is at a time of the simulation: position [m], yaw [rad, within ±π], velocity [m/s], world
+    axes. For a platform the position is that of the centre of its top face."""
+
+    name: str
+    time_s: float
+    position_m: Vec3
+    yaw_rad: float
+    velocity_m_s: Vec3
+
+    def face(self, target: Target) -> FacePose:
+        """The pose of the target's marker at this time."""
+        if isinstance(target, PlatformTarget):
+            # Looking up with the picture's up along the heading: see FacePose for the half turn.
+            return FacePose(self.position_m, yaw_rad=self.yaw_rad + math.pi, elevation_rad=math.pi / 2)
+        return FacePose(self.position_m, yaw_rad=self.yaw_rad)
+
+
+@dataclass(frozen=True, slots=True)
+class Wind:
+    """Air that moves: a mean velocity (where it blows to) and gusts, a first-order Gauss-Markov process per axis with
+    ``gust_m_s`` as its standard deviation along each horizontal axis (half of it vertically)."""
+
+    mean_m_s: Vec3 = (0.0, 0.0, 0.0)
+    gust_m_s: float = 0.0
+    time_constant_s: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Spawn:
+    """Where a drone stands at the start: ``position_m`` is on the ground under its centre."""
+
+    name: str
+    position_m: Vec3
+    yaw_rad: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """A whole world. ``seed`` decides everything in it that is drawn by chance (the walks of its targets)."""
+
+    name: str
+    room: Room
+    boxes: tuple[Box, ...] = ()
+    gates: tuple[Gate, ...] = ()
+    panels: tuple[Panel, ...] = ()
+    markers: tuple[Marker, ...] = ()
+    targets: tuple[Target, ...] = ()
+    spawns: tuple[Spawn, ...] = ()
+    wind: Wind = Wind()
+    seed: int = 0
+
+    def solids(self) -> tuple[Box, ...]:
+        """Every standing solid: the boxes, and the bars and legs of the gates."""
+        return self.boxes + tuple(bar for gate in self.gates for bar in gate.bars())

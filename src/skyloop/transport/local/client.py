@@ -1,0 +1,211 @@
+"""An application's end of the local transport."""
+
+from __future__ import annotations
+
+import array
+import logging
+import os
+import socket
+import threading
+from collections import deque
+from typing import Final
+
+from skyloop.errors import DecodeError, LinkError, UnknownNameError
+from skyloop.messages import FrameHeader
+from skyloop.messages.codec import HEADER_SIZE, MAX_BODY
+from skyloop.transport.base import ClientEnd, ClientHandler, Dialer, Pixels, check_packet, check_topic
+from skyloop.transport.local import packets
+from skyloop.transport.local.directory import connect, find_directory, set_timeout
+from skyloop.transport.local.slots import Leases
+from skyloop.transport.local.sockets import SEND_FLAGS, Socket, credentials
+
+_MAX_RECEIVED: Final = HEADER_SIZE + MAX_BODY + 256  # a frame's packet has a few bytes more than its header's
+_ANCILLARY: Final = socket.CMSG_SPACE(4 * array.array("i").itemsize)
+_RETRY_S: Final = 0.25  # for what did not fit into a full socket
+_log = logging.getLogger(__name__)
+
+
+def make_dialer(name: str, group: str | None) -> Dialer:
+    """See :func:`skyloop.transport.local.dial`."""
+    directory = find_directory(group)
+    path = directory.socket_path(name)
+
+    def dialer(handler: ClientHandler) -> LocalClient:
+        try:
+            directory.check()
+            sock = connect(path)
+        except FileNotFoundError:
+            raise UnknownNameError("proxy", name, [proxy.name for proxy in directory.proxies()]) from None
+        except ConnectionRefusedError:
+            raise LinkError(f"the proxy {name!r} is not running: it was killed and left its socket {path}") from None
+        except BlockingIOError:
+            raise LinkError(f"the proxy {name!r} does not accept connections: it is stopped or overloaded") from None
+        except OSError as error:
+            raise LinkError(f"cannot connect to the proxy {name!r} at {path}: {error.strerror}") from None
+        return LocalClient(sock, name, handler)
+
+    return dialer
+
+
+class LocalClient(ClientEnd):
+    """An application's end, made by the dialer that :func:`skyloop.transport.local.dial` returns."""
+
+    def __init__(self, sock: Socket, name: str, handler: ClientHandler) -> None:
+        self._address = f"local:{name} (pid {credentials(sock).pid})"
+        sock.limit_backlog()
+        set_timeout(sock, socket.SO_RCVTIMEO, _RETRY_S)
+        self._socket: Socket | None = sock
+        self._handler = handler
+        self._unsent: deque[bytes] = deque()  # the transport's own packets that did not fit, in order
+        self._leases = Leases(self._release)
+        self._closing = False
+        self._reason = ""
+        self._control(packets.hello())
+        self._thread = threading.Thread(target=self._run, args=(sock,), name=f"skyloop-{name}-client", daemon=True)
+        self._thread.start()
+
+    def send(self, packet: bytes) -> bool:
+        check_packet(packet)
+        sock = self._socket
+        if sock is None:
+            return False
+        try:
+            sock.send(packet, SEND_FLAGS)
+        except OSError:
+            return False
+        return True
+
+    def subscribe(self, topic: str, on: bool = True) -> None:
+        check_topic(topic)
+        self._control(packets.subscribe(topic, on))
+
+    def close(self) -> None:
+        self._end("closed by the application")
+        if threading.current_thread() is not self._thread:
+            self._thread.join()
+
+    @property
+    def same_clock(self) -> bool:
+        return True
+
+    @property
+    def address(self) -> str:
+        return self._address
+
+    def _end(self, reason: str) -> None:
+        """End the connection: the receiving thread does the rest."""
+        sock = self._socket
+        if sock is not None and not self._closing:
+            self._reason = reason
+            self._closing = True
+            sock.hang_up(packets.bye(reason))
+
+    def _release(self, slot: int) -> None:
+        self._control(packets.release(slot))
+
+    def _control(self, packet: bytes) -> None:
+        """Send one of the transport's own packets, later if it does not fit now.
+
+        The collector may call this at any point of any thread: there must be no lock in it.
+        """
+        sock = self._socket
+        if sock is None:
+            return
+        if not self._unsent:
+            try:
+                sock.send(packet, SEND_FLAGS)
+            except BlockingIOError:
+                pass
+            except OSError:
+                return  # it has ended
+            else:
+                return
+        self._unsent.append(packet)
+
+    # --- the receiving thread ---
+
+    def _run(self, sock: Socket) -> None:
+        try:
+            reason = self._receive(sock)
+        except Exception as error:  # noqa: BLE001  (a handler may raise anything)
+            _log.exception("the handler of %s failed; its connection ends", self._address)
+            reason = f"the application's handler failed: {error!r}"
+        self._end(reason)
+        reason = self._reason
+        self._socket = None
+        self._unsent.clear()
+        self._leases.end()
+        try:
+            self._handler.closed(reason)
+        except Exception:  # noqa: BLE001  (a handler may raise anything)
+            _log.exception("the handler of %s failed in closed()", self._address)
+
+    def _receive(self, sock: Socket) -> str:
+        """Deliver until the connection ends, and return why."""
+        receive = sock.recvmsg
+        deliver = self._handler.packet
+        while not self._closing:
+            try:
+                packet, ancillary, _, _ = receive(_MAX_RECEIVED, _ANCILLARY, socket.MSG_CMSG_CLOEXEC)
+            except BlockingIOError:
+                self._send_unsent(sock)
+                continue
+            except ConnectionResetError:
+                continue  # what was sent before it still comes, and then the end
+            except OSError as error:
+                return f"receiving failed: {error}"
+            if self._unsent:
+                self._send_unsent(sock)
+            if ancillary or packets.is_own(packet):
+                try:
+                    frame = self._take(packet, _descriptors(ancillary))
+                except (DecodeError, LinkError, OSError) as error:
+                    return f"the proxy does not keep to the protocol: {error}"
+                if frame is not None:
+                    self._handler.frame(*frame)
+                    frame = None  # else its slot stayed leased until the next packet
+            elif packet:
+                deliver(packet)
+            else:
+                return self._reason or "the proxy is gone"
+        return self._reason
+
+    def _take(self, packet: bytes, descriptors: list[int]) -> tuple[FrameHeader, Pixels] | None:
+        """Take one of the transport's own packets, and close the descriptors that came with it.
+
+        Returns the frame if it was one. Raises ``DecodeError``, ``LinkError`` or ``OSError`` for what makes no sense.
+        """
+        try:
+            message = packets.parse(packet)
+            if isinstance(message, packets.Frame):
+                return message.header, self._leases.pixels(message.slot, message.header.size)
+            if isinstance(message, packets.Slot):
+                if len(descriptors) != 1:
+                    raise LinkError(f"a slot was announced with {len(descriptors)} descriptors and needs one")
+                self._leases.add(message.slot, message.camera, message.capacity, descriptors[0])
+            elif isinstance(message, packets.Retire):
+                self._leases.retire(message.camera, message.before)
+            elif isinstance(message, packets.Bye):
+                self._reason = self._reason or message.reason
+            return None
+        finally:
+            for descriptor in descriptors:
+                os.close(descriptor)
+
+    def _send_unsent(self, sock: Socket) -> None:
+        try:
+            while self._unsent:
+                # It stays in the queue until it is sent, so that nothing that comes later overtakes it.
+                sock.send(self._unsent[0], SEND_FLAGS)
+                self._unsent.popleft()
+        except OSError:
+            return
+
+
+def _descriptors(ancillary: list[tuple[int, int, bytes]]) -> list[int]:
+    """The descriptors that came with a packet."""
+    descriptors = array.array("i")
+    for level, kind, data in ancillary:
+        if level == socket.SOL_SOCKET and kind == socket.SCM_RIGHTS:
+            descriptors.frombytes(data[: len(data) - len(data) % descriptors.itemsize])
+    return descriptors.tolist()

@@ -1,0 +1,161 @@
+"""The local transport's own packets: bytes to typed tuples and back. Pure; tables in ``docs/wire-format.md``.
+
+They share the header of all packets and have kinds from 0x40, which no sample has.
+"""
+
+from __future__ import annotations
+
+import struct
+from enum import IntEnum
+from typing import Final, NamedTuple
+
+from skyloop.errors import DecodeError
+from skyloop.messages import FrameHeader, decode
+from skyloop.messages.codec import HEADER, HEADER_SIZE, SIGNATURE, VERSION
+from skyloop.transport.base import MAX_TOPIC
+
+REVISION: Final = 1  #: of the local transport's own packets
+FIRST_KIND: Final = 0x40
+MAX_REASON: Final = 400  #: bytes of UTF-8
+_FRAME: Final = 0x44  # LocalKind.FRAME
+
+
+class LocalKind(IntEnum):
+    """The kinds of packet that the two ends exchange between themselves."""
+
+    HELLO = 0x40  #: first packet of a client
+    SUBSCRIBE = 0x41  #: client to server
+    RELEASE = 0x42  #: client to server: the frame in this slot is not looked at any more
+    SLOT = 0x43  #: server to client, with the slot's descriptor
+    FRAME = 0x44  #: server to client: a slot is filled
+    RETIRE = 0x45  #: server to client: older slots of a camera will not be used any more
+    BYE = 0x46  #: either way: why the connection ends
+
+
+class Hello(NamedTuple):
+    revision: int
+
+
+class Subscribe(NamedTuple):
+    topic: str
+    on: bool
+
+
+class Release(NamedTuple):
+    slot: int
+
+
+class Slot(NamedTuple):
+    slot: int
+    camera: int
+    capacity: int
+
+
+class Frame(NamedTuple):
+    slot: int
+    header: FrameHeader
+
+
+class Retire(NamedTuple):
+    camera: int
+    before: int
+
+
+class Bye(NamedTuple):
+    reason: str
+
+
+Message = Hello | Subscribe | Release | Slot | Frame | Retire | Bye
+
+_HELLO = struct.Struct("<H")
+_NUMBER = struct.Struct("<I")
+_SLOT = struct.Struct("<IIQ")
+_RETIRE = struct.Struct("<II")
+_FRAME_PREFIX = struct.Struct(HEADER.format + "I")
+
+
+def is_own(packet: bytes) -> bool:
+    """Whether a packet is for the transport itself and not for the handler."""
+    return packet[5:6] >= b"\x40" and packet.startswith(SIGNATURE)
+
+
+def hello() -> bytes:
+    return _packet(LocalKind.HELLO, _HELLO.pack(REVISION))
+
+
+def subscribe(topic: str, on: bool) -> bytes:
+    return _packet(LocalKind.SUBSCRIBE, bytes((on,)) + topic.encode())
+
+
+def release(slot: int) -> bytes:
+    return _packet(LocalKind.RELEASE, _NUMBER.pack(slot))
+
+
+def slot(number: int, camera: int, capacity: int) -> bytes:
+    return _packet(LocalKind.SLOT, _SLOT.pack(number, camera, capacity))
+
+
+def frame(number: int, header: bytes) -> bytes:
+    """``header`` is the whole packet of the :class:`FrameHeader`."""
+    return _FRAME_PREFIX.pack(SIGNATURE, VERSION, LocalKind.FRAME, 0, _NUMBER.size + len(header), number) + header
+
+
+def retire(camera: int, before: int) -> bytes:
+    return _packet(LocalKind.RETIRE, _RETIRE.pack(camera, before))
+
+
+def bye(reason: str) -> bytes:
+    return _packet(LocalKind.BYE, reason.encode(errors="replace")[:MAX_REASON])
+
+
+def _packet(kind: LocalKind, body: bytes) -> bytes:
+    return HEADER.pack(SIGNATURE, VERSION, kind, 0, len(body)) + body
+
+
+def parse(packet: bytes) -> Message:
+    """What one of the transport's own packets says. Raises :class:`DecodeError` for anything that is none."""
+    if len(packet) < HEADER_SIZE:
+        raise DecodeError(f"{len(packet)} bytes are less than the header of {HEADER_SIZE}")
+    if packet[5] == _FRAME:
+        return _parse_frame(packet)
+    signature, version, kind, reserved, length = HEADER.unpack_from(packet)
+    if signature != SIGNATURE or version != VERSION or reserved or length != len(packet) - HEADER_SIZE:
+        raise DecodeError(f"not a packet of the local transport: header {packet[:HEADER_SIZE].hex(' ')}")
+    body = packet[HEADER_SIZE:]
+    try:
+        if kind == LocalKind.SUBSCRIBE:
+            return _parse_subscribe(body)
+        if kind == LocalKind.BYE:
+            return Bye(body[:MAX_REASON].decode(errors="replace"))
+        layout, message = _FIXED[kind]
+        return message(*layout.unpack(body))
+    except (KeyError, IndexError, struct.error, UnicodeDecodeError) as error:
+        raise DecodeError(f"bad packet of kind {kind:#x} with {length} bytes of body: {error!r}") from None
+
+
+_FIXED: Final[dict[int, tuple[struct.Struct, type[Hello] | type[Release] | type[Slot] | type[Retire]]]] = {
+    LocalKind.HELLO: (_HELLO, Hello),
+    LocalKind.RELEASE: (_NUMBER, Release),
+    LocalKind.SLOT: (_SLOT, Slot),
+    LocalKind.RETIRE: (_RETIRE, Retire),
+}
+
+
+def _parse_frame(packet: bytes) -> Frame:
+    """The one that comes often: its header and slot in one go."""
+    if len(packet) < _FRAME_PREFIX.size:
+        raise DecodeError(f"{len(packet)} bytes are less than the {_FRAME_PREFIX.size} before the header of a frame")
+    signature, version, _, reserved, length, slot = _FRAME_PREFIX.unpack_from(packet)
+    if signature != SIGNATURE or version != VERSION or reserved or length != len(packet) - HEADER_SIZE:
+        raise DecodeError(f"not a frame packet of the local transport: header {packet[:HEADER_SIZE].hex(' ')}")
+    header = decode(packet[_FRAME_PREFIX.size :])
+    if type(header) is not FrameHeader:
+        raise DecodeError(f"a frame was announced by a {type(header).__name__} and must be by a FrameHeader")
+    return Frame(slot, header)
+
+
+def _parse_subscribe(body: bytes) -> Subscribe:
+    on, topic = body[0], body[1:].decode()
+    if on > 1 or not 0 < len(topic) <= MAX_TOPIC:
+        raise DecodeError(f"a subscription of {len(topic)} characters with flag {on}")
+    return Subscribe(topic, bool(on))

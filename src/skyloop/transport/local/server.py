@@ -1,0 +1,272 @@
+"""The proxy's end of the local transport: one connection an application, and one receiving thread each.
+
+A thread of its own that waits in ``recv`` hands a packet over in one system call; waiting for all connections at once
+(epoll) needs two, which made the delay of a command a third longer on an idle machine. The threads take turns at the
+handler, so that it is called by one at a time as the contract says.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from typing import Final
+
+from skyloop.errors import DecodeError, UsageError
+from skyloop.messages import FrameHeader
+from skyloop.transport.base import (
+    MAX_PACKET,
+    Peer,
+    Pixels,
+    ServerEnd,
+    ServerHandler,
+    check_frame,
+    check_packet,
+    video,
+)
+from skyloop.transport.local import packets
+from skyloop.transport.local.connection import MAX_SUBSCRIPTIONS, ServerConnection
+from skyloop.transport.local.directory import check_name, find_directory
+from skyloop.transport.local.frames import FrameExchange
+from skyloop.transport.local.slots import check_support
+from skyloop.transport.local.sockets import Socket, credentials, may_connect
+
+MAX_CLIENTS: Final = 128
+_RETRY_ACCEPT_S: Final = 0.2
+_VIDEO: Final = video("")
+_log = logging.getLogger(__name__)
+
+
+class LocalServer(ServerEnd):
+    """A proxy's end, found on this host by its name. Started once.
+
+    ``group`` names a group of users whose members may connect as well (default: the variable ``SKYLOOP_GROUP``).
+    Raises :class:`UsageError` for a name that can't be one; :meth:`start` raises :class:`NameTakenError` where a
+    running proxy has it, :class:`LinkError` where the directory of sockets is not safe, and
+    :class:`UnsupportedError` where the kernel lacks what is needed.
+    """
+
+    def __init__(self, name: str, *, group: str | None = None) -> None:
+        check_name(name)
+        self._name = name
+        self._directory = find_directory(group)
+        self._directory.socket_path(name)  # here, and not only when it starts, it says that the path is too long
+        self._exchange = FrameExchange()
+        # Changed under the turn only, and read by all: the tuples are replaced and never changed.
+        self._connections: set[ServerConnection] = set()
+        self._peers: dict[int, ServerConnection] = {}  # by the peer's number
+        self._topics: dict[str, tuple[ServerConnection, ...]] = {}
+        self._turn = threading.RLock()  # whoever has it may call the handler
+        self._receivers: set[int] = set()  # identities of the receiving threads
+        self._last_id = 0
+        self._started = False
+        self._state_lock = threading.Lock()  # guards starting and stopping
+        self._stopping = threading.Event()
+        self._listener: Socket | None = None
+        self._thread: threading.Thread | None = None
+
+    def start(self, handler: ServerHandler) -> None:
+        with self._state_lock:
+            if self._started:
+                raise UsageError(f"{self.address} was started before: make a new {type(self).__name__}")
+            check_support()
+            listener, inode = self._directory.listen(self._name)
+            self._started = True
+            self._listener = listener
+            self._thread = threading.Thread(
+                target=self._run, args=(handler, listener, inode), name=f"skyloop-{self._name}-server", daemon=True
+            )
+            self._thread.start()
+
+    def stop(self) -> None:
+        with self._state_lock:
+            thread, self._thread = self._thread, None
+            listener, self._listener = self._listener, None
+            if thread is None or listener is None:
+                return
+            self._stopping.set()
+            listener.hang_up()  # wakes who accepts
+        if threading.get_ident() not in self._receivers:  # a handler that stops its own server does not wait for itself
+            thread.join()
+
+    def send(self, peer: Peer, packet: bytes) -> bool:
+        check_packet(packet)
+        connection = self._peers.get(peer.id)
+        if connection is None:
+            return False
+        try:
+            connection.transmit(packet)
+        except OSError:
+            return False
+        return True
+
+    def publish(self, topic: str, packet: bytes) -> int:
+        check_packet(packet)
+        missed = 0
+        for connection in self._topics.get(topic, ()):
+            try:
+                connection.transmit(packet)
+            except OSError:
+                missed += 1
+        return missed
+
+    def publish_frame(self, header: FrameHeader, pixels: Pixels) -> int:
+        check_frame(header, pixels)
+        return self._exchange.publish(header, pixels)
+
+    def subscribers(self, topic: str) -> int:
+        return len(self._topics.get(topic, ()))
+
+    def disconnect(self, peer: Peer, reason: str) -> None:
+        connection = self._peers.get(peer.id)
+        if connection is not None:
+            connection.hang_up(reason)
+
+    @property
+    def address(self) -> str:
+        return f"local:{self._name}"
+
+    # --- the accepting thread ---
+
+    def _run(self, handler: ServerHandler, listener: Socket, inode: int) -> None:
+        threads: list[threading.Thread] = []
+        try:
+            while not self._stopping.is_set():
+                thread = self._accept(handler, listener)
+                if thread is not None:
+                    threads = [thread, *(other for other in threads if other.is_alive())]
+        finally:
+            self._directory.remove(self._name, inode)
+            for connection in list(self._connections):
+                connection.hang_up("the proxy stopped")
+            for thread in threads:
+                thread.join()
+
+    def _accept(self, handler: ServerHandler, listener: Socket) -> threading.Thread | None:
+        """Accept one caller and begin to receive from it."""
+        try:
+            accepted, _ = listener.accept()
+        except OSError as error:
+            if not self._stopping.is_set() and not isinstance(error, ConnectionError):
+                # Out of descriptors or memory: without a pause this thread would do nothing else but try.
+                _log.warning("%s cannot accept: %s", self.address, error)
+                self._stopping.wait(_RETRY_ACCEPT_S)
+            return None
+        sock = Socket(accepted.detach())
+        if not may_connect(sock, self._directory.gid):
+            sock.hang_up(packets.bye(f"{credentials(sock)} may not connect to {self.address}"))
+            return None
+        if len(self._connections) >= MAX_CLIENTS:
+            sock.hang_up(packets.bye(f"{self.address} has {MAX_CLIENTS} connections already, and takes no more"))
+            return None
+        self._last_id += 1
+        connection = ServerConnection(sock, Peer(self._last_id, str(credentials(sock))))
+        thread = threading.Thread(
+            target=self._converse, args=(handler, connection), name=f"skyloop-{self._name}-peer", daemon=True
+        )
+        with self._turn:
+            self._connections.add(connection)
+        try:
+            thread.start()
+        except RuntimeError as error:  # no more threads
+            connection.hang_up(f"{self.address} cannot serve it: {error}")
+            with self._turn:
+                self._connections.discard(connection)
+            return None
+        return thread
+
+    # --- the receiving threads ---
+
+    def _converse(self, handler: ServerHandler, connection: ServerConnection) -> None:
+        """Receive from one application until its connection ends."""
+        self._receivers.add(threading.get_ident())
+        try:
+            reason = self._receive(handler, connection)
+        except Exception as error:  # noqa: BLE001  (a handler may raise anything)
+            _log.exception("the handler of %s failed; %s is disconnected", self.address, connection.peer.address)
+            reason = f"the proxy's handler failed: {error!r}"
+        self._end(handler, connection, reason)
+        self._receivers.discard(threading.get_ident())
+
+    def _receive(self, handler: ServerHandler, connection: ServerConnection) -> str:
+        """Hand packets on, and return why it ended. Raises what the handler raises."""
+        receive, turn, peer, deliver = connection.receive, self._turn, connection.peer, handler.packet
+        while True:
+            try:
+                packet = receive(MAX_PACKET + 1)
+            except ConnectionResetError:
+                continue  # what was sent before it still comes, and then the end
+            except OSError as error:
+                return f"receiving failed: {error}"
+            with turn:
+                if not packet or connection.ending:
+                    # An empty packet cannot be told from the end, so it is one.
+                    return f"the application is gone ({peer.address})"
+                if len(packet) > MAX_PACKET:
+                    return f"it sent a packet of more than {MAX_PACKET} bytes"
+                if not connection.joined:
+                    self._welcome(handler, connection, packet)
+                elif not (packets.is_own(packet) and self._understood(connection, packet)):
+                    deliver(peer, packet)
+
+    def _welcome(self, handler: ServerHandler, connection: ServerConnection, packet: bytes) -> None:
+        """Take the first packet of a connection; whoever only wants to know who listens here sends none."""
+        if packet != packets.hello():
+            connection.hang_up(f"it did not say hello as revision {packets.REVISION} of the local transport does")
+            return
+        connection.joined = True
+        self._peers[connection.peer.id] = connection
+        handler.peer_joined(connection.peer)
+
+    def _understood(self, connection: ServerConnection, packet: bytes) -> bool:
+        """Take one of the transport's own packets. What makes no sense is left to the handler, as any garbage is."""
+        try:
+            message = packets.parse(packet)
+        except DecodeError:
+            return False
+        if isinstance(message, packets.Release):
+            return self._exchange.release(connection, message.slot)
+        if isinstance(message, packets.Subscribe):
+            return self._subscribe(connection, message)
+        if isinstance(message, packets.Bye):
+            connection.reason = connection.reason or message.reason
+            return True
+        return False
+
+    def _subscribe(self, connection: ServerConnection, wish: packets.Subscribe) -> bool:
+        topic = wish.topic
+        if wish.on and len(connection.topics) >= MAX_SUBSCRIPTIONS:
+            return False
+        if wish.on == (topic in connection.topics):
+            return True
+        if wish.on:
+            connection.topics.add(topic)
+            self._topics[topic] = (*self._topics.get(topic, ()), connection)
+        else:
+            connection.topics.discard(topic)
+            self._forget_topic(connection, topic)
+        if topic.startswith(_VIDEO):
+            change = self._exchange.subscribe if wish.on else self._exchange.unsubscribe
+            change(connection, topic.removeprefix(_VIDEO))
+        return True
+
+    def _forget_topic(self, connection: ServerConnection, topic: str) -> None:
+        remaining = tuple(other for other in self._topics[topic] if other is not connection)
+        if remaining:
+            self._topics[topic] = remaining
+        else:
+            del self._topics[topic]
+
+    def _end(self, handler: ServerHandler, connection: ServerConnection, reason: str) -> None:
+        with self._turn:
+            self._connections.discard(connection)
+            self._peers.pop(connection.peer.id, None)
+            for topic in connection.topics:
+                self._forget_topic(connection, topic)
+            self._exchange.leave(connection)
+            connection.hang_up(reason)
+            if not connection.joined:
+                return
+            try:
+                handler.peer_left(connection.peer, connection.reason)
+            except Exception:  # noqa: BLE001  (a handler may raise anything)
+                _log.exception("the handler of %s failed in peer_left()", self.address)

@@ -1,0 +1,319 @@
+"""The transport inside one process: for tests, and for a proxy and an application that share a process.
+
+It keeps the whole contract of :mod:`skyloop.transport.base`, receiving threads and bounded queues included, so what
+works over it works over the others. :class:`Faults` makes it lose, repeat, reorder and damage what travels, exactly
+the same way for the same seed.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import random
+import threading
+from collections import deque
+from dataclasses import dataclass
+from enum import Enum, auto
+from queue import SimpleQueue
+from typing import TypeVar
+
+import numpy as np
+
+from skyloop.errors import LinkError, UsageError
+from skyloop.messages import FrameHeader
+from skyloop.transport.base import (
+    ClientEnd,
+    ClientHandler,
+    Peer,
+    Pixels,
+    ServerEnd,
+    ServerHandler,
+    check_frame,
+    check_packet,
+    check_topic,
+    video,
+)
+
+DEPTH = 256  #: packets that wait at an end before further ones are dropped
+FRAME_DEPTH = 4  #: frames of one camera that wait at a client; then the newest takes the place of the one before it
+
+_log = logging.getLogger(__name__)
+_Item = TypeVar("_Item")
+_Frame = tuple[FrameHeader, Pixels]
+
+
+@dataclass(frozen=True, slots=True)
+class Faults:
+    """What goes wrong on the way, as probabilities between 0 and 1 for each packet or frame, in each direction.
+
+    ``corrupt`` flips one random bit, and is for packets only. ``reorder`` holds one back until the next has passed.
+    Each direction of each connection draws from a ``random.Random`` of its own, made from ``seed``.
+    """
+
+    seed: int = 0
+    drop: float = 0.0
+    duplicate: float = 0.0
+    reorder: float = 0.0
+    corrupt: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("drop", "duplicate", "reorder", "corrupt"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise UsageError(f"{name} is {getattr(self, name)!r} and must be a probability between 0 and 1")
+
+
+class _Way:
+    """One direction of one connection, with its faults. Not shared between threads without a lock."""
+
+    def __init__(self, faults: Faults, key: str) -> None:
+        self._faults = faults
+        self._random = random.Random(f"{faults.seed}/{key}")
+        self._held: list[object] = []
+
+    def packets(self, packet: bytes) -> list[bytes]:
+        """What arrives when this packet is sent: any number of packets, in order of arrival."""
+        if packet and self._random.random() < self._faults.corrupt:
+            damaged = bytearray(packet)
+            damaged[self._random.randrange(len(damaged))] ^= 1 << self._random.randrange(8)
+            packet = bytes(damaged)
+        return self.items(packet)
+
+    def items(self, item: _Item) -> list[_Item]:
+        """The same for anything, without damage."""
+        held: list[_Item] = self._held  # type: ignore[assignment]
+        chance = self._random.random
+        if chance() < self._faults.drop:
+            return []
+        if not held and chance() < self._faults.reorder:
+            held.append(item)
+            return []
+        copies = [item, item] if chance() < self._faults.duplicate else [item]
+        arriving = copies + held
+        held.clear()
+        return arriving
+
+
+class _What(Enum):
+    """What the server's receiving thread is told about a client."""
+
+    JOINED = auto()
+    PACKET = auto()
+    LEFT = auto()
+
+
+class MemoryServer(ServerEnd):
+    """A proxy's end. :meth:`dial` is its :data:`skyloop.transport.base.Dialer`. May be started again after a stop."""
+
+    def __init__(self, name: str = "memory", *, faults: Faults | None = None) -> None:
+        self._name = name
+        self._faults = faults or Faults()
+        self._lock = threading.Lock()  # guards joining and leaving; never held while a handler runs
+        self._clients: dict[int, MemoryClient] = {}
+        self._ids = itertools.count(1)
+        self._inbox: SimpleQueue[tuple[MemoryClient, _What] | None] = SimpleQueue()
+        self._thread: threading.Thread | None = None
+
+    def dial(self, handler: ClientHandler) -> MemoryClient:
+        """Connect. Raises :class:`LinkError` if the server is not started."""
+        with self._lock:
+            if self._thread is None:
+                raise LinkError(f"nobody serves {self.address}: start the server end first")
+            client = MemoryClient(self, Peer(next(self._ids), "this process"), handler, self._faults)
+            self._clients[client.peer.id] = client
+            self._inbox.put((client, _What.JOINED))
+        client.begin()
+        return client
+
+    def start(self, handler: ServerHandler) -> None:
+        with self._lock:
+            if self._thread is not None:
+                raise UsageError(f"{self.address} is already started")
+            self._inbox = SimpleQueue()
+            name = f"skyloop-{self._name}-server"
+            self._thread = threading.Thread(target=self._receive, args=(handler, self._inbox), name=name, daemon=True)
+            self._thread.start()
+
+    def stop(self) -> None:
+        with self._lock:
+            thread, self._thread = self._thread, None
+        if thread is None:
+            return
+        for client in list(self._clients.values()):
+            self.end(client, "the proxy stopped", muted=True)
+        self._inbox.put(None)
+        if thread is not threading.current_thread():
+            thread.join()
+
+    def send(self, peer: Peer, packet: bytes) -> bool:
+        check_packet(packet)
+        client = self._clients.get(peer.id)
+        return client is not None and client.deliver(packet)
+
+    def publish(self, topic: str, packet: bytes) -> int:
+        check_packet(packet)
+        return sum(not client.deliver(packet) for client in self._subscribed(topic))
+
+    def publish_frame(self, header: FrameHeader, pixels: Pixels) -> int:
+        check_frame(header, pixels)
+        wanted = self._subscribed(video(header.camera))
+        if not wanted:
+            return 0
+        copy = np.frombuffer(pixels.tobytes(), np.uint8)
+        return sum(not client.deliver_frame(header, copy) for client in wanted)
+
+    def subscribers(self, topic: str) -> int:
+        return len(self._subscribed(topic))
+
+    def disconnect(self, peer: Peer, reason: str) -> None:
+        client = self._clients.get(peer.id)
+        if client is not None:
+            self.end(client, reason, muted=True)
+
+    @property
+    def address(self) -> str:
+        return f"memory:{self._name}"
+
+    def arrived(self, client: MemoryClient) -> None:
+        """A packet was put into the client's ``outgoing``."""
+        self._inbox.put((client, _What.PACKET))
+
+    def end(self, client: MemoryClient, reason: str, *, muted: bool) -> None:
+        """End a connection, once. ``muted``: what it has sent and was not delivered yet is not wanted any more."""
+        with self._lock:
+            if self._clients.pop(client.peer.id, None) is None:
+                return
+            client.muted = muted
+            client.end(reason)
+            self._inbox.put((client, _What.LEFT))
+
+    def _subscribed(self, topic: str) -> list[MemoryClient]:
+        return [client for client in list(self._clients.values()) if topic in client.topics]
+
+    def _receive(self, handler: ServerHandler, inbox: SimpleQueue[tuple[MemoryClient, _What] | None]) -> None:
+        while (item := inbox.get()) is not None:
+            client, what = item
+            try:
+                if what is _What.PACKET:
+                    packet = client.outgoing.popleft()
+                    if not client.muted:
+                        handler.packet(client.peer, packet)
+                elif what is _What.JOINED:
+                    handler.peer_joined(client.peer)
+                else:
+                    handler.peer_left(client.peer, client.reason)
+            except Exception as error:  # noqa: BLE001  (a handler may raise anything)
+                _log.exception("the server's handler failed; the connection to %s ends", client.peer.address)
+                self.end(client, f"the server's handler failed: {error!r}", muted=True)
+
+
+class MemoryClient(ClientEnd):
+    """An application's end, made by :meth:`MemoryServer.dial`."""
+
+    def __init__(self, server: MemoryServer, peer: Peer, handler: ClientHandler, faults: Faults) -> None:
+        self.peer = peer
+        self.topics: set[str] = set()
+        self.outgoing: deque[bytes] = deque()
+        self.muted = False
+        self.reason = ""
+        self._server = server
+        self._handler = handler
+        self._up = _Way(faults, f"{peer.id}/up")
+        self._down = _Way(faults, f"{peer.id}/down")
+        self._up_lock = threading.Lock()
+        self._down_lock = threading.Lock()
+        # A packet, the name of a camera whose next frame is due, or None: the connection has ended.
+        self._inbox: SimpleQueue[bytes | str | None] = SimpleQueue()
+        self._frames: dict[str, deque[_Frame]] = {}
+        self._ended = False  # by whichever end: nothing can be sent any more
+        self._closing = False  # by this end: nothing more is delivered
+        self._thread = threading.Thread(target=self._receive, name=f"skyloop-memory-client-{peer.id}", daemon=True)
+
+    def begin(self) -> None:
+        """Start to deliver."""
+        self._thread.start()
+
+    def send(self, packet: bytes) -> bool:
+        check_packet(packet)
+        with self._up_lock:
+            if self._ended or len(self.outgoing) >= DEPTH:
+                return False
+            for arriving in self._up.packets(packet):
+                self.outgoing.append(arriving)
+                self._server.arrived(self)
+        return True
+
+    def subscribe(self, topic: str, on: bool = True) -> None:
+        check_topic(topic)
+        if on:
+            self.topics.add(topic)
+        else:
+            self.topics.discard(topic)
+
+    def close(self) -> None:
+        self._closing = True
+        self._server.end(self, "closed by the application", muted=False)
+        if threading.current_thread() is not self._thread:
+            self._thread.join()
+
+    @property
+    def same_clock(self) -> bool:
+        return True
+
+    @property
+    def address(self) -> str:
+        return self._server.address
+
+    def deliver(self, packet: bytes) -> bool:
+        """Take a packet from the server; False if too many wait already."""
+        with self._down_lock:
+            if self._ended or self._inbox.qsize() >= DEPTH:
+                return False
+            for arriving in self._down.packets(packet):
+                self._inbox.put(arriving)
+        return True
+
+    def deliver_frame(self, header: FrameHeader, pixels: Pixels) -> bool:
+        """Take a frame from the server; False if it took the place of one that still waited."""
+        room = True
+        with self._down_lock:
+            if self._ended:
+                return False
+            waiting = self._frames.setdefault(header.camera, deque())
+            for frame in self._down.items((header, pixels)):
+                if len(waiting) >= FRAME_DEPTH:
+                    waiting[-1] = frame
+                    room = False
+                else:
+                    waiting.append(frame)
+                    self._inbox.put(header.camera)
+        return room
+
+    def end(self, reason: str) -> None:
+        """The connection has ended: called once, by the server."""
+        with self._up_lock, self._down_lock:
+            self._ended = True
+            self.reason = reason
+            self._inbox.put(None)
+
+    def _receive(self) -> None:
+        while (item := self._inbox.get()) is not None:
+            if self._closing:
+                continue
+            try:
+                self._deliver_one(item)
+            except Exception as error:  # noqa: BLE001  (a handler may raise anything)
+                _log.exception("the client's handler failed; its connection ends")
+                self._closing = True
+                self._server.end(self, f"the client's handler failed: {error!r}", muted=False)
+        try:
+            self._handler.closed(self.reason)
+        except Exception:  # noqa: BLE001  (a handler may raise anything)
+            _log.exception("the client's handler failed in closed()")
+
+    def _deliver_one(self, item: bytes | str) -> None:
+        if isinstance(item, bytes):
+            self._handler.packet(item)
+            return
+        with self._down_lock:
+            header, pixels = self._frames[item].popleft()
+        self._handler.frame(header, pixels)

@@ -1,0 +1,33 @@
+"""The simulated drone keeps the drivers' contract, with all actions of its own and with fewer."""
+
+from __future__ import annotations
+
+from skyloop.drivers.base import Driver
+from skyloop.drivers.suite import DriverSuite
+from skyloop.drivers.uri import VehicleUri
+
+
+class SimSuite(DriverSuite):
+    untouched_parameters = frozenset({"sim.link", "sim.battery"})  # one cuts the suite off, the other drains
+
+    def make(self, uri: VehicleUri) -> Driver:
+        self.driver = super().make(uri)
+        return self.driver
+
+    def vehicle_disappears(self) -> None:
+        self.driver.set_parameter("sim.link", False)
+
+    def vehicle_appears(self) -> None:
+        self.driver.set_parameter("sim.link", True)
+
+
+class TestSim(SimSuite):
+    uri = "sim://?seed=4&speed=10&rate=100"
+
+
+class TestSimThatTakesAttitudesOnly(SimSuite):
+    uri = "sim://?world=empty&seed=4&speed=10&rate=100&native=attitude&cameras=none&wind=0"
+
+
+class TestSimThatKnowsItsPlace(SimSuite):
+    uri = "sim://?seed=4&speed=10&rate=100&position=1&cameras=bottom&native=takeoff,land,velocity"

@@ -1,0 +1,394 @@
+"""``video://``: recordings played in order and in time, devices, and files that are not what they should be."""
+
+from __future__ import annotations
+
+import random
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+from skyloop.clock import monotonic_ns
+from skyloop.drivers.base import Driver
+from skyloop.drivers.recording_sink import RecordingSink
+from skyloop.drivers.registry import make_driver
+from skyloop.drivers.video.player import LivePlayer, Screen
+from skyloop.drivers.video.sources import ContainerSource, Picture, Source
+from skyloop.errors import DriverError, FileFormatError, MissingExtraError, UnknownNameError, UsageError
+from skyloop.messages import Hover, LinkState
+
+DATA = Path(__file__).parents[1] / "data" / "ardrone2"
+FAST = "speed=1000"
+FRAMES = 24
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A clip of 24 grey pictures, 64×48 at 25 a second; picture n is of brightness 40 + 8 n."""
+    path = tmp_path_factory.mktemp("clip") / "clip.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        stream.bit_rate = 2_000_000
+        for n in range(FRAMES):
+            picture = np.full((48, 64, 3), 40 + 8 * n, np.uint8)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="bgr24")))
+        container.mux(stream.encode(None))
+    return path
+
+
+@contextmanager
+def playing(uri: str, sink: RecordingSink) -> Iterator[Driver]:
+    driver = make_driver(uri)
+    driver.open(sink)
+    try:
+        yield driver
+    finally:
+        driver.close()
+    assert not sink.problems
+
+
+def play(uri: str, *, keep_pixels: bool = False, timeout_s: float = 20.0) -> RecordingSink:
+    """All of a recording."""
+    sink = RecordingSink(keep_pixels=keep_pixels)
+    with playing(uri, sink):
+        ended = sink.wait(lambda: sink.link_state in (LinkState.CLOSED, LinkState.LOST), timeout_s)
+        assert ended, sink.links
+    return sink
+
+
+# Recordings ------------------------------------------------------------------------------------------------------
+
+
+def test_all_240_pictures_of_a_real_drone_come_in_order() -> None:
+    sink = play(f"video://{DATA / 'video-8s.pave'}?{FAST}")
+    assert sink.frame_counts == {"front": 240}
+    assert sink.links == [(LinkState.UP, ""), (LinkState.CLOSED, "end of the recording after 240 pictures")]
+    assert {(frame.width, frame.height, frame.intrinsics) for frame in sink.frames} == {(640, 360, None)}
+    newest = sink.newest
+    assert newest is not None
+    assert newest.native is not None
+    assert (newest.native["video.frames"], newest.native["video.damaged"]) == (240, 0)
+
+
+def test_a_torn_start_is_waited_out() -> None:
+    sink = play(f"video://{DATA / 'video-64-byte-headers.pave'}?{FAST}", keep_pixels=True)
+    assert sink.frame_counts == {"front": 17}
+    assert sink.frames[0].pixels.std() > 20  # a picture, not the grey of a decoder without its key frame
+
+
+def test_pictures_come_at_the_times_of_their_stamps() -> None:
+    begun_ns = monotonic_ns()
+    sink = play(f"video://{DATA / 'video-64-byte-headers.pave'}?camera=nose")
+    took_s = (monotonic_ns() - begun_ns) / 1e9
+    captured = np.array([frame.captured_ns for frame in sink.frames])
+    stamps_ms = np.array([248, 271, 303])  # of the header, less 1792577000: see the parser's test
+    assert sink.frame_counts == {"nose": 17}
+    np.testing.assert_allclose(np.diff(captured[:3]) / 1e6, np.diff(stamps_ms))
+    assert 0.4 < (captured[-1] - captured[0]) / 1e9 < 0.6
+    assert took_s > 0.4
+    late = np.array([frame.arrived_ns - frame.captured_ns for frame in sink.frames]) / 1e9
+    assert (late >= 0).all()
+    assert np.median(late) < 0.02
+
+
+def test_a_clip_plays_in_order_with_its_intrinsics(clip: Path) -> None:
+    sink = play(f"video://{clip}?{FAST}&fx=50&cx=30&distortion=0.1,0,0,0", keep_pixels=True)
+    brightness = [int(frame.pixels.mean()) for frame in sink.frames]
+    assert brightness == pytest.approx([40 + 8 * n for n in range(FRAMES)], abs=4)
+    intrinsics = sink.frames[0].intrinsics
+    assert intrinsics is not None
+    assert (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy) == (50, 50, 30, 23.5)
+    assert intrinsics.distortion == (0.1, 0, 0, 0)
+
+
+def test_the_capabilities_tell_the_size_before_it_is_opened(clip: Path) -> None:
+    capabilities = make_driver(f"video://{clip}?fx=50").capabilities()
+    camera = capabilities.cameras[0]
+    assert (camera.name, camera.width, camera.height, camera.fps) == ("front", 64, 48, 25)
+    assert camera.intrinsics is not None
+    assert not capabilities.actions
+    assert "not a vehicle" in capabilities.why_not
+
+
+def test_it_takes_no_command_and_is_always_safe(clip: Path) -> None:
+    with playing(f"video://{clip}", RecordingSink()) as driver:
+        with pytest.raises(UsageError, match="video takes no hover"):
+            driver.apply(Hover())
+        assert driver.failsafe(Hover())
+
+
+def test_it_begins_when_somebody_looks(clip: Path) -> None:
+    sink = RecordingSink(watch=set())
+    with playing(f"video://{clip}?{FAST}", sink):
+        assert sink.wait(lambda: sink.feedback_count >= 3, 5.0)
+        assert not sink.frame_counts
+        sink.watch = None
+        assert sink.wait(lambda: sink.link_state is LinkState.CLOSED, 5.0)
+    assert sink.frame_counts == {"front": FRAMES}
+
+
+def test_without_wait_it_plays_to_nobody(clip: Path) -> None:
+    sink = RecordingSink(watch=set())
+    with playing(f"video://{clip}?{FAST}&wait=0", sink):
+        assert sink.wait(lambda: sink.link_state is LinkState.CLOSED, 5.0)
+    assert not sink.frame_counts
+
+
+def test_a_loop_starts_over(clip: Path) -> None:
+    sink = RecordingSink(keep_pixels=False)
+    with playing(f"video://{clip}?{FAST}&loop=1", sink):
+        assert sink.wait(lambda: sink.frame_counts["front"] > 3 * FRAMES, 10.0)
+    assert [state for state, _ in sink.links] == [LinkState.UP]
+
+
+def test_a_loop_whose_file_is_gone_is_told(clip: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "gone.mp4"
+    copy.write_bytes(clip.read_bytes())
+    sink = RecordingSink(watch=set())
+    with playing(f"video://{copy}?{FAST}&loop=1", sink):
+        assert sink.wait(lambda: sink.link_state is LinkState.UP, 5.0)
+        copy.unlink()
+        sink.watch = None
+        assert sink.wait(lambda: sink.link_state is LinkState.LOST, 5.0)
+    assert "cannot start over" in sink.links[-1][1]
+
+
+def test_numbered_pictures_play_as_well(tmp_path: Path) -> None:
+    for n in range(5):
+        with av.open(str(tmp_path / f"shot{n:03}.png"), "w", format="image2", options={"update": "1"}) as container:
+            stream = container.add_stream("png", rate=1)
+            stream.width, stream.height, stream.pix_fmt = 32, 24, "rgb24"
+            picture = av.VideoFrame.from_ndarray(np.full((24, 32, 3), 50 * n, np.uint8), format="bgr24")
+            container.mux(stream.encode(picture.reformat(format="rgb24")))
+            container.mux(stream.encode(None))
+    sink = play(f"video://{tmp_path}/shot%25003d.png?{FAST}", keep_pixels=True)
+    assert [int(frame.pixels.mean()) for frame in sink.frames] == [0, 50, 100, 150, 200]
+
+
+# What is wrong with the address or the file ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("query", "message"),
+    [
+        ("sped=2", "no option of video:// named 'sped'; did you mean 'speed'"),
+        ("speed=0", "option speed is '0' and must be a number from 0.01"),
+        ("width=320", "width can be asked of a device only"),
+        ("cx=3", "option cx needs fx as well"),
+        ("fx=0", "option fx is '0'"),
+        ("fx=9&fy=0", "option fy is '0'"),
+        ("fx=9&distortion=1,2", "must be 4, 5 or 8 numbers"),
+        ("loop=maybe", "must be true or false"),
+    ],
+)
+def test_bad_options_are_refused(query: str, message: str) -> None:
+    with pytest.raises((UsageError, UnknownNameError), match=message):
+        make_driver(f"video:///tmp/x.mp4?{query}")
+
+
+def test_an_address_without_a_file_is_refused() -> None:
+    with pytest.raises(UsageError, match="names no file"):
+        make_driver("video://")
+
+
+def _text(folder: Path) -> Path:
+    path = folder / "notes.mp4"
+    path.write_text("this is no video at all\n" * 50)
+    return path
+
+
+def _empty(folder: Path) -> Path:
+    path = folder / "empty.mkv"
+    path.touch()
+    return path
+
+
+def _no_pave(folder: Path) -> Path:
+    path = folder / "noise.pave"
+    path.write_bytes(random.Random(1).randbytes(20_000))
+    return path
+
+
+def _sound(folder: Path) -> Path:
+    path = folder / "sound.wav"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("pcm_s16le", rate=8000, layout="mono")
+        samples = av.AudioFrame.from_ndarray(np.zeros((1, 800), np.int16), format="s16", layout="mono")
+        samples.sample_rate = 8000
+        container.mux(stream.encode(samples))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda folder: folder / "missing.mp4", UsageError, "missing.mp4: No such file"),
+        (lambda folder: folder, UsageError, "Is a directory"),
+        (lambda folder: folder / "shot%2503d.png", UsageError, "shot%03d.png cannot be opened"),
+        (_text, FileFormatError, "notes.mp4 cannot be opened as a video"),
+        (_empty, FileFormatError, "empty.mkv cannot be opened as a video"),
+        (_no_pave, FileFormatError, "noise.pave holds no frame of a PaVE stream"),
+        (_sound, FileFormatError, "sound.wav holds no video stream"),
+    ],
+)
+def test_a_bad_file_is_told_when_opened(
+    tmp_path: Path, make: Callable[[Path], Path], error: type[Exception], message: str
+) -> None:
+    driver = make_driver(f"video://{make(tmp_path)}")
+    assert driver.capabilities().cameras[0].name == "front"  # asking what it can do raises nothing
+    with pytest.raises(error, match=message):
+        driver.open(RecordingSink())
+    driver.close()
+
+
+def test_without_pyav_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in [name for name in sys.modules if name.startswith("skyloop.drivers.video") or name.startswith("av.")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'skyloop\[video\]'"):
+        make_driver("video:///tmp/x.mp4")
+
+
+# Damage ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
+def test_a_stream_that_was_cut_off_plays_as_far_as_it_goes(tmp_path: Path, share: float) -> None:
+    whole = (DATA / "video-8s.pave").read_bytes()
+    path = tmp_path / "cut.pave"
+    path.write_bytes(whole[: int(len(whole) * share)])
+    sink = play(f"video://{path}?{FAST}")
+    assert sink.frame_counts["front"] == pytest.approx(240 * share, abs=12)
+    assert sink.link_state is LinkState.CLOSED
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("name", ["video-64-byte-headers.pave", "clip.mp4"])
+def test_flipped_bits_end_in_no_error(tmp_path: Path, clip: Path, name: str, seed: int) -> None:
+    data = bytearray((clip if name == "clip.mp4" else DATA / name).read_bytes())
+    chance = random.Random(seed)
+    for _ in range(12):
+        data[chance.randrange(len(data))] ^= 1 << chance.randrange(8)
+    path = tmp_path / name
+    path.write_bytes(data)
+    try:
+        sink = play(f"video://{path}?{FAST}")
+    except FileFormatError:
+        return  # so damaged that it can't be opened: told clearly
+    assert sink.link_state in (LinkState.CLOSED, LinkState.LOST)
+    assert not [event for event in sink.events if event.kind == "driver_error"]
+
+
+def test_damaged_pictures_are_left_out_up_to_the_next_key_frame(tmp_path: Path) -> None:
+    data = bytearray((DATA / "video-8s.pave").read_bytes())
+    at = data.find(b"PaVE", 20_000)
+    data[at : at + 4] = b"xxxx"  # the header of the sixth frame or so
+    path = tmp_path / "hole.pave"
+    path.write_bytes(data)
+    sink = play(f"video://{path}?{FAST}")
+    assert 225 < sink.frame_counts["front"] < 238
+
+
+def test_a_stream_without_a_key_frame_shows_nothing_and_says_so(tmp_path: Path) -> None:
+    torn = (DATA / "video-64-byte-headers.pave").read_bytes()
+    path = tmp_path / "headless.pave"
+    path.write_bytes(torn[:7431])  # the stale frame and the two P frames after it
+    sink = play(f"video://{path}?{FAST}")
+    assert not sink.frame_counts
+    assert sink.links[-1] == (LinkState.LOST, "no picture of the recording can be decoded")
+
+
+# Devices ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_device_that_is_not_there_is_no_error() -> None:
+    sink = RecordingSink()
+    with playing("video:///dev/skyloop-no-such-camera?width=320&height=240&fps=15", sink) as driver:
+        camera = driver.capabilities().cameras[0]
+        assert (camera.width, camera.height, camera.fps) == (320, 240, 15)
+        assert sink.wait(lambda: sink.link_state is LinkState.LOST, 5.0)
+    assert sink.links == [(LinkState.LOST, "there is no device /dev/skyloop-no-such-camera")]
+
+
+def test_a_file_that_is_no_camera_is_told() -> None:
+    sink = RecordingSink()
+    with playing("video:///dev/null", sink):
+        assert sink.wait(lambda: sink.link_state is LinkState.LOST, 5.0)
+    assert "/dev/null cannot be opened" in sink.links[-1][1]
+
+
+@contextmanager
+def live(open_source: Callable[[], Source], sink: RecordingSink) -> Iterator[None]:
+    stop = threading.Event()
+    player = LivePlayer(Screen(sink, "front", lambda *_: None, stop), open_source, retry_s=0.01)
+    thread = threading.Thread(target=player.run)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join(10)
+    assert not thread.is_alive()
+    assert not sink.problems
+
+
+def test_a_device_that_comes_and_goes_is_opened_again() -> None:
+    answers: list[str] = ["nothing there", "nothing there", "5", "5"]
+
+    def open_source() -> Source:
+        answer = answers.pop(0) if answers else "nothing there"
+        if answer == "nothing there":
+            raise DriverError(answer)
+        return ContainerSource(f"testsrc=size=64x48:rate=25:duration={int(answer) / 25}", "lavfi", live=True)
+
+    sink = RecordingSink()
+    with live(open_source, sink):
+        assert sink.wait(lambda: len(sink.links) >= 5, 10.0)
+    states = [(state, reason) for state, reason in sink.links[:5]]
+    up, ended = (LinkState.UP, ""), (LinkState.LOST, "the device ended its stream")
+    assert states == [(LinkState.LOST, "nothing there"), up, ended, up, ended]
+    assert sink.frame_counts["front"] == 10
+
+
+class StalledCamera:
+    """Twelve pictures at 25 a second, by the stamps, that all come half a second after the first one."""
+
+    width, height, fps, damaged = 64, 48, 25.0, 0
+
+    def __init__(self) -> None:
+        self.decoded = 0
+
+    def pictures(self, late: Callable[[float], bool] | None = None) -> Iterator[Picture]:
+        assert late is not None
+        image = av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), format="bgr24")
+        yield Picture(7.0, image)
+        time.sleep(0.5)
+        for n in range(1, 13):
+            if not late(7.0 + n * 0.04):
+                self.decoded += 1
+                yield Picture(7.0 + n * 0.04, image)
+
+    def close(self) -> None:
+        pass
+
+
+def test_of_a_late_device_the_newest_pictures_count() -> None:
+    camera, sink = StalledCamera(), RecordingSink()
+    played = threading.Event()
+
+    def open_source() -> Source:
+        if played.is_set():
+            raise DriverError("unplugged")
+        played.set()
+        return camera
+
+    with live(open_source, sink):
+        assert sink.wait(lambda: sink.link_state is LinkState.LOST, 5.0)
+    assert camera.decoded <= 4  # those of the last 100 ms

@@ -1,0 +1,283 @@
+"""What a picture of a world shows. Agreement with exact geometry is in ``test_render_agreement``."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from skyloop.errors import UnknownNameError, UsageError
+from skyloop.messages.geometry import rotation_from_euler
+from skyloop.sim.camera import BOTTOM_CAMERA, FRONT_CAMERA, CameraModel, CameraPose
+from skyloop.sim.render import PlanarRenderer, Quality, Scene, SceneState
+from skyloop.sim.world import (
+    BoardTarget,
+    Box,
+    FacePose,
+    FixedYaw,
+    Gate,
+    Marker,
+    MarkerPattern,
+    Panel,
+    PlatformTarget,
+    Room,
+    TargetState,
+    WaypointPath,
+    World,
+)
+from skyloop.sim.world_file import load_world, shipped_worlds
+
+PLAIN = replace(FRONT_CAMERA, distortion=(0.0,) * 5, position_m=(0.0, 0.0, 0.0))
+SIDE = 5
+STILL = WaypointPath(((0.0, 0.0, 1.2), (0.1, 0.0, 1.2)), 0.1)
+BOARD = BoardTarget("board", MarkerPattern("DICT_4X4_50", 7, 0.3, 0.05), STILL, FixedYaw(0.0))
+SLAB = PlatformTarget("slab", MarkerPattern("DICT_5X5_100", 42, 0.4, 0.05), STILL, FixedYaw(0.0), (0.8, 0.8, 0.1))
+WORLD = World(
+    "test",
+    Room((8.0, 6.0, 3.0)),
+    boxes=(
+        Box("crate", (2.0, 1.5, 0.4), (0.8, 0.8, 0.8)),
+        Box("case", (2.5, -1.8, 0.9), (0.4, 1.2, 1.8), 0.2, "books"),
+    ),
+    gates=(Gate("gate", (1.0, -1.0, 1.2), (0.8, 0.8)),),
+    panels=(Panel("chart", FacePose((4.0, 0.0, 1.6), yaw_rad=np.pi), (1.6, 1.0), "poster_chart"),),
+    markers=(Marker("wall", FacePose((-4.0, 0.0, 1.5), yaw_rad=0.0), MarkerPattern("DICT_4X4_50", 3, 0.3, 0.05)),),
+    targets=(BOARD, SLAB),
+)
+
+
+def state_at(
+    drones: list[tuple[float, float, float]],
+    board: tuple[float, float, float] = (0.0, 2.5, 1.2),
+    slab: tuple[float, float, float] = (0.0, -2.3, 0.5),
+    board_yaw: float = np.pi,
+    slab_yaw: float = 0.0,
+) -> SceneState:
+    """Level drones facing east, and the two targets."""
+    targets = (
+        TargetState("board", 0.0, board, board_yaw, (0.0, 0.0, 0.0)),
+        TargetState("slab", 0.0, slab, slab_yaw, (0.0, 0.0, 0.0)),
+    )
+    return SceneState(np.array(drones).reshape(-1, 3), np.tile(np.eye(3), (len(drones), 1, 1)), targets)
+
+
+def detect(picture: NDArray[np.uint8], name: str = "DICT_4X4_50") -> dict[int, NDArray[np.float64]]:
+    """Marker ids and their corners (4, 2): top left, top right, bottom right, bottom left."""
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+    settings = cv2.aruco.DetectorParameters()
+    settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    corners, ids, _ = cv2.aruco.ArucoDetector(dictionary, settings).detectMarkers(picture)
+    return {} if ids is None else {int(i): c[0].astype(float) for i, c in zip(ids.ravel(), corners, strict=True)}
+
+
+def card_corners(face: FacePose, size_m: float) -> NDArray[np.float64]:
+    """World positions of a marker's corners in the detector's order, shape (4, 3)."""
+    offsets = np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]]) * size_m / 2
+    return np.array(face.position_m) + offsets @ face.rotation()[:, :2].T
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return Scene(WORLD, drones=2)
+
+
+def view_from(
+    scene: Scene,
+    state: SceneState,
+    position: tuple[float, float, float],
+    euler: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    model: CameraModel = PLAIN,
+    drone: int | None = None,
+    quality: Quality = Quality.SMOOTH,
+) -> NDArray[np.uint8]:
+    pose = model.pose(np.array(position), rotation_from_euler(*euler), drone)
+    return PlanarRenderer(scene, quality).render(state, pose, model)
+
+
+@pytest.mark.parametrize("quality", list(Quality))
+@pytest.mark.parametrize("model", [FRONT_CAMERA, BOTTOM_CAMERA, PLAIN.scaled(2.0)], ids=lambda m: f"{m.name}{m.width}")
+def test_a_picture_is_the_same_bit_by_bit_whatever_was_drawn_before(
+    scene: Scene, model: CameraModel, quality: Quality
+) -> None:
+    state = state_at([(-2.0, 0.0, 1.0), (0.0, 0.5, 1.1)])
+    pose = model.pose(state.drone_positions_m[0], state.drone_rotations[0], 0)
+    used = PlanarRenderer(scene, quality)
+    used.render(state_at([(1.0, 1.0, 2.0), (0.0, 0.0, 0.1)]), elsewhere(pose), model)
+    out = np.empty((model.height, model.width, 3), np.uint8)
+    assert used.render(state, pose, model, out) is out
+    again = PlanarRenderer(Scene(WORLD, drones=2), quality).render(state, pose, model)
+    assert np.array_equal(out, again)
+
+
+def elsewhere(pose: CameraPose) -> CameraPose:
+    """The same camera elsewhere."""
+    return replace(pose, position_m=pose.position_m + np.array([0.3, -0.2, 0.1]))
+
+
+def test_board_and_platform_show_their_markers_where_they_are(scene: Scene) -> None:
+    state = state_at(
+        [(-3.0, 0.0, 1.2)] * 2, board=(0.0, 0.3, 1.3), board_yaw=np.pi + 0.3, slab=(0.2, -0.9, 0.5), slab_yaw=0.7
+    )
+    board, slab = (s.face(t) for s, t in zip(state.targets, WORLD.targets, strict=True))
+    pose = PLAIN.pose(np.array([-1.5, 0.0, 1.2]), np.eye(3))
+    found = detect(view_from(scene, state, (-1.5, 0.0, 1.2)))[7]
+    expected = PLAIN.project((card_corners(board, 0.3) - pose.position_m) @ pose.rotation)
+    assert found == pytest.approx(expected, abs=0.7)
+
+    above = BOTTOM_CAMERA.pose(np.array([0.1, -0.8, 2.0]), np.eye(3))
+    found = detect(view_from(scene, state, (0.1, -0.8, 2.0), model=BOTTOM_CAMERA), "DICT_5X5_100")[42]
+    expected = BOTTOM_CAMERA.project((card_corners(slab, 0.4) - above.position_m) @ above.rotation)
+    assert found == pytest.approx(expected, abs=0.7)
+
+
+def ideal_marker_view(
+    face: FacePose, marker_id: int, size_m: float, card_m: float, pose: CameraPose, model: CameraModel
+) -> NDArray[np.uint8]:
+    """A marker before a grey wall as an ideal camera sees it: SIDE by SIDE exact samples a pixel."""
+    offsets = (np.arange(SIDE) + 0.5) / SIDE - 0.5
+    x = ((np.arange(model.width)[:, None] + offsets).ravel() - model.cx) / model.fx
+    y = ((np.arange(model.height)[:, None] + offsets).ravel() - model.cy) / model.fy
+    turn = face.rotation()
+    plane = pose.rotation.T @ np.column_stack([turn[:, :2], np.array(face.position_m) - pose.position_m])
+    u, v, w = (row[0] * x[None, :] + row[1] * y[:, None] + row[2] for row in np.linalg.inv(plane))
+    u, v = u / w, v / w
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    cells = cv2.aruco.generateImageMarker(dictionary, marker_id, 6, borderBits=1) > 127
+    column, row = (np.floor((c / size_m + 0.5) * 6).astype(int) for c in (u, -v))
+    black = (np.clip(column, 0, 5) == column) & (np.clip(row, 0, 5) == row)
+    ink = np.where(cells[np.clip(row, 0, 5), np.clip(column, 0, 5)], 235.0, 22.0)
+    card = np.maximum(np.abs(u), np.abs(v)) < card_m / 2
+    samples = np.where(black, ink, np.where(card, 235.0, 190.0))
+    picture = samples.reshape(model.height, SIDE, model.width, SIDE).mean(axis=(1, 3))
+    return np.asarray(np.rint(picture), dtype=np.uint8)
+
+
+def test_marker_corners_are_true_to_a_third_of_a_pixel_and_unbiased() -> None:
+    """Judged by what the detector finds in an ideal picture too: its own error, 0.2 px here, is not the renderer's."""
+    pattern = MarkerPattern("DICT_4X4_50", 3, 0.3, 0.05)
+    face = FacePose((3.99, 0.0, 1.5), yaw_rad=np.pi)
+    scene = Scene(World("wall", Room((8.0, 12.0, 3.0)), markers=(Marker("m", face, pattern),)), drones=0)
+    state = SceneState(np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    renderer = PlanarRenderer(scene)
+    rng = np.random.default_rng(0)
+    apart, off, radial = [], [], []
+    for distance in (0.8, 1.2, 1.6, 2.0):
+        for _ in range(6):
+            bearing = rng.uniform(-0.9, 0.9)
+            place = np.array(face.position_m) + distance * np.array(
+                [-np.cos(bearing), np.sin(bearing), rng.uniform(-0.2, 0.2)]
+            )
+            yaw = np.arctan2(-place[1], face.position_m[0] - place[0]) + rng.uniform(-0.1, 0.1)
+            pose = PLAIN.pose(place, rotation_from_euler(rng.uniform(-0.2, 0.2), rng.uniform(-0.05, 0.05), yaw))
+            exact = PLAIN.project((card_corners(face, 0.3) - pose.position_m) @ pose.rotation)
+            drawn = detect(renderer.render(state, pose, PLAIN)).get(3)
+            ideal = detect(ideal_marker_view(face, 3, 0.3, 0.4, pose, PLAIN)).get(3)
+            if drawn is None or ideal is None:
+                continue
+            apart.append(np.hypot(*(drawn - ideal).T))
+            off.append(drawn - exact)
+            outward = exact - exact.mean(axis=0)
+            outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+            radial.append(((drawn - ideal) * outward).sum(axis=1))
+    assert len(apart) >= 21  # of 24: the detector passes over a marker now and then, in ideal pictures as well
+    assert np.median(apart) < 0.2
+    assert np.median(np.hypot(*np.concatenate(off).T)) < 0.3
+    assert np.abs(np.mean(np.concatenate(off), axis=0)).max() < 0.06
+    assert abs(np.mean(radial)) < 0.06
+
+
+@pytest.mark.parametrize("name", shipped_worlds())
+def test_every_shipped_world_is_drawn_whole_and_with_detail(name: str) -> None:
+    world = load_world(name)
+    scene = Scene(world, drones=1)
+    targets = tuple(TargetState(t.name, 0.0, (0.5, 0.5, 1.0), 0.0, (0.0, 0.0, 0.0)) for t in world.targets)
+    state = SceneState(np.array([[0.0, 0.0, 1.0]]), np.eye(3)[None], targets)
+    renderer = PlanarRenderer(scene)
+    rng = np.random.default_rng(3)
+    for _ in range(6):
+        place = rng.uniform(-0.4, 0.4, 3) * world.room.size_m + (0.0, 0.0, world.room.size_m[2] / 2)
+        turn = rotation_from_euler(*rng.uniform((-0.5, -0.5, -3.1), (0.5, 0.5, 3.1)))
+        picture = renderer.render(state, FRONT_CAMERA.pose(place, turn, 0), FRONT_CAMERA)
+        assert (picture.max(axis=2) > 0).all(), "a pixel that shows nothing"
+        assert picture.std() > 4.0
+
+
+def test_open_ground_has_a_sky() -> None:
+    scene = Scene(World("field", Room((20.0, 20.0, 10.0), floor="grass", enclosed=False)), drones=0)
+    state = SceneState(np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    picture = view_from(scene, state, (0.0, 0.0, 2.0), model=FRONT_CAMERA)
+    blue, green, red = picture[20].mean(axis=0)
+    assert blue > green > red
+    blue, green, red = picture[-20].mean(axis=0)
+    assert green > blue
+    assert (picture.max(axis=2) > 0).all()
+
+
+def test_a_drone_sees_others_but_not_itself(scene: Scene) -> None:
+    here, there = (-2.0, 0.0, 1.0), (-0.8, 0.1, 1.1)
+    both = view_from(scene, state_at([here, there]), here, drone=0)
+    alone = view_from(scene, state_at([here, (-3.9, 0.0, 2.9)]), here, drone=0)
+    changed = np.asarray(both != alone).any(axis=2)
+    rows, columns = np.nonzero(np.atleast_2d(changed)[:140])
+    expected = PLAIN.project((np.array([there]) - here) @ PLAIN.rotation_matrix)[0]
+    assert columns.mean() == pytest.approx(expected[0], abs=6)
+    assert rows.mean() == pytest.approx(expected[1], abs=6)
+    outside = view_from(scene, state_at([here, (-3.9, 0.0, 2.9)]), (-2.3, 0.0, 1.0), drone=1)
+    assert (
+        np.abs(outside.astype(int) - view_from(scene, state_at([there, there]), (-2.3, 0.0, 1.0), drone=1)).max() > 60
+    )
+
+
+def test_a_flying_drone_darkens_the_floor_below_it_and_a_crate_that_it_is_over(scene: Scene) -> None:
+    down = (0.0, np.pi / 2, 0.0)
+    far = (-3.5, -2.6, 2.9)
+    bright = view_from(scene, state_at([far, far]), (-1.0, 0.0, 2.5), down)
+    dark = view_from(scene, state_at([(-1.0, 0.0, 0.6), far]), (-1.0, 0.0, 2.5), down, drone=0)
+    assert dark[110:130, 150:170].mean() < 0.8 * bright[110:130, 150:170].mean()
+    assert np.array_equal(dark[:10], bright[:10])
+    on_crate = view_from(scene, state_at([(2.0, 1.5, 1.1), far]), (2.0, 1.5, 2.0), down, drone=0)
+    crate = view_from(scene, state_at([far, far]), (2.0, 1.5, 2.0), down, drone=0)
+    assert on_crate[110:130, 150:170].mean() < 0.8 * crate[110:130, 150:170].mean()
+
+
+def test_what_does_not_fit_is_refused(scene: Scene) -> None:
+    state = state_at([(0.0, 0.0, 1.0)] * 2)
+    pose = PLAIN.pose(np.zeros(3), np.eye(3))
+    renderer = PlanarRenderer(scene)
+    with pytest.raises(UsageError, match="out is"):
+        renderer.render(state, pose, PLAIN, np.empty((10, 10, 3), np.uint8))
+    with pytest.raises(UsageError, match="2 drones"):
+        renderer.render(state_at([(0.0, 0.0, 1.0)]), pose, PLAIN)
+    with pytest.raises(UsageError, match="moving targets"):
+        renderer.render(replace(state, targets=()), pose, PLAIN)
+    with pytest.raises(UsageError, match="folds"):
+        renderer.render(state, pose, replace(PLAIN, distortion=(-0.9, 0.0, 0.0, 0.0, 0.0)))
+
+
+@pytest.mark.parametrize(
+    ("pattern", "error"),
+    [
+        (MarkerPattern("DICT_4X4_5", 0, 0.2, 0.0), UnknownNameError),
+        (MarkerPattern("DICT_4X4_50", 50, 0.2, 0.0), UsageError),
+    ],
+)
+def test_markers_that_do_not_exist_are_refused(pattern: MarkerPattern, error: type[Exception]) -> None:
+    world = World("w", Room((4.0, 4.0, 3.0)), markers=(Marker("m", FacePose((0.0, 0.0, 0.0)), pattern),))
+    with pytest.raises(error, match="DICT_4X4_50"):
+        Scene(world)
+
+
+def test_without_opencv_the_error_says_what_to_install() -> None:
+    code = (
+        "import sys; sys.modules['cv2'] = None\n"
+        "from skyloop.errors import MissingExtraError\n"
+        "try:\n    import skyloop.sim.render\n"
+        "except MissingExtraError as error:\n    print(error)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert "skyloop[sim]" in done.stdout

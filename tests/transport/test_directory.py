@@ -1,0 +1,209 @@
+"""The directory of sockets: names, who may enter, what is left by the dead."""
+
+from __future__ import annotations
+
+import grp
+import os
+import stat
+import sys
+from pathlib import Path
+
+import pytest
+
+from skyloop.errors import LinkError, NameTakenError, UnknownNameError, UnsupportedError, UsageError
+from skyloop.transport import local
+from skyloop.transport.local import LocalServer, dial, list_names
+from skyloop.transport.local.directory import find_directory
+from skyloop.transport.local.sockets import Socket
+from skyloop.transport.testing import ClientLog, ServerLog, wait_until
+
+
+@pytest.mark.parametrize("name", ["", "Alpha", "-a", ".a", "a/b", "a" * 49, "a b", "ä", "a\n"])
+def test_what_cannot_be_a_name_is_refused(name: str) -> None:
+    with pytest.raises(UsageError, match="cannot be the name of a proxy"):
+        LocalServer(name)
+    with pytest.raises(UsageError, match="cannot be the name of a proxy"):
+        dial(name)
+
+
+def test_running_proxies_are_listed(runtime_dir: Path) -> None:
+    assert list_names() == []
+    servers = [LocalServer(name) for name in ("bravo", "alpha", "a" * 48)]
+    logs = [ServerLog() for _ in servers]
+    for server, log in zip(servers, logs, strict=True):
+        server.start(log)
+    try:
+        found = list_names()
+        assert [proxy.name for proxy in found] == ["a" * 48, "alpha", "bravo"]
+        assert {proxy.pid for proxy in found} == {os.getpid()}
+        assert found[1].path == runtime_dir / "alpha.sock"
+    finally:
+        for server in servers:
+            server.stop()
+    assert list_names() == []
+    assert list(runtime_dir.iterdir()) == []
+    assert [log.joined for log in logs] == [[], [], []], "looking is not joining"
+
+
+def test_only_the_owner_may_enter(runtime_dir: Path) -> None:
+    server = LocalServer("alpha")
+    server.start(ServerLog())
+    try:
+        assert stat.S_IMODE(runtime_dir.stat().st_mode) == 0o700
+        assert stat.S_IMODE((runtime_dir / "alpha.sock").stat().st_mode) == 0o600
+    finally:
+        server.stop()
+
+
+@pytest.mark.parametrize("mode", [0o701, 0o704, 0o720, 0o777])
+def test_a_directory_open_to_others_is_refused(runtime_dir: Path, mode: int) -> None:
+    runtime_dir.mkdir()
+    runtime_dir.chmod(mode)
+    with pytest.raises(LinkError, match=f"open to others .mode {mode:04o}"):
+        LocalServer("alpha").start(ServerLog())
+    with pytest.raises(LinkError, match="open to others"):
+        dial("alpha")(ClientLog())
+    with pytest.raises(LinkError, match="open to others"):
+        list_names()
+
+
+def test_a_directory_in_an_open_place_is_refused(runtime_dir: Path) -> None:
+    runtime_dir.parent.chmod(0o777)
+    with pytest.raises(LinkError, match="can be changed by others"):
+        LocalServer("alpha").start(ServerLog())
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can make somebody else's directory")
+def test_a_directory_of_somebody_else_is_refused(runtime_dir: Path) -> None:
+    runtime_dir.mkdir(mode=0o700)
+    os.chown(runtime_dir, 65534, 65534)
+    with pytest.raises(LinkError, match=r"belongs to .* and not to"):
+        LocalServer("alpha").start(ServerLog())
+
+
+def test_what_is_no_directory_is_refused(runtime_dir: Path) -> None:
+    runtime_dir.write_text("")
+    with pytest.raises(LinkError, match="not a directory"):
+        LocalServer("alpha").start(ServerLog())
+    runtime_dir.unlink()
+    runtime_dir.symlink_to("/tmp")
+    with pytest.raises(LinkError, match="not a directory"):
+        LocalServer("alpha").start(ServerLog())
+
+
+def test_a_group_may_share_the_directory(runtime_dir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    group = grp.getgrgid(os.getegid())
+    server = LocalServer("alpha", group=group.gr_name)
+    server.start(ServerLog())
+    try:
+        assert stat.S_IMODE(runtime_dir.stat().st_mode) == 0o750
+        assert stat.S_IMODE((runtime_dir / "alpha.sock").stat().st_mode) == 0o660
+        assert (runtime_dir / "alpha.sock").stat().st_gid == group.gr_gid
+        assert [proxy.name for proxy in list_names(group=group.gr_name)] == ["alpha"]
+        monkeypatch.setenv("SKYLOOP_GROUP", group.gr_name)
+        assert [proxy.name for proxy in list_names()] == ["alpha"]
+    finally:
+        server.stop()
+
+
+def test_a_group_must_exist_and_have_a_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(UsageError, match="no group named 'no-such-group'"):
+        LocalServer("alpha", group="no-such-group")
+    monkeypatch.delenv("SKYLOOP_RUNTIME_DIR")
+    with pytest.raises(UsageError, match="set SKYLOOP_RUNTIME_DIR"):
+        LocalServer("alpha", group=grp.getgrgid(os.getegid()).gr_name)
+
+
+def test_without_a_setting_it_is_the_users_runtime_directory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("SKYLOOP_RUNTIME_DIR")
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "/run/user/4711")
+    assert find_directory().path == Path("/run/user/4711/skyloop")
+    monkeypatch.delenv("XDG_RUNTIME_DIR")
+    assert find_directory().path.name == "skyloop"
+
+
+def test_a_path_too_long_for_a_socket_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", "/tmp/" + "x" * 100)
+    with pytest.raises(UsageError, match="may have 107"):
+        LocalServer("alpha")
+
+
+def test_a_taken_name_is_told_with_its_owner() -> None:
+    first, log = LocalServer("alpha"), ServerLog()
+    first.start(log)
+    try:
+        with pytest.raises(NameTakenError, match=rf"'alpha' is in use by a running proxy .pid {os.getpid()}."):
+            LocalServer("alpha").start(ServerLog())
+        client = dial("alpha")(ClientLog())
+        wait_until(lambda: log.joined, "the first one serves on")
+        client.close()
+    finally:
+        first.stop()
+
+
+def test_an_unknown_name_gets_a_suggestion() -> None:
+    with pytest.raises(UnknownNameError, match="none is known here"):
+        dial("alpha")(ClientLog())
+    server = LocalServer("alpha")
+    server.start(ServerLog())
+    try:
+        with pytest.raises(UnknownNameError, match="no proxy named 'alpa'; did you mean 'alpha'"):
+            dial("alpa")(ClientLog())
+    finally:
+        server.stop()
+
+
+def leave_stale_socket(runtime_dir: Path) -> Path:
+    """What a killed proxy leaves."""
+    find_directory().create()
+    path = runtime_dir / "alpha.sock"
+    dead = Socket()
+    dead.bind(str(path))
+    dead.listen()
+    dead.close()
+    assert path.exists()
+    return path
+
+
+def test_a_stale_socket_is_refused_listed_away_and_replaced(runtime_dir: Path) -> None:
+    path = leave_stale_socket(runtime_dir)
+    with pytest.raises(LinkError, match="'alpha' is not running: it was killed"):
+        dial("alpha")(ClientLog())
+    assert list_names() == []
+    assert not path.exists()
+    leave_stale_socket(runtime_dir)
+    server, log = LocalServer("alpha"), ServerLog()
+    server.start(log)
+    client = dial("alpha")(ClientLog())
+    wait_until(lambda: log.joined, "it is served")
+    client.close()
+    server.stop()
+    assert list(runtime_dir.iterdir()) == []
+
+
+def test_stopping_leaves_the_socket_of_a_successor(runtime_dir: Path) -> None:
+    first, second = LocalServer("alpha"), LocalServer("alpha")
+    first.start(ServerLog())
+    (runtime_dir / "alpha.sock").unlink()
+    second.start(ServerLog())
+    try:
+        first.stop()
+        assert [proxy.name for proxy in list_names()] == ["alpha"]
+    finally:
+        second.stop()
+
+
+def test_a_server_end_is_started_once() -> None:
+    server = LocalServer("alpha")
+    server.stop()
+    server.start(ServerLog())
+    with pytest.raises(UsageError, match="was started before"):
+        server.start(ServerLog())
+    server.stop()
+
+
+def test_other_platforms_are_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "platform", "darwin")
+    for use in (lambda: dial("alpha"), list_names, lambda: local.LocalServer):
+        with pytest.raises(UnsupportedError, match=r"needs Linux .*network transport"):
+            use()

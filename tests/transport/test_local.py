@@ -1,0 +1,19 @@
+"""The local transport keeps the contract."""
+
+from __future__ import annotations
+
+import itertools
+
+from skyloop.transport.base import Dialer, ServerEnd
+from skyloop.transport.conformance import TransportSuite
+from skyloop.transport.local import LocalServer, dial
+
+_names = (f"suite-{number}" for number in itertools.count())
+
+
+class TestLocal(TransportSuite):
+    def make_server(self) -> ServerEnd:
+        return LocalServer(next(_names))
+
+    def dialer(self, server: ServerEnd) -> Dialer:
+        return dial(server.address.removeprefix("local:"))

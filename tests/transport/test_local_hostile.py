@@ -1,0 +1,291 @@
+"""What the other end of a local connection may send, and that it costs nobody but itself."""
+
+from __future__ import annotations
+
+import array
+import fcntl
+import os
+import resource
+import socket
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from skyloop.messages import encode
+from skyloop.messages.codec import HEADER
+from skyloop.transport.base import MAX_PACKET, ClientEnd
+from skyloop.transport.local import LocalServer, dial, packets
+from skyloop.transport.local.connection import MAX_SUBSCRIPTIONS
+from skyloop.transport.local.directory import find_directory
+from skyloop.transport.local.slots import SlotMemory
+from skyloop.transport.local.sockets import Socket
+from skyloop.transport.testing import ClientLog, ServerLog, header, wait_until
+
+
+def descriptors() -> int:
+    return len(list(Path("/proc/self/fd").iterdir()))
+
+
+def send_with(sock: socket.socket, packet: bytes, *fds: int) -> None:
+    sock.sendmsg([packet], [(socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", fds))])
+
+
+# --- a client that misbehaves ---
+
+
+@contextmanager
+def raw_client(*first: bytes) -> Iterator[tuple[Socket, ServerLog, ClientLog]]:
+    """A bare connection to a server, beside a good client that must be there to the end."""
+    server, log, good_log = LocalServer("alpha"), ServerLog(), ClientLog()
+    server.start(log)
+    good = dial("alpha")(good_log)
+    wait_until(lambda: log.joined, "the good one joined")
+    raw = Socket()
+    raw.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 20)
+    raw.settimeout(5)
+    raw.connect(str(find_directory().path / "alpha.sock"))
+    try:
+        for packet in first:
+            raw.send(packet)
+        yield raw, log, good_log
+        assert good.send(b"undisturbed")
+        wait_until(lambda: log.from_peer(log.joined[0]) == [b"undisturbed"], "the good one is served")
+        assert good_log.closings == []
+    finally:
+        raw.close()
+        good.close()
+        server.stop()
+
+
+def test_a_packet_too_large_ends_its_connection() -> None:
+    with raw_client(packets.hello(), bytes(MAX_PACKET), bytes(MAX_PACKET + 1)) as (raw, log, _):
+        wait_until(lambda: log.left, "it was disconnected")
+        assert log.left[0][0] == log.joined[1]
+        assert "more than 60012 bytes" in log.left[0][1]
+        assert log.from_peer(log.joined[1]) == [bytes(MAX_PACKET)]
+        assert packets.parse(raw.recv(1000)) == packets.Bye(log.left[0][1])
+
+
+def test_an_empty_packet_is_the_end() -> None:
+    with raw_client(packets.hello(), b"x", b"") as (_, log, _):
+        wait_until(lambda: log.left, "it was disconnected")
+        assert log.from_peer(log.joined[1]) == [b"x"]
+
+
+@pytest.mark.parametrize("first", [b"x", packets.subscribe("feedback", True), packets.hello()[:-2] + b"\x02\0"])
+def test_who_does_not_say_hello_is_turned_away(first: bytes) -> None:
+    with raw_client(first) as (raw, log, _):
+        message = packets.parse(raw.recv(1000))
+        assert isinstance(message, packets.Bye)
+        assert "did not say hello" in message.reason
+        assert raw.recv(1000) == b""
+        assert len(log.joined) == 1
+        assert log.left == []
+
+
+def test_what_makes_no_sense_is_left_to_the_handler() -> None:
+    nonsense = [
+        packets.release(1),  # which it does not have
+        packets.release(1)[:-1],
+        packets.slot(1, 1, 1),  # which only a proxy says
+        HEADER.pack(b"SKYL", 1, 0xFF, 0, 0),
+        HEADER.pack(b"SKYL", 2, 0x41, 0, 0),
+    ]
+    with raw_client(packets.hello(), *nonsense) as (_, log, _):
+        wait_until(lambda: len(log.packets) == len(nonsense), "the handler has them")
+        assert log.from_peer(log.joined[1]) == nonsense
+        assert log.left == []
+
+
+def test_subscriptions_are_bounded() -> None:
+    wishes = [packets.subscribe(f"topic-{number}", True) for number in range(MAX_SUBSCRIPTIONS + 1)]
+    with raw_client(packets.hello(), *wishes, *wishes[:3]) as (_, log, _):
+        wait_until(lambda: log.packets, "one too many was left to the handler")
+        assert log.packets[0][1] == wishes[-1]
+
+
+def test_descriptors_sent_to_a_server_are_not_kept() -> None:
+    with raw_client(packets.hello()) as (raw, log, _):
+        wait_until(lambda: len(log.joined) == 2, "it joined")
+        before = descriptors()
+        for _ in range(20):
+            send_with(raw, b"have these", 0, 0, 0)
+        wait_until(lambda: len(log.packets) == 20, "the packets came")
+        assert descriptors() == before
+
+
+def test_connections_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("skyloop.transport.local.server.MAX_CLIENTS", 2)
+    late = ClientLog()
+    with raw_client() as (_, log, _):
+        client = dial("alpha")(late)
+        wait_until(lambda: late.closings, "it was turned away")
+        assert "has 2 connections already" in late.closings[0]
+        client.close()
+        assert len(log.joined) == 1
+
+
+def test_a_server_out_of_descriptors_accepts_when_there_are_some_again() -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    server, log = LocalServer("alpha"), ServerLog()
+    server.start(log)
+    path = str(find_directory().path / "alpha.sock")
+    with Socket() as first, Socket() as second:
+        lowest_free = os.dup(second.fileno())
+        os.close(lowest_free)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (lowest_free, hard))
+        try:
+            for raw in (first, second):  # the kernel may have set one descriptor aside for the accept that waits
+                raw.connect(path)
+                raw.send(packets.hello())
+            second.settimeout(0.3)
+            with pytest.raises(TimeoutError):
+                second.recv(100)
+            assert len(log.joined) <= 1
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+        wait_until(lambda: len(log.joined) == 2, "both joined")
+    server.stop()
+
+
+# --- a proxy that misbehaves ---
+
+
+@contextmanager
+def raw_server() -> Iterator[tuple[socket.socket, ClientEnd, ClientLog]]:
+    """The bare end of a connection that a client made."""
+    listener, _ = find_directory().listen("alpha")
+    log = ClientLog()
+    before = descriptors()
+    client = dial("alpha")(log)
+    accepted, _ = listener.accept()
+    try:
+        assert accepted.recv(100) == packets.hello()
+        yield accepted, client, log
+    finally:
+        client.close()
+        accepted.close()
+        listener.close()
+    assert len(log.closings) == 1
+    assert descriptors() <= before
+
+
+def memfd(size: int, seals: int) -> int:
+    fd = os.memfd_create("test", os.MFD_ALLOW_SEALING)
+    os.ftruncate(fd, size)
+    fcntl.fcntl(fd, fcntl.F_ADD_SEALS, seals)
+    return fd
+
+
+@pytest.mark.parametrize(
+    ("size", "seals", "capacity", "complaint"),
+    [
+        (8192, 0, 8192, "not sealed"),
+        (8192, fcntl.F_SEAL_GROW, 8192, "not sealed"),
+        (4096, fcntl.F_SEAL_SHRINK, 8192, "8192 bytes in 4096"),
+        (4096, fcntl.F_SEAL_SHRINK, 0, "0 bytes in 4096"),
+        (1 << 40, fcntl.F_SEAL_SHRINK, 1 << 40, "1099511627776 bytes in"),
+    ],
+)
+def test_memory_that_could_vanish_is_refused(size: int, seals: int, capacity: int, complaint: str) -> None:
+    fd = memfd(size, seals)
+    try:
+        with raw_server() as (raw, _, log):
+            send_with(raw, packets.slot(1, 1, capacity), fd)
+            wait_until(lambda: log.closings, "the client refused it")
+            assert complaint in log.closings[0]
+    finally:
+        os.close(fd)
+
+
+def test_an_ordinary_file_is_refused() -> None:
+    with tempfile.TemporaryFile() as file:
+        file.truncate(8192)
+        with raw_server() as (raw, _, log):
+            send_with(raw, packets.slot(1, 1, 8192), file.fileno())
+            wait_until(lambda: log.closings, "the client refused it")
+            assert "not sealed" in log.closings[0]
+
+
+@pytest.mark.parametrize("count", [0, 2, 4])
+def test_a_slot_needs_one_descriptor(count: int) -> None:
+    with raw_server() as (raw, _, log):
+        send_with(raw, packets.slot(1, 1, 4096), *([0] * count)) if count else raw.send(packets.slot(1, 1, 4096))
+        wait_until(lambda: log.closings, "the client refused it")
+        assert f"with {count} descriptors" in log.closings[0]
+
+
+@pytest.mark.parametrize("packet", [b"a sample", packets.bye("x"), packets.frame(1, encode(header(1)))])
+def test_descriptors_out_of_place_are_closed(packet: bytes) -> None:
+    with raw_server() as (raw, _, _):
+        for _ in range(10):
+            try:
+                send_with(raw, packet, 0, 0, 0)
+            except ConnectionError:
+                break  # it has refused the first already
+
+
+@pytest.mark.parametrize(
+    ("packet", "complaint"),
+    [
+        (packets.frame(2, encode(header(1))), "slot 2, which it has not announced"),
+        (packets.frame(1, encode(header(1, 640, 480))), "frame of 921600 bytes in slot 1"),
+        (packets.frame(1, b"junk"), "header"),
+        (HEADER.pack(b"SKYL", 1, 0x7F, 0, 0), "kind 0x7f"),
+    ],
+)
+def test_frames_without_memory_are_refused(packet: bytes, complaint: str) -> None:
+    slot = SlotMemory(1, 0, 4096)
+    with raw_server() as (raw, _, log):
+        send_with(raw, packets.slot(1, 1, 4096), slot.fd)
+        raw.send(packet)
+        wait_until(lambda: log.closings, "the client refused it")
+        assert complaint in log.closings[0]
+        assert log.frames == []
+
+
+def test_the_memory_is_read_only_for_a_client() -> None:
+    slot = SlotMemory(1, 0, 4096)
+    slot.array[:] = 7
+    with raw_server() as (raw, _, log):
+        send_with(raw, packets.slot(1, 1, 4096), slot.fd)
+        raw.send(packets.frame(1, encode(header(1))))
+        wait_until(lambda: log.frames, "the frame came")
+        pixels = log.frames[0][1]
+        with pytest.raises(ValueError, match="WRITEABLE"):
+            pixels.flags.writeable = True
+        with pytest.raises(PermissionError):
+            os.pwrite(slot.fd, b"x", 0)
+        with pytest.raises(PermissionError):
+            os.ftruncate(slot.fd, 0)
+        assert np.all(pixels == 7)
+
+
+def test_the_end_comes_after_what_was_sent_before_it() -> None:
+    with raw_server() as (raw, _, log):
+        for number in range(50):
+            raw.send(bytes([number + 1]))
+        raw.close()
+        wait_until(lambda: log.closings, "the client noticed")
+        assert log.packets == [bytes([number + 1]) for number in range(50)]
+        assert log.closings == ["the proxy is gone"]
+
+
+def test_what_does_not_fit_is_sent_later_and_in_order() -> None:
+    with raw_server() as (raw, client, log):
+        sent = 0
+        while client.send(bytes(50_000)):  # until the proxy, which does not read, has a full buffer
+            sent += 1
+        while client.send(bytes(1)):
+            sent += 1
+        wishes = [(f"topic-{number}", True) for number in range(5)] + [("topic-1", False)]
+        for wish in wishes:
+            client.subscribe(*wish)
+        raw.settimeout(5)
+        received = [raw.recv(60_000) for _ in range(sent + len(wishes))]
+        assert [packets.parse(packet) for packet in received[sent:]] == [packets.Subscribe(*wish) for wish in wishes]
+        assert log.closings == []

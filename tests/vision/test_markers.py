@@ -1,0 +1,142 @@
+"""Markers drawn by a homography are found where they were put."""
+
+from __future__ import annotations
+
+import builtins
+import sys
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from skyloop.errors import MissingExtraError, UnknownNameError, UsageError
+from skyloop.messages import CameraInfo, Intrinsics
+from skyloop.vision import MarkerDetector, MarkerSighting
+from tests.vision.draw import INTRINSICS, facing, picture, project, square
+
+FORWARD = (0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0)
+
+
+def see(rotation: np.ndarray, position: list[float], **kwargs: Any) -> MarkerSighting:
+    image = picture([(7, rotation, np.array(position))])
+    (sighting,) = MarkerDetector().detect(image, INTRINSICS, **kwargs)
+    return sighting
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.5, -0.8])
+@pytest.mark.parametrize("nod", [0.0, 0.3])
+@pytest.mark.parametrize("position", [[0.0, 0.0, 1.5], [0.4, -0.25, 1.2], [-0.5, 0.3, 2.5]])
+def test_pose_of_a_marker(turn: float, nod: float, position: list[float]) -> None:
+    rotation = facing(turn, nod)
+    sighting = see(rotation, position)
+    assert sighting.id == 7
+    expected = project(square(rotation, np.array(position), 0.3))
+    assert np.abs(sighting.corners - expected).max() < 0.7
+    assert sighting.distance_m == pytest.approx(np.linalg.norm(position), rel=0.02)
+    assert np.linalg.norm(sighting.position - position) < 0.03 * sighting.distance_m
+    # Seen nearly from the front, turning either way looks the same: only what is plainly turned must come out so.
+    angle = np.arccos(np.clip(sighting.normal @ rotation[:, 2], -1, 1))
+    assert angle < (0.15 if sighting.ambiguity < 0.3 else 0.9)
+
+
+def test_far_marker_is_still_found() -> None:
+    assert see(facing(), [0.5, 0.2, 5.0]).distance_m == pytest.approx(5.03, rel=0.05)
+
+
+def test_nothing_to_see() -> None:
+    empty = np.full((240, 320, 3), 90, np.uint8)
+    noise = np.random.default_rng(1).integers(0, 255, (240, 320, 3), dtype=np.uint8)
+    detector = MarkerDetector()
+    assert detector.detect(empty, INTRINSICS) == []
+    assert detector.detect(noise, INTRINSICS) == []
+    turned_away = picture([(7, facing(np.pi), np.array([0, 0, 1.5]))])
+    assert [s.id for s in detector.detect(turned_away, INTRINSICS)] != [7]
+
+
+def test_several_in_the_order_of_their_ids() -> None:
+    places = {9: [-0.5, 0.0, 2.0], 3: [0.5, 0.1, 2.2], 21: [0.0, -0.5, 2.5]}
+    image = picture([(number, facing(), np.array(place)) for number, place in places.items()])
+    seen = MarkerDetector().detect(image, INTRINSICS)
+    assert [s.id for s in seen] == [3, 9, 21]
+    for sighting in seen:
+        assert np.linalg.norm(sighting.position - places[sighting.id]) < 0.06
+
+
+def test_body_axes() -> None:
+    sighting = see(facing(), [0.3, 0.2, 1.5])
+    camera = CameraInfo("front", 320, 240, 30.0, rotation=FORWARD, position=(0.1, 0.0, -0.02))
+    right, down, ahead = sighting.position
+    assert sighting.position_in_body(camera) == pytest.approx([ahead + 0.1, -right, -down - 0.02])
+    assert sighting.normal_in_body(camera)[0] < -0.9
+    with pytest.raises(UsageError, match="mounted"):
+        sighting.position_in_body(CameraInfo("front", 320, 240, 30.0))
+
+
+def test_distorted_lens() -> None:
+    lens = Intrinsics(280.0, 280.0, 159.5, 119.5, distortion=(-0.25, 0.05, 0.001, -0.001, 0.0))
+    straight = picture([(7, facing(0.4), np.array([0.35, 0.2, 1.5]))])
+    x, y = np.meshgrid(np.arange(320.0), np.arange(240.0))
+    pixels = np.stack([x.ravel(), y.ravel()], axis=1).reshape(-1, 1, 2)
+    ideal = cv2.undistortPoints(pixels, lens.matrix, np.array(lens.distortion), P=lens.matrix)
+    x, y = np.moveaxis(ideal.reshape(240, 320, 2).astype(np.float32), 2, 0)
+    bent = np.asarray(cv2.remap(straight, x, y, cv2.INTER_LINEAR), np.uint8)
+    (sighting,) = MarkerDetector().detect(bent, lens)
+    assert np.linalg.norm(sighting.position - [0.35, 0.2, 1.5]) < 0.03
+
+
+def test_fisheye_model_is_understood() -> None:
+    lens = Intrinsics(280.0, 280.0, 159.5, 119.5, distortion=(0.0, 0.0, 0.0, 0.0), model="fisheye")
+    straight = picture([(7, facing(), np.array([0.0, 0.0, 1.5]))])
+    (sighting,) = MarkerDetector().detect(straight, lens)
+    # In the middle a fisheye and a pinhole are the same to a few per mille.
+    assert sighting.distance_m == pytest.approx(1.5, rel=0.03)
+
+
+def test_grey_pictures_and_frames_with_intrinsics() -> None:
+    class Seen(np.ndarray):
+        intrinsics = INTRINSICS
+
+    image = picture([(7, facing(), np.array([0.0, 0.0, 1.5]))])
+    assert len(MarkerDetector().detect(image[:, :, 0], INTRINSICS)) == 1
+    frame = image.view(Seen)
+    frame.flags.writeable = False
+    assert len(MarkerDetector().detect(frame)) == 1
+
+
+def test_bad_input_is_told() -> None:
+    good = np.zeros((4, 4), np.uint8)
+    with pytest.raises(UsageError, match="edge in metres"):
+        MarkerDetector(size_m=-1)
+    with pytest.raises(UnknownNameError, match="4x4_50"):
+        MarkerDetector("4x4_5")
+    with pytest.raises(UsageError, match="no intrinsics"):
+        MarkerDetector().detect(good)
+    with pytest.raises(UsageError, match="empty"):
+        MarkerDetector().detect(np.zeros((0, 4), np.uint8), INTRINSICS)
+    with pytest.raises(UsageError, match="float64"):
+        MarkerDetector().detect(np.zeros((4, 4)), INTRINSICS)  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match="'pinhole' or 'fisheye'"):
+        MarkerDetector().detect(
+            picture([(7, facing(), np.array([0.0, 0.0, 1.5]))]), Intrinsics(280.0, 280.0, 160.0, 120.0, model="omni")
+        )
+
+
+def test_names_of_dictionaries() -> None:
+    image = picture([(7, facing(), np.array([0.0, 0.0, 1.5]))])
+    assert len(MarkerDetector("DICT_4X4_50").detect(image, INTRINSICS)) == 1
+    assert MarkerDetector("apriltag_36h11").detect(image, INTRINSICS) == []
+
+
+def test_without_opencv(monkeypatch: pytest.MonkeyPatch) -> None:
+    real = builtins.__import__
+
+    def refuse(name: str, *args: Any, **kwargs: Any) -> Any:
+        if name == "cv2":
+            raise ImportError("No module named 'cv2'")
+        return real(name, *args, **kwargs)
+
+    monkeypatch.delitem(sys.modules, "cv2")
+    monkeypatch.setattr(builtins, "__import__", refuse)
+    with pytest.raises(MissingExtraError, match=r"skyloop\[vision\]"):
+        MarkerDetector()
