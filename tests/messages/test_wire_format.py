@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import struct
 import typing
 from enum import EnumMeta
 from pathlib import Path
@@ -12,6 +13,10 @@ import pytest
 
 from skyloop import messages
 from skyloop.messages import annotation, codec, command, config
+from skyloop.transport.base import MAX_PACKET, MAX_TOPIC
+from skyloop.transport.local import packets
+from skyloop.transport.local.connection import MAX_SUBSCRIPTIONS
+from skyloop.transport.local.frames import MAX_LEASES
 
 PAGE = (Path(__file__).parents[2] / "docs" / "wire-format.md").read_text()
 SECTIONS = re.compile(r"^### (\w+)(?: — (kind|tag) (\d+))?\n(.*?)(?=^##|\Z)", re.MULTILINE | re.DOTALL)
@@ -50,3 +55,50 @@ def test_sizes_on_the_page() -> None:
     assert f"at most {codec.MAX_BODY:,}".replace(",", " ") in PAGE
     assert codec.SIGNATURE.hex(" ").upper() in PAGE
     assert codec.HEADER_SIZE == 12
+
+
+LOCAL = PAGE.partition("\n## The local transport\n")[2]
+LOCAL_ROWS = {
+    int(number, 16): (name, body)
+    for number, name, body in re.findall(r"^\| (0x\w+) \| (\w+) \| [^|]+ \| ([^|]+) \|$", LOCAL, re.MULTILINE)
+}
+WIDTHS = {"u8": "B", "u16": "H", "u32": "I", "u64": "Q"}
+
+
+def test_the_local_transports_own_kinds_are_complete() -> None:
+    assert {number: name for number, (name, _) in LOCAL_ROWS.items()} == {
+        int(kind): kind.name.lower() for kind in packets.LocalKind
+    }
+
+
+@pytest.mark.parametrize(
+    ("kind", "packet"),
+    [
+        (packets.LocalKind.HELLO, packets.hello()),
+        (packets.LocalKind.RELEASE, packets.release(0x01020304)),
+        (packets.LocalKind.SLOT, packets.slot(0x01020304, 0x05060708, 0x1112131415161718)),
+        (packets.LocalKind.RETIRE, packets.retire(0x01020304, 0x05060708)),
+    ],
+    ids=str,
+)
+def test_the_numbers_of_the_local_packets(kind: packets.LocalKind, packet: bytes) -> None:
+    layout = "<" + "".join(WIDTHS[width] for width in re.findall(r"\bu\d+\b", LOCAL_ROWS[kind][1]))
+    numbers = struct.unpack(layout, packet[codec.HEADER_SIZE :])
+    assert packets.parse(packet) == numbers
+
+
+def test_a_subscription_and_a_frame_are_built_as_the_page_says() -> None:
+    assert packets.subscribe("video/ä", True)[codec.HEADER_SIZE :] == b"\1" + "video/ä".encode()
+    header = codec.encode(messages.FrameHeader("front", 1, 2, 3, 4, 5, messages.Encoding.MONO8, 20))
+    frame = packets.frame(0x01020304, header)
+    assert frame[5] == 0x44
+    assert frame[12:] == bytes.fromhex("04030201") + header
+
+
+def test_numbers_in_the_text_about_the_local_transport() -> None:
+    assert f"now {packets.REVISION} |" in LOCAL
+    assert f"1 to {MAX_TOPIC} characters" in LOCAL
+    assert f"at most {packets.MAX_REASON} bytes" in LOCAL
+    assert f"1 to {MAX_PACKET:,} bytes".replace(",", " ") in LOCAL
+    assert f"At most {MAX_SUBSCRIPTIONS} at a time" in LOCAL
+    assert f"at most {MAX_LEASES} leases a camera" in LOCAL

@@ -56,9 +56,14 @@ KINDS: Final[dict[type[Sample], Kind]] = {
 
 _encode_body = msgspec.msgpack.Encoder().encode
 _KIND_NUMBERS: Final = {sample: int(kind) for sample, kind in KINDS.items()}
-_DECODERS: Final = {int(kind): msgspec.msgpack.Decoder(sample).decode for sample, kind in KINDS.items()}
 _pack_header = HEADER.pack
 _unpack_header = HEADER.unpack_from
+_unpack_length = struct.Struct("<I").unpack_from
+_PREFIX_SIZE: Final = 8
+_BY_PREFIX: Final = {
+    _pack_header(SIGNATURE, VERSION, kind, 0, 0)[:_PREFIX_SIZE]: msgspec.msgpack.Decoder(sample).decode
+    for sample, kind in KINDS.items()
+}
 
 
 def encode(sample: Sample) -> bytes:
@@ -74,14 +79,16 @@ def encode(sample: Sample) -> bytes:
 
 def decode(packet: bytes | memoryview) -> Sample:
     """The sample in a packet. Raises :class:`DecodeError` for anything else, in bounded time and memory."""
-    kind = packet_kind(packet)
-    decoder = _DECODERS.get(kind)
-    if decoder is None:
+    # One look-up settles signature, version, kind and reserved bytes; why a packet is refused is found out later.
+    decoder = _BY_PREFIX.get(bytes(packet[:_PREFIX_SIZE]))
+    size = len(packet) - HEADER_SIZE
+    if decoder is None or not 0 <= size <= MAX_BODY or _unpack_length(packet, _PREFIX_SIZE)[0] != size:
+        kind = packet_kind(packet)
         raise DecodeError(f"unknown kind {kind}: known are {', '.join(f'{k.value} {k.name}' for k in Kind)}")
     try:
         sample: Sample = decoder(memoryview(packet)[HEADER_SIZE:])
     except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
-        raise DecodeError(f"bad {Kind(kind).name.lower()} packet: {error}") from None
+        raise DecodeError(f"bad {Kind(packet[5]).name.lower()} packet: {error}") from None
     return sample
 
 

@@ -1,0 +1,63 @@
+"""Newest feedback and newest frame of one drone, waited for together by one thread."""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import Self
+
+from skyloop.client.frame import Arrival, Frame
+from skyloop.client.reception import Reception, VideoChannel
+from skyloop.client.slots import Bell, Buffer
+from skyloop.messages import Feedback
+
+
+class Inbox:
+    """One slot for feedback and one for frames, each with the newest, and one bell for both. A context manager."""
+
+    def __init__(self, reception: Reception, *, feedback: bool, channel: VideoChannel | None) -> None:
+        """``feedback``: whether it is wanted; ``channel``: the camera whose frames are wanted."""
+        self.bell = Bell()
+        self._feedback: Buffer[Feedback] = Buffer(1, self.bell)
+        self._frames: Buffer[Arrival] = Buffer(1, self.bell)
+        self._reception = reception
+        self._channel = channel
+        self._wants_feedback = feedback
+        self._put_feedback, self._put_frame = self._feedback.put, self._frames.put
+
+    def __enter__(self) -> Self:
+        if self._wants_feedback:
+            self._reception.on_feedback.add(self._put_feedback, lambda: self._feedback.dropped)
+        if self._channel is not None:
+            self._channel.topic.add(self._put_frame, lambda: self._frames.dropped)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._reception.on_feedback.remove(self._put_feedback)
+        if self._channel is not None:
+            self._channel.topic.remove(self._put_frame)
+
+    @property
+    def waiting(self) -> bool:
+        """Whether there is something to take."""
+        return self._feedback.waiting or self._frames.waiting
+
+    @property
+    def feedback_dropped(self) -> int:
+        """Samples that newer ones pushed out."""
+        return self._feedback.dropped
+
+    @property
+    def frames_dropped(self) -> int:
+        """Frames that newer ones pushed out."""
+        return self._frames.dropped
+
+    def feedback(self) -> Feedback | None:
+        """The newest, if it was not taken yet."""
+        return self._feedback.take()
+
+    def frame(self) -> Frame | None:
+        """The newest, if it was not taken yet."""
+        arrival = self._frames.take()
+        return None if arrival is None or self._channel is None else self._channel.picture(arrival)

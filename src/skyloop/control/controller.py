@@ -1,0 +1,178 @@
+"""The base class of controllers, and the loop that runs one."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+from skyloop.errors import AuthorityError, SkyloopError, UsageError
+
+if TYPE_CHECKING:
+    from skyloop.client import AuthorityStatus, Drone, Frame
+    from skyloop.client.inbox import Inbox
+    from skyloop.messages import Feedback
+
+Reason = Literal["time", "until", "stopped", "closed"]
+_LOOK_S = 0.1  #: how often ``until`` is asked while nothing comes
+
+
+@dataclass(frozen=True, slots=True)
+class RunSummary:
+    """How a run went."""
+
+    frames: int  #: calls of ``on_frame``
+    feedback: int  #: calls of ``on_feedback``
+    frames_dropped: int  #: frames that newer ones replaced while a callback was running
+    feedback_dropped: int
+    overruns: int  #: callbacks that took so long that something was dropped meanwhile
+    seconds: float
+    reason: Reason  #: why it ended
+
+    def __str__(self) -> str:
+        return (
+            f"{self.seconds:.1f} s until {self.reason}: {self.frames} frames ({self.frames_dropped} dropped), "
+            f"{self.feedback} feedback samples ({self.feedback_dropped} dropped), {self.overruns} overruns"
+        )
+
+
+class Controller:
+    """Write ``on_feedback`` or ``on_frame``, or both, and call :meth:`run`.
+
+    Each is called with the newest sample, one call at a time, on the thread that called :meth:`run`; what comes while
+    a call is running is replaced by what is newer. ``camera`` names whose frames come; None: the vehicle's first.
+    """
+
+    camera: str | None = None
+
+    def __init__(self, drone: Drone) -> None:
+        self.drone = drone
+        self._stopped = threading.Event()
+        self._inbox: Inbox | None = None
+
+    # To be written by the user ---------------------------------------------------------------------------------
+
+    def on_feedback(self, feedback: Feedback) -> None:
+        """Called with the newest feedback."""
+
+    def on_frame(self, frame: Frame) -> None:
+        """Called with the newest frame: BGR, shape (height, width, 3), uint8, read-only."""
+
+    def on_authority(self, status: AuthorityStatus) -> None:
+        """Called once when a command failed because somebody else took over, and once when it is given back."""
+
+    # To be called ----------------------------------------------------------------------------------------------
+
+    def stop(self) -> None:
+        """End :meth:`run` after the call that is under way. Any thread."""
+        self._stopped.set()
+        inbox = self._inbox
+        if inbox is not None:
+            inbox.bell.ring()
+
+    def run(self, seconds: float | None = None, until: Callable[[], bool] | None = None) -> RunSummary:
+        """Call the callbacks for ``seconds``, or until ``until()`` is true, :meth:`stop` or the drone's end.
+
+        An exception in a callback makes an airborne vehicle hover and comes out here. Only an
+        :class:`AuthorityError` because somebody else took over does not: :meth:`on_authority` is told, and it goes on.
+        """
+        if seconds is not None and not seconds >= 0.0:
+            raise UsageError(f"seconds is {seconds!r} and must be 0 or more")
+        own = type(self)
+        wants_frames = own.on_frame is not Controller.on_frame
+        wants_feedback = own.on_feedback is not Controller.on_feedback or not wants_frames
+        inbox = self.drone.inbox(feedback=wants_feedback, frames=wants_frames, camera=self.camera)
+        self._stopped.clear()
+        try:
+            with inbox:
+                self._inbox = inbox
+                return _Run(self, inbox, self._stopped).go(seconds, until)
+        finally:
+            self._inbox = None
+
+
+class _Run:
+    """One run of a controller."""
+
+    def __init__(self, controller: Controller, inbox: Inbox, stopped: threading.Event) -> None:
+        self._controller = controller
+        self._drone = controller.drone
+        self._inbox = inbox
+        self._stopped = stopped
+        self._frames = 0
+        self._feedback = 0
+        self._overruns = 0
+        self._lost = False  # somebody took over, and the controller was told
+
+    def go(self, seconds: float | None, until: Callable[[], bool] | None) -> RunSummary:
+        started = time.monotonic()
+        deadline = None if seconds is None else started + seconds
+        while True:
+            reason = self._over(deadline, until)
+            if reason is not None:
+                break
+            left_s = _LOOK_S if deadline is None else min(_LOOK_S, deadline - time.monotonic())
+            self._inbox.bell.wait_for(lambda: self._inbox.waiting or self._stopped.is_set(), max(0.0, left_s))
+            self._serve()
+        return RunSummary(
+            self._frames,
+            self._feedback,
+            self._inbox.frames_dropped,
+            self._inbox.feedback_dropped,
+            self._overruns,
+            time.monotonic() - started,
+            reason,
+        )
+
+    def _over(self, deadline: float | None, until: Callable[[], bool] | None) -> Reason | None:
+        if self._stopped.is_set():
+            return "stopped"
+        if self._drone.closed:
+            return "closed"
+        if deadline is not None and time.monotonic() >= deadline:
+            return "time"
+        return "until" if until is not None and until() else None
+
+    def _serve(self) -> None:
+        """One call for each kind of sample that came; feedback first, so that frames meet the newer state."""
+        feedback = self._inbox.feedback()
+        if feedback is not None:
+            self._feedback += 1
+            self._call(self._controller.on_feedback, feedback)
+        frame = None if self._stopped.is_set() else self._inbox.frame()
+        if frame is not None:
+            self._frames += 1
+            self._call(self._controller.on_frame, frame)
+
+    def _call(self, callback: Callable[[Any], None], sample: Any) -> None:
+        dropped = self._inbox.frames_dropped + self._inbox.feedback_dropped
+        try:
+            if self._lost and self._drone.authority.state == "held":
+                self._lost = False
+                self._controller.on_authority(self._drone.authority)
+            self._guarded(callback, sample)
+        except BaseException:
+            self._hover()
+            raise
+        if self._inbox.frames_dropped + self._inbox.feedback_dropped > dropped:
+            self._overruns += 1
+
+    def _guarded(self, callback: Callable[[Any], None], sample: Any) -> None:
+        try:
+            callback(sample)
+        except AuthorityError:
+            status = self._drone.authority
+            if status.state == "none":
+                raise  # nobody took over: it was never asked for, or given back by this application
+            if not self._lost and status.state != "held":
+                self._lost = True
+                self._controller.on_authority(status)
+
+    def _hover(self) -> None:
+        """Leave the vehicle in a safe state if it is in our hands and in the air."""
+        with contextlib.suppress(SkyloopError):
+            if self._drone.authority.state == "held" and self._drone.feedback().state.airborne:
+                self._drone.hover()

@@ -1,0 +1,194 @@
+"""The law that follows a marker by the camera: sightings and feedback in, velocities out. Pure: no clock, no thread.
+
+Position-based visual servoing (Chaumette and Hutchinson, "Visual servo control, part I", IEEE RAM 13(4), 2006): the
+marker's pose is levelled by the attitude at the picture's capture and placed where the vehicle was then; a filter
+tells where it is now and will be when the command takes hold; the vehicle keeps its distance along the line of sight,
+its height, and comes round when the marker is seen too much from the side.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.clock import nanoseconds, seconds
+from skyloop.control.target import Motion, Odometry, TargetFilter
+from skyloop.messages import Feedback, Velocity
+from skyloop.messages.geometry import wrap_angle
+
+Array = NDArray[np.float64]
+
+
+class Mode(StrEnum):
+    SEARCHING = "searching"  #: turning on the spot, at one height after the other
+    FOLLOWING = "following"  #: seen a moment ago
+    RECOVERING = "recovering"  #: lost: turning to where it must be now
+
+
+@dataclass(frozen=True, slots=True)
+class FollowSettings:
+    """What the law aims at and how hard. The defaults suit a small indoor vehicle with velocity control."""
+
+    distance_m: float = 1.5
+    lead_s: float = 0.12  #: from a command's decision to its taking hold
+    range_gain: float = 1.1  #: [1/s]
+    height_gain: float = 1.2  #: [1/s]
+    yaw_gain: float = 2.2  #: [1/s]
+    aside_gain: float = 1.2  #: how fast to come round to the marker's front [1/s]
+    aside_rad: float = 0.3  #: seen from less than this aside, it stays where it is
+    speed_m_s: float = 1.2  #: greatest, horizontally
+    climb_m_s: float = 0.6
+    turn_rad_s: float = 1.8
+    acceleration_m_s2: float = 2.0  #: of the set-point: a harder one tilts the camera off the marker
+    following_s: float = 0.35  #: since last seen
+    recovering_s: float = 3.0
+    search_rad_s: float = 0.7
+    search_heights_m: tuple[float, ...] = (0.0, 0.4, -0.3, 0.8)  #: above the first, one a full turn
+    lowest_m: float = 0.6
+    highest_m: float = 2.2
+
+
+class FollowLaw:
+    """Tell it every feedback and every sighting; ask it for the velocity. Times are on the proxy's clock [ns]."""
+
+    def __init__(self, settings: FollowSettings | None = None) -> None:
+        self.settings = settings or FollowSettings()
+        self.mode = Mode.SEARCHING
+        self._odometry = Odometry()
+        self._target = TargetFilter()
+        self._face: Array | None = None  # which way the marker looks, horizontal part, odometry axes
+        self._seen_ns: int | None = None
+        self._altitude: float | None = None
+        self._search = _Search(self.settings)
+        self._last: tuple[int, Array] | None = None  # when and what was asked for last: forward, left, up, yaw rate
+
+    def feedback(self, feedback: Feedback) -> None:
+        """Take the vehicle's newest state."""
+        self._odometry.add(feedback)
+        self._altitude = feedback.altitude
+
+    def see(self, position: Array, normal: Array, at_capture: Feedback, captured_ns: int, trust: float = 1.0) -> None:
+        """Take a sighting: the marker's position [m] and face normal, both (3,) in body axes at the capture.
+
+        ``at_capture`` gives the attitude then; ``trust`` (0 to 1) is how sure the normal is. Ignored while the
+        vehicle's attitude or motion is not known.
+        """
+        motion = self._odometry.at(captured_ns)
+        if motion is None or at_capture.roll is None or at_capture.pitch is None or at_capture.yaw is None:
+            return
+        to_level = at_capture.rotation
+        distance = float(np.linalg.norm(position))
+        # A corner's error of a fixed fraction of a pixel moves the range by a share that grows with its square.
+        self._target.see(motion.position + to_level @ position, 0.015 + 0.01 * distance**2, captured_ns)
+        face = (to_level @ normal)[:2]
+        weight = 0.25 * trust
+        self._face = face if self._face is None else (1 - weight) * self._face + weight * face
+        self._seen_ns = captured_ns
+
+    def step(self, now_ns: int) -> Velocity:
+        """What to ask the vehicle for now. All zero until the vehicle's motion is known."""
+        motion = self._odometry.at(now_ns)
+        if motion is None:
+            return Velocity()
+        ahead = motion.moved_to(now_ns + nanoseconds(self.settings.lead_s))
+        unseen_s = math.inf if self._seen_ns is None else seconds(now_ns - self._seen_ns)
+        if unseen_s > self.settings.recovering_s:
+            self.mode = Mode.SEARCHING
+            wanted = self._search.step(motion.yaw, self._altitude)
+        else:
+            self.mode = Mode.FOLLOWING if unseen_s <= self.settings.following_s else Mode.RECOVERING
+            wanted = self._follow(ahead, unseen_s)
+            self._search.restart(turning=wanted[3])
+        return self._smooth(wanted, now_ns)
+
+    def _follow(self, own: Motion, unseen_s: float) -> Array:
+        """Wanted forward, left, up [m/s] and yaw rate [rad/s] while the target is known."""
+        s = self.settings
+        # What is not seen is not flown to: translation fades out within a second of the loss, turning goes on.
+        fade = max(0.0, min(1.0, 1.0 - (unseen_s - s.following_s)))
+        place, speed = self._target.at(own.at_ns)
+        speed = speed * fade
+        offset = place - own.position
+        across = max(0.3, math.hypot(offset[0], offset[1]))
+        sight = offset[:2] / across
+        aside = np.array([-sight[1], sight[0]])  # to the left of the line of sight
+        away = float(np.linalg.norm(offset)) - s.distance_m
+        horizontal = speed[:2] + sight * (s.range_gain * away) + aside * self._come_round(sight, across)
+        horizontal = _shortened(horizontal * fade, s.speed_m_s)
+        up = fade * s.height_gain * offset[2] + speed[2]
+        error = wrap_angle(math.atan2(offset[1], offset[0]) - own.yaw)
+        sweep = float((speed[:2] - own.velocity[:2]) @ aside) / across
+        turn = s.yaw_gain * error + fade * 0.8 * sweep
+        c, si = math.cos(own.yaw), math.sin(own.yaw)
+        forward, left = c * horizontal[0] + si * horizontal[1], c * horizontal[1] - si * horizontal[0]
+        return np.array([forward, left, self._within_heights(up), max(-s.turn_rad_s, min(s.turn_rad_s, turn))])
+
+    def _come_round(self, sight: Array, across: float) -> float:
+        """Speed to the left of the line of sight [m/s] that brings the vehicle before the marker's face."""
+        s = self.settings
+        if self._face is None or float(np.hypot(*self._face)) < 0.3:  # looks up or down, or every way in turn
+            return 0.0
+        # From the direction marker-to-vehicle round to where the marker looks, counter-clockwise.
+        turned = float(self._face[0] * sight[1] - self._face[1] * sight[0])
+        angle = math.atan2(turned, -float(self._face @ sight))
+        excess = math.copysign(max(0.0, abs(angle) - s.aside_rad), angle)
+        return max(-0.9, min(0.9, -s.aside_gain * excess * across))
+
+    def _within_heights(self, up: float) -> float:
+        s = self.settings
+        if self._altitude is not None:
+            up = max(0.0, up) if self._altitude < s.lowest_m else up
+            up = min(0.0, up) if self._altitude > s.highest_m else up
+        return max(-s.climb_m_s, min(s.climb_m_s, up))
+
+    def _smooth(self, wanted: Array, now_ns: int) -> Velocity:
+        """Limits how fast the set-point changes."""
+        if self._last is not None:
+            before_ns, before = self._last
+            dt = max(0.0, min(0.2, seconds(now_ns - before_ns)))
+            change = wanted - before
+            change[:2] = _shortened(change[:2], self.settings.acceleration_m_s2 * dt)
+            wanted = before + change
+        self._last = (now_ns, wanted)
+        forward, left, up, yaw_rate = (float(v) for v in wanted)
+        return Velocity(forward=forward, left=left, up=up, yaw_rate=yaw_rate)
+
+
+class _Search:
+    """Turns on the spot; after each full turn goes to the next height."""
+
+    def __init__(self, settings: FollowSettings) -> None:
+        self._settings = settings
+        self._direction = 1.0
+        self._turned = 0.0
+        self._yaw: float | None = None
+        self._base: float | None = None
+
+    def restart(self, *, turning: float) -> None:
+        """The next search begins the way the vehicle is turning now [rad/s]."""
+        if abs(turning) > 0.05:
+            self._direction = math.copysign(1.0, turning)
+        self._turned, self._yaw, self._base = 0.0, None, None
+
+    def step(self, yaw: float, altitude: float | None) -> Array:
+        s = self._settings
+        if self._yaw is not None:
+            self._turned += abs(wrap_angle(yaw - self._yaw))
+        self._yaw = yaw
+        up = 0.0
+        if altitude is not None:
+            self._base = altitude if self._base is None else self._base
+            sweep = int(self._turned / (2 * math.pi))
+            goal = self._base + s.search_heights_m[sweep % len(s.search_heights_m)]
+            goal = max(s.lowest_m, min(s.highest_m, goal))
+            up = max(-0.4, min(0.4, 0.8 * (goal - altitude)))
+        return np.array([0.0, 0.0, up, self._direction * s.search_rad_s])
+
+
+def _shortened(vector: Array, longest: float) -> Array:
+    length = float(np.hypot(vector[0], vector[1]))
+    return vector if length <= longest else vector * (longest / length)

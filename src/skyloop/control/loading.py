@@ -1,0 +1,88 @@
+"""Loads the user's controller from a file, with errors that say where and what."""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+import sys
+from pathlib import Path
+from types import ModuleType
+
+from skyloop.control.controller import Controller
+from skyloop.errors import FileFormatError, UnknownNameError, UsageError
+
+
+def load_controller(path: str | Path, class_name: str | None = None) -> type[Controller]:
+    """The controller class in a Python file, which is run; it may import its neighbours, as a script may.
+
+    Classes that the file only imports count if it has none of its own. With several, ``class_name`` says which. Raises
+    :class:`FileFormatError` for a file that can't be read or run (with the line), or that has no controller;
+    :class:`UnknownNameError` for a class that it lacks; :class:`UsageError` for a missing file or several classes.
+    """
+    file = Path(path)
+    if file.is_dir():
+        raise UsageError(f"{file} is a directory: give a Python file in it")
+    if not file.exists():
+        raise UsageError(f"there is no file {file}: give a Python file with a class derived from skyloop.Controller")
+    module = _run(file)
+    found = {
+        name: value
+        for name, value in vars(module).items()
+        if inspect.isclass(value) and issubclass(value, Controller) and value is not Controller
+    }
+    own = {name: value for name, value in found.items() if value.__module__ == module.__name__}
+    return _choose(own or found, found, class_name, file)
+
+
+def _run(file: Path) -> ModuleType:
+    module_name = f"skyloop_user_{file.stem}"
+    spec = importlib.util.spec_from_file_location(module_name, file.resolve())
+    if spec is None or spec.loader is None:
+        raise FileFormatError(f"{file} is not a Python file: its name must end in .py")
+    module = importlib.util.module_from_spec(spec)
+    folder = str(file.resolve().parent)
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
+    sys.modules[module_name] = module  # so that dataclasses and pickling in the user's file work
+    try:
+        spec.loader.exec_module(module)
+    except SyntaxError as error:
+        where = "" if _is(error.filename, file) else f"{error.filename}, "
+        raise FileFormatError(f"{file}: {where}line {error.lineno}: {error.msg}") from error
+    except SystemExit as error:
+        raise FileFormatError(
+            f"{file}{_line_of(error, file)}: it ends the program when it is loaded; what only a script does belongs "
+            'under if __name__ == "__main__":'
+        ) from error
+    except Exception as error:
+        raise FileFormatError(f"{file}{_line_of(error, file)}: {type(error).__name__}: {error}") from error
+    return module
+
+
+def _choose(
+    likely: dict[str, type[Controller]], found: dict[str, type[Controller]], class_name: str | None, file: Path
+) -> type[Controller]:
+    if class_name is not None:
+        if class_name not in found:
+            raise UnknownNameError(f"controller in {file}", class_name, found)
+        return found[class_name]
+    if not likely:
+        raise FileFormatError(f"{file} has no controller: write a class derived from skyloop.Controller")
+    if len(likely) > 1:
+        raise UsageError(f"{file} has several controllers ({', '.join(sorted(likely))}): say which with --class NAME")
+    return next(iter(likely.values()))
+
+
+def _line_of(error: BaseException, file: Path) -> str:
+    """Where in the user's file it went wrong, if it did there."""
+    traceback = error.__traceback__
+    line = None
+    while traceback is not None:
+        if _is(traceback.tb_frame.f_code.co_filename, file):
+            line = traceback.tb_lineno
+        traceback = traceback.tb_next
+    return f", line {line}" if line is not None else ""
+
+
+def _is(name: str | None, file: Path) -> bool:
+    return name is not None and Path(name).resolve() == file.resolve()

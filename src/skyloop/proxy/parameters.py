@@ -1,0 +1,195 @@
+"""The parameters of a proxy and of its driver as one typed store.
+
+Checking is pure (:func:`check`). Where the driver has a parameter of the same name as the proxy, the driver's is the
+one that is shown and written, and the proxy obeys its value: ``limits.tilt`` of a vehicle with a limit of its own.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Iterable
+from typing import Final
+
+import msgspec
+
+from skyloop.errors import ParameterError, UnknownNameError
+from skyloop.messages import Parameter, ParameterPage, ParameterType, Refusal, Value
+from skyloop.messages.codec import MAX_BODY
+
+MAX_TEXT: Final = 1024  #: characters of a text value
+MAX_PARAMETER: Final = 8192  #: bytes of one encoded parameter: a driver's larger one is left out
+PAGE_BYTES: Final = MAX_BODY - 256  #: of encoded parameters in one reply
+
+_KIND_NAMES: Final = {bool: "a bool", int: "an int", float: "a float", str: "a text", tuple: "a vector"}
+_encoded = msgspec.msgpack.Encoder().encode
+
+
+def _own(name: str, value: float, unit: str, minimum: float, maximum: float, description: str) -> Parameter:
+    return Parameter(name, ParameterType.FLOAT, value, unit, minimum, maximum, value, description=description)
+
+
+#: The proxy's own parameters. ``docs/proxy.md`` shows them as a table.
+OWN: Final[tuple[Parameter, ...]] = (
+    _own(
+        "authority.timeout_s", 2.0, "s", 0.1, 3600.0, "A holder that sent no valid command for so long loses the lease"
+    ),
+    _own("autopilot.climb", 0.5, "m/s", 0.1, 3.0, "Climb rate of a software take-off, and at most in a software hover"),
+    _own("autopilot.descent", 0.4, "m/s", 0.1, 2.0, "Rate of descent of a software landing"),
+    _own("autopilot.takeoff_altitude", 1.0, "m", 0.3, 20.0, "Where a software take-off ends, below limits.altitude"),
+    _own("autopilot.velocity_i", 0.05, "rad/m", 0.0, 1.0, "Integral gain of the software velocity loop"),
+    _own("autopilot.velocity_p", 0.15, "rad s/m", 0.0, 1.0, "Proportional gain of the software velocity loop"),
+    _own("battery.land", 0.1, "", 0.0, 1.0, "Charge below which the vehicle lands and takes no set-points; 0: never"),
+    _own("battery.warn", 0.2, "", 0.0, 1.0, "Charge below which a low battery is told; 0: never"),
+    _own("command.max_age_s", 0.25, "s", 0.01, 10.0, "Older commands are refused as stale"),
+    _own(
+        "failsafe.hover_after_s", 0.5, "s", 0.05, 3600.0, "A flying vehicle hovers when nobody commanded it for so long"
+    ),
+    _own("failsafe.land_after_s", 5.0, "s", 0.1, 3600.0, "A flying vehicle lands when nobody commanded it for so long"),
+    _own(
+        "failsafe.retry_s",
+        0.25,
+        "s",
+        0.02,
+        10.0,
+        "Pace at which a failsafe that the vehicle did not take is tried again",
+    ),
+    _own("limits.altitude", 5.0, "m", 0.3, 500.0, "Greatest height above ground: climbing ends there"),
+    _own("limits.climb", 1.0, "m/s", 0.05, 10.0, "Greatest speed up or down"),
+    _own("limits.speed", 2.0, "m/s", 0.05, 30.0, "Greatest horizontal speed of a velocity set-point"),
+    _own("limits.tilt", 0.35, "rad", 0.02, 1.0, "Greatest tilt of an attitude set-point, roll and pitch together"),
+    _own("limits.yaw_rate", 1.75, "rad/s", 0.05, 10.0, "Greatest yaw rate"),
+)
+
+
+def check(parameter: Parameter, value: Value) -> Value:
+    """The value as it may be written: of the parameter's type, finite, within its range and choices.
+
+    An int is taken for a float; a bool is no number. Raises :class:`ParameterError` that says what would be right,
+    with the :class:`Refusal` as its code.
+    """
+    if parameter.read_only:
+        raise ParameterError(f"{parameter.name} can only be read", code=Refusal.READ_ONLY)
+    value = _typed(parameter, value)
+    numbers = value if isinstance(value, tuple) else () if isinstance(value, bool | str) else (value,)
+    for number in numbers:
+        _check_number(parameter, number)
+    if parameter.choices and value not in parameter.choices:
+        choices = ", ".join(repr(choice) for choice in parameter.choices)
+        raise ParameterError(f"{parameter.name} is one of {choices}, not {value!r}", code=Refusal.OUT_OF_RANGE)
+    if isinstance(value, str) and len(value) > MAX_TEXT:
+        raise ParameterError(
+            f"{parameter.name} takes at most {MAX_TEXT} characters, not {len(value)}", code=Refusal.OUT_OF_RANGE
+        )
+    return value
+
+
+def _typed(parameter: Parameter, value: Value) -> Value:
+    kind, is_bool = parameter.type, isinstance(value, bool)
+    if kind is ParameterType.FLOAT and isinstance(value, int | float) and not is_bool:
+        return _as_float(parameter, value)
+    if kind is ParameterType.VECTOR and isinstance(value, tuple):
+        length = len(parameter.value) if isinstance(parameter.value, tuple) else len(value)
+        if len(value) == length:
+            return tuple(_as_float(parameter, number) for number in value)
+        raise ParameterError(f"{parameter.name} takes {length} numbers, not {len(value)}", code=Refusal.WRONG_TYPE)
+    if kind is ParameterType.BOOL and is_bool:
+        return value
+    if kind is ParameterType.INT and isinstance(value, int) and not is_bool:
+        return value
+    if kind is ParameterType.TEXT and isinstance(value, str):
+        return value
+    name = _KIND_NAMES.get(type(value), type(value).__name__)
+    unit = f" in {parameter.unit}" if parameter.unit else ""
+    raise ParameterError(
+        f"{parameter.name} takes a {kind.value}{unit}, not {name} ({value!r:.60})", code=Refusal.WRONG_TYPE
+    )
+
+
+def _as_float(parameter: Parameter, number: float) -> float:
+    try:
+        return float(number)
+    except OverflowError:
+        raise ParameterError(f"{parameter.name} cannot be that large", code=Refusal.OUT_OF_RANGE) from None
+
+
+def _check_number(parameter: Parameter, number: float) -> None:
+    if isinstance(number, float) and not math.isfinite(number):
+        raise ParameterError(f"{parameter.name} must be finite, not {number}", code=Refusal.NON_FINITE)
+    low, high = parameter.minimum, parameter.maximum
+    if (low is not None and number < low) or (high is not None and number > high):
+        unit = f" {parameter.unit}" if parameter.unit else ""
+        allowed = " and ".join(
+            f"{word} {bound:g}{unit}" for word, bound in (("at least", low), ("at most", high)) if bound is not None
+        )
+        raise ParameterError(f"{parameter.name} must be {allowed}, not {number!r}", code=Refusal.OUT_OF_RANGE)
+
+
+class Parameters:
+    """The store. Any thread; driver calls happen on the caller's thread, outside of the store's lock."""
+
+    def __init__(
+        self,
+        read_driver: Callable[[], Iterable[Parameter]] = tuple,
+        write_driver: Callable[[str, Value], Value] | None = None,
+    ) -> None:
+        self._read_driver = read_driver
+        self._write_driver = write_driver
+        self._lock = threading.Lock()
+        self._own = {parameter.name: parameter for parameter in OWN}
+        self._driver: dict[str, Parameter] = {}
+        self.left_out: tuple[str, ...] = ()  #: driver's parameters that are too large to be sent
+
+    def refresh(self) -> None:
+        """Read the driver's parameters anew. Raises whatever the driver raises."""
+        read = {parameter.name: parameter for parameter in self._read_driver()}
+        large = tuple(name for name, parameter in read.items() if len(_encoded(parameter)) > MAX_PARAMETER)
+        with self._lock:
+            self._driver = {name: parameter for name, parameter in read.items() if name not in large}
+            self.left_out = large
+
+    def get(self, name: str) -> Parameter:
+        """One parameter as last known. Raises :class:`UnknownNameError`."""
+        with self._lock:
+            parameter = self._driver.get(name) or self._own.get(name)
+            if parameter is None:
+                raise UnknownNameError("parameter", name, {*self._own, *self._driver})
+            return parameter
+
+    def number(self, name: str) -> float:
+        """The value in force of one of the proxy's own parameters, the driver's where it has it too."""
+        value = self.get(name).value
+        if isinstance(value, int | float) and math.isfinite(value):
+            return float(value)
+        own = self._own[name].value  # a driver with another notion of this name: the proxy keeps its own
+        assert isinstance(own, float)
+        return own
+
+    def set(self, name: str, value: Value) -> Parameter:
+        """Write one parameter and return it as it is now.
+
+        Raises :class:`UnknownNameError`, :class:`ParameterError`, and whatever the driver raises.
+        """
+        parameter = self.get(name)
+        value = check(parameter, value)
+        with self._lock:
+            is_driver = name in self._driver
+        if is_driver and self._write_driver is not None:
+            value = self._write_driver(name, value)
+        written = msgspec.structs.replace(parameter, value=value)
+        with self._lock:
+            (self._driver if is_driver else self._own)[name] = written
+        return written
+
+    def page(self, first: int) -> ParameterPage:
+        """As many parameters, sorted by name and from the ``first`` on, as fit one reply."""
+        with self._lock:
+            everything = sorted({**self._own, **self._driver}.values(), key=lambda parameter: parameter.name)
+        chosen: list[Parameter] = []
+        size = 0
+        for parameter in everything[first:]:
+            size += len(_encoded(parameter))
+            if size > PAGE_BYTES:
+                break
+            chosen.append(parameter)
+        return ParameterPage(len(everything), first, tuple(chosen))

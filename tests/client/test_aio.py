@@ -1,0 +1,247 @@
+"""The asyncio face."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Coroutine, Iterator
+from typing import Any
+
+import pytest
+
+import skyloop.client
+from skyloop import aio
+from skyloop.errors import ClosedError, NoAnswerError, UsageError
+from skyloop.messages import Encoding, EventKind, FlightState, Hover, Land, Takeoff
+from tests.client.scripted import QUICK, WAIT_S, ScriptedProxy, background, scripted
+
+
+@pytest.fixture
+def proxy(monkeypatch: pytest.MonkeyPatch) -> Iterator[ScriptedProxy]:
+    with scripted() as proxy:
+
+        def connect(target: str, **options: Any) -> skyloop.client.Drone:
+            return skyloop.client.Drone(proxy.server.dial, app=target, policy=QUICK, **options).open()
+
+        monkeypatch.setattr("skyloop.client.connect", connect)
+        yield proxy
+
+
+def run(coroutine: Coroutine[Any, Any, None]) -> None:
+    asyncio.run(asyncio.wait_for(coroutine, 2 * WAIT_S))
+
+
+def test_a_flight(proxy: ScriptedProxy) -> None:
+    def vehicle() -> None:
+        proxy.until_commanded(Takeoff())
+        proxy.state = FlightState.HOVERING
+        proxy.until_commanded(Land())
+        proxy.state = FlightState.LANDED
+
+    async def fly() -> None:
+        async with aio.connect("me", stall_s=5.0) as drone:
+            assert (drone.name, drone.uri, drone.app_id) == ("scripted", "scripted://", 1)
+            assert drone.capabilities.vehicle == "scripted"
+            assert drone.authority.state == "held"
+            assert drone.link.application == "up"
+            assert await drone.takeoff()
+            assert drone.feedback().state is FlightState.HOVERING
+            assert drone.velocity(forward=0.1)
+            assert drone.attitude(pitch=0.1)
+            assert drone.hover()
+            assert drone.idle()
+            assert drone.command(Hover())
+            assert (await drone.next_feedback()).seq > 0
+            assert (await drone.wait("hovering")).state is FlightState.HOVERING
+            assert await drone.config.get("limits.tilt") == 0.35
+            await drone.config.set("limits.tilt", 0.2)
+            assert dict(await drone.config.items())["limits.tilt"] == 0.2
+            assert (await drone.config.describe("limits.tilt")).unit == "rad"
+            assert (await drone.stats())["command"].count > 0
+            assert drone.recent_events()
+        with pytest.raises(ClosedError):
+            drone.hover()
+
+    flying = background(vehicle)
+    run(fly())
+    flying.join(WAIT_S)
+    assert Land() in proxy.actions(), "the end of the block lands"
+
+
+def test_authority_and_emergency(proxy: ScriptedProxy) -> None:
+    async def fly() -> None:
+        drone = await aio.connect("me")
+        async with drone:
+            await drone.release_authority()
+            assert (await drone.request_authority(2)).priority == 2
+            assert drone.emergency_stop()
+            assert drone.reset_emergency()
+            assert await drone.land(wait=False)
+
+    run(fly())
+
+
+def test_frames(proxy: ScriptedProxy) -> None:
+    async def look() -> None:
+        async with aio.connect("me") as drone:
+            seqs = []
+            assert drone.frame() is None
+            sending = background(lambda: _send(proxy, 30))
+            async for frame in drone.frames(timeout_s=WAIT_S):
+                seqs.append(frame.seq)
+                drone.annotate(frame, [])
+                if frame.seq >= 20:
+                    break
+            assert seqs == sorted(set(seqs))
+            assert (await drone.next_frame()).seq >= 20
+            sending.join(WAIT_S)
+            with pytest.raises(NoAnswerError, match="no frame of bottom"):
+                async for _ in drone.frames("bottom", timeout_s=0.02):
+                    pass
+
+    run(look())
+
+
+def _send(proxy: ScriptedProxy, count: int) -> None:
+    pause = threading.Event()
+    for seq in range(1, count):
+        proxy.frame(seq)
+        pause.wait(0.005)
+
+
+def test_a_broken_jpeg_is_passed_over(proxy: ScriptedProxy) -> None:
+    pytest.importorskip("cv2")
+
+    async def look() -> None:
+        async with aio.connect("me") as drone:
+            drone.frame()
+            frames = drone.frames(timeout_s=WAIT_S)
+            task = asyncio.ensure_future(anext(frames))
+            await asyncio.sleep(0)
+            proxy.frame(1, encoding=Encoding.JPEG)
+            await drone.wait(lambda _: drone.sync.stats["video/front"].malformed > 0)
+            proxy.frame(2)
+            assert (await task).seq == 2
+            await frames.aclose()  # type: ignore[attr-defined]
+
+    run(look())
+
+
+def test_listeners_run_on_the_loop(proxy: ScriptedProxy) -> None:
+    async def listen() -> None:
+        loop_thread = threading.get_ident()
+        async with aio.connect("me") as drone:
+            came = asyncio.Event()
+            threads: set[int] = set()
+            events: list[EventKind] = []
+
+            def on_feedback(feedback: object) -> None:
+                threads.add(threading.get_ident())
+
+            async def on_event(event: skyloop.Event) -> None:
+                await asyncio.sleep(0)
+                threads.add(threading.get_ident())
+                events.append(event.kind)
+                if event.kind is EventKind.BATTERY_LOW:
+                    came.set()
+
+            def raising(feedback: object) -> None:
+                raise RuntimeError("boo")
+
+            listeners = [
+                drone.on_feedback(on_feedback),
+                drone.on_event(on_event),
+                drone.on_link(lambda status: None),
+                drone.on_command(lambda applied: None),
+                drone.on_annotation(lambda annotation: None),
+            ]
+            bad = drone.on_feedback(raising)
+            proxy.event(EventKind.BATTERY_LOW)
+            await came.wait()
+            await drone.wait(lambda _: bad.errors > 1)
+            assert threads == {loop_thread}
+            assert listeners[1].delivered >= 1
+            assert listeners[1].dropped == 0
+            for listener in [*listeners, bad]:
+                listener.cancel()
+            assert EventKind.CALLBACK_ERROR in [event.kind for event in drone.recent_events()]
+
+    run(listen())
+
+
+def test_processors_are_plain_functions(proxy: ScriptedProxy) -> None:
+    async def think(frame: object) -> None: ...
+
+    async def listen() -> None:
+        async with aio.connect("me") as drone:
+            seen = threading.Event()
+            drone.add_processor(lambda frame: seen.set())
+            proxy.frame(1)
+            assert await asyncio.to_thread(seen.wait, WAIT_S)
+            with pytest.raises(UsageError, match="plain function"):
+                drone.add_processor(think)
+            await drone.close()
+
+    run(listen())
+
+
+def test_a_cancelled_wait_gives_the_loop_back_at_once(proxy: ScriptedProxy) -> None:
+    async def wait() -> None:
+        async with aio.connect("me") as drone:
+            with pytest.raises(TimeoutError):
+                await asyncio.wait_for(drone.wait("flying", 0.5), 0.02)
+            assert drone.hover()
+
+    run(wait())
+
+
+def test_a_cancelled_connect_leaves_no_drone(proxy: ScriptedProxy, monkeypatch: pytest.MonkeyPatch) -> None:
+    go_on, closed = threading.Event(), threading.Event()
+    connect: Any = skyloop.client.connect  # the one that was put in its place
+
+    def slow(target: str, **options: Any) -> skyloop.client.Drone:
+        go_on.wait(WAIT_S)
+        drone: skyloop.client.Drone = connect(target, on_close=closed.set, **options)
+        return drone
+
+    monkeypatch.setattr("skyloop.client.connect", slow)
+
+    async def give_up() -> None:
+        with pytest.raises(TimeoutError):
+            await asyncio.wait_for(aio.connect("me")._connect(), 0.02)
+        go_on.set()
+        assert await asyncio.to_thread(closed.wait, WAIT_S)
+
+    run(give_up())
+
+
+def test_a_connect_whose_loop_has_ended_leaves_no_drone(proxy: ScriptedProxy, monkeypatch: pytest.MonkeyPatch) -> None:
+    go_on, closed = threading.Event(), threading.Event()
+    connect: Any = skyloop.client.connect  # the one that was put in its place
+
+    def slow(target: str, **options: Any) -> skyloop.client.Drone:
+        go_on.wait(WAIT_S)
+        drone: skyloop.client.Drone = connect(target, on_close=closed.set, **options)
+        return drone
+
+    monkeypatch.setattr("skyloop.client.connect", slow)
+
+    async def give_up() -> None:
+        with pytest.raises(TimeoutError):
+            await asyncio.wait_for(aio.connect("me")._connect(), 0.02)
+
+    run(give_up())
+    go_on.set()
+    assert closed.wait(WAIT_S)
+
+
+def test_errors_come_out(proxy: ScriptedProxy) -> None:
+    async def ask() -> None:
+        async with aio.connect("me") as drone:
+            with pytest.raises(KeyError):
+                await drone.config.get("limits.tild")
+            with pytest.raises(RuntimeError, match="mine"):
+                async with drone:
+                    raise RuntimeError("mine")
+
+    run(ask())

@@ -1,0 +1,122 @@
+"""Who may fly, as an application knows it."""
+
+from __future__ import annotations
+
+import pytest
+
+from skyloop.client.authority import Authority
+from skyloop.messages import Event, EventKind, Feedback, Value
+
+NOW = 10_000_000_000
+LATER = NOW + 2_000_000_000
+
+
+def event(kind: EventKind, **data: Value) -> Event:
+    return Event(kind, "", 0, data=data)
+
+
+def owned(owner_id: int = 0, lease: int = 0, owner: str | None = None) -> Feedback:
+    return Feedback(captured_ns=0, owner_id=owner_id, lease=lease, owner=owner)
+
+
+@pytest.fixture
+def authority() -> Authority:
+    authority = Authority("me")
+    authority.connected(3)
+    authority.asked(16)
+    return authority
+
+
+@pytest.fixture
+def held(authority: Authority) -> Authority:
+    assert authority.granted(5, NOW)
+    return authority
+
+
+def test_granted_by_reply_event_or_feedback() -> None:
+    for way in ("reply", "event", "feedback"):
+        authority = Authority("me")
+        authority.connected(3)
+        authority.asked(7)
+        assert authority.pending
+        changed = {
+            "reply": lambda a=authority: a.granted(5, NOW),
+            "event": lambda a=authority: a.event(event(EventKind.AUTHORITY_GRANTED, app_id=3, lease=5), NOW),
+            "feedback": lambda a=authority: a.feedback(owned(3, 5, "me"), NOW),
+        }[way]()
+        assert changed
+        assert not authority.pending
+        status = authority.status
+        assert (status.state, status.lease, status.priority, status.holder) == ("held", 5, 7, "me")
+        assert not authority.granted(5, NOW), "told again, nothing changed"
+
+
+def test_not_wanted_is_not_taken_from_feedback() -> None:
+    authority = Authority("me")
+    authority.connected(3)
+    assert not authority.feedback(owned(3, 5, "me"), NOW)
+    assert authority.status.state == "none"
+
+
+def test_queue(authority: Authority) -> None:
+    assert authority.queued(2, "other")
+    assert (authority.status.state, authority.status.holder, authority.status.position) == ("queued", "other", 2)
+    assert authority.event(event(EventKind.AUTHORITY_QUEUED, app_id=3, position=1), NOW)
+    assert authority.status.position == 1
+    assert authority.feedback(owned(9, 6, "third"), NOW)
+    assert authority.status.holder == "third"
+    assert authority.event(event(EventKind.AUTHORITY_GRANTED, app_id=3, lease=7), NOW)
+    assert authority.held
+
+
+def test_others_events_do_not_matter(held: Authority) -> None:
+    assert not held.event(event(EventKind.AUTHORITY_LOST, app_id=4, lease=5, reason="gone"), NOW)
+    assert not held.event(event(EventKind.AUTHORITY_GRANTED, app_id=4, lease=9), NOW)
+    assert not held.event(event(EventKind.STATE_CHANGED, app_id=3), NOW)
+    assert held.held
+
+
+def test_pre_emption_by_event_and_by_feedback(held: Authority) -> None:
+    assert held.event(event(EventKind.AUTHORITY_PREEMPTED, app_id=3, lease=5, by="boss"), NOW)
+    assert (held.status.state, held.status.holder, held.status.lease) == ("preempted", "boss", 0)
+    assert held.granted(7, NOW)
+    assert held.feedback(owned(9, 8, "boss"), NOW)
+    assert held.status.state == "preempted"
+    assert held.queued(1, "boss")
+    assert held.status.state == "preempted", "still said to be taken away, not just waiting"
+
+
+def test_an_old_lease_told_late_changes_nothing(held: Authority) -> None:
+    assert not held.event(event(EventKind.AUTHORITY_PREEMPTED, app_id=3, lease=4, by="boss"), NOW)
+    held.event(event(EventKind.AUTHORITY_PREEMPTED, app_id=3, lease=5, by="boss"), NOW)
+    assert not held.event(event(EventKind.AUTHORITY_GRANTED, app_id=3, lease=5), NOW)
+    assert not held.feedback(owned(3, 5, "me"), NOW), "feedback from before the pre-emption"
+    assert held.status.state == "preempted"
+
+
+def test_feedback_from_before_the_grant_does_not_end_it(held: Authority) -> None:
+    assert not held.feedback(owned(), NOW + 1)
+    assert not held.feedback(owned(9, 4, "before"), NOW + 1)
+    assert held.held
+
+
+def test_lost_by_silence(held: Authority) -> None:
+    assert held.feedback(owned(), LATER)
+    assert held.status.state == "none"
+    assert held.wanted, "it is to be asked for again"
+    held.granted(6, LATER)
+    assert held.event(event(EventKind.AUTHORITY_LOST, app_id=3, lease=6, reason="silent"), LATER)
+    assert held.status.state == "none"
+
+
+def test_given_back_and_refused(held: Authority) -> None:
+    assert held.given_back()
+    assert (held.status.state, held.wanted) == ("none", False)
+    assert not held.refused()
+
+
+def test_a_new_connection_begins_anew(held: Authority) -> None:
+    assert held.disconnected()
+    assert (held.status.state, held.wanted, held.status.priority) == ("none", True, 16)
+    held.connected(1)
+    assert held.granted(1, LATER), "a restarted proxy counts its leases from 1"

@@ -1,0 +1,219 @@
+"""Connecting by name and by address, with stand-ins for proxies' processes."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import skyloop
+from skyloop.client import private
+from skyloop.client.connect import _script_name, connect
+from skyloop.client.private import PrivateProxy
+from skyloop.errors import LinkError, NoAnswerError, UnknownNameError, UsageError
+from skyloop.messages import FlightState, LinkState
+from skyloop.transport.local import LocalServer
+from tests.client.scripted import ScriptedProxy
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the local transport needs Linux")
+ROOT = Path(__file__).parents[2]
+
+#: A stand-in for ``skyloop proxy``: a scripted proxy on the local transport, that ends with its parent.
+CHILD = """
+import os, sys
+sys.path.insert(0, {root!r})
+from skyloop.transport.local import LocalServer
+from tests.client.scripted import ScriptedProxy
+name, descriptor = sys.argv[sys.argv.index("--name") + 1], int(sys.argv[-1])
+proxy = ScriptedProxy()
+proxy.server = LocalServer(name)
+proxy.start()
+print("ready", name, flush=True)
+print("something is odd", file=sys.stderr, flush=True)
+os.read(descriptor, 1)
+proxy.stop()
+"""
+
+
+@pytest.fixture(autouse=True)
+def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", str(tmp_path / "run"))
+
+
+@pytest.fixture
+def alpha() -> Iterator[ScriptedProxy]:
+    proxy = ScriptedProxy()
+    proxy.server = LocalServer("alpha")  # type: ignore[assignment]  # another transport with the same contract
+    proxy.start()
+    yield proxy
+    proxy.stop()
+
+
+def command(code: str) -> list[str]:
+    return [sys.executable, "-c", textwrap.dedent(code).format(root=str(ROOT))]
+
+
+def alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def test_by_name(alpha: ScriptedProxy) -> None:
+    with skyloop.connect("alpha", name="ada", priority=3) as drone:
+        assert drone.authority.state == "held"
+        assert drone.authority.priority == 3
+        assert drone.feedback().state is FlightState.LANDED
+        drone.frame()
+        drone.wait(lambda _: alpha.server.subscribers("video/front") == 1, 10.0)
+        alpha.frame(2, value=9)
+        frame = drone.next_frame(timeout_s=5.0)
+        assert frame[0, 0, 0] == 9
+    assert drone.closed
+
+
+def test_wrong_name(alpha: ScriptedProxy) -> None:
+    with pytest.raises(UnknownNameError, match="no proxy named 'alfa'; did you mean 'alpha'"):
+        connect("alfa")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"target": ""},
+        {"target": 3},
+        {"target": "Not A Name"},
+        {"target": "alpha", "priority": 32},
+        {"target": "alpha", "wait_s": -1.0},
+        {"target": "alpha", "timeout_s": float("nan")},
+        {"target": "alpha", "rate_hz": 0.0},
+        {"target": "alpha", "name": ""},
+    ],
+)
+def test_unusable_arguments(arguments: dict[str, object]) -> None:
+    with pytest.raises(UsageError):
+        connect(**arguments)  # type: ignore[arg-type]
+
+
+def test_script_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    for given, name in (
+        ("/home/me/follow.py", "follow"),
+        ("/x/pkg/__main__.py", "pkg"),
+        ("", "python"),
+        ("-c", "c"),
+        ("a" * 99, "a" * 64),
+    ):
+        monkeypatch.setattr(sys, "argv", [given])
+        assert _script_name() == name
+
+
+def test_a_collector_of_frames_never_starves(alpha: ScriptedProxy) -> None:
+    """Frames lie in the transport's memory; beyond a few of them, they are copies."""
+    with skyloop.connect("alpha", access="observe") as drone:
+        drone.frame()
+        drone.wait(lambda _: alpha.server.subscribers("video/front") == 1, 10.0)
+        kept = []
+        for seq in range(1, 21):
+            alpha.frame(seq, value=seq)
+            kept.append(drone.next_frame(timeout_s=5.0))
+        assert [int(frame[0, 0, 0]) for frame in kept] == list(range(1, 21))
+
+
+@pytest.mark.process
+def test_a_private_proxy_ends_with_the_drone() -> None:
+    proxy = PrivateProxy("fake://", command(CHILD))
+    assert proxy.name.startswith(f"fake-{os.getpid()}-")
+    drone = skyloop.Drone(proxy.dialer(time.monotonic() + 20.0), app="me", on_close=proxy.close).open(timeout_s=20.0)
+    assert drone.name == "scripted"
+    assert alive(proxy.pid)
+    drone.close()
+    assert not alive(proxy.pid)
+    proxy.close()
+
+
+@pytest.mark.process
+def test_by_address(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(private, "PrivateProxy", lambda uri: PrivateProxy(uri, command(CHILD)))
+    with connect("fake://here") as drone:
+        assert drone.authority.state == "held"
+    with pytest.raises(UsageError, match="rate_hz"):
+        connect("fake://here", rate_hz=-1.0)
+
+
+@pytest.mark.process
+def test_a_private_proxy_that_dies_is_told_with_what_it_said() -> None:
+    proxy = PrivateProxy("fake://", command(CHILD))
+    drone = skyloop.Drone(proxy.dialer(time.monotonic() + 20.0), app="me", on_close=proxy.close).open(timeout_s=20.0)
+    try:
+        os.kill(proxy.pid, signal.SIGKILL)
+        deadline = time.monotonic() + 10.0
+        while "killed by signal 9" not in drone.link.reason:
+            assert time.monotonic() < deadline, drone.link
+            with pytest.raises(NoAnswerError):
+                drone.wait("flying", 0.02)
+        assert drone.link.application is LinkState.LOST
+        assert "something is odd" in drone.link.reason
+    finally:
+        drone.close()
+
+
+@pytest.mark.process
+def test_a_private_proxy_that_cannot_start() -> None:
+    code = "import sys; sys.exit('no such vehicle: unobtainium')"
+    proxy = PrivateProxy("fake://", [sys.executable, "-c", code])
+    try:
+        with pytest.raises(LinkError, match=r"(?s)ended with exit code 1; it said:\nno such vehicle: unobtainium"):
+            skyloop.Drone(proxy.dialer(time.monotonic() + 20.0), app="me").open()
+    finally:
+        proxy.close()
+
+
+@pytest.mark.process
+def test_a_private_proxy_that_takes_too_long_and_does_not_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(private, "_GRACE_S", 0.2)
+    code = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('x', flush=True); time.sleep(60)"
+    proxy = PrivateProxy("fake://", [sys.executable, "-c", code])
+    try:
+        assert proxy._process.stdout is not None
+        select.select([proxy._process.stdout], [], [], 10.0)
+        with pytest.raises(NoAnswerError, match="did not start in time"):
+            skyloop.Drone(proxy.dialer(time.monotonic() + 0.1), app="me").open(timeout_s=0.1)
+    finally:
+        proxy.close()
+    assert not alive(proxy.pid)
+
+
+@pytest.mark.process
+def test_a_private_proxy_ends_when_its_parent_is_killed(tmp_path: Path) -> None:
+    parent = textwrap.dedent(
+        """
+        import sys, time
+        sys.path.insert(0, {root!r})
+        from skyloop.client.private import PrivateProxy
+        proxy = PrivateProxy("fake://", {command!r})
+        print(proxy.pid, flush=True)
+        time.sleep(60)
+        """
+    ).format(root=str(ROOT), command=[sys.executable, "-c", "import os, sys; os.read(int(sys.argv[-1]), 1)"])
+    process = subprocess.Popen([sys.executable, "-c", parent], stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    child = int(process.stdout.readline())
+    descriptor = os.pidfd_open(child)
+    try:
+        process.kill()
+        process.wait(10.0)
+        ended, _, _ = select.select([descriptor], [], [], 10.0)
+        assert ended, "the child lives on"
+    finally:
+        os.close(descriptor)
+        process.stdout.close()

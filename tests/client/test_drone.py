@@ -1,0 +1,419 @@
+"""A drone against a proxy that is played by the test: reading, listening, waiting, statistics, the end."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from skyloop.client import Drone, Frame, LinkStatus
+from skyloop.errors import ClosedError, NoAnswerError, UnknownNameError, UsageError
+from skyloop.messages import (
+    Annotation,
+    Applied,
+    Encoding,
+    Event,
+    EventKind,
+    Feedback,
+    FlightState,
+    GetStatistics,
+    Hover,
+    LinkState,
+    Polyline,
+    ReleaseAuthority,
+    Statistics,
+    Text,
+)
+from skyloop.transport.base import ANNOTATIONS, COMMANDS, video
+from tests.client.scripted import WAIT_S, ScriptedProxy, background, flown, scripted
+
+
+@pytest.fixture
+def proxy() -> Iterator[ScriptedProxy]:
+    with scripted() as proxy:
+        yield proxy
+
+
+@pytest.fixture
+def drone(proxy: ScriptedProxy) -> Iterator[Drone]:
+    with flown(proxy) as drone:
+        yield drone
+
+
+def subscribed(proxy: ScriptedProxy, topic: str) -> bool:
+    return proxy.server.subscribers(topic) > 0
+
+
+def test_what_it_is(drone: Drone) -> None:
+    assert (drone.name, drone.uri, drone.app_id) == ("scripted", "scripted://", 1)
+    assert [camera.name for camera in drone.capabilities.cameras] == ["front", "bottom"]
+    assert drone.link == LinkStatus(LinkState.UP, LinkState.UP)
+    assert repr(drone) == "<Drone scripted (up, authority held)>"
+
+
+def test_feedback_newest_next_and_aged(proxy: ScriptedProxy, drone: Drone) -> None:
+    first = drone.next_feedback()
+    second = drone.next_feedback()
+    assert second.seq > first.seq
+    proxy.beating.clear()
+    sample = proxy.feedback(captured_ns=time.monotonic_ns() - 10**9, battery=0.5)
+    drone.wait(lambda feedback: feedback.battery == 0.5, WAIT_S)
+    assert drone.feedback() == sample
+    assert drone.feedback(max_age_s=60.0) == sample
+    with pytest.raises(NoAnswerError, match=r"s old, 0\.5 s were allowed"):
+        drone.feedback(max_age_s=0.5)
+    with pytest.raises(NoAnswerError, match="no feedback came within"):
+        drone.next_feedback(timeout_s=0.02)
+
+
+def test_frames_newest_and_next(proxy: ScriptedProxy, drone: Drone) -> None:
+    assert drone.frame() is None
+    proxy.frame(1, value=11)
+    first = drone.next_frame(timeout_s=WAIT_S)
+    assert isinstance(first, Frame)
+    assert (first.camera, first.seq, first.shape) == ("front", 1, (6, 8, 3))
+    assert np.all(first == 11)
+    assert first.feedback is not None
+    newest = drone.frame()
+    assert newest is not None
+    assert newest.seq == 1
+    with pytest.raises(NoAnswerError, match="no frame of front"):
+        drone.next_frame(timeout_s=0.02)
+    proxy.frame(2)
+    assert drone.next_frame(timeout_s=WAIT_S).seq == 2
+    assert drone.frame(max_age_s=60.0) is not None
+    assert drone.frame(max_age_s=0.0) is None
+
+
+def test_an_unknown_camera(drone: Drone) -> None:
+    with pytest.raises(UnknownNameError, match="did you mean 'bottom'"):
+        drone.frame("botom")
+    with pytest.raises(UnknownNameError):
+        drone.next_frame("left")
+    with pytest.raises(UnknownNameError):
+        drone.add_processor(lambda frame: None, "left")
+
+
+def test_frames_as_an_iterator(proxy: ScriptedProxy, drone: Drone) -> None:
+    got: list[int] = []
+    waiting = threading.Event()
+
+    def look() -> None:
+        for frame in drone.frames("bottom", timeout_s=WAIT_S):
+            got.append(frame.seq)
+            waiting.set()
+            if frame.seq == 3:
+                return
+
+    thread = threading.Thread(target=look)
+    thread.start()
+    drone.wait(lambda _: subscribed(proxy, video("bottom")), WAIT_S)
+    for seq in (1, 2, 3):
+        proxy.frame(seq, "bottom")
+        assert waiting.wait(WAIT_S)
+        waiting.clear()
+    thread.join(WAIT_S)
+    assert got == [1, 2, 3]
+    drone.wait(lambda _: not subscribed(proxy, video("bottom")), WAIT_S)
+
+
+def test_an_iterator_that_gets_nothing_says_so(drone: Drone) -> None:
+    with pytest.raises(NoAnswerError, match=r"no frame of front came within 0\.02 s"):
+        next(iter(drone.frames(timeout_s=0.02)))
+
+
+def test_closing_ends_iterators_and_waits(proxy: ScriptedProxy, drone: Drone) -> None:
+    ends: list[object] = []
+
+    def iterate() -> None:
+        ends.append(list(drone.frames()))
+
+    def wait() -> None:
+        with pytest.raises(ClosedError):
+            drone.wait("flying", WAIT_S)
+        with pytest.raises(ClosedError):
+            drone.next_frame()
+        ends.append("closed")
+
+    threads = [threading.Thread(target=iterate), threading.Thread(target=wait)]
+    for thread in threads:
+        thread.start()
+    drone.wait(lambda _: subscribed(proxy, video("front")), WAIT_S)
+    drone.close()
+    for thread in threads:
+        thread.join(WAIT_S)
+    assert len(ends) == 2
+    assert [] in ends
+    for use in (drone.feedback, drone.frame, drone.hover, drone.release_authority, drone.__enter__):
+        with pytest.raises(ClosedError, match="connect again"):
+            use()
+    drone.close()
+
+
+def test_processors_each_at_their_own_pace(proxy: ScriptedProxy, drone: Drone) -> None:
+    entered, go_on = threading.Event(), threading.Event()
+    slow: list[int] = []
+    quick: list[int] = []
+
+    def think(frame: Frame) -> None:
+        slow.append(frame.seq)
+        entered.set()
+        go_on.wait(WAIT_S)
+
+    thinker = drone.add_processor(think, name="thinker")
+    shown = threading.Semaphore(0)
+
+    def watch(frame: Frame) -> None:
+        quick.append(frame.seq)
+        shown.release()
+
+    watcher = drone.add_processor(watch, depth=20)
+    proxy.frame(1)
+    assert entered.wait(WAIT_S)
+    assert shown.acquire(timeout=WAIT_S)
+    for seq in range(2, 9):
+        proxy.frame(seq)
+        assert shown.acquire(timeout=WAIT_S)
+    entered.clear()
+    go_on.set()
+    assert entered.wait(WAIT_S)
+    assert slow == [1, 8]
+    assert (thinker.delivered, thinker.dropped, watcher.dropped) == (2, 6, 0)
+    assert quick == list(range(1, 9))
+    assert drone.stats["video/front"].dropped == 6
+    thinker.cancel()
+    watcher.cancel()
+    with pytest.raises(UsageError, match="depth"):
+        drone.add_processor(think, depth=0)
+
+
+def test_frames_that_cannot_be_understood(proxy: ScriptedProxy, drone: Drone) -> None:
+    pytest.importorskip("cv2")
+    got: list[int] = []
+    with drone.add_processor(lambda frame: got.append(frame.seq), inline=True):
+        proxy.frame(1, encoding=Encoding.JPEG)
+        proxy.frame(2)
+        drone.wait(lambda _: got == [2], WAIT_S)
+        assert drone.stats["video/front"].malformed == 1
+
+
+def test_a_repeated_or_overtaken_frame_is_not_shown_again(proxy: ScriptedProxy, drone: Drone) -> None:
+    got: list[int] = []
+    with drone.add_processor(lambda frame: got.append(frame.seq), inline=True):
+        for seq in (1, 2, 2, 1, 5):
+            proxy.frame(seq)
+        drone.wait(lambda _: 5 in got, WAIT_S)
+        assert got == [1, 2, 5]
+        assert drone.stats["video/front"].lost == 2
+
+
+def test_listeners(proxy: ScriptedProxy, drone: Drone) -> None:
+    feedback: list[Feedback] = []
+    inline: list[str] = []
+    events: list[Event] = []
+    applied: list[Applied] = []
+    with (
+        drone.on_feedback(feedback.append),
+        drone.on_feedback(lambda _: inline.append(threading.current_thread().name), inline=True),
+        drone.on_event(events.append),
+        drone.on_command(applied.append),
+    ):
+        drone.wait(lambda _: subscribed(proxy, COMMANDS), WAIT_S)
+        now_ns = time.monotonic_ns()
+        proxy.event(EventKind.BATTERY_LOW, "low", battery=0.1)
+        echo = Applied(1, 1, drone.app_id, now_ns - 2_000_000, now_ns, Hover(), Hover())
+        proxy.publish(echo, COMMANDS)
+        drone.wait(lambda _: bool(feedback and inline and events and applied), WAIT_S)
+    assert events[0].kind is EventKind.BATTERY_LOW
+    assert applied == [echo]
+    assert inline[0].startswith("skyloop-memory-client")
+    assert drone.recent_events()[-1].text == "low"
+    delay = drone.stats["command"].delay_s
+    assert delay is not None
+    assert delay.median == pytest.approx(0.002)
+
+
+def test_link_listeners_and_the_vehicle_s_hop(proxy: ScriptedProxy, drone: Drone) -> None:
+    told: list[LinkStatus] = []
+    with drone.on_link(told.append):
+        proxy.event(EventKind.VEHICLE_LINK, "no answer", state="lost", reason="no navdata")
+        proxy.more["vehicle_link"] = LinkState.LOST
+        drone.wait(lambda feedback: feedback.vehicle_link is LinkState.LOST and bool(told), WAIT_S)
+    assert told[0] == LinkStatus(LinkState.UP, LinkState.LOST, "no navdata")
+    assert drone.link == told[0]
+
+
+def test_a_raising_listener_is_an_event(proxy: ScriptedProxy, drone: Drone) -> None:
+    def raising(feedback: Feedback) -> None:
+        raise RuntimeError("boo")
+
+    events: list[Event] = []
+    with drone.on_event(events.append), drone.on_feedback(raising) as listener:
+        drone.wait(lambda _: bool(events) and listener.errors > 2, WAIT_S)
+    assert events[0].kind is EventKind.CALLBACK_ERROR
+    assert (events[0].seq, events[0].data, events[0].app) == (0, {"where": "feedback"}, "me")
+    assert "RuntimeError: boo" in events[0].text
+
+
+def test_a_raising_event_listener_does_not_feed_itself(proxy: ScriptedProxy, drone: Drone) -> None:
+    def raising(event: Event) -> None:
+        raise RuntimeError("boo")
+
+    with drone.on_event(raising) as listener:
+        proxy.event(EventKind.BATTERY_LOW)
+        drone.wait(lambda _: listener.errors == 2, WAIT_S)
+        seq = drone.feedback().seq
+        drone.wait(lambda feedback: feedback.seq > seq + 10, WAIT_S)
+        assert listener.errors == 2
+
+
+def test_inline_listeners_must_not_wait(proxy: ScriptedProxy, drone: Drone) -> None:
+    problems: list[str] = []
+
+    def waiting(feedback: Feedback) -> None:
+        for call in (lambda: drone.wait("flying"), drone.takeoff, drone.next_feedback, drone.next_frame):
+            try:
+                call()
+            except UsageError as error:
+                problems.append(str(error))
+        try:
+            _ = drone.config["limits.tilt"]
+        except Exception as error:  # noqa: BLE001
+            problems.append(str(error))
+
+    with drone.on_feedback(waiting, inline=True):
+        drone.wait(lambda _: len(problems) >= 5, WAIT_S)
+    assert all("inline listener can't wait" in problem for problem in problems)
+
+
+def test_not_callable(drone: Drone) -> None:
+    with pytest.raises(UsageError, match="can't be called"):
+        drone.on_event("print")  # type: ignore[arg-type]
+
+
+def test_wait_for_states_and_predicates(proxy: ScriptedProxy, drone: Drone) -> None:
+    assert drone.wait("landed", WAIT_S).state is FlightState.LANDED
+    proxy.state = FlightState.FLYING
+    assert drone.wait(["hovering", FlightState.FLYING], WAIT_S).state is FlightState.FLYING
+    with pytest.raises(NoAnswerError, match=r"not hovering or landed within 0\.02 s: it is flying"):
+        drone.wait(("hovering", "landed"), 0.02)
+    with pytest.raises(UnknownNameError, match="did you mean 'hovering'"):
+        drone.wait("hoovering")
+
+
+def test_annotations_both_ways(proxy: ScriptedProxy, drone: Drone) -> None:
+    got: list[Annotation] = []
+    proxy.frame(1)
+    drone.frame()
+    drone.wait(lambda _: subscribed(proxy, video("front")), WAIT_S)
+    proxy.frame(2)
+    frame = drone.next_frame(timeout_s=WAIT_S)
+    shape = Polyline(((0.0, 0.0), (1.0, 1.0)))
+    with drone.on_annotation(got.append):
+        assert drone.annotate(frame, [shape], source="tracker")
+        proxy.until(lambda: bool(proxy.others))
+        sent = proxy.others[0]
+        assert sent == Annotation("tracker", "front", frame.captured_ns, 8, 6, (shape,))
+        drone.wait(lambda _: subscribed(proxy, ANNOTATIONS), WAIT_S)
+        proxy.publish(sent, ANNOTATIONS)  # type: ignore[arg-type]
+        drone.wait(lambda _: bool(got), WAIT_S)
+    assert got == [sent]
+
+
+def test_drawings_may_come_from_numpy_and_are_checked(proxy: ScriptedProxy, drone: Drone) -> None:
+    drone.frame()
+    drone.wait(lambda _: subscribed(proxy, video("front")), WAIT_S)
+    proxy.frame(1)
+    frame = drone.next_frame(timeout_s=WAIT_S)
+    corners: Any = np.array([[0.0, 0.5], [1.0, 1.0]], np.float32)
+    assert drone.annotate(frame, [Polyline(corners), Text("it", (np.float64(1.5), 2.0))])
+    proxy.until(lambda: bool(proxy.others))
+    sent = proxy.others[0]
+    assert isinstance(sent, Annotation)
+    assert sent.shapes == (Polyline(((0.0, 0.5), (1.0, 1.0))), Text("it", (1.5, 2.0)))
+    wrong: Any
+    for wrong in ([3], [Polyline((("a", "b"),))], [object()], [Text("x" * 300, (0.0, 0.0))]):  # type: ignore[arg-type]
+        with pytest.raises(UsageError, match="can't be drawn"):
+            drone.annotate(frame, wrong)
+    with pytest.raises(UsageError):
+        drone.annotate(frame, [], source="x" * 65)
+
+
+def test_statistics(proxy: ScriptedProxy, drone: Drone) -> None:
+    proxy.answers[GetStatistics] = Statistics(
+        {"commands.delay.count": 9.0, "commands.delay.median_s": 0.0001, "commands.delay.p99_s": 0.0002}
+    )
+    drone.hover()
+    start = drone.stats["feedback"].count
+    drone.wait(lambda _: drone.stats["feedback"].count > start + 20, WAIT_S)
+    proxy.feedback(skip=3)
+    drone.wait(lambda _: drone.stats["feedback"].lost >= 3, WAIT_S)
+    stats = drone.stats
+    assert set(stats) == {"command", "feedback", "video/front", "video/bottom"}
+    assert stats["command"].count >= 1
+    assert stats["command"].delay_s is not None
+    assert (stats["command"].delay_s.median, stats["command"].delay_s.count) == (0.0001, 9)
+    assert stats["feedback"].lost >= 3
+    assert 30.0 < stats["feedback"].rate_hz < 130.0
+    assert stats["feedback"].delay_s is not None
+    assert 0.0 < stats["feedback"].delay_s.median < 0.05
+    assert stats["feedback"].age_s is not None
+    assert stats["video/front"].count == 0
+    assert stats["video/front"].age_s is None
+    proxy.answers[GetStatistics] = None  # a proxy that does not answer costs a moment, and the figure
+    assert drone.stats["command"].delay_s is None
+
+
+def test_the_end_of_the_block_lands(proxy: ScriptedProxy) -> None:
+    with flown(proxy) as drone:
+        proxy.state = FlightState.FLYING
+        drone.wait("flying", WAIT_S)
+        with drone:
+            landing = background(
+                lambda: proxy.until(lambda: "land" in [action.name for action in proxy.actions()]),
+                lambda: setattr(proxy, "state", FlightState.LANDED),
+            )
+        landing.join(WAIT_S)
+        assert "land" in [action.name for action in proxy.actions()]
+        assert isinstance(proxy.requests[-1], ReleaseAuthority)
+        assert drone.closed
+
+
+def test_the_end_of_the_block_hovers_if_asked_to(proxy: ScriptedProxy) -> None:
+    with flown(proxy, on_exit="hover") as drone:
+        proxy.state = FlightState.FLYING
+        drone.wait("flying", WAIT_S)
+        with drone:
+            pass
+    assert Hover() in proxy.actions()
+    assert "land" not in [action.name for action in proxy.actions()]
+
+
+def test_an_error_in_the_block_comes_out_and_a_landing_that_fails_is_logged(
+    proxy: ScriptedProxy, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_landing() -> bool:
+        raise NoAnswerError("it did not land")
+
+    with flown(proxy) as drone:
+        drone.command(Hover())
+        monkeypatch.setattr(drone, "land", no_landing)
+        with pytest.raises(RuntimeError, match="mine"), drone:
+            raise RuntimeError("mine")
+    assert "it did not land" in caplog.text
+
+
+def test_a_landed_drone_is_just_left(proxy: ScriptedProxy) -> None:
+    with flown(proxy) as drone, drone:
+        pass
+    assert {action.name for action in proxy.actions()} <= {"idle"}
+
+
+@pytest.mark.parametrize("options", [{"access": "fly"}, {"on_exit": "crash"}, {"app": ""}, {"app": "x" * 65}])
+def test_unusable_options(proxy: ScriptedProxy, options: dict[str, str]) -> None:
+    with pytest.raises(UsageError):
+        Drone(proxy.server.dial, **{"app": "me", **options})  # type: ignore[arg-type]

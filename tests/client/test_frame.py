@@ -1,0 +1,143 @@
+"""Frames and where their memory comes from."""
+
+from __future__ import annotations
+
+import pickle
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+
+from skyloop.client.frame import Arrival, size_error, to_bgr
+from skyloop.client.history import FeedbackHistory
+from skyloop.errors import DecodeError, MissingExtraError
+from skyloop.messages import Encoding, Feedback, FrameHeader, Intrinsics
+
+K = Intrinsics(10.0, 10.0, 4.0, 3.0)
+
+
+def header(encoding: Encoding = Encoding.BGR8, width: int = 8, height: int = 6, size: int = 144) -> FrameHeader:
+    return FrameHeader("front", 7, 1000, 2000, width, height, encoding, size, K)
+
+
+def pixels(size: int = 144) -> np.ndarray[tuple[int], np.dtype[np.uint8]]:
+    return (np.arange(size) % 251).astype(np.uint8)
+
+
+def arrival(head: FrameHeader, data: np.ndarray[tuple[int], np.dtype[np.uint8]]) -> Arrival:
+    return Arrival(head, data, 3000, 500, FeedbackHistory(), clock=lambda: 4500)
+
+
+def test_a_frame_is_the_received_memory_and_knows_its_origin() -> None:
+    data = pixels()
+    frame = arrival(header(), data).frame()
+    assert isinstance(frame, np.ndarray)
+    assert frame.shape == (6, 8, 3)
+    assert frame.dtype == np.uint8
+    assert np.shares_memory(frame, data)
+    assert not frame.flags.writeable
+    with pytest.raises(ValueError, match="read-only"):
+        frame[0, 0, 0] = 1
+    assert (frame.camera, frame.seq, frame.captured_ns, frame.published_ns, frame.received_ns) == (
+        "front",
+        7,
+        1000,
+        2000,
+        3000,
+    )
+    assert frame.intrinsics is K
+    assert frame.header.encoding is Encoding.BGR8
+    assert frame.age_s == pytest.approx((4500 + 500 - 1000) / 1e9)
+    assert type(frame.image) is np.ndarray
+    assert frame.feedback is None
+    assert frame.feedback_reach_s is None
+
+
+def test_what_is_derived_is_plain() -> None:
+    frame = arrival(header(), pixels()).frame()
+    own = frame.copy()
+    own[0, 0] = (1, 2, 3)
+    assert type(own) is np.ndarray
+    assert type(frame + 1) is np.ndarray
+    assert type(frame.mean(axis=0)) is np.ndarray
+    assert isinstance(frame.mean(), float)
+    assert type(frame == frame) is np.ndarray
+    others: list[Any] = [frame[1:], frame.reshape(-1), pickle.loads(pickle.dumps(frame))]
+    for derived in others:
+        with pytest.raises(AttributeError, match="derived from a frame and has no captured_ns"):
+            _ = derived.captured_ns
+        with pytest.raises(AttributeError):
+            _ = derived.feedback
+    with pytest.raises(AttributeError, match="no attribute 'colour'"):
+        _ = frame.colour
+
+
+def test_consumers_share_one_frame() -> None:
+    shared = arrival(header(), pixels())
+    first = shared.frame()
+    assert shared.frame() is first
+
+
+def test_rgb_and_mono_become_bgr() -> None:
+    rgb = to_bgr(header(Encoding.RGB8), pixels())
+    assert np.array_equal(rgb, pixels().reshape(6, 8, 3)[:, :, ::-1])
+    assert rgb.flags.c_contiguous
+    mono = to_bgr(header(Encoding.MONO8, size=48), pixels(48))
+    assert mono.shape == (6, 8, 3)
+    assert np.array_equal(mono[:, :, 0], pixels(48).reshape(6, 8))
+    assert np.array_equal(mono[:, :, 0], mono[:, :, 2])
+
+
+def test_jpeg_is_decoded_once() -> None:
+    cv2 = pytest.importorskip("cv2")
+    picture = np.full((24, 32, 3), (200, 100, 50), np.uint8)
+    _, data = cv2.imencode(".jpg", picture)
+    flat = data.reshape(-1)
+    one = arrival(header(Encoding.JPEG, 32, 24, flat.size), flat)
+    frame = one.frame()
+    assert np.abs(frame.astype(int) - picture).max() < 8
+    image = frame.base
+    del frame
+    assert one.frame().base is image, "decoded again"
+
+
+@pytest.mark.parametrize("data", [b"\xff\xd8no picture", b"\xff", b"\0" * 100])
+def test_a_broken_jpeg(data: bytes) -> None:
+    pytest.importorskip("cv2")
+    broken = np.frombuffer(data, np.uint8)
+    with pytest.raises(DecodeError, match="not a JPEG of 8 × 6"):
+        arrival(header(Encoding.JPEG, size=broken.size), broken).frame()
+
+
+def test_a_jpeg_without_opencv(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with pytest.raises(MissingExtraError, match=r"skyloop\[vision\]"):
+        arrival(header(Encoding.JPEG), pixels()).frame()
+
+
+def test_a_jpeg_of_another_size_is_refused() -> None:
+    cv2 = pytest.importorskip("cv2")
+    _, data = cv2.imencode(".jpg", np.zeros((24, 32, 3), np.uint8))
+    with pytest.raises(DecodeError):
+        arrival(header(Encoding.JPEG, size=data.size), data.reshape(-1)).frame()
+
+
+def test_sizes_are_checked() -> None:
+    assert size_error(header(), 144) == ""
+    assert "143 bytes and should have 144" in size_error(header(), 143)
+    assert size_error(header(Encoding.MONO8), 48) == ""
+    assert "99" in size_error(header(Encoding.JPEG, size=99), 98)
+
+
+def test_the_state_at_the_capture_gets_better_until_it_is_final() -> None:
+    history = FeedbackHistory()
+    frame = Arrival(header(), pixels(), 3000, 0, history).frame()
+    history.add(Feedback(captured_ns=500, altitude=1.0))
+    assert frame.feedback is not None
+    assert (frame.feedback.altitude, frame.feedback_reach_s) == (1.0, 500 / 1e9)
+    history.add(Feedback(captured_ns=2000, altitude=4.0))
+    assert frame.feedback.altitude == pytest.approx(2.0)
+    assert frame.feedback_reach_s == pytest.approx(1000 / 1e9)
+    history.add(Feedback(captured_ns=100))  # the proxy was restarted: what this frame knows stays
+    assert frame.feedback.altitude == pytest.approx(2.0)

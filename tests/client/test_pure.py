@@ -1,0 +1,115 @@
+"""Offset of clocks, history of feedback, statistics."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skyloop.client.history import FeedbackHistory, interpolate
+from skyloop.client.statistics import DEPTH, ChannelCounter, distribution
+from skyloop.client.timing import OffsetEstimator
+from skyloop.messages import Feedback, FlightState
+
+angles = st.floats(-math.pi, math.pi)
+
+
+@given(
+    st.integers(-(10**15), 10**15),
+    st.lists(st.tuples(st.integers(0, 10**8), st.integers(0, 10**8)), min_size=1, max_size=40),
+)
+def test_offset_is_true_to_its_uncertainty(offset_ns: int, trips: list[tuple[int, int]]) -> None:
+    estimator = OffsetEstimator()
+    now_ns = 10**12
+    for there_ns, back_ns in trips:
+        best = estimator.add(now_ns, now_ns + there_ns + offset_ns, now_ns + there_ns + back_ns)
+        assert abs(best.ns - offset_ns) <= best.uncertainty_ns
+        now_ns += 10**9
+    assert best.uncertainty_ns <= min(there + back for there, back in trips[-16:]) // 2 + 1
+
+
+def test_the_state_between_two_samples() -> None:
+    a = Feedback(
+        captured_ns=0, yaw=3.0, altitude=1.0, velocity=(0.0, 2.0, 0.0), state=FlightState.HOVERING, battery=0.5
+    )
+    b = Feedback(captured_ns=100, yaw=-3.0, altitude=2.0, velocity=(1.0, 0.0, 0.0), state=FlightState.FLYING)
+    middle = interpolate(a, b, 25)
+    assert middle.captured_ns == 25
+    assert middle.yaw == pytest.approx(3.0 + 0.25 * (math.tau - 6.0))
+    assert middle.altitude == pytest.approx(1.25)
+    assert middle.velocity == pytest.approx((0.25, 1.5, 0.0))
+    assert (middle.state, middle.battery, middle.roll) == (FlightState.HOVERING, 0.5, None)
+    assert interpolate(a, b, 75).state is FlightState.FLYING
+    assert interpolate(a, b, 75).battery is None
+
+
+@given(angles, angles, st.floats(0.0, 1.0))
+def test_angles_take_the_shorter_way(a: float, b: float, share: float) -> None:
+    at = round(share * 10**6)
+    got = interpolate(Feedback(captured_ns=0, yaw=a), Feedback(captured_ns=10**6, yaw=b), at).yaw
+    assert got is not None
+    assert -math.pi <= got <= math.pi
+    whole = abs(math.remainder(b - a, math.tau))
+    part = abs(math.remainder(got - a, math.tau))
+    assert part == pytest.approx(whole * at / 10**6, abs=1e-9)
+
+
+def test_history_looks_on_both_sides() -> None:
+    history = FeedbackHistory(depth=4)
+    assert history.at(5) == (None, None, False)
+    for at in (0, 10**9, 2 * 10**9):
+        history.add(Feedback(captured_ns=at, altitude=at / 1e9))
+    state, reach_s, final = history.at(1_250_000_000)
+    assert state is not None
+    assert state.altitude == pytest.approx(1.25)
+    assert (reach_s, final) == (0.75, True)
+    state, reach_s, final = history.at(10**9)
+    assert state is not None
+    assert (state.captured_ns, reach_s, final) == (10**9, 0.0, True)
+    state, reach_s, final = history.at(2_500_000_000)
+    assert state is not None
+    assert (state.captured_ns, reach_s, final) == (2 * 10**9, 0.5, False), "not beyond what is known"
+    state, reach_s, final = history.at(-(10**9))
+    assert state is not None
+    assert (state.captured_ns, reach_s, final) == (0, 1.0, False)
+
+
+def test_history_of_a_restarted_proxy_is_its_own() -> None:
+    history = FeedbackHistory()
+    history.add(Feedback(captured_ns=100))
+    history.add(Feedback(captured_ns=50))
+    state, _, _ = history.at(100)
+    assert state is not None
+    assert state.captured_ns == 50
+
+
+def test_distribution() -> None:
+    assert distribution(np.array([], np.int64)) is None
+    figures = distribution(np.arange(1, 101, dtype=np.int64) * 1_000_000)
+    assert figures is not None
+    assert figures.median == pytest.approx(0.0505)
+    assert figures.p99 == pytest.approx(0.099)
+    assert figures.maximum == pytest.approx(0.1)
+    assert figures.count == 100
+    assert figures.mean == pytest.approx(0.0505)
+
+
+def test_counter() -> None:
+    counter = ChannelCounter()
+    assert counter.stats(0).rate_hz == 0.0
+    assert counter.stats(0).delay_s is None
+    for number in range(3 * DEPTH):
+        now_ns = 10**9 + number * 10**7
+        counter.follow(number * 2)
+        counter.add(1000 + number, now_ns - 5000, now_ns)
+    stats = counter.stats(now_ns + 10**6, dropped=3, malformed=2)
+    assert (stats.count, stats.lost, stats.dropped, stats.malformed) == (3 * DEPTH, 3 * DEPTH - 1, 3, 2)
+    assert stats.rate_hz == pytest.approx(100.0)
+    assert stats.age_s == pytest.approx((10**6 + 5000) / 1e9)
+    assert stats.delay_s is not None
+    assert stats.delay_s.count == DEPTH
+    assert stats.delay_s.maximum == pytest.approx((1000 + 3 * DEPTH - 1) / 1e9)
+    assert counter.stats(now_ns + 3 * 10**9).rate_hz == 0.0, "it has stopped"

@@ -1,0 +1,128 @@
+"""The controller around the law: pictures in, commands, drawings and counts out. No simulator, no process."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+
+from skyloop.client.frame import Arrival, Frame
+from skyloop.client.history import FeedbackHistory
+from skyloop.control.follow import FollowMarker, FollowScore
+from skyloop.control.follow_law import Mode
+from skyloop.errors import UnknownNameError
+from skyloop.messages import CameraInfo, Capabilities, Encoding, Feedback, FrameHeader, Polyline, Text
+from tests.vision.draw import INTRINSICS, facing, picture
+
+FORWARD = (0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0)
+
+
+class Recorder:
+    """Stands for the drone: keeps what it is told."""
+
+    def __init__(self) -> None:
+        cameras = (CameraInfo("front", 320, 240, 15.0, rotation=FORWARD), CameraInfo("bottom", 320, 240, 15.0))
+        self.capabilities = Capabilities("sim", frozenset({"velocity"}), cameras)
+        self.velocities: list[dict[str, float]] = []
+        self.hovers = 0
+        self.drawn: list[list[Any]] = []
+
+    def velocity(self, **values: float) -> None:
+        self.velocities.append(values)
+
+    def hover(self) -> None:
+        self.hovers += 1
+
+    def annotate(self, frame: Frame, shapes: list[Any], source: str) -> None:
+        self.drawn.append(shapes)
+
+
+def state(captured_ns: int) -> Feedback:
+    return Feedback(
+        captured_ns=captured_ns,
+        roll=0.0,
+        pitch=0.0,
+        yaw=0.0,
+        altitude=1.0,
+        velocity=(0, 0, 0),
+        angular_velocity=(0, 0, 0),
+    )
+
+
+def frame(captured_ns: int, markers: list[tuple[int, list[float]]], known: bool = True) -> Frame:
+    image = picture([(number, facing(), np.array(place)) for number, place in markers])
+    history = FeedbackHistory()
+    if known:
+        history.add(state(captured_ns))
+    header = FrameHeader("front", 1, captured_ns, captured_ns, 320, 240, Encoding.BGR8, image.size, INTRINSICS)
+    return Arrival(header, image.reshape(-1), captured_ns, 0, history).frame()
+
+
+@pytest.fixture
+def drone() -> Recorder:
+    return Recorder()
+
+
+@pytest.fixture
+def follower(drone: Recorder) -> FollowMarker:
+    return FollowMarker(drone, 7)  # type: ignore[arg-type]
+
+
+def test_goes_to_its_own_marker_and_draws_it(follower: FollowMarker, drone: Recorder) -> None:
+    now = time.monotonic_ns()
+    follower.on_feedback(state(now))
+    follower.on_frame(frame(now, [(7, [0.3, 0.0, 2.5]), (3, [-0.5, 0.0, 2.0])]))
+    assert follower.mode is Mode.FOLLOWING
+    assert drone.velocities[-1]["forward"] > 0.2
+    assert drone.velocities[-1]["yaw_rate"] < -0.05, "it is to the right"
+    texts = [shape.text for shape in drone.drawn[-1] if isinstance(shape, Text)]
+    assert texts == ["marker 7  2.52 m"]
+    assert sum(isinstance(shape, Polyline) and shape.closed for shape in drone.drawn[-1]) == 2
+    assert follower.score.range_errors_m() == [pytest.approx(1.018, abs=0.05)]
+
+
+def test_searches_for_its_own_marker_only(follower: FollowMarker, drone: Recorder) -> None:
+    now = time.monotonic_ns()
+    follower.on_feedback(state(now))
+    follower.on_frame(frame(now, [(3, [0.0, 0.0, 2.0])]))
+    assert follower.mode is Mode.SEARCHING
+    assert drone.velocities[-1]["yaw_rate"] == pytest.approx(0.7)
+    assert drone.velocities[-1]["forward"] == 0.0
+    assert follower.score.share_in_view is None
+    assert follower.score.frames_before == 1
+    assert any(isinstance(s, Text) and s.text == "searching marker 7" for s in drone.drawn[-1])
+
+
+def test_frame_without_state_is_looked_at_but_not_flown_by(follower: FollowMarker, drone: Recorder) -> None:
+    now = time.monotonic_ns()
+    follower.on_feedback(state(now))
+    follower.on_frame(frame(now, [(7, [0.0, 0.0, 2.5])], known=False))
+    assert drone.velocities[-1]["forward"] == 0.0
+    assert follower.score.share_in_view == 1.0
+
+
+def test_holds_its_place_when_pictures_stop(follower: FollowMarker, drone: Recorder) -> None:
+    now = time.monotonic_ns()
+    follower.on_feedback(state(now))
+    follower.on_frame(frame(now, [(7, [0.0, 0.0, 2.5])]))
+    follower.on_feedback(state(now + 300_000_000))
+    assert drone.hovers == 0
+    follower.on_feedback(state(now + 600_000_000))
+    assert drone.hovers == 1
+
+
+def test_unknown_camera(drone: Recorder) -> None:
+    with pytest.raises(UnknownNameError, match="front"):
+        FollowMarker(drone, 7, camera="frnt")  # type: ignore[arg-type]
+
+
+def test_score_counts_from_the_first_sighting() -> None:
+    score = FollowScore()
+    for at_s, error in enumerate([None, None, 0.9, 0.2, None, -0.1]):
+        score.count(at_s * 10**9, error)
+    assert (score.frames_before, score.frames, score.in_view) == (2, 4, 3)
+    assert score.share_in_view == pytest.approx(0.75)
+    assert score.range_errors_m() == [0.9, 0.2, -0.1]
+    assert score.range_errors_m(after_s=1.0) == [0.2, -0.1]

@@ -1,0 +1,89 @@
+"""A vehicle for tests: it does at once what it is told, and tells its state at a steady rate."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+
+from skyloop.drivers.base import Driver, Sink
+from skyloop.drivers.uri import VehicleUri
+from skyloop.messages import (
+    ACTION_NAMES,
+    Action,
+    AnyAction,
+    Attitude,
+    CameraInfo,
+    Capabilities,
+    EmergencyStop,
+    Feedback,
+    FlightState,
+    Hover,
+    Land,
+    LinkState,
+    ResetEmergency,
+    Takeoff,
+    Velocity,
+)
+
+PERIOD_S = 0.02
+NEXT: dict[type[Action], FlightState] = {
+    Takeoff: FlightState.HOVERING,
+    Hover: FlightState.HOVERING,
+    Land: FlightState.LANDED,
+    Velocity: FlightState.FLYING,
+    Attitude: FlightState.FLYING,
+    EmergencyStop: FlightState.EMERGENCY,
+    ResetEmergency: FlightState.LANDED,
+}
+
+
+class FakeVehicle(Driver):
+    """Has a camera ``front`` of 32 × 24 pixels that shows the frame's number."""
+
+    def __init__(self, *, can_fly: bool = True) -> None:
+        super().__init__(VehicleUri("fake", text="fake://test"))
+        self.can_fly = can_fly
+        self.state = FlightState.LANDED
+        self.applied: list[AnyAction] = []
+        self.link_state = LinkState.UP
+        self.mute = threading.Event()  #: tells nothing while set
+        self._ended = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def capabilities(self) -> Capabilities:
+        return Capabilities(
+            "fake",
+            frozenset(ACTION_NAMES.values()) if self.can_fly else frozenset(),
+            (CameraInfo("front", 32, 24, 1 / PERIOD_S),),
+            why_not="" if self.can_fly else "it is a picture only",
+        )
+
+    def _open(self, sink: Sink) -> None:
+        self._ended.clear()
+        sink.link(LinkState.UP)
+        self._thread = threading.Thread(target=self._run, args=(sink,), daemon=True, name="fake-vehicle")
+        self._thread.start()
+
+    def _close(self) -> None:
+        self._ended.set()
+        if self._thread is not None:
+            self._thread.join()
+
+    def _apply(self, action: AnyAction) -> AnyAction:
+        self.applied.append(action)
+        self.state = NEXT.get(type(action), self.state)
+        return action
+
+    def _run(self, sink: Sink) -> None:
+        number = 0
+        while not self._ended.wait(PERIOD_S):
+            if self.mute.is_set():
+                continue
+            number += 1
+            now_ns = time.monotonic_ns()
+            sink.feedback(Feedback(captured_ns=now_ns, state=self.state, yaw=number * 0.01, altitude=1.0))
+            if sink.wants("front"):
+                picture = np.full((24, 32, 3), number % 256, np.uint8)
+                sink.frame("front", picture, now_ns, width=32, height=24)

@@ -1,0 +1,103 @@
+"""Real proxies and applications as processes, in a directory of sockets of their own."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import IO
+
+import pytest
+
+STARTS_WITHIN_S = 20.0
+
+
+@pytest.fixture(autouse=True)
+def sockets(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A directory of sockets for this test alone; with a short path, as those of sockets must be."""
+    with tempfile.TemporaryDirectory(prefix="skyloop-") as folder:
+        monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", str(Path(folder) / "run"))
+        yield Path(folder) / "run"
+
+
+class Process:
+    """A child whose lines can be waited for. Ended by its own number, whatever happens."""
+
+    def __init__(self, *arguments: str) -> None:
+        self.started_s = time.monotonic()
+        self._popen = subprocess.Popen(
+            [sys.executable, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env={**os.environ}
+        )
+        self.text = ""
+
+    @property
+    def pid(self) -> int:
+        return self._popen.pid
+
+    def until(self, words: str, timeout_s: float = STARTS_WITHIN_S) -> None:
+        """Read until it has said this."""
+        stream: IO[bytes] | None = self._popen.stdout
+        assert stream is not None
+        deadline = time.monotonic() + timeout_s
+        while words not in self.text:
+            ready, _, _ = select.select([stream], [], [], max(0.0, deadline - time.monotonic()))
+            assert ready, f"it did not say {words!r} within {timeout_s} s but: {self.text}"
+            said = os.read(stream.fileno(), 4096)
+            assert said, f"it ended without saying {words!r}: {self.text}"
+            self.text += said.decode()
+
+    def signal(self, number: signal.Signals) -> None:
+        os.kill(self.pid, number)
+
+    def wait(self, timeout_s: float = 10.0) -> int:
+        return self._popen.wait(timeout_s)
+
+    def end(self) -> None:
+        if self._popen.poll() is None:
+            os.kill(self.pid, signal.SIGCONT)
+            os.kill(self.pid, signal.SIGKILL)
+            self._popen.wait(10)
+        if self._popen.stdout is not None:
+            self._popen.stdout.close()
+
+
+@pytest.fixture
+def start() -> Iterator[Callable[..., Process]]:
+    """Starts Python processes that end with the test."""
+    running: list[Process] = []
+
+    def begin(*arguments: str) -> Process:
+        process = Process(*arguments)
+        running.append(process)
+        return process
+
+    yield begin
+    for process in reversed(running):
+        process.end()
+
+
+@pytest.fixture
+def proxy(start: Callable[..., Process]) -> Callable[..., Process]:
+    """Starts a proxy and waits until it serves."""
+
+    def begin(uri: str = "sim://?world=empty&cameras=none", name: str = "alpha") -> Process:
+        process = start("-m", "skyloop", "proxy", uri, "--name", name)
+        process.until("ready")
+        return process
+
+    return begin
+
+
+def eventually(condition: Callable[[], bool], what: str, timeout_s: float = 5.0) -> float:
+    """Wait in small steps for what nothing signals, never longer than this; how long it took [s]."""
+    begin = time.monotonic()
+    while not condition():
+        assert time.monotonic() - begin < timeout_s, f"not within {timeout_s} s: {what}"
+        time.sleep(0.002)
+    return time.monotonic() - begin

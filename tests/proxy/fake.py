@@ -1,0 +1,279 @@
+"""A proxy on a bench: a vehicle that does what it is told at once, applications over the memory transport, and a clock
+that stands still. A Ping's answer shows that everything sent before it was dealt with and everything told was heard."""
+
+from __future__ import annotations
+
+import queue
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from skyloop.clock import Clock, ManualClock
+from skyloop.drivers.base import Driver, Sink
+from skyloop.drivers.uri import VehicleUri
+from skyloop.messages import (
+    ACTION_NAMES,
+    AnyAction,
+    AnyReply,
+    AnyRequest,
+    Applied,
+    Attitude,
+    AuthorityGranted,
+    CameraInfo,
+    Capabilities,
+    Command,
+    EmergencyStop,
+    Event,
+    EventKind,
+    Feedback,
+    FlightState,
+    FrameHeader,
+    Hello,
+    Hover,
+    Land,
+    LinkState,
+    Parameter,
+    Ping,
+    Pong,
+    Reply,
+    Request,
+    RequestAuthority,
+    ResetEmergency,
+    Role,
+    Sample,
+    Takeoff,
+    Value,
+    Velocity,
+    Welcome,
+    decode,
+    encode,
+)
+from skyloop.proxy import Proxy
+from skyloop.transport.base import ANNOTATIONS, COMMANDS, EVENTS, FEEDBACK, ClientEnd, Dialer, Pixels
+from skyloop.transport.memory import MemoryServer
+
+WAIT_S = 10.0
+ALL = frozenset(ACTION_NAMES.values())
+_NEXT = {
+    Takeoff: FlightState.TAKING_OFF,
+    Hover: FlightState.HOVERING,
+    Land: FlightState.LANDING,
+    Attitude: FlightState.FLYING,
+    Velocity: FlightState.FLYING,
+    EmergencyStop: FlightState.EMERGENCY,
+    ResetEmergency: FlightState.LANDED,
+}
+
+
+class FakeDriver(Driver):
+    """Records what it is told, and shows it in its feedback from inside of the call."""
+
+    def __init__(self, clock: Clock, actions: Iterable[str] = ALL, parameters: Iterable[Parameter] = ()) -> None:
+        super().__init__(VehicleUri("fake", text="fake://"))
+        self.clock = clock
+        self.sink: Sink | None = None
+        self.told: list[AnyAction] = []
+        self.now = Feedback(captured_ns=0, state=FlightState.LANDED, battery=0.9, altitude=1.0)
+        self.fail: set[str] = set()  #: calls that raise now
+        self.native = list(parameters)
+        self.while_setting: Callable[[], None] = lambda: None
+        self.closed = False
+        self.answers = True  #: whether feedback follows a command
+        self._actions = frozenset(actions)
+
+    def capabilities(self) -> Capabilities:
+        why = "" if self._actions else "it is a picture"
+        return Capabilities("fake", self._actions, (CameraInfo("front", 4, 3, 15.0),), why_not=why)
+
+    def parameters(self) -> list[Parameter]:
+        self._may_fail("parameters")
+        return self.native
+
+    def set_parameter(self, name: str, value: Value) -> Value:
+        self.while_setting()
+        self._may_fail("set_parameter")
+        return value
+
+    def report(self, **changes: Any) -> None:
+        """Tell this of the vehicle now."""
+        fields = {name: getattr(self.now, name) for name in self.now.__struct_fields__} | changes
+        self.now = Feedback(**fields | {"captured_ns": self.clock()})
+        assert self.sink is not None
+        self.sink.feedback(self.now)
+
+    def link(self, state: LinkState, reason: str = "") -> None:
+        assert self.sink is not None
+        self.sink.link(state, reason)
+
+    def _open(self, sink: Sink) -> None:
+        self._may_fail("open")
+        self.sink = sink
+        sink.link(LinkState.UP)
+        self.report()
+
+    def _close(self) -> None:
+        self.closed = True
+
+    def _apply(self, action: AnyAction) -> AnyAction:
+        self._may_fail("apply")
+        self.told.append(action)
+        if self.answers and type(action) in _NEXT:
+            self.report(state=_NEXT[type(action)])
+        return action
+
+    def _may_fail(self, call: str) -> None:
+        if call in self.fail:
+            raise RuntimeError(f"{call} is broken")
+
+
+class App:
+    """One application, told everything."""
+
+    def __init__(self, dial: Dialer, clock: Clock) -> None:
+        self.clock = clock
+        self.events: list[Event] = []
+        self.feedback: list[Feedback] = []
+        self.applied: list[Applied] = []
+        self.others: list[Sample] = []
+        self.frames: list[tuple[FrameHeader, bytes]] = []
+        self.closed_by: queue.Queue[str] = queue.Queue()
+        self.app_id = 0
+        self.name = ""
+        self.lease = 0
+        self.seq = 0
+        self.intent = 0
+        self._replies: queue.Queue[Reply] = queue.Queue()
+        self._ids = 0
+        self.end: ClientEnd = dial(self)
+        for topic in (FEEDBACK, EVENTS, COMMANDS, ANNOTATIONS):
+            self.end.subscribe(topic)
+
+    # ClientHandler
+
+    def packet(self, packet: bytes) -> None:
+        sample = decode(packet)
+        if isinstance(sample, Reply):
+            self._replies.put(sample)
+        elif isinstance(sample, Event):
+            self.events.append(sample)
+        elif isinstance(sample, Feedback):
+            self.feedback.append(sample)
+        elif isinstance(sample, Applied):
+            self.applied.append(sample)
+        else:
+            self.others.append(sample)
+
+    def frame(self, header: FrameHeader, pixels: Pixels) -> None:
+        self.frames.append((header, pixels.tobytes()))
+
+    def closed(self, reason: str) -> None:
+        self.closed_by.put(reason)
+
+    # What tests do with it
+
+    def ask(self, body: AnyRequest) -> AnyReply:
+        """One request and its answer; everything told before the answer has been heard then."""
+        return self.answer(self.post(body))
+
+    def post(self, body: AnyRequest) -> int:
+        self._ids += 1
+        assert self.end.send(encode(Request(self._ids, body)))
+        return self._ids
+
+    def answer(self, number: int) -> AnyReply:
+        reply = self._replies.get(timeout=WAIT_S)
+        assert reply.id == number
+        return reply.body
+
+    def sync(self) -> None:
+        assert isinstance(self.ask(Ping(1)), Pong)
+
+    def hello(self, name: str, role: Role = Role.PILOT) -> Welcome:
+        welcome = self.ask(Hello(name, role))
+        assert isinstance(welcome, Welcome)
+        self.app_id, self.name = welcome.app_id, name
+        return welcome
+
+    def take_authority(self, priority: int = 16) -> int:
+        granted = self.ask(RequestAuthority(priority))
+        assert isinstance(granted, AuthorityGranted), granted
+        self.lease = granted.lease
+        return self.lease
+
+    def command(self, action: AnyAction, *, repeat: bool = False, sync: bool = True, **changes: Any) -> Command:
+        """Send a command; ``repeat`` keeps the intent, ``changes`` are fields that are to be wrong."""
+        self.seq += 1
+        self.intent += not repeat
+        fields = {"seq": self.seq, "lease": self.lease, "intent": self.intent, "sent_ns": self.clock()} | changes
+        command = Command(action=action, **fields)
+        assert self.end.send(encode(command))
+        if sync:
+            self.sync()
+        return command
+
+    def told(self, kind: EventKind) -> list[Event]:
+        """The events of a kind so far."""
+        self.sync()
+        return [event for event in self.events if event.kind is kind]
+
+    def refusals(self) -> list[str]:
+        """The reasons for which commands of this application were refused, as told."""
+        told = self.told(EventKind.COMMAND_REFUSED)
+        return [str(event.data["reason"]) for event in told if event.app == self.name]
+
+    def last_feedback(self) -> Feedback:
+        self.sync()
+        return self.feedback[-1]
+
+
+class Bench:
+    """A proxy with a fake vehicle, stepped by hand."""
+
+    def __init__(self, actions: Iterable[str] = ALL, parameters: Iterable[Parameter] = ()) -> None:
+        self.clock = ManualClock(1000 * 10**9)
+        self.server = MemoryServer("bench")
+        self.driver = FakeDriver(self.clock, actions, parameters)
+        self.proxy = Proxy(self.driver, self.server, name="bench", clock=self.clock, ticker=False)
+        self.apps: list[App] = []
+
+    def __enter__(self) -> Bench:
+        self.proxy.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.proxy.stop()
+        for app in self.apps:
+            app.end.close()
+
+    def stranger(self) -> App:
+        """A connection without Hello."""
+        app = App(self.server.dial, self.clock)
+        self.apps.append(app)
+        return app
+
+    def join(self, name: str, role: Role = Role.PILOT) -> App:
+        app = self.stranger()
+        app.hello(name, role)
+        return app
+
+    def pilot(self, name: str = "pilot", priority: int = 16) -> App:
+        app = self.join(name)
+        app.take_authority(priority)
+        return app
+
+    def airborne(self, name: str = "pilot", priority: int = 16) -> App:
+        """A pilot whose vehicle hovers, with the record of the driver cleared."""
+        app = self.pilot(name, priority)
+        app.command(Takeoff())
+        self.driver.report(state=FlightState.HOVERING)
+        self.driver.told.clear()
+        return app
+
+    def run(self, seconds: float, each: Callable[[], object] = lambda: None) -> None:
+        """Let time pass in steps of 20 ms, the proxy's tick after each, then ``each``."""
+        for _ in range(round(seconds / 0.02)):
+            self.clock.advance(0.02)
+            self.proxy.tick(self.clock())
+            each()
+
+    def tick(self) -> None:
+        self.proxy.tick(self.clock())

@@ -1,0 +1,284 @@
+"""The software autopilot against a point mass, and its signs, states and lacks by table."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from skyloop.clock import NS_PER_S
+from skyloop.messages import Attitude, Feedback, FlightState, Hover, Land, Takeoff, Velocity
+from skyloop.proxy.autopilot import PERIOD_S, Autopilot, AutopilotSettings, software_actions
+
+ATTITUDE = frozenset({"attitude"})
+GRAVITY = 9.81
+STEP_NS = round(PERIOD_S * NS_PER_S)
+
+
+@dataclass
+class PointMass:
+    """A vehicle that takes attitude with climb rate: first-order tilt and climb, drag, wind. Body axes; yaw turns."""
+
+    position: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])  # east, north, up [m]
+    velocity: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])  # east, north, up [m/s]
+    yaw: float = 0.0
+    roll: float = 0.0
+    pitch: float = 0.0
+    wind: tuple[float, float] = (0.0, 0.0)
+    now_ns: int = NS_PER_S
+
+    def step(self, told: Attitude) -> None:
+        lag = PERIOD_S / 0.15
+        self.roll += (told.roll - self.roll) * lag
+        self.pitch += (told.pitch - self.pitch) * lag
+        self.yaw += told.yaw_rate * PERIOD_S
+        forward, left = GRAVITY * math.tan(self.pitch), -GRAVITY * math.tan(self.roll)
+        cos, sin = math.cos(self.yaw), math.sin(self.yaw)
+        push = (cos * forward - sin * left, sin * forward + cos * left)
+        for axis in (0, 1):
+            drag = 0.3 * (self.velocity[axis] - self.wind[axis])
+            self.velocity[axis] += (push[axis] - drag) * PERIOD_S
+        self.velocity[2] += (told.climb - self.velocity[2]) * PERIOD_S / 0.2
+        for axis in range(3):
+            self.position[axis] += self.velocity[axis] * PERIOD_S
+        if self.position[2] <= 0.0:
+            self.position[2], self.velocity[2] = 0.0, max(0.0, self.velocity[2])
+        self.now_ns += STEP_NS
+
+    def feedback(self, *, position: bool = True) -> Feedback:
+        east, north, up = self.velocity
+        cos, sin = math.cos(self.yaw), math.sin(self.yaw)
+        return Feedback(
+            captured_ns=self.now_ns,
+            yaw=self.yaw,
+            altitude=self.position[2],
+            velocity=(cos * east + sin * north, cos * north - sin * east, up),
+            position=(self.position[0], self.position[1], self.position[2]) if position else None,
+        )
+
+
+def fly(autopilot: Autopilot, mass: PointMass, seconds: float, *, position: bool = True) -> None:
+    for _ in range(round(seconds / PERIOD_S)):
+        told = autopilot.step(mass.now_ns, mass.feedback(position=position))
+        assert told is None or isinstance(told, Attitude)
+        mass.step(told or Attitude(climb=-1.0))
+
+
+def taken_off(mass: PointMass) -> Autopilot:
+    autopilot = Autopilot(ATTITUDE)
+    autopilot.start(Takeoff(), mass.now_ns, mass.feedback())
+    fly(autopilot, mass, 6.0)
+    return autopilot
+
+
+@pytest.mark.parametrize(
+    ("native", "added"),
+    [
+        ({"attitude"}, {"takeoff", "hover", "land", "velocity"}),
+        ({"velocity"}, {"takeoff", "hover", "land"}),
+        ({"takeoff", "land", "hover", "attitude"}, {"velocity"}),
+        ({"takeoff", "land"}, set()),
+        (set(), set()),
+    ],
+)
+def test_it_adds_what_set_points_can_make(native: set[str], added: set[str]) -> None:
+    assert software_actions(frozenset(native)) == added
+
+
+@pytest.mark.parametrize(
+    ("wanted", "roll_sign", "pitch_sign"),
+    [(Velocity(1.0), 0, 1), (Velocity(-1.0), 0, -1), (Velocity(left=1.0), -1, 0), (Velocity(left=-1.0), 1, 0)],
+)
+def test_signs_are_those_of_rep_103(wanted: Velocity, roll_sign: int, pitch_sign: int) -> None:
+    autopilot = Autopilot(ATTITUDE)
+    still = Feedback(captured_ns=0, velocity=(0.0, 0.0, 0.0))
+    autopilot.start(wanted, 0, still)
+    told = autopilot.step(0, still)
+    assert isinstance(told, Attitude)
+    assert (told.roll > 0) - (told.roll < 0) == roll_sign
+    assert (told.pitch > 0) - (told.pitch < 0) == pitch_sign
+
+
+def test_take_off_hover_and_landing() -> None:
+    mass = PointMass()
+    autopilot = Autopilot(ATTITUDE)
+    assert autopilot.state(FlightState.UNKNOWN) is FlightState.LANDED
+    autopilot.start(Takeoff(), mass.now_ns, mass.feedback())
+    assert autopilot.state(FlightState.UNKNOWN) is FlightState.TAKING_OFF
+    fly(autopilot, mass, 6.0)
+    assert autopilot.state(FlightState.UNKNOWN) is FlightState.HOVERING
+    assert mass.position[2] == pytest.approx(1.0, abs=0.05)
+    autopilot.start(Land(), mass.now_ns, mass.feedback())
+    assert autopilot.state(FlightState.UNKNOWN) is FlightState.LANDING
+    fly(autopilot, mass, 6.0)
+    assert autopilot.state(FlightState.UNKNOWN) is FlightState.LANDED
+    assert mass.position[2] == pytest.approx(0.0, abs=0.01)
+    assert autopilot.step(mass.now_ns, mass.feedback()) is None
+
+
+@pytest.mark.parametrize("wanted", [Velocity(1.0), Velocity(left=-0.8), Velocity(0.6, 0.6, 0.2, 0.3)])
+def test_a_velocity_is_reached_and_held(wanted: Velocity) -> None:
+    mass = PointMass()
+    autopilot = taken_off(mass)
+    autopilot.start(wanted, mass.now_ns, mass.feedback())
+    fly(autopilot, mass, 8.0)
+    velocity = mass.feedback().velocity
+    assert velocity is not None
+    assert velocity == pytest.approx((wanted.forward, wanted.left, wanted.up), abs=0.12)
+    assert autopilot.state(FlightState.UNKNOWN) is FlightState.FLYING
+
+
+@pytest.mark.parametrize("yaw", [0.0, 2.0, -1.2])
+def test_hover_brakes_and_holds_the_place_in_wind(yaw: float) -> None:
+    mass = PointMass(yaw=yaw)
+    autopilot = taken_off(mass)
+    autopilot.start(Velocity(1.0), mass.now_ns, mass.feedback())
+    fly(autopilot, mass, 4.0)
+    mass.wind = (1.0, -1.0)
+    autopilot.start(Hover(), mass.now_ns, mass.feedback())
+    fly(autopilot, mass, 15.0)
+    place = list(mass.position)
+    fly(autopilot, mass, 10.0)
+    assert math.dist(place, mass.position) < 0.1
+    assert math.hypot(*mass.velocity) < 0.05
+
+
+def test_hover_without_a_position_stands_still() -> None:
+    mass = PointMass(wind=(1.0, 0.0))
+    autopilot = taken_off(mass)
+    autopilot.start(Hover(), mass.now_ns, mass.feedback(position=False))
+    fly(autopilot, mass, 20.0, position=False)
+    assert math.hypot(*mass.velocity) < 0.05
+
+
+def test_a_vehicle_that_takes_velocities_gets_velocities() -> None:
+    autopilot = Autopilot(frozenset({"velocity"}))
+    feedback = Feedback(captured_ns=0, altitude=0.0)
+    autopilot.start(Takeoff(), 0, feedback)
+    assert autopilot.step(0, feedback) == Velocity(up=0.5)
+    high = Feedback(captured_ns=STEP_NS, altitude=0.95)
+    assert autopilot.step(STEP_NS, high) == Velocity()
+    assert autopilot.step(2 * STEP_NS, high) == Velocity(up=pytest.approx(0.05))  # type: ignore[arg-type]
+
+
+def test_without_knowledge_it_stays_level_and_goes_by_time() -> None:
+    autopilot = Autopilot(ATTITUDE)
+    autopilot.start(Takeoff(), 0, None)
+    assert autopilot.step(0, None) == Attitude(climb=0.5)
+    assert autopilot.step(2 * NS_PER_S, None) == Attitude()
+    assert autopilot.state(FlightState.UNKNOWN) is FlightState.HOVERING
+    autopilot.start(Velocity(1.0, 0.0, 0.2, 0.1), 2 * NS_PER_S, None)
+    assert autopilot.step(3 * NS_PER_S, None) == Attitude(0.0, 0.0, 0.2, 0.1)
+    autopilot.start(Land(), 3 * NS_PER_S, None)
+    assert autopilot.step(17 * NS_PER_S, None) == Attitude(climb=-0.4)
+    assert autopilot.state(FlightState.UNKNOWN) is FlightState.LANDING
+    autopilot.step(18 * NS_PER_S, None)
+    assert autopilot.state(FlightState.UNKNOWN) is FlightState.LANDED
+
+
+def test_stale_feedback_is_not_steered_by() -> None:
+    autopilot = Autopilot(ATTITUDE)
+    old = Feedback(captured_ns=0, velocity=(3.0, 3.0, 0.0))
+    autopilot.start(Hover(), 0, old)
+    assert autopilot.step(NS_PER_S // 2, old) != Attitude()
+    assert autopilot.step(NS_PER_S // 2 + 1, old) == Attitude()
+
+
+def test_an_altimeter_that_never_reads_zero_still_ends_the_landing() -> None:
+    autopilot = Autopilot(ATTITUDE)
+    for step in range(200):
+        now = step * STEP_NS
+        feedback = Feedback(captured_ns=now, altitude=max(0.25, 1.0 - 0.4 * step * PERIOD_S))
+        if step == 0:
+            autopilot.start(Land(), now, feedback)
+        autopilot.step(now, feedback)
+    assert autopilot.state(FlightState.UNKNOWN) is FlightState.LANDED
+
+
+@pytest.mark.parametrize(
+    ("native", "mode", "told", "expected"),
+    [
+        ({"takeoff", "land", "hover", "attitude"}, Velocity(), FlightState.FLYING, FlightState.FLYING),
+        ({"takeoff", "land", "attitude"}, Hover(), FlightState.FLYING, FlightState.HOVERING),
+        ({"takeoff", "land", "attitude"}, Hover(), FlightState.LANDED, FlightState.LANDED),
+        ({"takeoff", "attitude"}, Land(), FlightState.FLYING, FlightState.LANDING),
+        ({"takeoff", "attitude"}, Land(), FlightState.LANDED, FlightState.LANDED),
+        ({"attitude"}, Takeoff(), FlightState.UNKNOWN, FlightState.TAKING_OFF),
+        ({"attitude"}, Takeoff(), FlightState.EMERGENCY, FlightState.EMERGENCY),
+    ],
+)
+def test_the_vehicles_own_word_counts_where_it_has_the_notion(
+    native: set[str], mode: Takeoff | Hover | Land | Velocity, told: FlightState, expected: FlightState
+) -> None:
+    autopilot = Autopilot(frozenset(native))
+    autopilot.start(mode, 0, None)
+    assert autopilot.state(told) is expected
+
+
+@pytest.mark.parametrize(
+    ("action", "expected"),
+    [
+        ("attitude", FlightState.FLYING),
+        ("hover", FlightState.HOVERING),
+        ("emergency_stop", FlightState.EMERGENCY),
+        ("reset_emergency", FlightState.LANDED),
+    ],
+)
+def test_what_the_vehicle_does_itself_stops_the_autopilot(action: str, expected: FlightState) -> None:
+    autopilot = Autopilot(ATTITUDE)
+    autopilot.start(Hover(), 0, None)
+    autopilot.stop(action)
+    assert autopilot.step(0, None) is None
+    assert autopilot.state(FlightState.UNKNOWN) is expected
+
+
+def test_an_attitude_on_the_ground_is_no_flight() -> None:
+    autopilot = Autopilot(ATTITUDE)
+    autopilot.stop("attitude")
+    assert autopilot.state(FlightState.UNKNOWN) is FlightState.LANDED
+
+
+def test_a_vehicle_first_seen_in_the_air_is_flying() -> None:
+    autopilot = Autopilot(ATTITUDE)
+    autopilot.notice(Feedback(captured_ns=0, altitude=0.1))
+    assert autopilot.state(FlightState.UNKNOWN) is FlightState.LANDED
+    autopilot.notice(Feedback(captured_ns=0, altitude=1.0))
+    assert autopilot.state(FlightState.UNKNOWN) is FlightState.FLYING
+
+
+@settings(max_examples=60)
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from([Takeoff(), Hover(), Land(), Velocity(50.0, -50.0, 0.1, 0.2)]),
+            st.none() | st.floats(-5, 50),
+            st.none() | st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-5, 5)),
+            st.none() | st.tuples(st.floats(-1e4, 1e4), st.floats(-1e4, 1e4), st.just(1.0)),
+        ),
+        max_size=50,
+    )
+)
+def test_whatever_it_hears_it_never_tilts_beyond_the_limit(
+    heard: list[
+        tuple[
+            Takeoff | Hover | Land | Velocity,
+            float | None,
+            tuple[float, float, float] | None,
+            tuple[float, float, float] | None,
+        ]
+    ],
+) -> None:
+    autopilot = Autopilot(ATTITUDE, AutopilotSettings(tilt=0.2))
+    now = 0
+    for action, altitude, velocity, position in heard:
+        now += STEP_NS
+        feedback = Feedback(captured_ns=now, altitude=altitude, velocity=velocity, position=position, yaw=0.3)
+        autopilot.start(action, now, feedback)
+        told = autopilot.step(now, feedback)
+        assert told is None or isinstance(told, Attitude)
+        if told is not None:
+            assert math.hypot(told.roll, told.pitch) <= 0.2 * (1 + 1e-9)
+            assert abs(told.climb) <= 0.5

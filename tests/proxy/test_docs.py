@@ -1,0 +1,77 @@
+"""``docs/proxy.md`` is true of the code."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from skyloop.messages import FlightState, Refusal
+from skyloop.proxy import failsafe, gate, proxy, requests, serve, sessions, vehicle
+from skyloop.proxy.parameters import MAX_PARAMETER, OWN
+
+PAGE = (Path(__file__).parents[2] / "docs" / "proxy.md").read_text(encoding="utf-8")
+_PLANS = {"done": "APPLY", "hover": "HOVER", "refused": "REFUSE", "nothing to do": "HOLD"}
+
+
+def rows(first_cell: str) -> list[list[str]]:
+    """The cells of the table whose header begins with this cell."""
+    lines = PAGE.splitlines()
+    start = next(number for number, line in enumerate(lines) if line.startswith(f"| {first_cell} |"))
+    table = []
+    for line in lines[start + 2 :]:
+        if not line.startswith("|"):
+            break
+        table.append([cell.strip() for cell in line.strip("|").split("|")])
+    return table
+
+
+def test_the_table_of_parameters_is_the_one_in_force() -> None:
+    written = [
+        [f"`{own.name}`", f"{own.value:g}", own.unit, f"{own.minimum:g} to {own.maximum:g}", own.description]
+        for own in OWN
+    ]
+    assert rows("name") == written
+
+
+def test_the_table_of_flight_states_is_the_one_in_force() -> None:
+    kinds = ["Takeoff", "Hover", "Land", "Velocity", "ResetEmergency"]
+    plans = {kind.__name__: plan for kind, plan in gate.PLANS.items()}
+    assert plans["Attitude"] == plans["Velocity"]
+    seen = set()
+    for names, *cells in rows("state"):
+        for name in names.split(", "):
+            state = FlightState(name.replace(" ", "_"))
+            seen.add(state)
+            for kind, cell in zip(kinds, cells, strict=True):
+                expected = _PLANS.get(cell, "HOLD" if cell.endswith("goes on") else "?")
+                assert plans[kind][state].name == expected, (kind, state)
+    assert seen == set(FlightState)
+
+
+def test_every_reason_for_refusing_a_command_is_named() -> None:
+    for reason in (
+        Refusal.OUT_OF_SEQUENCE,
+        Refusal.STALE,
+        Refusal.FOREIGN_LEASE,
+        Refusal.NO_AUTHORITY,
+        Refusal.NON_FINITE,
+        Refusal.NOT_FRESH,
+        Refusal.VEHICLE_LINK_LOST,
+        Refusal.UNSUPPORTED,
+        Refusal.WRONG_STATE,
+        Refusal.BUSY,
+    ):
+        assert f"`{reason.value}`" in PAGE
+
+
+def test_the_numbers_that_are_no_parameters_are_those_of_the_code() -> None:
+    for sentence in (
+        f"at most {gate.MAX_AHEAD_S:g} s in the future",
+        f"than {sessions.MAX_MALFORMED} malformed packets within a second",
+        f"At most {requests.MAX_PENDING}\nrequests",
+        f"more than {MAX_PARAMETER} bytes",
+        f"up to {proxy.MAX_ANNOTATION} bytes",
+        f"it rose by {failsafe.BATTERY_REARM:g} above",
+        f"for at most {serve.LAND_WITHIN_S:g} s",
+        f"at least {1e9 / vehicle.KEEP_ALIVE_NS:g} times a second",
+    ):
+        assert sentence in PAGE

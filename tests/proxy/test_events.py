@@ -1,0 +1,55 @@
+"""Repeated things: the first is told at once, the others in sums, and nothing is kept for ever."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skyloop.clock import NS_PER_S
+from skyloop.messages import EventKind
+from skyloop.proxy.events import Notice, Repeats
+
+S = NS_PER_S
+NOTICE = Notice(EventKind.COMMAND_REFUSED, "no")
+
+
+def note(repeats: Repeats, key: str, now_ns: int) -> bool:
+    first = repeats.first(key)
+    if first:
+        repeats.begin(key, NOTICE, now_ns)
+    return first
+
+
+def test_the_first_is_told_and_the_rest_summed() -> None:
+    repeats = Repeats()
+    assert note(repeats, "a", 0)
+    assert not note(repeats, "a", 1)
+    assert not note(repeats, "a", 2)
+    assert note(repeats, "b", 2)  # another key has its own count
+    assert repeats.due(S - 1) == []
+    assert repeats.due(S) == [(NOTICE, 2)]
+    assert not note(repeats, "a", S + 1)
+    assert repeats.due(2 * S) == [(NOTICE, 1)]
+    assert repeats.due(3 * S) == []
+    assert note(repeats, "a", 3 * S + 1)
+
+
+def test_what_ended_is_forgotten() -> None:
+    repeats = Repeats()
+    for number in range(1000):
+        note(repeats, str(number), 0)
+    repeats.due(S)
+    assert repeats._told == {}
+    assert repeats._counts == {}
+
+
+@given(st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, S // 2)), max_size=80))
+def test_every_one_is_counted_once(history: list[tuple[str, int]]) -> None:
+    repeats = Repeats()
+    now = told = 0
+    for key, later in history:
+        now += later
+        told += sum(count for _, count in repeats.due(now))
+        told += note(repeats, key, now)
+    told += sum(count for _, count in repeats.due(now + S))
+    assert told == len(history)

@@ -1,0 +1,213 @@
+"""The ladder: exact times, what ends a step, and the pace of retries."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skyloop.clock import NS_PER_S
+from skyloop.messages import Failsafe, FlightState, Hover, Land
+from skyloop.proxy.failsafe import BatteryLow, Do, Effect, Ladder, LadderSettings, Step, View
+
+S = NS_PER_S
+MS = S // 1000
+T0 = 100 * S
+FLYING = View(FlightState.FLYING, True, T0, "held", True, 0.9)
+LANDED = replace(FLYING, state=FlightState.LANDED, airborne=False)
+
+
+def taken(ladder: Ladder, now_ns: int, view: View, ok: bool = True) -> list[Effect]:
+    effects = ladder.tick(now_ns, view)
+    if any(isinstance(effect, Do) for effect in effects):
+        ladder.tried(ok)
+    return effects
+
+
+def test_silence_makes_it_hover_and_then_land_to_the_nanosecond() -> None:
+    ladder = Ladder()
+    assert taken(ladder, T0 + 500 * MS - 1, FLYING) == []
+    assert taken(ladder, T0 + 500 * MS, FLYING) == [Step(Failsafe.HOVER, "silent"), Do(Hover())]
+    hovering = replace(FLYING, state=FlightState.HOVERING)
+    assert taken(ladder, T0 + 5 * S - 1, hovering) == []
+    assert taken(ladder, T0 + 5 * S, hovering) == [Step(Failsafe.LAND, "silent"), Do(Land())]
+
+
+@pytest.mark.parametrize("pilot", ["released", "silent", "none"])
+def test_without_a_pilot_the_reason_is_why(pilot: str) -> None:
+    ladder = Ladder()
+    view = replace(FLYING, pilot=pilot)
+    assert taken(ladder, T0 + 499 * MS, view) == []
+    assert taken(ladder, T0 + 500 * MS, view) == [Step(Failsafe.HOVER, pilot), Do(Hover())]
+
+
+def test_a_dead_connection_makes_it_hover_at_once_and_land_after_the_same_five_seconds() -> None:
+    ladder = Ladder()
+    gone = replace(FLYING, pilot="gone")
+    assert taken(ladder, T0 + MS, gone) == [Step(Failsafe.HOVER, "gone"), Do(Hover())]
+    gone = replace(gone, state=FlightState.HOVERING)
+    assert taken(ladder, T0 + 5 * S - 1, gone) == []
+    assert taken(ladder, T0 + 5 * S, gone) == [Step(Failsafe.LAND, "gone"), Do(Land())]
+
+
+def test_nothing_happens_on_the_ground() -> None:
+    ladder = Ladder()
+    assert taken(ladder, T0 + 100 * S, replace(LANDED, pilot="gone")) == []
+    assert ladder.idle
+
+
+def test_a_fresh_command_ends_a_step() -> None:
+    ladder = Ladder()
+    taken(ladder, T0 + S, FLYING)
+    assert ladder.fresh_command() == [Step(Failsafe.NONE, "fresh command")]
+    assert taken(ladder, T0 + S, replace(FLYING, heard_ns=T0 + S)) == []
+
+
+def test_being_heard_without_a_fresh_command_keeps_the_step_but_does_not_land() -> None:
+    ladder = Ladder()
+    taken(ladder, T0 + S, FLYING)
+    heard = replace(FLYING, state=FlightState.HOVERING, heard_ns=T0 + 60 * S)
+    assert taken(ladder, T0 + 60 * S, heard) == []
+    assert ladder.step is Failsafe.HOVER
+
+
+def test_landing_ends_the_step() -> None:
+    ladder = Ladder()
+    taken(ladder, T0 + 6 * S, FLYING)
+    assert taken(ladder, T0 + 9 * S, LANDED) == [Step(Failsafe.NONE, "landed")]
+
+
+def test_what_the_driver_did_not_take_is_tried_again_at_the_set_pace() -> None:
+    ladder = Ladder(LadderSettings(retry_s=0.25))
+    view = replace(FLYING, state=FlightState.HOVERING)
+    tries = [now for now in range(T0, T0 + 2 * S, 20 * MS) if Do(Hover()) in taken(ladder, now, view, ok=False)]
+    assert tries[0] == T0 + 500 * MS
+    assert all(later - earlier == 260 * MS for earlier, later in pairwise(tries))  # next tick
+    assert len(tries) == 6
+
+
+def test_what_was_taken_is_repeated_only_while_the_state_contradicts_it() -> None:
+    ladder = Ladder()
+    taken(ladder, T0 + S, FLYING)
+    assert taken(ladder, T0 + S + 100 * MS, FLYING) == []
+    assert taken(ladder, T0 + S + 250 * MS, FLYING) == [Do(Hover())]
+    assert taken(ladder, T0 + 2 * S, replace(FLYING, state=FlightState.HOVERING)) == []
+
+
+@pytest.mark.parametrize("state", [FlightState.TAKING_OFF, FlightState.LANDING])
+def test_hover_never_breaks_off_a_manoeuvre(state: FlightState) -> None:
+    ladder = Ladder()
+    view = replace(FLYING, state=state, pilot="gone")
+    assert Do(Hover()) not in taken(ladder, T0 + S, view)
+    expected = Failsafe.HOVER if state is FlightState.TAKING_OFF else Failsafe.NONE
+    assert ladder.step is expected
+    up = replace(view, state=FlightState.HOVERING)
+    assert Do(Hover()) in taken(ladder, T0 + 2 * S, up)
+
+
+def test_land_does_break_off_a_take_off() -> None:
+    ladder = Ladder()
+    assert Do(Land()) in taken(ladder, T0 + 5 * S, replace(FLYING, state=FlightState.TAKING_OFF))
+
+
+def test_a_low_battery_is_told_once_and_again_only_after_it_rose() -> None:
+    ladder = Ladder()
+    levels = [0.21, 0.19, 0.18, 0.21, 0.19, 0.26, 0.19]
+    told = [ladder.tick(T0, replace(LANDED, battery=level)) for level in levels]
+    assert told == [[], [BatteryLow(0.19)], [], [], [], [], [BatteryLow(0.19)]]
+
+
+def test_an_empty_battery_lands_and_bars_set_points_until_down() -> None:
+    ladder = Ladder()
+    empty = replace(FLYING, battery=0.09)
+    assert taken(ladder, T0, empty) == [BatteryLow(0.09), Step(Failsafe.LAND, "battery"), Do(Land())]
+    assert ladder.barred == "battery"
+    assert ladder.fresh_command() == []
+    assert taken(ladder, T0, replace(empty, battery=0.12, state=FlightState.LANDING)) == []
+    assert ladder.barred == "battery"  # it rises when the load falls: that is no new charge
+    assert taken(ladder, T0, replace(LANDED, battery=0.12)) == [Step(Failsafe.NONE, "landed")]
+    assert ladder.barred == ""
+
+
+def test_an_empty_battery_on_the_ground_bars_a_take_off() -> None:
+    ladder = Ladder()
+    ladder.tick(T0, replace(LANDED, battery=0.05))
+    assert ladder.barred == "battery"
+    ladder.tick(T0, replace(LANDED, battery=0.95))
+    assert ladder.barred == ""
+
+
+def test_zero_disables_the_battery_steps() -> None:
+    ladder = Ladder(LadderSettings(battery_warn=0.0, battery_land=0.0))
+    assert taken(ladder, T0, replace(FLYING, battery=0.0)) == []
+
+
+def test_an_unknown_battery_is_no_low_battery() -> None:
+    assert taken(Ladder(), T0, replace(FLYING, battery=None)) == []
+
+
+def test_a_lost_vehicle_link_makes_it_hover() -> None:
+    ladder = Ladder()
+    assert taken(ladder, T0, replace(FLYING, link_up=False)) == [Step(Failsafe.HOVER, "vehicle_link"), Do(Hover())]
+
+
+def test_handing_over_hovers_without_a_step() -> None:
+    ladder = Ladder()
+    ladder.hand_over(T0)
+    assert not ladder.idle
+    assert taken(ladder, T0, FLYING) == [Do(Hover())]
+    assert ladder.step is Failsafe.NONE
+    assert ladder.fresh_command() == []
+    assert ladder.idle
+
+
+def test_handing_over_does_not_break_off_the_ladders_landing() -> None:
+    ladder = Ladder()
+    taken(ladder, T0 + 5 * S, FLYING)
+    ladder.hand_over(T0 + 5 * S)
+    assert taken(ladder, T0 + 6 * S, FLYING) == [Do(Land())]
+
+
+def test_an_ordered_landing_stays() -> None:
+    ladder = Ladder()
+    ladder.order_landing()
+    assert taken(ladder, T0, FLYING) == [Step(Failsafe.LAND, "closing"), Do(Land())]
+    assert ladder.fresh_command() == []
+    ladder.tick(T0, LANDED)
+    assert ladder.barred == "closing"
+
+
+views = st.builds(
+    View,
+    state=st.sampled_from(list(FlightState)),
+    airborne=st.booleans(),
+    heard_ns=st.integers(0, 8 * S),
+    pilot=st.sampled_from(["held", "released", "silent", "gone", "none"]),
+    link_up=st.booleans(),
+    battery=st.none() | st.floats(0, 1),
+)
+
+
+@given(st.lists(st.tuples(views, st.integers(0, S), st.booleans(), st.booleans()), max_size=40))
+def test_any_history_keeps_the_pace_and_climbs_only_upwards(history: list[tuple[View, int, bool, bool]]) -> None:
+    ladder = Ladder()
+    now, last_try, new = 0, -S, True
+    for view, later, fresh, ok in history:
+        now += later
+        if fresh:
+            ladder.fresh_command()
+        before = ladder.step
+        effects = taken(ladder, now, view, ok)
+        if not view.airborne:
+            assert ladder.step is Failsafe.NONE
+            assert not any(isinstance(effect, Do) for effect in effects)
+        elif before is Failsafe.LAND:
+            assert ladder.step is Failsafe.LAND
+        new = new or any(isinstance(effect, Step) for effect in effects)  # since the last try
+        for effect in effects:
+            if isinstance(effect, Do):
+                assert new or now - last_try >= S // 4
+                last_try, new = now, False

@@ -1,0 +1,173 @@
+"""Parameters: every kind of bad value is refused with what would be right."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skyloop.errors import ParameterError, UnknownNameError
+from skyloop.messages import Parameter, ParameterType, Refusal, Reply, Value, encode
+from skyloop.proxy.parameters import MAX_PARAMETER, OWN, Parameters, check
+
+P, T = Parameter, ParameterType
+SPEED = P("x.speed", T.FLOAT, 1.0, "m/s", 0.5, 2.0)
+COUNT = P("x.count", T.INT, 1, "", 0, 10)
+FLAG = P("x.flag", T.BOOL, True)
+TEXT = P("x.text", T.TEXT, "a")
+MODE = P("x.mode", T.TEXT, "a", choices=("a", "b"))
+PLACE = P("x.place", T.VECTOR, (0.0, 0.0, 0.0), "m", -5, 5)
+FIXED = P("x.fixed", T.INT, 1, read_only=True)
+
+
+@pytest.mark.parametrize(
+    ("parameter", "value", "expected"),
+    [
+        (SPEED, 1.5, 1.5),
+        (SPEED, 1, 1.0),
+        (COUNT, 10, 10),
+        (FLAG, False, False),
+        (TEXT, "", ""),
+        (MODE, "b", "b"),
+        (PLACE, (1, 2.0, -5.0), (1.0, 2.0, -5.0)),
+    ],
+)
+def test_good_values_come_back_in_the_parameters_type(parameter: Parameter, value: Value, expected: Value) -> None:
+    checked = check(parameter, value)
+    assert checked == expected
+    assert type(checked) is type(expected)
+
+
+@pytest.mark.parametrize(
+    ("parameter", "value", "code", "words"),
+    [
+        (SPEED, True, Refusal.WRONG_TYPE, ["x.speed", "float", "m/s", "bool"]),
+        (SPEED, "1.5", Refusal.WRONG_TYPE, ["float", "text"]),
+        (SPEED, (1.0,), Refusal.WRONG_TYPE, ["float", "vector"]),
+        (SPEED, math.nan, Refusal.NON_FINITE, ["finite"]),
+        (SPEED, math.inf, Refusal.NON_FINITE, ["finite"]),
+        (SPEED, 0.4, Refusal.OUT_OF_RANGE, ["at least 0.5 m/s", "at most 2 m/s", "0.4"]),
+        (SPEED, 10**400, Refusal.OUT_OF_RANGE, ["x.speed"]),
+        (COUNT, 1.0, Refusal.WRONG_TYPE, ["int", "float"]),
+        (COUNT, True, Refusal.WRONG_TYPE, ["int", "bool"]),
+        (COUNT, 11, Refusal.OUT_OF_RANGE, ["at least 0 and at most 10"]),
+        (COUNT, 10**400, Refusal.OUT_OF_RANGE, ["at most 10"]),
+        (FLAG, 1, Refusal.WRONG_TYPE, ["bool", "int"]),
+        (TEXT, 1, Refusal.WRONG_TYPE, ["text"]),
+        (TEXT, "x" * 1025, Refusal.OUT_OF_RANGE, ["1024"]),
+        (MODE, "c", Refusal.OUT_OF_RANGE, ["'a'", "'b'", "'c'"]),
+        (PLACE, (1.0, 2.0), Refusal.WRONG_TYPE, ["3 numbers", "2"]),
+        (PLACE, (1.0, 2.0, math.nan), Refusal.NON_FINITE, ["finite"]),
+        (PLACE, (1.0, 2.0, 6.0), Refusal.OUT_OF_RANGE, ["at most 5 m"]),
+        (FIXED, 1, Refusal.READ_ONLY, ["only be read"]),
+    ],
+)
+def test_bad_values_are_refused_with_what_would_be_right(
+    parameter: Parameter, value: Value, code: Refusal, words: list[str]
+) -> None:
+    with pytest.raises(ParameterError) as caught:
+        check(parameter, value)
+    assert caught.value.code == code
+    for word in words:
+        assert word in str(caught.value)
+
+
+values = (
+    st.booleans() | st.integers() | st.floats() | st.text(max_size=20) | st.lists(st.floats(), max_size=5).map(tuple)
+)
+
+
+@given(st.sampled_from([SPEED, COUNT, FLAG, TEXT, MODE, PLACE, FIXED, *OWN]), values)
+def test_anything_is_checked_or_refused(parameter: Parameter, value: Value) -> None:
+    refused: ParameterError | None = None
+    try:
+        checked = check(parameter, value)
+    except ParameterError as error:
+        refused = error
+    if refused is None:
+        assert type(checked) is type(parameter.value)
+        assert check(parameter, checked) == checked
+    else:
+        assert parameter.name in str(refused)
+        assert refused.code in set(Refusal)
+
+
+def test_the_defaults_of_the_proxys_own_are_allowed_and_named_well() -> None:
+    for parameter in OWN:
+        assert check(parameter, parameter.value) == parameter.value == parameter.default
+        assert parameter.name.islower()
+        assert parameter.description
+    assert len({parameter.name for parameter in OWN}) == len(OWN)
+
+
+def test_a_number_that_was_set_is_in_force() -> None:
+    store = Parameters()
+    assert store.number("limits.tilt") == 0.35
+    written = store.set("limits.tilt", 0.2)
+    assert (written.value, written.default, store.number("limits.tilt")) == (0.2, 0.35, 0.2)
+
+
+def test_unknown_names_get_suggestions() -> None:
+    store = Parameters()
+    with pytest.raises(UnknownNameError, match=r"did you mean 'limits\.tilt'"):
+        store.get("limits.tlt")
+    with pytest.raises(UnknownNameError):
+        store.set("limits.tlt", 0.1)
+
+
+def test_the_driver_wins_on_shared_names() -> None:
+    written: list[tuple[str, Value]] = []
+
+    def write(name: str, value: Value) -> Value:
+        written.append((name, value))
+        return 0.21  # rounded by the vehicle
+
+    native = P("limits.tilt", T.FLOAT, 0.5, "rad", 0.1, 0.52, 0.4)
+    store = Parameters(lambda: [native, P("camera.fps", T.INT, 15)], write)
+    store.refresh()
+    assert store.get("limits.tilt") == native
+    assert store.number("limits.tilt") == 0.5
+    assert store.set("limits.tilt", 0.2).value == 0.21
+    assert written == [("limits.tilt", 0.2)]
+    assert store.number("limits.tilt") == 0.21
+    store.set("limits.climb", 0.5)
+    assert len(written) == 1  # the proxy's own never reaches the driver
+    with pytest.raises(ParameterError, match=r"0\.52"):
+        store.set("limits.tilt", 0.53)
+
+
+def test_a_driver_with_another_notion_of_a_shared_name_leaves_the_proxys_in_force() -> None:
+    store = Parameters(lambda: [P("limits.tilt", T.TEXT, "steep"), P("limits.climb", T.FLOAT, math.nan)])
+    store.refresh()
+    assert store.number("limits.tilt") == 0.35
+    assert store.number("limits.climb") == 1.0
+
+
+def test_pages_hold_everything_once_in_order_and_fit_a_packet() -> None:
+    many = [P(f"driver.{number:03}", T.TEXT, "x" * 900, description="d" * 50) for number in range(200)]
+    store = Parameters(lambda: many)
+    store.refresh()
+    names: list[str] = []
+    pages = 0
+    while True:
+        page = store.page(len(names))
+        encode(Reply(2**63 - 1, page))
+        assert page.first == len(names)
+        names += [parameter.name for parameter in page.parameters]
+        pages += 1
+        if len(names) == page.total:
+            break
+    assert names == sorted([parameter.name for parameter in (*many, *OWN)])
+    assert pages == 4
+    assert store.page(10**9).parameters == ()
+
+
+def test_a_parameter_too_large_to_send_is_left_out() -> None:
+    store = Parameters(lambda: [P("a.huge", T.TEXT, "x" * MAX_PARAMETER), P("a.small", T.INT, 1)])
+    store.refresh()
+    assert store.left_out == ("a.huge",)
+    assert store.get("a.small").value == 1
+    with pytest.raises(UnknownNameError):
+        store.get("a.huge")

@@ -1,0 +1,151 @@
+"""Who flies: several applications at one proxy."""
+
+from __future__ import annotations
+
+from skyloop.messages import (
+    AuthorityGranted,
+    AuthorityQueued,
+    Done,
+    EventKind,
+    FlightState,
+    Hover,
+    Idle,
+    Land,
+    Refusal,
+    Refused,
+    ReleaseAuthority,
+    RequestAuthority,
+    Role,
+    Velocity,
+)
+from tests.proxy.fake import Bench
+
+
+def test_two_pilots_and_three_observers(bench: Bench) -> None:
+    alice = bench.airborne("alice", 16)
+    bob = bench.join("bob")
+    observers = [bench.join(f"observer {number}", Role.OBSERVER) for number in range(3)]
+    old_lease = alice.lease
+
+    alice.command(Velocity(0.5))
+    assert bench.driver.told == [Velocity(0.5)]
+    for observer in observers:
+        observer.lease = old_lease
+        observer.command(Velocity(9.0))
+        assert observer.refusals() == [Refusal.OBSERVER]
+    bob.lease = old_lease  # the right number from the wrong application
+    bob.command(Velocity(9.0))
+    assert bob.told(EventKind.COMMAND_REFUSED)[-1].data["reason"] == Refusal.NO_AUTHORITY
+    assert bench.driver.told == [Velocity(0.5)]
+
+    bob.take_authority(4)
+    assert bench.driver.told == [Velocity(0.5), Hover()]  # hover in between
+    assert bob.lease > old_lease
+    for app in (alice, *observers):
+        (preempted,) = app.told(EventKind.AUTHORITY_PREEMPTED)
+        assert preempted.app == "alice"
+        assert preempted.data == {"app_id": 1, "lease": 1, "by": "bob", "by_id": 2, "by_priority": 4}
+        bench.tick()
+        feedback = app.last_feedback()
+        assert (feedback.owner, feedback.owner_id, feedback.owner_priority) == ("bob", bob.app_id, 4)
+        assert feedback.lease == bob.lease
+
+    alice.command(Velocity(7.0))
+    assert Refusal.FOREIGN_LEASE in alice.refusals()
+    bob.command(Velocity(left=0.5))
+    assert bench.driver.told[2:] == [Velocity(left=0.5)]
+
+    assert bob.ask(ReleaseAuthority()) == Done()
+    granted = alice.told(EventKind.AUTHORITY_GRANTED)[-1]  # the pre-empted one was waiting in line
+    assert granted.data["app_id"] == alice.app_id
+    assert bench.driver.told[3:] == [Hover()]
+    alice.command(Velocity(7.0), repeat=True)  # under the old lease, not even now
+    alice.lease = int(granted.data["lease"])  # type: ignore[arg-type]
+    alice.command(Velocity(7.0), repeat=True)  # nor what was asked for under the old lease
+    assert bench.driver.told[3:] == [Hover()]
+    alice.command(Velocity(0.25))
+    assert bench.driver.told[4:] == [Velocity(0.25)]
+
+
+def test_the_answers_to_requests(bench: Bench) -> None:
+    alice, bob, observer = bench.join("alice"), bench.join("bob"), bench.join("eve", Role.OBSERVER)
+    assert alice.ask(RequestAuthority(10)) == AuthorityGranted(1)
+    assert alice.ask(RequestAuthority(12)) == AuthorityGranted(1)  # its priority changes
+    bench.tick()
+    assert alice.last_feedback().owner_priority == 12
+    assert bob.ask(RequestAuthority(12)) == AuthorityQueued(1, "alice", 12)
+    refused = bob.ask(RequestAuthority(12, queue=False))
+    assert isinstance(refused, Refused)
+    assert refused.code is Refusal.BUSY
+    assert "alice" in refused.message
+    assert "12" in refused.message
+    refused = observer.ask(RequestAuthority(0))
+    assert isinstance(refused, Refused)
+    assert refused.code is Refusal.OBSERVER
+
+
+def test_a_silent_holder_loses_the_lease_and_an_idle_one_keeps_it(bench: Bench) -> None:
+    alice, bob = bench.pilot("alice"), bench.join("bob")
+    bench.run(5.0, lambda: alice.command(Idle(), repeat=True))
+    assert alice.told(EventKind.AUTHORITY_LOST) == []
+    bob.ask(RequestAuthority(20))
+    bench.run(1.98)
+    assert bob.told(EventKind.AUTHORITY_LOST) == []
+    bench.run(0.04)
+    (lost,) = bob.told(EventKind.AUTHORITY_LOST)
+    assert (lost.app, lost.data["reason"], lost.data["by"]) == ("alice", "silent", "bob")
+    assert bob.last_feedback().owner == "bob"
+
+
+def test_refused_repeats_after_a_failsafe_keep_the_lease(bench: Bench) -> None:
+    alice = bench.airborne()
+    alice.command(Velocity(0.5))
+    bench.run(0.6)
+    bench.run(4.0, lambda: alice.command(Velocity(0.5), repeat=True))
+    assert set(alice.refusals()) == {Refusal.NOT_FRESH}
+    assert alice.told(EventKind.AUTHORITY_LOST) == []
+    assert bench.driver.told == [Velocity(0.5), Hover()]
+
+
+def test_a_dead_holder_is_followed_by_the_next_in_line(bench: Bench) -> None:
+    alice, bob = bench.airborne("alice"), bench.join("bob")
+    bob.ask(RequestAuthority(20))
+    alice.command(Velocity(0.5))
+    alice.end.close()
+    bob.sync()
+    (lost,) = bob.told(EventKind.AUTHORITY_LOST)
+    assert lost.data["reason"] == "gone"
+    assert bob.told(EventKind.AUTHORITY_GRANTED)[-1].data["app_id"] == bob.app_id
+    assert bench.driver.told == [Velocity(0.5), Hover()]
+    left = bob.told(EventKind.APPLICATION_LINK)[-1]
+    assert (left.app, left.data["state"]) == ("alice", "lost")
+
+
+def test_a_landing_is_not_broken_off_by_a_take_over(bench: Bench) -> None:
+    alice, bob = bench.airborne("alice"), bench.join("bob")
+    alice.command(Land())
+    bob.take_authority(0)
+    bench.run(0.2)
+    assert bench.driver.told == [Land()]
+    bob.command(Hover())
+    assert bench.driver.told == [Land(), Hover()]
+
+
+def test_a_hover_that_the_driver_did_not_take_at_a_take_over_is_tried_again(bench: Bench) -> None:
+    alice, bob = bench.airborne("alice"), bench.join("bob")
+    alice.command(Velocity(0.5))
+    bench.driver.fail = {"apply"}
+    bob.take_authority(0)
+    assert bench.driver.told == [Velocity(0.5)]
+    assert bob.told(EventKind.DRIVER_ERROR)
+    bench.driver.fail = set()
+    bench.run(0.3)
+    assert bench.driver.told == [Velocity(0.5), Hover()]
+
+
+def test_a_hand_over_on_the_ground_tells_the_vehicle_nothing(bench: Bench) -> None:
+    bench.pilot("alice")
+    bench.pilot("bob", 0)
+    bench.run(1.0)
+    assert bench.driver.told == []
+    assert bench.proxy.helm.state is FlightState.LANDED

@@ -1,0 +1,213 @@
+"""The ladder in the whole proxy: exact times, what is told, and who may end it."""
+
+from __future__ import annotations
+
+import pytest
+
+from skyloop.messages import (
+    Attitude,
+    EventKind,
+    Failsafe,
+    FlightState,
+    Hover,
+    Idle,
+    Land,
+    Refusal,
+    ReleaseAuthority,
+    Takeoff,
+    Velocity,
+)
+from tests.proxy.fake import App, Bench
+
+
+def steps(app: App) -> list[tuple[object, object]]:
+    return [(event.data["step"], event.data["reason"]) for event in app.told(EventKind.FAILSAFE)]
+
+
+def test_a_silent_pilot(bench: Bench) -> None:
+    pilot, witness = bench.airborne(), bench.join("witness")
+    pilot.command(Velocity(0.5))
+    bench.run(0.48)
+    assert bench.driver.told == [Velocity(0.5)]
+    bench.run(0.02)
+    assert bench.driver.told == [Velocity(0.5), Hover()]
+    assert steps(witness) == [("hover", "silent")]
+    assert witness.last_feedback().failsafe is Failsafe.HOVER
+    assert witness.applied[-1].app_id == 0
+    bench.run(4.48)
+    assert bench.driver.told == [Velocity(0.5), Hover()]
+    bench.run(0.02)
+    assert bench.driver.told == [Velocity(0.5), Hover(), Land()]
+    assert steps(witness)[-1] == ("land", "silent")
+    bench.driver.report(state=FlightState.LANDED)
+    bench.run(0.02)
+    assert steps(witness)[-1] == ("none", "landed")
+    assert witness.last_feedback().failsafe is Failsafe.NONE
+
+
+def test_a_killed_pilot(bench: Bench) -> None:
+    pilot, witness = bench.airborne(), bench.join("witness")
+    pilot.command(Velocity(0.5))
+    pilot.end.close()
+    witness.sync()
+    bench.run(0.02)
+    assert bench.driver.told == [Velocity(0.5), Hover()]
+    assert steps(witness) == [("hover", "gone")]
+    bench.run(4.96)
+    assert bench.driver.told[2:] == []
+    bench.run(0.02)
+    assert bench.driver.told[2:] == [Land()]
+
+
+def test_a_pilot_who_released(bench: Bench) -> None:
+    pilot = bench.airborne()
+    pilot.command(Velocity(0.5))
+    pilot.ask(ReleaseAuthority())
+    bench.run(0.48)
+    assert bench.driver.told == [Velocity(0.5)]
+    bench.run(0.02)
+    assert bench.driver.told == [Velocity(0.5), Hover()]
+    assert steps(pilot) == [("hover", "released")]
+
+
+def test_a_pilot_who_comes_back_ends_the_step_with_a_fresh_command_only(bench: Bench) -> None:
+    pilot = bench.airborne()
+    pilot.command(Velocity(0.5))
+    bench.run(0.6)
+    pilot.command(Velocity(0.5), repeat=True)
+    pilot.command(Idle())
+    assert pilot.refusals() == [Refusal.NOT_FRESH]
+    assert steps(pilot) == [("hover", "silent")]
+    pilot.command(Velocity(0.2))
+    assert steps(pilot) == [("hover", "silent"), ("none", "fresh command")]
+    assert bench.driver.told == [Velocity(0.5), Hover(), Velocity(0.2)]
+
+
+def test_a_pilot_who_comes_back_breaks_the_ladders_landing_off(bench: Bench) -> None:
+    pilot = bench.airborne()
+    pilot.command(Velocity(0.5))
+    bench.run(5.0)
+    assert bench.driver.told == [Velocity(0.5), Hover(), Land()]
+    pilot.take_authority()
+    bench.run(0.4, lambda: pilot.command(Idle(), repeat=True))
+    assert bench.driver.told[3:] == []  # to be there is not enough
+    pilot.command(Velocity(0.2))
+    pilot.command(Velocity(0.2), repeat=True)
+    assert bench.driver.told[3:] == [Hover(), Velocity(0.2)]
+    assert steps(pilot)[-1] == ("none", "fresh command")
+
+
+def test_a_low_battery(bench: Bench) -> None:
+    pilot = bench.airborne()
+    bench.driver.report(battery=0.19)
+    bench.run(0.1, lambda: pilot.command(Velocity(0.1)))
+    assert len(pilot.told(EventKind.BATTERY_LOW)) == 1
+    assert Land() not in bench.driver.told
+    bench.driver.report(battery=0.09)
+    bench.run(0.02)
+    assert bench.driver.told[-1] == Land()
+    assert steps(pilot) == [("land", "battery")]
+    pilot.command(Velocity(0.1))
+    pilot.command(Takeoff())
+    assert pilot.refusals() == [Refusal.WRONG_STATE]
+    assert bench.driver.told[-1] == Land()
+    bench.driver.report(state=FlightState.LANDED)
+    bench.run(0.02)
+    pilot.command(Takeoff())
+    assert bench.driver.told[-1] == Land()
+    assert "battery" in pilot.told(EventKind.COMMAND_REFUSED)[-1].text
+
+
+def test_a_driver_that_fails_is_tried_again_at_a_bounded_pace(bench: Bench) -> None:
+    pilot = bench.airborne()
+    bench.driver.fail = {"apply"}
+    bench.run(3.5)
+    errors = pilot.told(EventKind.DRIVER_ERROR)
+    assert 3 <= len(errors) <= 4  # one at once, then a sum a second
+    tries = sum(count for event in errors if isinstance(count := event.data["count"], int))
+    assert 9 <= tries <= 13  # 4 a second, some not told yet
+    bench.driver.fail = set()
+    bench.run(0.26)
+    assert bench.driver.told == [Hover()]
+
+
+def test_nothing_is_done_on_the_ground(bench: Bench) -> None:
+    pilot = bench.pilot()
+    bench.run(6.0)
+    assert bench.driver.told == []
+    assert steps(pilot) == []
+
+
+def test_a_vehicle_found_flying_waits_for_its_pilot(bench: Bench) -> None:
+    witness = bench.join("witness")
+    bench.driver.report(state=FlightState.FLYING)
+    bench.run(0.48)
+    assert bench.driver.told == []
+    bench.run(0.02)
+    assert steps(witness) == [("hover", "none")]
+    bench.run(4.5)
+    assert bench.driver.told == [Hover(), Land()]
+
+
+def test_a_vehicle_that_never_tells_its_state_is_watched_from_its_first_command_on(bench: Bench) -> None:
+    bench.driver.answers = False
+    bench.driver.report(state=FlightState.UNKNOWN)
+    pilot = bench.pilot()
+    bench.run(0.6)
+    assert bench.driver.told == []
+    pilot.take_authority()
+    pilot.command(Takeoff())
+    bench.run(5.0)
+    assert bench.driver.told == [Takeoff(), Hover(), Land()]
+
+
+def test_landing_before_the_end(bench: Bench) -> None:
+    pilot = bench.airborne()
+    assert bench.proxy.watch.order_landing(bench.clock())
+    assert bench.driver.told == [Land()]
+    pilot.command(Velocity(0.5))
+    assert pilot.refusals() == [Refusal.WRONG_STATE]
+    bench.driver.report(state=FlightState.LANDED)
+    assert bench.proxy.land(1.0)
+    bench.proxy.stop(reason="it is late")
+    assert "it is late" in next(event.text for event in pilot.events if event.kind is EventKind.PROXY_CLOSING)
+    assert bench.driver.told == [Land()]
+    assert bench.driver.closed
+
+
+def test_ending_in_the_air_leaves_it_hovering(bench: Bench) -> None:
+    pilot = bench.airborne()
+    pilot.command(Velocity(0.5))
+    bench.proxy.stop()
+    assert bench.driver.told == [Velocity(0.5), Hover()]
+
+
+def test_a_vehicle_that_lacks_hover_gets_it_from_the_autopilot() -> None:
+    with Bench(actions={"takeoff", "land", "attitude"}) as bench:
+        pilot = bench.airborne()
+        pilot.command(Attitude(0.1))
+        bench.run(0.6)
+        assert steps(pilot) == [("hover", "silent")]
+        assert bench.driver.told[0] == Attitude(0.1)
+        assert {type(action) for action in bench.driver.told} == {Attitude}
+        bench.run(4.5)
+        assert bench.driver.told[-1] == Land()
+        after = len(bench.driver.told)
+        bench.run(0.2)
+        assert len(bench.driver.told) == after  # the vehicle lands: the autopilot steers no longer
+
+
+def test_a_driver_whose_failsafe_raises_against_its_contract_is_tried_again(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pilot = bench.airborne()
+
+    def broken(action: Hover | Land) -> bool:
+        raise RuntimeError("it may not")
+
+    monkeypatch.setattr(bench.driver, "failsafe", broken)
+    bench.run(0.6)
+    assert "it may not" in pilot.told(EventKind.DRIVER_ERROR)[0].text
+    monkeypatch.undo()
+    bench.run(0.3)
+    assert bench.driver.told == [Hover()]

@@ -1,0 +1,294 @@
+"""What the vehicle tells: feedback, frames, events; and what goes to whom."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+
+from skyloop.clock import monotonic_ns
+from skyloop.drivers.base import Sink
+from skyloop.drivers.uri import VehicleUri
+from skyloop.errors import UsageError
+from skyloop.messages import (
+    Annotation,
+    CameraInfo,
+    Capabilities,
+    Encoding,
+    EventKind,
+    FlightState,
+    GetStatistics,
+    Hover,
+    Intrinsics,
+    LinkState,
+    Role,
+    Severity,
+    Statistics,
+    Takeoff,
+    Text,
+    Velocity,
+    encode,
+)
+from skyloop.proxy import Proxy
+from skyloop.transport.memory import MemoryServer
+from tests.proxy.fake import WAIT_S, App, Bench, FakeDriver
+
+PIXELS = np.arange(36, dtype=np.uint8).reshape(3, 4, 3)
+
+
+def sink_of(bench: Bench) -> Sink:
+    assert bench.driver.sink is not None
+    return bench.driver.sink
+
+
+def test_feedback_is_stamped_with_the_proxys_own_fields(bench: Bench) -> None:
+    pilot = bench.pilot("alice", 9)
+    bench.clock.advance(0.01)
+    bench.driver.report(altitude=2.5, native={"temperature": 21})
+    feedback = pilot.last_feedback()
+    assert (feedback.altitude, feedback.native) == (2.5, {"temperature": 21})
+    assert feedback.captured_ns == feedback.published_ns == bench.clock()
+    assert (feedback.owner, feedback.owner_id, feedback.owner_priority, feedback.lease) == ("alice", 1, 9, 1)
+    assert feedback.vehicle_link is LinkState.UP
+    bench.driver.report()
+    assert pilot.last_feedback().seq == feedback.seq + 1
+
+
+def test_a_silent_vehicle_leaves_the_proxys_own_feedback(bench: Bench) -> None:
+    app = bench.join("me")
+    app.sync()
+    seen = len(app.feedback)
+    captured = bench.driver.now.captured_ns
+    bench.run(2.0)
+    app.sync()
+    news = app.feedback[seen:]
+    assert 4 <= len(news) <= 10
+    assert {feedback.captured_ns for feedback in news} == {captured}  # it is no newer than it is
+    bench.driver.link(LinkState.LOST, "gone")
+    bench.tick()
+    assert app.last_feedback().vehicle_link is LinkState.LOST
+
+
+def test_before_anything_was_heard_there_is_feedback_without_invented_data() -> None:
+    with Bench() as bench:
+        app = bench.join("me")
+        bench.proxy.vehicle._raw = None
+        bench.run(0.3)
+        feedback = app.last_feedback()
+        assert (feedback.state, feedback.altitude, feedback.battery) == (FlightState.UNKNOWN, None, None)
+
+
+def test_changes_of_the_flight_state_are_told(bench: Bench) -> None:
+    app = bench.join("me")
+    bench.driver.report(state=FlightState.FLYING)
+    bench.driver.report(state=FlightState.FLYING)
+    bench.driver.report(state=FlightState.EMERGENCY)
+    flying, emergency = app.told(EventKind.STATE_CHANGED)[-2:]
+    assert flying.data == {"before": "landed", "after": "flying"}
+    assert emergency.severity is Severity.ERROR
+
+
+def test_native_telemetry_that_is_too_large_is_left_out_and_told(bench: Bench) -> None:
+    app = bench.join("me")
+    bench.driver.report(altitude=3.0, native={"text": "x" * 70_000})
+    feedback = app.last_feedback()
+    assert (feedback.altitude, feedback.native) == (3.0, None)
+    assert len(app.told(EventKind.DRIVER_ERROR)) == 1
+
+
+def test_frames_carry_their_number_time_and_intrinsics(bench: Bench) -> None:
+    app = bench.join("me")
+    sink = sink_of(bench)
+    assert not sink.wants("front")
+    sink.frame("front", PIXELS, 5, width=4, height=3)  # nobody looks: counted all the same
+    app.end.subscribe("video/front")
+    assert sink.wants("front")
+    intrinsics = Intrinsics(1.0, 1.0, 2.0, 1.5)
+    sink.frame("front", PIXELS, 6, width=4, height=3, intrinsics=intrinsics)
+    app.sync()
+    ((header, pixels),) = app.frames
+    assert pixels == PIXELS.tobytes()
+    assert (header.camera, header.seq, header.captured_ns, header.published_ns) == ("front", 2, 6, bench.clock())
+    assert (header.width, header.height, header.size, header.encoding) == (4, 3, 36, Encoding.BGR8)
+    assert header.intrinsics == intrinsics
+
+
+def test_a_cameras_nominal_intrinsics_are_used_for_frames_of_its_size() -> None:
+    nominal = Intrinsics(2.0, 2.0, 2.0, 1.5)
+
+    class Driver(FakeDriver):
+        def capabilities(self) -> Capabilities:
+            return Capabilities("fake", cameras=(CameraInfo("front", 4, 3, 15.0, intrinsics=nominal),))
+
+    bench = Bench()
+    bench.driver = Driver(bench.clock)
+    bench.proxy = Proxy(bench.driver, bench.server, name="bench", clock=bench.clock, ticker=False)
+    with bench:
+        app = bench.join("me")
+        app.end.subscribe("video/front")
+        sink_of(bench).frame("front", PIXELS, 1, width=4, height=3)
+        sink_of(bench).frame("front", PIXELS[:1], 1, width=4, height=1)
+        app.sync()
+        assert [header.intrinsics for header, _ in app.frames] == [nominal, None]
+
+
+def test_a_frame_of_the_wrong_size_is_told_and_not_shown(bench: Bench) -> None:
+    app = bench.join("me")
+    app.end.subscribe("video/front")
+    sink_of(bench).frame("front", PIXELS, 1, width=4, height=4)
+    (event,) = app.told(EventKind.DRIVER_ERROR)
+    assert "36 bytes" in event.text
+    assert "48 bytes" in event.text
+    assert app.frames == []
+
+
+def test_pixels_that_no_transport_takes_are_told(bench: Bench) -> None:
+    app = bench.join("me")
+    app.end.subscribe("video/front")
+    sink_of(bench).frame("front", PIXELS[:, ::-1], 1, width=4, height=3)
+    assert len(app.told(EventKind.DRIVER_ERROR)) == 1
+    assert app.frames == []
+
+
+def test_the_vehicles_own_events_are_passed_on(bench: Bench) -> None:
+    app = bench.join("me")
+    sink_of(bench).event(EventKind.COLLISION, "touched a wall", Severity.WARNING, speed_m_s=0.4)
+    (event,) = app.told(EventKind.COLLISION)
+    assert (event.text, event.data) == ("touched a wall", {"speed_m_s": 0.4})
+
+
+def test_an_event_with_particulars_that_cannot_be_sent_is_told_without_them(
+    bench: Bench, caplog: pytest.LogCaptureFixture
+) -> None:
+    app = bench.join("me")
+    sink_of(bench).event(EventKind.VEHICLE_MESSAGE, "m" * 5000, detail="x" * 70_000)
+    (event,) = app.told(EventKind.VEHICLE_MESSAGE)
+    assert len(event.text) == 1000
+    assert event.data == {}
+    assert "cannot be sent" in caplog.text
+
+
+def test_events_are_numbered_without_gaps(bench: Bench) -> None:
+    app = bench.join("me")
+    for _ in range(20):
+        bench.driver.link(LinkState.LOST)
+        bench.driver.link(LinkState.UP)
+    app.sync()
+    numbers = [event.seq for event in app.events]
+    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+
+
+def test_events_that_could_not_be_handed_over_are_told(bench: Bench) -> None:
+    witness = bench.join("witness")
+    refusing = 3
+
+    def publish(topic: str, packet: bytes) -> int:
+        nonlocal refusing
+        refusing -= 1
+        return bench.server.publish(topic, packet) + (refusing >= 0)
+
+    bench.proxy.events._publish = publish
+    for number in range(5):
+        bench.proxy.events.tell(EventKind.VEHICLE_MESSAGE, str(number))
+    bench.run(1.0)
+    (event,) = witness.told(EventKind.SAMPLES_LOST)
+    assert event.data == {"count": 3}
+    statistics = witness.ask(GetStatistics())
+    assert isinstance(statistics, Statistics)
+    assert statistics.counters["events.missed"] == 3
+
+
+def test_annotations_go_to_who_wants_them_from_any_role(bench: Bench) -> None:
+    observer, viewer = bench.join("tracker", Role.OBSERVER), bench.join("viewer")
+    small = Annotation("tracker", "front", 1, 4, 3, (Text("here", (1.0, 2.0)),))
+    large = Annotation("tracker", "front", 1, 4, 3, tuple(Text("x" * 256, (1.0, 2.0)) for _ in range(200)))
+    observer.end.send(encode(small))
+    observer.end.send(encode(large))
+    observer.sync()
+    viewer.sync()
+    assert viewer.others == [small]
+    (event,) = viewer.told(EventKind.PACKET_MALFORMED)
+    assert "32768" in event.text
+
+
+def test_the_software_autopilots_state_is_shown() -> None:
+    with Bench(actions={"attitude"}) as bench:
+        bench.driver.report(state=FlightState.UNKNOWN, altitude=0.0, velocity=(0.0, 0.0, 0.0))
+        bench.tick()
+        pilot = bench.pilot()
+        pilot.command(Takeoff())
+
+        def rise() -> None:
+            altitude = (bench.driver.now.altitude or 0.0) + 0.02
+            bench.driver.report(altitude=min(1.0, altitude), state=FlightState.UNKNOWN)
+            pilot.command(Takeoff(), repeat=True)
+
+        bench.run(0.5, rise)
+        assert pilot.last_feedback().state is FlightState.TAKING_OFF
+        assert {type(action).__name__ for action in bench.driver.told} == {"Attitude"}
+        bench.run(1.0, rise)
+        assert pilot.last_feedback().state is FlightState.HOVERING
+        assert any(echo.app_id == 0 for echo in pilot.applied)
+        pilot.command(Velocity(0.5))
+        bench.run(0.1)
+        assert pilot.last_feedback().state is FlightState.FLYING
+        bench.run(0.5)  # silent: the ladder uses the autopilot too
+        assert pilot.last_feedback().state is FlightState.HOVERING
+        bench.driver.fail = {"apply"}
+        bench.run(0.1)
+        assert "autopilot" in pilot.told(EventKind.DRIVER_ERROR)[-1].text
+
+
+def test_a_name_must_fit() -> None:
+    driver = FakeDriver(Bench().clock)
+    for name in ("", "x" * 65):
+        with pytest.raises(UsageError, match="1 to 64"):
+            Proxy(driver, MemoryServer("m"), name=name)
+
+
+def test_a_proxy_is_started_once_and_stops_twice(bench: Bench) -> None:
+    with pytest.raises(UsageError, match="started before"):
+        bench.proxy.start()
+    bench.proxy.stop()
+    bench.proxy.stop()
+
+
+def test_a_driver_that_cannot_be_opened_leaves_nothing_behind() -> None:
+    bench = Bench()
+    bench.driver.fail = {"open"}
+    before = threading.active_count()
+    with pytest.raises(RuntimeError, match="open is broken"):
+        bench.proxy.start()
+    assert threading.active_count() == before
+
+
+def test_a_server_end_that_cannot_be_started_opens_no_driver() -> None:
+    first = Bench()
+    with first:
+        second = Proxy(FakeDriver(first.clock), first.server, name="bench", clock=first.clock, ticker=False)
+        with pytest.raises(UsageError):
+            second.start()
+        second.stop()
+        assert isinstance(second.driver, FakeDriver)
+        assert second.driver.sink is None
+
+
+def test_the_ticker_takes_the_ladders_step_by_itself() -> None:
+    class Clocked(FakeDriver):
+        hovered = threading.Event()
+
+        def _apply(self, action: object) -> object:  # type: ignore[override]
+            if isinstance(action, Hover):
+                self.hovered.set()
+            return action
+
+    server = MemoryServer("real")
+    driver = Clocked(monotonic_ns)
+    assert driver.uri == VehicleUri("fake", text="fake://")
+    with Proxy(driver, server, name="real"):
+        driver.report(state=FlightState.FLYING)
+        pilot = App(server.dial, monotonic_ns)
+        assert driver.hovered.wait(WAIT_S)
+        pilot.end.close()
+    assert not any(thread.name == "skyloop-ticker" for thread in threading.enumerate())

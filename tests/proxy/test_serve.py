@@ -1,0 +1,120 @@
+"""A proxy as a process: how it says that it is ready, and how it ends."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from skyloop.clock import monotonic_ns
+from skyloop.errors import UsageError
+from skyloop.messages import EventKind, Takeoff
+from skyloop.proxy.serve import serve
+from skyloop.transport.local import dial
+from tests.proxy.fake import WAIT_S, App
+from tests.proxy.toy_process import Toy
+
+pytestmark = [pytest.mark.process, pytest.mark.skipif(sys.platform != "linux", reason="the local transport is Linux's")]
+
+ROOT = Path(__file__).parents[2]
+Start = Callable[..., subprocess.Popen[str]]
+
+
+@pytest.fixture
+def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Start]:
+    runtime = tmp_path / "run"
+    monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", str(runtime))
+    processes: list[subprocess.Popen[str]] = []
+
+    def start(*arguments: str, descriptors: tuple[int, ...] = ()) -> subprocess.Popen[str]:
+        command = [sys.executable, "-m", "tests.proxy.toy_process", "toy", *arguments]
+        process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, pass_fds=descriptors)
+        processes.append(process)
+        assert process.stdout is not None
+        ready = process.stdout.readline()
+        assert ready == f"ready toy: fake:// at local:toy, process {process.pid}\n"
+        return process
+
+    yield start
+    for process in processes:
+        process.kill()
+        process.wait()
+        assert process.stdout is not None
+        process.stdout.close()
+
+
+def flying() -> App:
+    app = App(dial("toy"), monotonic_ns)
+    app.hello("pilot")
+    app.take_authority()
+    app.command(Takeoff())
+    return app
+
+
+def rest_of(process: subprocess.Popen[str]) -> list[str]:
+    out, _ = process.communicate(timeout=WAIT_S)
+    return out.splitlines()
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_lands_first_and_tells_why(start: Start, number: signal.Signals) -> None:
+    process = start()
+    app = flying()
+    process.send_signal(number)
+    assert rest_of(process) == ["told takeoff", "told land", "closed", "served"]
+    assert process.returncode == 0
+    app.closed_by.get(timeout=WAIT_S)
+    (closing,) = [event for event in app.events if event.kind is EventKind.PROXY_CLOSING]
+    assert number.name in closing.text
+    assert next(event for event in app.events if event.kind is EventKind.FAILSAFE).data["reason"] == "closing"
+    app.end.close()
+
+
+def test_the_end_of_the_parent_ends_it_at_once(start: Start) -> None:
+    reading, writing = os.pipe()
+    try:
+        process = start(str(reading), descriptors=(reading,))
+        app = flying()
+        process.send_signal(signal.SIGINT)  # the terminal's Ctrl-C is the parent's to handle
+        app.sync()
+    finally:
+        os.close(reading)
+        os.close(writing)
+    assert rest_of(process) == ["told takeoff", "told hover", "closed", "served"]
+    app.closed_by.get(timeout=WAIT_S)
+    app.end.close()
+
+
+def test_in_this_process_it_gives_everything_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", str(tmp_path / "run"))
+    drivers: list[Toy] = []
+
+    def make_driver(uri: str) -> Toy:
+        drivers.append(Toy(monotonic_ns))
+        return drivers[-1]
+
+    monkeypatch.setattr("skyloop.proxy.serve.make_driver", make_driver)
+    before, handler = set(threading.enumerate()), signal.getsignal(signal.SIGTERM)
+
+    def end_it() -> None:
+        os.kill(os.getpid(), signal.SIGTERM)  # its handler is in place, as applications could connect
+
+    monkeypatch.setattr("skyloop.proxy.serve._announce", lambda line: threading.Thread(target=end_it).start())
+    serve("fake://", "toy")
+    assert signal.getsignal(signal.SIGTERM) is handler
+    assert {thread for thread in threading.enumerate() if thread.name.startswith("skyloop")} <= before
+    assert list((tmp_path / "run").iterdir()) == []
+
+
+def test_a_descriptor_that_is_not_open_is_refused() -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    os.close(writing)
+    with pytest.raises(UsageError, match=f"{reading} is not open"):
+        serve("fake://", "toy", parent_fd=reading)
