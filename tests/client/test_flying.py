@@ -19,6 +19,7 @@ from skyloop.messages import (
     Event,
     EventKind,
     Failsafe,
+    Feedback,
     FlightState,
     Hover,
     Idle,
@@ -223,6 +224,18 @@ def test_a_failsafe_ends_the_set_point(proxy: ScriptedProxy, drone: Drone) -> No
     before = len(proxy.commands)
     proxy.until(lambda: len(proxy.commands) > before + 3)
     assert set(proxy.actions()[before + 1 :]) == {Idle()}
+
+
+def test_what_a_listener_commands_in_answer_to_a_failsafe_stays(proxy: ScriptedProxy, drone: Drone) -> None:
+    def answer(feedback: Feedback) -> None:
+        if feedback.failsafe is Failsafe.HOVER and not answered:
+            answered.append(drone.velocity(left=0.5))
+
+    answered: list[bool] = []
+    with drone.on_feedback(answer, inline=True):
+        proxy.more["failsafe"] = Failsafe.HOVER
+        proxy.until(lambda: proxy.actions().count(Velocity(left=0.5)) >= 4)
+    assert len(answered) == 1
 
 
 def test_released_and_requested_again(proxy: ScriptedProxy, drone: Drone) -> None:

@@ -88,6 +88,11 @@ class Commander:
             self._due_ns = max(now_ns, self._sent_ns + self._min_interval_ns)
 
     @property
+    def open_ns(self) -> int:
+        """From when on a new set-point goes out at once."""
+        return self._sent_ns + self._min_interval_ns
+
+    @property
     def due_ns(self) -> int:
         """When :meth:`next` wants to be called."""
         return self._due_ns

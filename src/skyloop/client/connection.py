@@ -97,6 +97,12 @@ class Connection:
         assert self._end is not None
         return self._end.send
 
+    @property
+    def knock(self) -> Callable[[], None]:
+        """The transport's way to say that a packet follows at once."""
+        assert self._end is not None
+        return self._end.knock
+
     def send(self, packet: bytes) -> bool:
         end = self._end
         return end is not None and not self._quiet and end.send(packet)

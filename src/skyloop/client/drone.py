@@ -83,7 +83,7 @@ class Drone(Flying, Reading):
             deadline = time.monotonic() + timeout_s
             self._link.start(timeout_s)
             left_s = max(0.1, deadline - time.monotonic())
-            if not self._reception.bell.wait_for(lambda: self._reception.newest is not None, left_s):
+            if not self._reception.bell.wait_for(self._known, left_s):
                 raise NoAnswerError(f"{self.name} answered, but told nothing of its vehicle within {timeout_s:g} s")
             if self._role is Role.PILOT:
                 self.request_authority(priority, wait_s=wait_s)
@@ -180,6 +180,10 @@ class Drone(Flying, Reading):
         return f"<Drone {self.name or '?'} ({self._link.state.value}, authority {self.authority.state})>"
 
     # Inside ----------------------------------------------------------------------------------------------------
+
+    def _known(self) -> bool:
+        """Whether the vehicle's state is known and the link was judged."""
+        return self._reception.newest is not None and self._reception.status.application is not LinkState.CONNECTING
 
     def _flies(self) -> bool:
         """Whether this application has the vehicle in the air, or has just told it to take off."""

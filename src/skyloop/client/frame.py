@@ -37,14 +37,42 @@ class Frame(_Base):
     exposure) and ``published_ns`` on the proxy's clock, ``received_ns`` on this host's.
     """
 
-    camera: str  #: name of the camera
-    seq: int  #: grows by one with each frame that the camera gave
-    captured_ns: int
-    published_ns: int
-    received_ns: int
-    intrinsics: Intrinsics | None  #: of the camera, in pixels of this frame
-    header: FrameHeader
     _arrival: Arrival
+
+    @property
+    def header(self) -> FrameHeader:
+        """What came with the pixels."""
+        return self._arrival.header
+
+    @property
+    def camera(self) -> str:
+        """Name of the camera."""
+        return self._arrival.header.camera
+
+    @property
+    def seq(self) -> int:
+        """Grows by one with each frame that the camera gave."""
+        return self._arrival.header.seq
+
+    @property
+    def captured_ns(self) -> int:
+        """Middle of the exposure, on the proxy's clock [ns]."""
+        return self._arrival.header.captured_ns
+
+    @property
+    def published_ns(self) -> int:
+        """When the proxy had it, on its clock [ns]."""
+        return self._arrival.header.published_ns
+
+    @property
+    def received_ns(self) -> int:
+        """When it was here, on this host's clock [ns]."""
+        return self._arrival.received_ns
+
+    @property
+    def intrinsics(self) -> Intrinsics | None:
+        """Of the camera, in pixels of this frame."""
+        return self._arrival.header.intrinsics
 
     @property
     def image(self) -> NDArray[np.uint8]:
@@ -138,21 +166,14 @@ class Arrival:
             return frame
 
     def _make(self) -> Frame:
-        header = self.header
         image = self._image
         if image is None:
             assert self._pixels is not None
-            image = self._image = to_bgr(header, self._pixels)
-            image.flags.writeable = False
+            image = self._image = to_bgr(self.header, self._pixels)
+            if image.flags.writeable:
+                image.flags.writeable = False
             self._pixels = None
         frame = image.view(Frame)
-        frame.camera = header.camera
-        frame.seq = header.seq
-        frame.captured_ns = header.captured_ns
-        frame.published_ns = header.published_ns
-        frame.received_ns = self.received_ns
-        frame.intrinsics = header.intrinsics
-        frame.header = header
         frame._arrival = self
         return frame
 

@@ -92,6 +92,8 @@ class Link:
         self._connection: Connection | None = None
         #: Hands a packet to the transport of the present connection; False if it could not be handed over.
         self.transmit: Callable[[bytes], bool] = _nowhere
+        #: Says that a packet follows at once.
+        self.knock: Callable[[], None] = _nobody
         self._wake = Bell()
         self._poked = False
         self._closing = False
@@ -275,7 +277,7 @@ class Link:
                 for topic in self._topics:
                     connection.subscribe(topic, True)
                 self._connection = connection
-                self.transmit = connection.transmit
+                self.transmit, self.knock = connection.transmit, connection.knock
         except BaseException:
             connection.close(LinkError("the connection was given up"))
             raise
@@ -306,7 +308,7 @@ class Link:
     def _drop(self, error: LinkError, reason: str) -> None:
         with self._lock:
             connection, self._connection = self._connection, None
-            self.transmit = _nowhere
+            self.transmit, self.knock = _nowhere, _nobody
         if connection is None:
             return
         self._malformed_before += connection.monitor.malformed_count
@@ -323,3 +325,7 @@ class Link:
 
 def _nowhere(packet: bytes) -> bool:  # noqa: ARG001  (there is no connection to hand it to)
     return False
+
+
+def _nobody() -> None:
+    """Whom one knocks at when there is no connection."""

@@ -97,6 +97,8 @@ class Pilot:
         Raises :class:`AuthorityError` while somebody else has the authority, or nobody asked for it.
         """
         now_ns = self._clock()
+        if self._authority.held and self._commander.open_ns <= now_ns:
+            self.link.knock()  # the proxy wakes up while the command is being made
         stop = type(action) is EmergencyStop
         with self._lock:
             authority = self._authority

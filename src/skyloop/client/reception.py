@@ -153,18 +153,24 @@ class Reception:
         return self.pilot.tick(now_ns)
 
     def feedback(self, sample: Feedback, now_ns: int) -> None:
+        before = self.newest
         self.history.add(sample)
         self.newest = sample
         self.received_ns = now_ns
-        self.pilot.feedback(sample, now_ns)  # before any listener: its calls are newer than what this sample ends
-        if sample.vehicle_link is not self.status.vehicle:
-            self._status_changed(replace(self.status, vehicle=sample.vehicle_link, reason=self._vehicle_reason()))
+        # A failsafe or another owner ends the set-point, but not what a listener commands in answer to this sample.
+        news = before is None or sample.failsafe is not before.failsafe or sample.owner_id != before.owner_id
+        if news:
+            self.pilot.feedback(sample, now_ns)
         self.on_feedback.publish(sample)  # first whoever waits for it, then the books
         self.bell.ring()
         offset_ns = self.link.offset_ns
         counter = self.counter
         counter.follow(sample.seq)
         counter.add(now_ns + offset_ns - sample.published_ns, sample.captured_ns - offset_ns, now_ns)
+        if not news:
+            self.pilot.feedback(sample, now_ns)
+        if sample.vehicle_link is not self.status.vehicle:
+            self._status_changed(replace(self.status, vehicle=sample.vehicle_link, reason=self._vehicle_reason()))
 
     def frame(self, header: FrameHeader, pixels: Pixels, now_ns: int) -> None:
         channel = self.channels.get(header.camera)

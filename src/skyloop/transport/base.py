@@ -127,6 +127,12 @@ class ClientEnd(ABC):
     def send(self, packet: bytes) -> bool:
         """Send to the proxy; False if it could not be handed over. Any thread."""
 
+    def knock(self) -> None:  # noqa: B027  (nothing is a good answer)
+        """Say that a packet follows at once, so that the other end wakes up while it is still being made.
+
+        It changes nothing but delays: a transport that gains nothing by it does nothing. Any thread.
+        """
+
     @abstractmethod
     def subscribe(self, topic: str, on: bool = True) -> None:
         """Ask for a topic, or no longer. Any thread. Raises :class:`skyloop.errors.UsageError` for a name too long."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from skyloop.clock import monotonic_ns, nanoseconds, seconds
 from skyloop.sim.camera import CameraModel, CameraPose
-from skyloop.sim.render import PlanarRenderer, Quality, Scene, SceneState, SensorEffects
+from skyloop.sim.render import PlanarRenderer, Quality, Renderer, Scene, SceneState, SensorEffects
 from skyloop.sim.world import World
 
 _LONGEST_WAIT_S: Final = 0.5
@@ -83,9 +83,10 @@ class Studio:
     The scene is made at the start, which costs some tenths of a second: start it when the first picture is wanted.
     """
 
-    def __init__(self, world: World, drones: int, quality: str) -> None:
+    def __init__(self, world: World, drones: int, renderer: str, quality: str) -> None:
         self._world = world
         self._drones = drones
+        self._renderer = renderer
         self._quality = Quality(quality)
         self._changed = threading.Condition()
         self._waiting: dict[Camera, Exposure] = {}  # oldest camera first
@@ -124,7 +125,7 @@ class Studio:
 
     def _run(self) -> None:
         try:
-            renderer = PlanarRenderer(Scene(self._world, self._drones), self._quality)
+            renderer = self._make_renderer()
         except Exception as error:  # noqa: BLE001  told to the drivers: there will be no pictures
             with self._changed:
                 screens = {camera.screen for camera in self._waiting}
@@ -139,6 +140,14 @@ class Studio:
                 exposure.camera.screen.failed(error)
             else:
                 heapq.heappush(self._finished, (exposure.due_ns, next(self._order), exposure, picture))
+
+    def _make_renderer(self) -> Renderer:
+        """On the thread that draws, which what it makes belongs to."""
+        if self._renderer == "mujoco":
+            from skyloop.sim.render.mujoco import MujocoRenderer
+
+            return MujocoRenderer(self._world, self._drones)
+        return PlanarRenderer(Scene(self._world, self._drones), self._quality)
 
     def _next(self) -> Exposure | None:
         """The next exposure to draw, handing out meanwhile what is due; None to stop."""
@@ -161,6 +170,15 @@ class Studio:
             with self._handing:
                 if not exposure.camera.gone:
                     exposure.camera.screen.show(exposure.model, picture, exposure.captured_ns)
+
+
+def require_renderer(name: str) -> None:
+    """Raises :class:`skyloop.errors.MissingExtraError` or :class:`skyloop.errors.UnsupportedError` where this renderer
+    can't draw, with what to install."""
+    if name == "mujoco":
+        from skyloop.sim.render.mujoco import require_opengl
+
+        require_opengl()
 
 
 def expose(

@@ -92,8 +92,8 @@ class SimHost:
     def board(self, drone: int, passenger: Passenger, screen: Screen, models: list[CameraModel]) -> tuple[Camera, ...]:
         """Begin to tell a passenger about a drone and to draw its cameras; the first one starts the world.
 
-        Raises :class:`UsageError` if somebody else has this drone, :class:`skyloop.errors.MissingExtraError` if
-        cameras are wanted and what draws is not installed.
+        Raises :class:`UsageError` if somebody else has this drone, :class:`skyloop.errors.MissingExtraError` or
+        :class:`skyloop.errors.UnsupportedError` if cameras are wanted and what draws is not installed.
         """
         with self._lock:
             if drone in self._passengers:
@@ -128,8 +128,9 @@ class SimHost:
     def _cameras(self, drone: int, screen: Screen, models: list[CameraModel]) -> tuple[Camera, ...]:
         if not models:
             return ()
-        from skyloop.drivers.sim.cameras import Camera, Shutter
+        from skyloop.drivers.sim.cameras import Camera, Shutter, require_renderer
 
+        require_renderer(self.options.renderer)
         cameras = []
         for n, model in enumerate(models):
             place = drone * len(models) + n
@@ -208,7 +209,8 @@ class _Runner:
         from skyloop.sim.render import SceneState
 
         if self._studio is None:
-            self._studio = Studio(self._simulation.world, self._host.drones, self._host.options.quality)
+            options = self._host.options
+            self._studio = Studio(self._simulation.world, self._host.drones, options.renderer, options.quality)
             self._studio.start()
         positions, rotations = self._simulation.poses()
         state = SceneState(positions, rotations, self._simulation.target_states())

@@ -3,10 +3,11 @@
 Options: ``world`` its name or file (``room``); ``seed`` (0); ``speed`` seconds of simulation a second (1); ``cameras``
 (``front,bottom``, or ``none``); ``width``, ``height``, ``fps`` of all cameras; ``latency`` of all cameras [s];
 ``noise`` a factor on every sensor's and camera's noise (1); ``wind`` a factor on the world's wind (1); ``battery``
-charge at the start, 0 to 1 (1); ``quality`` of the pictures, ``fast``, ``smooth`` or ``best``; ``native`` the actions
-that the vehicle itself takes, the others being left to the proxy (all); ``position`` whether the vehicle knows its
-place, as with an indoor positioning system (0); ``truth`` whether feedback carries the true state besides (1);
-``rate`` of feedback [1/s] (40).
+charge at the start, 0 to 1 (1); ``renderer`` what draws the pictures, ``planar`` or ``mujoco`` (``planar``);
+``quality`` of the planar ones, ``fast``, ``smooth`` or ``best`` (``smooth``); ``native`` the actions that the vehicle
+itself takes, the others being left to the proxy (all); ``position`` whether the vehicle knows its place, as with an
+indoor positioning system (0); ``truth`` whether feedback carries the true state besides (1); ``rate`` of feedback
+[1/s] (40).
 """
 
 from __future__ import annotations
@@ -25,11 +26,12 @@ from skyloop.sim.world_file import load_world
 
 CAMERAS: Final = {camera.name: camera for camera in (FRONT_CAMERA, BOTTOM_CAMERA)}
 QUALITIES: Final = ("fast", "smooth", "best")
+RENDERERS: Final = ("planar", "mujoco")
 EVERY_ACTION: Final = frozenset(ACTION_NAMES.values())
 ALWAYS_NATIVE: Final = frozenset({"idle", "emergency_stop", "reset_emergency"})
 _KNOWN: Final = {
     *("world", "seed", "speed", "cameras", "width", "height", "fps", "latency", "noise", "wind", "battery"),
-    *("quality", "native", "position", "truth", "rate"),
+    *("renderer", "quality", "native", "position", "truth", "rate"),
 }
 
 
@@ -44,6 +46,7 @@ class SimOptions:
     noise: float = 1.0
     wind: float = 1.0
     battery: float = 1.0
+    renderer: str = "planar"
     quality: str = "smooth"
     native: frozenset[str] = EVERY_ACTION
     position: bool = False
@@ -60,6 +63,9 @@ class SimOptions:
         quality = options.get("quality", "smooth")
         if quality not in QUALITIES:
             raise UnknownNameError("quality of pictures", quality, QUALITIES)
+        renderer = options.get("renderer", "planar")
+        if renderer not in RENDERERS:
+            raise UnknownNameError("renderer", renderer, RENDERERS)
         noise = uri.number("noise", 1.0, minimum=0.0, maximum=20.0)
         return cls(
             world=options.get("world", "room"),
@@ -69,6 +75,7 @@ class SimOptions:
             noise=noise,
             wind=uri.number("wind", 1.0, minimum=0.0, maximum=20.0),
             battery=uri.number("battery", 1.0, minimum=0.001, maximum=1.0),
+            renderer=renderer,
             quality=quality,
             native=_native(options.get("native")),
             position=uri.flag("position"),

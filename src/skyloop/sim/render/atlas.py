@@ -56,6 +56,11 @@ class AtlasBuilder:
             self._images.append(image)
         return self._known[key]
 
+    @property
+    def images(self) -> list[NDArray[np.uint8]]:
+        """The textures collected so far, in the order of their numbers; BGR, shape (h, w, 3)."""
+        return self._images
+
     def pack(self) -> Atlas:
         """Puts all textures on shelves, the tallest first."""
         sizes = [(_padded(i.shape[1]), _padded(i.shape[0])) for i in self._images]

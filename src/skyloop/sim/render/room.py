@@ -22,9 +22,10 @@ _SKY_M = 400.0
 _LEAN = np.array([-0.16, 0.20])
 
 
-def static_quads(world: World, atlas: AtlasBuilder) -> Quads:
-    """All of a world that never moves."""
-    parts = [_shell(world, atlas)]
+def static_quads(world: World, atlas: AtlasBuilder, *, painted_shadows: bool = True) -> Quads:
+    """All of a world that never moves. ``painted_shadows``: whether what stands on the floor has its soft shadow in the
+    floor's texture; not for a renderer that casts shadows itself."""
+    parts = [_shell(world, atlas, world.solids() if painted_shadows else ())]
     parts += [_box(box, atlas) for box in world.solids()]
     for panel in world.panels:
         shapes = QuadBuilder()
@@ -45,13 +46,13 @@ def _surface(atlas: AtlasBuilder, name: str, width_m: float, height_m: float, de
     return atlas.add(key, lambda: draw_surface(name, width_m, height_m, density))
 
 
-def _shell(world: World, atlas: AtlasBuilder) -> Quads:
-    """Floor, walls and ceiling; or ground and sky."""
+def _shell(world: World, atlas: AtlasBuilder, shadowing: tuple[Box, ...]) -> Quads:
+    """Floor, walls and ceiling; or ground and sky. ``shadowing``: whose shadows are painted on the floor."""
     room = world.room
     x, y, z = room.size_m
     density = min(_FINEST, _LARGEST / max(x, y, z))
     shapes = QuadBuilder()
-    floor = atlas.add("floor", lambda: _floor(world, density))
+    floor = atlas.add("floor", lambda: _floor(room, density, shadowing))
     shapes.rectangle((-x / 2, -y / 2, 0), (x, 0, 0), (0, y, 0), floor)
     if not room.enclosed:
         _outdoors(shapes, atlas, room)
@@ -85,8 +86,7 @@ def _corner_dark(height: int, width: int, per_m: float, sides: float, top: float
     return np.asarray(down[:, None] * across[None, :], dtype=np.float32)
 
 
-def _floor(world: World, density: float) -> NDArray[np.uint8]:
-    room = world.room
+def _floor(room: Room, density: float, shadowing: tuple[Box, ...]) -> NDArray[np.uint8]:
     picture = draw_surface(room.floor, room.size_m[0], room.size_m[1], density)
     height, width = picture.shape[:2]
     edge = 0.22 if room.enclosed else 0.0
@@ -94,7 +94,7 @@ def _floor(world: World, density: float) -> NDArray[np.uint8]:
     corner = np.array([-room.size_m[0] / 2, room.size_m[1] / 2])
     for reach, lean, blur_m, dark in ((0.0, 0.0, 0.06, 0.42), (1.0, 1.0, 0.05, 0.24)):
         mask = np.zeros((height, width), np.uint8)
-        for box in world.solids():
+        for box in shadowing:
             points = box.corners()
             if points[:, 2].min() > 1.0 and reach == 0.0:
                 continue

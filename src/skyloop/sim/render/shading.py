@@ -19,7 +19,7 @@ from skyloop.sim.render.visibility import View
 CHUNK = 16384  # samples worked on at a time: few enough for the working arrays to stay in the cache
 
 # Light from high up, a little from the east and the south, over an even one; calm differences between faces.
-_SUN = np.array([0.33, -0.42, 0.85])
+SUN = np.array([0.33, -0.42, 0.85])
 _AMBIENT, _DIRECT = 0.74, 0.30
 _UNIT = 128.0  # light 1.0 in the eight-bit gain
 _SHARPER = 0.6  # pixels count as this much smaller when a level is chosen: a little shimmer for crisper textures
@@ -29,7 +29,7 @@ _ONE = 0x3F800000  # 1.0 as the bits of a float32
 
 def light_on(normals: Floats) -> Floats:
     """Brightness of faces by their normals, shape (n,), around 1."""
-    direct = np.clip(normals @ (_SUN / np.linalg.norm(_SUN)), 0.0, None)
+    direct = np.clip(normals @ (SUN / np.linalg.norm(SUN)), 0.0, None)
     return np.asarray(_AMBIENT + _DIRECT * direct)
 
 

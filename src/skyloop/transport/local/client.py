@@ -8,14 +8,16 @@ import os
 import socket
 import threading
 from collections import deque
+from collections.abc import Sequence
 from typing import Final
 
 from skyloop.errors import DecodeError, LinkError, UnknownNameError
 from skyloop.messages import FrameHeader
 from skyloop.messages.codec import HEADER_SIZE, MAX_BODY
-from skyloop.transport.base import ClientEnd, ClientHandler, Dialer, Pixels, check_packet, check_topic
+from skyloop.transport.base import MAX_PACKET, ClientEnd, ClientHandler, Dialer, Pixels, check_packet, check_topic
 from skyloop.transport.local import packets
 from skyloop.transport.local.directory import connect, find_directory, set_timeout
+from skyloop.transport.local.packets import OWN
 from skyloop.transport.local.slots import Leases
 from skyloop.transport.local.sockets import SEND_FLAGS, Socket, credentials
 
@@ -65,7 +67,8 @@ class LocalClient(ClientEnd):
         self._thread.start()
 
     def send(self, packet: bytes) -> bool:
-        check_packet(packet)
+        if not 0 < len(packet) <= MAX_PACKET:
+            check_packet(packet)
         sock = self._socket
         if sock is None:
             return False
@@ -74,6 +77,9 @@ class LocalClient(ClientEnd):
         except OSError:
             return False
         return True
+
+    def knock(self) -> None:
+        self.send(packets.KNOCK)
 
     def subscribe(self, topic: str, on: bool = True) -> None:
         check_topic(topic)
@@ -156,21 +162,23 @@ class LocalClient(ClientEnd):
                 return f"receiving failed: {error}"
             if self._unsent:
                 self._send_unsent(sock)
-            if ancillary or packets.is_own(packet):
+            if packet[5:6] < OWN and packet and not ancillary:
+                deliver(packet)
+            elif not packet:
+                return self._reason or "the proxy is gone"
+            elif ancillary or packets.is_own(packet):
                 try:
-                    frame = self._take(packet, _descriptors(ancillary))
+                    frame = self._take(packet, _descriptors(ancillary) if ancillary else ())
                 except (DecodeError, LinkError, OSError) as error:
                     return f"the proxy does not keep to the protocol: {error}"
                 if frame is not None:
                     self._handler.frame(*frame)
                     frame = None  # else its slot stayed leased until the next packet
-            elif packet:
-                deliver(packet)
             else:
-                return self._reason or "the proxy is gone"
+                deliver(packet)
         return self._reason
 
-    def _take(self, packet: bytes, descriptors: list[int]) -> tuple[FrameHeader, Pixels] | None:
+    def _take(self, packet: bytes, descriptors: Sequence[int]) -> tuple[FrameHeader, Pixels] | None:
         """Take one of the transport's own packets, and close the descriptors that came with it.
 
         Returns the frame if it was one. Raises ``DecodeError``, ``LinkError`` or ``OSError`` for what makes no sense.

@@ -1,0 +1,200 @@
+"""``skyloop bench sim``: the simulator on this machine. Its physics alone, and the drawing of its cameras."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+
+from skyloop.bench.local import Machine, Spread, spread
+from skyloop.clock import monotonic_ns, nanoseconds
+from skyloop.messages import Takeoff, Velocity
+from skyloop.sim import STEP_S, Simulation, load_world
+from skyloop.sim.camera import BOTTOM_CAMERA, FRONT_CAMERA, CameraModel
+from skyloop.sim.render import PlanarRenderer, Scene, SceneState, SensorEffects, use_one_core
+from skyloop.sim.render.opencv import cv2
+
+DRAWING_WORLD = "room"  #: furnished, with markers and a moving board
+#: Worlds and drones in them: free flight in an open hall, and a hundred crowded among gates, some of which they touch.
+FLEETS = (("empty", 1), ("empty", 10), ("empty", 100), ("gates", 100))
+SIZES = (1.0, 2.0)  #: pictures as wide as the cameras' own, and twice as wide
+CAMERAS_AT_ONCE = 10
+FRAMES_PER_S = 30.0  #: of each camera, by which the drones fly on between pictures
+#: Whole cycles of everything that is done every so many steps, so that every batch does the same work.
+BATCH_STEPS = 100
+LEAST_ROUNDS = 3  #: however short the time
+
+#: What this project holds itself to: simulated seconds a second, by the number of drones …
+REAL_TIME_TARGETS = {1: 25.0, 100: 15.0}
+#: … and pictures a second on one core, front and bottom in turn, by the width of the picture.
+FRAMES_TARGETS = {320: 60.0}
+
+_TAKE_OFF_S = 5.0
+#: Circles of half a metre, so fast that the pictures of the front camera are smeared by the turning.
+_CIRCLING = Velocity(forward=0.5, yaw_rate=1.0)
+
+Progress = Callable[[float], None]
+
+
+class PhysicsRow(msgspec.Struct, frozen=True):
+    """So many drones flying circles, nothing drawn. ``step``: of batches of :data:`BATCH_STEPS`, for each step."""
+
+    world: str
+    drones: int
+    step: Spread
+    real_time: float  #: simulated seconds a second
+    target: float | None
+
+
+class DrawingRow(msgspec.Struct, frozen=True):
+    """Pictures with the flaws of the sensor on them. ``round``: the time that ``pictures`` of them take."""
+
+    cameras: str
+    width: int
+    height: int
+    pictures: int
+    round: Spread
+    frames_per_s: float
+    target: float | None
+
+
+class SimResults(msgspec.Struct, frozen=True):
+    machine: Machine
+    physics: list[PhysicsRow]
+    drawing: list[DrawingRow]
+
+
+def measure(seconds: float, progress: Progress = lambda _: None) -> SimResults:
+    """Measure in about ``seconds``, beside some for making the scenes; ``progress`` is told the share that is done.
+
+    Everything runs in the calling thread; OpenCV is kept to it meanwhile.
+    """
+    parts = len(FLEETS) + len(SIZES) + 1
+    share_s = seconds / parts
+    physics: list[PhysicsRow] = []
+    drawing: list[DrawingRow] = []
+
+    def part(number: int) -> Progress:
+        return lambda share: progress((number + share) / parts)
+
+    with _one_core():
+        for number, (world, drones) in enumerate(FLEETS):
+            physics.append(measure_physics(world, drones, share_s, part(number)))
+        for number, factor in enumerate(SIZES, len(FLEETS)):
+            drawing += measure_pair(factor, share_s, part(number))
+        drawing.append(measure_many(share_s, part(parts - 1)))
+    return SimResults(Machine.here(), physics, drawing)
+
+
+def measure_physics(world: str, drones: int, seconds: float, progress: Progress) -> PhysicsRow:
+    """Step a world full of flying drones for so long."""
+    simulation = _circling(world, drones)
+    batches: list[int] = []
+    for _ in _rounds(seconds, progress):
+        begin = monotonic_ns()
+        simulation.step(BATCH_STEPS)
+        batches.append(monotonic_ns() - begin)
+    step = spread([ns / BATCH_STEPS for ns in batches])
+    simulated_s = len(batches) * BATCH_STEPS * STEP_S
+    return PhysicsRow(world, drones, step, simulated_s / (sum(batches) * 1e-9), REAL_TIME_TARGETS.get(drones))
+
+
+def measure_pair(factor: float, seconds: float, progress: Progress) -> list[DrawingRow]:
+    """The two cameras of one drone in turn, in pictures ``factor`` times as wide as the usual ones."""
+    models = [FRONT_CAMERA.scaled(factor), BOTTOM_CAMERA.scaled(factor)]
+    flight = _Flight(1, [(0, model) for model in models])
+    front: list[int] = []
+    bottom: list[int] = []
+    for _ in _rounds(seconds, progress):
+        front.append(flight.draw(0))
+        bottom.append(flight.draw(1))
+    together = [a + b for a, b in zip(front, bottom, strict=True)]
+    target = FRAMES_TARGETS.get(models[0].width)
+    return [
+        _drawing_row("front", models[0], 1, front),
+        _drawing_row("bottom", models[1], 1, bottom),
+        _drawing_row("front and bottom", models[0], 2, together, target),
+    ]
+
+
+def measure_many(seconds: float, progress: Progress) -> DrawingRow:
+    """The front cameras of ten drones that see one another."""
+    flight = _Flight(CAMERAS_AT_ONCE, [(drone, FRONT_CAMERA) for drone in range(CAMERAS_AT_ONCE)])
+    rounds = [sum(flight.draw(n) for n in range(CAMERAS_AT_ONCE)) for _ in _rounds(seconds, progress)]
+    return _drawing_row(f"{CAMERAS_AT_ONCE} × front", FRONT_CAMERA, CAMERAS_AT_ONCE, rounds)
+
+
+@dataclass(frozen=True, slots=True)
+class _Camera:
+    drone: int
+    model: CameraModel
+    effects: SensorEffects
+
+
+class _Flight:
+    """Drones that circle in the furnished room, and their cameras, which expose one after the other."""
+
+    def __init__(self, drones: int, cameras: list[tuple[int, CameraModel]]) -> None:
+        self._simulation = _circling(DRAWING_WORLD, drones)
+        self._renderer = PlanarRenderer(Scene(self._simulation.world, drones))
+        self._cameras = [_Camera(drone, model, SensorEffects(model, n)) for n, (drone, model) in enumerate(cameras)]
+        self._steps = max(1, math.floor(1.0 / (FRAMES_PER_S * STEP_S * len(cameras))))
+        self._number = 0
+        for at in range(len(cameras)):
+            self.draw(at)  # the first picture of a lens makes its tables
+
+    def draw(self, at: int) -> int:
+        """Fly on, then draw what a camera sees with the flaws of its sensor; returns the time of the drawing [ns]."""
+        simulation, camera = self._simulation, self._cameras[at]
+        simulation.step(self._steps)
+        positions, rotations = simulation.poses()
+        rates = np.array(simulation.truth(camera.drone).angular_velocity_rad_s)
+        targets = simulation.target_states()
+        self._number += 1
+        begin = monotonic_ns()
+        state = SceneState(positions, rotations, targets)
+        pose = camera.model.pose(positions[camera.drone], rotations[camera.drone], camera.drone)
+        camera.effects.apply(self._renderer.render(state, pose, camera.model), self._number, rates)
+        return monotonic_ns() - begin
+
+
+def _circling(world: str, drones: int) -> Simulation:
+    """A world whose drones have taken off and fly circles."""
+    simulation = Simulation(load_world(world), drones, seed=1)
+    for action in (Takeoff(), _CIRCLING):
+        for drone in range(drones):
+            simulation.command(drone, action)
+        simulation.step(round(_TAKE_OFF_S / STEP_S))
+    return simulation
+
+
+def _rounds(seconds: float, progress: Progress) -> Iterator[None]:
+    """Goes round until the time is up, and at least :data:`LEAST_ROUNDS` times."""
+    begin, limit = monotonic_ns(), nanoseconds(seconds)
+    done = 0
+    while done < LEAST_ROUNDS or monotonic_ns() - begin < limit:
+        yield
+        done += 1
+        progress(min(1.0, (monotonic_ns() - begin) / max(1, limit)))
+
+
+def _drawing_row(
+    cameras: str, model: CameraModel, pictures: int, rounds: list[int], target: float | None = None
+) -> DrawingRow:
+    rate = pictures * len(rounds) / (sum(rounds) * 1e-9)
+    return DrawingRow(cameras, model.width, model.height, pictures, spread(rounds), rate, target)
+
+
+@contextmanager
+def _one_core() -> Iterator[None]:
+    """OpenCV keeps to the calling thread; afterwards it may use as many as before."""
+    before = cv2.getNumThreads()
+    use_one_core()
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)

@@ -1,0 +1,5 @@
+"""The ``skyloop`` command."""
+
+from skyloop.cli.app import main
+
+__all__ = ["main"]

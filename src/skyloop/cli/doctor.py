@@ -1,0 +1,192 @@
+"""``skyloop doctor``: what of this machine works with Skyloop, and what to install for the rest."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import platform
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+import typer
+from rich.console import Console
+from rich.text import Text
+
+IMPORT_BUDGET_S: Final = 0.3
+
+#: Each optional part: the extra's name, what it is for, and the modules that it needs.
+EXTRAS: Final = (
+    ("sim", "simulator's cameras", ("cv2",)),
+    ("vision", "markers and other vision", ("cv2",)),
+    ("video", "recorded video, H.264", ("av",)),
+    ("cockpit", "page in the browser", ("starlette", "uvicorn", "websockets", "cv2")),
+)
+
+
+class Health(StrEnum):
+    GOOD = "good"
+    MISSING = "missing"  #: works without it
+    BAD = "bad"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One line of the report, and one of advice where there is any."""
+
+    what: str
+    health: Health
+    detail: str
+    advice: str = ""
+
+
+MARKS: Final = {Health.GOOD: ("✓", "green"), Health.MISSING: ("–", "yellow"), Health.BAD: ("✗", "red")}
+
+
+def doctor() -> None:
+    """Check Python, the local transport, the optional parts, the drivers and the running proxies.
+
+    Marks: ✓ works, – optional and not there, ✗ broken. The exit code is 1 if something is broken.
+    """
+    console = Console(soft_wrap=True)
+    findings = []
+    for finding in examine():
+        console.print(as_text(finding))
+        findings.append(finding)
+    if any(finding.health is Health.BAD for finding in findings):
+        raise typer.Exit(1)
+
+
+def as_text(finding: Finding) -> Text:
+    """For people."""
+    mark, colour = MARKS[finding.health]
+    text = Text.assemble((mark, colour), f" {finding.what}: {finding.detail}")
+    return text.append(f"\n  → {finding.advice}", "bold") if finding.advice else text
+
+
+def examine() -> Iterator[Finding]:
+    """All findings, in the order to be read. A check that breaks is a finding too."""
+    checks: dict[str, Callable[[], Iterator[Finding]]] = {
+        "Python": _python,
+        "local transport": _local_transport,
+        "import skyloop": _import_time,
+        "optional parts": _extras,
+        "drivers": _drivers,
+        "proxies": _proxies,
+    }
+    for what, check in checks.items():
+        try:
+            yield from check()
+        except Exception as error:  # noqa: BLE001  a doctor reports what is broken, also in the checks
+            yield Finding(what, Health.BAD, f"{type(error).__name__}: {error}")
+
+
+def _python() -> Iterator[Finding]:
+    import skyloop
+
+    yield Finding(
+        "Python",
+        Health.GOOD,
+        f"{platform.python_version()} on {platform.system()} {platform.machine()}, {os.cpu_count()} cores, "
+        f"Skyloop {skyloop.__version__}",
+    )
+
+
+def _local_transport() -> Iterator[Finding]:
+    if sys.platform != "linux":
+        yield Finding(
+            "local transport",
+            Health.BAD,
+            f"needs Linux, and this is {platform.system()}",
+            "run proxies and applications on Linux; the network transport to come will do without",
+        )
+        return
+    from skyloop.transport.local.directory import DIRECTORY_VARIABLE, find_directory
+
+    try:
+        os.close(os.memfd_create("skyloop-doctor", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING))
+        for end in socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET):
+            end.close()
+    except OSError as error:
+        yield Finding(
+            "local transport", Health.BAD, f"this system refuses it: {error}", "allow memfd_create and Unix sockets"
+        )
+        return
+    directory = find_directory()
+    try:
+        directory.create()
+    except OSError as error:
+        detail = f"{directory.path} can't be made: {error.strerror}"
+        yield Finding("local transport", Health.BAD, detail, f"set {DIRECTORY_VARIABLE} to a directory of your own")
+    else:
+        yield Finding("local transport", Health.GOOD, f"sockets in {directory.path}")
+
+
+def _import_time() -> Iterator[Finding]:
+    begin = time.perf_counter()
+    subprocess.run([sys.executable, "-c", "pass"], check=True)
+    bare = time.perf_counter() - begin
+    begin = time.perf_counter()
+    subprocess.run([sys.executable, "-c", "import skyloop; skyloop.connect"], check=True)
+    taken = time.perf_counter() - begin - bare
+    slow = taken > IMPORT_BUDGET_S
+    advice = "a slow or busy machine, or a first start without compiled files: try again" if slow else ""
+    yield Finding("import skyloop", Health.GOOD, f"{taken:.2f} s", advice)
+
+
+def _extras() -> Iterator[Finding]:
+    for extra, use, modules in EXTRAS:
+        what, install = f"{use} [{extra}]", f"pip install 'skyloop[{extra}]'"
+        versions, missing, broken = [], [], []
+        for module in modules:
+            try:
+                versions.append(f"{module} {getattr(importlib.import_module(module), '__version__', '')}".strip())
+            except ModuleNotFoundError:
+                missing.append(module)
+            except ImportError as error:  # it is there, but something that it needs is not
+                broken.append(f"{module}: {error}")
+        if broken:
+            yield Finding(what, Health.BAD, "; ".join(broken), f"{install} --force-reinstall")
+        elif missing:
+            yield Finding(what, Health.MISSING, f"{' and '.join(missing)} not installed", install)
+        else:
+            yield Finding(what, Health.GOOD, ", ".join(versions))
+
+
+def _drivers() -> Iterator[Finding]:
+    from skyloop.drivers.registry import driver_class, known_schemes
+    from skyloop.errors import MissingExtraError
+
+    schemes = known_schemes()
+    if not schemes:
+        yield Finding("drivers", Health.BAD, "none is registered", "install Skyloop with pip, or once more")
+    for scheme in schemes:
+        try:
+            driver = driver_class(scheme)
+        except MissingExtraError as error:
+            yield Finding(f"driver {scheme}://", Health.MISSING, str(error))
+        except Exception as error:  # noqa: BLE001  other people's drivers may raise anything
+            yield Finding(f"driver {scheme}://", Health.BAD, str(error), "repair or uninstall that package")
+        else:
+            yield Finding(f"driver {scheme}://", Health.GOOD, f"{driver.__module__}.{driver.__qualname__}")
+
+
+def _proxies() -> Iterator[Finding]:
+    from skyloop.cli.listing import running
+
+    rows = running()
+    if not rows:
+        yield Finding("proxies", Health.GOOD, "none is running", "to start one: skyloop proxy sim:// --name alpha")
+    for row in rows:
+        if row.problem:
+            advice = "stopped (Ctrl-Z)? it goes on with: kill -CONT PID; else end it and start it anew"
+            if row.pid is not None:
+                advice = advice.replace("PID", str(row.pid))
+            yield Finding(f"proxy {row.name}", Health.BAD, row.problem, advice)
+        else:
+            yield Finding(f"proxy {row.name}", Health.GOOD, f"{row.uri}, {row.state}")

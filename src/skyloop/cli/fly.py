@@ -1,0 +1,126 @@
+"""``skyloop fly``: flies a controller from a file."""
+
+from __future__ import annotations
+
+import inspect
+import signal
+import traceback
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, NoReturn
+
+import typer
+
+from skyloop.errors import SkyloopError, UsageError
+
+if TYPE_CHECKING:
+    from skyloop.client import Drone
+    from skyloop.control import Controller
+
+ADVICE = "wait in line with --wait SECONDS, or take over with a higher --priority (a lower number, 0 is the highest)"
+
+
+def fly(
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="A Python file with a class derived from skyloop.Controller")
+    ],
+    on: Annotated[
+        str, typer.Option(metavar="NAME", help="A running proxy, or a vehicle's address such as sim://")
+    ] = "sim://",
+    class_name: Annotated[
+        str | None, typer.Option("--class", metavar="CLASS", help="Which one, if the file has several")
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option(metavar="S", min=0.0, help="How long; until Ctrl-C if not given")
+    ] = None,
+    priority: Annotated[int, typer.Option(metavar="P", min=0, max=31, help="0 is the highest, 31 the lowest")] = 16,
+    wait: Annotated[float, typer.Option(metavar="S", min=0.0, help="How long to wait in line for the authority")] = 0.0,
+    takeoff: Annotated[bool, typer.Option(help="Take off first, or leave that to the controller")] = True,
+) -> None:
+    """Take off, run a controller, land. Ctrl-C lands too, and so does an error in the controller."""
+    from skyloop.cli.piloting import connect_pilot
+    from skyloop.control.loading import load_controller
+
+    controller_class = load_controller(file, class_name)
+    for number in (signal.SIGINT, signal.SIGTERM):  # the first is ignored where a shell runs this in the background
+        signal.signal(number, _interrupt)
+    with connect_pilot(on, ADVICE, name=file.name[:64], priority=priority, wait_s=wait) as drone:
+        controller = make(controller_class, drone)
+        worked = _run(controller, drone, seconds, takeoff=takeoff)
+        _land(drone)
+    if not worked:
+        raise typer.Exit(1)
+
+
+def make(controller_class: type[Controller], drone: Drone) -> Controller:
+    """The user's controller. Raises :class:`UsageError` for a class that can't be made as one is here."""
+    name = controller_class.__name__
+    try:
+        inspect.signature(controller_class).bind(drone)
+    except TypeError as error:
+        raise UsageError(
+            f"{name} can't be made as {name}(drone): {error}; give its other arguments default values"
+        ) from None
+    controller = controller_class(drone)
+    if getattr(controller, "drone", None) is not drone:
+        raise UsageError(f"{name}.__init__ must begin with super().__init__(drone)")
+    return controller
+
+
+def what_failed(error: Exception) -> str:
+    """What a person needs to mend it: the traceback without Skyloop's own lines.
+
+    An error that Skyloop raised on purpose with no line of the user in it is one line; any other is told in full.
+    """
+    home = str(Path(__file__).parents[1])
+    told = traceback.TracebackException.from_exception(error)
+    if all(line.filename.startswith(home) for line in told.stack):
+        return f"skyloop: {error}" if isinstance(error, SkyloopError) else "".join(told.format()).rstrip()
+    part: traceback.TracebackException | None = told
+    while part is not None:
+        theirs = [line for line in part.stack if not line.filename.startswith(home)]
+        part.stack = traceback.StackSummary.from_list(theirs)
+        part = part.__cause__ or part.__context__
+    return "".join(told.format()).rstrip()
+
+
+def _run(controller: Controller, drone: Drone, seconds: float | None, *, takeoff: bool) -> bool:
+    """Whether it ended as it should. Errors of the take-off come out; those of the controller are shown."""
+    try:
+        if takeoff and drone.capabilities.actions and not drone.feedback().state.airborne:
+            _say(f"taking off with {drone.name}")
+            drone.takeoff()
+        try:
+            summary = controller.run(seconds=seconds)
+        except Exception as error:  # noqa: BLE001  the user's code may raise anything
+            _say(what_failed(error))
+            _say("the controller failed")
+            return False
+        _say(str(summary))
+    except KeyboardInterrupt:
+        _say("stopped by Ctrl-C")
+    return True
+
+
+def _land(drone: Drone) -> None:
+    """Land what is in the air and in our hands. Who interrupts that too leaves it to the proxy's failsafe."""
+    if not drone.feedback().state.airborne:
+        return
+    if drone.authority.state in ("queued", "preempted"):
+        _say(f"{drone.authority.holder or 'somebody else'} took over: the drone is left to them")
+        return
+    _say("landing")
+    try:
+        drone.land()
+    except KeyboardInterrupt:
+        _say("left in the air: its proxy lets it hover, then lands it")
+        drone.close()
+        raise
+
+
+def _interrupt(number: int, frame: FrameType | None) -> NoReturn:  # noqa: ARG001  as signal handlers are called
+    raise KeyboardInterrupt
+
+
+def _say(text: str) -> None:
+    typer.echo(text, err=True)

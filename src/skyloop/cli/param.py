@@ -1,0 +1,124 @@
+"""``skyloop param``: lists, shows and writes a vehicle's parameters."""
+
+from __future__ import annotations
+
+from typing import Annotated, Final
+
+import msgspec
+import typer
+
+from skyloop.cli.text import columns
+from skyloop.errors import UsageError
+from skyloop.messages import Parameter, ParameterType, Value
+
+ADVICE: Final = "write when they have landed, or take over with a higher --priority (a lower number, 0 is the highest)"
+TRUTH: Final = {
+    word: truth for truth, words in ((True, "true yes on 1"), (False, "false no off 0")) for word in words.split()
+}
+KINDS: Final = {
+    ParameterType.BOOL: "true or false",
+    ParameterType.INT: "a whole number",
+    ParameterType.FLOAT: "a number",
+    ParameterType.VECTOR: "numbers such as 0.1,0,-0.5",
+    ParameterType.TEXT: "a text",
+}
+
+
+def param(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="A running proxy; skyloop list shows them")],
+    key: Annotated[
+        str | None, typer.Argument(metavar="[KEY]", help="A parameter, or the first part of several: limits")
+    ] = None,
+    value: Annotated[
+        str | None, typer.Argument(metavar="[VALUE]", help="Its new value; needs the authority for a moment")
+    ] = None,
+    priority: Annotated[
+        int, typer.Option(metavar="P", min=0, max=31, help="Of a writer: 0 is the highest, 31 the lowest")
+    ] = 31,
+    json: Annotated[bool, typer.Option("--json", help="For programs: a JSON array of parameters")] = False,
+) -> None:
+    """List the parameters of a vehicle, show one, or write one."""
+    found = _write(name, key, value, priority) if key is not None and value is not None else _read(name, key)
+    if json:
+        typer.echo(msgspec.json.encode([msgspec.structs.asdict(each) for each in found]).decode())
+        return
+    for line in details(found[0]) if [each.name for each in found] == [key] else table(found):
+        typer.echo(line)
+
+
+def _read(name: str, key: str | None) -> list[Parameter]:
+    from skyloop.client import connect
+
+    with connect(name, access="observe", name="skyloop param") as drone:
+        if key is None:
+            return drone.config.parameters()
+        group = [each for each in drone.config.parameters() if each.name.startswith(f"{key.rstrip('.')}.")]
+        return group or [drone.config.describe(key)]
+
+
+def _write(name: str, key: str, value: str, priority: int) -> list[Parameter]:
+    from skyloop.cli.piloting import connect_pilot
+
+    with connect_pilot(name, ADVICE, priority=priority, name="skyloop param", on_exit="hover") as drone:
+        drone.config[key] = parse_value(drone.config.describe(key), value)
+        return [drone.config.describe(key)]
+
+
+def parse_value(parameter: Parameter, text: str) -> Value:
+    """The value that a person typed, by the parameter's type. Raises :class:`UsageError`."""
+    try:
+        match parameter.type:
+            case ParameterType.BOOL:
+                return TRUTH[text.strip().lower()]
+            case ParameterType.INT:
+                return int(text)
+            case ParameterType.FLOAT:
+                return float(text)
+            case ParameterType.VECTOR:
+                return tuple(float(part) for part in text.strip(" ()[]").replace(",", " ").split())
+            case ParameterType.TEXT:
+                return text
+    except (ValueError, KeyError):
+        raise UsageError(f"{parameter.name} takes {KINDS[parameter.type]}, not {text!r}") from None
+
+
+def table(parameters: list[Parameter]) -> list[str]:
+    """A line each: name, value with unit, what is allowed."""
+    rows = [(p.name, f"{show(p.value)} {p.unit}".rstrip(), allowed(p)) for p in parameters]
+    return columns([("PARAMETER", "VALUE", "ALLOWED"), *rows])
+
+
+def details(parameter: Parameter) -> list[str]:
+    """All that is known of one."""
+    p = parameter
+    rows = [
+        (p.name, f"{show(p.value)} {p.unit}".rstrip()),
+        ("  allowed", allowed(p) or KINDS[p.type]),
+        ("  default", "" if p.default is None else show(p.default)),
+        ("  what", p.description),
+    ]
+    return columns([row for row in rows if row[1]])
+
+
+def allowed(parameter: Parameter) -> str:
+    """Which values it takes, for people."""
+    p = parameter
+    if p.read_only:
+        return "read-only"
+    if p.choices:
+        return ", ".join(map(show, p.choices))
+    if p.type is ParameterType.BOOL:
+        return KINDS[p.type]
+    low, high = ("" if end is None else f"{end:g}" for end in (p.minimum, p.maximum))
+    if low and high:
+        return f"{low} to {high}" + (" each" if p.type is ParameterType.VECTOR else "")
+    return f"at least {low}" if low else f"at most {high}" if high else ""
+
+
+def show(value: Value) -> str:
+    """As it can be typed."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple):
+        return ",".join(map(show, value))
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

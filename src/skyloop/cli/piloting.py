@@ -1,0 +1,21 @@
+"""Connecting with the wish to command, from the command line."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from skyloop.client import Drone, connect
+from skyloop.errors import AuthorityError
+
+
+def connect_pilot(target: str, advice: str, **options: Any) -> Drone:
+    """As :func:`skyloop.connect`; where somebody else flies, the error says who, and what to do on the command line."""
+    try:
+        return connect(target, **options)
+    except AuthorityError as error:
+        if error.code != "busy":
+            raise
+        from skyloop.cli.listing import describe
+
+        holder = describe(target).owner or "another application"
+        raise AuthorityError(f"{holder} holds the authority over {target}: {advice}", code=error.code) from error

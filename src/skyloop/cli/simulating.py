@@ -1,0 +1,24 @@
+"""What a process that only simulates does for itself."""
+
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from skyloop.drivers.sim import SimOptions
+
+SWITCH_INTERVAL_S: Final = 0.001
+
+
+def settle(options: SimOptions) -> None:
+    """Make room, in this whole process, for the threads that pass commands on beside those that step and draw.
+
+    The interpreter lock is handed over after a millisecond, not five, and OpenCV keeps to one core. Not for a process
+    that is the user's. Raises :class:`MissingExtraError` if cameras are wanted and what draws is not installed.
+    """
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    if options.cameras:
+        from skyloop.sim.render import use_one_core
+
+        use_one_core()

@@ -1,0 +1,173 @@
+"""``skyloop watch``: what a drone does, live in the terminal, or line by line into a pipe."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Annotated, Final
+
+import msgspec
+import typer
+from rich.console import Console, Group
+from rich.live import Live
+from rich.panel import Panel
+from rich.table import Table
+from rich.text import Text
+
+from skyloop.messages import Event, Failsafe, Feedback, Severity
+
+if TYPE_CHECKING:
+    from skyloop.client import Drone
+
+REFRESH_HZ: Final = 8
+LINE_EVERY_S: Final = 1.0
+EVENTS_SHOWN: Final = 8
+COLOURS: Final = {Severity.INFO: "cyan", Severity.WARNING: "yellow", Severity.ERROR: "red"}
+
+
+def watch(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="A running proxy; skyloop list shows them")],
+    seconds: Annotated[
+        float | None, typer.Option(metavar="S", min=0.0, help="How long; until Ctrl-C if not given")
+    ] = None,
+    video: Annotated[bool, typer.Option(help="Ask for the first camera's frames, to show their rate and age")] = True,
+    json: Annotated[
+        bool, typer.Option("--json", help="For programs: a JSON object a line, one a second and one an event")
+    ] = False,
+) -> None:
+    """Show state, attitude, authority, links, channels and events of a drone, live. Read-only.
+
+    Where the output is no terminal: one line a second, and one for each event.
+    """
+    from skyloop.client import connect
+
+    with connect(name, access="observe", name="skyloop watch") as drone:
+        duration_s = math.inf if seconds is None else seconds
+        if video and drone.capabilities.cameras:
+            drone.frame()  # the first call asks for them
+        try:
+            if json:
+                _lines(drone, duration_s, _state_json, _event_json)
+            elif sys.stdout.isatty():
+                _live(drone, duration_s)
+            else:
+                _lines(drone, duration_s, state_line, event_line)
+        except KeyboardInterrupt:
+            pass  # how it is meant to end
+
+
+def _lines(drone: Drone, duration_s: float, state: Callable[[Drone], str], event: Callable[[Event], str]) -> None:
+    """Absolute deadlines, so that there is a line for each second; the first one at once."""
+    due = time.monotonic()
+    end = due + duration_s
+    with drone.on_event(lambda one: typer.echo(event(one))):
+        typer.echo(state(drone))
+        while (due := due + LINE_EVERY_S) <= end:
+            time.sleep(max(0.0, due - time.monotonic()))
+            typer.echo(state(drone))
+
+
+def _live(drone: Drone, duration_s: float) -> None:
+    end = time.monotonic() + duration_s
+    with Live(console=Console(), refresh_per_second=REFRESH_HZ) as live:
+        while time.monotonic() < end:
+            live.update(picture(drone))
+            time.sleep(1 / REFRESH_HZ)
+
+
+# Lines ---------------------------------------------------------------------------------------------------------
+
+
+def state_line(drone: Drone) -> str:
+    """The state at one time, short."""
+    feedback, link = drone.feedback(), drone.link
+    rates = [f"{name} {channel.rate_hz:.0f}/s" for name, channel in drone.stats.items() if channel.count > 1]
+    parts = [
+        time.strftime("%H:%M:%S"),
+        feedback.state.value,
+        f"altitude {_metres(feedback.altitude)}",
+        f"battery {_share(feedback.battery)}",
+        f"pilot {feedback.owner or 'nobody'}",
+        f"proxy {link.application.value}",
+        f"vehicle {link.vehicle.value}",
+        *([f"failsafe {feedback.failsafe.value}"] if feedback.failsafe is not Failsafe.NONE else []),
+        *rates,
+    ]
+    return "  ".join(parts)
+
+
+def event_line(event: Event) -> str:
+    """An event as a line of its own."""
+    return f"{time.strftime('%H:%M:%S')}  {event.severity.value}: {event.text}"
+
+
+def _state_json(drone: Drone) -> str:
+    shown = {"feedback": msgspec.structs.asdict(drone.feedback()), "link": drone.link, "stats": drone.stats}
+    return msgspec.json.encode(shown).decode()
+
+
+def _event_json(event: Event) -> str:
+    return msgspec.json.encode({"event": msgspec.structs.asdict(event)}).decode()
+
+
+# The live picture ----------------------------------------------------------------------------------------------
+
+
+def picture(drone: Drone) -> Group:
+    """All that is shown at one time."""
+    newest_ns = drone.feedback().captured_ns
+    return Group(
+        Panel(_state(drone), title=Text(f"{drone.name} · {drone.uri}"), title_align="left"),
+        _channels(drone),
+        *[
+            Text.assemble((f"{(event.at_ns - newest_ns) / 1e9:+7.1f} s", COLOURS[event.severity]), f" {event.text}")
+            for event in drone.recent_events()[-EVENTS_SHOWN:]
+        ],
+    )
+
+
+def _state(drone: Drone) -> Table:
+    feedback, link = drone.feedback(), drone.link
+    table = Table.grid(padding=(0, 3))
+    table.add_row("state", Text(feedback.state.value, "bold"), "pilot", Text(feedback.owner or "nobody"))
+    table.add_row("battery", _share(feedback.battery), "failsafe", feedback.failsafe.value)
+    table.add_row("roll, pitch, yaw", _angles(feedback), "link to proxy", link.application.value)
+    table.add_row("altitude", _metres(feedback.altitude), "link to vehicle", link.vehicle.value)
+    table.add_row("velocity", _vector(feedback.velocity, "m/s"), "position", _vector(feedback.position, "m"))
+    return table
+
+
+def _channels(drone: Drone) -> Table:
+    table = Table("channel", "rate", "delay median", "p99", "age", "lost", "dropped", box=None)
+    for name, channel in drone.stats.items():
+        delay = channel.delay_s
+        table.add_row(
+            name,
+            f"{channel.rate_hz:.1f} Hz",
+            "–" if delay is None else f"{delay.median * 1e3:.2f} ms",
+            "–" if delay is None else f"{delay.p99 * 1e3:.2f} ms",
+            "–" if channel.age_s is None else f"{channel.age_s * 1e3:.0f} ms",
+            str(channel.lost),
+            str(channel.dropped),
+        )
+    return table
+
+
+def _angles(feedback: Feedback) -> str:
+    if feedback.roll is None or feedback.pitch is None or feedback.yaw is None:
+        return "unknown"
+    return " ".join(f"{math.degrees(a):6.1f}°" for a in (feedback.roll, feedback.pitch, feedback.yaw))
+
+
+def _share(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.0%}"
+
+
+def _metres(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.2f} m"
+
+
+def _vector(value: tuple[float, float, float] | None, unit: str) -> str:
+    return "unknown" if value is None else " ".join(f"{v:6.2f}" for v in value) + f" {unit}"

@@ -1,0 +1,81 @@
+"""The command line in this process or in one of its own, beside real proxies in a directory of sockets of their own."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from skyloop.cli import main
+from tests.processes.conftest import Process
+
+FAST_SIM = "sim://?world=empty&cameras=none&speed=6&wind=0"
+
+
+class Ended(NamedTuple):
+    """How a command ended."""
+
+    code: int
+    out: str
+    err: str
+
+
+Run = Callable[..., Ended]
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]) -> Iterator[Run]:
+    """Runs a command in this process, as ``skyloop ARGUMENTS`` would."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    path = list(sys.path)
+
+    def runner(*arguments: str) -> Ended:
+        with pytest.raises(SystemExit) as ended:
+            main(list(arguments))
+        code = ended.value.code
+        assert code is None or isinstance(code, int)
+        out, err = capsys.readouterr()
+        return Ended(code or 0, out, err)
+
+    yield runner
+    sys.path[:] = path
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def sockets() -> Iterator[Path]:
+    """A directory of sockets for this module alone; with a short path, as those of sockets must be."""
+    with tempfile.TemporaryDirectory(prefix="skyloop-") as folder, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SKYLOOP_RUNTIME_DIR", str(Path(folder) / "run"))
+        yield Path(folder) / "run"
+
+
+@pytest.fixture
+def start() -> Iterator[Callable[..., Process]]:
+    """Starts ``skyloop ARGUMENTS`` in a process of its own, which ends with the test."""
+    running: list[Process] = []
+
+    def begin(*arguments: str) -> Process:
+        running.append(Process("-m", "skyloop", *arguments))
+        return running[-1]
+
+    yield begin
+    for process in reversed(running):
+        process.end()
+
+
+@pytest.fixture(scope="module")
+def alpha(sockets: Path) -> Iterator[Process]:
+    """A proxy of that name, of a simulated drone in a hurry."""
+    process = Process("-m", "skyloop", "proxy", FAST_SIM, "--name", "alpha")
+    try:
+        process.until("ready")
+        yield process
+    finally:
+        process.end()

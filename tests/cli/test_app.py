@@ -1,0 +1,110 @@
+"""The command line as a whole: help, wrong words, exit codes, and what starting costs."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+from typer.testing import CliRunner
+
+import skyloop
+from skyloop.cli import app as cli
+from skyloop.errors import LinkError, ParameterError, UnknownNameError
+from tests.cli.conftest import Run
+
+runner = CliRunner(env={"COLUMNS": "80", "TERM": "dumb"})
+
+
+@pytest.mark.parametrize("command", cli.COMMANDS)
+def test_every_command_has_help_with_an_example_in_80_columns(command: str) -> None:
+    result = runner.invoke(cli.build([command]), [command, "--help"], prog_name="skyloop")
+    assert result.exit_code == 0
+    assert f"Example: skyloop {command}" in result.output
+    assert max(map(len, result.output.splitlines())) <= 80
+
+
+def test_the_list_of_commands_says_of_each_what_it_does() -> None:
+    result = runner.invoke(cli.build(), ["--help"], prog_name="skyloop")
+    assert result.exit_code == 0
+    for command, entry in cli.COMMANDS.items():
+        assert any(line.split() == [command, *entry.summary.split()] for line in result.output.splitlines()), (
+            f"{command} is cut off, or not there"
+        )
+
+
+@pytest.mark.parametrize("command", cli.COMMANDS)
+def test_every_example_is_made_of_words_that_the_command_knows(command: str) -> None:
+    """The words are parsed; the command itself is not called."""
+    import typer
+
+    group = typer.main.get_command(cli.build([command]))
+    _, *words = cli.COMMANDS[command].example.split()
+    own = group.get_command(None, command)  # type: ignore[attr-defined]
+    own.make_context(command, words)
+
+
+def test_the_version_is_told(run: Run) -> None:
+    assert run("--version") == (0, f"skyloop {skyloop.__version__}\n", "")
+
+
+def test_without_a_word_help_is_shown(run: Run) -> None:
+    ended = run()
+    assert ended == run("--help")
+    assert (ended.code, ended.err) == (0, "")
+    assert "Commands:" in ended.out
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["proxi"], "Did you mean 'proxy'"),
+        (["list", "--jsn"], "--json"),
+        (["proxy"], "Missing argument"),
+        (["sim", "--drones", "0"], "--drones"),
+        (["sim", "--drones", "many"], "--drones"),
+        (["fly", "x.py", "--priority", "32"], "--priority"),
+        (["cockpit", "alpha", "--port", "70000"], "--port"),
+    ],
+)
+def test_a_wrong_word_ends_with_2_and_says_what_would_be_right(run: Run, words: list[str], said: str) -> None:
+    ended = run(*words)
+    assert (ended.code, ended.out) == (2, "")
+    assert said in ended.err
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (UnknownNameError("proxy", "alfa", ["alpha"]), 2),
+        (ParameterError("limits.tilt must be less"), 2),
+        (LinkError("gone"), 1),
+    ],
+)
+def test_errors_are_one_line_and_an_exit_code(
+    run: Run, monkeypatch: pytest.MonkeyPatch, error: Exception, code: int
+) -> None:
+    def fail() -> None:
+        raise error
+
+    monkeypatch.setattr("skyloop.cli.listing.list_proxies", fail)
+    assert run("list") == (code, "", f"skyloop: {error}\n")
+
+
+def test_ctrl_c_ends_with_what_shells_expect(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("skyloop.cli.listing.list_proxies", interrupted)
+    assert run("list").code == 130
+
+
+def test_a_command_imports_nothing_that_it_does_not_need() -> None:
+    """What a private proxy, or a list, would only pay for at its start."""
+    code = (
+        "import sys; from skyloop.cli.app import build; build(['proxy', 'list', 'fly', 'param', 'sim', 'cockpit']);"
+        "print(*[m for m in ('cv2', 'av', 'rich.live', 'rich.table', 'uvicorn', 'skyloop.client', 'skyloop.proxy',"
+        "'skyloop.sim', 'numpy') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []

@@ -1,0 +1,89 @@
+"""What the doctor finds, on this machine and on worse ones."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from collections.abc import Iterator
+from types import ModuleType
+
+import pytest
+
+from skyloop.cli import doctor
+from skyloop.cli.doctor import Finding, Health, as_text
+from tests.cli.conftest import Run
+
+
+@pytest.fixture(autouse=True)
+def _short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The import time takes two processes: once is enough."""
+
+    def none() -> Iterator[Finding]:
+        yield Finding("import skyloop", Health.GOOD, "")
+
+    monkeypatch.setattr(doctor, "_import_time", none)
+
+
+def lacking(monkeypatch: pytest.MonkeyPatch, name: str, error: ImportError) -> None:
+    real = importlib.import_module
+
+    def import_module(module: str) -> ModuleType:
+        if module == name:
+            raise error
+        return real(module)
+
+    monkeypatch.setattr("skyloop.cli.doctor.importlib.import_module", import_module)
+
+
+def test_a_machine_that_is_well(run: Run) -> None:
+    ended = run("doctor")
+    assert ended.code == 0, ended.out
+    assert "✓ Python: 3." in ended.out
+    assert f"sockets in {os.environ['SKYLOOP_RUNTIME_DIR']}" in ended.out
+    assert "driver sim://: skyloop.drivers.sim" in ended.out
+    assert "✗" not in ended.out
+
+
+def test_a_part_that_is_not_installed_is_no_fault_and_is_told_with_what_installs_it(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lacking(monkeypatch, "uvicorn", ModuleNotFoundError("No module named 'uvicorn'", name="uvicorn"))
+    ended = run("doctor")
+    assert ended.code == 0
+    assert "– page in the browser [cockpit]: uvicorn not installed\n  → pip install 'skyloop[cockpit]'" in ended.out
+
+
+def test_a_part_that_is_broken_is_a_fault(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    lacking(monkeypatch, "av", ImportError("libav.so: cannot open shared object file"))
+    ended = run("doctor")
+    assert ended.code == 1
+    assert "✗ recorded video, H.264 [video]: av: libav.so: cannot open" in ended.out
+
+
+def test_a_directory_that_can_not_be_is_a_fault(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", "/proc/none/run")
+    ended = run("doctor")
+    assert ended.code == 1
+    assert "✗ local transport: /proc/none/run can't be made" in ended.out
+
+
+def test_another_system_is_told_so(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.platform", "darwin")
+    ended = run("doctor")
+    assert ended.code == 1
+    assert "✗ local transport: needs Linux" in ended.out
+
+
+def test_a_driver_that_can_not_be_loaded_is_a_fault_of_its_own(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(scheme: str) -> type:
+        raise RuntimeError(f"{scheme} is broken")
+
+    monkeypatch.setattr("skyloop.drivers.registry.driver_class", broken)
+    ended = run("doctor")
+    assert ended.code == 1
+    assert "✗ driver sim://: sim is broken" in ended.out
+    assert "✓ recorded video" in ended.out
+
+
+def test_what_is_found_is_never_taken_for_markup() -> None:
+    assert str(as_text(Finding("a", Health.GOOD, "[bold]b[/]"))) == "✓ a: [bold]b[/]"
