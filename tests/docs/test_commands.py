@@ -1,0 +1,71 @@
+"""The command lines on the pages exist, with their options; so do make's targets and the extras."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import tomllib
+
+import pytest
+from typer.main import get_command
+
+from skyloop.cli.app import build
+from tests.docs.pages import PAGES, ROOT, blocks, spans
+
+SHELL = [
+    line.strip()
+    for block in blocks("", "bash", "sh", "console")
+    for line in block.code.replace("\\\n", " ").splitlines()
+]
+SPANS = sorted({span for page in PAGES for span in spans(page)})
+EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+GROUP = get_command(build())
+
+
+def words(line: str) -> list[str]:
+    return shlex.split(line.removeprefix("$ "), comments=True)
+
+
+def parse(name: str, arguments: list[str]) -> None:
+    """Raises what the command line would tell the user."""
+    command = GROUP.commands[name]  # type: ignore[attr-defined]
+    command.make_context(name, list(arguments))
+
+
+LINES = sorted({line for line in SHELL if words(line)[:1] == ["skyloop"]})
+
+
+def test_the_pages_show_command_lines() -> None:
+    assert len(LINES) >= 4
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_a_command_line_is_accepted(line: str) -> None:
+    parse(words(line)[1], words(line)[2:])
+
+
+@pytest.mark.parametrize("span", [span for span in SPANS if span.startswith("skyloop ")])
+def test_a_command_in_the_text_is_accepted(span: str) -> None:
+    _, name, *arguments = words(span)
+    if name == "COMMAND":
+        return
+    assert name in GROUP.commands  # type: ignore[attr-defined]
+    if arguments:
+        parse(name, arguments)
+
+
+@pytest.mark.parametrize("line", sorted({line for line in (*SHELL, *SPANS) if line.startswith("make ")}))
+def test_a_target_of_make_exists(line: str) -> None:
+    target = words(line)[1]
+    makefile = (ROOT / "Makefile").read_text()
+    assert re.search(rf"^{target}:", makefile, re.MULTILINE)
+    if target == "demo":
+        for extra in (word for word in words(line)[2:] if word.startswith("ARGS=")):
+            parse("demo", shlex.split(extra.removeprefix("ARGS=")))
+
+
+@pytest.mark.parametrize("line", sorted({line for line in (*SHELL, *SPANS) if "pip install" in line}))
+def test_extras_that_are_to_be_installed_exist(line: str) -> None:
+    found = re.search(r"\[([\w,]+)\]", line)
+    assert found, f"{line} names no extra"
+    assert set(found[1].split(",")) <= set(EXTRAS)

@@ -1,0 +1,49 @@
+"""What the pages point to is there."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from tests.docs.pages import PAGES, ROOT, prose, spans
+
+MOST_BYTES = 300_000
+_LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
+
+
+def links(page: Path) -> list[str]:
+    return [target for target in _LINK.findall(prose(page)) if not re.match(r"\w+:", target)]
+
+
+def anchors(page: Path) -> set[str]:
+    """As GitHub makes them of headings."""
+    headings = re.findall(r"^#+ (.+)$", prose(page), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_within_the_repository_lead_somewhere(page: Path) -> None:
+    for target in links(page):
+        path, _, anchor = target.partition("#")
+        file = (page.parent / path).resolve() if path else page
+        assert file.exists(), f"{page.name} points to {target}"
+        assert file.is_relative_to(ROOT)
+        assert not anchor or anchor in anchors(file), f"{page.name} points to {target}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_files_that_are_named_exist(page: Path) -> None:
+    for span in spans(page):
+        if re.match(r"(docs|src|tests|scripts)/[\w./-]*$", span):
+            assert (ROOT / span).exists(), f"{page.name} names {span}"
+
+
+def test_pictures_are_small_and_all_are_shown() -> None:
+    shown = {(page.parent / target).resolve() for page in PAGES for target in links(page)}
+    pictures = list((ROOT / "docs" / "pictures").iterdir())
+    assert pictures
+    for picture in pictures:
+        assert picture in shown, f"{picture.name} is shown nowhere"
+        assert picture.stat().st_size < MOST_BYTES

@@ -1,0 +1,86 @@
+"""The tables and figures on the pages are those of the code."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+
+import pytest
+
+from skyloop.cockpit.server import _LARGEST_MESSAGE
+from skyloop.drivers.sim import options as sim_options
+from skyloop.drivers.video import driver as video_driver
+from skyloop.messages import FlightState, Hover, Land, ResetEmergency, Takeoff, Velocity
+from skyloop.proxy.gate import PLANS, Plan
+from skyloop.proxy.parameters import OWN
+from skyloop.proxy.proxy import MAX_ANNOTATION
+from skyloop.proxy.requests import MAX_PENDING
+from skyloop.proxy.sessions import MAX_MALFORMED
+from skyloop.sim.world_file import shipped_worlds
+from skyloop.transport.base import MAX_PACKET
+from skyloop.transport.local.connection import MAX_SUBSCRIPTIONS
+from skyloop.transport.local.frames import MAX_LEASES
+from skyloop.transport.local.server import MAX_CLIENTS
+from tests.docs.pages import ROOT, rows, section
+
+
+def names(cell: str) -> list[str]:
+    return re.findall(r"`([^`]+)`", cell)
+
+
+def test_the_extras() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    table = rows(section("README.md", "## Installing"))
+    assert [row[0] for row in table] == ["(none)", *(f"`{extra}`" for extra in project["optional-dependencies"])]
+    for requirement in project["dependencies"]:
+        assert re.split(r"[>=<]", requirement)[0] in table[0][2].lower()
+
+
+def test_the_proxys_parameters() -> None:
+    table = rows(section("docs/proxy.md", "## Parameters"))
+    assert table == [
+        [f"`{p.name}`", f"{p.value:g}", p.unit, f"{p.minimum:g} to {p.maximum:g}", p.description] for p in OWN
+    ]
+
+
+def test_what_is_done_in_which_flight_state() -> None:
+    columns = (Takeoff, Hover, Land, Velocity, ResetEmergency)
+    words = {"done": Plan.APPLY, "refused": Plan.REFUSE, "hover": Plan.HOVER}
+    seen = set()
+    for states, *cells in rows(section("docs/proxy.md", "## Which commands are executed")):
+        for state in states.split(", "):
+            seen.add(FlightState(state.replace(" ", "_")))
+            for action, cell in zip(columns, cells, strict=True):
+                plan = PLANS[action][FlightState(state.replace(" ", "_"))]
+                assert plan is words.get(cell, Plan.HOLD), (state, action.__name__)
+    assert seen == set(FlightState)
+
+
+@pytest.mark.parametrize(
+    ("heading", "known"), [("### `sim://`", sim_options._KNOWN), ("### `video://`", video_driver._OPTIONS)]
+)
+def test_the_options_of_addresses(heading: str, known: set[str]) -> None:
+    table = rows(section("docs/drivers.md", heading))
+    assert sorted(name for row in table for name in names(row[0])) == sorted(known)
+
+
+def test_the_worlds_that_come_with_it() -> None:
+    text = section("docs/vehicles.md", "## `sim://`").partition("Worlds that come with it:")[2].partition(";")[0]
+    assert sorted(names(text)) == sorted(shipped_worlds())
+
+
+def test_figures_about_security() -> None:
+    text = " ".join((ROOT / "docs" / "security.md").read_text().split())
+
+    def spaced(number: int) -> str:
+        return f"{number:,}".replace(",", " ")
+
+    for words in (
+        f"at most {spaced(MAX_PACKET)} bytes",
+        f"more than {MAX_MALFORMED} within a second",
+        f"at most {MAX_LEASES} frames",
+        f"at most {MAX_CLIENTS} connections, {MAX_SUBSCRIPTIONS} subscriptions and {MAX_PENDING} waiting requests",
+        f"{spaced(MAX_ANNOTATION)} bytes an annotation",
+        f"at most {_LARGEST_MESSAGE} bytes a message",
+    ):
+        assert words in text, words
