@@ -46,7 +46,7 @@ class UnknownNameError(UsageError, KeyError):
         if self.suggestions:
             hint = "did you mean " + " or ".join(repr(s) for s in self.suggestions) + "?"
         elif choices:
-            shown = ", ".join(choices[:12]) + (", …" if len(choices) > 12 else "")
+            shown = ", ".join(choices[:24]) + (", …" if len(choices) > 24 else "")
             hint = f"known: {shown}"
         else:
             hint = "none is known here"

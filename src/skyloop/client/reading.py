@@ -15,7 +15,7 @@ from skyloop.client.handle import Handle
 from skyloop.client.inbox import Inbox
 from skyloop.client.reception import LinkStatus, VideoChannel
 from skyloop.client.slots import Buffer
-from skyloop.errors import ClosedError, NoAnswerError, UnknownNameError, UsageError
+from skyloop.errors import ClosedError, NoAnswerError, UnknownNameError, UnsupportedError, UsageError
 from skyloop.messages import Annotation, Applied, Event, EventKind, Feedback, FlightState, Severity, encode
 from skyloop.messages.annotation import Shape
 
@@ -195,14 +195,17 @@ class Reading(Handle):
         return time.monotonic_ns() + self._link.offset_ns
 
     def channel(self, camera: str | None = None) -> VideoChannel:
-        """The channel of a camera (None: the first). Raises :class:`UnknownNameError`."""
+        """The channel of a camera (None: the first). Raises :class:`UnknownNameError`, or :class:`UnsupportedError`
+        for a vehicle that has none."""
         self._check_open()
         channels = self._reception.channels
-        if camera is None and channels:
+        if not channels:
+            raise UnsupportedError("no camera: this vehicle gives no pictures")
+        if camera is None:
             return next(iter(channels.values()))
-        channel = channels.get(camera or "")
+        channel = channels.get(camera)
         if channel is None:
-            raise UnknownNameError("camera", camera or "", channels)
+            raise UnknownNameError("camera", camera, channels)
         return channel
 
     def _listen(

@@ -27,5 +27,6 @@ class Counters:
             values["commands.delay.median_s"] = delays[len(delays) // 2] / NS_PER_S
             values["commands.delay.p99_s"] = delays[int(0.99 * (len(delays) - 1))] / NS_PER_S
             values["commands.delay.max_s"] = delays[-1] / NS_PER_S
+            values["commands.delay.mean_s"] = sum(delays) / len(delays) / NS_PER_S
             values["commands.delay.count"] = float(len(delays))
         return dict(sorted(values.items()))

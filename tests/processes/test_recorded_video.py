@@ -1,0 +1,49 @@
+"""Eight seconds that a real AR.Drone 2 recorded, through proxy, transport, a processor and a controller."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import skyloop
+from skyloop.errors import UnsupportedError
+from tests.processes.conftest import eventually
+
+pytestmark = pytest.mark.process
+
+RECORDING = Path(__file__).parents[1] / "data" / "ardrone2" / "video-8s.pave"
+FRAMES = 240
+
+
+class Look(skyloop.Controller):
+    def __init__(self, drone: skyloop.Drone) -> None:
+        super().__init__(drone)
+        self.seen: list[int] = []
+        self.brightness: list[float] = []
+
+    def on_frame(self, frame: skyloop.Frame) -> None:
+        assert frame.shape == (360, 640, 3)
+        self.seen.append(frame.seq)
+        self.brightness.append(float(np.mean(frame[::8, ::8])))
+        if len(self.seen) == FRAMES:
+            self.stop()
+
+
+def test_all_frames_reach_a_processor_and_a_controller_in_order() -> None:
+    pytest.importorskip("av", reason="reading recorded video needs PyAV: pip install 'skyloop[video]'")
+    with skyloop.connect(f"video://{RECORDING}") as drone:
+        with pytest.raises(UnsupportedError, match="record"):
+            drone.takeoff()
+        processed: list[int] = []
+        processor = drone.add_processor(lambda frame: processed.append(frame.seq))
+        controller = Look(drone)
+        controller.run(seconds=20)
+        eventually(lambda: len(processed) + processor.dropped >= FRAMES, "the processor is through as well")
+    assert processed == sorted(processed)
+    assert controller.seen == sorted(controller.seen)
+    # Both keep up with 30 frames a second, unless the machine takes their turn away for longer than a frame lasts.
+    assert processor.dropped <= FRAMES // 50
+    assert len(controller.seen) >= FRAMES - FRAMES // 50
+    assert len(set(controller.brightness)) > FRAMES // 2  # they are not always the same picture
