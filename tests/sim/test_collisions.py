@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from skyloop.errors import UsageError
@@ -49,6 +49,7 @@ set_points = st.builds(
 
 
 @settings(max_examples=25, deadline=None)
+@example("gates", [Attitude(pitch=-0.5), Velocity(up=-1.0), Velocity(up=-2.0)], 0)  # one came down upon the other
 @given(st.sampled_from(["room", "gates"]), st.lists(set_points, min_size=1, max_size=6), st.integers(0, 1000))
 def test_no_drone_ends_within_a_solid_or_outside_of_the_room(
     name: str, actions: list[Velocity | Attitude], seed: int
@@ -175,6 +176,22 @@ def test_drones_do_not_pass_through_one_another() -> None:
     occurrences = simulation.take_occurrences()
     assert {occurrence.drone for occurrence in occurrences} == {0, 1}
     assert "another drone" in occurrences[0].text
+
+
+def test_a_drone_that_lands_on_another_does_not_push_it_into_the_floor() -> None:
+    world = parse_world(
+        "[room]\nsize = [5, 5, 3]\n[[spawn]]\nposition = [0, 0, 0]\n[[spawn]]\nposition = [1.5, 0, 0]\nyaw_deg = 180\n"
+    )
+    simulation = Simulation(world, 2, parameters=replace(TOUGH, restitution=0.0))
+    simulation.command(1, Takeoff())
+    simulation.step(steps(4))
+    while simulation.truth(1).position_m[0] > 0.05:
+        simulation.command(1, Velocity(forward=0.5))
+        simulation.step(5)
+    simulation.command(1, Velocity(up=-2.0))
+    for _ in range(steps(4)):
+        simulation.step()
+        assert min(simulation.truth(drone).position_m[2] for drone in (0, 1)) > IDEAL.half_height_m - 1e-6
 
 
 def test_a_spawn_within_a_box_is_refused() -> None:

@@ -160,6 +160,7 @@ class Collisions:
         share = float(self._mass[other] / (self._mass[one] + self._mass[other]))
         position[:, one] += normal * depth * share
         position[:, other] -= normal * depth * (1.0 - share)
+        self._keep_above_floor(one, other)
         into = -float((velocity[:, one] - velocity[:, other]) @ normal)
         if into > 0:
             change = into * (1.0 + (min(self._bounce[one], self._bounce[other]) if into > _STILL_M_S else 0.0))
@@ -167,6 +168,13 @@ class Collisions:
             velocity[:, other] -= normal * change * (1.0 - share)
             if into > _STILL_M_S:
                 contacts.impacts += [(one, into, "another drone"), (other, into, "another drone")]
+
+    def _keep_above_floor(self, *drones: int) -> None:
+        """Lift a drone that another one has just pushed into the floor, and the other by as much."""
+        heights = self._bodies.position[2]
+        below = max(float(self._hull[2, drone] - heights[drone]) for drone in drones)
+        if below > 0.0:
+            heights[list(drones)] += below
 
     def _plan(self, step: int, who: Indices, clearance: Floats) -> None:
         """Set when each drone has to be looked at again. Two drones each may use up half of the gap between them."""
