@@ -182,9 +182,12 @@ class Reception:
             return  # repeated or overtaken
         offset_ns = self.link.offset_ns
         arrival = Arrival(header, pixels, now_ns, offset_ns, self.history, self._clock)
-        channel.newest = arrival
-        channel.topic.publish(arrival)  # first whoever waits for it, then the books
+        # First whoever waits for it, then the books. The frame before is let go of last: giving its memory back to the
+        # proxy takes longer than all of this.
+        before, channel.newest = channel.newest, arrival
+        channel.topic.publish(arrival)
         channel.bell.ring()
+        del before
         counter.follow(header.seq)
         counter.add(now_ns + offset_ns - header.published_ns, header.captured_ns - offset_ns, now_ns)
         channel.watch.heard_ns = now_ns

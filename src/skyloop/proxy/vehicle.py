@@ -148,19 +148,21 @@ class Vehicle:
         """A whole frame, from the driver."""
         with self._frame_lock:
             seq = self._frame_seq[camera] = self._frame_seq.get(camera, 0) + 1
-        self._counts[f"frames.{camera}.received"] += 1
         channels = _CHANNELS.get(encoding)
         if channels is not None and pixels.nbytes != width * height * channels:
             expected = f"{width} × {height} {encoding.value} is {width * height * channels} bytes"
             self._fail("frame", f"frame of camera {camera} has {pixels.nbytes} bytes, and {expected}")
-            return
-        if not self.wants(camera):
-            return
-        if intrinsics is None:
-            intrinsics = self._nominal_intrinsics(camera, width, height)
-        header = FrameHeader(
-            camera, seq, captured_ns, self._clock(), width, height, encoding, pixels.nbytes, intrinsics
-        )
+        elif self.wants(camera):
+            if intrinsics is None:
+                intrinsics = self._nominal_intrinsics(camera, width, height)
+            header = FrameHeader(
+                camera, seq, captured_ns, self._clock(), width, height, encoding, pixels.nbytes, intrinsics
+            )
+            self._hand_on(header, pixels)
+        self._counts[f"frames.{camera}.received"] += 1
+
+    def _hand_on(self, header: FrameHeader, pixels: NDArray[np.uint8]) -> None:
+        camera = header.camera
         try:
             missed = self._publish_frame(header, pixels)
         except (ValueError, TypeError) as error:
