@@ -9,7 +9,7 @@ from multiprocessing.context import SpawnContext
 from typing import TYPE_CHECKING
 
 from skyloop.bench.rounds import COMMAND, FEEDBACK, Channel, Pipe, Workers, paced
-from skyloop.messages import Applied, Feedback, Velocity
+from skyloop.messages import AnyAction, Applied, Feedback, Velocity
 
 if TYPE_CHECKING:
     from skyloop.client import Drone, Frame
@@ -76,7 +76,7 @@ def apply(pipe: Pipe, name: str) -> None:
             pipe.send("connected")
             for index in paced(count, channel.period_s):
                 if channel.name == COMMAND.name:
-                    drone.velocity(forward=0.001 * (index % 100))
+                    drone.velocity(forward=0.001 * (index % 100 + 1))
             time.sleep(SETTLE_S)
         pipe.send((inline, threaded))
 
@@ -86,8 +86,12 @@ def _listen(drone: Drone, channel: Channel) -> tuple[list[int], list[int]]:
     inline: list[int] = []
     threaded: list[int] = []
 
+    last: AnyAction = Velocity()
+
     def applied(echo: Applied) -> None:
-        if type(echo.asked) is Velocity:
+        nonlocal last
+        if type(echo.asked) is Velocity and echo.asked != last:  # each call has another one: equal ones are repeats
+            last = echo.asked
             inline.append(echo.applied_ns - echo.sent_ns)
 
     def came(into: list[int]) -> Callable[[Feedback | Frame], None]:

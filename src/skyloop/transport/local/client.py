@@ -8,13 +8,11 @@ import os
 import socket
 import threading
 from collections import deque
-from collections.abc import Sequence
 from typing import Final
 
 from skyloop.errors import DecodeError, LinkError, UnknownNameError
-from skyloop.messages import FrameHeader
 from skyloop.messages.codec import HEADER_SIZE, MAX_BODY
-from skyloop.transport.base import MAX_PACKET, ClientEnd, ClientHandler, Dialer, Pixels, check_packet, check_topic
+from skyloop.transport.base import MAX_PACKET, ClientEnd, ClientHandler, Dialer, check_packet, check_topic
 from skyloop.transport.local import packets
 from skyloop.transport.local.directory import connect, find_directory, set_timeout
 from skyloop.transport.local.packets import OWN
@@ -149,7 +147,7 @@ class LocalClient(ClientEnd):
     def _receive(self, sock: Socket) -> str:
         """Deliver until the connection ends, and return why."""
         receive = sock.recvmsg
-        deliver = self._handler.packet
+        deliver, show = self._handler.packet, self._handler.frame
         while not self._closing:
             try:
                 packet, ancillary, _, _ = receive(_MAX_RECEIVED, _ANCILLARY, socket.MSG_CMSG_CLOEXEC)
@@ -162,31 +160,35 @@ class LocalClient(ClientEnd):
                 return f"receiving failed: {error}"
             if self._unsent:
                 self._send_unsent(sock)
-            if packet[5:6] < OWN and packet and not ancillary:
+            kind = packet[5:6]
+            if kind < OWN and packet and not ancillary:
                 deliver(packet)
             elif not packet:
                 return self._reason or "the proxy is gone"
             elif ancillary or packets.is_own(packet):
                 try:
-                    frame = self._take(packet, _descriptors(ancillary) if ancillary else ())
+                    if kind != packets.FRAME or ancillary:
+                        self._take(packet, _descriptors(ancillary))
+                        continue
+                    number, header = packets.parse_frame(packet)
+                    pixels = self._leases.pixels(number, header.size)
                 except (DecodeError, LinkError, OSError) as error:
                     return f"the proxy does not keep to the protocol: {error}"
-                if frame is not None:
-                    self._handler.frame(*frame)
-                    frame = None  # else its slot stayed leased until the next packet
+                show(header, pixels)
+                del pixels  # else their slot stayed leased until the next packet
             else:
                 deliver(packet)
         return self._reason
 
-    def _take(self, packet: bytes, descriptors: Sequence[int]) -> tuple[FrameHeader, Pixels] | None:
-        """Take one of the transport's own packets, and close the descriptors that came with it.
+    def _take(self, packet: bytes, descriptors: list[int]) -> None:
+        """Take one of the transport's own packets that is no frame, and close the descriptors that came with it.
 
-        Returns the frame if it was one. Raises ``DecodeError``, ``LinkError`` or ``OSError`` for what makes no sense.
+        Raises ``DecodeError``, ``LinkError`` or ``OSError`` for what makes no sense.
         """
         try:
             message = packets.parse(packet)
             if isinstance(message, packets.Frame):
-                return message.header, self._leases.pixels(message.slot, message.header.size)
+                raise LinkError(f"a frame came with {len(descriptors)} descriptors and has none")
             if isinstance(message, packets.Slot):
                 if len(descriptors) != 1:
                     raise LinkError(f"a slot was announced with {len(descriptors)} descriptors and needs one")
@@ -195,7 +197,6 @@ class LocalClient(ClientEnd):
                 self._leases.retire(message.camera, message.before)
             elif isinstance(message, packets.Bye):
                 self._reason = self._reason or message.reason
-            return None
         finally:
             for descriptor in descriptors:
                 os.close(descriptor)

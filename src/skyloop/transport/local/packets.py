@@ -19,6 +19,7 @@ FIRST_KIND: Final = 0x40
 OWN: Final = b"\x40"  #: the same as a byte: from here on, the sixth byte of a packet says that it is the transport's
 MAX_REASON: Final = 400  #: bytes of UTF-8
 _FRAME: Final = 0x44  # LocalKind.FRAME
+FRAME: Final = b"\x44"  #: the same, as the sixth byte of a packet
 
 
 class LocalKind(IntEnum):
@@ -119,7 +120,7 @@ def parse(packet: bytes) -> Message:
     if len(packet) < HEADER_SIZE:
         raise DecodeError(f"{len(packet)} bytes are less than the header of {HEADER_SIZE}")
     if packet[5] == _FRAME:
-        return _parse_frame(packet)
+        return parse_frame(packet)
     signature, version, kind, reserved, length = HEADER.unpack_from(packet)
     if signature != SIGNATURE or version != VERSION or reserved or length != len(packet) - HEADER_SIZE:
         raise DecodeError(f"not a packet of the local transport: header {packet[:HEADER_SIZE].hex(' ')}")
@@ -143,7 +144,7 @@ _FIXED: Final[dict[int, tuple[struct.Struct, type[Hello] | type[Release] | type[
 }
 
 
-def _parse_frame(packet: bytes) -> Frame:
+def parse_frame(packet: bytes) -> Frame:
     """The one that comes often: its header and slot in one go."""
     if len(packet) < _FRAME_PREFIX.size:
         raise DecodeError(f"{len(packet)} bytes are less than the {_FRAME_PREFIX.size} before the header of a frame")
