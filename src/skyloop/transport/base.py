@@ -7,7 +7,7 @@ it knows packets and topics, but not what they mean. Whoever implements it passe
 - Nothing here ever blocks on the other end. What does not fit now is not sent, and the caller is told.
 - A packet arrives whole or not at all. Order is kept within one connection. It has 1 to :data:`MAX_PACKET` bytes;
   whoever tries to send another gets a :class:`skyloop.errors.UsageError`.
-- Handlers are called on the transport's receiving thread, one call at a time per end: return quickly. A handler that
+- Handlers are called on the transport's receiving threads, one call at a time per end: return quickly. A handler that
   raises ends its own connection, not the transport.
 - When one end goes away, however it ends, the other is told by ``peer_left`` or ``closed``, once.
 """
