@@ -1,0 +1,51 @@
+"""Rotations: axes, signs and the way back."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skyloop.messages import Feedback
+from skyloop.messages.geometry import euler_from_rotation, rotation_from_euler, wrap_angle
+
+angles = st.floats(-math.pi + 1e-6, math.pi - 1e-6)
+pitches = st.floats(-math.pi / 2 + 1e-3, math.pi / 2 - 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("roll", "pitch", "yaw", "body", "world"),
+    [
+        (0.0, 0.0, math.pi / 2, (1, 0, 0), (0, 1, 0)),  # facing north
+        (0.0, 0.1, 0.0, (1, 0, 0), (math.cos(0.1), 0, -math.sin(0.1))),  # nose down
+        (0.1, 0.0, 0.0, (0, 1, 0), (0, math.cos(0.1), math.sin(0.1))),  # right side down lifts the left one
+    ],
+)
+def test_signs(roll: float, pitch: float, yaw: float, body: tuple[float, ...], world: tuple[float, ...]) -> None:
+    assert rotation_from_euler(roll, pitch, yaw) @ np.array(body) == pytest.approx(np.array(world))
+
+
+@given(angles, pitches, angles)
+def test_there_and_back(roll: float, pitch: float, yaw: float) -> None:
+    rotation = rotation_from_euler(roll, pitch, yaw)
+    assert rotation @ rotation.T == pytest.approx(np.eye(3), abs=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1.0)
+    assert euler_from_rotation(rotation) == pytest.approx((roll, pitch, yaw), abs=1e-6)
+
+
+@given(st.floats(-100, 100))
+def test_wrapped_angles_are_the_same_angle(angle: float) -> None:
+    wrapped = wrap_angle(angle)
+    assert -math.pi <= wrapped < math.pi
+    assert math.cos(wrapped) == pytest.approx(math.cos(angle), abs=1e-9)
+    assert math.sin(wrapped) == pytest.approx(math.sin(angle), abs=1e-9)
+
+
+def test_feedback_gives_its_rotation_once_it_knows_it() -> None:
+    known = Feedback(captured_ns=1, roll=0.1, pitch=-0.2, yaw=0.3)
+    assert euler_from_rotation(known.rotation) == pytest.approx((0.1, -0.2, 0.3))
+    with pytest.raises(ValueError, match="not told its attitude"):
+        _ = Feedback(captured_ns=1, roll=0.1, pitch=None, yaw=0.3).rotation
