@@ -27,25 +27,23 @@ class BenchVehicle(Driver):
 
     def __init__(self) -> None:
         super().__init__(parse_uri("bench://"))
-        self._to: Sink | None = None
 
     def capabilities(self) -> Capabilities:
         return Capabilities("bench", frozenset(ACTION_NAMES.values()), (CameraInfo(CAMERA, 320, 240, 15.0),))
 
     def _open(self, sink: Sink) -> None:
-        self._to = sink
         sink.link(LinkState.UP)
         self._tell(sink)
 
     def _close(self) -> None:
-        self._to = None
+        """There is nothing to give back."""
 
     def _apply(self, action: AnyAction) -> AnyAction:
         return action
 
     def produce(self, channel: Channel, count: int) -> None:
         """Give ``count`` samples of the channel at its period."""
-        sink = self._to
+        sink = self._sink
         assert sink is not None
         image = np.random.default_rng(1).integers(0, 255, channel.frame_bytes, np.uint8)
         for _ in paced(count, channel.period_s):

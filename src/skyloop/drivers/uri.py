@@ -57,11 +57,6 @@ class VehicleUri:
         return meanings[given.lower()]
 
 
-def is_uri(text: str) -> bool:
-    """Whether this looks like a vehicle's address rather than a proxy's name."""
-    return "://" in text
-
-
 def parse_uri(text: str) -> VehicleUri:
     """Parse a vehicle's address. Raises :class:`UsageError`."""
     scheme, separator, rest = text.partition("://")

@@ -15,11 +15,7 @@ from skyloop.messages.codec import HEADER, HEADER_SIZE, SIGNATURE, VERSION
 from skyloop.transport.base import MAX_TOPIC
 
 REVISION: Final = 1  #: of the local transport's own packets
-FIRST_KIND: Final = 0x40
-OWN: Final = b"\x40"  #: the same as a byte: from here on, the sixth byte of a packet says that it is the transport's
 MAX_REASON: Final = 400  #: bytes of UTF-8
-_FRAME: Final = 0x44  # LocalKind.FRAME
-FRAME: Final = b"\x44"  #: the same, as the sixth byte of a packet
 
 
 class LocalKind(IntEnum):
@@ -33,6 +29,11 @@ class LocalKind(IntEnum):
     RETIRE = 0x45  #: server to client: older slots of a camera will not be used any more
     BYE = 0x46  #: either way: why the connection ends
     KNOCK = 0x47  #: client to server: a packet follows at once, wake up
+
+
+# The sixth byte of a packet is its kind: these are compared with it as it stands there.
+OWN: Final = bytes([LocalKind.HELLO])  #: from here on, a packet is the transport's own
+FRAME: Final = bytes([LocalKind.FRAME])
 
 
 class Hello(NamedTuple):
@@ -119,7 +120,7 @@ def parse(packet: bytes) -> Message:
     """What one of the transport's own packets says. Raises :class:`DecodeError` for anything that is none."""
     if len(packet) < HEADER_SIZE:
         raise DecodeError(f"{len(packet)} bytes are less than the header of {HEADER_SIZE}")
-    if packet[5] == _FRAME:
+    if packet[5:6] == FRAME:
         return parse_frame(packet)
     signature, version, kind, reserved, length = HEADER.unpack_from(packet)
     if signature != SIGNATURE or version != VERSION or reserved or length != len(packet) - HEADER_SIZE:
