@@ -17,6 +17,7 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
+from skyloop.transport.testing import wait_until
 from tests.proxy.fake import App, Bench
 
 
@@ -170,6 +171,8 @@ def test_landing_before_the_end(bench: Bench) -> None:
     bench.driver.report(state=FlightState.LANDED)
     assert bench.proxy.land(1.0)
     bench.proxy.stop(reason="it is late")
+    # What was published before the end still comes, on the pilot's own thread.
+    wait_until(lambda: any(event.kind is EventKind.PROXY_CLOSING for event in pilot.events), "the pilot hears of it")
     assert "it is late" in next(event.text for event in pilot.events if event.kind is EventKind.PROXY_CLOSING)
     assert bench.driver.told == [Land()]
     assert bench.driver.closed
