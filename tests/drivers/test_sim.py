@@ -12,7 +12,8 @@ import pytest
 from skyloop.drivers.base import Driver
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.registry import make_driver
-from skyloop.drivers.sim import SimDriver, SimHost, SimOptions
+from skyloop.drivers.sim import SimDriver
+from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import FileFormatError, ParameterError, UnknownNameError, UsageError
 from skyloop.messages import (
     Attitude,
@@ -26,6 +27,8 @@ from skyloop.messages import (
     Value,
     Velocity,
 )
+from skyloop.sim.host import SimHost
+from skyloop.sim.options import SimOptions
 
 CALM = "wind=0&noise=0&seed=1"
 
@@ -268,9 +271,13 @@ def test_bad_values_are_refused(name: str, value: Value, message: str) -> None:
 # Several drones --------------------------------------------------------------------------------------------------
 
 
+def riding(host: SimHost, drone: int) -> SimDriver:
+    return SimDriver(VehicleUri("sim"), host=host, drone=drone)
+
+
 def test_several_drones_fly_in_one_world() -> None:
     host = SimHost(SimOptions(cameras=(), speed=4.0, seed=3), drones=3)
-    with opened(host.driver(0)) as (one, heard_one), opened(host.driver(2)) as (three, heard_three):
+    with opened(riding(host, 0)) as (one, heard_one), opened(riding(host, 2)) as (three, heard_three):
         assert one.host is three.host
         in_the_air(three, heard_three)
         assert heard_one.newest is not None
@@ -285,16 +292,16 @@ def test_several_drones_fly_in_one_world() -> None:
         calls, told = heard_one.calls, heard_three.feedback_count
         assert heard_three.wait(lambda: heard_three.feedback_count > told + 5, 5.0)
         assert heard_one.calls == calls
-        with opened(host.driver(0)) as (_, heard_again):  # and it can come back
+        with opened(riding(host, 0)) as (_, heard_again):  # and it can come back
             assert heard_again.newest is not None
 
 
 def test_one_drone_has_one_driver() -> None:
     host = SimHost(SimOptions(cameras=()), drones=1)
-    with opened(host.driver(0)) as (_, heard):
-        with pytest.raises(UsageError, match="has a driver already"):
-            host.driver(0).open(RecordingSink())
+    with opened(riding(host, 0)) as (_, heard):
+        with pytest.raises(UsageError, match="is taken already"):
+            riding(host, 0).open(RecordingSink())
         told = heard.feedback_count
         assert heard.wait(lambda: heard.feedback_count > told + 2, 5.0)  # the first one is not disturbed
     with pytest.raises(UsageError, match="numbered from 0 to 0"):
-        host.driver(1)
+        riding(host, 1).open(RecordingSink())

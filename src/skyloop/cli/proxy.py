@@ -22,7 +22,7 @@ def proxy(
     vehicle = parse_uri(uri)
     if vehicle.scheme == "sim":
         from skyloop.cli.simulating import settle
-        from skyloop.drivers.sim import SimOptions
+        from skyloop.drivers.sim import options_of
 
-        settle(SimOptions.of(vehicle))
+        settle(options_of(vehicle))
     serve(uri, name, group=group, parent_fd=parent_fd)

@@ -30,18 +30,20 @@ def sim(
 ) -> None:
     """Simulate drones that see one another in one world, each with a proxy of its own, until Ctrl-C."""
     from skyloop.cli.simulating import settle
-    from skyloop.drivers.sim import SimHost, SimOptions
+    from skyloop.drivers.sim import SimDriver, options_of
     from skyloop.drivers.uri import parse_uri
     from skyloop.proxy import Proxy
     from skyloop.proxy.serve import run
+    from skyloop.sim.host import SimHost
     from skyloop.transport.local import LocalServer
 
     uri = parse_uri(address(world, seed, speed, option or []))
-    options = SimOptions.of(uri)
+    options = options_of(uri)
     settle(options)
     host = SimHost(options, drones)
     names = [name] if drones == 1 else [f"{name}{number}" for number in range(1, drones + 1)]
-    run([Proxy(host.driver(index, uri), LocalServer(each), name=each) for index, each in enumerate(names)])
+    drivers = [SimDriver(uri, host=host, drone=index) for index in range(drones)]
+    run([Proxy(driver, LocalServer(each), name=each) for driver, each in zip(drivers, names, strict=True)])
 
 
 def address(world: str, seed: int, speed: float, others: list[str]) -> str:

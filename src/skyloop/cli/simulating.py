@@ -6,7 +6,7 @@ import sys
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from skyloop.drivers.sim import SimOptions
+    from skyloop.sim.options import SimOptions
 
 SWITCH_INTERVAL_S: Final = 0.001
 

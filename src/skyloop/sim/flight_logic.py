@@ -1,4 +1,4 @@
-"""The firmware's flight states as a table: what leads from which state to which. A pair that isn't here is ignored, as
+"""The autopilot's flight states as a table: what leads from which state to which. A pair that isn't here is ignored, as
 firmware ignores what doesn't fit."""
 
 from __future__ import annotations

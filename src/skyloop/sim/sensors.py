@@ -1,6 +1,6 @@
 """What the vehicles believe about themselves: truth with noise, and with biases that wander slowly.
 
-Altitude and velocity are worked out at the rate of the firmware's loops, which fly by them. Inertial values and
+Altitude and velocity are worked out at the rate of the autopilot's loops, which fly by them. Inertial values and
 attitude are worked out when somebody looks, from noise that belongs to the step: same step, same value.
 """
 

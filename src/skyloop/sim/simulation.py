@@ -15,11 +15,11 @@ import numpy as np
 from skyloop.errors import UsageError
 from skyloop.messages import Action, AnyAction, FlightState
 from skyloop.messages.geometry import wrap_angle
+from skyloop.sim.autopilot import Autopilot
 from skyloop.sim.battery import Batteries
 from skyloop.sim.collisions import Collisions
 from skyloop.sim.control_loops import ControlLoops
 from skyloop.sim.dynamics import STEP_S, Bodies, body_rates, rotations
-from skyloop.sim.firmware import Firmware
 from skyloop.sim.parameters import GRAVITY_M_S2, Limits, VehicleParameters
 from skyloop.sim.placement import place
 from skyloop.sim.reports import Occurrence, VehicleFeedback, VehicleTruth
@@ -30,7 +30,7 @@ from skyloop.sim.targets import TargetTrack
 from skyloop.sim.wind import WindField
 from skyloop.sim.world import TargetState, Vec3, Wind, World
 
-LOOP_STEPS = 4  # the firmware's outer loops, altimeter and velocity: 62.5 Hz
+LOOP_STEPS = 4  # the autopilot's outer loops, altimeter and velocity: 62.5 Hz
 SLOW_STEPS = 25  # battery and the wandering of biases: 10 Hz
 
 T = TypeVar("T")
@@ -82,7 +82,7 @@ class Simulation:
         all_limits = _one_each(limits, drones, "limits")
         loops = ControlLoops(self.parameters, all_limits, self._bodies, LOOP_STEPS * STEP_S)
         self._loops = loops
-        self._firmware = Firmware(self.parameters, all_limits, loops, self._sensors, self._batteries)
+        self._autopilot = Autopilot(self.parameters, all_limits, loops, self._sensors, self._batteries)
 
     # Time ------------------------------------------------------------------------------------------------------
 
@@ -111,16 +111,16 @@ class Simulation:
         if self._step % LOOP_STEPS == 0:
             self._wind.blow(self._bodies.air)
             self._sensors.estimate()
-            self._firmware.supervise(self.time_s)
+            self._autopilot.supervise(self.time_s)
             self._loops.update(self._sensors)
         if self._step % SLOW_STEPS == 0:
             self._sensors.wander()
             self._batteries.drain(self._bodies.thrust, SLOW_STEPS * STEP_S)
-            self._firmware.watch_batteries(self.time_s)
+            self._autopilot.watch_batteries(self.time_s)
         self._bodies.step()
         contacts = self._collisions.resolve(self._step)
         self._step += 1
-        self._firmware.feel(contacts, self.time_s)
+        self._autopilot.feel(contacts, self.time_s)
 
     # Flying ----------------------------------------------------------------------------------------------------
 
@@ -136,16 +136,16 @@ class Simulation:
         if not action.finite:
             raise UsageError(f"a set-point must be finite: {action!r}")
         with self._lock:
-            return self._firmware.command(self._number(drone), action, self.time_s)
+            return self._autopilot.command(self._number(drone), action, self.time_s)
 
     def limits(self, drone: int) -> Limits:
         """The limits in force."""
-        return self._firmware.limits[self._number(drone)]
+        return self._autopilot.limits[self._number(drone)]
 
     def set_limits(self, drone: int, limits: Limits) -> None:
         """Change what the drone lets its pilot ask for, from the next command on; the ceiling holds at once."""
         with self._lock:
-            self._firmware.set_limits(self._number(drone), limits)
+            self._autopilot.set_limits(self._number(drone), limits)
 
     # Conditions ------------------------------------------------------------------------------------------------
 
@@ -165,7 +165,7 @@ class Simulation:
 
     def state(self, drone: int) -> FlightState:
         """The drone's flight state."""
-        return self._firmware.states[self._number(drone)]
+        return self._autopilot.states[self._number(drone)]
 
     def feedback(self, drone: int) -> VehicleFeedback:
         """What the drone believes now. Altitude and velocity are up to 12 ms older: their sensors run at 62.5 Hz."""
@@ -174,8 +174,8 @@ class Simulation:
             inertial = sensors.inertial(self._step)[:, i].tolist()
             return VehicleFeedback(
                 time_s=self.time_s,
-                state=self._firmware.states[i],
-                emergency_reason=self._firmware.reasons[i],
+                state=self._autopilot.states[i],
+                emergency_reason=self._autopilot.reasons[i],
                 battery=float(self._batteries.charge[i]),
                 battery_v=float(self._batteries.voltage[i]),
                 roll_rad=inertial[6],
@@ -194,7 +194,7 @@ class Simulation:
             roll, pitch, yaw = bodies.angles[:, i].tolist()
             return VehicleTruth(
                 time_s=self.time_s,
-                state=self._firmware.states[i],
+                state=self._autopilot.states[i],
                 position_m=_vec3(bodies.position[:, i]),
                 velocity_m_s=_vec3(bodies.velocity[:, i]),
                 roll_rad=roll,
@@ -221,8 +221,8 @@ class Simulation:
     def take_occurrences(self) -> list[Occurrence]:
         """What happened since the last call, oldest first; the newest 1000 are kept."""
         with self._lock:
-            taken = list(self._firmware.occurrences)
-            self._firmware.occurrences.clear()
+            taken = list(self._autopilot.occurrences)
+            self._autopilot.occurrences.clear()
             return taken
 
     def _number(self, drone: int) -> int:

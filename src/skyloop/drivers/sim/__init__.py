@@ -1,7 +1,6 @@
-"""``sim://``: a simulated drone in a simulated world, alone or with others of one :class:`SimHost`."""
+"""``sim://``: a simulated drone in a simulated world, alone or with others of one host."""
 
 from skyloop.drivers.sim.driver import SimDriver
-from skyloop.drivers.sim.host import SimHost
-from skyloop.drivers.sim.options import SimOptions
+from skyloop.drivers.sim.options import options_of
 
-__all__ = ["SimDriver", "SimHost", "SimOptions"]
+__all__ = ["SimDriver", "options_of"]

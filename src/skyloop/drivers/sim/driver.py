@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.sim import parameters as table
-from skyloop.drivers.sim.host import Report, SimHost
-from skyloop.drivers.sim.options import SimOptions
+from skyloop.drivers.sim.options import options_of
 from skyloop.drivers.sim.set_points import SetPointFlight
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import SkyloopError
@@ -28,12 +27,13 @@ from skyloop.messages import (
     Value,
 )
 from skyloop.sim.camera import CameraModel
+from skyloop.sim.host import Report, SimHost
 from skyloop.sim.parameters import LIMIT_RANGES, Limits
 from skyloop.sim.reports import Occurrence, OccurrenceKind
 from skyloop.sim.world import Wind
 
 if TYPE_CHECKING:
-    from skyloop.drivers.sim.cameras import Camera
+    from skyloop.sim.studio import Camera
 
 _OCCURRENCES: Final = {
     OccurrenceKind.COLLISION: (EventKind.COLLISION, Severity.WARNING),
@@ -50,11 +50,9 @@ class SimDriver(Driver):
     second one is ``truth.target2``), all in world axes. ``sim.time_s`` is the simulation's own time.
     """
 
-    def __init__(
-        self, uri: VehicleUri, *, host: SimHost | None = None, drone: int = 0, options: SimOptions | None = None
-    ) -> None:
+    def __init__(self, uri: VehicleUri, *, host: SimHost | None = None, drone: int = 0) -> None:
         super().__init__(uri)
-        self.options = options or SimOptions.of(uri)
+        self.options = options_of(uri) if host is None else host.options
         self.drone = drone
         self.host = host  #: the world; None until a driver with a world of its own is opened
         self._shared = host is not None

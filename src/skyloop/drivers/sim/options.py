@@ -1,4 +1,4 @@
-"""What a ``sim://`` address asks for. Pure, but for the reading of a world file when the world is made.
+"""What a ``sim://`` address asks for. Pure.
 
 Options: ``world`` its name or file (``room``); ``seed`` (0); ``speed`` seconds of simulation a second (1); ``cameras``
 (``front,bottom``, or ``none``); ``width``, ``height``, ``fps`` of all cameras; ``latency`` of all cameras [s];
@@ -12,22 +12,18 @@ indoor positioning system (0); ``truth`` whether feedback carries the true state
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from typing import Final
 
 from skyloop.drivers.base import reject_unknown_options
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import UnknownNameError, UsageError
-from skyloop.messages import ACTION_NAMES
 from skyloop.sim.camera import BOTTOM_CAMERA, FRONT_CAMERA, CameraModel
-from skyloop.sim.parameters import VehicleParameters
-from skyloop.sim.world import Wind, World
-from skyloop.sim.world_file import load_world
+from skyloop.sim.options import EVERY_ACTION, SimOptions
 
 CAMERAS: Final = {camera.name: camera for camera in (FRONT_CAMERA, BOTTOM_CAMERA)}
 QUALITIES: Final = ("fast", "smooth", "best")
 RENDERERS: Final = ("planar", "mujoco")
-EVERY_ACTION: Final = frozenset(ACTION_NAMES.values())
 ALWAYS_NATIVE: Final = frozenset({"idle", "emergency_stop", "reset_emergency"})
 _KNOWN: Final = {
     *("world", "seed", "speed", "cameras", "width", "height", "fps", "latency", "noise", "wind", "battery"),
@@ -35,73 +31,34 @@ _KNOWN: Final = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class SimOptions:
-    """A simulated world and how its drones are made."""
-
-    world: str = "room"
-    seed: int = 0
-    speed: float = 1.0
-    cameras: tuple[CameraModel, ...] = (FRONT_CAMERA, BOTTOM_CAMERA)
-    noise: float = 1.0
-    wind: float = 1.0
-    battery: float = 1.0
-    renderer: str = "planar"
-    quality: str = "smooth"
-    native: frozenset[str] = EVERY_ACTION
-    position: bool = False
-    truth: bool = True
-    rate_hz: float = 40.0
-
-    @classmethod
-    def of(cls, uri: VehicleUri) -> SimOptions:
-        """From an address. Raises :class:`UsageError` for what makes no sense."""
-        reject_unknown_options(uri, _KNOWN)
-        if uri.place:
-            raise UsageError(f"{uri}: a simulated drone has no place; did you mean sim://?world={uri.place}")
-        options = uri.options
-        quality = options.get("quality", "smooth")
-        if quality not in QUALITIES:
-            raise UnknownNameError("quality of pictures", quality, QUALITIES)
-        renderer = options.get("renderer", "planar")
-        if renderer not in RENDERERS:
-            raise UnknownNameError("renderer", renderer, RENDERERS)
-        noise = uri.number("noise", 1.0, minimum=0.0, maximum=20.0)
-        return cls(
-            world=options.get("world", "room"),
-            seed=uri.whole("seed", 0),
-            speed=uri.number("speed", 1.0, minimum=0.01, maximum=100.0),
-            cameras=tuple(_camera(uri, model, noise) for model in _models(options.get("cameras", "front,bottom"))),
-            noise=noise,
-            wind=uri.number("wind", 1.0, minimum=0.0, maximum=20.0),
-            battery=uri.number("battery", 1.0, minimum=0.001, maximum=1.0),
-            renderer=renderer,
-            quality=quality,
-            native=_native(options.get("native")),
-            position=uri.flag("position"),
-            truth=uri.flag("truth", default=True),
-            rate_hz=uri.number("rate", 40.0, minimum=1.0, maximum=200.0),
-        )
-
-    def load_world(self) -> World:
-        """Raises :class:`UnknownNameError` or :class:`skyloop.errors.FileFormatError`."""
-        return load_world(self.world, self.seed)
-
-    def blowing(self, wind: Wind) -> Wind:
-        """The world's wind by this factor."""
-        x, y, z = wind.mean_m_s
-        mean = (x * self.wind, y * self.wind, z * self.wind)
-        return replace(wind, mean_m_s=mean, gust_m_s=wind.gust_m_s * self.wind)
-
-    def vehicle(self) -> VehicleParameters:
-        """The vehicle, with its sensors' noise and biases by this factor."""
-        standard = VehicleParameters()
-        flaws = {
-            field.name: getattr(standard, field.name) * self.noise
-            for field in fields(standard)
-            if ("_noise_" in field.name or "_bias_" in field.name) and "time_constant" not in field.name
-        }
-        return replace(standard, **flaws)
+def options_of(uri: VehicleUri) -> SimOptions:
+    """From an address. Raises :class:`UsageError` for what makes no sense."""
+    reject_unknown_options(uri, _KNOWN)
+    if uri.place:
+        raise UsageError(f"{uri}: a simulated drone has no place; did you mean sim://?world={uri.place}")
+    options = uri.options
+    quality = options.get("quality", "smooth")
+    if quality not in QUALITIES:
+        raise UnknownNameError("quality of pictures", quality, QUALITIES)
+    renderer = options.get("renderer", "planar")
+    if renderer not in RENDERERS:
+        raise UnknownNameError("renderer", renderer, RENDERERS)
+    noise = uri.number("noise", 1.0, minimum=0.0, maximum=20.0)
+    return SimOptions(
+        world=options.get("world", "room"),
+        seed=uri.whole("seed", 0),
+        speed=uri.number("speed", 1.0, minimum=0.01, maximum=100.0),
+        cameras=tuple(_camera(uri, model, noise) for model in _models(options.get("cameras", "front,bottom"))),
+        noise=noise,
+        wind=uri.number("wind", 1.0, minimum=0.0, maximum=20.0),
+        battery=uri.number("battery", 1.0, minimum=0.001, maximum=1.0),
+        renderer=renderer,
+        quality=quality,
+        native=_native(options.get("native")),
+        position=uri.flag("position"),
+        truth=uri.flag("truth", default=True),
+        rate_hz=uri.number("rate", 40.0, minimum=1.0, maximum=200.0),
+    )
 
 
 def _models(text: str) -> list[CameraModel]:

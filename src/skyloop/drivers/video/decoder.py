@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, Literal
 
-from skyloop.drivers.pave import Codec, PaveFrame
 from skyloop.errors import MissingExtraError
+from skyloop.wire.ardrone.pave import Codec, PaveFrame
 
 try:
     import av

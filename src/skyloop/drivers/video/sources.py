@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
-from skyloop.drivers.pave import PaveFrame, PaveParser
 from skyloop.drivers.video.decoder import PaveDecoder, av, limit_memory
 from skyloop.errors import DriverError, FileFormatError, UsageError
+from skyloop.wire.ardrone.pave import PaveFrame, PaveParser
 
 if TYPE_CHECKING:
     from av.container import InputContainer

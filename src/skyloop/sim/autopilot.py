@@ -31,7 +31,7 @@ _STANDING_S = 0.05  # a drone that touched the ground no longer ago than this st
 _KEPT_OCCURRENCES = 1000
 
 
-class Firmware:
+class Autopilot:
     """Flight states and set-points of all drones. Times are of the simulation."""
 
     def __init__(

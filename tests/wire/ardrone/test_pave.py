@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyloop.drivers.pave import DEFAULT_MAX_PAYLOAD, FrameType, PaveFrame, PaveParser
+from skyloop.wire.ardrone.pave import DEFAULT_MAX_PAYLOAD, FrameType, PaveFrame, PaveParser
 
-DATA = Path(__file__).parents[1] / "data" / "ardrone2"
+DATA = Path(__file__).parents[2] / "data" / "ardrone2"
 LONG = (DATA / "video-8s.pave").read_bytes()
 TORN = (DATA / "video-64-byte-headers.pave").read_bytes()
 START = LONG[:200_000]

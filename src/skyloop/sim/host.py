@@ -1,4 +1,4 @@
-"""A world with its drones that keeps time, and the drivers of those drones."""
+"""A world with its drones that keeps time and is drawn, for those who ride on the drones."""
 
 from __future__ import annotations
 
@@ -9,18 +9,16 @@ from typing import TYPE_CHECKING, Final, Protocol
 import numpy as np
 
 from skyloop.clock import nanoseconds
-from skyloop.drivers.sim.options import SimOptions
-from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import UsageError
+from skyloop.sim.options import SimOptions
 from skyloop.sim.pacing import Pacer
 from skyloop.sim.reports import Occurrence, VehicleFeedback, VehicleTruth
 from skyloop.sim.simulation import Simulation
 from skyloop.sim.world import TargetState, Wind
 
 if TYPE_CHECKING:
-    from skyloop.drivers.sim.cameras import Camera, Screen, Studio
-    from skyloop.drivers.sim.driver import SimDriver
     from skyloop.sim.camera import CameraModel
+    from skyloop.sim.studio import Camera, Screen, Studio
 
 TICK_S: Final = 0.008  #: of the clock: steps are done in bunches of so much
 
@@ -49,9 +47,9 @@ class Passenger(Protocol):
 
 
 class SimHost:
-    """Several drones in one world, each to be had as a driver by :meth:`driver`.
+    """Several drones in one world, numbered from 0, each for one :class:`Passenger`: a driver, or emulated firmware.
 
-    The world is stepped while at least one of its drivers is open. Raises :class:`UsageError` for a world that does
+    The world is stepped while at least one of them is aboard. Raises :class:`UsageError` for a world that does
     not exist, can't be read, or has no place for so many drones.
     """
 
@@ -73,16 +71,8 @@ class SimHost:
 
     @property
     def drones(self) -> int:
-        """How many there are; they are numbered from 0."""
+        """How many there are."""
         return self.simulation.drones
-
-    def driver(self, drone: int = 0, uri: VehicleUri | None = None) -> SimDriver:
-        """The driver of one of the drones, not opened. ``uri`` is what it is called by."""
-        from skyloop.drivers.sim.driver import SimDriver
-
-        if not 0 <= drone < self.drones:
-            raise UsageError(f"no drone {drone}: they are numbered from 0 to {self.drones - 1}")
-        return SimDriver(uri or VehicleUri("sim"), host=self, drone=drone, options=self.options)
 
     def set_wind(self, wind: Wind) -> None:
         """Another wind from now on, for all drones."""
@@ -92,12 +82,14 @@ class SimHost:
     def board(self, drone: int, passenger: Passenger, screen: Screen, models: list[CameraModel]) -> tuple[Camera, ...]:
         """Begin to tell a passenger about a drone and to draw its cameras; the first one starts the world.
 
-        Raises :class:`UsageError` if somebody else has this drone, :class:`skyloop.errors.MissingExtraError` or
-        :class:`skyloop.errors.UnsupportedError` if cameras are wanted and what draws is not installed.
+        Raises :class:`UsageError` if there is no such drone or somebody else has it,
+        :class:`skyloop.errors.MissingExtraError` or :class:`skyloop.errors.UnsupportedError` if cameras are wanted and what draws is not installed.
         """
+        if not 0 <= drone < self.drones:
+            raise UsageError(f"no drone {drone}: they are numbered from 0 to {self.drones - 1}")
         with self._lock:
             if drone in self._passengers:
-                raise UsageError(f"drone {drone} of this world has a driver already")
+                raise UsageError(f"drone {drone} of this world is taken already")
             cameras = self._cameras(drone, screen, models)
             self._passengers = {**self._passengers, drone: (passenger, cameras)}
             if self._runner is None:
@@ -128,7 +120,7 @@ class SimHost:
     def _cameras(self, drone: int, screen: Screen, models: list[CameraModel]) -> tuple[Camera, ...]:
         if not models:
             return ()
-        from skyloop.drivers.sim.cameras import Camera, Shutter, require_renderer
+        from skyloop.sim.studio import Camera, Shutter, require_renderer
 
         require_renderer(self.options.renderer)
         cameras = []
@@ -205,8 +197,8 @@ class _Runner:
         ]
         if not due:
             return
-        from skyloop.drivers.sim.cameras import Studio, expose
         from skyloop.sim.render import SceneState
+        from skyloop.sim.studio import Studio, expose
 
         if self._studio is None:
             options = self._host.options

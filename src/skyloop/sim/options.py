@@ -1,0 +1,53 @@
+"""How a simulated world and its drones are made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Final
+
+from skyloop.messages import ACTION_NAMES
+from skyloop.sim.camera import BOTTOM_CAMERA, FRONT_CAMERA, CameraModel
+from skyloop.sim.parameters import VehicleParameters
+from skyloop.sim.world import Wind, World
+from skyloop.sim.world_file import load_world
+
+EVERY_ACTION: Final = frozenset(ACTION_NAMES.values())
+
+
+@dataclass(frozen=True, slots=True)
+class SimOptions:
+    """A simulated world and how its drones are made."""
+
+    world: str = "room"
+    seed: int = 0
+    speed: float = 1.0
+    cameras: tuple[CameraModel, ...] = (FRONT_CAMERA, BOTTOM_CAMERA)
+    noise: float = 1.0
+    wind: float = 1.0
+    battery: float = 1.0
+    renderer: str = "planar"
+    quality: str = "smooth"
+    native: frozenset[str] = EVERY_ACTION
+    position: bool = False
+    truth: bool = True
+    rate_hz: float = 40.0
+
+    def load_world(self) -> World:
+        """Raises :class:`UnknownNameError` or :class:`skyloop.errors.FileFormatError`."""
+        return load_world(self.world, self.seed)
+
+    def blowing(self, wind: Wind) -> Wind:
+        """The world's wind by this factor."""
+        x, y, z = wind.mean_m_s
+        mean = (x * self.wind, y * self.wind, z * self.wind)
+        return replace(wind, mean_m_s=mean, gust_m_s=wind.gust_m_s * self.wind)
+
+    def vehicle(self) -> VehicleParameters:
+        """The vehicle, with its sensors' noise and biases by this factor."""
+        standard = VehicleParameters()
+        flaws = {
+            field.name: getattr(standard, field.name) * self.noise
+            for field in fields(standard)
+            if ("_noise_" in field.name or "_bias_" in field.name) and "time_constant" not in field.name
+        }
+        return replace(standard, **flaws)
