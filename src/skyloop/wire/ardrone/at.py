@@ -1,0 +1,113 @@
+"""AT commands of the AR.Drone (UDP port 5556): text lines both ways. Pure.
+
+``AT*NAME=sequence[,argument]*`` and a carriage return; several in a datagram, none across two. Numbers are signed
+decimals, texts stand in double quotes, and a float is sent as the signed integer that has the same 32 bits. Source:
+Parrot AR.Drone Developer Guide, chapter 6, and ``at_msgs.h`` of the AR.Drone SDK 2.0.1.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+from dataclasses import dataclass
+from enum import IntEnum, IntFlag
+from typing import Final, TypeAlias
+
+from skyloop.errors import UsageError
+
+PORT: Final = 5556
+MAX_LINE: Final = 1024  #: characters; the drone drops a longer one whole
+SILENCE_RESET_S: Final = 2.0  #: after so long without a command the drone expects the sequence from 1 again
+
+Argument: TypeAlias = int | float | str
+
+
+class Ref(IntFlag):
+    """Bits of ``REF``."""
+
+    EMERGENCY = 1 << 8  #: each change from 0 to 1 stops the motors, or ends the emergency
+    TAKEOFF = 1 << 9  #: 1 take off and stay in the air, 0 land and stay on the ground
+    FIXED = 0x11540000  #: bits 18, 20, 22, 24 and 28, which the guide asks for and no drone misses
+
+
+class Pcmd(IntFlag):
+    """Bits of the flags of ``PCMD`` and ``PCMD_MAG``."""
+
+    HOVER = 0  #: the four values are ignored
+    PROGRESSIVE = 1  #: the four values are followed
+    COMBINED_YAW = 2
+    ABSOLUTE = 4  #: relative to a heading: ``PCMD_MAG`` only
+
+
+class Ctrl(IntEnum):
+    """Modes of ``CTRL``."""
+
+    NONE = 0
+    UPDATE = 1
+    PIC_UPDATE = 2
+    GET_LOGS = 3
+    GET_CONFIGURATION = 4  #: sent over the control port
+    CLEAR_ACK = 5
+    GET_CUSTOM_IDS = 6  #: sent over the control port
+
+
+@dataclass(frozen=True, slots=True)
+class AtCommand:
+    """One line as it came. ``arguments`` are integers (floats still as their bits, see :func:`to_float`) and texts."""
+
+    name: str
+    sequence: int
+    arguments: tuple[int | str, ...]
+
+
+def format_command(name: str, sequence: int, *arguments: Argument) -> bytes:
+    """One line. Raises :class:`UsageError` for a float that is not finite, a quote in a text, or too long a line."""
+    words = [str(sequence), *(_word(argument) for argument in arguments)]
+    line = f"AT*{name}={','.join(words)}\r".encode("latin-1", "replace")
+    if len(line) > MAX_LINE:
+        raise UsageError(f"AT*{name} of {len(line)} characters: the drone takes at most {MAX_LINE}")
+    return line
+
+
+def to_bits(value: float) -> int:
+    """The signed integer with the same 32 bits as this float: 0.5 is 1056964608."""
+    return int(struct.unpack("<i", struct.pack("<f", value))[0])
+
+
+def to_float(bits: int) -> float:
+    """Back again. Bits beyond 32 are cut off."""
+    return float(struct.unpack("<f", struct.pack("<I", bits & 0xFFFFFFFF))[0])
+
+
+_LINE: Final = re.compile(rb"AT\*([A-Z_]+)=(-?\d{1,10})((?:,(?:-?\d{1,11}|\"[^\"\r\n]*\"))*)\Z")
+_ARGUMENT: Final = re.compile(rb",(?:(-?\d+)|\"([^\"]*)\")")
+
+
+def parse_commands(datagram: bytes) -> tuple[list[AtCommand], int]:
+    """The commands of a datagram, and how many lines made no sense, which a drone ignores. Never raises."""
+    commands, malformed = [], 0
+    for line in re.split(rb"[\r\n]+", datagram.rstrip(b"\0")):
+        if not line:
+            continue
+        found = _LINE.match(line) if len(line) < MAX_LINE else None
+        if found is None:
+            malformed += 1
+            continue
+        arguments = tuple(
+            int(number) if number else text.decode("latin-1") for number, text in _ARGUMENT.findall(found[3])
+        )
+        commands.append(AtCommand(found[1].decode("ascii"), int(found[2]), arguments))
+    return commands, malformed
+
+
+def _word(argument: Argument) -> str:
+    if isinstance(argument, str):
+        if '"' in argument or "\r" in argument or "\n" in argument:
+            raise UsageError(f"{argument!r} can't be sent to the drone: it holds a quote or a line break")
+        return f'"{argument}"'
+    if isinstance(argument, float):
+        if not math.isfinite(argument):
+            raise UsageError(f"{argument} can't be sent to the drone: it is not finite")
+        return str(to_bits(argument))
+    return str(int(argument))
