@@ -7,7 +7,7 @@
     │   ├── UnknownNameError (also KeyError)   no such proxy, camera, parameter …; carries ``suggestions``
     │   ├── FileFormatError               a file cannot be understood; names the file and the place
     │   └── NameTakenError                the name asked for is in use; says by whom
-    ├── DecodeError (also ValueError)     bytes from elsewhere are not a Skyloop packet
+    ├── DecodeError (also ValueError)     bytes from elsewhere are no Skyloop packet, or not what a vehicle sends
     ├── MissingExtraError (also ImportError)   an optional part is not installed; names the ``pip install``
     ├── UnsupportedError                  this platform or this vehicle cannot do what was asked
     ├── RefusedError                      the other end understood and said no; carries ``code`` and its reason
