@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
-
 from skyloop.messages import Takeoff
 from skyloop.sim import STEP_S, Simulation, VehicleParameters, Wind, World, parse_world
+from skyloop.sim.parameters import with_ideal_sensors
 
 HALL = parse_world("[room]\nsize = [20, 20, 10]\n", "hall")
 
-_FLAWS = [field.name for field in fields(VehicleParameters) if "_noise_" in field.name or "_bias_" in field.name]
-
 #: A vehicle that knows exactly where it is.
-IDEAL = replace(VehicleParameters(), **dict.fromkeys(_FLAWS, 0.0))
+IDEAL = with_ideal_sensors(VehicleParameters())
 
 
 def steps(seconds: float) -> int:

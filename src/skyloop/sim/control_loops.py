@@ -38,6 +38,8 @@ class ControlLoops:
         self._integral = np.zeros((2, n))
         self._velocity_gain = column(parameters, lambda p: p.velocity_gain_per_s)
         self._integral_gain = column(parameters, lambda p: p.velocity_integral_per_s2) * period_s
+        self._level_brake = column(parameters, lambda p: p.level_brake_per_m) / GRAVITY_M_S2
+        self._any_level_brake = bool(self._level_brake.any())
         self._altitude_gain = column(parameters, lambda p: p.altitude_gain_per_s)
         self._climb_gain = column(parameters, lambda p: p.climb_gain_per_s)
         self._least_thrust = column(parameters, lambda p: p.least_thrust) * GRAVITY_M_S2
@@ -92,6 +94,8 @@ class ControlLoops:
         command = self._bodies.attitude_command
         roll, pitch = self._level_tilts(sensors.velocity)
         np.copyto(command[:2], self._set_point[:2])
+        if self._any_level_brake:
+            command[:2] += self._level_brakes(sensors.velocity)
         np.copyto(command[0], roll, where=self._by_velocity)
         np.copyto(command[1], pitch, where=self._by_velocity)
         np.copyto(command[2], self._set_point[3])
@@ -115,6 +119,15 @@ class ControlLoops:
         pitch = np.minimum(np.maximum(ahead / GRAVITY_M_S2, -most), most)
         roll = np.minimum(np.maximum(aside / -GRAVITY_M_S2, -most), most)
         return roll, pitch
+
+    def _level_brakes(self, velocity: Floats) -> Floats:
+        """Roll and pitch against the speed, to be added to the set-points of drones that fly by attitude."""
+        forward, left = velocity[:2]
+        lean = np.array([left, -forward]) * (self._level_brake * np.hypot(forward, left))
+        most = self._tilt_limit
+        share = np.maximum(1.0 - np.abs(self._set_point[:2]) / most, 0.0)
+        braked: Floats = np.minimum(np.maximum(lean, -most), most) * share
+        return braked
 
     def _lift(self, sensors: Sensors) -> None:
         altitude, climbing = sensors.altitude, sensors.velocity[2]

@@ -20,6 +20,7 @@ from skyloop.sim.streams import Floats
 STEP_S = 0.004
 
 _MOST_TILT_RAD = 1.2  # far from the singularity of Euler angles at π/2
+_MOST_TILTING_AIRSPEED_M_S = 3.0  # the air tilts no further beyond: no recording is faster
 
 
 def column(parameters: Sequence[VehicleParameters], value: Callable[[VehicleParameters], float]) -> Floats:
@@ -74,6 +75,8 @@ class Bodies:
         self._quadratic = np.array(
             [quadratic, quadratic, column(parameters, lambda p: p.vertical_quadratic_drag_per_m)]
         )
+        self._airspeed_tilt = column(parameters, lambda p: p.airspeed_tilt_rad_s2_per_m2)
+        self._any_airspeed_tilt = bool(self._airspeed_tilt.any())
         self._rotor_height = column(parameters, lambda p: p.rotor_height_m)
         self._rotor_offset = column(parameters, lambda p: p.rotor_height_m - p.half_height_m)
         self._ground_effect = column(parameters, lambda p: p.ground_effect**0.5 * p.rotor_radius_m / 4)
@@ -102,6 +105,8 @@ class Bodies:
         change, other = self._a, self._b
         np.multiply(self._held, self.angles, out=change)
         np.subtract(self.attitude_command, change, out=change)
+        if self._any_airspeed_tilt:
+            change[:2] += self._tilt_by_airspeed()
         np.multiply(change, self._stiff, out=change)
         np.multiply(self.rates, self._damp, out=other)
         np.subtract(change, other, out=change)
@@ -115,6 +120,16 @@ class Bodies:
         np.maximum(tilts, -_MOST_TILT_RAD, out=tilts)
         np.sin(self.angles, out=self.sin)
         np.cos(self.angles, out=self.cos)
+
+    def _tilt_by_airspeed(self) -> Floats:
+        """Roll and pitch that the air adds to what is commanded, shape (2, n): the leading side goes up."""
+        east, north = self.velocity[:2] - self.air[:2]
+        sin_yaw, cos_yaw = self.sin[2], self.cos[2]
+        forward, left = cos_yaw * east + sin_yaw * north, cos_yaw * north - sin_yaw * east
+        speed = np.hypot(east, north)
+        slowed = np.minimum(speed, _MOST_TILTING_AIRSPEED_M_S) ** 2 / np.maximum(speed, 1e-9)
+        tilt: Floats = np.array([left, -forward]) * (self._airspeed_tilt * slowed)
+        return tilt
 
     def _accelerate(self) -> Floats:
         lift = self._lift()

@@ -10,7 +10,7 @@ Forward Flight", ARC R&M 3021, 1955. [S] AR.Drone SDK 2.0.1, default configurati
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 from skyloop.errors import UsageError
 
@@ -30,6 +30,9 @@ class VehicleParameters:
     quadratic_drag_per_m: float = 0.04
     vertical_linear_drag_per_s: float = 0.45  # estimate: as horizontally
     vertical_quadratic_drag_per_m: float = 0.12  # estimate: three times the area seen from above
+    # How far the air that the vehicle flies into lifts its leading side, against attitude loops that don't take it out:
+    # this angle times the square of the horizontal airspeed, up to 3 m/s. Blades flap, and hulls catch the wind.
+    airspeed_tilt_rad_s2_per_m2: float = 0.0
 
     # Motors
     rotor_radius_m: float = 0.10  # 8 inch propellers [P]
@@ -44,6 +47,9 @@ class VehicleParameters:
     attitude_damping: float = 0.8
     most_angular_acceleration_rad_s2: float = 60.0  # estimate
     yaw_time_constant_s: float = 0.1  # [E] c5 = 10 1/s
+    # By roll and pitch set-points near level, firmware may lean against the speed on its own: this deceleration per
+    # square of the speed when the set-point is level, less in proportion to it, and none at the full tilt.
+    level_brake_per_m: float = 0.0
     climb_gain_per_s: float = 3.0  # estimate; the AR.Drone's whole response is softer, [E] c7 = 1.4 1/s
     altitude_gain_per_s: float = 1.2  # damps the altitude hold with ζ = 0.8 at the climb gain above
     velocity_gain_per_s: float = 2.0  # estimate
@@ -122,6 +128,12 @@ _POSITIVE = frozenset(
         "crash_speed_m_s",
     }
 )
+
+
+def with_ideal_sensors(vehicle: VehicleParameters) -> VehicleParameters:
+    """The same vehicle, knowing exactly where it is: without noise and biases."""
+    flaws = [field.name for field in fields(vehicle) if "_noise_" in field.name or "_bias_" in field.name]
+    return replace(vehicle, **dict.fromkeys(flaws, 0.0))
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,188 @@
+"""Recorded pitch steps of a real vehicle, and the same commands flown by simulated ones.
+
+A recording is a folder of three text files, as the control characterisation of rc500/ardrone_archive_aarons_laptop
+wrote them, one line a sample: Unix time of receipt [s] and a value.
+
+==================  ==================================================================================================
+``command_dump``    pitch command, -1 to 1 of the drone's own limit, negative nose down; stamped when it was sent
+``theta_dump``      pitch [millidegrees], negative nose down
+``vx_dump``         forward speed as the drone estimates it [mm/s]
+==================  ==================================================================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from skyloop.errors import FileFormatError, UsageError
+from skyloop.messages import Attitude, Takeoff
+from skyloop.sim.dynamics import STEP_S
+from skyloop.sim.parameters import Limits, VehicleParameters, with_ideal_sensors
+from skyloop.sim.simulation import Simulation
+from skyloop.sim.streams import Floats
+from skyloop.sim.world_file import parse_world
+
+#: How long after the beginning of a step the vehicles are compared.
+WINDOW_S = 3.0
+#: The recorded drone sends samples so often.
+SAMPLE_PERIOD_S = 0.005
+#: Half a command and a whole one tilted the recorded drone equally far: from this magnitude on it tilts fully.
+FULL_TILT_COMMAND = 0.5
+
+_HALL = parse_world("[room]\nsize = [30, 30, 10]\n", "hall")
+_SETTLED_S = 4.0  # after this the simulated drones have taken off and hover
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """Samples of one quantity: ``times_s`` and ``values``, both of shape (n,), times never falling."""
+
+    times_s: Floats
+    values: Floats
+
+    def between(self, begin_s: float, end_s: float) -> Track:
+        """The samples from a time to another."""
+        chosen = (self.times_s >= begin_s) & (self.times_s <= end_s)
+        return Track(self.times_s[chosen], self.values[chosen])
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """A flight. ``command``: as recorded, but nose down positive; ``pitch``: nose down positive [rad]; ``forward``:
+    speed [m/s]. Times are seconds of the clock that stamped them."""
+
+    name: str
+    command: Track
+    pitch: Track
+    forward: Track
+
+    def steps(self) -> list[float]:
+        """When the command changed [s]."""
+        changes = np.flatnonzero(np.diff(self.command.values)) + 1
+        return [float(time) for time in self.command.times_s[changes]]
+
+    def since(self, begin_s: float) -> Recording:
+        """The same with times that count from this one."""
+        tracks = (self.command, self.pitch, self.forward)
+        return Recording(self.name, *(Track(track.times_s - begin_s, track.values) for track in tracks))
+
+
+@dataclass(frozen=True, slots=True)
+class Response:
+    """What simulated vehicles did, one row each: ``pitch`` [rad] and ``forward`` [m/s], shape (vehicles, samples), at
+    ``times_s`` after the step's beginning."""
+
+    times_s: Floats
+    pitch: Floats
+    forward: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Misfit:
+    """Simulated less recorded, at the times of the recorded samples: ``pitch`` [rad], ``forward`` [m/s]."""
+
+    pitch: Floats
+    forward: Floats
+
+    @property
+    def pitch_rms(self) -> float:
+        """[rad]"""
+        return float(np.sqrt(np.mean(self.pitch**2)))
+
+    @property
+    def forward_rms(self) -> float:
+        """[m/s]"""
+        return float(np.sqrt(np.mean(self.forward**2)))
+
+
+def read_recording(folder: Path, *, as_stamped: bool = False) -> Recording:
+    """The recording in a folder. With ``as_stamped``, samples keep the times of receipt; otherwise they get times at
+    which the drone can have taken them, see :func:`sample_times`. Raises :class:`FileFormatError`."""
+    command, theta, vx = (_read(folder / f"{name}_dump.dat") for name in ("command", "theta", "vx"))
+    if not as_stamped:
+        theta, vx = (Track(sample_times(track.times_s), track.values) for track in (theta, vx))
+    pitch = Track(theta.times_s, np.radians(-theta.values / 1000))
+    return Recording(folder.name, Track(command.times_s, -command.values), pitch, Track(vx.times_s, vx.values / 1000))
+
+
+def _read(path: Path) -> Track:
+    try:
+        lines = path.read_text().splitlines()
+    except OSError as error:
+        raise FileFormatError(f"{path} can't be read: {error.strerror}") from error
+    except UnicodeDecodeError:
+        raise FileFormatError(f"{path} is no text") from None
+    rows = []
+    for number, line in enumerate(lines, start=1):
+        try:
+            time_s, value = map(float, line.split())
+        except ValueError:
+            raise FileFormatError(f"{path}, line {number}: a time and a value are wanted, not {line!r}") from None
+        rows.append((time_s, value))
+    table = np.array(rows, dtype=np.float64).reshape(-1, 2)
+    if len(table) < 2 or not np.isfinite(table).all() or (np.diff(table[:, 0]) < 0).any():
+        raise FileFormatError(f"{path}: at least two lines, finite numbers and times that don't fall are wanted")
+    return Track(table[:, 0], table[:, 1])
+
+
+def sample_times(received_s: Floats, period_s: float = SAMPLE_PERIOD_S) -> Floats:
+    """When samples were taken, at the latest, from when they were received: each a period before the one after it, or
+    earlier. A radio link that hangs and then delivers all at once makes times of receipt useless for dynamics."""
+    ticks = np.arange(len(received_s)) * period_s
+    latest: Floats = np.minimum.accumulate((received_s - ticks)[::-1])[::-1] + ticks
+    return latest
+
+
+def replay(command: Track, vehicles: Sequence[VehicleParameters], duration_s: float = WINDOW_S) -> Response:
+    """Fly a command, nose down positive, with simulated vehicles in calm air whose sensors don't err.
+
+    Each hovers, and from time 0 on gets the command as its pitch set-point: magnitudes from :data:`FULL_TILT_COMMAND`
+    on are the tilt limit. Where the command is 0 the set-point is level, which isn't the same as to hover. Raises
+    :class:`UsageError` if there are no vehicles, or more than have room.
+    """
+    if not vehicles:
+        raise UsageError("at least one vehicle is wanted")
+    limits = Limits()
+    ideal = [with_ideal_sensors(vehicle) for vehicle in vehicles]
+    simulation = Simulation(_HALL, len(ideal), seed=0, parameters=ideal, limits=limits)
+    drones = range(len(ideal))
+    for drone in drones:
+        simulation.command(drone, Takeoff())
+    simulation.step(round(_SETTLED_S / STEP_S))
+    times: Floats = np.arange(round(duration_s / STEP_S) + 1, dtype=np.float64) * STEP_S
+    pitch, forward = np.empty((2, len(ideal), len(times)))
+    given = None
+    for number, value in enumerate(_held(command, times)):
+        if value != given:
+            given = value
+            share = min(max(given / FULL_TILT_COMMAND, -1.0), 1.0)
+            for drone in drones:
+                simulation.command(drone, Attitude(pitch=share * limits.tilt_rad))
+        for drone in drones:
+            truth = simulation.truth(drone)
+            pitch[drone, number], forward[drone, number] = truth.pitch_rad, truth.velocity_m_s[0]
+        simulation.step()
+    return Response(times, pitch, forward)
+
+
+def _held(command: Track, times_s: Floats) -> list[float]:
+    """The command in force at these times: the last one before, and none before the first."""
+    last = np.searchsorted(command.times_s, times_s + 1e-9, side="right") - 1
+    values = np.where(last < 0, 0.0, command.values[np.maximum(last, 0)])
+    return [float(value) for value in values]
+
+
+def compare(response: Response, recorded: Recording, begin_s: float = 0.0, end_s: float = WINDOW_S) -> list[Misfit]:
+    """How each vehicle differs from a recording with times like the response's, between two of them."""
+    pitch, forward = recorded.pitch.between(begin_s, end_s), recorded.forward.between(begin_s, end_s)
+    return [
+        Misfit(
+            np.interp(pitch.times_s, response.times_s, own_pitch) - pitch.values,
+            np.interp(forward.times_s, response.times_s, own_forward) - forward.values,
+        )
+        for own_pitch, own_forward in zip(response.pitch, response.forward, strict=True)
+    ]

@@ -1,0 +1,260 @@
+"""The simulated AR.Drone answers like the recorded one, and what it needed leaves other vehicles as they are."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from functools import cache
+from math import degrees, radians
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skyloop.errors import FileFormatError, UsageError
+from skyloop.messages import AnyAction, Attitude, Hover, Velocity
+from skyloop.sim import Limits, Simulation, VehicleParameters, Wind
+from skyloop.sim.identification import (
+    SAMPLE_PERIOD_S,
+    Recording,
+    Track,
+    compare,
+    read_recording,
+    replay,
+    sample_times,
+)
+from skyloop.sim.parameters import GRAVITY_M_S2, with_ideal_sensors
+from skyloop.sim.streams import Floats
+from skyloop.sim.vehicles import AR_DRONE
+from tests.docs.pages import rows, section
+from tests.sim.helpers import HALL, IDEAL, flying, steps
+
+FLIGHTS = Path(__file__).parents[1] / "data" / "ardrone-flights"
+JUDGED = "1sImpulseNH1"
+FITTED = ("0.5sImpulseNH5", "8sStepHalfMagNH1")
+
+
+@cache
+def recorded(name: str) -> Recording:
+    """A run, with times from its step on."""
+    recording = read_recording(FLIGHTS / name)
+    return recording.since(recording.steps()[0])
+
+
+# As recorded ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", [*FITTED, JUDGED])
+def test_each_step_is_answered_as_recorded(name: str) -> None:
+    run = recorded(name)
+    [misfit] = compare(replay(run.command, [AR_DRONE]), run)
+    assert len(misfit.pitch) > 550
+    assert degrees(misfit.pitch_rms) < 2.0
+    assert misfit.forward_rms < 0.25
+
+
+def test_the_vehicle_by_default_would_not_pass() -> None:
+    """So the recordings tell vehicles apart."""
+    run = recorded(JUDGED)
+    ours, default = compare(replay(run.command, [AR_DRONE, VehicleParameters()]), run)
+    assert degrees(default.pitch_rms) > 2.0 > 2 * degrees(ours.pitch_rms)
+
+
+def test_half_a_command_tilted_the_recorded_drone_as_far_as_a_whole_one() -> None:
+    runs = {name: recorded(name) for name in FITTED}
+    commands = {name: run.command.values.max() for name, run in runs.items()}
+    tilts = {name: degrees(run.pitch.between(0.2, 0.5).values.max()) for name, run in runs.items()}
+    assert commands == {FITTED[0]: 1.0, FITTED[1]: 0.5}
+    assert all(12.0 < tilt < 13.0 for tilt in tilts.values())
+
+
+@pytest.mark.parametrize(("name", "length_s"), [(FITTED[0], 0.5), (JUDGED, 1.02), (FITTED[1], 2.02)])
+def test_a_run_holds_one_step_and_its_release(name: str, length_s: float) -> None:
+    assert recorded(name).steps() == pytest.approx([0.0, length_s], abs=0.001)
+
+
+# Reading --------------------------------------------------------------------------------------------------------------
+
+
+def test_signs_and_units_are_ours() -> None:
+    run, raw = read_recording(FLIGHTS / JUDGED), np.loadtxt(FLIGHTS / JUDGED / "theta_dump.dat")
+    assert run.name == JUDGED
+    assert run.pitch.values == pytest.approx(np.radians(-raw[:, 1] / 1000))
+    assert run.command.values.min() == 0.0
+    assert run.forward.values.max() == pytest.approx(2.06, abs=0.01)
+
+
+def test_times_of_receipt_are_kept_on_demand() -> None:
+    raw = np.loadtxt(FLIGHTS / JUDGED / "theta_dump.dat")
+    stamped, evened = (read_recording(FLIGHTS / JUDGED, as_stamped=flag).pitch.times_s for flag in (True, False))
+    assert (stamped == raw[:, 0]).all()
+    assert (stamped - evened).max() > 0.3  # so long the link hung around the step
+
+
+@given(st.lists(st.floats(0.0, 0.5), min_size=1, max_size=60))
+def test_samples_are_a_period_apart_and_never_later_than_received(gaps: list[float]) -> None:
+    received: Floats = np.array(gaps, dtype=np.float64).cumsum(dtype=np.float64)
+    taken = sample_times(received)
+    assert (taken <= received + 1e-9).all()
+    assert (np.diff(taken) >= SAMPLE_PERIOD_S - 1e-9).all()
+    assert taken[-1] == pytest.approx(received[-1])
+
+
+def test_a_link_without_jitter_changes_no_time() -> None:
+    even: Floats = np.arange(100, dtype=np.float64) * SAMPLE_PERIOD_S
+    assert sample_times(even) == pytest.approx(even)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("0.0 1.0\n0.1\n", "line 2: a time and a value are wanted, not '0.1'"),
+        ("0.0 1.0\n0.1 north\n", "line 2"),
+        ("0.1 1.0\n0.0 1.0\n", "times that don't fall"),
+        ("0.1 nan\n0.2 1.0\n", "finite numbers"),
+        ("", "at least two lines"),
+    ],
+)
+def test_what_is_no_recording_is_refused(tmp_path: Path, text: str, complaint: str) -> None:
+    for name in ("command", "theta", "vx"):
+        (tmp_path / f"{name}_dump.dat").write_text("0.0 0.0\n1.0 0.0\n")
+    (tmp_path / "theta_dump.dat").write_text(text)
+    with pytest.raises(FileFormatError, match=complaint):
+        read_recording(tmp_path)
+
+
+def test_a_recording_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(FileFormatError, match=r"command_dump\.dat can't be read: No such file"):
+        read_recording(tmp_path)
+
+
+def test_a_recording_that_is_no_text_is_named(tmp_path: Path) -> None:
+    (tmp_path / "command_dump.dat").write_bytes(b"\xff\xfe\x80")
+    with pytest.raises(FileFormatError, match=r"command_dump\.dat is no text"):
+        read_recording(tmp_path)
+
+
+# Replaying ------------------------------------------------------------------------------------------------------------
+
+
+def constant(value: float) -> Track:
+    return Track(np.array([0.0, 10.0]), np.array([value, value]))
+
+
+def test_a_command_beyond_half_is_the_tilt_limit() -> None:
+    half, whole = (replay(constant(value), [IDEAL]) for value in (0.5, 1.0))
+    assert (half.pitch == whole.pitch).all()
+    assert whole.pitch[0, -1] == pytest.approx(Limits().tilt_rad, abs=0.001)
+
+
+def test_before_its_first_line_a_command_is_none() -> None:
+    late = Track(np.array([1.0, 10.0]), np.array([1.0, 1.0]))
+    response = replay(late, [IDEAL])
+    assert np.abs(response.pitch[0, response.times_s <= 1.0]).max() < 0.002
+    assert response.pitch[0, -1] > 0.2
+
+
+def test_no_vehicle_is_refused() -> None:
+    with pytest.raises(UsageError, match="at least one vehicle"):
+        replay(constant(1.0), [])
+
+
+# What was added to the model ------------------------------------------------------------------------------------------
+
+
+def fly(simulation: Simulation, action: AnyAction, seconds: float) -> None:
+    simulation.command(0, action)
+    simulation.step(steps(seconds))
+
+
+def test_both_additions_are_off_by_default() -> None:
+    default = VehicleParameters()
+    assert (default.airspeed_tilt_rad_s2_per_m2, default.level_brake_per_m) == (0.0, 0.0)
+
+
+def test_a_default_vehicle_flies_the_same_beside_an_ar_drone() -> None:
+    alone = Simulation(HALL, 1, seed=3)
+    beside = Simulation(HALL, 2, seed=3, parameters=[VehicleParameters(), AR_DRONE])
+    for simulation in (alone, beside):
+        fly(simulation, Hover(), 0.1)
+        for action, seconds in ((Velocity(forward=1.0), 1.0), (Attitude(pitch=0.1, roll=0.05), 1.0)):
+            fly(simulation, action, seconds)
+    assert alone.truth(0) == beside.truth(0)
+
+
+@pytest.mark.parametrize(
+    ("wind", "pitch_sign", "roll_sign"),
+    [((-2.0, 0.0, 0.0), -1, 0), ((2.0, 0.0, 0.0), 1, 0), ((0.0, -2.0, 0.0), 0, 1), ((0.0, 2.0, 0.0), 0, -1)],
+)
+def test_air_lifts_the_side_that_it_comes_to(wind: tuple[float, float, float], pitch_sign: int, roll_sign: int) -> None:
+    tilt = 0.02
+    simulation = flying(parameters=replace(IDEAL, airspeed_tilt_rad_s2_per_m2=tilt, linear_drag_per_s=0.0))
+    simulation.set_wind(Wind(mean_m_s=wind))
+    fly(simulation, Attitude(), 1.0)
+    truth = simulation.truth(0)
+    airspeed = np.subtract(truth.velocity_m_s, wind)[:2]
+    expected = tilt * float(airspeed @ airspeed)
+    assert truth.pitch_rad == pytest.approx(pitch_sign * expected, abs=0.01)
+    assert truth.roll_rad == pytest.approx(roll_sign * expected, abs=0.01)
+
+
+def test_a_gale_tilts_no_further_than_three_metres_a_second() -> None:
+    simulation = flying(parameters=replace(IDEAL, airspeed_tilt_rad_s2_per_m2=0.01))
+    simulation.set_wind(Wind(mean_m_s=(-12.0, 0.0, 0.0)))
+    fly(simulation, Attitude(), 0.8)
+    assert simulation.truth(0).pitch_rad == pytest.approx(-0.09, abs=0.003)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_the_brake_fades_as_the_set_point_grows(share: float) -> None:
+    """Flying to the right, a drone that is told to pitch only leans left by the whole brake."""
+    brake, limit = 0.3, Limits().tilt_rad
+    simulation = flying(parameters=replace(IDEAL, level_brake_per_m=brake))
+    fly(simulation, Velocity(left=-1.0), 2.0)
+    simulation.command(0, Attitude(pitch=share * limit))
+    simulation.step(steps(0.6))
+    truth = simulation.truth(0)
+    forward, left, _ = truth.velocity_m_s
+    speed = (forward**2 + left**2) ** 0.5
+    lean = brake * speed * np.array([left, -forward]) / GRAVITY_M_S2
+    assert truth.pitch_rad == pytest.approx(share * limit + (1 - share) * lean[1], abs=radians(0.5))
+    assert truth.roll_rad == pytest.approx(lean[0], abs=radians(0.7))
+    assert lean[0] < -radians(0.7)
+
+
+def test_an_ar_drone_holds_its_place_when_it_hovers() -> None:
+    simulation = flying(parameters=AR_DRONE, seconds=6.0)
+    begin = np.array(simulation.truth(0).position_m)
+    simulation.step(steps(10.0))
+    assert np.abs(np.array(simulation.truth(0).position_m) - begin).max() < 0.5
+
+
+def test_an_ar_drone_stops_from_full_tilt_when_it_is_told_to_hover() -> None:
+    simulation = flying(parameters=with_ideal_sensors(AR_DRONE))
+    fly(simulation, Attitude(pitch=Limits().tilt_rad), 1.0)
+    assert simulation.truth(0).velocity_m_s[0] > 1.2
+    fly(simulation, Hover(), 4.0)
+    assert abs(simulation.truth(0).velocity_m_s[0]) < 0.2
+
+
+# The page -------------------------------------------------------------------------------------------------------------
+
+PAGE = "docs/ardrone-model.md"
+
+
+def test_the_page_has_the_parameters_of_the_code() -> None:
+    table = {row[0].strip("`"): float(row[1]) for row in rows(section(PAGE, "## Model and parameters"))}
+    default = VehicleParameters()
+    changed = {f.name for f in fields(default) if getattr(AR_DRONE, f.name) != getattr(default, f.name)}
+    assert table == {name: getattr(AR_DRONE, name) for name in changed}
+
+
+def test_the_page_has_the_figures_that_are_reached() -> None:
+    table = rows(section(PAGE, "## Figures"))
+    assert {row[0]: row[1] for row in table} == {**dict.fromkeys(FITTED, "fitted"), JUDGED: "judged"}
+    for name, _, pitch, forward in table:
+        run = recorded(name)
+        [misfit] = compare(replay(run.command, [AR_DRONE]), run)
+        assert degrees(misfit.pitch_rms) == pytest.approx(float(pitch.rstrip("°")), abs=0.011)
+        assert misfit.forward_rms == pytest.approx(float(forward.removesuffix(" m/s")), abs=0.0011)
