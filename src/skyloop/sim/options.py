@@ -12,6 +12,7 @@ from skyloop.sim.world import Wind, World
 from skyloop.sim.world_file import load_world
 
 EVERY_ACTION: Final = frozenset(ACTION_NAMES.values())
+STANDARD_VEHICLE: Final = VehicleParameters()
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +32,7 @@ class SimOptions:
     position: bool = False
     truth: bool = True
     rate_hz: float = 40.0
+    parameters: VehicleParameters = STANDARD_VEHICLE
 
     def load_world(self) -> World:
         """Raises :class:`UnknownNameError` or :class:`skyloop.errors.FileFormatError`."""
@@ -44,10 +46,9 @@ class SimOptions:
 
     def vehicle(self) -> VehicleParameters:
         """The vehicle, with its sensors' noise and biases by this factor."""
-        standard = VehicleParameters()
         flaws = {
-            field.name: getattr(standard, field.name) * self.noise
-            for field in fields(standard)
+            field.name: getattr(self.parameters, field.name) * self.noise
+            for field in fields(self.parameters)
             if ("_noise_" in field.name or "_bias_" in field.name) and "time_constant" not in field.name
         }
-        return replace(standard, **flaws)
+        return replace(self.parameters, **flaws)

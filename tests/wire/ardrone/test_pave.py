@@ -60,12 +60,22 @@ def test_a_torn_start_is_skipped_and_counted() -> None:
     assert parser.skipped_bytes == len(WHOLE[0].payload) + 68 - 1000 + left
 
 
-def test_garbage_between_frames_costs_no_frame() -> None:
+@pytest.mark.parametrize("step", [1 << 20, 1448])
+def test_garbage_after_a_frame_costs_this_frame_as_it_may_have_grown_within(step: int) -> None:
     cut = 68 + len(WHOLE[0].payload)
-    frames, parser = parse(START[:cut] + b"rubbish PaVE and more rubbish" * 9 + START[cut:])
-    assert [frame.payload for frame in frames] == [frame.payload for frame in WHOLE]
-    assert [frame.after_damage for frame in frames[:3]] == [False, True, False]
-    assert parser.skipped_bytes > 9 * 20
+    frames, parser = parse(START[:cut] + b"rubbish PaVE and more rubbish" * 9 + START[cut:], step)
+    assert [frame.payload for frame in frames] == [frame.payload for frame in WHOLE[1:]]
+    assert [frame.after_damage for frame in frames[:2]] == [True, False]
+    assert parser.skipped_bytes > cut + 9 * 20
+    assert parser.broken_frames >= 1
+
+
+def test_what_a_frame_lacks_or_has_too_much_of_is_found_by_what_follows() -> None:
+    cut = 68 + len(WHOLE[0].payload)
+    for data in (START[: cut - 2000] + START[cut + 3000 :], START[: cut - 2000] + b"more" + START[cut - 2000 :]):
+        frames, parser = parse(data, 1 << 20)
+        assert frames[0].number > WHOLE[0].number
+        assert parser.broken_frames >= 1
 
 
 def test_a_length_that_is_too_long_costs_one_frame_only() -> None:

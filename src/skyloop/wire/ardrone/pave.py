@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
 
+from skyloop.errors import UsageError
+
 SIGNATURE: Final = b"PaVE"
 MIN_HEADER: Final = 64
 MAX_HEADER: Final = 128
@@ -20,6 +22,9 @@ DEFAULT_MAX_PAYLOAD: Final = 1 << 20  #: a 720p key frame of the drone is under 
 
 _HEADER: Final = struct.Struct("<4sBBHI4HIIBBBBIIHBBBBHI")  # up to and with advertised_size, 52 bytes
 _ADVERTISEMENT: Final = 1
+_RESERVED: Final = struct.Struct("<I3f")  # the last 16 bytes of a long header; the last 12 of a short one are zeros
+_VERSION: Final = 2
+_MACROBLOCK: Final = 16
 
 
 class Codec(IntEnum):
@@ -74,6 +79,41 @@ class _Header:
     stream_id: int
 
 
+def build_header(
+    *,
+    payload_size: int,
+    type: FrameType,
+    number: int,
+    timestamp_ms: int,
+    width: int,
+    height: int,
+    codec: Codec = Codec.MPEG4_AVC,
+    stream_id: int = 1,
+    position: int = 0,
+    sps_size: int = 0,
+    pps_size: int = 0,
+    header_size: int = 68,
+    attitude_rad: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> bytes:
+    """The header of a frame in one slice and one chunk. Numbers too large for their field begin again at 0.
+
+    ``width`` and ``height`` [px] are the picture's; it is encoded in whole macroblocks. ``position`` counts the bytes
+    of all payloads before, without their ``sps_size`` and ``pps_size``. ``attitude_rad``, the drone's theta, phi and
+    psi, has its place only in the header of 68 bytes (observed in a capture, documented nowhere). Raises
+    :class:`UsageError` for a ``header_size`` other than 64 and 68.
+    """
+    if header_size not in (MIN_HEADER, _HEADER.size + _RESERVED.size):
+        raise UsageError(f"a header has 64 bytes, as early firmware writes it, or 68, not {header_size}")
+    encoded_width, encoded_height = (-(-side // _MACROBLOCK) * _MACROBLOCK for side in (width, height))
+    sides = encoded_width, encoded_height, width, height
+    low, high = position & 0xFFFFFFFF, position >> 32 & 0xFFFFFFFF
+    head = _HEADER.pack(
+        *(SIGNATURE, _VERSION, codec, header_size, payload_size, *sides, number & 0xFFFFFFFF),
+        *(timestamp_ms & 0xFFFFFFFF, 1, 0, type, 0, low, high, stream_id, 1, 0, sps_size, pps_size, 0, payload_size),
+    )
+    return head + (_RESERVED.pack(2, *attitude_rad) if header_size > MIN_HEADER else bytes(MIN_HEADER - len(head)))
+
+
 class PaveParser:
     """Cuts a stream of bytes into frames, whatever the pieces it comes in and whatever is wrong with it.
 
@@ -106,6 +146,10 @@ class PaveParser:
                 continue
             if len(self._buffer) < header.size + header.payload_size:
                 break
+            if not self._is_followed_well(header):
+                self.broken_frames += 1
+                self._skip(len(SIGNATURE))
+                continue
             frame = self._take_frame(header)
             if frame.payload:
                 frames.append(frame)
@@ -148,6 +192,11 @@ class PaveParser:
             self._searched = inner + 1
         self._searched = max(self._searched, limit - len(SIGNATURE) + 1)
         return False
+
+    def _is_followed_well(self, header: _Header) -> bool:
+        """Whether what came after the frame, as far as it came, begins another: else bytes of this one are wrong."""
+        end = header.size + header.payload_size
+        return SIGNATURE.startswith(self._buffer[end : end + len(SIGNATURE)])
 
     def _take_frame(self, header: _Header) -> PaveFrame:
         end = header.size + header.payload_size

@@ -100,6 +100,13 @@ def is_p264(packet: bytes | bytearray | memoryview) -> bool:
     return int.from_bytes(bytes(packet[:4]), "little") >> (32 - START_CODE_BITS) == P264_START
 
 
+def is_intra(packet: bytes | bytearray | memoryview) -> bool:
+    """Whether a datagram begins like a picture that is complete in itself."""
+    head = int.from_bytes(bytes(packet[:4]), "little")
+    kind = head >> (32 - START_CODE_BITS - FORMAT_BITS - RESOLUTION_BITS - TYPE_BITS) & (1 << TYPE_BITS) - 1
+    return head >> (32 - START_CODE_BITS) == UVLC_START and kind == PictureType.INTRA
+
+
 class UvlcDecoder:
     """Decodes the pictures of one drone in the order of their coming. Not for several threads at once."""
 

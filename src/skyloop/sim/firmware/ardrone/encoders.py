@@ -1,0 +1,128 @@
+"""What encodes an AR.Drone 2's pictures: H.264 or MPEG-4 by PyAV, which is imported when one is made."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import TYPE_CHECKING, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.errors import MissingExtraError
+from skyloop.wire.ardrone.keys import VideoCodec
+from skyloop.wire.ardrone.pave import Codec
+
+if TYPE_CHECKING:
+    from av.video.codeccontext import VideoCodecContext
+
+GROUP: Final = 15  #: pictures from one key frame to the next
+
+_SPS, _PPS, _IDR, _SLICE = 7, 8, 5, 1  # types of NAL units
+_START_CODE: Final = b"\0\0\0\1"
+_ANY_START_CODE: Final = re.compile(rb"\x00{2,3}\x01")
+_X264: Final = {
+    "preset": "ultrafast",
+    "tune": "zerolatency",
+    "x264-params": f"keyint={GROUP}:min-keyint={GROUP}:scenecut=0:sliced-threads=0:threads=1:repeat-headers=1",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """Of a stream: what the header of its frames tells."""
+
+    codec: Codec
+    width: int
+    height: int
+    stream_id: int
+
+
+MP4_360P: Final = Format(Codec.MPEG4_VISUAL, 640, 360, 0)
+H264_360P: Final = Format(Codec.MPEG4_AVC, 640, 360, 1)
+H264_720P: Final = Format(Codec.MPEG4_AVC, 1280, 720, 2)
+#: What is sent live for each value of ``video:video_codec``.
+FORMATS: Final = {
+    VideoCodec.MP4_360P: MP4_360P,
+    VideoCodec.H264_360P: H264_360P,
+    VideoCodec.MP4_360P_H264_720P: MP4_360P,
+    VideoCodec.H264_720P: H264_720P,
+    VideoCodec.MP4_360P_SLRS: MP4_360P,
+    VideoCodec.H264_360P_SLRS: H264_360P,
+    VideoCodec.H264_720P_SLRS: H264_720P,
+    VideoCodec.H264_AUTO_RESIZE: H264_360P,
+    VideoCodec.MP4_360P_H264_360P: MP4_360P,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Encoded:
+    """A picture's payload. A key picture begins with parameters of these sizes, start codes included."""
+
+    payload: bytes
+    key: bool
+    sps_size: int = 0
+    pps_size: int = 0
+
+
+class Encoder:
+    """One stream's. Raises :class:`MissingExtraError` without PyAV."""
+
+    def __init__(self, form: Format, fps: float, bitrate_kbps: int) -> None:
+        require_encoder()
+        import av
+
+        name: Literal["libx264", "mpeg4"] = "libx264" if form.codec is Codec.MPEG4_AVC else "mpeg4"
+        context: VideoCodecContext = av.CodecContext.create(name, "w")
+        context.width, context.height, context.pix_fmt = form.width, form.height, "yuv420p"
+        context.framerate = Fraction(fps).limit_denominator(1000)
+        context.time_base = 1 / context.framerate
+        context.bit_rate = bitrate_kbps * 1000
+        context.gop_size = GROUP
+        context.thread_count = 1
+        if name == "libx264":
+            context.options = dict(_X264)
+            context.profile = "Baseline"
+        else:
+            context.max_b_frames = 0
+        self._context = context
+        self._form = form
+        self._count = 0
+
+    def encode(self, picture: NDArray[np.uint8]) -> Encoded | None:
+        """A picture (height, width, 3), BGR, of any size: it is scaled. None if the encoder gave nothing."""
+        import av
+
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="bgr24")
+        frame = frame.reformat(self._form.width, self._form.height, "yuv420p")
+        frame.pts = self._count
+        frame.time_base = self._context.time_base
+        self._count += 1
+        packets = self._context.encode(frame)
+        data = b"".join(bytes(packet) for packet in packets)
+        if not data:
+            return None
+        if self._form.codec is Codec.MPEG4_AVC:
+            return as_the_drone_does(data)
+        return Encoded(data, any(packet.is_keyframe for packet in packets))
+
+
+def as_the_drone_does(stream: bytes) -> Encoded:
+    """An access unit in Annex B form with nothing but parameters and slices, each after four bytes of start code."""
+    units = [unit for unit in _ANY_START_CODE.split(stream) if unit]
+    kept = [(unit[0] & 31, _START_CODE + unit) for unit in units if unit[0] & 31 in (_SPS, _PPS, _IDR, _SLICE)]
+    return Encoded(
+        payload=b"".join(unit for _, unit in kept),
+        key=any(kind == _IDR for kind, _ in kept),
+        sps_size=sum(len(unit) for kind, unit in kept if kind == _SPS),
+        pps_size=sum(len(unit) for kind, unit in kept if kind == _PPS),
+    )
+
+
+def require_encoder() -> None:
+    """Raises :class:`MissingExtraError` where PyAV is not installed."""
+    try:
+        import av  # noqa: F401
+    except ImportError as error:
+        raise MissingExtraError("the video of an emulated AR.Drone 2", "video", cause=str(error)) from error

@@ -1,0 +1,39 @@
+"""What flies: one drone of a simulation, as the firmware's flight logic sees it."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from skyloop.messages import AnyAction, FlightState
+from skyloop.sim.parameters import Limits
+from skyloop.sim.simulation import Simulation
+
+
+class Vehicle(Protocol):
+    """A body with motors and an autopilot that holds attitude, velocity and altitude."""
+
+    @property
+    def state(self) -> FlightState: ...
+
+    def command(self, action: AnyAction) -> AnyAction:
+        """What was applied, :class:`skyloop.messages.Idle` where it was ignored."""
+
+    def set_limits(self, limits: Limits) -> None: ...
+
+
+class SimulatedVehicle:
+    """A drone of a simulation."""
+
+    def __init__(self, simulation: Simulation, drone: int) -> None:
+        self._simulation = simulation
+        self._drone = drone
+
+    @property
+    def state(self) -> FlightState:
+        return self._simulation.state(self._drone)
+
+    def command(self, action: AnyAction) -> AnyAction:
+        return self._simulation.command(self._drone, action)
+
+    def set_limits(self, limits: Limits) -> None:
+        self._simulation.set_limits(self._drone, limits)

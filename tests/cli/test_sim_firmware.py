@@ -1,0 +1,76 @@
+"""``skyloop sim --firmware``: an emulated drone as a process of its own."""
+
+from __future__ import annotations
+
+import re
+import signal
+import socket
+from collections.abc import Callable
+
+import pytest
+
+from skyloop.cli.firmware import ports_from
+from skyloop.errors import UsageError
+from skyloop.sim.firmware.ardrone import Ports
+from tests.cli.conftest import Run
+from tests.processes.conftest import Process
+from tests.sim.firmware.pilot import HERE, Pilot
+
+pytest.importorskip("av")
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_it_says_where_it_listens_and_ends_when_told(start: Callable[..., Process], number: signal.Signals) -> None:
+    process = start(
+        *("sim", "--firmware", "ardrone2", "--drones", "2", "--world", "empty", "--port-base", "0"),
+        *("--lose", "0.05", "--delay", "0.001", "--repeat", "0.05", "--reorder", "0.05", "--fault-seed", "7"),
+    )
+    process.until("control tcp", 20.0)
+    process.until("drone 1 on 127.0.0.1")
+    found = re.search(
+        r"ready ardrone2 drone 0 on 127.0.0.1: at udp (\d+), navdata udp (\d+), video tcp (\d+), control tcp (\d+)\n",
+        process.text,
+    )
+    assert found, process.text
+    at, navdata, video, control = map(int, found.groups())
+    with Pilot(Ports(navdata, video, at, control)) as pilot:
+        pilot.configure("general:navdata_demo", "TRUE")
+        pilot.until(lambda n: n.options, "it tells")
+    process.signal(number)
+    assert process.wait() == 0
+
+
+def test_ports_count_from_a_base() -> None:
+    assert ports_from(5550, 0) == Ports()
+    assert ports_from(5550, 1) == Ports(5564, 5565, 5566, 5569)
+    assert ports_from(0, 3) == Ports(0, 0, 0, 0)
+    with pytest.raises(UsageError, match="65535"):
+        ports_from(65000, 60)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--lose", "0.1"), "--lose is for --firmware: say --firmware ardrone2 as well"),
+        (("--bind", "0.0.0.0"), "--bind is for --firmware"),
+        (("--firmware", "ardrone2", "--name", "mine"), "--name is the proxy's"),
+        (("--firmware", "ardrone2", "--option", "cameras=front"), "--option cameras can't be chosen with --firmware"),
+        (("--firmware", "ardrone3"), "'ardrone3' is not one of 'ardrone1', 'ardrone2'"),
+        (("--firmware", "ardrone2", "--lose", "1.5"), "Invalid value for '--lose'"),
+        (("--firmware", "ardrone2", "--port-base", "0", "--bind", "no such host"), "can't be opened"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(run: Run, arguments: tuple[str, ...], said: str) -> None:
+    ended = run("sim", "--world", "empty", *arguments)
+    assert ended.code != 0
+    assert said in ended.err
+
+
+def test_a_port_that_is_taken_is_named(run: Run) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind((HERE, 0))
+        base = other.getsockname()[1] - 4
+        ended = run("sim", "--world", "empty", "--firmware", "ardrone2", "--port-base", str(base))
+    assert ended.code == 1
+    assert f"the drone's navdata port, UDP {base + 4} on 127.0.0.1, can't be opened" in ended.err

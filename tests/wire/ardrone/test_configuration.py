@@ -1,0 +1,98 @@
+"""Values and dumps of the configuration: as written, as read, as recorded in the facts of real drones."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skyloop.errors import DecodeError
+from skyloop.wire.ardrone.configuration import END_OF_DUMP, format_dump, format_value, parse_dump, parse_value
+from skyloop.wire.ardrone.keys import KEYS, Value
+
+FLOATS = st.floats(allow_nan=False, allow_infinity=False, width=32)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (True, "TRUE"),
+        (False, "FALSE"),
+        (3000, "3000"),
+        (0.2094395, "2.094395e-01"),
+        ((1.0, -2.0), "{ 1.000000e+00 -2.000000e+00 }"),
+        ("My ARDrone", "My ARDrone"),
+    ],
+)
+def test_values_as_the_drone_writes_them(value: Value, text: str) -> None:
+    assert format_value(value) == text
+    assert parse_value(text, value) == value
+
+
+@given(st.booleans() | st.integers(-(2**31), 2**31 - 1))
+def test_whole_values_come_back(value: Value) -> None:
+    assert parse_value(format_value(value), value) == value
+
+
+@given(FLOATS)
+def test_floats_come_back_to_seven_digits(value: float) -> None:
+    back = parse_value(format_value(value), 0.0)
+    assert isinstance(back, float)
+    assert math.isclose(back, value, rel_tol=1e-6, abs_tol=1e-44)
+
+
+@given(st.lists(FLOATS, min_size=1, max_size=9))
+def test_vectors_come_back(values: list[float]) -> None:
+    back = parse_value(format_value(tuple(values)), (0.0,))
+    assert isinstance(back, tuple)
+    assert back == pytest.approx(values, rel=1e-6, abs=1e-44)
+
+
+@pytest.mark.parametrize(("text", "like"), [("1", True), ("true", True), ("0.25", 0.0), (" 7 ", 0)])
+def test_other_ways_to_write_them(text: str, like: Value) -> None:
+    assert parse_value(text, like) == (0.25 if like == 0.0 and isinstance(like, float) else 7 if like == 0 else True)
+
+
+@pytest.mark.parametrize(
+    ("text", "like"),
+    [("maybe", True), ("1.5", 0), ("", 0), ("nan", 0.0), ("inf", 0.0), ("{ 1.0 x }", (0.0,)), ("{ nan }", (0.0,))],
+)
+def test_texts_that_are_no_such_value(text: str, like: Value) -> None:
+    with pytest.raises(DecodeError, match="is no"):
+        parse_value(text, like)
+
+
+def test_a_dump_comes_back() -> None:
+    values = {name: key.default for name, key in KEYS.items()}
+    dump = format_dump(values)
+    assert dump.endswith(END_OF_DUMP)
+    texts = parse_dump(dump)
+    assert texts.keys() == values.keys()
+    for name, value in values.items():
+        assert format_value(parse_value(texts[name], value)) == format_value(value)
+
+
+def test_a_dump_by_hand() -> None:
+    dump = (
+        b"general:num_version_config            = 1\n"
+        b"general:num_version_soft              = 1.7.4\r\n"
+        b"nothing to see here\n"
+        b"section = without colon\n"
+        b"GENERAL:Ardrone_Name = a = b\n"
+        b"general:num_version_config            = 2\n"
+        b"control:gyros_offset = { 1.0e+00 2.0e+00 3.0e+00 }\n"
+        b"\0general:after_the_end = 1\n"
+    )
+    assert parse_dump(dump) == {
+        "general:num_version_config": "2",
+        "general:num_version_soft": "1.7.4",
+        "general:ardrone_name": "a = b",
+        "control:gyros_offset": "{ 1.0e+00 2.0e+00 3.0e+00 }",
+    }
+
+
+@given(st.binary(max_size=500))
+def test_any_dump_can_be_read(dump: bytes) -> None:
+    assert all(":" in name for name in parse_dump(dump))
