@@ -26,6 +26,7 @@ if TYPE_CHECKING:
         Frame,
         LinkStatus,
         Listener,
+        Logbook,
         Processor,
         connect,
     )
@@ -65,6 +66,7 @@ if TYPE_CHECKING:
         Intrinsics,
         Land,
         LinkState,
+        LogEntry,
         Parameter,
         Points,
         Polyline,
@@ -73,6 +75,7 @@ if TYPE_CHECKING:
         Text,
         Velocity,
     )
+    from skyloop.recording import Recorder, record
 
 _HOMES = {
     "skyloop.client": (
@@ -83,6 +86,7 @@ _HOMES = {
         "Frame",
         "LinkStatus",
         "Listener",
+        "Logbook",
         "Processor",
         "connect",
     ),
@@ -122,6 +126,7 @@ _HOMES = {
         "Intrinsics",
         "Land",
         "LinkState",
+        "LogEntry",
         "Parameter",
         "Points",
         "Polyline",
@@ -130,6 +135,7 @@ _HOMES = {
         "Text",
         "Velocity",
     ),
+    "skyloop.recording": ("Recorder", "record"),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 
@@ -167,6 +173,8 @@ __all__ = [
     "LinkState",
     "LinkStatus",
     "Listener",
+    "LogEntry",
+    "Logbook",
     "MissingExtraError",
     "NameTakenError",
     "NoAnswerError",
@@ -175,6 +183,7 @@ __all__ = [
     "Points",
     "Polyline",
     "Processor",
+    "Recorder",
     "RefusedError",
     "RunSummary",
     "Severity",
@@ -186,6 +195,7 @@ __all__ = [
     "UsageError",
     "Velocity",
     "connect",
+    "record",
 ]
 
 __version__: str

@@ -23,6 +23,7 @@ from typing import Any, TypeVar
 
 from skyloop import client
 from skyloop.client.frame import Arrival
+from skyloop.client.logbook import Logbook
 from skyloop.client.reading import Wanted
 from skyloop.client.slots import Buffer
 from skyloop.errors import NoAnswerError, UsageError
@@ -34,6 +35,7 @@ from skyloop.messages import (
     Encoding,
     Event,
     Feedback,
+    LogEntry,
     Parameter,
     Value,
 )
@@ -248,6 +250,9 @@ class Drone:
     def on_annotation(self, function: Callback[Annotation]) -> Listener:
         return Listener(self.sync.on_annotation(_on_loop(function)))
 
+    def on_log(self, function: Callback[LogEntry]) -> Listener:
+        return Listener(self.sync.on_log(_on_loop(function)))
+
     def add_processor(
         self, function: Callable[[client.Frame], object], camera: str | None = None, **options: Any
     ) -> client.Processor[Any]:
@@ -260,6 +265,10 @@ class Drone:
 
     def annotate(self, frame: client.Frame, shapes: Iterable[Shape], source: str | None = None) -> bool:
         return self.sync.annotate(frame, shapes, source)
+
+    @property
+    def log(self) -> Logbook:
+        return self.sync.log
 
 
 class Listener:

@@ -90,6 +90,7 @@ def test_frames(proxy: ScriptedProxy) -> None:
             async for frame in drone.frames(timeout_s=WAIT_S):
                 seqs.append(frame.seq)
                 drone.annotate(frame, [])
+                assert drone.log.number("seq", frame.seq)
                 if frame.seq >= 20:
                     break
             assert seqs == sorted(set(seqs))
@@ -154,6 +155,7 @@ def test_listeners_run_on_the_loop(proxy: ScriptedProxy) -> None:
                 drone.on_link(lambda status: None),
                 drone.on_command(lambda applied: None),
                 drone.on_annotation(lambda annotation: None),
+                drone.on_log(lambda entry: None),
             ]
             bad = drone.on_feedback(raising)
             proxy.event(EventKind.BATTERY_LOW)

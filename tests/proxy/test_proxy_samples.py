@@ -22,6 +22,7 @@ from skyloop.messages import (
     Hover,
     Intrinsics,
     LinkState,
+    LogEntry,
     Role,
     Severity,
     Statistics,
@@ -210,6 +211,19 @@ def test_annotations_go_to_who_wants_them_from_any_role(bench: Bench) -> None:
     assert viewer.others == [small]
     (event,) = viewer.told(EventKind.PACKET_MALFORMED)
     assert "32768" in event.text
+
+
+def test_logs_go_to_who_wants_them_from_any_role(bench: Bench) -> None:
+    observer, viewer = bench.join("tracker", Role.OBSERVER), bench.join("viewer")
+    viewer.end.subscribe("logs")
+    entry = LogEntry("tracker", "error", 1, number=0.5)
+    observer.end.send(encode(entry))
+    observer.sync()
+    viewer.sync()
+    assert viewer.others == [entry]
+    statistics = viewer.ask(GetStatistics())
+    assert isinstance(statistics, Statistics)
+    assert statistics.counters["logs.relayed"] == 1
 
 
 def test_the_software_autopilots_state_is_shown() -> None:

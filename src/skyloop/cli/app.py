@@ -42,9 +42,11 @@ COMMANDS: Final = {
         "param alpha limits.tilt 0.2",
         {"ignore_unknown_options": True},  # a value may begin with a minus
     ),
+    "record": Entry("record", "record", "Record drones to an MCAP file", "record alpha -o flight.mcap"),
+    "log": Entry("log", "log", "Look at recordings, export, compare and mend them", "log info flight.mcap"),
     "cockpit": Entry("cockpit", "cockpit", "A page in the browser that watches a drone", "cockpit alpha"),
     "doctor": Entry("doctor", "doctor", "What of this machine works, and what to install", "doctor"),
-    "bench": Entry("bench", "bench", "Measure the delays of each channel", "bench local --seconds 10"),
+    "bench": Entry("bench", "bench", "Measure the delays of each channel", "bench delays --seconds 30"),
 }
 
 
@@ -61,12 +63,11 @@ def build(names: Iterable[str] = COMMANDS) -> typer.Typer:
     for name in names:
         entry = COMMANDS[name]
         function = getattr(import_module(f"skyloop.cli.{entry.module}"), entry.function)
-        app.command(
-            name,
-            short_help=entry.summary,
-            epilog=f"Example: skyloop {entry.example}",
-            context_settings=dict(entry.settings),
-        )(function)
+        example = f"Example: skyloop {entry.example}"
+        if isinstance(function, typer.Typer):  # a command with commands of its own
+            app.add_typer(function, name=name, short_help=entry.summary, epilog=example)
+            continue
+        app.command(name, short_help=entry.summary, epilog=example, context_settings=dict(entry.settings))(function)
     return app
 
 

@@ -7,6 +7,7 @@ from skyloop.client.delivery import Listener, Processor
 from skyloop.client.drone import Drone
 from skyloop.client.frame import Frame
 from skyloop.client.link import RedialPolicy
+from skyloop.client.logbook import Logbook
 from skyloop.client.monitor import Thresholds
 from skyloop.client.reception import LinkStatus
 from skyloop.client.statistics import ChannelStats, Distribution
@@ -24,6 +25,7 @@ __all__ = [
     "Frame",
     "LinkStatus",
     "Listener",
+    "Logbook",
     "Processor",
     "RedialPolicy",
     "Stats",

@@ -1,8 +1,9 @@
 """Which command goes out when. Pure: no socket, no thread, the time is an argument.
 
-The newest set-point wins: it is sent at once and repeated at a steady rate on absolute deadlines. While there is
-none, ``Idle`` is repeated, which keeps the authority alive and leaves the vehicle as it is. A set-point from before
-a lost link, a lost authority or a failsafe is never taken up again.
+The newest set-point wins: it is sent at once and, unless a newer one comes within one and a quarter periods,
+repeated at a steady rate on absolute deadlines. While there is none, ``Idle`` is repeated, which keeps the authority
+alive and leaves the vehicle as it is. A set-point from before a lost link, a lost authority or a failsafe is never
+taken up again.
 """
 
 from __future__ import annotations
@@ -54,8 +55,9 @@ class Commander:
     """Keeps the newest set-point of one application.
 
     ``rate_hz``: of repeats; ``stall_s``: after this long without a call a velocity or attitude decays to hover
-    (``math.inf``: never); ``min_interval_s``: set-points are sent no closer than this; ``keep_s``: a set-point given
-    while the link was down is sent when it is back if it is younger than this.
+    (``math.inf``: never); ``min_interval_s``: what the application asks for is sent no closer than this, repeats in
+    between do not count; ``keep_s``: a set-point given while the link was down is sent when it is back if it is younger
+    than this.
     """
 
     def __init__(
@@ -72,7 +74,11 @@ class Commander:
         self.action: AnyAction = _IDLE
         self.intent = 0
         self._asked_ns = 0
-        self._sent_ns = -self._min_interval_ns
+        # Repeats must not get in the way of an application that has about the same beat: the first one lets it go
+        # first, and only what the application asked for holds up what it asks for next.
+        self._first_ns = self._period_ns * 5 // 4
+        self._new_sent_ns = -self._min_interval_ns  # when an intent was sent for the first time
+        self._sent_intent = 0
         self._due_ns = 0
         self._failsafe = Failsafe.NONE
 
@@ -85,12 +91,12 @@ class Commander:
         if stops or type(action) in _DONE_IN:  # rare and important: at once
             self._due_ns = now_ns
         else:
-            self._due_ns = max(now_ns, self._sent_ns + self._min_interval_ns)
+            self._due_ns = max(now_ns, self.open_ns)
 
     @property
     def open_ns(self) -> int:
         """From when on a new set-point goes out at once."""
-        return self._sent_ns + self._min_interval_ns
+        return self._new_sent_ns + self._min_interval_ns
 
     @property
     def due_ns(self) -> int:
@@ -105,9 +111,12 @@ class Commander:
             self.action = _HOVER
         elif self._expired(now_ns):
             self.action = _IDLE
-        self._sent_ns = now_ns
-        # The next deadline follows the last one, not the time at which we got round to it; after a set-point that
-        # was sent at once, or more than a period late, the beat starts anew.
+        if self.intent != self._sent_intent:
+            self._sent_intent, self._new_sent_ns = self.intent, now_ns
+            self._due_ns = now_ns + self._first_ns
+            return self.action
+        # The next deadline follows the last one, not the time at which we got round to it; after one more than a
+        # period late the beat starts anew.
         self._due_ns += self._period_ns
         if self._due_ns <= now_ns:
             self._due_ns = now_ns + self._period_ns

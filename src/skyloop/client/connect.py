@@ -5,15 +5,19 @@ from __future__ import annotations
 import math
 import sys
 import time
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Final
 
 from skyloop.client.drone import Access, Drone, OnExit
+from skyloop.client.pace import Way
 from skyloop.errors import UsageError
 from skyloop.messages import DEFAULT_PRIORITY, HIGHEST_PRIORITY, LOWEST_PRIORITY
 
 NAME_TIMEOUT_S: Final = 5.0
 START_TIMEOUT_S: Final = 20.0  #: for a private proxy and its vehicle
+#: Entry points by the scheme of an address: a function that takes the address and returns a :class:`Way`, or None.
+CONNECTORS: Final = "skyloop.connectors"
 
 
 def connect(
@@ -51,22 +55,40 @@ def connect(
     app = name if name is not None else _script_name()
     deadline = time.monotonic() + (timeout_s or (START_TIMEOUT_S if "://" in target else NAME_TIMEOUT_S))
     if "://" in target:
-        from skyloop.client.private import PrivateProxy
-
-        private = PrivateProxy(target)
-        dial = private.dialer(deadline)
-        end = private.close
+        way = _way(target)
+        dial, end, reach, pace = way.dialer(deadline), way.close, way.reach, way.pace
     else:
         from skyloop.transport.local import dial as local_dial
 
-        dial, end = local_dial(target), None
+        dial, end, reach, pace = local_dial(target), None, target, None
     try:
-        drone = Drone(dial, app=app, access=access, rate_hz=rate_hz, stall_s=stall_s, on_exit=on_exit, on_close=end)
+        drone = Drone(
+            dial,
+            app=app,
+            access=access,
+            rate_hz=rate_hz,
+            stall_s=stall_s,
+            on_exit=on_exit,
+            pace=pace,
+            on_close=end,
+            reach=reach,
+        )
     except BaseException:
         if end is not None:
             end()
         raise
     return drone.open(priority=priority, wait_s=wait_s, timeout_s=deadline - time.monotonic())
+
+
+def _way(uri: str) -> Way:
+    """A private proxy, unless an installed package has another way to this address."""
+    for entry in entry_points(group=CONNECTORS, name=uri.partition("://")[0]):
+        own: Way | None = entry.load()(uri)
+        if own is not None:
+            return own
+    from skyloop.client.private import PrivateProxy
+
+    return PrivateProxy(uri)
 
 
 def _script_name() -> str:

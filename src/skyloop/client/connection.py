@@ -19,6 +19,7 @@ from skyloop.messages import (
     Event,
     Feedback,
     FrameHeader,
+    LogEntry,
     Ping,
     Pong,
     Reply,
@@ -51,6 +52,7 @@ class Connection:
             Event: user.event,
             Applied: user.applied,
             Annotation: user.annotation,
+            LogEntry: user.log_entry,
             Reply: self._reply,
         }
         self._take_feedback = user.feedback

@@ -13,11 +13,12 @@ from skyloop.client.commander import Commander
 from skyloop.client.config import Config
 from skyloop.client.flying import Flying
 from skyloop.client.link import Link, RedialPolicy
+from skyloop.client.logbook import Logbook
+from skyloop.client.pace import Pace
 from skyloop.client.pilot import Pilot
 from skyloop.client.reading import Reading
 from skyloop.client.reception import LinkStatus, Reception
 from skyloop.client.statistics import ChannelStats, Distribution
-from skyloop.clock import Clock
 from skyloop.errors import LinkError, NoAnswerError, SkyloopError, UsageError
 from skyloop.messages import Event, GetStatistics, Hello, LinkState, Role, Statistics
 from skyloop.transport.base import EVENTS, FEEDBACK, Dialer
@@ -45,8 +46,9 @@ class Drone(Flying, Reading):
         stall_s: float = 1.0,
         on_exit: OnExit = "land",
         policy: RedialPolicy | None = None,
-        clock: Clock = time.monotonic_ns,
+        pace: Pace | None = None,
         on_close: Callable[[], None] | None = None,
+        reach: str | None = None,
     ) -> None:
         if access not in ("pilot", "observe"):
             raise UsageError(f'access is {access!r} and must be "pilot" or "observe"')
@@ -60,15 +62,21 @@ class Drone(Flying, Reading):
         self._role = role
         self._on_exit = on_exit
         self._on_close = on_close
+        #: What another process connects to for the same vehicle; None if only this process can reach it.
+        self.reach = reach
         commander = Commander(rate_hz=rate_hz, stall_s=stall_s)
-        reception = self._reception = Reception(app, clock)
-        self._link = reception.link = Link(dial, Hello(app, role), reception, policy=policy, clock=clock)
+        pace = pace or Pace()
+        reception = self._reception = Reception(app, pace)
+        self._link = reception.link = Link(
+            dial, Hello(app, role), reception, policy=policy, clock=pace.clock, begin=pace.begin
+        )
         self.config = reception.config = Config(self._link, lambda: self._pilot.status.lease, reception.tell)
+        self.log = Logbook(self._link, app, self._now_ns)
         self._pilot = reception.pilot = Pilot(
             app,
             role,
             commander,
-            clock,
+            pace,
             tell=reception.tell,
             changed=lambda _: reception.bell.ring(),
             granted=self.config.granted,
@@ -87,6 +95,7 @@ class Drone(Flying, Reading):
                 raise NoAnswerError(f"{self.name} answered, but told nothing of its vehicle within {timeout_s:g} s")
             if self._role is Role.PILOT:
                 self.request_authority(priority, wait_s=wait_s)
+            self._reception.pace.opened()
         except BaseException:
             self.close()
             raise
@@ -103,6 +112,11 @@ class Drone(Flying, Reading):
     def uri(self) -> str:
         """The vehicle's address."""
         return "" if self._reception.welcome is None else self._reception.welcome.uri
+
+    @property
+    def clock_offset_ns(self) -> int:
+        """The proxy's clock less this process's [ns], as estimated."""
+        return self._link.offset_ns
 
     @property
     def app_id(self) -> int:
@@ -188,6 +202,8 @@ class Drone(Flying, Reading):
     def _flies(self) -> bool:
         """Whether this application has the vehicle in the air, or has just told it to take off."""
         newest = self._reception.newest
+        if self._reception.status.vehicle is LinkState.CLOSED:
+            return False  # a recording that is over: nothing can be landed any more
         airborne = newest is not None and newest.state.airborne
         return self._pilot.status.state == "held" and (airborne or self._pilot.wants_flight)
 

@@ -140,7 +140,7 @@ class Flying(Handle):
         """Command it, and wait until feedback that is newer than the command shows one of the states."""
         reception, pilot = self._reception, self._pilot
         deadline = time.monotonic() + timeout_s
-        asked_ns = time.monotonic_ns()
+        asked_ns = reception.pace.clock()
         sent = self._command(action)
         seq = pilot.seq
         if not wait:

@@ -156,6 +156,11 @@ class Arrival:
         """Time since the capture [s]."""
         return (self._clock() + self._offset_ns - self.header.captured_ns) / 1e9
 
+    def as_came(self) -> Pixels | None:
+        """The bytes as the transport gave them, shape (size,); None once somebody has looked at the picture."""
+        with self._lock:
+            return self._pixels
+
     def frame(self) -> Frame:
         """The picture. Raises :class:`DecodeError` if the pixels are not what the header says."""
         with self._lock:

@@ -7,7 +7,7 @@ from typing import Self
 
 from skyloop.client.frame import Arrival, Frame
 from skyloop.client.reception import Reception, VideoChannel
-from skyloop.client.slots import Bell, Buffer
+from skyloop.client.slots import Buffer
 from skyloop.messages import Feedback
 
 
@@ -16,7 +16,8 @@ class Inbox:
 
     def __init__(self, reception: Reception, *, feedback: bool, channel: VideoChannel | None) -> None:
         """``feedback``: whether it is wanted; ``channel``: the camera whose frames are wanted."""
-        self.bell = Bell()
+        self.clock = reception.pace.clock  #: on which a controller's time runs
+        self.bell = reception.pace.bell()
         self._feedback: Buffer[Feedback] = Buffer(1, self.bell)
         self._frames: Buffer[Arrival] = Buffer(1, self.bell)
         self._reception = reception

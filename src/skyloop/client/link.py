@@ -24,6 +24,7 @@ from skyloop.messages import (
     FrameHeader,
     Hello,
     LinkState,
+    LogEntry,
     Refused,
     Welcome,
 )
@@ -68,6 +69,7 @@ class LinkUser(Protocol):
     def event(self, event: Event, now_ns: int) -> None: ...
     def applied(self, applied: Applied, now_ns: int) -> None: ...
     def annotation(self, annotation: Annotation, now_ns: int) -> None: ...
+    def log_entry(self, entry: LogEntry, now_ns: int) -> None: ...
 
 
 class Link:
@@ -81,12 +83,15 @@ class Link:
         *,
         policy: RedialPolicy | None = None,
         clock: Clock = time.monotonic_ns,
+        begin: Callable[[Link], None] | None = None,
     ) -> None:
+        """``begin`` sees to it that :meth:`attend` is called from the first connection on; by default a thread does."""
         self._dial = dial
         self._hello = hello
         self._user = user
         self._policy = policy or RedialPolicy()
         self._clock = clock
+        self._begin = begin or Link.attend_for_ever
         self._topics: list[str] = []
         self._lock = threading.Lock()  # guards the topics and the change of connection
         self._connection: Connection | None = None
@@ -95,7 +100,7 @@ class Link:
         #: Says that a packet follows at once.
         self.knock: Callable[[], None] = _nobody
         self._wake = Bell()
-        self._poked = False
+        self.poked = False  #: somebody wants it to be attended to now
         self._closing = False
         self._failures = 0
         self._thread = threading.Thread(target=self._run, name="skyloop-link", daemon=True)
@@ -118,7 +123,7 @@ class Link:
             except NoAnswerError:  # the one packet may have been lost, or the proxy is slow to start
                 if time.monotonic() > deadline:
                     raise
-        self._thread.start()
+        self._begin(self)
 
     def close(self) -> None:
         """End the connection and the thread. Idempotent."""
@@ -158,7 +163,7 @@ class Link:
 
     def poke(self) -> None:
         """Let the link's thread look now what there is to do."""
-        self._poked = True
+        self.poked = True
         self._wake.ring()
 
     def subscribe(self, topic: str, on: bool = True) -> None:
@@ -217,16 +222,24 @@ class Link:
 
     # The link's thread -----------------------------------------------------------------------------------------
 
+    def attend_for_ever(self) -> None:
+        """Attend to it on a thread of its own."""
+        self._thread.start()
+
+    def attend(self) -> float:
+        """Do what is due now; returns for how many seconds there is nothing to do unless it is poked."""
+        self.poked = False
+        try:
+            return self._step()
+        except Exception:  # noqa: BLE001  (whatever goes wrong, the link has to come back)
+            _log.exception("the link's thread failed; it connects anew")
+            self._drop(LinkError("an error in the link"), "an error in the link")
+            return self._policy.cap_s
+
     def _run(self) -> None:
         while not self._closing:
-            try:
-                pause_s = self._step()
-            except Exception:  # noqa: BLE001  (whatever goes wrong, the link has to come back)
-                _log.exception("the link's thread failed; it connects anew")
-                self._drop(LinkError("an error in the link"), "an error in the link")
-                pause_s = self._policy.cap_s
-            self._wake.wait_for(lambda: self._poked, pause_s)
-            self._poked = False
+            pause_s = self.attend()
+            self._wake.wait_for(lambda: self.poked, pause_s)
 
     def _step(self) -> float:
         """Do what is due; returns for how many seconds there is nothing to do."""

@@ -10,9 +10,8 @@ from skyloop.client.authority import Authority, AuthorityStatus
 from skyloop.client.commander import Commander
 from skyloop.client.delivery import Tell
 from skyloop.client.link import Link
-from skyloop.client.slots import Bell
+from skyloop.client.pace import Pace
 from skyloop.client.statistics import ChannelCounter
-from skyloop.clock import Clock
 from skyloop.errors import AuthorityError, LinkError, NoAnswerError, UsageError
 from skyloop.messages import (
     HIGHEST_PRIORITY,
@@ -49,7 +48,7 @@ class Pilot:
         name: str,
         role: Role,
         commander: Commander,
-        clock: Clock,
+        pace: Pace,
         *,
         tell: Tell,
         changed: Callable[[AuthorityStatus], None],
@@ -58,7 +57,7 @@ class Pilot:
         self._name = name
         self._role = role
         self._commander = commander
-        self._clock = clock
+        self._clock = pace.clock
         self._tell = tell
         self._changed = changed
         self._granted = granted
@@ -68,7 +67,7 @@ class Pilot:
         self._ask_now = False
         self._refusal: Refused | None = None
         self.link: Link
-        self.bell = Bell()  #: rings when the status of the authority changes
+        self.bell = pace.bell()  #: rings when the status of the authority changes
         self.sends = ChannelCounter()  #: commands sent; dropped: those that could not be handed to the link
 
     @property

@@ -13,6 +13,7 @@ import time
 from collections.abc import Sequence
 from typing import IO, Final
 
+from skyloop.client.pace import Pace
 from skyloop.errors import LinkError, NoAnswerError, UsageError
 from skyloop.transport.base import ClientEnd, ClientHandler, Dialer
 
@@ -33,7 +34,9 @@ class PrivateProxy:
     def __init__(self, uri: str, command: Sequence[str] = (sys.executable, "-m", "skyloop", "proxy")) -> None:
         scheme = re.sub(r"[^a-z0-9]", "", uri.partition("://")[0].lower()) or "vehicle"
         self.name = f"{scheme[:16]}-{os.getpid()}-{next(_numbers)}"
+        self.reach = self.name
         self.uri = uri
+        self.pace = Pace()
         self._messages: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115  (closed by close())
         reading, self._alive_fd = os.pipe()
         try:

@@ -16,7 +16,7 @@ from skyloop.client.inbox import Inbox
 from skyloop.client.reception import LinkStatus, VideoChannel
 from skyloop.client.slots import Buffer
 from skyloop.errors import ClosedError, NoAnswerError, UnknownNameError, UnsupportedError, UsageError
-from skyloop.messages import Annotation, Applied, Event, EventKind, Feedback, FlightState, Severity, encode
+from skyloop.messages import Annotation, Applied, Event, EventKind, Feedback, FlightState, LogEntry, Severity, encode
 from skyloop.messages.annotation import Shape
 
 T = TypeVar("T")
@@ -84,7 +84,7 @@ class Reading(Handle):
     def frames(self, camera: str | None = None, *, timeout_s: float = 5.0) -> Iterator[Frame]:
         """Each newest frame, until the drone is closed; slow loops skip frames. Raises :class:`NoAnswerError`."""
         channel = self.channel(camera)
-        buffer: Buffer[Arrival] = Buffer()
+        buffer: Buffer[Arrival] = Buffer(bell=self._reception.pace.bell())
         sink = buffer.put
         self._buffers.append(buffer)
         channel.topic.add(sink, lambda: buffer.dropped)
@@ -131,21 +131,30 @@ class Reading(Handle):
         """Call with each newest feedback, on a thread of its own, or ``inline`` on the receiving thread."""
         return self._listen(self._reception.on_feedback, function, "feedback", inline=inline)
 
-    def on_event(self, function: Callable[[Event], object]) -> Listener[Event]:
-        """Call with each event, the client's own (number 0) included; 256 may wait. On a thread of its own."""
-        return self._listen(self._reception.on_event, function, "event", depth=EVENT_DEPTH)
+    # What follows is called on a thread of its own, or ``inline`` on the receiving thread.
+
+    def on_event(self, function: Callable[[Event], object], *, inline: bool = False) -> Listener[Event]:
+        """Call with each event, the client's own (number 0) included; 256 may wait.
+
+        Inline, the client's own come on whichever thread has made them.
+        """
+        return self._listen(self._reception.on_event, function, "event", depth=EVENT_DEPTH, inline=inline)
 
     def on_link(self, function: Callable[[LinkStatus], object]) -> Listener[LinkStatus]:
         """Call whenever one of the two hops changes its state. On a thread of its own."""
         return self._listen(self._reception.on_link, function, "link", depth=EVENT_DEPTH)
 
-    def on_command(self, function: Callable[[Applied], object]) -> Listener[Applied]:
-        """Call with what the proxy made of each command, anybody's; 256 may wait. On a thread of its own."""
-        return self._listen(self._reception.on_command, function, "command", depth=EVENT_DEPTH)
+    def on_command(self, function: Callable[[Applied], object], *, inline: bool = False) -> Listener[Applied]:
+        """Call with what the proxy made of each command, anybody's; 256 may wait."""
+        return self._listen(self._reception.on_command, function, "command", depth=EVENT_DEPTH, inline=inline)
 
-    def on_annotation(self, function: Callable[[Annotation], object]) -> Listener[Annotation]:
-        """Call with what anybody drew on a frame; 256 may wait. On a thread of its own."""
-        return self._listen(self._reception.on_annotation, function, "annotation", depth=EVENT_DEPTH)
+    def on_annotation(self, function: Callable[[Annotation], object], *, inline: bool = False) -> Listener[Annotation]:
+        """Call with what anybody drew on a frame; 256 may wait."""
+        return self._listen(self._reception.on_annotation, function, "annotation", depth=EVENT_DEPTH, inline=inline)
+
+    def on_log(self, function: Callable[[LogEntry], object], *, inline: bool = False) -> Listener[LogEntry]:
+        """Call with what any application logs, this one included (see ``drone.log``); 256 may wait."""
+        return self._listen(self._reception.on_log, function, "log", depth=EVENT_DEPTH, inline=inline)
 
     def add_processor(
         self,
@@ -188,11 +197,15 @@ class Reading(Handle):
             raise UsageError(f"this can't be drawn on a frame: {error}") from None
         return self._link.transmit(packet)
 
+    def tell(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: str) -> None:
+        """Make an event of this application's own (number 0): it goes to its own listeners and nowhere else."""
+        self._reception.tell(kind, text, severity, **data)
+
     # Inside ----------------------------------------------------------------------------------------------------
 
     def _now_ns(self) -> int:
         """Now, on the proxy's clock."""
-        return time.monotonic_ns() + self._link.offset_ns
+        return self._reception.pace.clock() + self._link.offset_ns
 
     def channel(self, camera: str | None = None) -> VideoChannel:
         """The channel of a camera (None: the first). Raises :class:`UnknownNameError`, or :class:`UnsupportedError`
@@ -220,6 +233,7 @@ class Reading(Handle):
         self._check_open()
         if not callable(function):
             raise UsageError(f"{function!r:.80} can't be called: a function with one argument is needed")
+        inline = inline or self._reception.pace.in_step
         listener = Listener(
             function, topic, self._report, name=name, depth=depth, inline=inline, on_cancel=self._cancelled
         )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
@@ -11,9 +10,8 @@ from skyloop.client.delivery import Topic
 from skyloop.client.frame import Arrival, Frame
 from skyloop.client.history import FeedbackHistory
 from skyloop.client.monitor import StallWatch
-from skyloop.client.slots import Bell
+from skyloop.client.pace import Pace
 from skyloop.client.statistics import ChannelCounter, ChannelStats
-from skyloop.clock import Clock
 from skyloop.errors import DecodeError
 from skyloop.messages import (
     Annotation,
@@ -24,10 +22,11 @@ from skyloop.messages import (
     Feedback,
     FrameHeader,
     LinkState,
+    LogEntry,
     Severity,
     Welcome,
 )
-from skyloop.transport.base import ANNOTATIONS, COMMANDS, Pixels, video
+from skyloop.transport.base import ANNOTATIONS, COMMANDS, LOGS, Pixels, video
 
 if TYPE_CHECKING:
     from skyloop.client.config import Config
@@ -50,13 +49,13 @@ class LinkStatus:
 class VideoChannel:
     """One camera's frames. The first consumer subscribes to it, the last one that goes ends that."""
 
-    def __init__(self, camera: CameraInfo, link: Link, clock: Clock) -> None:
+    def __init__(self, camera: CameraInfo, link: Link, pace: Pace) -> None:
         self.camera = camera
         self.newest: Arrival | None = None
-        self.bell = Bell()
+        self.bell = pace.bell()
         self.counter = ChannelCounter()
         self.undecodable = 0
-        self.watch = StallWatch(max(1.0, 5.0 / camera.fps if camera.fps > 0 else 1.0), clock())
+        self.watch = StallWatch(max(1.0, 5.0 / camera.fps if camera.fps > 0 else 1.0), pace.clock())
         self.keep = False  #: subscribed for good, by ``frame()`` or ``next_frame()``
         self._read: Arrival | None = None  # what next_frame() gave last
         self._link = link
@@ -98,9 +97,10 @@ class VideoChannel:
 class Reception:
     """The receiving side of a drone: a :class:`skyloop.client.link.LinkUser`."""
 
-    def __init__(self, name: str, clock: Clock = time.monotonic_ns) -> None:
+    def __init__(self, name: str, pace: Pace | None = None) -> None:
         self._name = name
-        self._clock = clock
+        self.pace = pace or Pace()
+        self._clock = self.pace.clock
         self.link: Link
         self.pilot: Pilot
         self.config: Config
@@ -108,7 +108,7 @@ class Reception:
         self.newest: Feedback | None = None
         self.received_ns = 0  #: when the newest feedback came, on our clock
         self.history = FeedbackHistory()
-        self.bell = Bell()  #: rings with each feedback, and when something changes that somebody may wait for
+        self.bell = self.pace.bell()  #: rings with each feedback, and when something changes that somebody may wait for
         self.refusal: Event | None = None  #: the last command of ours that was refused
         self.recent: deque[Event] = deque(maxlen=RECENT_EVENTS)
         self.status = LinkStatus(LinkState.CONNECTING, LinkState.CONNECTING)
@@ -120,6 +120,7 @@ class Reception:
         self.on_link: Topic[LinkStatus] = Topic()
         self.on_command: Topic[Applied] = Topic(lambda on: self.link.subscribe(COMMANDS, on))
         self.on_annotation: Topic[Annotation] = Topic(lambda on: self.link.subscribe(ANNOTATIONS, on))
+        self.on_log: Topic[LogEntry] = Topic(lambda on: self.link.subscribe(LOGS, on))
 
     # What the link calls ---------------------------------------------------------------------------------------
 
@@ -132,7 +133,7 @@ class Reception:
             channel.watch.heard_ns = now_ns
         for camera in welcome.capabilities.cameras:
             if camera.name not in self.channels:
-                self.channels[camera.name] = VideoChannel(camera, self.link, self._clock)
+                self.channels[camera.name] = VideoChannel(camera, self.link, self.pace)
         self.pilot.connected(welcome.app_id)
 
     def disconnected(self, reason: str) -> None:  # noqa: ARG002  (told by link_changed)
@@ -207,6 +208,9 @@ class Reception:
 
     def annotation(self, annotation: Annotation, now_ns: int) -> None:  # noqa: ARG002  (all are called alike)
         self.on_annotation.publish(annotation)
+
+    def log_entry(self, entry: LogEntry, now_ns: int) -> None:  # noqa: ARG002  (all are called alike)
+        self.on_log.publish(entry)
 
     # For the drone ---------------------------------------------------------------------------------------------
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
+from skyloop.clock import NS_PER_S, nanoseconds
 from skyloop.errors import AuthorityError, SkyloopError, UsageError
+from skyloop.messages import LinkState
 
 if TYPE_CHECKING:
     from skyloop.client import AuthorityStatus, Drone, Frame
@@ -108,13 +109,15 @@ class _Run:
         self._lost = False  # somebody took over, and the controller was told
 
     def go(self, seconds: float | None, until: Callable[[], bool] | None) -> RunSummary:
-        started = time.monotonic()
-        deadline = None if seconds is None else started + seconds
+        started_ns = self._inbox.clock()
+        deadline_ns = None if seconds is None else started_ns + nanoseconds(seconds)
         while True:
-            reason = self._over(deadline, until)
+            reason = self._over(deadline_ns, until)
             if reason is not None:
                 break
-            left_s = _LOOK_S if deadline is None else min(_LOOK_S, deadline - time.monotonic())
+            left_s = _LOOK_S
+            if deadline_ns is not None:
+                left_s = min(left_s, (deadline_ns - self._inbox.clock()) / NS_PER_S)
             self._inbox.bell.wait_for(lambda: self._inbox.waiting or self._stopped.is_set(), max(0.0, left_s))
             self._serve()
         return RunSummary(
@@ -123,18 +126,22 @@ class _Run:
             self._inbox.frames_dropped,
             self._inbox.feedback_dropped,
             self._overruns,
-            time.monotonic() - started,
+            (self._inbox.clock() - started_ns) / NS_PER_S,
             reason,
         )
 
-    def _over(self, deadline: float | None, until: Callable[[], bool] | None) -> Reason | None:
+    def _over(self, deadline_ns: int | None, until: Callable[[], bool] | None) -> Reason | None:
         if self._stopped.is_set():
             return "stopped"
-        if self._drone.closed:
+        if self._drone.closed or self._ended():
             return "closed"
-        if deadline is not None and time.monotonic() >= deadline:
+        if deadline_ns is not None and self._inbox.clock() >= deadline_ns:
             return "time"
         return "until" if until is not None and until() else None
+
+    def _ended(self) -> bool:
+        """Whether the vehicle ended on purpose, as a recording does, and all that came before that was served."""
+        return self._drone.link.vehicle is LinkState.CLOSED and not self._inbox.waiting
 
     def _serve(self) -> None:
         """One call for each kind of sample that came; feedback first, so that frames meet the newer state."""

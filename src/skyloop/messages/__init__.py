@@ -61,6 +61,7 @@ from skyloop.messages.kinds import (
     Role,
     Severity,
 )
+from skyloop.messages.log import LogEntry
 from skyloop.messages.parameter import Parameter, ParameterType
 
 __all__ = [
@@ -99,6 +100,7 @@ __all__ = [
     "Land",
     "LinkState",
     "ListParameters",
+    "LogEntry",
     "Parameter",
     "ParameterPage",
     "ParameterType",

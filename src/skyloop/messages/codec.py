@@ -20,6 +20,7 @@ from skyloop.messages.config import Reply, Request
 from skyloop.messages.event import Event
 from skyloop.messages.feedback import Feedback
 from skyloop.messages.frame import FrameHeader
+from skyloop.messages.log import LogEntry
 
 SIGNATURE: Final = b"SKYL"
 VERSION: Final = 1
@@ -27,7 +28,7 @@ HEADER: Final = struct.Struct("<4sBBHI")
 HEADER_SIZE: Final = HEADER.size
 MAX_BODY: Final = 60_000  #: of a sample, so that a packet fits one datagram; pixels travel apart
 
-Sample = Command | Applied | Feedback | FrameHeader | Event | Request | Reply | Annotation
+Sample = Command | Applied | Feedback | FrameHeader | Event | Request | Reply | Annotation | LogEntry
 
 
 class Kind(IntEnum):
@@ -41,6 +42,7 @@ class Kind(IntEnum):
     REPLY = 6
     ANNOTATION = 7
     APPLIED = 8
+    LOG = 9
 
 
 KINDS: Final[dict[type[Sample], Kind]] = {
@@ -52,6 +54,7 @@ KINDS: Final[dict[type[Sample], Kind]] = {
     Reply: Kind.REPLY,
     Annotation: Kind.ANNOTATION,
     Applied: Kind.APPLIED,
+    LogEntry: Kind.LOG,
 }
 
 _encode_body = msgspec.msgpack.Encoder().encode

@@ -87,6 +87,7 @@ class EventKind(StrEnum):
     VEHICLE_MESSAGE = "vehicle_message"  #: text from the vehicle itself
     SAMPLES_LOST = "samples_lost"  #: events that a slow application did not get; data: count
     CALLBACK_ERROR = "callback_error"  #: an application's own listener or processor raised; data: where
+    RECORDING = "recording"  #: a recorder started, ended, dropped samples or can't write; data: state, path
     PROXY_CLOSING = "proxy_closing"  #: the proxy ends on purpose
 
 

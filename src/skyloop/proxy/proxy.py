@@ -21,6 +21,7 @@ from skyloop.messages import (
     Command,
     EventKind,
     LinkState,
+    LogEntry,
     Request,
     Severity,
     Value,
@@ -39,7 +40,7 @@ from skyloop.proxy.sessions import MAX_MALFORMED, Session
 from skyloop.proxy.statistics import Counters
 from skyloop.proxy.vehicle import Vehicle
 from skyloop.proxy.watch import Watch
-from skyloop.transport.base import ANNOTATIONS, Peer, ServerEnd
+from skyloop.transport.base import ANNOTATIONS, LOGS, Peer, ServerEnd
 
 MAX_NAME: Final = 64  #: characters of a proxy's name
 MAX_ANNOTATION: Final = 32_768  #: bytes of an annotation's packet
@@ -184,7 +185,9 @@ class Proxy:
         elif isinstance(sample, Request):
             self.requests.take(session, sample, now_ns)
         elif kind is Annotation:
-            self._relay(session, packet, now_ns)
+            self._relay_annotation(session, packet, now_ns)
+        elif kind is LogEntry:
+            self._relay(session, packet, now_ns, LOGS)
         else:
             self._malformed(session, f"{kind.__name__} is for the proxy to send", now_ns)
 
@@ -201,15 +204,20 @@ class Proxy:
             self.watch.gone(session, self.clock())
         del self._sessions[peer.id]
 
-    def _relay(self, session: Session, packet: bytes, now_ns: int) -> None:
-        if session.role is None:
-            self._malformed(session, "an annotation came before Hello", now_ns)
-        elif len(packet) > MAX_ANNOTATION:
+    def _relay_annotation(self, session: Session, packet: bytes, now_ns: int) -> None:
+        if len(packet) > MAX_ANNOTATION:
             why = f"an annotation has {len(packet)} bytes, at most {MAX_ANNOTATION} are relayed"
             self._malformed(session, why, now_ns)
         else:
-            self._counts["annotations.relayed"] += 1
-            self.server.publish(ANNOTATIONS, packet)
+            self._relay(session, packet, now_ns, ANNOTATIONS)
+
+    def _relay(self, session: Session, packet: bytes, now_ns: int, topic: str) -> None:
+        """Hand what an application tells the others to whoever subscribed to it."""
+        if session.role is None:
+            self._malformed(session, f"a packet for {topic} came before Hello", now_ns)
+        else:
+            self._counts[f"{topic}.relayed"] += 1
+            self.server.publish(topic, packet)
 
     def _malformed(self, session: Session, reason: str, now_ns: int) -> None:
         self._counts["packets.malformed"] += 1

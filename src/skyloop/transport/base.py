@@ -31,6 +31,7 @@ FEEDBACK = "feedback"
 EVENTS = "events"
 COMMANDS = "commands"  #: echoes (Applied) of all commands that the proxy received
 ANNOTATIONS = "annotations"
+LOGS = "logs"  #: what applications log (LogEntry)
 MAX_TOPIC = 80  #: characters
 MAX_PACKET = HEADER_SIZE + MAX_BODY  #: bytes
 

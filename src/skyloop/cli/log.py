@@ -1,0 +1,235 @@
+"""``skyloop log``: looks at recordings, exports, compares and mends them."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+from rich.console import Console
+
+from skyloop.errors import FileFormatError, UsageError
+
+if TYPE_CHECKING:
+    from skyloop.logfile.layout import Channel
+    from skyloop.logfile.reader import Recording
+
+log = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
+
+File = Annotated[Path, typer.Argument(metavar="FILE", help="A recording: an MCAP file that Skyloop wrote")]
+DroneName = Annotated[str | None, typer.Option("--drone", metavar="NAME", help="Which one (default: the first)")]
+_EXAMPLE: Final = "Example: skyloop log "
+
+
+class Form(StrEnum):
+    """What a recording can be exported as."""
+
+    CSV = "csv"
+    PARQUET = "parquet"
+    NPZ = "npz"
+    MP4 = "mp4"
+
+
+class Which(StrEnum):
+    """Which side of the proxy's limits is compared."""
+
+    ASKED = "asked"
+    APPLIED = "applied"
+
+
+@log.callback()
+def _log() -> None:
+    """Look at recordings: what is in them, a report, exports, comparisons; and mend them.
+
+    skyloop log COMMAND --help tells more about each.
+    """
+
+
+@log.command(short_help="What is in a recording", epilog=f"{_EXAMPLE}info flight.mcap")
+def info(
+    file: File,
+    json: Annotated[bool, typer.Option("--json", help="For programs: one JSON object")] = False,
+) -> None:
+    """Channels with their counts, rates, gaps, missing samples and delays; drops; what is wrong with the file."""
+    from skyloop.cli import log_tables
+    from skyloop.recording.review.summary import summarise
+
+    recording = _open(file)
+    with _progress("reading") as progress:
+        summary = summarise(recording, progress)
+    if json:
+        typer.echo(log_tables.as_json(recording, summary))
+        return
+    console = Console(highlight=False)
+    for part in log_tables.info(recording, summary):
+        console.print(part)
+
+
+@log.command(short_help="A page that shows a flight", epilog=f"{_EXAMPLE}report flight.mcap -o report.html")
+def report(
+    file: File,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="PAGE", help="Default: FILE with the ending .html")
+    ] = None,
+    drone: DroneName = None,
+    pictures: Annotated[int, typer.Option(min=0, max=48, help="How many key frames of each camera")] = 8,
+) -> None:
+    """One HTML page that needs nothing else: path, attitude with set-points, battery, events, delays, key frames."""
+    from skyloop.recording.review.report import write_report
+
+    recording = _open(file)
+    target = output or file.with_suffix(".html")
+    with _progress("drawing") as progress:
+        write_report(recording, recording.drone(drone).name, target, pictures=pictures, progress=progress)
+    _say(f"{target}: {target.stat().st_size / 1e6:.1f} MB")
+
+
+@log.command(short_help="Samples and pictures for other programs", epilog=f"{_EXAMPLE}export flight.mcap --to csv")
+def export(
+    file: File,
+    to: Annotated[Form, typer.Option("--to", help="csv and parquet: a file for each channel")] = Form.CSV,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="PATH", help="A folder for csv and parquet, else a file"),
+    ] = None,
+    drone: DroneName = None,
+    channel: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="Only this one, e.g. feedback; may be repeated")
+    ] = None,
+    camera: Annotated[str | None, typer.Option(metavar="NAME", help="For mp4 (default: the first)")] = None,
+    burn_time: Annotated[bool, typer.Option("--burn-time", help="For mp4: write the time into the pictures")] = False,
+) -> None:
+    """Write the samples as tables, or a camera's frames as a video with their own times."""
+    from skyloop.recording.review import export as ways
+
+    recording = _open(file)
+    name = recording.drone(drone).name
+    if to is Form.MP4:
+        _refuse({"--channel": bool(channel)}, to)
+        chosen = camera or _first_camera(recording, name)
+        target = output or file.with_name(f"{file.stem}-{chosen}.mp4")
+        with _progress(f"encoding {chosen}") as progress:
+            count = ways.export_mp4(recording, name, chosen, target, burn_time=burn_time, progress=progress)
+        _say(f"{target}: {count} frames of {chosen}")
+        return
+    _refuse({"--camera": camera is not None, "--burn-time": burn_time}, to)
+    with _progress("reading") as progress:
+        found = ways.read(recording, name, _channels(channel), progress)
+    if to is Form.NPZ:
+        written = ways.export_npz(found, output or file.with_suffix(".npz"))
+    else:
+        write = ways.export_csv if to is Form.CSV else ways.export_parquet
+        written = write(found, output or file.with_name(f"{file.stem}-{to.value}"))
+    rows = ", ".join(f"{len(table)} × {title}" for title, table in found.items())
+    _say(f"{written[0] if len(written) == 1 else written[0].parent}: {rows}")
+
+
+@log.command(
+    short_help="The commands of two recordings, side by side",
+    epilog=f"{_EXAMPLE}compare old.mcap new.mcap -o both.html",
+)
+def compare(
+    old: Annotated[Path, typer.Argument(metavar="OLD", help="A recording")],
+    new: Annotated[Path, typer.Argument(metavar="NEW", help="Another, such as one of a replay of the first")],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="PAGE", help="Draw them: a .html page or a .png picture")
+    ] = None,
+    drone: DroneName = None,
+    what: Annotated[Which, typer.Option(help="What applications asked for, or what was applied")] = Which.ASKED,
+    part: Annotated[float, typer.Option(min=0.0, help="They part where set-points differ by more [SI unit]")] = 0.01,
+) -> None:
+    """How a changed controller's commands differ from the old one's: RMS of each set-point, and where they part."""
+    from skyloop.cli import log_tables
+    from skyloop.recording.review.compare import compare as commands_of
+
+    if output is not None and output.suffix not in (".html", ".png"):
+        raise UsageError(f"{output} can't be drawn: its name must end in .html or .png")
+    older, newer = _open(old), _open(new)
+    found = commands_of(older, newer, drone=drone, what=what.value, part=part)
+    Console(highlight=False).print(log_tables.comparison(found, str(old), str(new)))
+    if output is not None:
+        from skyloop.recording.review.compare_page import write_comparison
+
+        write_comparison(found, str(old), str(new), output)
+        _say(f"{output}: {output.stat().st_size / 1e3:.0f} kB")
+
+
+@log.command(short_help="Mend a recording that was cut off", epilog=f"{_EXAMPLE}recover flight.mcap")
+def recover(
+    file: File,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="NEW", help="Default: FILE-recovered.mcap beside it")
+    ] = None,
+) -> None:
+    """Write what can be read of a cut or damaged recording to a new file, with its index; the old one is left alone."""
+    from skyloop.recording.review import recover as mending
+
+    recording = _open(file)
+    with _progress("looking") as progress:
+        wrong = mending.problems(recording, progress)
+    if not wrong and output is None:
+        _say(f"{file} is whole: there is nothing to mend")
+        return
+    target = output or file.with_name(f"{file.stem}-recovered.mcap")
+    with _progress("mending") as progress:
+        saved = mending.recover(recording, target, progress)
+    for problem in saved.why:
+        _say(f"{file}: {problem}")
+    for topic, count in sorted(saved.messages.items()):
+        typer.echo(f"{count:8} {topic}")
+    lost = f"; at most {saved.lost} bytes are lost" if saved.lost else ""
+    _say(f"{target}: {sum(saved.messages.values())} messages, {saved.seconds:.1f} s saved{lost}")
+
+
+# Inside --------------------------------------------------------------------------------------------------------
+
+
+def _open(file: Path) -> Recording:
+    from skyloop.logfile.reader import Recording
+
+    return Recording.open(file)
+
+
+def _first_camera(recording: Recording, drone: str) -> str:
+    cameras = recording.cameras(drone)
+    if not cameras:
+        raise FileFormatError(f"{recording.path} holds no frames of {drone}")
+    return cameras[0]
+
+
+def _channels(names: list[str] | None) -> list[Channel] | None:
+    from skyloop.errors import UnknownNameError
+    from skyloop.logfile.layout import Channel
+
+    known = {channel.value for channel in Channel}
+    for name in names or ():
+        if name not in known:
+            raise UnknownNameError("channel", name, known)
+    return [Channel(name) for name in names] if names else None
+
+
+def _refuse(given: dict[str, bool], to: Form) -> None:
+    for option, is_given in given.items():
+        if is_given:
+            raise UsageError(f"{option} says nothing about {to.value}: leave it out, or choose another --to")
+
+
+@contextmanager
+def _progress(what: str) -> Iterator[Callable[[float], None]]:
+    """A bar on a terminal that goes away at the end; nothing into a pipe."""
+    if not sys.stderr.isatty():
+        yield lambda _: None
+        return
+    from rich.progress import Progress
+
+    with Progress(transient=True, console=Console(stderr=True)) as bar:
+        task = bar.add_task(what, total=1.0)
+        yield lambda share: bar.update(task, completed=share)
+
+
+def _say(text: str) -> None:
+    typer.echo(text, err=True)

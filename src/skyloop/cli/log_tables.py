@@ -1,0 +1,116 @@
+"""How recordings look in the terminal."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import msgspec
+from rich.console import RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from skyloop.clock import NS_PER_S
+from skyloop.logfile.reader import Recording
+from skyloop.recording.review.compare import Comparison
+from skyloop.recording.review.summary import Delay, Row, Summary
+
+
+def info(recording: Recording, summary: Summary) -> Iterator[RenderableType]:
+    """All that ``skyloop log info`` shows."""
+    yield _head(recording, summary)
+    yield _channels(summary)
+    for words in _losses(summary):
+        yield Text(words, "yellow")
+    for note in summary.notes:
+        yield Text(note, "bold yellow")
+
+
+def as_json(recording: Recording, summary: Summary) -> str:
+    """The same for programs."""
+    head = {"file": str(recording.path), "drones": recording.drones, "started_unix_ns": recording.start.started_unix_ns}
+    return msgspec.json.encode(head | {"summary": summary}, enc_hook=str).decode()
+
+
+def _head(recording: Recording, summary: Summary) -> Table:
+    table = Table.grid(padding=(0, 2))
+    start = recording.start
+    began = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(start.started_unix_ns / NS_PER_S))
+    size = recording.found.size / 1e6
+    table.add_row("file", Text(f"{recording.path}" + (f", number {start.file}" if start.file > 1 else ""), "bold"))
+    table.add_row("recorded", f"{began}, {summary.seconds:.1f} s, {size:.1f} MB, by Skyloop {start.skyloop}")
+    for drone in recording.drones:
+        what = drone.described
+        cameras = ", ".join(f"{one.name} {one.width}×{one.height}" for one in what.cameras) or "none"
+        table.add_row("drone", f"{drone.name}: {what.vehicle}, {drone.uri or 'no address'}; cameras: {cameras}")
+    events = ", ".join(f"{count} {severity}" for severity, count in sorted(summary.events.items()))
+    table.add_row("events", events or "none")
+    return table
+
+
+def _channels(summary: Summary) -> Table:
+    table = Table("topic", box=None)
+    for title in ("count", "rate", "gaps", "longest", "missing", "size"):
+        table.add_column(title, justify="right", no_wrap=True)
+    table.add_column("delay [ms]: median (p99)")
+    for row in summary.rows:
+        table.add_row(
+            row.topic,
+            str(row.count),
+            _rate(row),
+            str(row.gaps) if row.gaps else "",
+            f"{row.longest_s:.3g} s" if row.steady and row.longest_s is not None else "",
+            str(row.missing) if row.missing else "",
+            _size(row.bytes),
+            "\n".join(map(_delay, row.delays)),
+        )
+    return table
+
+
+def _rate(row: Row) -> str:
+    return f"{row.rate_hz:.3g} Hz" if row.steady and row.rate_hz is not None else ""
+
+
+def _size(number: int) -> str:
+    return f"{number / 1e6:.1f} MB" if number >= 1e5 else f"{number / 1e3:.1f} kB"
+
+
+def _delay(delay: Delay) -> str:
+    return f"{delay.median_s * 1e3:.2f} ({delay.p99_s * 1e3:.2f}) {delay.what}"
+
+
+def _losses(summary: Summary) -> Iterator[str]:
+    for what, counts in (("left out by the recorder", summary.dropped), ("never reached the recorder", summary.missed)):
+        for drone, channels in counts.items():
+            words = ", ".join(f"{count} of {channel}" for channel, count in channels.items() if count)
+            if words:
+                yield f"{drone}: {words} {what}"
+
+
+def comparison(found: Comparison, old: str, new: str) -> Table:
+    """The differences of two recordings."""
+    parts = "they never part" if found.part_at_s is None else f"they part at {found.part_at_s:.2f} s"
+    table = Table(
+        "set-point",
+        "RMS",
+        "largest",
+        "at",
+        "compared",
+        box=None,
+        title=f"{new} against {old}",
+        title_justify="left",
+        caption=(
+            f"{found.seconds:.1f} s compared, {found.aligned}; {found.counts[0]} and {found.counts[1]} commands; "
+            f"the same kind of action {found.same_action:.1%} of the time; {parts}"
+        ),
+        caption_justify="left",
+    )
+    for field in found.fields:
+        table.add_row(
+            field.name,
+            f"{field.rms:.4f} {field.unit}",
+            f"{field.largest:.4f} {field.unit}",
+            f"{field.largest_at_s:.2f} s",
+            f"{field.seconds:.1f} s",
+        )
+    return table

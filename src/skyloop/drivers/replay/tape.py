@@ -1,0 +1,126 @@
+"""What a recording holds of one drone, in order, with the time at which each thing was known; and times of a replay."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import takewhile
+from typing import Final
+
+from skyloop.clock import nanoseconds
+from skyloop.logfile.layout import Channel, DroneRecord
+from skyloop.logfile.pictures import Picture
+from skyloop.logfile.reader import Item, Recording
+from skyloop.logfile.times import Course
+from skyloop.messages import Applied, CameraInfo, Capabilities, Encoding, Event, Feedback, Parameter
+
+#: What is told again. Annotations and logs are an application's own: it makes new ones.
+CHANNELS: Final = (Channel.FEEDBACK, Channel.FRAMES, Channel.EVENTS, Channel.COMMANDS, Channel.PARAMETERS)
+
+Told = Feedback | Picture | Event | Applied | Parameter
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """One thing, and when the proxy knew of it, on the clock of that proxy."""
+
+    at_ns: int
+    value: Told
+
+
+class Tape:
+    """A drone's recording, from so many seconds after its begin on."""
+
+    def __init__(self, recording: Recording, drone: DroneRecord, start_s: float = 0.0) -> None:
+        self._recording = recording
+        self._drone = drone
+        self.begin_ns = 0  #: on the clock of the recorded proxy
+        timed = (moment.at_ns for moment in self.moments() if not isinstance(moment.value, Parameter))
+        first_ns = next(timed, None)
+        if first_ns is not None:
+            self.begin_ns = first_ns + nanoseconds(start_s)
+
+    @property
+    def empty(self) -> bool:
+        """Whether there is nothing in it, from its begin on."""
+        return not any(moment.at_ns > self.begin_ns for moment in self.moments())
+
+    @property
+    def damaged(self) -> list[str]:
+        """What of it could not be read, in words."""
+        cut = self._recording.cut
+        return [*([f"the file was cut off: {cut}"] if cut else []), *self._recording.damaged]
+
+    def first_feedback(self) -> Feedback | None:
+        """The first state that is known."""
+        return next((moment.value for moment in self.moments() if isinstance(moment.value, Feedback)), None)
+
+    def parameters(self) -> list[Parameter]:
+        """Those that are known at its begin."""
+        early = takewhile(lambda moment: moment.at_ns <= self.begin_ns, self.moments())
+        return [moment.value for moment in early if isinstance(moment.value, Parameter)]
+
+    def moments(self) -> Iterator[Moment]:
+        """Everything in the order in which it was received; times never go backwards."""
+        course = Course()
+        for found in self._recording.items_and_pictures(self._drone.name, CHANNELS):
+            value = found.value if isinstance(found, Item) else found
+            at_ns = course.follow(value)
+            if isinstance(value, Parameter):  # those from before the begin are still in force
+                yield Moment(max(at_ns, self.begin_ns), value)
+            elif at_ns >= self.begin_ns:
+                yield Moment(at_ns, value)
+
+
+def capabilities(recording: Recording, drone: DroneRecord) -> Capabilities:
+    """What a replay of it can do: it shows the cameras of which there are frames, and takes every command if the
+    vehicle took any, natively or through the software autopilot; what was recorded happens all the same."""
+    was = drone.described
+    known = {camera.name: camera for camera in was.cameras}
+    return Capabilities(
+        vehicle="replay",
+        actions=was.actions and frozenset(_ACTIONS),
+        cameras=tuple(_camera(recording, drone.name, name, known.get(name)) for name in recording.cameras(drone.name)),
+        description=f"recording of {drone.name}: {was.description or was.vehicle}",
+        why_not=was.why_not,
+    )
+
+
+_ACTIONS: Final = ("takeoff", "land", "hover", "velocity", "attitude", "emergency_stop", "reset_emergency")
+
+
+def _camera(recording: Recording, drone: str, name: str, known: CameraInfo | None) -> CameraInfo:
+    first = next(recording.pictures(drone, name), None)
+    if first is None:
+        return known or CameraInfo(name, 1, 1, 1.0)
+    header = first.header
+    encoding = header.encoding if header.encoding in (Encoding.RGB8, Encoding.MONO8) else Encoding.BGR8
+    return CameraInfo(
+        name,
+        header.width,
+        header.height,
+        known.fps if known is not None else 30.0,
+        encoding,
+        header.intrinsics or (known.intrinsics if known is not None else None),
+        known.rotation if known is not None else None,
+        known.position if known is not None else None,
+    )
+
+
+class Timeline:
+    """Maps the clock of the recording to the clock of its replay. Pure."""
+
+    def __init__(self, speed: float, begin_ns: int, origin_ns: int) -> None:
+        """``begin_ns`` on the recording's clock is ``origin_ns`` on the replay's."""
+        self._speed = speed
+        self._begin_ns = begin_ns
+        self._origin_ns = origin_ns
+
+    def at(self, recorded_ns: int) -> int:
+        """When that is in the replay."""
+        passed_ns = recorded_ns - self._begin_ns
+        return self._origin_ns + (passed_ns if self._speed == 1.0 else round(passed_ns / self._speed))
+
+    def put_off(self, ns: int) -> None:
+        """What is still to come happens so much later."""
+        self._origin_ns += ns

@@ -1,0 +1,281 @@
+"""What a recording looks like: topics, schemas and times, and the way there and back. The page is docs/recording.md.
+
+Pure, and without the MCAP library. Our own samples are JSON objects, made by :func:`encode` and read by :func:`decode`;
+messages for viewers are in :mod:`skyloop.recording.foxglove`.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+import msgspec
+from msgspec import inspect
+
+from skyloop.errors import FileFormatError
+from skyloop.logfile.plain import decode, encode, from_plain, schema, schema_name, to_plain
+from skyloop.messages import (
+    Annotation,
+    Applied,
+    Capabilities,
+    Event,
+    Feedback,
+    FrameHeader,
+    LogEntry,
+    Parameter,
+)
+
+__all__ = [
+    "Channel",
+    "ClockPair",
+    "DroneRecord",
+    "Drops",
+    "End",
+    "FrameRecord",
+    "Start",
+    "TYPES",
+    "Topic",
+    "calibration_topic",
+    "decode",
+    "drawing_topic",
+    "encode",
+    "from_metadata",
+    "from_plain",
+    "image_topic",
+    "optical_frame",
+    "parse_topic",
+    "path_topic",
+    "pose_topic",
+    "schema",
+    "schema_name",
+    "to_metadata",
+    "to_plain",
+]
+
+T = TypeVar("T")
+
+PROFILE: Final = "skyloop"  #: of the MCAP header
+VERSION: Final = 1  #: of this layout
+JSON: Final = "json"  #: message encoding of our own samples
+JSON_SCHEMA: Final = "jsonschema"  #: schema encoding of our own samples
+PROTOBUF: Final = "protobuf"  #: both encodings of messages for viewers
+
+# Names of the metadata records. All their values are texts; see :class:`ClockPair` and :class:`Start`.
+META_CLOCK: Final = "skyloop.clock"
+META_RECORDING: Final = "skyloop.recording"
+META_END: Final = "skyloop.end"  #: missing in a file that was not closed
+
+LOG: Final = "/log"  #: foxglove.Log of all drones: events and logged texts
+TF: Final = "/tf"  #: foxglove.FrameTransform: world → NAME, NAME → NAME/CAMERA
+WORLD: Final = "world"  #: the fixed frame: x east, y north, z up [m]
+
+
+# Times ---------------------------------------------------------------------------------------------------------
+
+
+class ClockPair(msgspec.Struct, frozen=True):
+    """Metadata ``skyloop.clock``: one moment on the recorder's two clocks.
+
+    ``log_time`` of a message is when it was received, ``publish_time`` when it was captured (sent, told), both as Unix
+    time [ns] by this pair. Times *within* our samples are on the proxy's monotonic clock, untouched.
+    """
+
+    monotonic_ns: int
+    unix_ns: int
+    pid: int
+    boot: str = ""  #: of the host: another one means that monotonic times can't be compared
+
+    @classmethod
+    def now(cls) -> ClockPair:
+        before = time.monotonic_ns()
+        unix = time.time_ns()
+        return cls((before + time.monotonic_ns()) // 2, unix, os.getpid(), _boot_id())
+
+    def unix(self, monotonic_ns: int, offset_ns: int = 0) -> int:
+        """Unix time [ns] of a monotonic one; ``offset_ns``: the clock that it is on less the recorder's."""
+        return max(0, monotonic_ns - offset_ns - self.monotonic_ns + self.unix_ns)
+
+    def monotonic(self, unix_ns: int, offset_ns: int = 0) -> int:
+        """The way back from :meth:`unix`."""
+        return unix_ns - self.unix_ns + self.monotonic_ns + offset_ns
+
+
+def _boot_id() -> str:
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    except OSError:
+        return ""
+
+
+# Metadata ------------------------------------------------------------------------------------------------------
+
+
+class DroneRecord(msgspec.Struct, frozen=True):
+    """One drone of a recording, in metadata ``skyloop.recording``."""
+
+    name: str
+    uri: str = ""
+    capabilities: dict[str, Any] = {}  #: as :func:`to_plain` makes them of :class:`Capabilities`
+    clock_offset_ns: int = 0  #: the proxy's clock less the recorder's, as known at the start
+
+    @property
+    def described(self) -> Capabilities:
+        """What the vehicle can do."""
+        return from_plain(self.capabilities, Capabilities)
+
+
+class Start(msgspec.Struct, frozen=True):
+    """Metadata ``skyloop.recording``, written first in each file."""
+
+    layout: int
+    skyloop: str  #: version of Skyloop
+    drones: tuple[DroneRecord, ...]
+    started_unix_ns: int  #: of the whole recording; the same in all of its files
+    file: int = 1  #: number of this file within the recording, from 1
+    options: dict[str, Any] = {}  #: of the recorder: channels, encoding, quality
+
+
+class End(msgspec.Struct, frozen=True):
+    """Metadata ``skyloop.end``, written last in a file that was closed. All counts are since the recording started."""
+
+    reason: str  #: ``closed``, or ``rotated`` with another file to follow
+    ended_unix_ns: int
+    written: dict[str, int]  #: messages of *this file*, by topic
+    dropped: dict[str, dict[str, int]] = {}  #: by drone and channel: received, and left out by the recorder
+    missed: dict[str, dict[str, int]] = {}  #: by drone and channel: never received, by gaps in the numbers
+
+
+def to_metadata(record: msgspec.Struct) -> dict[str, str]:
+    """A metadata record's texts: a text as it is, all else as JSON."""
+    fields = msgspec.to_builtins(record)
+    return {
+        key: value if isinstance(value, str) else msgspec.json.encode(value).decode() for key, value in fields.items()
+    }
+
+
+def from_metadata(texts: Mapping[str, str], kind: type[T]) -> T:
+    """The way back. Raises :class:`FileFormatError`."""
+    info = inspect.type_info(kind)
+    assert isinstance(info, inspect.StructType)
+    try:
+        fields = {
+            field.name: texts[field.name]
+            if isinstance(field.type, inspect.StrType)
+            else msgspec.json.decode(texts[field.name])
+            for field in info.fields
+            if field.name in texts
+        }
+        return msgspec.convert(fields, kind)
+    except (msgspec.DecodeError, msgspec.ValidationError) as error:
+        raise FileFormatError(f"metadata that can't be understood as {kind.__name__}: {error}") from None
+
+
+# Our own samples -----------------------------------------------------------------------------------------------
+
+
+class Channel(StrEnum):
+    """Our own channels; topics are ``/NAME/CHANNEL``, for frames ``/NAME/frames/CAMERA``."""
+
+    FEEDBACK = "feedback"
+    COMMANDS = "commands"
+    EVENTS = "events"
+    PARAMETERS = "parameters"
+    ANNOTATIONS = "annotations"
+    LOGS = "logs"
+    FRAMES = "frames"
+    DROPS = "drops"
+
+
+class FrameRecord(msgspec.Struct, frozen=True):
+    """A recorded frame. Its picture is the message on :func:`image_topic` of the same ``sequence`` and times."""
+
+    header: FrameHeader  #: as it came
+    received_ns: int  #: on the recorder's monotonic clock
+    format: str  #: of the picture in the file: ``jpeg``, ``png``
+
+
+class Drops(msgspec.Struct, frozen=True):
+    """Totals since the recording started, written when one has changed; by channel: ``feedback``, ``video.front`` …"""
+
+    at_ns: int  #: on the recorder's monotonic clock
+    dropped: dict[str, int]  #: received, and left out because the disk or the encoder was slower
+    missed: dict[str, int]  #: never received: left out by the proxy for a slow recorder, or lost on the way
+
+
+#: What the messages of our own channels are.
+TYPES: Final[dict[Channel, type[msgspec.Struct]]] = {
+    Channel.FEEDBACK: Feedback,
+    Channel.COMMANDS: Applied,
+    Channel.EVENTS: Event,
+    Channel.PARAMETERS: Parameter,
+    Channel.ANNOTATIONS: Annotation,
+    Channel.LOGS: LogEntry,
+    Channel.FRAMES: FrameRecord,
+    Channel.DROPS: Drops,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """Our own topic, taken apart."""
+
+    drone: str
+    channel: Channel
+    camera: str = ""
+
+    def __str__(self) -> str:
+        return "/" + "/".join(map(_quoted, (self.drone, self.channel.value, *([self.camera] if self.camera else []))))
+
+
+def parse_topic(topic: str) -> Topic | None:
+    """The parts of one of our own topics; None for any other."""
+    parts = [_unquoted(part) for part in topic.split("/")]
+    if len(parts) not in (3, 4) or parts[0] or parts[2] not in set(Channel):
+        return None
+    channel = Channel(parts[2])
+    if (channel is Channel.FRAMES) != (len(parts) == 4):
+        return None
+    return Topic(parts[1], channel, parts[3] if len(parts) == 4 else "")
+
+
+def image_topic(drone: str, camera: str) -> str:
+    """foxglove.CompressedImage."""
+    return f"/{_quoted(drone)}/camera/{_quoted(camera)}/image"
+
+
+def calibration_topic(drone: str, camera: str) -> str:
+    """foxglove.CameraCalibration."""
+    return f"/{_quoted(drone)}/camera/{_quoted(camera)}/calibration"
+
+
+def drawing_topic(drone: str, camera: str) -> str:
+    """foxglove.ImageAnnotations."""
+    return f"/{_quoted(drone)}/camera/{_quoted(camera)}/annotations"
+
+
+def pose_topic(drone: str) -> str:
+    """foxglove.PoseInFrame."""
+    return f"/{_quoted(drone)}/pose"
+
+
+def path_topic(drone: str) -> str:
+    """foxglove.PosesInFrame: where it has been since the recording started."""
+    return f"/{_quoted(drone)}/path"
+
+
+def optical_frame(drone: str, camera: str) -> str:
+    """Name of a camera's frame: x right, y down, z forward."""
+    return f"{drone}/{camera}"
+
+
+def _quoted(name: str) -> str:
+    return name.replace("%", "%25").replace("/", "%2F")
+
+
+def _unquoted(part: str) -> str:
+    return part.replace("%2F", "/").replace("%25", "%")

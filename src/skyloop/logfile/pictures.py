@@ -1,0 +1,101 @@
+"""A recorded frame, and its pixels.
+
+The picture is the field ``data`` of a foxglove.CompressedImage, taken out of its Protocol Buffers encoding
+(https://protobuf.dev/programming-guides/encoding/, https://docs.foxglove.dev/docs/sdk/schemas/compressed-image).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.errors import FileFormatError, MissingExtraError
+from skyloop.logfile.layout import FrameRecord
+from skyloop.messages import Encoding, FrameHeader
+
+_DATA: Final = 2  #: number of the field with the compressed picture
+_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  #: kinds of field
+_FIXED_SIZE: Final = {_FIXED64: 8, _FIXED32: 4}
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A frame of a recording."""
+
+    camera: str
+    record: FrameRecord
+    log_ns: int  #: when it was received, Unix time [ns]
+    publish_ns: int  #: when it was captured, Unix time [ns]
+    message: bytes  #: foxglove.CompressedImage
+
+    @property
+    def header(self) -> FrameHeader:
+        return self.record.header
+
+    @property
+    def compressed(self) -> bytes:
+        """The picture's file, in ``record.format``. Raises :class:`FileFormatError`."""
+        return _field(self.message, _DATA)
+
+    def pixels(self) -> NDArray[np.uint8]:
+        """BGR, shape (height, width, 3), uint8. Raises :class:`FileFormatError` for what can't be decoded."""
+        return decode_image(self.compressed, f"frame {self.header.seq} of {self.camera}", grey=False)
+
+    def as_recorded(self) -> tuple[NDArray[np.uint8], Encoding]:
+        """The pixels in the encoding in which the vehicle gave them if that was raw, else BGR."""
+        grey = self.header.encoding is Encoding.MONO8
+        image = decode_image(self.compressed, f"frame {self.header.seq} of {self.camera}", grey=grey)
+        if self.header.encoding is Encoding.RGB8:
+            return np.ascontiguousarray(image[:, :, ::-1]), Encoding.RGB8
+        return image, Encoding.MONO8 if grey else Encoding.BGR8
+
+
+def decode_image(data: bytes, what: str, *, grey: bool) -> NDArray[np.uint8]:
+    """JPEG or PNG to BGR, shape (h, w, 3), or with ``grey`` (h, w)."""
+    try:
+        import cv2
+    except ImportError as error:
+        raise MissingExtraError("decoding recorded frames", "vision", cause=str(error)) from None
+    image: Any = None
+    if data:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR)
+    if image is None:
+        raise FileFormatError(f"{what} can't be decoded: it is neither JPEG nor PNG, or it is damaged")
+    result: NDArray[np.uint8] = image
+    return result
+
+
+def _field(message: bytes, number: int) -> bytes:
+    """A field of bytes of an encoded message; empty if it is not there."""
+    at = 0
+    while at < len(message):
+        key, at = _varint(message, at)
+        kind = key & 7
+        if kind == _VARINT:
+            _, at = _varint(message, at)
+        elif kind in _FIXED_SIZE:
+            at += _FIXED_SIZE[kind]
+        elif kind == _BYTES:
+            size, at = _varint(message, at)
+            if key >> 3 == number:
+                return message[at : at + size]
+            at += size
+        else:
+            raise FileFormatError(f"an image's message is damaged at byte {at}")
+    return b""
+
+
+def _varint(message: bytes, at: int) -> tuple[int, int]:
+    """A number of seven bits a byte, and where it ends."""
+    number = shift = 0
+    while at < len(message) and shift < 64:
+        byte = message[at]
+        at += 1
+        number |= (byte & 0x7F) << shift
+        if byte < 0x80:
+            return number, at
+        shift += 7
+    raise FileFormatError(f"an image's message is damaged at byte {at}")

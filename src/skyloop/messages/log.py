@@ -1,0 +1,30 @@
+"""What an application logs itself: text, numbers and arrays, for recorders and for people to plot.
+
+Relayed by the proxy on the ``logs`` topic, from any application.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Final
+
+import msgspec
+
+from skyloop.messages.command import Count
+from skyloop.messages.frame import Name
+from skyloop.messages.kinds import Severity
+
+MAX_TEXT: Final = 4096  #: characters
+MAX_VALUES: Final = 4096  #: numbers of an array
+
+
+class LogEntry(msgspec.Struct, frozen=True, array_like=True):
+    """One entry: exactly one of ``text``, ``number`` and ``values`` is given."""
+
+    source: Name  #: the application, or the part of it, that logged it
+    name: Annotated[str, msgspec.Meta(max_length=64)]  #: of the series; empty for text that belongs to none
+    at_ns: int  #: when it was logged, on the proxy's clock
+    text: Annotated[str, msgspec.Meta(max_length=MAX_TEXT)] | None = None
+    number: float | None = None
+    values: Annotated[tuple[float, ...], msgspec.Meta(max_length=MAX_VALUES)] | None = None  #: an array, row by row
+    shape: Annotated[tuple[Count, ...], msgspec.Meta(max_length=8)] = ()  #: of that array
+    severity: Severity = Severity.INFO  #: of a text

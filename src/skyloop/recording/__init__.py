@@ -1,0 +1,27 @@
+"""Recordings of flights: written by :func:`record`, to MCAP files that other viewers open too."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from skyloop.recording.recorder import Recorder, record
+    from skyloop.recording.status import RecorderState, Status
+
+_HOMES = {
+    "Recorder": "skyloop.recording.recorder",
+    "RecorderState": "skyloop.recording.status",
+    "Status": "skyloop.recording.status",
+    "record": "skyloop.recording.recorder",
+}
+
+__all__ = ["Recorder", "RecorderState", "Status", "record"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'skyloop.recording' has no attribute {name!r}")
+    value = getattr(import_module(_HOMES[name]), name)
+    globals()[name] = value
+    return value

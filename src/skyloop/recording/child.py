@@ -1,0 +1,212 @@
+"""The recorder as a process of its own, which the flight does not feel: both of its ends."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO, Final
+
+import msgspec
+
+from skyloop.client import connect
+from skyloop.client.slots import Bell
+from skyloop.errors import LinkError, MissingExtraError, NoAnswerError, SkyloopError, UsageError
+from skyloop.messages import Severity
+from skyloop.recording.engine import Engine
+from skyloop.recording.options import Options
+from skyloop.recording.status import News, RecorderState, Status
+
+START_S: Final = 20.0
+_END_S: Final = 15.0  # to write what has come, before it is told to end
+_HARDER_S: Final = 3.0
+_TELL_S: Final = 0.25
+_NICE: Final = 5  # the flight comes first
+_TAIL: Final = 2000
+
+
+class Order(msgspec.Struct, frozen=True):
+    """What a child is to record."""
+
+    targets: tuple[str, ...]  #: what each drone is connected to by
+    path: str
+    options: Options
+
+
+class Line(msgspec.Struct, frozen=True, omit_defaults=True):
+    """What a child says: one JSON object a line."""
+
+    status: Status | None = None
+    news: News | None = None
+    trouble: str = ""  #: why it could not start
+    usage: bool = False  #: that was the caller's fault
+
+
+# The child -----------------------------------------------------------------------------------------------------
+
+
+def run_child(order: Order) -> int:
+    """Record until standard input ends or SIGTERM comes; exit code 0, or 2 if it could not start."""
+    stop = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    threading.Thread(target=_watch_parent, args=(stop,), name="parent", daemon=True).start()
+    if hasattr(os, "nice"):
+        os.nice(_NICE)
+    news: deque[News] = deque()  # told by this thread, so that a parent that does not read never holds up the writing
+    with contextlib.ExitStack() as stack:
+        try:
+            drones = [stack.enter_context(connect(t, access="observe", name="recorder")) for t in order.targets]
+            engine = Engine(drones, Path(order.path), order.options, news.append)
+            engine.start()
+        except SkyloopError as error:
+            _say(Line(trouble=str(error), usage=isinstance(error, UsageError)))
+            return 2
+        stack.callback(engine.stop)
+        while not stop.is_set():
+            _report(engine, news)
+            stop.wait(_TELL_S)
+        engine.stop()
+        _report(engine, news)
+    return 0
+
+
+def _watch_parent(stop: threading.Event) -> None:
+    """Standard input is a pipe whose writing end the parent has: it ends with the parent, however that ends."""
+    with contextlib.suppress(OSError):
+        while os.read(0, 64):
+            pass
+    stop.set()
+
+
+def _report(engine: Engine, news: deque[News]) -> None:
+    while news:
+        _say(Line(news=news.popleft()))
+    _say(Line(status=engine.status))
+
+
+def _say(line: Line) -> None:
+    with contextlib.suppress(OSError):  # nobody listens any more
+        sys.stdout.buffer.write(msgspec.json.encode(line) + b"\n")
+        sys.stdout.buffer.flush()
+
+
+# The parent ----------------------------------------------------------------------------------------------------
+
+
+class RecorderProcess:
+    """A child that records; it ends with :meth:`stop`, and with this process however that ends.
+
+    It has a session of its own: Ctrl-C in the terminal is for the application. ``hear`` gets its news, on a thread of
+    its own. Raises what the child says when it can't record.
+    """
+
+    def __init__(self, order: Order, hear: Callable[[News], None] = lambda _: None) -> None:
+        self._hear = hear
+        self._status = Status(path=order.path)
+        self._trouble: Line | None = None
+        self._bell = Bell()
+        self._ended = False
+        self._complaints: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115  (closed by stop())
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "skyloop.recording", msgspec.json.encode(order).decode()],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=self._complaints,
+                start_new_session=True,
+            )
+        except BaseException:
+            self._complaints.close()
+            raise
+        self._thread = threading.Thread(target=self._listen, name="skyloop-recorder", daemon=True)
+        self._thread.start()
+        try:
+            self._wait_for_start()
+        except BaseException:
+            self.stop()
+            raise
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    @property
+    def status(self) -> Status:
+        return self._status
+
+    def start(self) -> None:
+        """It has begun already."""
+
+    def stop(self) -> None:
+        """Let it write what has come and close its file, and wait for that. Idempotent."""
+        process = self._process
+        if process.stdin is not None and not process.stdin.closed:
+            with contextlib.suppress(OSError):
+                process.stdin.close()
+        wait_s = _END_S
+        for harder in (process.terminate, process.kill):
+            try:
+                process.wait(wait_s)
+            except subprocess.TimeoutExpired:
+                harder()
+                wait_s = _HARDER_S
+        process.wait()
+        self._thread.join()
+        self._complaints.close()
+
+    def _wait_for_start(self) -> None:
+        def decided() -> bool:
+            return self._ended or self._status.state is not RecorderState.STARTING
+
+        if not self._bell.wait_for(decided, START_S):
+            raise NoAnswerError(f"the recorder's process did not start within {START_S:g} s")
+        if self._trouble is not None:
+            raise (UsageError if self._trouble.usage else LinkError)(self._trouble.trouble)
+        if self._ended:
+            raise LinkError(f"the recorder's process {self._how_it_ended()}")
+
+    def _listen(self) -> None:
+        assert self._process.stdout is not None
+        with self._process.stdout as lines:
+            for text in lines:
+                self._take(msgspec.json.decode(text, type=Line))
+                self._bell.ring()
+        self._process.wait()
+        self._ended = True
+        if self._trouble is None and self._status.state not in (RecorderState.CLOSED, RecorderState.FAILED):
+            reason = f"the recorder's process {self._how_it_ended()}"
+            self._status = msgspec.structs.replace(self._status, state=RecorderState.FAILED, reason=reason)
+            self._hear(News(f"{reason}; what it wrote is in {self._status.path}", Severity.ERROR))
+        self._bell.ring()
+
+    def _take(self, line: Line) -> None:
+        if line.status is not None:
+            self._status = line.status
+        if line.news is not None:
+            self._hear(line.news)
+        if line.trouble:
+            self._trouble = line
+
+    def _how_it_ended(self) -> str:
+        code = self._process.returncode
+        how = f"was killed by signal {-code}" if code is not None and code < 0 else f"ended with exit code {code}"
+        self._complaints.seek(0, os.SEEK_END)
+        self._complaints.seek(max(0, self._complaints.tell() - _TAIL))
+        said = self._complaints.read().decode(errors="replace").strip()
+        return f"{how}; it said:\n{said}" if said else how
+
+
+def check_installed() -> None:
+    """Raise :class:`MissingExtraError` here, where it is asked for, and not in a child."""
+    from importlib.util import find_spec
+
+    missing = [name for name in ("mcap", "foxglove_schemas_protobuf", "cv2") if find_spec(name) is None]
+    if missing:
+        raise MissingExtraError("recording", "record", cause=f"no {', '.join(missing)}")

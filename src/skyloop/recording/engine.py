@@ -1,0 +1,116 @@
+"""The recorder within a process: taps on drones, a backlog, and the thread that writes it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from skyloop.client import Drone
+from skyloop.errors import UsageError
+from skyloop.logfile.layout import ClockPair, DroneRecord, to_plain
+from skyloop.messages import Severity
+from skyloop.recording.backlog import Backlog
+from skyloop.recording.options import MB, Options
+from skyloop.recording.status import News, Status
+from skyloop.recording.taps import Tap
+from skyloop.recording.translation import Translator
+from skyloop.recording.writer import FileWriter
+
+
+class Engine:
+    """Records these drones from :meth:`start` to :meth:`stop`. ``hear`` gets the news, on the writing thread."""
+
+    def __init__(
+        self,
+        drones: Sequence[Drone],
+        path: Path,
+        options: Options,
+        hear: Callable[[News], None] = lambda _: None,
+        **writing: Any,
+    ) -> None:
+        """``writing`` replaces the disk, for tests. Raises :class:`UsageError`."""
+        names = [drone.name for drone in drones]
+        if len(set(names)) < len(names):
+            raise UsageError(f"the drones of one recording need different names, not {', '.join(names)}")
+        options.check_cameras(camera.name for drone in drones for camera in drone.capabilities.cameras)
+        self._hear = hear
+        self._backlog = Backlog(round(options.buffer_mb * MB))
+        self._taps = [Tap(number, drone, options, self._backlog) for number, drone in enumerate(drones)]
+        clock = ClockPair.now()
+        self._started_ns = clock.monotonic_ns
+        self._ended_ns: int | None = None
+        records = [
+            DroneRecord(drone.name, drone.uri, to_plain(drone.capabilities), drone.clock_offset_ns) for drone in drones
+        ]
+        translators = [
+            Translator(drone.name, drone.capabilities, clock, lambda drone=drone: drone.clock_offset_ns)  # type: ignore[misc]
+            for drone in drones
+        ]
+        self._writer = FileWriter(path, options, self._backlog, records, translators, clock, self._tell, **writing)
+        self._writer.dropped = lambda: self._counts(Tap.dropped)
+        self._writer.missed = lambda: self._counts(Tap.missed)
+        self._writer.each_second = self._tell_drops
+        self._told: dict[Tap, tuple[dict[str, int], dict[str, int]]] = {tap: ({}, {}) for tap in self._taps}
+
+    def start(self) -> None:
+        """Open the file and begin. Raises :class:`UsageError`."""
+        self._writer.start()
+        for tap in self._taps:
+            tap.start()
+
+    def stop(self, timeout_s: float = 10.0) -> None:
+        """Write what has come, and close the file. Idempotent."""
+        if self._ended_ns is not None:
+            return
+        self._ended_ns = time.monotonic_ns()
+        for tap in self._taps:
+            tap.stop()
+        self._writer.stop(timeout_s)
+
+    @property
+    def status(self) -> Status:
+        """How it goes now. Any thread."""
+        writer = self._writer
+        return Status(
+            writer.state,
+            writer.reason,
+            str(writer.path),
+            tuple(map(str, writer.files)),
+            ((self._ended_ns or time.monotonic_ns()) - self._started_ns) / 1e9,
+            writer.bytes,
+            writer.messages,
+            self._backlog.size,
+            self._counts(Tap.dropped),
+            self._counts(Tap.missed),
+        )
+
+    def _counts(self, of: Callable[[Tap], dict[str, int]]) -> dict[str, dict[str, int]]:
+        return {tap.drone.name: counts for tap in self._taps if (counts := of(tap))}
+
+    # On the writing thread -------------------------------------------------------------------------------------
+
+    def _tell(self, text: str, severity: Severity) -> None:
+        for tap in self._taps:
+            self._tell_one(tap, text, severity)
+        self._hear(News(text, severity))
+
+    def _tell_one(self, tap: Tap, text: str, severity: Severity) -> None:
+        """Into the file, and to everybody who listens to what is logged."""
+        tap.put_event(text, severity, {"state": self._writer.state.value, "path": str(self._writer.path)})
+        tap.drone.log.text(text, name="recording", severity=severity)
+
+    def _tell_drops(self) -> None:
+        for tap in self._taps:
+            now = (tap.dropped(), tap.missed())
+            before, self._told[tap] = self._told[tap], now
+            if now == before:
+                continue
+            tap.put_drops(*now)
+            if now[0] != before[0]:
+                more = {channel: count - before[0].get(channel, 0) for channel, count in now[0].items()}
+                words = ", ".join(f"{count} of {channel}" for channel, count in more.items() if count)
+                text = f"{tap.drone.name}: the recording leaves out {words}: the disk or the encoder is too slow"
+                self._tell_one(tap, text, Severity.WARNING)
+                self._hear(News(text, Severity.WARNING))

@@ -1,0 +1,234 @@
+"""Messages for viewers, in Foxglove's public protobuf schemas: pictures, calibration, poses, drawings, texts.
+
+Pure. Needs the extra ``record``. Times are Unix ns; frames are named as in :mod:`skyloop.logfile.layout`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+from skyloop.errors import MissingExtraError
+from skyloop.logfile.layout import WORLD, optical_frame
+from skyloop.messages import Annotation, CameraInfo, Feedback, Intrinsics, Points, Polyline, Severity
+from skyloop.messages.annotation import Colour, Point, Shape, Text
+
+try:
+    from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+    from foxglove_schemas_protobuf.Color_pb2 import Color
+    from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+    from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+    from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
+    from foxglove_schemas_protobuf.Log_pb2 import Log
+    from foxglove_schemas_protobuf.Point2_pb2 import Point2
+    from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
+    from foxglove_schemas_protobuf.Pose_pb2 import Pose
+    from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+    from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+    from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
+    from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
+    from google.protobuf.descriptor_pb2 import FileDescriptorSet
+    from google.protobuf.timestamp_pb2 import Timestamp
+except ImportError as error:
+    raise MissingExtraError("recording", "record", cause=str(error)) from None
+
+if TYPE_CHECKING:
+    from google.protobuf.message import Message
+
+__all__ = [
+    "CameraCalibration",
+    "CompressedImage",
+    "FrameTransform",
+    "ImageAnnotations",
+    "Log",
+    "PoseInFrame",
+    "PosesInFrame",
+]
+
+LINE_WIDTH: Final = 2.0  # pixels
+FONT_SIZE: Final = 14.0
+_LEVELS: Final = {Severity.INFO: Log.INFO, Severity.WARNING: Log.WARNING, Severity.ERROR: Log.ERROR}
+
+Vector = tuple[float, float, float]
+
+
+def schema(message: type[Message]) -> bytes:
+    """The file descriptor set of a message with all that it needs, as MCAP wants it."""
+    found = FileDescriptorSet()
+    seen: set[str] = set()
+
+    def add(file: Any) -> None:
+        if file.name not in seen:
+            seen.add(file.name)
+            for needed in file.dependencies:
+                add(needed)
+            file.CopyToProto(found.file.add())
+
+    add(message.DESCRIPTOR.file)
+    return found.SerializeToString()
+
+
+def timestamp(unix_ns: int) -> Timestamp:
+    seconds, nanos = divmod(unix_ns, 1_000_000_000)
+    return Timestamp(seconds=seconds, nanos=nanos)
+
+
+# Pictures ------------------------------------------------------------------------------------------------------
+
+
+def image(drone: str, camera: str, captured_ns: int, data: bytes, format_: str) -> bytes:
+    """A picture as a file of the format named (``jpeg``, ``png``)."""
+    message = CompressedImage(
+        timestamp=timestamp(captured_ns), frame_id=optical_frame(drone, camera), data=data, format=format_
+    )
+    return message.SerializeToString()
+
+
+def calibration(drone: str, camera: str, at_ns: int, width: int, height: int, intrinsics: Intrinsics) -> bytes:
+    """Intrinsics of pictures of this size."""
+    fx, fy, cx, cy = intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy
+    message = CameraCalibration(
+        timestamp=timestamp(at_ns),
+        frame_id=optical_frame(drone, camera),
+        width=width,
+        height=height,
+        distortion_model="kannala_brandt" if intrinsics.model == "fisheye" else "plumb_bob",
+        D=_coefficients(intrinsics),
+        K=(fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0),
+        R=(1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0),
+        P=(fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0),
+    )
+    return message.SerializeToString()
+
+
+def _coefficients(intrinsics: Intrinsics) -> Sequence[float]:
+    """As many as the viewers' model has: 4 for a fisheye, 5 for a pinhole."""
+    wanted = 4 if intrinsics.model == "fisheye" else 5
+    given = intrinsics.distortion
+    return given if len(given) > wanted else (*given, *[0.0] * (wanted - len(given)))
+
+
+# Places --------------------------------------------------------------------------------------------------------
+
+
+def pose(feedback: Feedback) -> Pose | None:
+    """Where it is in world axes; None while the attitude is not known.
+
+    Without a position it stands above the origin, at its altitude: attitude and height can be seen all the same.
+    """
+    if feedback.roll is None or feedback.pitch is None or feedback.yaw is None:
+        return None
+    x, y, z = feedback.position or (0.0, 0.0, feedback.altitude or 0.0)
+    return Pose(position=Vector3(x=x, y=y, z=z), orientation=quaternion(feedback.roll, feedback.pitch, feedback.yaw))
+
+
+def quaternion(roll: float, pitch: float, yaw: float) -> Quaternion:
+    """Of the rotation Rz(yaw) · Ry(pitch) · Rx(roll), angles in rad."""
+    cr, sr = math.cos(roll / 2), math.sin(roll / 2)
+    cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
+    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
+    return Quaternion(
+        x=cy * cp * sr - sy * sp * cr,
+        y=cy * sp * cr + sy * cp * sr,
+        z=sy * cp * cr - cy * sp * sr,
+        w=cy * cp * cr + sy * sp * sr,
+    )
+
+
+def pose_in_world(at_ns: int, place: Pose) -> bytes:
+    return PoseInFrame(timestamp=timestamp(at_ns), frame_id=WORLD, pose=place).SerializeToString()
+
+
+def path_in_world(at_ns: int, places: Iterable[Pose]) -> bytes:
+    return PosesInFrame(timestamp=timestamp(at_ns), frame_id=WORLD, poses=places).SerializeToString()
+
+
+def world_to_drone(drone: str, at_ns: int, place: Pose) -> bytes:
+    return _transform(WORLD, drone, at_ns, place.position, place.orientation)
+
+
+def drone_to_camera(drone: str, camera: CameraInfo, at_ns: int) -> bytes | None:
+    """Where a camera is mounted; None if that is not known."""
+    if camera.rotation is None:
+        return None
+    import numpy as np
+
+    from skyloop.messages.geometry import euler_from_rotation
+
+    x, y, z = camera.position or (0.0, 0.0, 0.0)
+    turned = quaternion(*euler_from_rotation(np.array(camera.rotation).reshape(3, 3)))
+    return _transform(drone, optical_frame(drone, camera.name), at_ns, Vector3(x=x, y=y, z=z), turned)
+
+
+def _transform(parent: str, child: str, at_ns: int, translation: Vector3, rotation: Quaternion) -> bytes:
+    return FrameTransform(
+        timestamp=timestamp(at_ns),
+        parent_frame_id=parent,
+        child_frame_id=child,
+        translation=translation,
+        rotation=rotation,
+    ).SerializeToString()
+
+
+# Drawings and texts --------------------------------------------------------------------------------------------
+
+
+def drawing(annotation: Annotation, captured_ns: int) -> bytes:
+    """What was drawn on a frame captured at this Unix time."""
+    message = ImageAnnotations()
+    at = timestamp(captured_ns)
+    for shape in annotation.shapes:
+        _draw(message, shape, at)
+    return message.SerializeToString()
+
+
+def _draw(message: ImageAnnotations, shape: Shape, at: Timestamp) -> None:
+    colour = _colour(shape.colour)
+    if isinstance(shape, Text):
+        message.texts.add(
+            timestamp=at, position=_point(shape.at), text=shape.text, font_size=FONT_SIZE, text_color=colour
+        )
+        return
+    kind = PointsAnnotation.POINTS
+    if isinstance(shape, Polyline):
+        kind = PointsAnnotation.LINE_LOOP if shape.closed else PointsAnnotation.LINE_STRIP
+    assert isinstance(shape, Polyline | Points)
+    message.points.add(
+        timestamp=at,
+        type=kind,
+        points=[_point(point) for point in shape.points],
+        outline_color=colour,
+        thickness=LINE_WIDTH,
+    )
+
+
+def _point(point: Point) -> Point2:
+    return Point2(x=point[0], y=point[1])
+
+
+def _colour(colour: Colour) -> Color:
+    red, green, blue = (channel / 255 for channel in colour)
+    return Color(r=red, g=green, b=blue, a=1.0)
+
+
+def log(drone: str, at_ns: int, severity: Severity, text: str, source: str) -> bytes:
+    """A line for people; ``source`` is what says it."""
+    message = Log(timestamp=timestamp(at_ns), level=_LEVELS[severity], message=text, name=drone, file=source)
+    return message.SerializeToString()
+
+
+# The way back --------------------------------------------------------------------------------------------------
+
+
+def read_image(data: bytes | memoryview) -> tuple[bytes, str]:
+    """A picture's bytes and their format, from the message on its topic."""
+    message = CompressedImage.FromString(bytes(data))
+    return message.data, message.format
+
+
+def read_pose(data: bytes) -> tuple[Vector, tuple[float, float, float, float]]:
+    """Position [m] and quaternion (x, y, z, w) of a pose in the world."""
+    place: Any = PoseInFrame.FromString(data).pose
+    at, turned = place.position, place.orientation
+    return (at.x, at.y, at.z), (turned.x, turned.y, turned.z, turned.w)

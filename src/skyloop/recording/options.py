@@ -1,0 +1,107 @@
+"""What to record and how, checked before anything is opened; and which file comes next."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Final, Literal
+
+import msgspec
+
+from skyloop.errors import UnknownNameError, UsageError
+from skyloop.logfile.layout import Channel
+
+Lossy = Literal["jpeg", "png"]
+
+MB: Final = 1_000_000
+VIDEO: Final = "video"
+#: What can be chosen; ``video.CAMERA`` is one camera.
+CHOICES: Final = (*(one.value for one in Channel if one not in (Channel.FRAMES, Channel.DROPS)), VIDEO)
+
+
+class Options(msgspec.Struct, frozen=True):
+    """How to record; see :func:`skyloop.record` for what each means. Raises :class:`UsageError`."""
+
+    channels: tuple[str, ...] = CHOICES
+    encoding: Lossy = "jpeg"
+    quality: int = 90
+    rotate_mb: float | None = None
+    rotate_s: float | None = None
+    min_free_mb: float = 256.0
+    buffer_mb: float = 64.0
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        if self.encoding not in ("jpeg", "png"):
+            raise UsageError(f'encoding is {self.encoding!r} and must be "jpeg" or, without any loss, "png"')
+        if not isinstance(self.quality, int) or not 1 <= self.quality <= 100:
+            raise UsageError(f"quality is {self.quality!r} and must be a whole number from 1 to 100 (best)")
+        for name, least in (("rotate_mb", 1.0), ("rotate_s", 1.0), ("min_free_mb", 0.0), ("buffer_mb", 1.0)):
+            value = getattr(self, name)
+            if value is None and name.startswith("rotate"):
+                continue
+            if not isinstance(value, int | float) or not least <= value < math.inf:
+                raise UsageError(f"{name} is {value!r} and must be a number of at least {least:g}")
+
+    @property
+    def rotates(self) -> bool:
+        return self.rotate_mb is not None or self.rotate_s is not None
+
+    def wants(self, channel: Channel) -> bool:
+        """Whether one of the channels that have no camera is recorded."""
+        return channel.value in self.channels
+
+    def wants_camera(self, camera: str) -> bool:
+        return VIDEO in self.channels or f"{VIDEO}.{camera}" in self.channels
+
+    def check_cameras(self, known: Iterable[str]) -> None:
+        """Raises :class:`UnknownNameError` for a camera that no drone has."""
+        cameras = set(known)
+        for name in self.channels:
+            kind, dot, camera = name.partition(".")
+            if kind == VIDEO and dot and camera not in cameras:
+                raise UnknownNameError("camera", camera, cameras)
+
+
+def channels_of(names: Iterable[str] | None) -> tuple[str, ...]:
+    """Channels as the caller named them, as :data:`CHOICES`; ``command`` means ``commands``. None: all.
+
+    Raises :class:`UnknownNameError`, :class:`UsageError` for none at all.
+    """
+    if names is None:
+        return CHOICES
+    if isinstance(names, str):
+        names = (names,)
+    found = []
+    for name in names:
+        plural = f"{name}s"
+        if name in CHOICES or (name.startswith(f"{VIDEO}.") and len(name) > len(VIDEO) + 1):
+            found.append(name)
+        elif plural in CHOICES:
+            found.append(plural)
+        else:
+            raise UnknownNameError("channel to record", str(name), (*CHOICES, f"{VIDEO}.CAMERA"))
+    if not found:
+        raise UsageError(f"no channel to record: choose from {', '.join(CHOICES)}")
+    return tuple(found)
+
+
+def numbered(path: Path, number: int) -> Path:
+    """The file with this number of a recording: ``flight-0002.mcap``."""
+    return path.with_name(f"{path.stem}-{number:04d}{path.suffix}")
+
+
+def first_path(path: Path, drones: list[str], options: Options) -> Path:
+    """Where to record to; in a folder, a file named by drones and time. Raises :class:`UsageError`."""
+    if path.is_dir():
+        path = path / f"{'-'.join(drones)[:64].replace('/', '_')}-{time.strftime('%Y%m%d-%H%M%S')}.mcap"
+    if not path.suffix:
+        path = path.with_suffix(".mcap")
+    if not path.parent.is_dir():
+        raise UsageError(f"{path.parent} is no folder: make it first")
+    first = numbered(path, 1) if options.rotates else path
+    if first.exists() and not options.overwrite:
+        raise UsageError(f"{first} exists already: choose another name, or allow it to be overwritten")
+    return path

@@ -1,0 +1,175 @@
+"""One MCAP file of a recording. What was committed stays readable, whatever happens to what comes after it."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any, Final, Protocol, cast
+
+import msgspec
+
+from skyloop.errors import MissingExtraError
+from skyloop.logfile import layout
+from skyloop.logfile.layout import META_CLOCK, META_END, META_RECORDING, PROFILE, ClockPair, End, Start, to_metadata
+from skyloop.recording.options import MB
+
+if TYPE_CHECKING:
+    from google.protobuf.message import Message as Protobuf
+
+CHUNK: Final = MB  #: bytes after which a chunk is closed, if it is not by :meth:`RecordingFile.commit`
+
+
+class Target(Protocol):
+    """An unbuffered file opened for writing."""
+
+    def write(self, data: Any, /) -> int | None: ...
+    def truncate(self, size: int | None = None, /) -> int: ...
+    def fileno(self) -> int: ...
+    def close(self) -> None: ...
+
+
+Opener = Callable[[Path, bool], Target]
+
+
+def open_target(path: Path, overwrite: bool) -> Target:
+    """Raises ``OSError``."""
+    return cast(Target, path.open("wb" if overwrite else "xb", buffering=0))
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One message of the file. ``kind`` is the class of one of our samples, or a protobuf class."""
+
+    topic: str
+    kind: type[msgspec.Struct] | type[Protobuf]
+    data: bytes
+    log_ns: int  #: Unix time
+    publish_ns: int
+    sequence: int = 0
+
+
+class Output:
+    """What the MCAP writer writes to: nothing reaches the file before :meth:`flush`, and then all of it or nothing."""
+
+    def __init__(self, target: Target) -> None:
+        self.committed = 0  #: bytes that are in the file, up to the end of a record
+        self.waiting = 0  #: bytes that are not
+        self._target = target
+        self._pieces: list[bytes] = []
+
+    def write(self, data: bytes) -> int:
+        self._pieces.append(data)
+        self.waiting += len(data)
+        return len(data)
+
+    def tell(self) -> int:
+        return self.committed + self.waiting
+
+    def flush(self) -> None:
+        """Raises ``OSError``; the file then ends where it ended before."""
+        try:
+            for piece in self._pieces:
+                rest = memoryview(piece)
+                while rest:
+                    rest = rest[self._target.write(rest) or 0 :]
+        except OSError:
+            self._target.truncate(self.committed)
+            raise
+        else:
+            self.committed += self.waiting
+        finally:
+            self.waiting = 0
+            self._pieces.clear()
+
+
+class RecordingFile:
+    """What is written is in the file after :meth:`commit`.
+
+    Every method raises ``OSError`` when the disk does; then only :meth:`abandon` is of use.
+    """
+
+    def __init__(
+        self, path: Path, start: Start, clock: ClockPair, *, overwrite: bool = False, opener: Opener = open_target
+    ) -> None:
+        try:
+            from mcap.writer import CompressionType, Writer
+        except ImportError as error:
+            raise MissingExtraError("recording", "record", cause=str(error)) from None
+        self.path = path
+        self.written: Counter[str] = Counter()
+        self.count = 0  #: messages
+        self._target = opener(path, overwrite)
+        self._output = Output(self._target)
+        self._writer = Writer(cast(IO[Any], self._output), chunk_size=CHUNK, compression=CompressionType.LZ4)
+        self._schemas: dict[type, int] = {}
+        self._channels: dict[str, int] = {}
+        try:
+            self._writer.start(PROFILE, f"skyloop {start.skyloop}")
+            self._writer.add_metadata(META_CLOCK, to_metadata(clock))
+            self._writer.add_metadata(META_RECORDING, to_metadata(start))
+            self._output.flush()
+        except OSError:
+            self.abandon()
+            raise
+
+    @property
+    def size(self) -> int:
+        """Bytes, those that are on the way included."""
+        return self._output.tell()
+
+    @property
+    def lost(self) -> bool:
+        """Whether it was deleted: what is written goes nowhere. (One that was moved is still written.)"""
+        try:
+            return os.fstat(self._target.fileno()).st_nlink == 0
+        except OSError:
+            return True
+
+    def write(self, message: Message) -> None:
+        channel = self._channels.get(message.topic)
+        if channel is None:
+            channel = self._add_channel(message)
+        self._writer.add_message(channel, message.log_ns, message.data, message.publish_ns, message.sequence)
+        self.written[message.topic] += 1
+        self.count += 1
+
+    def commit(self) -> None:
+        """Close the chunk and put everything into the file."""
+        self._writer.flush()  # type: ignore[no-untyped-call]
+
+    def close(self, end: End) -> None:
+        """Write the summary and close."""
+        try:
+            self._writer.flush()  # type: ignore[no-untyped-call]
+            self._writer.add_metadata(META_END, to_metadata(end))
+            self._writer.finish()  # type: ignore[no-untyped-call]
+            self._output.flush()
+        finally:
+            self._target.close()
+
+    def abandon(self) -> None:
+        """Leave it as it is: readable up to what was committed, without a summary. An empty one is removed."""
+        self._target.close()
+        if not self._output.committed:
+            self.path.unlink(missing_ok=True)
+
+    def _add_channel(self, message: Message) -> int:
+        kind = message.kind
+        schema = self._schemas.get(kind)
+        if schema is None:
+            schema = self._schemas[kind] = self._add_schema(kind)
+        encoding = layout.JSON if issubclass(kind, msgspec.Struct) else layout.PROTOBUF
+        channel = self._channels[message.topic] = self._writer.register_channel(message.topic, encoding, schema)
+        return channel
+
+    def _add_schema(self, kind: type[Any]) -> int:
+        if issubclass(kind, msgspec.Struct):
+            name, encoding, data = layout.schema_name(kind), layout.JSON_SCHEMA, layout.schema(kind)
+        else:
+            from skyloop.recording import foxglove
+
+            name, encoding, data = kind.DESCRIPTOR.full_name, layout.PROTOBUF, foxglove.schema(kind)
+        return int(self._writer.register_schema(name, encoding, data))

@@ -1,0 +1,171 @@
+"""``skyloop.record``: a recorder for drones that are connected, or that are named."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Protocol, Self
+
+from skyloop.client import Drone, connect
+from skyloop.errors import UsageError
+from skyloop.messages import EventKind
+from skyloop.recording.child import Order, RecorderProcess, check_installed
+from skyloop.recording.engine import Engine
+from skyloop.recording.options import Lossy, Options, channels_of, first_path
+from skyloop.recording.status import News, RecorderState, Status
+
+
+class Backend(Protocol):
+    """Who records: a process, or threads of this one."""
+
+    @property
+    def status(self) -> Status: ...
+    def start(self) -> None: ...
+    def stop(self) -> None: ...
+
+
+class Recorder:
+    """A recording that goes on until :meth:`close`, or the end of its block. Any thread."""
+
+    def __init__(self, drones: Sequence[Drone | str], path: Path, options: Options, in_process: bool) -> None:
+        """What :func:`record` calls."""
+        self._listening = [drone for drone in drones if isinstance(drone, Drone)]
+        self._own: list[Drone] = []  # connected by this recorder
+        self._backend: Backend
+        if in_process:
+            self._backend = self._within(drones, path, options)
+        else:
+            targets = tuple(drone if isinstance(drone, str) else str(drone.reach) for drone in drones)
+            self._backend = RecorderProcess(Order(targets, str(path.absolute()), options), self._hear)
+
+    def _within(self, drones: Sequence[Drone | str], path: Path, options: Options) -> Engine:
+        try:
+            known = []
+            for drone in drones:
+                if isinstance(drone, str):
+                    drone = connect(drone, access="observe", name="recorder")
+                    self._own.append(drone)
+                known.append(drone)
+            engine = Engine(known, path, options, self._hear)
+            engine.start()
+        except BaseException:
+            self._close_own()
+            raise
+        return engine
+
+    @property
+    def status(self) -> Status:
+        """All that is known now; some parts have names of their own here."""
+        return self._backend.status
+
+    @property
+    def state(self) -> RecorderState:
+        return self.status.state
+
+    @property
+    def reason(self) -> str:
+        """Why it is paused or has failed."""
+        return self.status.reason
+
+    @property
+    def path(self) -> Path:
+        """The file being written, or written last."""
+        return Path(self.status.path)
+
+    @property
+    def files(self) -> list[Path]:
+        """All files of this recording, oldest first."""
+        return [Path(file) for file in self.status.files]
+
+    @property
+    def seconds(self) -> float:
+        return self.status.seconds
+
+    @property
+    def bytes(self) -> int:
+        """Written so far, in all files."""
+        return self.status.bytes
+
+    @property
+    def dropped(self) -> dict[str, dict[str, int]]:
+        """By drone and channel: how many samples were received and left out."""
+        return self.status.dropped
+
+    @property
+    def missed(self) -> dict[str, dict[str, int]]:
+        """By drone and channel: how many samples never reached the recorder."""
+        return self.status.missed
+
+    def close(self) -> None:
+        """Write what has come and close the file. Idempotent."""
+        self._backend.stop()
+        self._close_own()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return f"<Recorder {self.path} ({self.state.value}, {self.seconds:.0f} s, {self.bytes / 1e6:.1f} MB)>"
+
+    def _hear(self, news: News) -> None:
+        for drone in self._listening:
+            drone.tell(EventKind.RECORDING, news.text, news.severity)
+
+    def _close_own(self) -> None:
+        for drone in self._own:
+            drone.close()
+
+
+def record(
+    drones: Drone | str | Iterable[Drone | str],
+    path: str | Path,
+    *,
+    channels: Iterable[str] | None = None,
+    encoding: Lossy = "jpeg",
+    quality: int = 90,
+    rotate_mb: float | None = None,
+    rotate_s: float | None = None,
+    min_free_mb: float = 256.0,
+    buffer_mb: float = 64.0,
+    overwrite: bool = False,
+    in_process: bool | None = None,
+) -> Recorder:
+    """Record one drone or several to an MCAP file; returns when it records. Use it as a context manager.
+
+    ``drones``: connected ones, or names of running proxies. ``path``: a file, or a folder in which a name is chosen.
+    ``channels``: which ones (default: all), of ``commands``, ``feedback``, ``events``, ``parameters``, ``annotations``,
+    ``logs``, ``video`` and ``video.CAMERA``. ``encoding``: of frames that come raw, ``"jpeg"`` with a ``quality`` from
+    1 to 100, or ``"png"`` without any loss; frames that come as JPEG are kept as such. ``rotate_mb``, ``rotate_s``:
+    begin a new file after so much or so long (``flight-0001.mcap``, …), each complete in itself. ``min_free_mb``: room
+    to leave on the disk: below it frames are not recorded, below a quarter of it nothing. ``buffer_mb``: how much may
+    wait for a slow disk before frames are dropped. ``overwrite``: an existing file. ``in_process``: record on threads
+    of this process and not in one of its own (default: only if the drone can't be reached from another process).
+
+    Raises :class:`UsageError`, :class:`UnknownNameError`, :class:`LinkError`, :class:`MissingExtraError`.
+    """
+    several = [drones] if not isinstance(drones, Iterable) or isinstance(drones, str) else list(drones)
+    if not several or not all(isinstance(drone, Drone | str) for drone in several):
+        raise UsageError(f"drones is {drones!r:.80} and must be a drone, a proxy's name, or several of them")
+    check_installed()
+    options = Options(
+        channels=channels_of(channels),
+        encoding=encoding,
+        quality=quality,
+        rotate_mb=rotate_mb,
+        rotate_s=rotate_s,
+        min_free_mb=min_free_mb,
+        buffer_mb=buffer_mb,
+        overwrite=overwrite,
+    )
+    names = [drone if isinstance(drone, str) else drone.name for drone in several]
+    alone = [drone.name for drone in several if isinstance(drone, Drone) and drone.reach is None]
+    if in_process is False and alone:
+        raise UsageError(f"{alone[0]} can't be reached from another process: record it in this one")
+    where = first_path(Path(path), names, options)
+    return Recorder(several, where, options, bool(alone) if in_process is None else in_process)

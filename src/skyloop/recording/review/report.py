@@ -1,0 +1,272 @@
+"""The report of a flight: one page with its path, its course over time, its key frames and its events."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from html import escape
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from skyloop.clock import NS_PER_S
+from skyloop.logfile.layout import Channel
+from skyloop.logfile.reader import Progress, Recording
+from skyloop.messages import FlightState
+from skyloop.recording.review import flight
+from skyloop.recording.review.keyframes import figures
+from skyloop.recording.review.page import Page, facts, table
+from skyloop.recording.review.summary import Summary, summarise
+from skyloop.recording.review.svg import Floats, Line, TimeAxis, band_chart, limits, map_chart
+from skyloop.recording.review.tables import Table, tables
+
+_TABLES: Final = (Channel.FEEDBACK, Channel.COMMANDS, Channel.EVENTS, Channel.FRAMES, Channel.LOGS)
+_STATES: Final = {
+    FlightState.LANDED.value: "landed",
+    FlightState.TAKING_OFF.value: "rising",
+    FlightState.LANDING.value: "falling",
+    FlightState.EMERGENCY.value: "alarm",
+    FlightState.UNKNOWN.value: "calm",
+    "*": "flying",
+}
+_FAILSAFES: Final = {"none": "", "*": "alarm"}
+_LINKS: Final = {"up": "", "closed": "calm", "*": "alarm"}
+_COMMANDS: Final = {"idle": "", "emergency_stop": "alarm", "takeoff": "rising", "land": "falling", "*": "flying"}
+_COLOURS: Final = ("c1", "c2", "c3", "c4", "c5", "c6")
+_MOST_EVENTS: Final = 500
+_SAME_CLOCK_S: Final = 60.0  #: a delay of more than this is none: two clocks that have nothing to do with each other
+
+
+def write_report(
+    recording: Recording, drone: str, path: Path, *, pictures: int = 8, progress: Progress | None = None
+) -> None:
+    """Write the page. Reads the recording three times. Raises :class:`UsageError` where it can't be written."""
+    tell = progress or (lambda _: None)
+    summary = summarise(recording, lambda share: tell(share / 3))
+    found = tables(recording, drone, _TABLES, lambda share: tell((1 + share) / 3))
+    page = make_page(recording, drone, found, summary)
+    _frames(page, recording, drone, found, pictures, lambda share: tell((2 + share) / 3))
+    _events(page, found.get("events"))
+    _channels(page, summary)
+    page.add(
+        f"<footer>{escape(recording.path.name)}, recorded by Skyloop {escape(recording.start.skyloop)}. Times are "
+    )
+    page.add("seconds since the first sample, by the clock of the drone's proxy.</footer>")
+    page.write(path)
+
+
+def make_page(recording: Recording, drone: str, found: dict[str, Table], summary: Summary) -> Page:
+    """The head, the path and the course over time."""
+    ends = [float(one.numbers("t_s")[-1]) for one in found.values() if len(one)]
+    axis = TimeAxis(0.0, max([*ends, 0.1]))
+    page = Page(f"{drone}: flight report", axis)
+    feedback, commands = found.get("feedback"), found.get("commands")
+    way = None if feedback is None else flight.way(feedback)
+    _head(page, recording, drone, summary)
+    frames = sum(len(one) for name, one in found.items() if name.startswith("frames."))
+    page.add(facts(flight.facts(feedback, commands, way, frames, axis.end_s)))
+    for note in (*summary.notes, *_losses(summary, drone)):
+        page.add(f'<p class="note">{escape(note)}</p>')
+    if feedback is None:
+        page.add('<p class="note">no feedback was recorded: there is no course to draw</p>')
+    elif way is not None:
+        _path(page, feedback, way)
+    page.add('<h2>Course <i class="sub now"></i></h2>')
+    page.add(f'<section class="panel">{_bands(found, axis)}</section>')
+    for title, unit, lines, least, zero in _charts(recording, drone, found):
+        page.chart(title, unit, lines, limits(lines, least_span=least, zero=zero))
+    return page
+
+
+def _head(page: Page, recording: Recording, drone: str, summary: Summary) -> None:
+    known = recording.drone(drone)
+    began = time.strftime("%d %B %Y, %H:%M:%S", time.localtime(recording.start.started_unix_ns / NS_PER_S))
+    what = known.described
+    page.add(f"<h1>{escape(drone)}</h1>")
+    page.add(
+        f'<p class="sub">{escape(began)} · {escape(what.description or what.vehicle)} · '
+        f"<code>{escape(known.uri)}</code> · {summary.seconds:.1f} s</p>"
+    )
+
+
+def _losses(summary: Summary, drone: str) -> Iterator[str]:
+    for what, counts in (("left out by the recorder", summary.dropped), ("never reached it", summary.missed)):
+        words = ", ".join(f"{count} of {channel}" for channel, count in counts.get(drone, {}).items() if count)
+        if words:
+            yield f"{words} {what}"
+
+
+def _path(page: Page, feedback: Table, way: flight.Way) -> None:
+    page.way(way)
+    t_s = feedback.numbers("t_s")
+    high = Line("altitude", t_s, feedback.numbers("altitude"))
+    page.add(
+        '<h2>Path</h2><div class="pair"><section class="panel"><header><h3>From above<i>m, x east, y north</i></h3>'
+    )
+    page.add(f'<span class="sub">{escape(way.source)}; from blue to orange</span></header>')
+    page.add(map_chart("path", way.x, way.y, way.t_s) + "</section>")
+    page.add('<section class="panel"><header><h3>From the side<i>m, height over x</i></h3></header>')
+    page.add(map_chart("side", way.x, high.values, t_s) if feedback.known("altitude") else "<p>not known</p>")
+    page.add("</section></div>")
+
+
+def _bands(found: dict[str, Table], axis: TimeAxis) -> str:
+    rows = []
+    feedback, commands = found.get("feedback"), found.get("commands")
+    if feedback is not None:
+        t_s = feedback.numbers("t_s")
+        for title, column, styles in (
+            ("state", "state", _STATES),
+            ("pilot", "owner", {"*": "calm"}),
+            ("failsafe", "failsafe", _FAILSAFES),
+            ("link", "vehicle_link", _LINKS),
+        ):
+            rows.append((title, flight.spans(t_s, feedback[column].astype(np.str_), styles, axis.end_s)))
+    if commands is not None:
+        asked = np.where(commands["app_id"] > 0, commands["asked"], "")
+        rows.append(("asked for", flight.spans(commands.numbers("t_s"), asked, _COMMANDS, axis.end_s)))
+    return band_chart(
+        "bands", [(title, spans) for title, spans in rows if spans], flight.marks(found.get("events")), axis
+    )
+
+
+def _charts(
+    recording: Recording, drone: str, found: dict[str, Table]
+) -> Iterator[tuple[str, str, list[Line], float, bool]]:
+    """Title, unit, lines, least span of the vertical axis, and whether it begins at zero."""
+    feedback, commands = found.get("feedback"), found.get("commands")
+    if feedback is not None:
+        t_s = feedback.numbers("t_s")
+        if feedback.known("altitude"):
+            yield "Altitude", "m", [Line("altitude", t_s, feedback.numbers("altitude"))], 1.0, True
+        attitude = [
+            Line(name, t_s, np.degrees(feedback.numbers(name)), style)
+            for name, style in (("roll", "c1"), ("pitch", "c2"))
+            if feedback.known(name)
+        ]
+        attitude += _set_points(commands, ("roll", "c1"), ("pitch", "c2"), degrees=True)
+        if attitude:
+            yield "Roll and pitch", "°, right side and nose down are positive", attitude, 6.0, False
+        if feedback.known("yaw"):
+            yield "Yaw", "°, counter-clockwise", [Line("yaw", t_s, _turned(feedback.numbers("yaw")))], 20.0, False
+        names = (("forward", "c1"), ("left", "c2"), ("up", "c3"))
+        velocity = [
+            Line(name, t_s, feedback.numbers(f"velocity_{name}"), style)
+            for name, style in names
+            if feedback.known(f"velocity_{name}")
+        ]
+        velocity += _set_points(commands, *names, ("climb", "c3"))
+        if velocity:
+            yield "Velocity", "m/s, in the body's levelled axes", velocity, 0.5, False
+        if feedback.known("battery"):
+            yield "Battery", "%", [Line("charge", t_s, 100.0 * feedback.numbers("battery"), "c5")], 100.0, True
+    delays = list(_delays(recording, drone, found))
+    if delays:
+        yield "Delays", "ms, up to their 99.5th percentile", delays, 1.0, True
+    logged = list(_logged(found.get("logs")))
+    if logged:
+        yield "Logged by applications", "", logged, 1.0, False
+
+
+def _set_points(commands: Table | None, *names: tuple[str, str], degrees: bool = False) -> list[Line]:
+    """What was applied, where a set-point has such a number."""
+    if commands is None:
+        return []
+    found = []
+    for name, style in names:
+        values = commands.numbers(f"applied_{name}")
+        if np.isfinite(values).any():
+            shown = np.degrees(values) if degrees else values
+            found.append(Line(f"{name} set", commands.numbers("t_s"), shown, style, dashed=True, steps=True))
+    return found
+
+
+def _turned(yaw: Floats) -> Floats:
+    """In degrees, with a gap where it goes from one end of its range to the other."""
+    degrees = np.degrees(yaw)
+    jumps = np.abs(np.diff(degrees, prepend=degrees[:1])) > 180.0
+    return np.where(jumps, np.nan, degrees)
+
+
+def _delays(recording: Recording, drone: str, found: dict[str, Table]) -> Iterator[Line]:
+    """From the capture to the recorder, and of commands from being sent to being applied [ms]."""
+    offset_ns = recording.drone(drone).clock_offset_ns
+    colours = iter(_COLOURS)
+    for name, samples in found.items():
+        if name == "commands":
+            pilots = samples["app_id"] > 0
+            late = (samples["applied_ns"] - samples["sent_ns"])[pilots] / 1e6
+            yield _clipped(Line("command to the vehicle", samples.numbers("t_s")[pilots], late, next(colours)))
+        elif name == "feedback" or name.startswith("frames."):
+            received = recording.clock.monotonic(0, offset_ns) + samples["received_unix_ns"].astype(np.int64)
+            late = (received - samples["captured_ns"]) / 1e6
+            if np.abs(np.median(late)) < _SAME_CLOCK_S * 1e3:
+                title = "age of feedback" if name == "feedback" else f"age of {name.partition('.')[2]} frames"
+                yield _clipped(Line(title, samples.numbers("t_s"), late, next(colours)))
+
+
+def _clipped(line: Line) -> Line:
+    """One late sample must not flatten all others."""
+    if not len(line.values):
+        return line
+    return Line(line.label, line.t_s, np.minimum(line.values, np.percentile(line.values, 99.5) * 1.05), line.style)
+
+
+def _logged(logs: Table | None) -> Iterator[Line]:
+    """The series of numbers that have a name, at most six."""
+    if logs is None or "number" not in logs.columns:
+        return
+    numbers = logs.numbers("number")
+    names = [str(name) for name in dict.fromkeys(logs["name"][np.isfinite(numbers)].tolist())]
+    for name, style in zip(names, _COLOURS, strict=False):
+        chosen = (logs["name"] == name) & np.isfinite(numbers)
+        yield Line(name, logs.numbers("t_s")[chosen], numbers[chosen], style)
+
+
+def _frames(
+    page: Page, recording: Recording, drone: str, found: dict[str, Table], most: int, progress: Progress
+) -> None:
+    events = found.get("events")
+    cameras = recording.cameras(drone)
+    for number, camera in enumerate(cameras):
+        frames = found.get(f"frames.{camera}")
+        shown = figures(recording, drone, camera, frames, events, most) if most and frames is not None else []
+        if shown:
+            page.add(f'<h2>Key frames of {escape(camera)}</h2><div class="frames">{"".join(shown)}</div>')
+        progress((number + 1) / len(cameras))
+
+
+def _events(page: Page, events: Table | None) -> None:
+    if events is None or not len(events):
+        return
+    columns = (events.numbers("t_s"), events["kind"], events["text"], events["app"], events["severity"])
+    rows = [
+        [f"{t:.2f}", escape(str(kind).replace("_", " ")), escape(str(app)), _severe(str(severity), str(text))]
+        for t, kind, text, app, severity in list(zip(*columns, strict=True))[:_MOST_EVENTS]
+    ]
+    more = len(events) - _MOST_EVENTS
+    page.add("<h2>Events</h2>" + table(("time [s]", "kind", "application", "what"), rows, ("n", "", "", "")))
+    if more > 0:
+        page.add(f'<p class="sub">and {more} more</p>')
+
+
+def _severe(severity: str, text: str) -> str:
+    return f'<span class="dot {escape(severity)}"></span>{escape(text)}'
+
+
+def _channels(page: Page, summary: Summary) -> None:
+    rows = [
+        [
+            f"<code>{escape(row.topic)}</code>",
+            str(row.count),
+            f"{row.rate_hz:.1f}" if row.rate_hz is not None and row.steady else "",
+            str(row.gaps) if row.gaps else "",
+            str(row.missing) if row.missing else "",
+            f"{row.bytes / 1e6:.2f}",
+            "<br>".join(f"{one.median_s * 1e3:.2f} ({one.p99_s * 1e3:.2f}) {escape(one.what)}" for one in row.delays),
+        ]
+        for row in summary.rows
+    ]
+    head = ("channel", "count", "rate [Hz]", "gaps", "missing", "size [MB]", "delay [ms]: median (p99)")
+    page.add("<h2>Channels</h2>" + table(head, rows, ("", "n", "n", "n", "n", "n", "")))

@@ -1,0 +1,160 @@
+"""What stands in the table of ``skyloop log info``: counts, rates, gaps, drops and delays by channel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+
+from skyloop.clock import NS_PER_S
+from skyloop.logfile.layout import Channel, Drops, FrameRecord
+from skyloop.logfile.reader import Progress, Recording
+from skyloop.messages import Applied, Event, Feedback
+
+GAP_FACTOR: Final = 3.0  #: a step between two messages of so many usual ones is a gap
+MIN_STEPS: Final = 5  #: with fewer, what is usual is not known
+
+
+@dataclass(frozen=True, slots=True)
+class Delay:
+    """From one time to another [s]."""
+
+    what: str  #: from what to what
+    median_s: float
+    p99_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One channel."""
+
+    topic: str
+    schema: str
+    count: int
+    rate_hz: float | None  #: None for a single message, or for several at one time
+    gaps: int  #: steps of more than three usual ones; of steady channels only
+    longest_s: float | None  #: longest step between two messages [s]
+    missing: int  #: by the gaps in the samples' own numbers
+    bytes: int
+    steady: bool  #: whether it comes at a pace of its own, so that rate and gaps say something
+    delays: tuple[Delay, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """A recording at a glance."""
+
+    rows: tuple[Row, ...]
+    seconds: float
+    dropped: dict[str, dict[str, int]]  #: by drone and channel: left out by the recorder
+    missed: dict[str, dict[str, int]]  #: by drone and channel: never reached it
+    events: dict[str, int]  #: how many of each severity
+    notes: tuple[str, ...] = ()  #: what is wrong with the file, in words
+
+
+@dataclass(slots=True)
+class _Tally:
+    """What is gathered of one channel."""
+
+    bytes: int = 0
+    times: list[int] = field(default_factory=list)
+    numbers: list[int] = field(default_factory=list)
+    delays: dict[str, list[int]] = field(default_factory=dict)
+
+    def delay(self, what: str, ns: int) -> None:
+        self.delays.setdefault(what, []).append(ns)
+
+
+#: Channels that come at a steady pace.
+_STEADY: Final = frozenset({Channel.FEEDBACK, Channel.COMMANDS, Channel.FRAMES})
+
+
+def summarise(recording: Recording, progress: Progress | None = None) -> Summary:
+    """Read all of it once."""
+    series = {one.topic: one for one in recording.series}
+    tallies: dict[str, _Tally] = {topic: _Tally() for topic in series}
+    severities: dict[str, int] = {}
+    drops: dict[str, Drops] = {}
+    offsets = {drone.name: drone.clock_offset_ns for drone in recording.drones}
+    for entry in recording.entries(progress=progress):
+        tally = tallies.setdefault(entry.topic, _Tally())
+        tally.bytes += len(entry.data)
+        tally.times.append(entry.log_ns)
+        own = series[entry.topic].own if entry.topic in series else None
+        if own is None:
+            continue
+        value = recording.decoded(entry, own.channel)
+        if isinstance(value, Drops):
+            drops[own.drone] = value
+        elif isinstance(value, Event):
+            severities[value.severity.value] = severities.get(value.severity.value, 0) + 1
+        if value is not None:
+            received_ns = recording.clock.monotonic(entry.log_ns, offsets.get(own.drone, 0))
+            _measure(tally, value, received_ns)
+    end = recording.end
+    return Summary(
+        rows=tuple(_row(topic, tallies[topic], series) for topic in sorted(tallies)),
+        seconds=recording.seconds,
+        dropped=end.dropped if end else {name: known.dropped for name, known in drops.items() if known.dropped},
+        missed=end.missed if end else {name: known.missed for name, known in drops.items() if known.missed},
+        events=severities,
+        notes=tuple(notes(recording)),
+    )
+
+
+def notes(recording: Recording) -> list[str]:
+    """What is wrong with the file, in words."""
+    found = []
+    if recording.cut:
+        found.append(f"cut off: {recording.cut} (skyloop log recover mends it)")
+    elif recording.end is None:
+        found.append("mended, or never closed: what the recorder had not written yet when it was stopped is missing")
+    return [*found, *recording.damaged]
+
+
+def _measure(tally: _Tally, value: Any, received_ns: int) -> None:
+    """Numbers and delays of one sample; ``received_ns`` on the proxy's clock."""
+    if isinstance(value, Feedback):
+        tally.numbers.append(value.seq)
+        tally.delay("capture to proxy", value.published_ns - value.captured_ns)
+        tally.delay("proxy to recorder", received_ns - value.published_ns)
+    elif isinstance(value, FrameRecord):
+        tally.numbers.append(value.header.seq)
+        tally.delay("capture to proxy", value.header.published_ns - value.header.captured_ns)
+        tally.delay("proxy to recorder", received_ns - value.header.published_ns)
+    elif isinstance(value, Applied) and value.app_id:
+        tally.delay("sent to vehicle", value.applied_ns - value.sent_ns)
+    elif isinstance(value, Event) and value.seq:
+        tally.numbers.append(value.seq)
+
+
+def _row(topic: str, tally: _Tally, series: dict[str, Any]) -> Row:
+    times = np.sort(np.array(tally.times, np.int64))
+    steps = np.diff(times) / NS_PER_S
+    known = series.get(topic)
+    steady = known is not None and known.own is not None and known.own.channel in _STEADY
+    usual = float(np.median(steps)) if len(steps) >= MIN_STEPS else 0.0
+    gaps = int((steps > GAP_FACTOR * usual).sum()) if steady and usual > 0 else 0
+    span = float(steps.sum())
+    return Row(
+        topic=topic,
+        schema=known.schema if known is not None else "",
+        count=len(times),
+        rate_hz=len(steps) / span if span > 0 else None,
+        gaps=gaps,
+        longest_s=float(steps.max()) if len(steps) else None,
+        missing=_missing(tally.numbers),
+        bytes=tally.bytes,
+        steady=steady,
+        delays=tuple(
+            Delay(what, float(np.median(ns)) / NS_PER_S, float(np.percentile(ns, 99)) / NS_PER_S)
+            for what, ns in tally.delays.items()
+        ),
+    )
+
+
+def _missing(numbers: list[int]) -> int:
+    """By the gaps in numbers that grow by one; one that is not higher begins anew."""
+    steps = np.diff(np.array(numbers, np.int64))
+    return int((steps[steps > 1] - 1).sum())

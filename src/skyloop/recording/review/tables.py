@@ -1,0 +1,203 @@
+"""The samples of one drone as columns: what exports, reports and comparisons are made from."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.clock import NS_PER_S
+from skyloop.logfile.layout import Channel, Drops, FrameRecord
+from skyloop.logfile.reader import Item, Progress, Recording
+from skyloop.logfile.times import Course
+from skyloop.messages import (
+    AnyAction,
+    Applied,
+    Event,
+    Feedback,
+    LogEntry,
+    Parameter,
+)
+
+#: Names of the parts of vectors, in their order.
+AXES: Final[dict[str, tuple[str, ...]]] = {
+    "velocity": ("forward", "left", "up"),
+    "angular_velocity": ("x", "y", "z"),
+    "acceleration": ("x", "y", "z"),
+    "position": ("x", "y", "z"),
+}
+#: The numbers that an action may carry, in the order of the columns.
+ACTION_FIELDS: Final = ("roll", "pitch", "climb", "forward", "left", "up", "yaw_rate")
+Cell = float | int | str | bool | None
+
+
+@dataclass(slots=True)
+class Table:
+    """Columns of one length. A column is of numbers (NaN: not known) or of texts (empty: not known).
+
+    ``t_s`` is the time since the recording's first sample [s], by the proxy's clock; further times are in ns.
+    """
+
+    name: str
+    columns: dict[str, NDArray[Any]] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values()))) if self.columns else 0
+
+    def __getitem__(self, column: str) -> NDArray[Any]:
+        return self.columns[column]
+
+    def numbers(self, column: str) -> NDArray[np.float64]:
+        """A column as floats; of NaN only if there is none of that name."""
+        found = self.columns.get(column)
+        if found is None:
+            return np.full(len(self), np.nan)
+        return found.astype(np.float64)
+
+    def known(self, column: str) -> bool:
+        """Whether there is at least one number in a column."""
+        return bool(np.isfinite(self.numbers(column)).any())
+
+
+class _Builder:
+    """Collects rows whose columns become known as they come."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._rows = 0
+        self._columns: dict[str, list[Cell]] = {}
+
+    def add(self, row: dict[str, Cell]) -> None:
+        for name, cell in row.items():
+            column = self._columns.get(name)
+            if column is None:
+                column = self._columns[name] = [None] * self._rows
+            column.append(cell)
+        self._rows += 1
+        for column in self._columns.values():
+            if len(column) < self._rows:
+                column.append(None)
+
+    def table(self) -> Table:
+        return Table(self._name, {name: _array(cells) for name, cells in self._columns.items()})
+
+
+def _array(cells: list[Cell]) -> NDArray[Any]:
+    """Whole numbers where all are, floats where all are numbers, else texts."""
+    kinds = {type(cell) for cell in cells}
+    if kinds <= {int}:
+        return np.array(cells, np.int64)
+    if kinds <= {bool}:
+        return np.array(cells, np.bool_)
+    if kinds <= {int, float, bool, type(None)}:
+        return np.array([np.nan if cell is None else float(cell) for cell in cells], np.float64)
+    return np.array(["" if cell is None else str(cell) for cell in cells], np.str_)
+
+
+def tables(
+    recording: Recording,
+    drone: str,
+    channels: Collection[Channel] = tuple(Channel),
+    progress: Progress | None = None,
+) -> dict[str, Table]:
+    """By name (``feedback``, ``commands``, ``frames.CAMERA`` …), in the order of the channels; without empty ones."""
+    builders: dict[str, _Builder] = {}
+    for item, at_ns, first_ns in timed(recording, drone, channels, progress):
+        name = item.channel.value + (f".{item.camera}" if item.camera else "")
+        builder = builders.get(name)
+        if builder is None:
+            builder = builders[name] = _Builder(name)
+        builder.add({"t_s": (at_ns - first_ns) / NS_PER_S, **row(item)})
+    order = list(Channel)
+    names = sorted(builders, key=lambda name: (order.index(Channel(name.partition(".")[0])), name))
+    return {name: builders[name].table() for name in names}
+
+
+def timed(
+    recording: Recording, drone: str, channels: Collection[Channel], progress: Progress | None = None
+) -> Iterator[tuple[Item, int, int]]:
+    """Samples with their time and that of the recording's first one, on the proxy's clock [ns].
+
+    The first one is that of all channels, so that tables of several calls have the same beginning.
+    """
+    first_ns = begin_ns(recording, drone)
+    course = Course()
+    for item in recording.items(drone, channels, progress=progress):
+        yield item, max(first_ns, course.follow(item.value)), first_ns
+
+
+def begin_ns(recording: Recording, drone: str) -> int:
+    """The time of the first sample that has one, on the proxy's clock [ns]; 0 if none has."""
+    course = Course()
+    for item in recording.items(drone):
+        course.follow(item.value)
+        if course.first_ns is not None:
+            return course.first_ns
+    return 0
+
+
+def row(item: Item) -> dict[str, Cell]:
+    """A sample as cells by the names of their columns."""
+    value = item.value
+    cells: dict[str, Cell]
+    if isinstance(value, Feedback):
+        cells = _feedback(value)
+    elif isinstance(value, Applied):
+        cells = {
+            "seq": value.seq,
+            "app_id": value.app_id,
+            "sent_ns": value.sent_ns,
+            "applied_ns": value.applied_ns,
+            **_action("asked", value.asked),
+            **_action("applied", value.applied),
+        }
+    elif isinstance(value, Event):
+        cells = {"kind": value.kind.value, "severity": value.severity.value, "app": value.app or "", "text": value.text}
+        cells |= {"at_ns": value.at_ns, **{f"data.{name}": _cell(one) for name, one in value.data.items()}}
+    elif isinstance(value, Parameter):
+        cells = {"name": value.name, "value": str(_cell(value.value)), "unit": value.unit}
+    elif isinstance(value, LogEntry):
+        cells = {"source": value.source, "name": value.name, "number": value.number, "text": value.text or ""}
+        if value.values is not None:
+            cells["values"] = _cell(value.values)
+    elif isinstance(value, FrameRecord):
+        header = value.header
+        cells = {"seq": header.seq, "captured_ns": header.captured_ns, "published_ns": header.published_ns}
+        cells |= {"received_ns": value.received_ns, "width": header.width, "height": header.height}
+    elif isinstance(value, Drops):
+        cells = {f"dropped.{name}": count for name, count in value.dropped.items()}
+        cells |= {f"missed.{name}": count for name, count in value.missed.items()}
+    else:
+        cells = {"source": value.source, "camera": value.camera, "captured_ns": value.captured_ns}
+        cells["shapes"] = len(value.shapes)
+    return cells | {"received_unix_ns": item.entry.log_ns}
+
+
+def _feedback(feedback: Feedback) -> dict[str, Cell]:
+    cells: dict[str, Cell] = {}
+    for name in feedback.__struct_fields__:
+        value = getattr(feedback, name)
+        if name in AXES:
+            for axis, number in zip(AXES[name], value or (None, None, None), strict=True):
+                cells[f"{name}_{axis}"] = number
+        elif name != "native":
+            cells[name] = "" if value is None and name == "owner" else value
+    for name, value in (feedback.native or {}).items():
+        cells[f"native.{name}"] = _cell(value)
+    return cells
+
+
+def _action(prefix: str, action: AnyAction) -> dict[str, Cell]:
+    numbers: dict[str, Cell] = {f"{prefix}_{name}": getattr(action, name, None) for name in ACTION_FIELDS}
+    return {prefix: action.name, **numbers}
+
+
+def _cell(value: Any) -> Cell:
+    """Tuples as text, numbers with spaces between."""
+    if isinstance(value, tuple | list):
+        return " ".join(f"{number:.9g}" for number in value)
+    cell: Cell = value
+    return cell

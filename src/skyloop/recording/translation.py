@@ -1,0 +1,185 @@
+"""From what arrived to the messages of a file: our own sample, and beside it what viewers understand. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, Final
+
+from skyloop.logfile import layout
+from skyloop.logfile.layout import Channel, ClockPair, Drops, FrameRecord, Topic
+from skyloop.messages import (
+    Annotation,
+    Applied,
+    CameraInfo,
+    Capabilities,
+    Event,
+    Feedback,
+    FrameHeader,
+    Intrinsics,
+    LogEntry,
+    Parameter,
+)
+from skyloop.recording import foxglove
+from skyloop.recording.backlog import Item
+from skyloop.recording.output import Message
+
+_SEQUENCES: Final = 1 << 32
+_PLACES: Final = 400  #: of a path; when there are more, each second one is left out
+_PATH_EVERY_NS: Final = 1_000_000_000
+
+
+class Picture:
+    """A frame as it goes into the file."""
+
+    __slots__ = ("data", "record")
+
+    def __init__(self, record: FrameRecord, data: bytes) -> None:
+        self.record = record
+        self.data = data
+
+
+class Path:
+    """The places where a drone has been, thinned out so that they never become many. Oldest first."""
+
+    def __init__(self) -> None:
+        self.places: list[Any] = []
+        self._step = 1
+        self._count = 0
+
+    def add(self, place: Any) -> None:
+        if self._count % self._step == 0:
+            self.places.append(place)
+            if len(self.places) > _PLACES:
+                del self.places[1::2]
+                self._step *= 2
+        self._count += 1
+
+
+class Translator:
+    """Makes the messages of one drone. ``offset_ns()`` is the proxy's clock less the recorder's."""
+
+    def __init__(
+        self, drone: str, capabilities: Capabilities, clock: ClockPair, offset_ns: Callable[[], int] = lambda: 0
+    ) -> None:
+        self._drone = drone
+        self._cameras = capabilities.cameras
+        self._clock = clock
+        self._offset_ns = offset_ns
+        self._topics: dict[Channel, str] = {
+            channel: str(Topic(drone, channel)) for channel in Channel if channel is not Channel.FRAMES
+        }
+        self._parameters: dict[str, Parameter] = {}
+        self._intrinsics: dict[str, tuple[int, int, Intrinsics]] = {}
+        self._path = Path()
+        self._path_due_ns = 0
+        self._makers: dict[type, Callable[[Any, int], Iterator[Message]]] = {
+            Feedback: self._feedback,
+            Applied: self._applied,
+            Event: self._event,
+            Parameter: self._parameter,
+            Annotation: self._annotation,
+            LogEntry: self._log,
+            Picture: self._picture,
+            Drops: self._drops,
+        }
+
+    def messages(self, item: Item) -> Iterator[Message]:
+        """What this becomes."""
+        return self._makers[type(item.sample)](item.sample, self._clock.unix(item.received_ns))
+
+    def prelude(self, now_ns: int) -> Iterator[Message]:
+        """What each file needs at its beginning to be complete in itself; ``now_ns`` on the recorder's clock."""
+        at_ns = self._clock.unix(now_ns)
+        for parameter in list(self._parameters.values()):
+            yield from self._parameter(parameter, at_ns)
+        for camera in self._cameras:
+            yield from self._mounting(camera, at_ns)
+            if camera.intrinsics is not None:
+                yield from self._calibration(camera.name, camera.width, camera.height, camera.intrinsics, at_ns)
+        for name, (width, height, intrinsics) in list(self._intrinsics.items()):
+            yield from self._calibration(name, width, height, intrinsics, at_ns)
+
+    # Each kind -------------------------------------------------------------------------------------------------
+
+    def _own(self, channel: Channel, sample: Any, log_ns: int, publish_ns: int, sequence: int = 0) -> Message:
+        data = layout.encode(sample)
+        return Message(self._topics[channel], type(sample), data, log_ns, publish_ns, sequence % _SEQUENCES)
+
+    def _unix(self, proxy_ns: int) -> int:
+        """Unix time of a time on the proxy's clock."""
+        return self._clock.unix(proxy_ns, self._offset_ns())
+
+    def _feedback(self, feedback: Feedback, log_ns: int) -> Iterator[Message]:
+        at_ns = self._unix(feedback.captured_ns)
+        yield self._own(Channel.FEEDBACK, feedback, log_ns, at_ns, feedback.seq)
+        place = foxglove.pose(feedback)
+        if place is None:
+            return
+        drone = self._drone
+        pose = foxglove.pose_in_world(at_ns, place)
+        yield Message(layout.pose_topic(drone), foxglove.PoseInFrame, pose, log_ns, at_ns)
+        transform = foxglove.world_to_drone(drone, at_ns, place)
+        yield Message(layout.TF, foxglove.FrameTransform, transform, log_ns, at_ns)
+        if feedback.position is not None:
+            self._path.add(place)
+            if at_ns >= self._path_due_ns:
+                self._path_due_ns = at_ns + _PATH_EVERY_NS
+                path = foxglove.path_in_world(at_ns, self._path.places)
+                yield Message(layout.path_topic(drone), foxglove.PosesInFrame, path, log_ns, at_ns)
+
+    def _applied(self, applied: Applied, log_ns: int) -> Iterator[Message]:
+        yield self._own(Channel.COMMANDS, applied, log_ns, self._unix(applied.applied_ns), applied.seq)
+
+    def _event(self, event: Event, log_ns: int) -> Iterator[Message]:
+        at_ns = self._unix(event.at_ns)
+        yield self._own(Channel.EVENTS, event, log_ns, at_ns, event.seq)
+        line = foxglove.log(self._drone, at_ns, event.severity, event.text, event.kind.value)
+        yield Message(layout.LOG, foxglove.Log, line, log_ns, at_ns)
+
+    def _parameter(self, parameter: Parameter, log_ns: int) -> Iterator[Message]:
+        self._parameters[parameter.name] = parameter
+        yield self._own(Channel.PARAMETERS, parameter, log_ns, log_ns)
+
+    def _annotation(self, annotation: Annotation, log_ns: int) -> Iterator[Message]:
+        at_ns = self._unix(annotation.captured_ns)
+        yield self._own(Channel.ANNOTATIONS, annotation, log_ns, at_ns)
+        topic = layout.drawing_topic(self._drone, annotation.camera)
+        yield Message(topic, foxglove.ImageAnnotations, foxglove.drawing(annotation, at_ns), log_ns, at_ns)
+
+    def _log(self, entry: LogEntry, log_ns: int) -> Iterator[Message]:
+        at_ns = self._unix(entry.at_ns)
+        yield self._own(Channel.LOGS, entry, log_ns, at_ns)
+        if entry.text is not None:
+            text = f"{entry.name}: {entry.text}" if entry.name else entry.text
+            line = foxglove.log(self._drone, at_ns, entry.severity, text, entry.source)
+            yield Message(layout.LOG, foxglove.Log, line, log_ns, at_ns)
+
+    def _drops(self, drops: Drops, log_ns: int) -> Iterator[Message]:
+        yield self._own(Channel.DROPS, drops, log_ns, log_ns)
+
+    def _picture(self, picture: Picture, log_ns: int) -> Iterator[Message]:
+        record = picture.record
+        header: FrameHeader = record.header
+        drone, camera = self._drone, header.camera
+        at_ns = self._unix(header.captured_ns)
+        sequence = header.seq % _SEQUENCES
+        if header.intrinsics is not None:
+            now = (header.width, header.height, header.intrinsics)
+            if self._intrinsics.get(camera) != now:
+                self._intrinsics[camera] = now
+                yield from self._calibration(camera, *now, log_ns)
+        topic = str(Topic(drone, Channel.FRAMES, camera))
+        yield Message(topic, FrameRecord, layout.encode(record), log_ns, at_ns, sequence)
+        image = foxglove.image(drone, camera, at_ns, picture.data, record.format)
+        yield Message(layout.image_topic(drone, camera), foxglove.CompressedImage, image, log_ns, at_ns, sequence)
+
+    def _calibration(
+        self, camera: str, width: int, height: int, intrinsics: Intrinsics, at_ns: int
+    ) -> Iterator[Message]:
+        data = foxglove.calibration(self._drone, camera, at_ns, width, height, intrinsics)
+        yield Message(layout.calibration_topic(self._drone, camera), foxglove.CameraCalibration, data, at_ns, at_ns)
+
+    def _mounting(self, camera: CameraInfo, at_ns: int) -> Iterator[Message]:
+        transform = foxglove.drone_to_camera(self._drone, camera, at_ns)
+        if transform is not None:
+            yield Message(layout.TF, foxglove.FrameTransform, transform, at_ns, at_ns)

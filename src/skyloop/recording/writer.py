@@ -1,0 +1,279 @@
+"""The thread that writes: takes what was received, translates it, and keeps files, disk and people in order."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from skyloop.clock import nanoseconds
+from skyloop.errors import UsageError
+from skyloop.logfile.layout import VERSION, ClockPair, DroneRecord, End, Start
+from skyloop.messages import Severity
+from skyloop.recording.backlog import Backlog, Item, Rank
+from skyloop.recording.options import MB, Options, numbered
+from skyloop.recording.output import CHUNK, Opener, RecordingFile, open_target
+from skyloop.recording.status import RecorderState, Room, judge_room
+from skyloop.recording.translation import Translator
+
+BEAT_S: Final = 0.05  #: what has come is taken this often, so that it need not wake anybody
+_COMMIT_NS: Final = nanoseconds(0.5)  #: what is older than this is in the file, if the disk can do it
+_REOPEN: Final = 4 * MB  #: bytes that must be free before another file is begun on a disk that was full
+_LOOK_NS: Final = nanoseconds(1.0)  #: how often the disk is looked at, and a file that can't be written tried again
+
+Tell = Callable[[str, Severity], None]
+
+
+def free_space(folder: Path) -> int:
+    """Bytes. Raises ``OSError``."""
+    return shutil.disk_usage(folder).free
+
+
+class FileWriter:
+    """Writes a backlog to a file, or to one after the other. Any thread may look at its public attributes."""
+
+    def __init__(
+        self,
+        path: Path,
+        options: Options,
+        backlog: Backlog,
+        drones: Sequence[DroneRecord],
+        translators: Sequence[Translator],
+        clock: ClockPair,
+        tell: Tell,
+        *,
+        opener: Opener = open_target,
+        free: Callable[[Path], int] = free_space,
+    ) -> None:
+        self.state = RecorderState.STARTING
+        self.reason = ""
+        self.files: list[Path] = []
+        self.room = Room.ALL
+        self.dropped: Callable[[], dict[str, dict[str, int]]] = dict  #: totals for the end of each file
+        self.missed: Callable[[], dict[str, dict[str, int]]] = dict
+        self.each_second: Callable[[], None] = lambda: None
+        self._path = path
+        self._options = options
+        self._backlog = backlog
+        self._translators = translators
+        self._clock = clock
+        self._tell = tell
+        self._opener = opener
+        self._free = free
+        self._floor = round(options.min_free_mb * MB)
+        self._start = Start(VERSION, _version(), tuple(drones), clock.unix_ns, options=msgspec.to_builtins(options))
+        self._file: RecordingFile | None = None
+        self._uncommitted: list[Item] = []
+        self._closed_bytes = self._closed_messages = 0
+        self._now_ns = clock.monotonic_ns
+        self._opened_ns = self._commit_due_ns = self._look_due_ns = 0
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="skyloop-recorder", daemon=True)
+
+    def start(self) -> None:
+        """Open the first file and begin. Raises :class:`UsageError` where it can't be written."""
+        folder = self._path.parent
+        try:
+            free = self._free(folder)
+            self.room = judge_room(free, self._floor, Room.ALL)
+            if self.room is Room.NOTHING:
+                raise UsageError(
+                    f"{folder} has {free / MB:.0f} MB left, and recording leaves {self._floor / MB:.0f} MB free: "
+                    "choose another folder, or a lower floor"
+                )
+            self._open()
+        except OSError as error:
+            raise UsageError(f"can't record to {self._path}: {_why(error)}") from error
+        self._thread.start()
+
+    def stop(self, timeout_s: float = 10.0) -> None:
+        """Write what has come and close the file. Idempotent. A disk that hangs longer is left to its thread."""
+        self._closing.set()
+        if self._thread.ident is not None:
+            self._thread.join(timeout_s)
+
+    @property
+    def path(self) -> Path:
+        return self.files[-1] if self.files else self._path
+
+    @property
+    def bytes(self) -> int:
+        """In all files so far."""
+        file = self._file
+        return self._closed_bytes + (0 if file is None else file.size)
+
+    @property
+    def messages(self) -> int:
+        """In all files so far."""
+        file = self._file
+        return self._closed_messages + (0 if file is None else file.count)
+
+    # The thread ------------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        due_s = time.monotonic()
+        ending = False
+        while not ending:
+            due_s = max(due_s + BEAT_S, time.monotonic())
+            ending = self._closing.wait(max(0.0, due_s - time.monotonic()))
+            if ending:
+                self._look_due_ns = 0  # a last try, if it stands still, and the last counts
+            self.step(time.monotonic_ns())
+        self._end()
+
+    def step(self, now_ns: int) -> None:
+        """Do what is due. Called by the thread, or by a test."""
+        self._now_ns = now_ns
+        try:
+            if now_ns >= self._look_due_ns:
+                self._look_due_ns = now_ns + _LOOK_NS
+                self._look()
+                self.each_second()
+            if self._file is not None:
+                self._write()
+                self._rotate_when_due()
+        except OSError as error:
+            self._pause(_why(error))
+
+    def _write(self) -> None:
+        """Translate and write all that waits, committing as it goes."""
+        file = self._file
+        assert file is not None
+        while taken := self._backlog.take(CHUNK):
+            batch = [item for item in taken if self._admits(item)]
+            self._uncommitted += batch  # first, so that nothing of the batch is lost when the disk fails in its midst
+            for item in batch:
+                for message in self._translators[item.drone].messages(item):
+                    file.write(message)
+            if sum(item.size for item in self._uncommitted) >= CHUNK:
+                self._commit()
+        if self._now_ns >= self._commit_due_ns:
+            self._commit()
+
+    def _admits(self, item: Item) -> bool:
+        if item.rank is not Rank.FRAME or self.room is Room.ALL:
+            return True
+        self._backlog.count(item)
+        return False
+
+    def _commit(self) -> None:
+        assert self._file is not None
+        self._file.commit()
+        self._uncommitted.clear()
+        self._commit_due_ns = self._now_ns + _COMMIT_NS
+
+    def _rotate_when_due(self) -> None:
+        file, options = self._file, self._options
+        assert file is not None
+        by_size = options.rotate_mb is not None and file.size >= options.rotate_mb * MB
+        by_time = options.rotate_s is not None and self._now_ns - self._opened_ns >= nanoseconds(options.rotate_s)
+        if by_size or by_time:
+            self._close("rotated")
+            self._open()
+
+    # Files -----------------------------------------------------------------------------------------------------
+
+    def _open(self) -> None:
+        number = len(self.files) + 1
+        # What follows a pause has a name that was not asked for: it overwrites nothing.
+        overwrite = self._options.overwrite and (number == 1 or self._options.rotates)
+        first = number == 1 and not self._options.rotates
+        path = self._path if first else self._next_free(number, overwrite)
+        start = msgspec.structs.replace(self._start, file=number)
+        file = RecordingFile(path, start, self._clock, overwrite=overwrite, opener=self._opener)
+        try:
+            for translator in self._translators:
+                for message in translator.prelude(self._now_ns):
+                    file.write(message)
+            file.commit()
+        except OSError:
+            file.abandon()
+            raise
+        self._file = file
+        self._opened_ns = self._now_ns
+        self.files.append(path)
+        self.state, self.reason = RecorderState.RECORDING, ""
+        self._tell(f"recording to {path}", Severity.INFO)
+
+    def _next_free(self, number: int, overwrite: bool) -> Path:
+        path = numbered(self._path, number)
+        while path.exists() and not overwrite:
+            number += 1
+            path = numbered(self._path, number)
+        return path
+
+    def _close(self, reason: str) -> None:
+        file = self._file
+        assert file is not None
+        end = End(reason, time.time_ns(), dict(file.written), self.dropped(), self.missed())
+        file.close(end)
+        self._file = None
+        self._uncommitted.clear()
+        self._count(file)
+
+    def _count(self, file: RecordingFile) -> None:
+        self._closed_bytes += file.size
+        self._closed_messages += file.count
+
+    def _pause(self, why: str) -> None:
+        """The disk does not do what it should. What was not committed waits for the next file."""
+        file, self._file = self._file, None
+        if file is not None:
+            file.abandon()
+            self._count(file)
+            self._backlog.put_back(self._uncommitted)
+            self._uncommitted.clear()
+        if (self.state, self.reason) != (RecorderState.PAUSED, why):
+            self.state, self.reason = RecorderState.PAUSED, why
+            self._tell(f"recording stands still ({why}): what was written stays, frames are lost", Severity.ERROR)
+
+    def _look(self) -> None:
+        """How the disk and the file are."""
+        file = self._file
+        if file is not None and file.lost:
+            self._pause(f"{file.path} was removed")
+            return
+        free = self._free(self.path.parent)
+        self._judge_room(free)
+        if self._file is None and self.room is not Room.NOTHING and free >= _REOPEN:
+            self._open()
+
+    def _judge_room(self, free: int) -> None:
+        before = self.room
+        self.room = room = judge_room(free, self._floor, before)
+        if room is before:
+            return
+        left = f"{free / MB:.0f} MB left in {self.path.parent}"
+        if room is Room.NOTHING:
+            if self._file is not None:
+                self._close("rotated")
+            self._pause(left)
+        elif room is Room.NO_FRAMES:
+            self._tell(f"{left}: frames are recorded no longer", Severity.WARNING)
+        else:
+            self._tell(f"{left}: everything is recorded again", Severity.INFO)
+
+    def _end(self) -> None:
+        try:
+            if self._file is not None:
+                self._close("closed")
+        except OSError as error:
+            self._pause(_why(error))
+        self.state = RecorderState.FAILED if self.state is RecorderState.PAUSED else RecorderState.CLOSED
+
+
+def _why(error: OSError) -> str:
+    """For people."""
+    place = f": {error.filename}" if error.filename else ""
+    return f"{error.strerror or error}{place}"
+
+
+def _version() -> str:
+    import skyloop
+
+    return skyloop.__version__

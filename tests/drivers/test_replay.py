@@ -1,0 +1,301 @@
+"""What a replay tells, when, and what it does with commands."""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from skyloop.clock import ManualClock
+from skyloop.drivers.recording_sink import RecordingSink
+from skyloop.drivers.registry import make_driver
+from skyloop.drivers.replay import ReplayDriver
+from skyloop.drivers.replay.driver import _OPTIONS
+from skyloop.drivers.replay.tape import Tape, Timeline
+from skyloop.errors import ParameterError, UnknownNameError, UsageError
+from skyloop.logfile.reader import Recording
+from skyloop.messages import (
+    Encoding,
+    EventKind,
+    Feedback,
+    FlightState,
+    Hover,
+    Land,
+    LinkState,
+    Velocity,
+)
+from tests.docs.pages import rows, section
+from tests.recording.flights import BEGIN_NS, CAPABILITIES, MS, Plan, feedback_at, write_flight
+
+WAIT_S = 10.0
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Not to be changed."""
+    return write_flight(tmp_path_factory.mktemp("flights") / "flight.mcap")
+
+
+def driver_of(path: Path, query: str = "") -> ReplayDriver:
+    driver = make_driver(f"replay://{path}{query}")
+    assert isinstance(driver, ReplayDriver)
+    return driver
+
+
+@contextmanager
+def played(path: Path, query: str = "?speed=20", keep: int = 4096) -> Iterator[tuple[ReplayDriver, RecordingSink]]:
+    driver, sink = driver_of(path, query), RecordingSink(keep=keep)
+    driver.open(sink)
+    try:
+        yield driver, sink
+    finally:
+        driver.close()
+    assert not sink.problems, sink.problems
+
+
+def test_everything_is_told_again(flight: Path) -> None:
+    with played(flight) as (_, sink):
+        assert sink.wait(lambda: sink.link_state is LinkState.CLOSED, WAIT_S)
+        assert sink.links[0] == (LinkState.UP, "")
+        assert "end of the recording after 20 frames" in sink.links[-1][1]
+        assert sink.frame_counts == {"front": 20}
+        assert sink.feedback_count == 96
+        frame = sink.frames[0]
+        assert (frame.width, frame.height, frame.encoding) == (64, 48, Encoding.BGR8)
+        assert frame.intrinsics is not None
+        assert frame.intrinsics.fx == 60.0
+        states = [feedback.state for feedback in sink.feedbacks]
+        assert {FlightState.LANDED, FlightState.TAKING_OFF, FlightState.FLYING, FlightState.LANDING} == set(states)
+        told = sink.feedbacks[30]
+        assert told.altitude is not None
+        assert told.owner is None
+        assert told.seq == 0
+
+
+def test_the_recorded_commands_are_in_the_native_telemetry(flight: Path) -> None:
+    with played(flight) as (_, sink):
+        assert sink.wait(lambda: sink.link_state is LinkState.CLOSED, WAIT_S)
+        natives = [feedback.native or {} for feedback in sink.feedbacks]
+    assert "replay.asked" not in natives[0]
+    assert {native.get("replay.asked") for native in natives[2:]} == {"takeoff", "velocity", "land"}
+    flying = next(native for native in natives if native.get("replay.asked") == "velocity")
+    values = flying["replay.applied.values"]
+    assert isinstance(values, tuple)
+    assert values[0] == pytest.approx(0.4)
+    assert flying["replay.owner"] == "pilot.py"
+    assert flying["motor"] == 0.5
+    positions = [float(native["replay.position_s"]) for native in natives]  # type: ignore[arg-type]
+    assert positions == sorted(positions)
+    assert positions[-1] == pytest.approx(1.98, abs=0.03)
+
+
+def test_events_of_the_old_proxy_are_no_news_of_the_new_one(flight: Path) -> None:
+    with played(flight) as (_, sink):
+        assert sink.wait(lambda: sink.link_state is LinkState.CLOSED, WAIT_S)
+        events = list(sink.events)
+    assert [event.text for event in events if event.kind is EventKind.COLLISION] == ["touched a chair"]
+    recorded = {event.data["recorded_kind"]: event for event in events if "recorded_kind" in event.data}
+    assert set(recorded) == {"authority_granted", "failsafe"}
+    assert {event.kind for event in recorded.values()} == {EventKind.VEHICLE_MESSAGE}
+    assert recorded["failsafe"].text == "recorded: failsafe: hover"
+    assert not any(event.kind is EventKind.STATE_CHANGED for event in events)
+
+
+def test_the_recorded_parameters_can_be_read(flight: Path) -> None:
+    with played(flight) as (driver, sink):
+        assert sink.wait(lambda: sink.link_state is LinkState.CLOSED, WAIT_S)
+        found = {parameter.name: parameter for parameter in driver.parameters()}
+        assert found["recorded.limits.tilt"].value == 0.2  # it was changed half way
+        assert all(parameter.read_only for parameter in found.values())
+        with pytest.raises(ParameterError):
+            driver.set_parameter("recorded.limits.tilt", 0.1)
+
+
+def test_it_is_paced_by_the_recording(flight: Path) -> None:
+    with played(flight, "?speed=4") as (_, sink):
+        assert sink.wait(lambda: sink.link_state is LinkState.CLOSED, WAIT_S)
+        captured = [feedback.captured_ns for feedback in sink.feedbacks]
+        frames = [frame.captured_ns for frame in sink.frames]
+        ages = sorted(frame.arrived_ns - frame.captured_ns for frame in sink.frames)
+    assert (captured[-1] - captured[0]) / 1e9 == pytest.approx(1.98 / 4, rel=0.03)
+    assert (frames[-1] - frames[0]) / 1e9 == pytest.approx(1.9 / 4, rel=0.03)
+    assert 7 * MS < ages[len(ages) // 2] < 30 * MS  # captured 30 ms before it was published, at four times the speed
+
+
+def test_it_starts_where_it_is_told_to(flight: Path) -> None:
+    with played(flight, "?speed=20&start=1.5") as (driver, sink):
+        assert sink.wait(lambda: sink.link_state is LinkState.CLOSED, WAIT_S)
+        assert sink.feedback_count == 25
+        assert {parameter.name for parameter in driver.parameters()} >= {"recorded.sim.battery"}
+
+
+def test_it_starts_over(flight: Path) -> None:
+    with played(flight, "?speed=50&loop=1") as (_, sink):
+        assert sink.wait(lambda: sink.feedback_count > 250, WAIT_S)
+        newest = sink.newest
+        assert newest is not None
+        assert newest.native is not None
+        assert newest.native["replay.loops"] in (2, 3)
+        assert sink.link_state is LinkState.UP
+
+
+def test_it_waits_for_somebody_to_look(flight: Path) -> None:
+    driver, sink = driver_of(flight, "?speed=20&wait=1"), RecordingSink(watch=set())
+    driver.open(sink)
+    try:
+        assert sink.wait(lambda: sink.feedback_count >= 3, WAIT_S)
+        assert {feedback.state for feedback in sink.feedbacks} == {FlightState.LANDED}
+        sink.watch = {"front"}
+        assert sink.wait(lambda: sink.link_state is LinkState.CLOSED, WAIT_S)
+        assert sink.frame_counts["front"] == 20
+    finally:
+        driver.close()
+
+
+def test_frames_that_nobody_wants_are_not_decoded(flight: Path) -> None:
+    driver, sink = driver_of(flight, "?speed=50"), RecordingSink(watch=set())
+    driver.open(sink)
+    try:
+        assert sink.wait(lambda: sink.link_state is LinkState.CLOSED, WAIT_S)
+    finally:
+        driver.close()
+    assert sink.frame_counts == {}
+    assert "20 frames" in sink.links[-1][1]
+
+
+def test_a_lost_link_is_lost_again(tmp_path: Path) -> None:
+    def lost(at_ms: int) -> Feedback | None:
+        if not 400 <= at_ms < 600:
+            return None
+        return msgspec.structs.replace(feedback_at(Plan(), at_ms, at_ms // 20 + 1), vehicle_link=LinkState.LOST)
+
+    path = write_flight(tmp_path / "flight.mcap", Plan(seconds=1.0, extra=lost))
+    with played(path) as (_, sink):
+        assert sink.wait(lambda: sink.link_state is LinkState.CLOSED, WAIT_S)
+        assert [state for state, _ in sink.links] == [LinkState.UP, LinkState.LOST, LinkState.UP, LinkState.CLOSED]
+
+
+def test_a_cut_file_is_played_as_far_as_it_goes_and_that_is_told(tmp_path: Path, flight: Path) -> None:
+    path = tmp_path / "cut.mcap"
+    data = flight.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    with played(path) as (_, sink):
+        assert sink.wait(lambda: sink.link_state is LinkState.CLOSED, WAIT_S)
+        assert 0 < sink.feedback_count < 96
+        assert any("the file was cut off" in event.text for event in sink.events)
+
+
+def test_commands_are_taken_and_change_nothing(flight: Path) -> None:
+    with played(flight) as (driver, _):
+        assert driver.apply(Velocity(forward=0.5)) == Velocity(forward=0.5)
+        assert driver.failsafe(Land())
+        assert driver.failsafe(Hover())
+
+
+def test_capabilities(flight: Path, tmp_path: Path) -> None:
+    found = driver_of(flight).capabilities()
+    assert found.vehicle == "replay"
+    assert found.actions == CAPABILITIES.actions
+    assert [(camera.name, camera.width, camera.fps) for camera in found.cameras] == [("front", 64, 10.0)]
+    assert "a simulated quadrotor" in found.description
+    plain = msgspec.structs.replace(CAPABILITIES, cameras=(), actions=frozenset(), why_not="it is a picture only")
+    path = write_flight(tmp_path / "plain.mcap", Plan(capabilities=plain, seconds=0.3))
+    found = driver_of(path).capabilities()
+    assert (found.actions, found.why_not) == (frozenset(), "it is a picture only")
+    assert [camera.name for camera in found.cameras] == ["front"]  # frames there were, whatever was announced
+
+
+@pytest.mark.parametrize(
+    ("query", "words"),
+    [
+        ("?speed=0", "speed"),
+        ("?speed=fast", "speed"),
+        ("?start=-1", "start"),
+        ("?speed=max&loop=1", "neither with loop"),
+    ],
+)
+def test_options_that_make_no_sense(flight: Path, query: str, words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        driver_of(flight, query)
+
+
+def test_what_can_not_be_played_says_so(flight: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="names no file"):
+        make_driver("replay://")
+    missing = driver_of(tmp_path / "none.mcap")
+    assert "No such file" in missing.capabilities().why_not
+    with pytest.raises(UsageError, match="No such file"):
+        missing.open(RecordingSink())
+    with pytest.raises(UnknownNameError, match="drone"):
+        driver_of(flight, "?drone=beta").open(RecordingSink())
+    with pytest.raises(UsageError, match=r"lasts 2\.0 s, and start is 7 s"):
+        driver_of(flight, "?start=7").open(RecordingSink())
+    with pytest.raises(UsageError, match=r"in step with one application: call skyloop\.connect"):
+        driver_of(flight, "?speed=max").open(RecordingSink())
+
+
+# Step by step ------------------------------------------------------------------------------------------------------
+
+
+def test_steps_tell_one_moment_each_and_leave_nothing_out(flight: Path) -> None:
+    driver, sink, clock = driver_of(flight, "?speed=max"), RecordingSink(keep=4096), ManualClock(BEGIN_NS)
+    driver.clock = clock
+    driver.open(sink)
+    steps = driver.steps
+    assert steps is not None
+    assert sink.feedback_count == 1  # the first state, for whoever connects
+    while (due_ns := steps.due_ns) is not None:
+        assert due_ns >= clock.now_ns
+        clock.now_ns = due_ns
+        calls = sink.calls
+        steps.step()
+        assert sink.calls <= calls + 2
+    driver.close()
+    assert sink.frame_counts == {"front": 20}
+    assert sink.feedback_count == 97
+    assert sink.link_state is LinkState.CLOSED
+    assert [feedback.captured_ns for feedback in list(sink.feedbacks)[1:3]] == [BEGIN_NS - 4 * MS, BEGIN_NS + 16 * MS]
+    with pytest.raises(UsageError, match="over"):
+        steps.step()
+
+
+def test_a_timeline() -> None:
+    timeline = Timeline(2.0, 1000, 50_000)
+    assert [timeline.at(time) for time in (1000, 3000, 0)] == [50_000, 51_000, 49_500]
+    timeline.put_off(100)
+    assert timeline.at(1000) == 50_100
+
+
+def test_a_tape_knows_its_begin(flight: Path) -> None:
+    recording = Recording.open(flight)
+    tape = Tape(recording, recording.drone())
+    assert tape.begin_ns == BEGIN_NS
+    assert not tape.empty
+    assert Tape(recording, recording.drone(), 1e4).empty
+    first = tape.first_feedback()
+    assert first is not None
+    assert first.seq == 1
+
+
+def test_closing_ends_the_thread(flight: Path) -> None:
+    before = threading.active_count()
+    with played(flight, "?speed=1") as (_, sink):
+        assert sink.wait(lambda: sink.feedback_count > 0, WAIT_S)
+    assert threading.active_count() == before
+
+
+def test_the_page_lists_the_options_and_what_is_added_to_the_telemetry(flight: Path) -> None:
+    text = section("docs/replay.md", "## `replay://`")
+    options, _, rest = text.partition("What the vehicle told")
+    assert {row[0].strip("`") for row in rows(options)} == _OPTIONS
+    with played(flight) as (_, sink):
+        assert sink.wait(lambda: sink.link_state is LinkState.CLOSED, WAIT_S)
+        newest = sink.newest
+    assert newest is not None
+    added = {name for name in newest.native or {} if name.startswith("replay.")}
+    assert set(re.findall(r"`(replay\.[\w.]+)`", rest)) == added

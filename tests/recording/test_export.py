@@ -1,0 +1,136 @@
+"""``skyloop log export``: CSV, Parquet, NumPy and MP4 hold what was recorded."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from pathlib import Path
+
+import av
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from skyloop.errors import FileFormatError, UnknownNameError
+from skyloop.logfile.layout import Channel
+from skyloop.logfile.reader import Recording
+from skyloop.recording.review.export import export_csv, export_mp4, read
+from skyloop.recording.review.tables import Table, tables
+from tests.cli.conftest import Ended
+from tests.recording.flights import BEGIN_NS, MS, Plan, write_flight
+
+Log = Callable[..., Ended]
+TABLES = {"feedback", "commands", "events", "parameters", "logs", "frames.front", "drops"}
+
+
+def test_tables_hold_every_sample(flight: Path) -> None:
+    found = tables(Recording.open(flight), "alpha")
+    assert set(found) == TABLES
+    assert {name: len(table) for name, table in found.items()} == {
+        "feedback": 96,
+        "commands": 40,
+        "events": 7,
+        "parameters": 3,
+        "logs": 3,
+        "frames.front": 20,
+        "drops": 1,
+    }
+    feedback = found["feedback"]
+    assert feedback["t_s"][:3] == pytest.approx([0.0, 0.02, 0.04])
+    assert feedback["captured_ns"].dtype == np.int64
+    assert feedback["captured_ns"][0] == BEGIN_NS - 4 * MS
+    assert np.isnan(feedback.numbers("battery_v")).all()
+    assert not feedback.known("battery_v")
+    assert feedback["native.note"][0] == "fine"
+    assert feedback["owner"][0] == "pilot.py"
+    commands = found["commands"]
+    assert set(commands["asked"]) == {"takeoff", "velocity", "land"}
+    flying = commands["asked"] == "velocity"
+    assert commands["applied_forward"][flying] == pytest.approx(0.4)
+    assert np.isnan(commands["applied_forward"][~flying]).all()
+    assert found["logs"]["values"].tolist().count("1 2") == 1
+    assert np.nanmax(found["events"].numbers("data.speed_m_s")) == 0.3
+
+
+def test_a_table_without_a_column() -> None:
+    assert len(Table("x")) == 0
+    assert np.isnan(Table("x", {"t_s": np.zeros(3)}).numbers("y")).all()
+
+
+def test_csv(log: Log, flight: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "made" / "csv"
+    ended = log("export", flight, "--to", "csv", "-o", folder)
+    assert ended.code == 0
+    assert "96 × feedback" in ended.err
+    assert {path.stem for path in folder.iterdir()} == TABLES
+    with (folder / "feedback.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 96
+    assert rows[0]["battery_v"] == ""
+    assert float(rows[10]["position_x"]) == tables(Recording.open(flight), "alpha")["feedback"]["position_x"][10]
+    assert int(rows[1]["captured_ns"]) == BEGIN_NS + 16 * MS
+
+
+def test_parquet(log: Log, flight: Path, tmp_path: Path) -> None:
+    assert log("export", flight, "--to", "parquet", "-o", tmp_path, "--channel", "feedback").code == 0
+    table = pq.read_table(tmp_path / "feedback.parquet")
+    assert table.num_rows == 96
+    assert table["battery_v"].null_count == 96
+    assert table["state"][0].as_py() == "landed"
+    assert not (tmp_path / "commands.parquet").exists()
+
+
+def test_numpy(log: Log, flight: Path, tmp_path: Path) -> None:
+    ended = log("export", flight, "--to", "npz", "-o", tmp_path / "flight.npz")
+    assert ended.code == 0
+    with np.load(tmp_path / "flight.npz") as arrays:
+        assert arrays["feedback/altitude"].max() == pytest.approx(1.2)
+        assert arrays["events/text"].tolist().count("touched a chair") == 1
+
+
+@pytest.mark.parametrize("burn", [False, True])
+def test_mp4_keeps_each_frames_time(log: Log, flight: Path, tmp_path: Path, burn: bool) -> None:
+    path = tmp_path / "front.mp4"
+    ended = log("export", flight, "--to", "mp4", "-o", path, *(["--burn-time"] if burn else []))
+    assert ended.code == 0
+    assert "20 frames of front" in ended.err
+    with av.open(str(path)) as container:
+        pictures = list(container.decode(video=0))
+    assert len(pictures) == 20
+    times = [float(picture.pts * picture.time_base) for picture in pictures]  # type: ignore[operator]
+    assert times == pytest.approx([0.1 * number for number in range(20)], abs=0.001)
+    image = pictures[5].to_ndarray(format="bgr24")
+    assert image.shape == (48, 64, 3)
+    corner = image[34:, 24:40].max()
+    assert corner > 200 if burn else corner < 160  # white figures on a dark ramp, away from the bright column
+
+
+def test_frames_that_are_damaged_are_left_out(tmp_path: Path) -> None:
+    path = write_flight(tmp_path / "flight.mcap", Plan(frame_ms=0))
+    with pytest.raises(UnknownNameError, match="camera of alpha"):
+        export_mp4(Recording.open(path), "alpha", "front", tmp_path / "x.mp4")
+
+
+def test_wrong_words(log: Log, flight: Path, tmp_path: Path) -> None:
+    for arguments, words in (
+        (["--channel", "feedbak"], "did you mean 'feedback'"),
+        (["--drone", "beta"], "no drone in"),
+        (["--to", "mp4", "--camera", "sideways", "-o", tmp_path / "x.mp4"], "known: front"),
+        (["--to", "mp4", "--channel", "feedback"], "--channel says nothing about mp4"),
+        (["--burn-time"], "--burn-time says nothing about csv"),
+        (["--channel", "annotations"], "holds none of these channels"),
+        (["-o", "/proc/nothing/here"], "can't be made"),
+        (["--to", "xlsx"], "--to"),
+    ):
+        ended = log("export", flight, *arguments)
+        assert (ended.code, ended.out) == (2, "")
+        assert words in ended.err, ended.err
+
+
+def test_where_it_can_not_be_written(flight: Path, tmp_path: Path) -> None:
+    (tmp_path / "feedback.csv").mkdir()
+    found = read(Recording.open(flight), "alpha", (Channel.FEEDBACK,))
+    with pytest.raises(Exception, match="can't be written: Is a directory"):
+        export_csv(found, tmp_path)
+    with pytest.raises(FileFormatError, match="holds none"):
+        read(Recording.open(flight), "alpha", (Channel.ANNOTATIONS,))

@@ -1,0 +1,235 @@
+"""Recordings are read whole, cut off and damaged; what is none is refused with words."""
+
+from __future__ import annotations
+
+import contextlib
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.writer import CompressionType, Writer
+
+from skyloop.errors import FileFormatError, UnknownNameError, UsageError
+from skyloop.logfile.layout import Channel, image_topic
+from skyloop.logfile.pictures import Picture, decode_image
+from skyloop.logfile.reader import Item, Recording
+from skyloop.logfile.times import Course, told_ns
+from skyloop.messages import Encoding, Feedback, LogEntry, Parameter, ParameterType
+from tests.recording.flights import HEIGHT, UNIX_NS, WIDTH, Plan, picture_at, write_flight
+
+
+def counts(path: Path) -> Counter[str]:
+    recording = Recording.open(path)
+    return Counter(item.channel.value for item in recording.items(recording.drones[0].name))
+
+
+def test_what_it_is(flight: Path) -> None:
+    recording = Recording.open(flight)
+    assert [drone.name for drone in recording.drones] == ["alpha"]
+    assert recording.drone().described.vehicle == "sim"
+    assert recording.cameras("alpha") == ["front"]
+    assert recording.seconds == pytest.approx(1.98, abs=0.01)
+    assert (recording.cut, recording.damaged) == ("", [])
+    assert recording.end is not None
+    assert recording.end.reason == "closed"
+    own = {series.own.channel for series in recording.series if series.own is not None}
+    assert own == set(Channel) - {Channel.ANNOTATIONS}
+    assert {series.schema for series in recording.series if series.own is None} == {"foxglove.CompressedImage"}
+
+
+def test_samples_come_in_order_and_typed(flight: Path) -> None:
+    recording = Recording.open(flight)
+    items = list(recording.items("alpha"))
+    times = [item.entry.log_ns for item in items]
+    assert times == sorted(times)
+    assert Counter(item.channel for item in items)[Channel.COMMANDS] == 40
+    feedback = next(item.value for item in items if item.channel is Channel.FEEDBACK)
+    assert isinstance(feedback, Feedback)
+    assert feedback.native == {"motor": 0.5, "note": "fine"}
+    later = list(recording.items("alpha", (Channel.FEEDBACK,), from_ns=UNIX_NS + 1_500_000_000))
+    assert len(later) == 25
+    assert list(recording.items("beta")) == []
+
+
+def test_progress_is_told(flight: Path) -> None:
+    told: list[float] = []
+    for _ in Recording.open(flight).entries(progress=told.append):
+        pass
+    assert told == sorted(told)
+    assert told[-1] == 1.0
+
+
+@pytest.mark.parametrize("png", [True, False])
+def test_pictures_are_decoded(tmp_path: Path, png: bool) -> None:
+    path = write_flight(tmp_path / "flight.mcap", Plan(png=png, seconds=0.5))
+    pictures = list(Recording.open(path).pictures("alpha", "front"))
+    assert [picture.header.seq for picture in pictures] == [1, 2, 3, 4, 5]
+    for picture in pictures:
+        pixels, encoding = picture.as_recorded()
+        assert encoding is Encoding.BGR8
+        assert pixels.shape == (HEIGHT, WIDTH, 3)
+        difference = np.abs(pixels.astype(int) - picture_at(picture.header.seq))
+        assert difference.max() == 0 if png else difference.mean() < 6
+        assert np.array_equal(picture.pixels(), pixels)
+
+
+def test_pictures_and_samples_together(flight: Path) -> None:
+    found = list(Recording.open(flight).items_and_pictures("alpha", (Channel.FRAMES, Channel.EVENTS)))
+    assert sum(isinstance(one, Picture) for one in found) == 20
+    assert {one.channel for one in found if isinstance(one, Item)} == {Channel.EVENTS}
+
+
+def test_unknown_names_are_told(flight: Path) -> None:
+    recording = Recording.open(flight)
+    with pytest.raises(UnknownNameError, match="did you mean 'alpha'"):
+        recording.drone("alfa")
+    with pytest.raises(UnknownNameError, match="known: front"):
+        next(recording.pictures("alpha", "sideways"))
+
+
+# What is no whole recording ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_a_file_that_was_cut_is_read_as_far_as_it_goes(tmp_path: Path, compression: CompressionType) -> None:
+    whole = write_flight(tmp_path / "whole.mcap", Plan(compression=compression, chunk_size=4096))
+    last = Recording.open(whole).found.pieces[-1]
+    data = whole.read_bytes()[: last.offset + last.size]
+    before = 0
+    for share in (0.3, 0.6, 0.9):
+        cut = tmp_path / "cut.mcap"
+        cut.write_bytes(data[: round(share * len(data))])
+        recording = Recording.open(cut)
+        assert recording.cut
+        seen = sum(1 for _ in recording.items("alpha"))
+        assert before < seen < sum(counts(whole).values())
+        assert recording.damaged == []
+        assert recording.cameras("alpha") == ["front"]
+        before = seen
+
+
+def test_a_damaged_chunk_is_left_out(tmp_path: Path) -> None:
+    path = write_flight(tmp_path / "flight.mcap", Plan(chunk_size=4096))
+    whole = sum(counts(path).values())
+    piece = Recording.open(path).found.pieces[2]
+    data = bytearray(path.read_bytes())
+    data[piece.offset + piece.size // 2] ^= 0xFF
+    path.write_bytes(data)
+    recording = Recording.open(path)
+    seen = sum(1 for _ in recording.items("alpha"))
+    assert 0.5 * whole < seen < whole
+    assert any(f"at byte {piece.offset}" in words for words in recording.damaged)
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data())
+def test_no_damage_does_more_than_leave_something_out(
+    tmp_path_factory: pytest.TempPathFactory, flight: Path, data: st.DataObject
+) -> None:
+    content = bytearray(flight.read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        content[data.draw(st.integers(8, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path = tmp_path_factory.getbasetemp() / "torn.mcap"
+    path.write_bytes(content)
+    with contextlib.suppress(FileFormatError):
+        recording = Recording.open(path)
+        for one in recording.items_and_pictures(recording.drone().name, tuple(Channel)):
+            if isinstance(one, Picture):
+                one.pixels()
+
+
+def test_what_is_no_recording_is_refused_with_words(tmp_path: Path, flight: Path) -> None:
+    path = tmp_path / "x.mcap"
+    with pytest.raises(UsageError, match="No such file"):
+        Recording.open(path)
+    path.touch()
+    with pytest.raises(FileFormatError, match="is empty"):
+        Recording.open(path)
+    path.write_bytes(b"\x00\x00\x00\x18ftypmp42")
+    with pytest.raises(FileFormatError, match="is no MCAP file: it begins with"):
+        Recording.open(path)
+    path.write_bytes(flight.read_bytes()[:20])
+    with pytest.raises(FileFormatError, match="ends before its first sample"):
+        Recording.open(path)
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.register_channel("/camera", "json", writer.register_schema("x", "jsonschema", b"{}"))
+        writer.finish()  # type: ignore[no-untyped-call]
+    with pytest.raises(FileFormatError, match=r"no recording of Skyloop's \(its topics: /camera\)"):
+        Recording.open(path)
+    with pytest.raises(UsageError, match="Is a directory"):
+        Recording.open(tmp_path)
+
+
+def test_messages_outside_of_chunks_are_read(tmp_path: Path, flight: Path) -> None:
+    source = Recording.open(flight)
+    path = tmp_path / "flat.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, use_chunking=False)
+        writer.start("skyloop")
+        for record in source.found.metadata:
+            writer.add_metadata(record.name, record.metadata)
+        schema = writer.register_schema("skyloop.Feedback", "jsonschema", b"{}")
+        channel = writer.register_channel("/alpha/feedback", "json", schema)
+        for entry in source.entries({"/alpha/feedback"}):
+            writer.add_message(channel, entry.log_ns, entry.data, entry.publish_ns)
+        writer.finish()  # type: ignore[no-untyped-call]
+    assert counts(path) == {"feedback": counts(flight)["feedback"]}
+
+
+def test_a_message_that_is_not_what_it_should_be_is_counted(tmp_path: Path, flight: Path) -> None:
+    path = tmp_path / "flat.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("skyloop")
+        for record in Recording.open(flight).found.metadata:
+            writer.add_metadata(record.name, record.metadata)
+        schema = writer.register_schema("skyloop.Feedback", "jsonschema", b"{}")
+        channel = writer.register_channel("/alpha/feedback", "json", schema)
+        for data in (b"not json", b'{"captured_ns": "yesterday"}', b'{"captured_ns": 5}'):
+            writer.add_message(channel, 1, data, 1)
+        writer.finish()  # type: ignore[no-untyped-call]
+    recording = Recording.open(path)
+    assert [item.value.captured_ns for item in recording.items("alpha")] == [5]
+    assert len(recording.damaged) == 2
+
+
+def test_pictures_that_are_none() -> None:
+    with pytest.raises(FileFormatError, match="frame 3 can't be decoded"):
+        decode_image(b"\xff\xd8nonsense", "frame 3", grey=False)
+    with pytest.raises(FileFormatError, match="can't be decoded"):
+        decode_image(b"", "frame 3", grey=True)
+
+
+# Times -------------------------------------------------------------------------------------------------------------
+
+
+def feedback(ms: int) -> Feedback:
+    return Feedback(captured_ns=ms * 1_000_000 - 5, published_ns=ms * 1_000_000)
+
+
+def test_a_course_never_goes_back_and_is_not_led_astray() -> None:
+    course = Course()
+    parameter = Parameter("a", ParameterType.FLOAT, 1.0)
+    assert told_ns(parameter) is None
+    assert course.follow(parameter) == 0
+    steps = [feedback(1000), feedback(1020), feedback(1010), feedback(10**9), feedback(1040)]
+    assert [course.follow(step) // 1_000_000 for step in steps] == [1000, 1020, 1020, 1020, 1040]
+    assert course.follow(LogEntry("me", "x", 2_000_000_000, number=1.0)) == 2_000_000_000
+    assert course.first_ns == 1_000_000_000
+
+
+def test_a_course_goes_on_after_a_long_pause() -> None:
+    course = Course()
+    hours = 5 * 3600 * 1000
+    steps = [feedback(1000), feedback(hours), feedback(hours + 20), feedback(hours + 40)]
+    assert [course.follow(step) // 1_000_000 for step in steps] == [1000, 1000, hours + 20, hours + 40]
+
+
+def test_image_topics_are_those_of_the_layout(flight: Path) -> None:
+    entries = list(Recording.open(flight).entries({image_topic("alpha", "front")}))
+    assert [entry.sequence for entry in entries] == list(range(1, 21))

@@ -1,0 +1,90 @@
+"""``skyloop log recover``: what can be read is saved, with an index; the damaged file is left alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+from skyloop.errors import UsageError
+from skyloop.logfile.reader import Recording
+from skyloop.recording.review.recover import problems, recover
+from tests.cli.conftest import Ended
+from tests.recording.flights import Plan, write_flight
+
+Log = Callable[..., Ended]
+
+
+@pytest.fixture
+def cut(tmp_path: Path) -> Path:
+    """Two thirds of a recording."""
+    path = write_flight(tmp_path / "flight.mcap", Plan(chunk_size=4096))
+    last = Recording.open(path).found.pieces[-1]
+    path.write_bytes(path.read_bytes()[: (last.offset + last.size) * 2 // 3])
+    return path
+
+
+def samples(path: Path) -> list[tuple[str, int, bytes]]:
+    return [(entry.topic, entry.log_ns, entry.data) for entry in Recording.open(path).entries()]
+
+
+def test_everything_that_can_be_read_is_saved(log: Log, cut: Path) -> None:
+    before = cut.read_bytes()
+    readable = samples(cut)
+    ended = log("recover", cut)
+    mended = cut.with_name("flight-recovered.mcap")
+    assert ended.code == 0
+    assert "it ends within a record" in ended.err
+    assert f"{mended}: {len(readable)} messages" in ended.err
+    assert "at most" in ended.err
+    assert "/alpha/feedback" in ended.out
+    assert cut.read_bytes() == before
+    recording = Recording.open(mended)
+    assert recording.cut == ""
+    assert sorted(samples(mended)) == sorted(readable)
+    assert len(list(recording.pictures("alpha", "front"))) >= 10
+    with mended.open("rb") as file:  # others find their way in it by its index
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    assert summary.statistics is not None
+    assert summary.statistics.message_count == len(readable)
+    assert summary.chunk_indexes
+
+
+def test_what_is_damaged_in_the_middle_is_left_out(tmp_path: Path) -> None:
+    path = write_flight(tmp_path / "flight.mcap", Plan(chunk_size=4096))
+    whole = len(samples(path))
+    piece = Recording.open(path).found.pieces[1]
+    data = bytearray(path.read_bytes())
+    data[piece.offset + 40] ^= 0x55
+    path.write_bytes(data)
+    recording = Recording.open(path)
+    assert len(problems(recording)) == 1
+    saved = recover(Recording.open(path), tmp_path / "mended.mcap")
+    assert 0.5 * whole < sum(saved.messages.values()) < whole
+    assert saved.lost == piece.size
+    assert len(saved.why) == 1
+    assert problems(Recording.open(saved.path)) == ()
+
+
+def test_a_whole_file_needs_nothing(log: Log, flight: Path) -> None:
+    ended = log("recover", flight)
+    assert (ended.code, ended.err) == (0, f"{flight} is whole: there is nothing to mend\n")
+    assert not flight.with_name("flight-recovered.mcap").exists()
+
+
+def test_nothing_is_overwritten(log: Log, cut: Path, tmp_path: Path) -> None:
+    target = tmp_path / "other.mcap"
+    target.write_text("mine")
+    ended = log("recover", cut, "-o", target)
+    assert ended.code == 2
+    assert "exists already: choose another name" in ended.err
+    assert target.read_text() == "mine"
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_where_it_can_not_be_written_it_says_so(cut: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="No such file or directory"):
+        recover(Recording.open(cut), tmp_path / "nowhere" / "x.mcap")

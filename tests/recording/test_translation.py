@@ -1,0 +1,106 @@
+"""What arrives becomes messages: times on two clocks, calibration, paths, and what a new file begins with."""
+
+from __future__ import annotations
+
+from skyloop.logfile import layout
+from skyloop.logfile.layout import Channel, ClockPair, FrameRecord
+from skyloop.messages import CameraInfo, Capabilities, Encoding, Feedback, FrameHeader, Intrinsics, LogEntry, Parameter
+from skyloop.messages import ParameterType as Type
+from skyloop.recording.backlog import Item, Rank
+from skyloop.recording.output import Message
+from skyloop.recording.translation import Path, Picture, Translator
+from tests.messages.samples import CAMERA
+
+UNIX = 1_000_000_000_000_000_000
+CLOCK = ClockPair(0, UNIX, 1)
+AHEAD_NS = 5_000  #: the proxy's clock less the recorder's
+
+
+def translator(*cameras: CameraInfo) -> Translator:
+    return Translator("alpha", Capabilities("test", cameras=cameras), CLOCK, lambda: AHEAD_NS)
+
+
+def messages(of: Translator, sample: object, received_ns: int = 9_000) -> list[Message]:
+    return list(of.messages(Item(0, "any", Rank.KEPT, received_ns, sample, 1)))
+
+
+def topics(found: list[Message]) -> list[str]:
+    return [message.topic for message in found]
+
+
+def picture(seq: int, intrinsics: Intrinsics | None, width: int = 4) -> Picture:
+    header = FrameHeader("front", seq, seq + AHEAD_NS, seq, width, 3, Encoding.JPEG, 7, intrinsics)
+    return Picture(FrameRecord(header, seq, "jpeg"), b"picture")
+
+
+def test_capture_is_on_the_proxys_clock_and_receiving_on_ours() -> None:
+    (message,) = messages(translator(), Feedback(captured_ns=7_000, seq=3))
+    assert (message.publish_ns, message.log_ns, message.sequence) == (UNIX + 2_000, UNIX + 9_000, 3)
+    assert layout.decode(message.data, Feedback).captured_ns == 7_000
+
+
+def test_numbers_beyond_32_bits_begin_anew() -> None:
+    (message,) = messages(translator(), Feedback(captured_ns=1, seq=2**32 + 5))
+    assert message.sequence == 5
+
+
+def test_a_frame_and_its_picture_belong_together() -> None:
+    record, image = messages(translator(), picture(2**32 + 1, None))
+    assert (record.topic, image.topic) == ("/alpha/frames/front", "/alpha/camera/front/image")
+    assert (record.log_ns, record.publish_ns, record.sequence) == (image.log_ns, image.publish_ns, 1)
+
+
+def test_calibration_comes_when_it_changes_and_in_each_file() -> None:
+    one, other = Intrinsics(1.0, 1.0, 2.0, 1.5), Intrinsics(2.0, 2.0, 2.0, 1.5)
+    found = translator()
+    calibration = "/alpha/camera/front/calibration"
+    came = [
+        calibration in topics(messages(found, picture(seq, now))) for seq, now in enumerate((one, one, other, None))
+    ]
+    assert came == [True, False, True, False]
+    assert topics(list(found.prelude(1))) == [calibration]
+    assert calibration in topics(messages(found, picture(9, other, width=8)))
+
+
+def test_a_file_begins_with_parameters_cameras_and_their_places() -> None:
+    found = translator(CAMERA, CameraInfo("bottom", 4, 3, 30.0))
+    messages(found, Parameter("tilt", Type.FLOAT, 0.1))
+    messages(found, Parameter("tilt", Type.FLOAT, 0.2))
+    parameter, mounting, calibration = found.prelude(1)
+    assert layout.decode(parameter.data, Parameter).value == 0.2
+    assert (mounting.topic, calibration.topic) == (layout.TF, "/alpha/camera/front/calibration")
+
+
+def test_logged_numbers_are_not_lines_for_people() -> None:
+    number = LogEntry("me", "error", 7_000, number=0.5)
+    assert topics(messages(translator(), number)) == ["/alpha/logs"]
+    text = LogEntry("me", "mode", 7_000, text="searching")
+    assert topics(messages(translator(), text)) == ["/alpha/logs", layout.LOG]
+
+
+def test_every_channel_of_our_own_can_be_translated() -> None:
+    assert set(layout.TYPES) == set(Channel)
+
+
+def test_the_path_is_told_once_a_second_and_only_with_positions() -> None:
+    found = translator()
+    counts = 0
+    for tenth in range(30):
+        state = Feedback(
+            captured_ns=tenth * 100_000_000, roll=0.0, pitch=0.0, yaw=0.0, position=(0.1 * tenth, 0.0, 1.0)
+        )
+        counts += "/alpha/path" in topics(messages(found, state))
+    assert counts == 3
+    blind = Feedback(captured_ns=10**10, roll=0.0, pitch=0.0, yaw=0.0, altitude=1.0)
+    assert topics(messages(found, blind)) == ["/alpha/feedback", "/alpha/pose", "/tf"]
+
+
+def test_a_long_path_is_thinned_out_evenly() -> None:
+    path = Path()
+    for place in range(10_000):
+        path.add(place)
+    assert len(path.places) <= 400
+    steps = {after - before for before, after in zip(path.places, path.places[1:], strict=False)}
+    assert len(steps) == 1
+    assert path.places[0] == 0
+    assert path.places[-1] > 9_900

@@ -1,0 +1,355 @@
+"""The writing thread's steps: rotation, disks that fill up, stand still or vanish, and what is told."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from skyloop.clock import NS_PER_S
+from skyloop.errors import UsageError
+from skyloop.logfile import layout
+from skyloop.logfile.layout import META_END, META_RECORDING, ClockPair, DroneRecord, End, FrameRecord, Start
+from skyloop.messages import (
+    Applied,
+    Capabilities,
+    Encoding,
+    Feedback,
+    FrameHeader,
+    Idle,
+    Parameter,
+    ParameterType,
+    Severity,
+)
+from skyloop.recording.backlog import Backlog, Item, Rank
+from skyloop.recording.options import MB, Options
+from skyloop.recording.status import Room, judge_room
+from skyloop.recording.translation import Picture, Translator
+from skyloop.recording.writer import FileWriter
+from tests.recording import files
+from tests.recording.disks import Disk
+
+CLOCK = ClockPair(0, 1_000_000_000_000_000_000, 1)
+ABLE = Capabilities("test")
+
+
+class Bench:
+    """A writer whose thread is this test."""
+
+    def __init__(self, folder: Path, disk: Disk, **options: Any) -> None:
+        self.path = folder / "flight.mcap"
+        self.disk = disk
+        self.backlog = Backlog(options.pop("buffer", 10 * MB))
+        self.told: list[tuple[str, Severity]] = []
+        self.now_ns = 0
+        self.writer = FileWriter(
+            self.path,
+            Options(**{"min_free_mb": 0.0, **options}),
+            self.backlog,
+            [DroneRecord("alpha")],
+            [Translator("alpha", ABLE, CLOCK)],
+            CLOCK,
+            lambda text, severity: self.told.append((text, severity)),
+            opener=disk.open,
+            free=disk.free,
+        )
+        self.writer._open()  # as start() does, without the thread
+
+    def commands(self, *numbers: int) -> None:
+        for number in numbers:
+            applied = Applied(number, 1, 1, number, number, Idle(), Idle())
+            self.backlog.put(Item(0, "commands", Rank.KEPT, number, applied, 400))
+
+    def frames(self, *numbers: int, size: int = 1000) -> None:
+        for number in numbers:
+            header = FrameHeader("front", number, number, number, 4, 3, Encoding.BGR8, 36)
+            picture = Picture(FrameRecord(header, number, "jpeg"), bytes(range(256)) * (size // 256 + 1))
+            self.backlog.put(Item(0, "video.front", Rank.FRAME, number, picture, size))
+
+    def step(self, seconds: float = 1.0) -> None:
+        """A second later, when everything is due."""
+        self.now_ns += round(seconds * NS_PER_S)
+        self.writer.step(self.now_ns)
+
+    def texts(self) -> str:
+        return "\n".join(text for text, _ in self.told)
+
+
+Make = Callable[..., Bench]
+
+
+@pytest.fixture
+def make() -> Iterator[Make]:
+    """Makes benches, and closes their files."""
+    made: list[Bench] = []
+
+    def one(folder: Path, disk: Disk, **options: Any) -> Bench:
+        made.append(Bench(folder, disk, **options))
+        return made[-1]
+
+    yield one
+    for bench in made:
+        bench.writer._end()
+
+
+def written(*paths: Path, topic: str = "/alpha/commands") -> list[int]:
+    return [one.sequence for path in paths for one in files.of(path, topic)]
+
+
+def test_a_writer_with_its_thread(tmp_path: Path) -> None:
+    backlog = Backlog(MB)
+    options = Options(min_free_mb=0.0)
+    drones, translators = [DroneRecord("alpha")], [Translator("alpha", ABLE, CLOCK)]
+    writer = FileWriter(tmp_path / "f.mcap", options, backlog, drones, translators, CLOCK, lambda *_: None)
+    writer.start()
+    backlog.put(Item(0, "commands", Rank.KEPT, 1, Applied(1, 1, 1, 1, 1, Idle(), Idle()), 400))
+    writer.stop()
+    writer.stop()
+    assert writer.state.value == "closed"
+    assert written(tmp_path / "f.mcap") == [1]
+    assert files.is_complete(tmp_path / "f.mcap")
+    assert writer.bytes == (tmp_path / "f.mcap").stat().st_size
+
+
+def test_what_is_written_can_be_read_before_the_file_is_closed(make: Make, tmp_path: Path) -> None:
+    bench = make(tmp_path, Disk())
+    bench.commands(1, 2)
+    bench.step()
+    assert written(bench.path) == [1, 2]
+    assert bench.writer.messages == 2
+
+
+def test_rotation_by_size_and_each_file_is_complete_in_itself(make: Make, tmp_path: Path) -> None:
+    bench = make(tmp_path, Disk(), rotate_mb=1)
+    tilt = Parameter("limits.tilt", ParameterType.FLOAT, 0.2)
+    bench.backlog.put(Item(0, "parameters", Rank.KEPT, 1, tilt, 400))
+    for number in range(4):
+        bench.frames(number, size=400_000)
+        bench.commands(number)
+        bench.step()
+    bench.writer._end()
+    paths = sorted(tmp_path.iterdir())
+    assert [path.name for path in paths] == [f"flight-{number:04d}.mcap" for number in range(1, len(paths) + 1)]
+    assert bench.writer.files == paths
+    assert len(paths) >= 2 or bench.writer.bytes < MB
+    assert written(*paths) == [0, 1, 2, 3]
+    for number, path in enumerate(paths, 1):
+        assert files.is_complete(path)
+        found = files.metadata(path)
+        assert layout.from_metadata(found[META_RECORDING], Start).file == number
+        reason = layout.from_metadata(found[META_END], End).reason
+        assert reason == ("closed" if path == paths[-1] else "rotated")
+        (parameter,) = files.of(path, "/alpha/parameters")
+        assert layout.decode(parameter.data, Parameter) == tilt
+
+
+def test_rotation_by_time(make: Make, tmp_path: Path) -> None:
+    bench = make(tmp_path, Disk(), rotate_s=10)
+    for second in range(1, 26):
+        bench.commands(second)
+        bench.step()
+    bench.writer._end()
+    assert [written(path)[-1] for path in bench.writer.files] == [10, 20, 25]
+    assert written(*bench.writer.files) == list(range(1, 26))
+
+
+@pytest.mark.parametrize("room", [0, 300, 2500])
+def test_a_full_disk_pauses_and_nothing_that_must_be_kept_is_lost(make: Make, tmp_path: Path, room: int) -> None:
+    bench = make(tmp_path, Disk())
+    bench.commands(1, 2, 3)
+    bench.step()
+    bench.disk.room = room
+    bench.commands(*range(4, 60))
+    bench.step()
+    assert bench.writer.state.value == "paused"
+    assert "No space left" in bench.writer.reason
+    assert written(bench.path) == [1, 2, 3]
+    bench.step()  # tried again in vain, and told once
+    bench.commands(60)
+    bench.step()
+    assert bench.texts().count("No space left") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["flight.mcap"]
+    bench.disk.room = 10**9
+    bench.step()
+    assert bench.writer.state.value == "recording"
+    bench.writer._end()
+    assert [path.name for path in bench.writer.files] == ["flight.mcap", "flight-0002.mcap"]
+    assert written(*bench.writer.files) == list(range(1, 61))
+    assert bench.backlog.dropped == {}
+
+
+def test_what_follows_a_pause_overwrites_nothing(make: Make, tmp_path: Path) -> None:
+    (tmp_path / "flight-0002.mcap").write_text("precious")
+    bench = make(tmp_path, Disk(), overwrite=True)
+    bench.disk.room = 0
+    bench.commands(1)
+    bench.step()
+    bench.disk.room = 10**9
+    bench.step()
+    assert [path.name for path in bench.writer.files] == ["flight.mcap", "flight-0003.mcap"]
+    assert (tmp_path / "flight-0002.mcap").read_text() == "precious"
+
+
+def test_a_disk_that_is_full_to_the_end(make: Make, tmp_path: Path) -> None:
+    bench = make(tmp_path, Disk())
+    bench.commands(1)
+    bench.step()
+    bench.disk.room = 0
+    bench.commands(2)
+    bench.step()
+    bench.writer._end()
+    assert bench.writer.state.value == "failed"
+    assert "No space left" in bench.writer.reason
+    assert written(bench.path) == [1]
+
+
+def test_a_disk_that_fills_up_while_closing(make: Make, tmp_path: Path) -> None:
+    bench = make(tmp_path, Disk())
+    bench.commands(1)
+    bench.step()
+    bench.disk.room = 20
+    bench.writer._end()
+    assert bench.writer.state.value == "failed"
+    assert written(bench.path) == [1]
+
+
+def test_the_floor_stops_frames_first_then_all_until_there_is_room(make: Make, tmp_path: Path) -> None:
+    bench = make(tmp_path, Disk(100 * MB), min_free_mb=40)
+    bench.frames(1)
+    bench.step()
+    bench.disk.room = 30 * MB
+    bench.step()
+    bench.frames(2)
+    bench.commands(2)
+    bench.step()
+    assert bench.backlog.dropped == {(0, "video.front"): 1}
+    assert written(bench.path) == [2]
+    bench.disk.room = 9 * MB
+    bench.commands(3)
+    bench.step()
+    assert bench.writer.state.value == "paused"
+    assert files.is_complete(bench.path), "there was room to close it"
+    bench.disk.room = 45 * MB  # above the floor, but not by the margin
+    bench.step()
+    assert bench.writer.room is Room.NO_FRAMES
+    bench.disk.room = 60 * MB
+    bench.step()
+    bench.frames(4)
+    bench.step()
+    bench.writer._end()
+    assert written(*bench.writer.files) == [2, 3]
+    assert written(*bench.writer.files, topic="/alpha/frames/front") == [1, 4]
+    assert [severity for _, severity in bench.told] == [
+        Severity.INFO,
+        Severity.WARNING,
+        Severity.ERROR,
+        Severity.WARNING,
+        Severity.INFO,
+        Severity.INFO,
+    ]
+
+
+@pytest.mark.parametrize(
+    ("free", "before", "after"),
+    [
+        (100, Room.ALL, Room.ALL),
+        (99, Room.ALL, Room.NO_FRAMES),
+        (24, Room.ALL, Room.NOTHING),
+        (124, Room.NO_FRAMES, Room.NO_FRAMES),
+        (125, Room.NO_FRAMES, Room.ALL),
+        (24, Room.NO_FRAMES, Room.NOTHING),
+        (31, Room.NOTHING, Room.NOTHING),
+        (32, Room.NOTHING, Room.NO_FRAMES),
+        (200, Room.NOTHING, Room.ALL),
+    ],
+)
+def test_room_is_judged_with_a_margin(free: int, before: Room, after: Room) -> None:
+    assert judge_room(free, 100, before) is after
+
+
+def test_a_removed_folder_is_told_and_recording_goes_on_when_it_is_back(make: Make, tmp_path: Path) -> None:
+    folder = tmp_path / "flights"
+    folder.mkdir()
+    bench = make(folder, Disk())
+    bench.commands(1)
+    bench.step()
+    shutil.rmtree(folder)
+    bench.commands(2)
+    bench.step()
+    assert bench.writer.state.value == "paused"
+    assert "was removed" in bench.texts()
+    bench.step()
+    assert str(folder) in bench.writer.reason
+    folder.mkdir()
+    bench.commands(3)
+    bench.step()
+    bench.writer._end()
+    assert bench.writer.state.value == "closed"
+    assert written(folder / "flight-0002.mcap") == [2, 3]
+
+
+def test_a_moved_file_is_still_written(make: Make, tmp_path: Path) -> None:
+    bench = make(tmp_path, Disk())
+    bench.path.rename(tmp_path / "moved.mcap")
+    bench.commands(1)
+    bench.step()
+    bench.writer._end()
+    assert written(tmp_path / "moved.mcap") == [1]
+
+
+def test_a_disk_slower_than_the_data_costs_frames_and_no_command(make: Make, tmp_path: Path) -> None:
+    bench = make(tmp_path, Disk(), buffer=60_000)
+    bench.commands(0)
+    bench.step()
+    bench.disk.moving.clear()
+    bench.disk.writing.clear()
+    bench.commands(1)
+    stuck = threading.Thread(target=bench.step)
+    stuck.start()
+    assert bench.disk.writing.wait(10.0)
+    for number in range(2, 42):
+        bench.commands(number)
+        bench.frames(number)
+        bench.backlog.put(Item(0, "feedback", Rank.STATE, number, Feedback(captured_ns=number, seq=number), 400))
+    assert bench.backlog.size <= 60_000
+    bench.disk.moving.set()
+    stuck.join(10.0)
+    bench.step()
+    bench.writer._end()
+    assert written(bench.path) == list(range(42))
+    frames = written(bench.path, topic="/alpha/frames/front")
+    dropped = bench.backlog.dropped
+    assert 0 < len(frames) < 40
+    assert dropped[0, "video.front"] == 40 - len(frames)
+    assert dropped[0, "feedback"] == 0
+
+
+@pytest.mark.parametrize(
+    ("prepare", "match"),
+    [
+        (lambda path: path.write_text("x"), "File exists"),
+        (lambda path: path.parent.rmdir(), "No such file"),
+    ],
+)
+def test_what_can_not_be_started(tmp_path: Path, prepare: Callable[[Path], object], match: str) -> None:
+    path = tmp_path / "folder" / "f.mcap"
+    path.parent.mkdir()
+    prepare(path)
+    options = Options(min_free_mb=0.0)
+    writer = FileWriter(path, options, Backlog(MB), [], [], CLOCK, lambda *_: None)
+    with pytest.raises(UsageError, match=match):
+        writer.start()
+    writer.stop()
+
+
+def test_a_disk_without_room_is_refused_at_the_start(tmp_path: Path) -> None:
+    disk = Disk(9 * MB)
+    options = Options(min_free_mb=40)
+    path = tmp_path / "f.mcap"
+    writer = FileWriter(path, options, Backlog(MB), [], [], CLOCK, lambda *_: None, opener=disk.open, free=disk.free)
+    with pytest.raises(UsageError, match="has 9 MB left, and recording leaves 40 MB free"):
+        writer.start()
