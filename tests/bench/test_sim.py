@@ -11,7 +11,7 @@ import typer
 from typer.testing import CliRunner
 
 from skyloop.bench import sim
-from skyloop.bench.local import Spread
+from skyloop.bench.statistics import Spread
 from skyloop.cli.bench import bench, drawing_table, physics_table
 from skyloop.sim import STEP_S
 
@@ -94,10 +94,9 @@ def test_the_command_prints_and_writes_json(
     monkeypatch.setattr(sim, "measure", known)
     app = typer.Typer()
     app.command()(bench)
-    file = tmp_path / "sim.json"
-    result = CliRunner().invoke(app, ["sim", "--seconds", "5", "--json", str(file)], env={"COLUMNS": "120"})
+    result = CliRunner().invoke(app, ["sim", "--seconds", "5", "--output", str(tmp_path)], env={"COLUMNS": "120"})
     assert result.exit_code == 0, result.output
     assert asked == [5.0]
     assert "Physics alone" in result.output
     assert "10 × front" in result.output
-    assert msgspec.json.decode(file.read_bytes(), type=sim.SimResults) == measured[0]
+    assert msgspec.json.decode((tmp_path / "sim.json").read_bytes(), type=sim.SimResults) == measured[0]

@@ -1,8 +1,8 @@
 """The floor: the bare hand-over in Python, without Skyloop.
 
-Two processes, one ``SOCK_SEQPACKET`` socket. A packet is 100 bytes that carry the time of sending. A frame is copied
-into memory that both map, and a packet of 24 bytes announces it; the receiver makes an array over the memory. This is
-the least that any library in Python must do to bring the same bytes over, asleep between samples as Skyloop is.
+One ``SOCK_SEQPACKET`` socket. A packet is 100 bytes that carry the time of sending. A frame is copied into memory that
+both processes map, and a packet of 24 bytes announces it; the receiver makes an array over the memory. This is the
+least that any library in Python must do to bring the same bytes over, with a thread at each end that waits.
 """
 
 from __future__ import annotations
@@ -11,73 +11,89 @@ import mmap
 import os
 import socket
 import struct
-import time
-from multiprocessing.context import SpawnContext
+import threading
+from pathlib import Path
 
 import numpy as np
 
-from skyloop.bench.rounds import PACKET_BYTES, VIDEO_LARGE, Channel, Pipe, Workers, paced
+from skyloop.bench.contract import Heard, Image
+from skyloop.bench.schedule import COMMAND, FEEDBACK, LARGE, VIDEO
+from skyloop.bench.waypoints import Setpoint
 
+PACKET_BYTES = 100  #: about what a command or feedback packet takes
 STAMP = struct.Struct("<qqq")  #: time of sending, columns, rows
-END = b"end"
-MEMORY_BYTES = VIDEO_LARGE.frame_bytes
+PACKET = struct.Struct("<qqq3d52x")  #: the same, zeros for the size, and three numbers
+assert PACKET.size == PACKET_BYTES
+MEMORY_BYTES = LARGE.frame_bytes
 
 
-class Floor:
-    """The pair of processes. :meth:`measure` may be called again and again."""
+class Vehicle:
+    def __init__(self, address: str, heard: Heard) -> None:
+        self._path = Path(address) / "floor"
+        descriptor = os.memfd_create("skyloop-bench-floor")
+        os.ftruncate(descriptor, MEMORY_BYTES)
+        self._descriptor = descriptor
+        self._memory = np.frombuffer(mmap.mmap(descriptor, MEMORY_BYTES), np.uint8)
+        self._memory[:] = 1  # the pages are there before the first frame, as Skyloop's slots are after their first use
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._listener.bind(str(self._path))
+        self._listener.listen(1)
+        self._heard = heard
+        self._socket: socket.socket
+        self._thread = threading.Thread(target=self._receive, name="floor-receive", daemon=True)
+        self._thread.start()
 
-    def __init__(self, context: SpawnContext) -> None:
-        near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        with near, far:
-            self._workers = Workers(context)
-            self._sender = self._workers.start(send, near)
-            self._receiver = self._workers.start(receive, far)
+    def feedback(self, sent_ns: int) -> None:
+        self._socket.send(PACKET.pack(sent_ns, 0, 0, 0.1, 0.2, 0.3))
 
-    def measure(self, channel: Channel, count: int) -> list[int]:
-        """Delays in ns of ``count`` samples, from just before sending (or copying) to in the receiver's hands."""
-        self._sender.send((channel, count))
-        delays: list[int] = self._receiver.recv()
-        return delays
+    def frame(self, sent_ns: int, image: Image) -> None:
+        height, width, _ = image.shape
+        np.copyto(self._memory[: image.size], image.reshape(-1))
+        self._socket.send(STAMP.pack(sent_ns, width, height))
 
     def close(self) -> None:
-        self._workers.close()
+        self._listener.shutdown(socket.SHUT_RDWR)  # wakes the thread, should nobody have come
+        self._thread.join()
+        self._listener.close()
+        self._path.unlink()
+        os.close(self._descriptor)
+
+    def _receive(self) -> None:
+        try:
+            self._socket, _ = self._listener.accept()
+        except OSError:
+            return  # closed before anybody came
+        with self._socket as sock:
+            socket.send_fds(sock, [b"memory"], [self._descriptor])
+            while packet := sock.recv(256):
+                self._heard(COMMAND, STAMP.unpack_from(packet)[0])
 
 
-def send(pipe: Pipe, sock: socket.socket) -> None:
-    """The sending process: does each turn that comes over the pipe."""
-    descriptor = os.memfd_create("skyloop-bench-floor")
-    os.ftruncate(descriptor, MEMORY_BYTES)
-    memory = np.frombuffer(mmap.mmap(descriptor, MEMORY_BYTES), np.uint8)
-    memory[:] = 1  # the pages are there before the first turn, as Skyloop's slots are after their first use
-    socket.send_fds(sock, [END], [descriptor])
-    padding = bytes(PACKET_BYTES - STAMP.size)
-    pipe.send("ready")
-    while (turn := pipe.recv()) is not None:
-        channel, count = turn
-        image = np.random.default_rng(1).integers(0, 255, channel.frame_bytes, np.uint8)
-        slot = memory[: channel.frame_bytes]
-        for _ in paced(count, channel.period_s):
-            now = time.monotonic_ns()
-            if channel.width:
-                np.copyto(slot, image)
-                sock.send(STAMP.pack(now, channel.width, channel.height))
+class Application:
+    def __init__(self, address: str, heard: Heard) -> None:
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._socket.connect(str(Path(address) / "floor"))
+        _, (descriptor, *_), _, _ = socket.recv_fds(self._socket, 16, 1)
+        self._memory = mmap.mmap(descriptor, MEMORY_BYTES, prot=mmap.PROT_READ)
+        os.close(descriptor)
+        self._heard = heard
+        self._thread = threading.Thread(target=self._receive, name="floor-receive", daemon=True)
+        self._thread.start()
+
+    def command(self, sent_ns: int, setpoint: Setpoint) -> None:
+        self._socket.send(PACKET.pack(sent_ns, 0, 0, *setpoint))
+
+    def close(self) -> None:
+        self._socket.shutdown(socket.SHUT_RDWR)
+        self._thread.join()
+        self._socket.close()
+
+    def _receive(self) -> None:
+        sock, memory, heard = self._socket, self._memory, self._heard
+        while packet := sock.recv(256):
+            sent_ns, width, height = STAMP.unpack_from(packet)
+            if width:
+                np.frombuffer(memory, np.uint8, width * height * 3).reshape(height, width, 3)
+                heard(VIDEO, sent_ns)
             else:
-                sock.send(STAMP.pack(now, 0, 0) + padding)
-        sock.send(END)
-
-
-def receive(pipe: Pipe, sock: socket.socket) -> None:
-    """The receiving process: answers each turn with its delays."""
-    _, (descriptor, *_), _, _ = socket.recv_fds(sock, 16, 1)
-    memory = mmap.mmap(descriptor, MEMORY_BYTES, prot=mmap.PROT_READ)
-    pipe.send("ready")
-    delays: list[int] = []
-    while packet := sock.recv(256):
-        if packet == END:
-            pipe.send(delays)
-            delays = []
-            continue
-        sent, width, height = STAMP.unpack_from(packet)
-        if width:
-            np.frombuffer(memory, np.uint8, width * height * 3).reshape(height, width, 3)
-        delays.append(time.monotonic_ns() - sent)
+                heard(FEEDBACK, sent_ns)

@@ -1,117 +1,64 @@
-"""Skyloop's own pair of processes: a proxy, and an application that connects for each turn."""
+"""The two processes of one contender, measured turn by turn."""
 
 from __future__ import annotations
 
-import os
+import sys
 import time
-from collections.abc import Callable
-from multiprocessing.context import SpawnContext
-from typing import TYPE_CHECKING
+from typing import Final
 
-from skyloop.bench.rounds import COMMAND, FEEDBACK, Channel, Pipe, Workers, paced
-from skyloop.messages import AnyAction, Applied, Feedback, Velocity
+from skyloop.bench.contract import Arrivals, application_side, vehicle_side
+from skyloop.bench.schedule import CHANNELS, SETTLE_S, WARM_UP_S, Turn
+from skyloop.bench.workers import STARTS_WITHIN_S, Workers
 
-if TYPE_CHECKING:
-    from skyloop.client import Drone, Frame
-
-WARM_UP = 5  #: samples at the start of a turn that are not counted: threads and slots of a new connection
-SETTLE_S = 0.3  #: for the last samples of a turn to arrive
+_LATE_S: Final = 20.0  # for an answer on a busy machine
+_AHEAD_NS: Final = 50_000_000
 
 
 class Pair:
-    """A proxy in one process, an application in another, over the local transport."""
+    """``module`` holds the contender's ends (see :mod:`skyloop.bench.contract`), and ``address`` is a folder of its own
+    for its sockets. ``python`` is the interpreter that it runs under.
+    """
 
-    def __init__(self, context: SpawnContext) -> None:
-        name = f"bench-{os.getpid()}"
-        self._workers = Workers(context)
-        self._proxy = self._workers.start(serve, name)
-        self._application = self._workers.start(apply, name)
+    def __init__(
+        self,
+        workers: Workers,
+        module: str,
+        address: str,
+        *,
+        python: str = sys.executable,
+        application_module: str | None = None,
+    ) -> None:
+        self.vehicle = workers.start(vehicle_side, module, address, python=python)
+        self.application = workers.start(application_side, application_module or module, address, python=python)
+        for worker in (self.vehicle, self.application):
+            worker.answer(STARTS_WITHIN_S)
 
-    def measure(self, channel: Channel, count: int) -> tuple[list[int], list[int]]:
-        """Delays in ns: in the hands of an inline listener, and of one in its own thread.
+    def open(self, turn: Turn) -> None:
+        """Connect the two for a turn."""
+        for worker in (self.vehicle, self.application):
+            worker.pipe.send(turn)
+            worker.answer(STARTS_WITHIN_S)
 
-        Commands count from the user's call to the driver having them, feedback and frames from the driver's hand-over
-        to the application's; for commands there is no second list.
-        """
-        self._application.send((channel, count + WARM_UP))
-        self._application.recv()
-        if channel.name != COMMAND.name:
-            self._proxy.send((channel, count + WARM_UP))
-            self._proxy.recv()
-        inline, threaded = self._application.recv()
-        return inline[WARM_UP:], threaded[WARM_UP:]
+    def begin(self) -> int:
+        """Let the samples flow; returns when counting begins [ns]."""
+        begin_ns = time.monotonic_ns() + round(WARM_UP_S * 1e9) + _AHEAD_NS
+        for worker in (self.vehicle, self.application):
+            worker.pipe.send(begin_ns)
+        return begin_ns
 
-    def close(self) -> None:
-        self._workers.close()
+    def arrivals(self, turn: Turn, begin_ns: int) -> Arrivals:
+        """What was sent in the turn and arrived; waits for its end."""
+        found: Arrivals = {channel: [] for channel in CHANNELS}
+        for worker in (self.application, self.vehicle):
+            found |= worker.answer(turn.seconds + WARM_UP_S + SETTLE_S + _LATE_S)
+        return since(found, begin_ns)
 
-
-def serve(pipe: Pipe, name: str) -> None:
-    """The proxy's process."""
-    from skyloop.bench.vehicle import BenchVehicle
-    from skyloop.proxy import Proxy
-    from skyloop.transport.local import LocalServer
-
-    vehicle = BenchVehicle()
-    proxy = Proxy(vehicle, LocalServer(name), name=name)
-    proxy.start()
-    pipe.send("ready")
-    try:
-        while (turn := pipe.recv()) is not None:
-            channel, count = turn
-            vehicle.produce(channel, count)
-            pipe.send("done")
-    finally:
-        proxy.stop()
-
-
-def apply(pipe: Pipe, name: str) -> None:
-    """The application's process."""
-    from skyloop.client import connect
-
-    pipe.send("ready")
-    while (turn := pipe.recv()) is not None:
-        channel, count = turn
-        with connect(name, name="bench", on_exit="hover") as drone:
-            inline, threaded = _listen(drone, channel)
-            pipe.send("connected")
-            for index in paced(count, channel.period_s):
-                if channel.name == COMMAND.name:
-                    drone.velocity(forward=0.001 * (index % 100 + 1))
-            time.sleep(SETTLE_S)
-        pipe.send((inline, threaded))
+    def measure(self, turn: Turn) -> Arrivals:
+        """A whole turn."""
+        self.open(turn)
+        return self.arrivals(turn, self.begin())
 
 
-def _listen(drone: Drone, channel: Channel) -> tuple[list[int], list[int]]:
-    """Two lists that fill with the delays of the channel's samples."""
-    inline: list[int] = []
-    threaded: list[int] = []
-
-    last: AnyAction = Velocity()
-
-    def applied(echo: Applied) -> None:
-        nonlocal last
-        if type(echo.asked) is Velocity and echo.asked != last:  # each call has another one: equal ones are repeats
-            last = echo.asked
-            inline.append(echo.applied_ns - echo.sent_ns)
-
-    def came(into: list[int]) -> Callable[[Feedback | Frame], None]:
-        known = 0
-
-        def arrived(sample: Feedback | Frame) -> None:
-            nonlocal known
-            now_ns = time.monotonic_ns()
-            if sample.captured_ns > known:  # the proxy repeats an old state when somebody took the authority
-                known = sample.captured_ns
-                into.append(now_ns - known)
-
-        return arrived
-
-    if channel.name == COMMAND.name:
-        drone.on_command(applied)
-    elif channel.name == FEEDBACK.name:
-        drone.on_feedback(came(inline), inline=True)
-        drone.on_feedback(came(threaded))
-    else:
-        drone.add_processor(came(inline), inline=True)
-        drone.add_processor(came(threaded))
-    return inline, threaded
+def since(arrivals: Arrivals, begin_ns: int) -> Arrivals:
+    """Without what was sent before."""
+    return {channel: [pair for pair in pairs if pair[0] >= begin_ns] for channel, pairs in arrivals.items()}

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from skyloop.bench.local import Machine, Spread, spread
+from skyloop.bench.machine import Machine
+from skyloop.bench.statistics import Spread, spread
 from skyloop.clock import monotonic_ns, nanoseconds
 from skyloop.messages import Takeoff, Velocity
 from skyloop.sim import STEP_S, Simulation, load_world

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import time
+from typing import Final
 
-import numpy as np
-
-from skyloop.bench.rounds import Channel, paced
+from skyloop.bench.contract import Heard, Image
+from skyloop.bench.schedule import COMMAND
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.uri import parse_uri
 from skyloop.messages import (
@@ -17,47 +17,64 @@ from skyloop.messages import (
     Feedback,
     FlightState,
     LinkState,
+    Velocity,
 )
 
-CAMERA = "bench"
+CAMERA: Final = "bench"
+_WRAPS_NS: Final = 1 << 40  # 18 minutes
+_UNIT_M_S: Final = 2.0**-46
+
+
+def stamped(sent_ns: int) -> float:
+    """A time as a climb rate of less than 2 cm/s, which a command carries to the last bit within all limits."""
+    return (sent_ns % _WRAPS_NS) * _UNIT_M_S
+
+
+def stamp_of(up: float, now_ns: int) -> int:
+    """The time within the last 18 minutes that :func:`stamped` made this of [ns]."""
+    return now_ns - (now_ns - round(up / _UNIT_M_S)) % _WRAPS_NS
 
 
 class BenchVehicle(Driver):
-    """Hovers for ever; gives feedback and frames when it is told to."""
+    """Hovers for ever; gives feedback and frames when it is told to, and ``heard`` is told of each new set-point."""
 
-    def __init__(self) -> None:
+    def __init__(self, heard: Heard) -> None:
         super().__init__(parse_uri("bench://"))
+        self._heard = heard
+        self._last_up = 0.0
 
     def capabilities(self) -> Capabilities:
         return Capabilities("bench", frozenset(ACTION_NAMES.values()), (CameraInfo(CAMERA, 320, 240, 15.0),))
 
     def _open(self, sink: Sink) -> None:
         sink.link(LinkState.UP)
-        self._tell(sink)
+        self.tell(time.monotonic_ns())
 
     def _close(self) -> None:
         """There is nothing to give back."""
 
     def _apply(self, action: AnyAction) -> AnyAction:
+        now_ns = time.monotonic_ns()
+        if type(action) is Velocity and action.up != self._last_up:  # each call has another one: equal ones are repeats
+            self._last_up = action.up
+            self._heard(COMMAND, stamp_of(action.up, now_ns))
         return action
 
-    def produce(self, channel: Channel, count: int) -> None:
-        """Give ``count`` samples of the channel at its period."""
+    def show(self, captured_ns: int, image: Image) -> None:
+        """Give a frame."""
         sink = self._sink
-        assert sink is not None
-        image = np.random.default_rng(1).integers(0, 255, channel.frame_bytes, np.uint8)
-        for _ in paced(count, channel.period_s):
-            if channel.width:
-                now = time.monotonic_ns()
-                sink.frame(CAMERA, image, now, width=channel.width, height=channel.height)
-            else:
-                self._tell(sink)
+        if sink is not None:
+            height, width, _ = image.shape
+            sink.frame(CAMERA, image, captured_ns, width=width, height=height)
 
-    def _tell(self, sink: Sink) -> None:
-        """Feedback as full as a real vehicle's."""
+    def tell(self, captured_ns: int) -> None:
+        """Give feedback as full as a real vehicle's."""
+        sink = self._sink
+        if sink is None:
+            return
         sink.feedback(
             Feedback(
-                captured_ns=time.monotonic_ns(),
+                captured_ns=captured_ns,
                 state=FlightState.HOVERING,
                 battery=0.8,
                 battery_v=11.4,

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import sys
+from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 import typer
@@ -13,73 +14,217 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from skyloop.errors import UsageError
+
 if TYPE_CHECKING:
-    from skyloop.bench.local import Machine, Results, Spread
+    from skyloop.bench import tables
+    from skyloop.bench.schedule import Size
     from skyloop.bench.sim import SimResults
+    from skyloop.bench.statistics import Spread
 
 
 class What(StrEnum):
-    LOCAL = "local"
+    DELAYS = "delays"
+    LOAD = "load"
+    LOOP = "loop"
     SIM = "sim"
 
 
+LEAST_S = 0.5
 _WHAT_HELP = (
-    "local: each channel against the bare hand-over, on this host; sim: the simulator's physics and drawing on one core"
+    "delays: the paper's experiment, and the same by a bare hand-over and by other libraries; load: what observers, a "
+    "slow processor and a recorder do to the pilot; loop: from a frame to its command, by stage; sim: the simulator"
 )
+_ONLY = {  # options that mean something for one thing only
+    "--peers": (What.DELAYS,),
+    "--ros-python": (What.DELAYS,),
+    "--sizes": (What.DELAYS, What.LOOP),
+    "--observers": (What.LOAD,),
+    "--slow-processor": (What.LOAD,),
+    "--stuck": (What.LOAD,),
+    "--recorder": (What.LOAD,),
+    "--record-to": (What.LOAD,),
+}
 
 
 def bench(
     what: Annotated[What, typer.Argument(help=_WHAT_HELP)],
-    seconds: Annotated[float, typer.Option(min=4.0, help="About how long")] = 40.0,
-    json: Annotated[Path | None, typer.Option("--json", help="Write the figures there too")] = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=LEAST_S, help="How long to measure each contender, case or size [default: 30]")
+    ] = None,
+    minutes: Annotated[float | None, typer.Option(min=0.01, help="The same in minutes; the paper's were 5")] = None,
+    sizes: Annotated[
+        str | None, typer.Option(help="delays, loop: of the frames, such as 320x240,640x480 [default: 320x240]")
+    ] = None,
+    peers: Annotated[
+        str | None, typer.Option(help="delays: compare with ros2, zenoh, zeromq, several with commas, or all")
+    ] = None,
+    ros_python: Annotated[
+        str | None, typer.Option(help="delays: the Python that has rclpy [default: $SKYLOOP_ROS_PYTHON or this one]")
+    ] = None,
+    observers: Annotated[
+        str | None, typer.Option(help="load: how many, one case for each number [default: 1,8,32]")
+    ] = None,
+    slow_processor: Annotated[
+        bool | None, typer.Option("--slow-processor/--no-slow-processor", help="load: 200 ms a frame")
+    ] = None,
+    stuck: Annotated[bool | None, typer.Option("--stuck/--no-stuck", help="load: one of 8 observers stopped")] = None,
+    recorder: Annotated[
+        bool | None, typer.Option("--recorder/--no-recorder", help="load: record 640x480 at 30 frames a second")
+    ] = None,
+    record_to: Annotated[Path | None, typer.Option(help="load: the folder that the recorder writes to")] = None,
+    output: Annotated[
+        Path | None, typer.Option(help="A folder for the figures as JSON and, of delays, the diagrams (PNG and SVG)")
+    ] = None,
 ) -> None:
-    """Measure, as medians and 99th percentiles: delays against the floor, or the simulator against its targets."""
-    with Progress(transient=True) as progress:
-        task = progress.add_task(f"measuring {what.value}", total=1.0)
-        results, tables = _measured(what, seconds, lambda share: progress.update(task, completed=share))
-    for shown in tables:
-        Console().print(shown)
-    if json is not None:
-        json.write_bytes(msgspec.json.format(msgspec.json.encode(results), indent=2) + b"\n")
+    """Measure delays, as medians and 99th percentiles, or how fast the simulator is, and compare with the targets.
+
+    load and the recorder's cases start up to 35 processes. Nothing else should run meanwhile.
+    """
+    given = {
+        "--sizes": sizes,
+        "--peers": peers,
+        "--ros-python": ros_python,
+        "--observers": observers,
+        "--slow-processor": slow_processor,
+        "--stuck": stuck,
+        "--recorder": recorder,
+        "--record-to": record_to,
+    }
+    check_options(what, given)
+    if seconds is not None and minutes is not None:
+        raise UsageError("--seconds and --minutes say the same: give one of them")
+    duration_s = max(LEAST_S, minutes * 60.0) if minutes is not None else seconds if seconds is not None else 30.0
+    if output is not None:
+        output.mkdir(parents=True, exist_ok=True)
+    with Progress(transient=True, disable=not sys.stderr.isatty(), console=Console(stderr=True)) as bar:
+        task = bar.add_task(f"measuring {what.value}", total=1.0)
+
+        def progress(share: float, doing: str = "") -> None:
+            bar.update(task, completed=share, description=doing or f"measuring {what.value}")
+
+        match what:
+            case What.DELAYS:
+                results, shown = _delays(duration_s, sizes, peers, ros_python, progress)
+            case What.LOAD:
+                settings = (slow_processor is not False, stuck is not False, recorder is not False)
+                results, shown = _load(duration_s, observers, settings, record_to, progress)
+            case What.LOOP:
+                results, shown = _loop(duration_s, sizes, progress)
+            case What.SIM:
+                results, shown = _sim(duration_s, progress)
+    for table in shown:
+        Console().print(table)
+    if output is not None:
+        for file in write(what, results, output):
+            typer.echo(f"wrote {file}")
 
 
-def _measured(
-    what: What, seconds: float, progress: Callable[[float], None]
-) -> tuple[Results | SimResults, list[Table]]:
-    if what is What.SIM:
-        from skyloop.bench import sim
-
-        drawn = sim.measure(seconds, progress)
-        return drawn, [physics_table(drawn), drawing_table(drawn)]
-    from skyloop.bench import local
-
-    results = local.measure(seconds, progress)
-    return results, [table(results)]
+def check_options(what: What, given: Mapping[str, object]) -> None:
+    """Raises :class:`UsageError` for an option that means nothing for this."""
+    for option, value in given.items():
+        if value is not None and what not in _ONLY[option]:
+            raise UsageError(f"{option} is for bench {' and '.join(_ONLY[option])}, not for bench {what.value}")
 
 
-def table(results: Results) -> Table:
-    """The figures as a person reads them."""
-    shown = Table(
-        "channel",
-        "bare hand-over",
-        "Skyloop",
-        "ratio",
-        "target",
-        "own thread",
-        "samples",
-        title=f"Delay in µs: median (p99). {_where(results.machine)}",
-        box=None,
+def parse_sizes(text: str | None) -> list[Size]:
+    """Sizes of frames such as ``320x240,640x480``. Raises :class:`UsageError`."""
+    from skyloop.bench.schedule import LARGE, SMALL, Size
+
+    if text is None:
+        return [SMALL]
+    sizes = []
+    for word in text.split(","):
+        width, _, height = word.strip().replace("×", "x").partition("x")
+        size = Size(int(width), int(height)) if width.isdecimal() and height.isdecimal() else Size(0, 0)
+        if not 0 < size.frame_bytes <= LARGE.frame_bytes:
+            raise UsageError(
+                f"{word!r} is no size of frames: give such as 320x240, at most {LARGE.width}x{LARGE.height}"
+            )
+        sizes.append(size)
+    return list(dict.fromkeys(sizes))
+
+
+def parse_numbers(text: str | None) -> list[int]:
+    """Numbers of observers such as ``1,8,32``. Raises :class:`UsageError`."""
+    words = ["1", "8", "32"] if text is None else [word.strip() for word in text.split(",")]
+    if not all(word.isdecimal() and int(word) <= 100 for word in words):
+        raise UsageError(f"--observers is {text!r} and must be numbers up to 100 with commas, such as 1,8,32")
+    return [int(word) for word in words]
+
+
+def write(what: What, results: Any, folder: Path) -> list[Path]:
+    """The results as JSON, and the diagrams of delays. Raises :class:`MissingExtraError` after the JSON is written."""
+    file = folder / f"{what.value}.json"
+    file.write_bytes(msgspec.json.encode(results) + b"\n")
+    if what is not What.DELAYS:
+        return [file]
+    from skyloop.bench.figures import draw
+
+    return [file, *draw(results, folder)]
+
+
+def _delays(
+    seconds: float, sizes: str | None, peers: str | None, ros_python: str | None, progress: Any
+) -> tuple[Any, list[Table]]:
+    from skyloop.bench import delays, tables
+    from skyloop.bench.peers import chosen, find
+    from skyloop.bench.targets import judge_delays
+
+    wanted = parse_sizes(sizes)
+    found, skipped = find(chosen(peers or "none"), ros_python)
+    for name, why in skipped.items():
+        typer.echo(f"without {name}: {why}", err=True)
+    results = delays.measure(seconds, wanted, found, skipped, progress)
+    verdicts = tables.verdict_table(judge_delays(results))
+    return results, _rich(
+        [tables.paper_table(results), tables.comparison_table(results), verdicts], str(results.machine)
     )
-    for row in results.rows:
-        shown.add_row(
-            row.channel,
-            _spread(row.floor),
-            _spread(row.skyloop),
-            f"{row.ratio:.2f} ×",
-            f"≤ {row.target} ×",
-            "" if row.threaded is None else _spread(row.threaded),
-            str(row.skyloop.samples),
-        )
+
+
+def _load(
+    seconds: float, observers: str | None, settings: tuple[bool, bool, bool], record_to: Path | None, progress: Any
+) -> tuple[Any, list[Table]]:
+    from skyloop.bench import load, tables
+    from skyloop.bench.onlookers import recorder_problem
+    from skyloop.bench.targets import judge_load
+
+    slow, stuck, recorder = settings
+    skipped = {}
+    if recorder and (problem := recorder_problem()):
+        recorder = False
+        skipped["recorder"] = problem
+        typer.echo(f"without the recorder: {problem}", err=True)
+    cases = load.cases_of(parse_numbers(observers), slow_processor=slow, stuck=stuck, recorder=recorder)
+    results = load.measure(seconds, cases, record_to=record_to, skipped=skipped, progress=progress)
+    return results, _rich(
+        [tables.load_table(results), tables.cpu_table(results), tables.verdict_table(judge_load(results))],
+        str(results.machine),
+    )
+
+
+def _loop(seconds: float, sizes: str | None, progress: Any) -> tuple[Any, list[Table]]:
+    from skyloop.bench import loop, tables
+
+    results = loop.measure(seconds, parse_sizes(sizes), progress)
+    return results, _rich([tables.loop_table(results)], str(results.machine))
+
+
+def _sim(seconds: float, progress: Any) -> tuple[Any, list[Table]]:
+    from skyloop.bench import sim
+
+    results = sim.measure(seconds, progress)
+    return results, [physics_table(results), drawing_table(results)]
+
+
+def _rich(found: Sequence[tables.Table], where: str) -> list[Table]:
+    shown = []
+    for one in found:
+        if one.rows:
+            table = Table(*one.columns, title=one.title, caption=where, box=None)
+            for row in one.rows:
+                table.add_row(*row)
+            shown.append(table)
     return shown
 
 
@@ -87,7 +232,7 @@ def physics_table(results: SimResults) -> Table:
     """Flying without pictures."""
     title = "Physics alone, µs a step: median (p99)"
     shown = Table(
-        "drones", "world", "a step", "real time", "target", title=title, caption=_where(results.machine), box=None
+        "drones", "world", "a step", "real time", "target", title=title, caption=str(results.machine), box=None
     )
     for row in results.physics:
         target = "" if row.target is None else f"≥ {row.target:g} ×"
@@ -117,10 +262,6 @@ def drawing_table(results: SimResults) -> Table:
             str(row.round.samples),
         )
     return shown
-
-
-def _where(machine: Machine) -> str:
-    return f"Python {machine.python}, {machine.system}, {machine.cores} cores"
 
 
 def _spread(spread: Spread) -> str:

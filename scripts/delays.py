@@ -1,0 +1,73 @@
+"""Puts measured delays into ``docs/delays.md``: its tables and pictures are made from JSON and from nothing else.
+
+``python scripts/delays.py`` makes them anew from ``docs/measured``; ``python scripts/delays.py FOLDER`` takes new
+results from the folder that ``skyloop bench … --output FOLDER`` wrote: those of ``delays.json``, ``load.json`` and
+``loop.json`` that are there.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+from skyloop.bench import delays, load, loop, tables
+from skyloop.bench.figures import draw
+from skyloop.bench.page import fill
+from skyloop.bench.targets import judge_delays, judge_load
+
+DOCS = Path(__file__).parents[1] / "docs"
+MEASURED = DOCS / "measured"
+PAGE = DOCS / "delays.md"
+IDLE_LOAD = 0.5  # average number of processes that wanted a core
+FILES = ("delays.json", "load.json", "loop.json")
+
+
+def main() -> None:
+    if len(sys.argv) > 2:
+        sys.exit(f"usage: {sys.argv[0]} [FOLDER]")
+    if len(sys.argv) == 2:
+        take(Path(sys.argv[1]))
+    PAGE.write_text(fill(PAGE.read_text(), blocks(MEASURED)))
+    for file in draw(delays.load(MEASURED / "delays.json"), DOCS / "pictures"):
+        print(file)
+
+
+def take(folder: Path) -> None:
+    """Keep the results of a run beside the page."""
+    found = [folder / name for name in FILES if (folder / name).exists()]
+    if not found:
+        sys.exit(f"{folder} holds none of {', '.join(FILES)}")
+    MEASURED.mkdir(exist_ok=True)
+    for file in found:
+        shutil.copy(file, MEASURED)
+
+
+def blocks(folder: Path) -> dict[str, str]:
+    """What belongs into the marked places of the page."""
+    experiment = delays.load(folder / "delays.json")
+    crowd = load.load(folder / "load.json")
+    trips = loop.load(folder / "loop.json")
+    return {
+        "machine": machine(experiment),
+        "paper": tables.paper_table(experiment).markdown(),
+        "comparison": tables.comparison_table(experiment).markdown(),
+        "targets": tables.verdict_table([*judge_delays(experiment), *judge_load(crowd)]).markdown(),
+        "load": tables.load_table(crowd).markdown(),
+        "processor": tables.cpu_table(crowd).markdown(),
+        "loop": tables.loop_table(trips).markdown(),
+    }
+
+
+def machine(results: delays.Delays) -> str:
+    """The machine in a sentence, how long was measured, and a warning if it was not alone."""
+    where = results.machine
+    packages = ", ".join(f"{name} {version}" for name, version in where.packages.items())
+    text = f"{where} ({packages}); {results.seconds:g} s for each contender with each size."
+    if where.load is None or where.load > IDLE_LOAD:
+        text += "\n\n**The machine had other work at the same time**: the medians say something, the tails little."
+    return text
+
+
+if __name__ == "__main__":
+    main()

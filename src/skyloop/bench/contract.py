@@ -1,0 +1,113 @@
+"""What every contender is measured by: two processes that each have one end of it, and stamps on one clock.
+
+A contender is a module with two classes, ``Vehicle(address, heard)`` and ``Application(address, heard)``. The
+sender's stamp is taken when the user's data are there and before the contender is called; ``heard(channel, sent_ns)``
+is called when the receiver's user has them, a frame as an array. Stamps travel with the samples.
+
+Imported by interpreters that have no more than NumPy and the contender: nothing else is imported here.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from importlib import import_module
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.bench.schedule import COMMAND, FEEDBACK, SETTLE_S, VIDEO, Size, Turn, paced
+from skyloop.bench.waypoints import Setpoint, fly
+from skyloop.bench.workers import Pipe
+
+Image = NDArray[np.uint8]
+#: Told of each sample that is in its receiver's hands: its channel, and when it was sent [ns, monotonic].
+Heard = Callable[[str, int], None]
+#: By channel: when each sample was sent, and when it was heard.
+Arrivals = dict[str, list[tuple[int, int]]]
+
+
+class VehicleEnd(Protocol):
+    """Where feedback and frames come from and commands arrive."""
+
+    def feedback(self, sent_ns: int) -> None: ...
+    def frame(self, sent_ns: int, image: Image) -> None: ...
+    def close(self) -> None: ...
+
+
+class ApplicationEnd(Protocol):
+    """The user's: where commands come from and feedback and frames arrive. Opened after the vehicle's."""
+
+    def command(self, sent_ns: int, setpoint: Setpoint) -> None: ...
+    def close(self) -> None: ...
+
+
+class Recorder:
+    """Keeps what was heard; its :meth:`heard` is called by any thread."""
+
+    def __init__(self) -> None:
+        self.arrivals: Arrivals = {}
+
+    def heard(self, channel: str, sent_ns: int) -> None:
+        now_ns = time.monotonic_ns()
+        self.arrivals.setdefault(channel, []).append((sent_ns, now_ns))
+
+
+def vehicle_side(pipe: Pipe, module: str, address: str) -> None:
+    """The vehicle's process: a turn after the other."""
+    contender = import_module(module)
+    for turn in _turns(pipe):
+        recorder = Recorder()
+        end: VehicleEnd = contender.Vehicle(address, recorder.heard)
+        try:
+            pipe.send("open")
+            produce(end, turn, pipe.recv())
+            time.sleep(SETTLE_S)
+        finally:
+            end.close()
+        pipe.send(recorder.arrivals)
+
+
+def application_side(pipe: Pipe, module: str, address: str) -> None:
+    """The application's process: a turn after the other."""
+    contender = import_module(module)
+    for turn in _turns(pipe):
+        recorder = Recorder()
+        end: ApplicationEnd = contender.Application(address, recorder.heard)
+        try:
+            pipe.send("open")
+            begin_ns = pipe.recv()
+            for _, setpoint in zip(paced(turn.deadlines_ns(COMMAND, begin_ns)), fly(), strict=False):
+                end.command(time.monotonic_ns(), setpoint)
+            time.sleep(SETTLE_S)
+        finally:
+            end.close()
+        pipe.send(recorder.arrivals)
+
+
+def produce(end: VehicleEnd, turn: Turn, begin_ns: int) -> None:
+    """Feedback from one thread and frames from another, as drivers do."""
+
+    def tell() -> None:
+        for _ in paced(turn.deadlines_ns(FEEDBACK, begin_ns)):
+            end.feedback(time.monotonic_ns())
+
+    teller = threading.Thread(target=tell, name="bench-feedback", daemon=True)
+    teller.start()
+    image = picture(turn.size)
+    for _ in paced(turn.deadlines_ns(VIDEO, begin_ns)):
+        end.frame(time.monotonic_ns(), image)
+    teller.join()
+
+
+def picture(size: Size) -> Image:
+    """Noise, shape (height, width, 3): nothing that could be left out on the way."""
+    return np.random.default_rng(1).integers(0, 255, (size.height, size.width, 3), np.uint8)
+
+
+def _turns(pipe: Pipe) -> Iterator[Any]:
+    pipe.send("ready")
+    while (turn := pipe.recv()) is not None:
+        yield turn

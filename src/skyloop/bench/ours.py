@@ -1,0 +1,71 @@
+"""Skyloop's own ends: a proxy with a vehicle that only makes samples, and an application's drone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from skyloop.bench.contract import Heard, Image
+from skyloop.bench.schedule import FEEDBACK, VIDEO
+from skyloop.bench.vehicle import CAMERA, BenchVehicle, stamped
+from skyloop.bench.waypoints import Setpoint
+from skyloop.client import Frame, connect
+from skyloop.messages import Feedback
+from skyloop.proxy import Proxy
+from skyloop.transport.local import LocalServer
+
+
+def proxy_name(address: str) -> str:
+    """Of the proxy that is measured; ``address`` is a folder of this run alone."""
+    return Path(address).name.lower()
+
+
+class Vehicle:
+    """The proxy's process."""
+
+    def __init__(self, address: str, heard: Heard) -> None:
+        name = proxy_name(address)
+        self._vehicle = BenchVehicle(heard)
+        self._proxy = Proxy(self._vehicle, LocalServer(name), name=name)
+        self._proxy.start()
+
+    def feedback(self, sent_ns: int) -> None:
+        self._vehicle.tell(sent_ns)
+
+    def frame(self, sent_ns: int, image: Image) -> None:
+        self._vehicle.show(sent_ns, image)
+
+    def close(self) -> None:
+        self._proxy.stop()
+
+
+class Listening:
+    """Tells of feedback and frames on the link's receiving thread, each once."""
+
+    def __init__(self, heard: Heard) -> None:
+        self._heard = heard
+        self._known_ns = 0
+
+    def feedback(self, feedback: Feedback) -> None:
+        if feedback.captured_ns > self._known_ns:  # the proxy repeats an old state when somebody took the authority
+            self._known_ns = feedback.captured_ns
+            self._heard(FEEDBACK, feedback.captured_ns)
+
+    def frame(self, frame: Frame) -> None:
+        self._heard(VIDEO, frame.captured_ns)
+
+
+class Application:
+    """The pilot."""
+
+    def __init__(self, address: str, heard: Heard) -> None:
+        self._drone = connect(proxy_name(address), name="bench", on_exit="hover")
+        listening = Listening(heard)
+        self._drone.on_feedback(listening.feedback, inline=True)
+        self._drone.add_processor(listening.frame, camera=CAMERA, inline=True)
+
+    def command(self, sent_ns: int, setpoint: Setpoint) -> None:
+        forward, left, yaw_rate = setpoint
+        self._drone.velocity(forward=forward, left=left, up=stamped(sent_ns), yaw_rate=yaw_rate)
+
+    def close(self) -> None:
+        self._drone.close()

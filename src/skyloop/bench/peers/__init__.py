@@ -1,0 +1,103 @@
+"""What a user would take instead of Skyloop, where it is installed: one file each, measured by the same contract."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final
+
+from skyloop.errors import UnknownNameError
+
+ROS_PYTHON_VARIABLE: Final = "SKYLOOP_ROS_PYTHON"
+_LOOKS_WITHIN_S: Final = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class Contender:
+    """Something that is measured: a module with its two ends, and the interpreter that it runs under."""
+
+    name: str
+    title: str
+    module: str
+    python: str = sys.executable
+    version: str = ""
+
+
+OURS: Final = Contender("skyloop", "Skyloop", "skyloop.bench.ours")
+FLOOR: Final = Contender("floor", "bare hand-over", "skyloop.bench.floor")
+
+
+@dataclass(frozen=True, slots=True)
+class Peer:
+    """Another library: what it must be possible to import, and the package whose version counts."""
+
+    title: str
+    imports: str
+    package: str
+    install: str
+
+
+PEERS: Final = {
+    "ros2": Peer(
+        "ROS 2 (rclpy)",
+        "rclpy, sensor_msgs.msg, geometry_msgs.msg, numpy",
+        "rclpy",
+        "pip install ros-rclpy ros-rmw-fastrtps-cpp ros-sensor-msgs, in an environment of its own, "
+        "whose interpreter --ros-python names",
+    ),
+    "zenoh": Peer("Zenoh", "zenoh", "eclipse-zenoh", "pip install 'skyloop[bench]'"),
+    "zeromq": Peer("ZeroMQ", "zmq", "pyzmq", "pip install 'skyloop[bench]'"),
+}
+
+
+def chosen(text: str) -> list[str]:
+    """Names of peers from a list with commas; ``all`` and ``none`` are words for themselves.
+
+    Raises :class:`UnknownNameError`.
+    """
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    if names == ["all"]:
+        return list(PEERS)
+    if names == ["none"]:
+        return []
+    for name in names:
+        if name not in PEERS:
+            raise UnknownNameError("peer", name, [*PEERS, "all", "none"])
+    return list(dict.fromkeys(names))
+
+
+def find(names: Iterable[str], ros_python: str | None = None) -> tuple[list[Contender], dict[str, str]]:
+    """Those that can be measured here, and why the others can't.
+
+    ``ros_python``: the interpreter with ``rclpy``; None: what the variable ``SKYLOOP_ROS_PYTHON`` names, or this one.
+    """
+    found: list[Contender] = []
+    skipped: dict[str, str] = {}
+    for name in names:
+        peer = PEERS[name]
+        python = sys.executable
+        if name == "ros2":
+            python = ros_python or os.environ.get(ROS_PYTHON_VARIABLE) or python
+        version, problem = _look(python, peer)
+        if problem:
+            skipped[name] = f"{problem}: {peer.install}"
+        else:
+            found.append(Contender(name, peer.title, f"skyloop.bench.peers.{name}", python, version))
+    return found, skipped
+
+
+def _look(python: str, peer: Peer) -> tuple[str, str]:
+    """Version, and what is wrong; one of the two is empty."""
+    code = f"import {peer.imports}; from importlib.metadata import version; print(version({peer.package!r}))"
+    try:
+        ended = subprocess.run(
+            [python, "-c", code], capture_output=True, text=True, timeout=_LOOKS_WITHIN_S, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return "", f"{python} does not run ({type(error).__name__})"
+    if ended.returncode:
+        return "", (ended.stderr.strip().splitlines() or ["it can't be imported"])[-1]
+    return ended.stdout.strip().splitlines()[-1], ""

@@ -1,0 +1,101 @@
+"""Processes with a pipe each, if need be under another interpreter, which need not have Skyloop's dependencies."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import subprocess
+import sys
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Protocol, Self
+
+from skyloop.errors import LinkError, NoAnswerError
+
+STARTS_WITHIN_S: Final = 30.0
+ENDS_WITHIN_S: Final = 5.0
+_PACKAGES: Final = Path(__file__).parents[2]  # where ``skyloop`` is found
+# At the end of the path: another interpreter has its own packages, made for its own version, before ours.
+_BOOT: Final = "import sys; sys.path.append(sys.argv[1]); from skyloop.bench.workers import child; child(sys.argv[2])"
+
+
+class Pipe(Protocol):
+    """One end of a duplex ``multiprocessing`` connection."""
+
+    def send(self, obj: Any, /) -> None: ...
+    def recv(self) -> Any: ...
+    def poll(self, timeout: float | None = 0.0, /) -> bool: ...
+
+
+class Worker:
+    """A process that does ``work(pipe, *arguments)``."""
+
+    def __init__(self, python: str, work: Callable[..., None], arguments: tuple[Any, ...]) -> None:
+        self.pipe, theirs = multiprocessing.Pipe()
+        with theirs:
+            number = theirs.fileno()
+            self._process = subprocess.Popen([python, "-c", _BOOT, str(_PACKAGES), str(number)], pass_fds=[number])
+        self.pid = self._process.pid
+        self._what = " ".join([work.__name__, *map(str, arguments[:1])])
+        self.pipe.send((work.__module__, work.__qualname__, arguments))
+
+    def answer(self, timeout_s: float) -> Any:
+        """What it says next. Raises :class:`NoAnswerError` if that does not come, :class:`LinkError` if it ended."""
+        if not self.pipe.poll(timeout_s):
+            raise NoAnswerError(f"the measuring process of {self._what} said nothing for {timeout_s:g} s")
+        try:
+            answer = self.pipe.recv()
+        except (EOFError, ConnectionResetError):
+            raise LinkError(f"the measuring process of {self._what} ended; its error stands above") from None
+        return answer
+
+    def end(self) -> None:
+        """``None`` on the pipe ends the work."""
+        with contextlib.suppress(OSError):  # it ended already
+            self.pipe.send(None)
+
+    def wait(self) -> None:
+        """Until it has ended, by force if need be."""
+        try:
+            self._process.wait(ENDS_WITHIN_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self.pipe.close()
+
+
+class Workers:
+    """All of them end with the block."""
+
+    def __init__(self) -> None:
+        self._running: list[Worker] = []
+
+    def start(self, work: Callable[..., None], *arguments: Any, python: str = sys.executable) -> Worker:
+        """Start ``work(pipe, *arguments)``, a function of a module; it says ``"ready"`` first."""
+        worker = Worker(python, work, arguments)
+        self._running.append(worker)
+        return worker
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        for worker in self._running:
+            worker.end()
+        for worker in self._running:
+            worker.wait()
+        self._running.clear()
+
+
+def child(number: str) -> None:
+    """What a worker's process does."""
+    from importlib import import_module
+
+    with Connection(int(number)) as pipe:
+        module, name, arguments = pipe.recv()
+        with contextlib.suppress(KeyboardInterrupt, EOFError, BrokenPipeError):  # whoever measured has ended
+            getattr(import_module(module), name)(pipe, *arguments)
