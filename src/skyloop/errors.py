@@ -66,7 +66,7 @@ class NameTakenError(UsageError):
 
 
 class DecodeError(SkyloopError, ValueError):
-    """Bytes that are no valid packet, of Skyloop or of a vehicle: wrong signature, version, kind, length, type or range."""
+    """Bytes that are no valid packet, of Skyloop or a vehicle: wrong signature, version, kind, length or range."""
 
 
 class MissingExtraError(SkyloopError, ImportError):

@@ -200,7 +200,7 @@ class Vehicle:
         text = f"link to the vehicle: {before.value} → {state.value}" + (f" ({reason})" if reason else "")
         severity = Severity.INFO if state is LinkState.UP else Severity.WARNING
         self._events.tell(EventKind.VEHICLE_LINK, text, severity, data={"state": state.value, "reason": reason})
-        if self.link_up and not was_up:
+        if self.link_up and (not was_up or state is LinkState.UP):  # all of it may be known now: read it again
             self.on_link_up()
 
     def event(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: Value) -> None:

@@ -83,7 +83,8 @@ class SimHost:
         """Begin to tell a passenger about a drone and to draw its cameras; the first one starts the world.
 
         Raises :class:`UsageError` if there is no such drone or somebody else has it,
-        :class:`skyloop.errors.MissingExtraError` or :class:`skyloop.errors.UnsupportedError` if cameras are wanted and what draws is not installed.
+        :class:`skyloop.errors.MissingExtraError` or :class:`skyloop.errors.UnsupportedError` if cameras are wanted and
+        what draws is not installed.
         """
         if not 0 <= drone < self.drones:
             raise UsageError(f"no drone {drone}: they are numbered from 0 to {self.drones - 1}")

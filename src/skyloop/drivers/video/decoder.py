@@ -21,6 +21,8 @@ __all__ = ["PaveDecoder", "av", "limit_memory"]
 
 MAX_PIXELS: Final = 7680 * 4320
 _DECODERS: Final[dict[int, Literal["mpeg4", "h264"]]] = {Codec.MPEG4_VISUAL: "mpeg4", Codec.MPEG4_AVC: "h264"}
+# FFmpeg refuses an MPEG-4 frame now and then that is padded by a single bit, unless the sequence's end follows.
+_ENDS: Final = {int(Codec.MPEG4_VISUAL): b"\0\0\1\xb1"}
 
 
 def limit_memory(context: CodecContext) -> None:
@@ -32,8 +34,10 @@ class PaveDecoder:
     """Frames of a PaVE stream to pictures, one in and at most one out, without delay.
 
     Gives nothing before the first key frame (a stream torn open, or the stale frame with which the drone greets), and
-    after damage nothing up to the next key frame: those pictures would be smeared. ``waited`` counts frames left out
-    for that, ``damaged`` those that could not be decoded.
+    after damage or a gap in the frames' numbers nothing up to the next key frame: those pictures would be smeared.
+    ``waited`` counts frames left out for that, ``damaged`` those that could not be decoded.
+
+    PaVE and H.264 have no checksum: a flipped bit that makes another valid stream passes. A stream over TCP has one.
     """
 
     def __init__(self) -> None:
@@ -42,10 +46,17 @@ class PaveDecoder:
         self._codec: int | None = None
         self._context: VideoCodecContext | None = None
         self._needs_key = True
+        self._number = 0  # of the frame before
+
+    def restart(self) -> None:
+        """What comes next does not continue what came before: wait for a key frame."""
+        self._needs_key = True
 
     def decode(self, frame: PaveFrame) -> av.VideoFrame | None:
         """The picture of this frame, or None. Never raises for what a frame holds."""
-        self._needs_key = self._needs_key or frame.after_damage or frame.codec != self._codec
+        follows = frame.number == self._number + 1 & 0xFFFFFFFF and frame.codec == self._codec
+        self._needs_key = self._needs_key or frame.after_damage or not follows
+        self._number = frame.number
         if self._needs_key and not frame.is_key:
             self.waited += 1
             return None
@@ -55,10 +66,10 @@ class PaveDecoder:
             self.damaged += 1
             return None
         try:
-            images = self._context.decode(av.Packet(frame.payload))
+            images = self._context.decode(av.Packet(frame.payload + _ENDS.get(frame.codec, b"")))
         except (av.error.FFmpegError, ValueError):
             images = []
-        if not images or images[-1].is_corrupt:
+        if not images or images[-1].is_corrupt or not _fits(images[-1], frame):
             self.damaged += 1
             self._needs_key = True
             return None
@@ -71,8 +82,15 @@ class PaveDecoder:
         if name is None:
             return
         context = av.CodecContext.create(name, "r")
-        context.options = {"err_detect": "explode"}  # a frame with errors is refused instead of patched up
+        # A frame with errors is refused instead of patched up, and one of H.264 also if bits of it are left over: the
+        # like of it would refuse every end of an MPEG-4 sequence.
+        context.options = {"err_detect": "explode+aggressive" if codec == Codec.MPEG4_AVC else "explode"}
         limit_memory(context)
         context.flags |= av.codec.context.Flags.low_delay
         context.thread_count = 1  # frame threads would hold pictures back
         self._context, self._needs_key = context, False
+
+
+def _fits(image: av.VideoFrame, frame: PaveFrame) -> bool:
+    """Whether an H.264 picture has the size that its header says. Of MPEG-4 it is not known what real drones do."""
+    return frame.codec != Codec.MPEG4_AVC or (image.width, image.height) == (frame.width, frame.height)

@@ -12,13 +12,14 @@ from functools import partial
 from pathlib import Path
 
 from skyloop.drivers.base import Driver, Sink, reject_unknown_options
+from skyloop.drivers.intrinsics import INTRINSICS_OPTIONS, check_intrinsics, intrinsics_of
 from skyloop.drivers.uri import VehicleUri
 from skyloop.drivers.video.player import FilePlayer, LivePlayer, Screen
 from skyloop.drivers.video.sources import DEFAULT_FPS, Source, is_device, open_device, open_file
 from skyloop.errors import DriverError, SkyloopError, UsageError
 from skyloop.messages import CameraInfo, Capabilities, EventKind, Hover, Intrinsics, Land, LinkState, Severity
 
-_OPTIONS = {"camera", "loop", "speed", "wait", "fx", "fy", "cx", "cy", "distortion", "width", "height", "fps"}
+_OPTIONS = {"camera", "loop", "speed", "wait", "width", "height", "fps", *INTRINSICS_OPTIONS}
 _DEVICE_OPTIONS = {"width", "height", "fps"}
 _CLOSE_S = 2.0
 
@@ -44,9 +45,7 @@ class VideoDriver(Driver):
         self._asked_width = uri.whole("width", 640, minimum=1, maximum=16384)
         self._asked_height = uri.whole("height", 480, minimum=1, maximum=16384)
         self._asked_fps = uri.number("fps", DEFAULT_FPS, minimum=0.1, maximum=1000.0)
-        for focal_length in ("fx", "fy"):
-            uri.number(focal_length, 1.0, minimum=1e-3)
-        self._distortion = _distortion(uri)
+        check_intrinsics(uri)
         self._info: CameraInfo | None = None
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -118,27 +117,4 @@ class VideoDriver(Driver):
 
     def _intrinsics(self, width: int, height: int) -> Intrinsics | None:
         """From the options; unknown (None) unless the focal length is given."""
-        if "fx" not in self.uri.options:
-            return None
-        fx = self.uri.number("fx", 0.0)
-        return Intrinsics(
-            fx=fx,
-            fy=self.uri.number("fy", fx),
-            cx=self.uri.number("cx", (width - 1) / 2),
-            cy=self.uri.number("cy", (height - 1) / 2),
-            distortion=self._distortion,
-        )
-
-
-def _distortion(uri: VehicleUri) -> tuple[float, ...]:
-    given = uri.options.get("distortion", "")
-    try:
-        numbers = tuple(float(part) for part in given.split(",")) if given else ()
-    except ValueError:
-        numbers = (0.0,)
-    if len(numbers) not in (0, 4, 5, 8):
-        raise UsageError(f"{uri}: distortion is {given!r} and must be 4, 5 or 8 numbers: k1,k2,p1,p2[,k3[,k4,k5,k6]]")
-    for option in {"fy", "cx", "cy", "distortion"} & uri.options.keys():
-        if "fx" not in uri.options:
-            raise UsageError(f"{uri}: option {option} needs fx as well")
-    return numbers
+        return intrinsics_of(self.uri, width, height)

@@ -16,7 +16,8 @@ On free ports of this machine, for a test::
 """
 
 from skyloop.sim.firmware.ardrone.firmware import ArdroneFirmware
-from skyloop.sim.firmware.ardrone.settings import Ports, with_ardrones
+from skyloop.sim.firmware.ardrone.settings import with_ardrones
 from skyloop.transport.faults import Faults
+from skyloop.wire.ardrone.ports import Ports
 
 __all__ = ["ArdroneFirmware", "Faults", "Ports", "with_ardrones"]

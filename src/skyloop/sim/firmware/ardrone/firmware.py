@@ -9,9 +9,10 @@ from skyloop.errors import UsageError
 from skyloop.sim.firmware.ardrone.board import MainBoard
 from skyloop.sim.firmware.ardrone.encoders import require_encoder
 from skyloop.sim.firmware.ardrone.running import RunningFirmware
-from skyloop.sim.firmware.ardrone.settings import NO_FAULTS, STANDARD_PORTS, Ports, Settings
+from skyloop.sim.firmware.ardrone.settings import NO_FAULTS, Settings
 from skyloop.sim.host import SimHost
 from skyloop.transport.faults import Faults
+from skyloop.wire.ardrone.ports import STANDARD, Ports
 
 VERSIONS: Final = (1, 2)
 
@@ -39,7 +40,7 @@ class ArdroneFirmware:
         *,
         version: int = 2,
         bind: str = "127.0.0.1",
-        ports: Ports = STANDARD_PORTS,
+        ports: Ports = STANDARD,
         faults: Faults = NO_FAULTS,
         delay_s: float = 0.0,
         header_size: int = 68,

@@ -18,7 +18,7 @@ from skyloop.sim.firmware.ardrone.clock import DroneClock
 from skyloop.sim.firmware.ardrone.datagrams import Address, DatagramPort
 from skyloop.sim.firmware.ardrone.listeners import Listeners
 from skyloop.sim.firmware.ardrone.loop import Loop
-from skyloop.sim.firmware.ardrone.settings import Ports, Settings
+from skyloop.sim.firmware.ardrone.settings import Settings
 from skyloop.sim.firmware.ardrone.streams import Outlet, StreamPort
 from skyloop.sim.firmware.ardrone.telemetry import Snapshot, options_of, tags_of
 from skyloop.sim.firmware.ardrone.vehicle import SimulatedVehicle
@@ -26,6 +26,7 @@ from skyloop.sim.firmware.ardrone.video import Packer, PavePacker, Piece, UvlcPa
 from skyloop.sim.host import Report, SimHost
 from skyloop.sim.reports import Occurrence
 from skyloop.wire.ardrone import navdata
+from skyloop.wire.ardrone.ports import Ports
 
 if TYPE_CHECKING:
     from skyloop.sim.studio import Camera

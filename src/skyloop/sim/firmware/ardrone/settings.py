@@ -8,9 +8,8 @@ from typing import Final
 from skyloop.sim.options import SimOptions
 from skyloop.sim.vehicles import AR_DRONE
 from skyloop.transport.faults import Faults
-from skyloop.wire.ardrone import at, configuration, navdata
+from skyloop.wire.ardrone.ports import Ports
 
-VIDEO_PORT: Final = 5555
 NO_FAULTS: Final = Faults()
 REPORTS_HZ: Final = 125.0  #: as often as a world that keeps time reports
 
@@ -21,24 +20,6 @@ def with_ardrones(options: SimOptions | None = None) -> SimOptions:
     Cameras are the firmware's own, whatever the options say.
     """
     return replace(options or SimOptions(), parameters=AR_DRONE, rate_hz=REPORTS_HZ, cameras=())
-
-
-@dataclass(frozen=True, slots=True)
-class Ports:
-    """The drone's; 0 stands for any free one."""
-
-    navdata: int = navdata.PORT
-    video: int = VIDEO_PORT  #: UDP of an AR.Drone 1, TCP of an AR.Drone 2
-    at: int = at.PORT
-    control: int = configuration.PORT
-
-    @classmethod
-    def free(cls) -> Ports:
-        """Any free ones."""
-        return cls(0, 0, 0, 0)
-
-
-STANDARD_PORTS: Final = Ports()
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,15 @@
+#!/usr/bin/env bash
+# Installs programs that we did not write and that fly the emulated AR.Drone in tests/third_party, into .third-party/.
+# Nothing of Skyloop needs them; without them those tests are skipped. Needs a Python with venv, and node with npm.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+
+python=.third-party/pyardrone/bin/python
+if ! "$python" -c 'import cv2, pyardrone' 2>/dev/null; then
+  "${PYTHON:-python3}" -m venv .third-party/pyardrone
+  "$python" -m pip install --quiet --disable-pip-version-check pyardrone==0.6.1 'opencv-python-headless>=4.10,<5'
+fi
+
+if [[ ! -e .third-party/node_modules/ar-drone/package.json ]]; then
+  npm install --silent --no-audit --no-fund --prefix .third-party ar-drone@0.3.3
+fi

@@ -1,0 +1,187 @@
+"""The driver of ``ardrone://``: what the proxy calls, put together from the link, the video and the parameters."""
+
+from __future__ import annotations
+
+import secrets
+from typing import Final
+
+from skyloop.clock import monotonic_ns
+from skyloop.drivers.ardrone.cameras import cameras_of
+from skyloop.drivers.ardrone.commands import Commands
+from skyloop.drivers.ardrone.decoding import make_decoder
+from skyloop.drivers.ardrone.link import Link
+from skyloop.drivers.ardrone.options import options_of
+from skyloop.drivers.ardrone.parameters import Entry, active_camera, entries_of, taken, written
+from skyloop.drivers.ardrone.session import Session, Telling
+from skyloop.drivers.ardrone.setup import own_ids
+from skyloop.drivers.ardrone.video import Notice, Picture, VideoReceiver
+from skyloop.drivers.base import Driver, Sink
+from skyloop.drivers.intrinsics import intrinsics_of
+from skyloop.drivers.uri import VehicleUri
+from skyloop.errors import DriverError, ParameterError, SkyloopError
+from skyloop.messages import (
+    AnyAction,
+    Capabilities,
+    EventKind,
+    Parameter,
+    Refusal,
+    Severity,
+    Value,
+)
+
+ACTIONS: Final = frozenset({"idle", "takeoff", "hover", "land", "attitude", "emergency_stop", "reset_emergency"})
+_NOTICES: Final = {
+    Notice.STREAMING: (EventKind.VEHICLE_MESSAGE, Severity.INFO),
+    Notice.LOST: (EventKind.VEHICLE_MESSAGE, Severity.WARNING),
+    Notice.UNSUPPORTED: (EventKind.DRIVER_ERROR, Severity.ERROR),
+    Notice.FAULT: (EventKind.DRIVER_ERROR, Severity.ERROR),
+}
+
+
+class ArdroneDriver(Driver):
+    """A Parrot AR.Drone, 1 or 2. ``docs/ardrone.md`` has its options, parameters, events and telemetry."""
+
+    def __init__(self, uri: VehicleUri) -> None:
+        super().__init__(uri)
+        self.options = options_of(uri)
+        self._session: Session | None = None
+        self._link: Link | None = None
+        self._video: VideoReceiver | None = None
+        self._commands: Commands | None = None
+        self._camera = "front"
+
+    def capabilities(self) -> Capabilities:
+        """Cameras are those of an AR.Drone 2 unless the address says that it is a 1."""
+        version = self.options.version
+        return Capabilities(
+            vehicle=f"ardrone{version}" if version else "ardrone",
+            actions=ACTIONS,
+            cameras=cameras_of(self.uri, version) if self.options.video else (),
+            description=f"a Parrot AR.Drone{f' {version}' if version else ''} at {self.options.host}",
+        )
+
+    # Life cycle ------------------------------------------------------------------------------------------------
+
+    def _open(self, sink: Sink) -> None:
+        if self.options.video:
+            make_decoder(self.options.version or 2)  # says now what is not installed
+        session = Session(self.options, own_ids(secrets.randbits(32)), monotonic_ns(), extra=self._video_telemetry)
+        self._session = session
+        self._link = Link(session, lambda tellings: self._deliver(sink, tellings))
+        self._commands = Commands(session.pilot, self._link.say)
+        self._link.start()
+
+    def _close(self) -> None:
+        if self._link is not None:
+            self._link.stop()
+        if self._video is not None:
+            self._video.stop()
+        self._session = self._link = self._video = self._commands = None
+
+    def _deliver(self, sink: Sink, tellings: list[Telling]) -> None:
+        """On the link's thread."""
+        for telling in tellings:
+            telling(sink)
+        session = self._session
+        if session is not None and session.ready:
+            self._camera = active_camera(session.configurator.values)
+            if self._video is None and self.options.video and session.version is not None:
+                self._start_video(sink, session.version)
+
+    # Flying ----------------------------------------------------------------------------------------------------
+
+    def _apply(self, action: AnyAction) -> AnyAction:
+        if action.name not in ACTIONS:
+            return super()._apply(action)
+        if self._link is None:
+            raise DriverError(f"{self.uri} is not open")
+        return self._link.command(action)
+
+    # Parameters ------------------------------------------------------------------------------------------------
+
+    def parameters(self) -> list[Parameter]:
+        """The commands that are no actions and, once it was read, the drone's configuration."""
+        if self._link is None or self._commands is None:
+            return []
+        with self._link.lock:
+            version = self._link.session.version
+            known = self._commands.parameters(version)
+        return known + [entry.parameter for entry in self._entries().values()]
+
+    def set_parameter(self, name: str, value: Value) -> Value:
+        """Takes up to 0.9 s: the drone acknowledges, and what it made of it is read back."""
+        link, commands = self._link, self._commands
+        if link is None or commands is None:
+            raise ParameterError(f"{self.uri} is not open", code=Refusal.VEHICLE_LINK_LOST)
+        with link.lock:
+            known = {parameter.name: parameter for parameter in commands.parameters(link.session.version)}
+        if name in known:
+            return commands.write(known[name], value)
+        entries = self._entries()
+        if not entries:
+            raise ParameterError("the drone's configuration was not read yet", code=Refusal.VEHICLE_LINK_LOST)
+        return self._configure(link, *written(entries, name, value))
+
+    def _configure(self, link: Link, entry: Entry, text: str) -> Value:
+        failure = link.write(entry.key, text)
+        if failure is not None:
+            raise ParameterError(f"{entry.parameter.name}: {failure}", code=Refusal.DRIVER_FAILED)
+        with link.lock:
+            session = link.session
+            told = session.configurator.values.get(entry.key, "")
+            session.read_limits()
+            accepted = taken(entry, text, told)
+            if accepted:
+                session.remembered[entry.key] = told
+        if not accepted:
+            raise ParameterError(f"the drone keeps {entry.key} at {told}, it did not take {text}")
+        return entry.from_text(told)
+
+    def _entries(self) -> dict[str, Entry]:
+        link = self._link
+        if link is None:
+            return {}
+        with link.lock:
+            values, version = dict(link.session.configurator.values), link.session.version
+        return entries_of(values, version)
+
+    # Video -----------------------------------------------------------------------------------------------------
+
+    def _start_video(self, sink: Sink, version: int) -> None:
+        options = self.options
+
+        def show(picture: Picture) -> None:
+            intrinsics = None
+            if self._camera == "front":
+                intrinsics = intrinsics_of(self.uri, picture.width, picture.height)
+            sink.frame(
+                self._camera,
+                picture.pixels,
+                picture.captured_ns,
+                width=picture.width,
+                height=picture.height,
+                intrinsics=intrinsics,
+            )
+
+        def tell(notice: Notice, text: str) -> None:
+            kind, severity = _NOTICES[notice]
+            sink.event(kind, f"video {notice.value}: {text}", severity, where="video")
+
+        self._video = VideoReceiver(
+            options.host,
+            options.ports.video,
+            version=version,
+            show=show,
+            told=tell,
+            wants=lambda: sink.wants(self._camera),
+        )
+        try:
+            self._video.start()
+        except SkyloopError as error:
+            sink.event(EventKind.DRIVER_ERROR, f"no video: {error}", Severity.ERROR, where="video")
+
+    def _video_telemetry(self) -> dict[str, Value]:
+        if self._video is None:
+            return {}
+        counters = self._video.counters
+        return {f"video.{name}": getattr(counters, name) for name in counters.__dataclass_fields__}

@@ -1,0 +1,290 @@
+"""One drone, from the first datagram on: what its navdata mean, what it is told, and how the link to it stands. Pure.
+
+The time comes as an argument; bytes go in and out. What is for the proxy's sink is collected as *tellings*, for the
+caller to deliver when it holds no lock.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Final, TypeAlias
+
+from skyloop.clock import nanoseconds, seconds
+from skyloop.drivers.ardrone.configuration import Configurator, Exchange, Ids
+from skyloop.drivers.ardrone.feedback import ClimbMeter, control_state, feedback_of
+from skyloop.drivers.ardrone.health import Health, Notice
+from skyloop.drivers.ardrone.native import native_of
+from skyloop.drivers.ardrone.options import ArdroneOptions
+from skyloop.drivers.ardrone.pilot import Condition, Pilot
+from skyloop.drivers.ardrone.reception import DroneClock, Reception
+from skyloop.drivers.ardrone.sender import Message, Sequencer
+from skyloop.drivers.ardrone.set_points import limits_of
+from skyloop.drivers.ardrone.setup import Setup
+from skyloop.drivers.base import Sink
+from skyloop.messages import AnyAction, EventKind, LinkState, Severity, Value
+from skyloop.wire.ardrone.navdata import Navdata, State
+from skyloop.wire.ardrone.options import Demo
+
+TICK_NS: Final = nanoseconds(0.03)  #: the pace of AT commands that the drone's guide asks for
+HURRY_NS: Final = nanoseconds(0.01)  #: a new decision is not said sooner after the last datagram than this
+DEGRADED_NS: Final = nanoseconds(0.25)  #: of silence
+LOST_NS: Final = nanoseconds(1.0)
+FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a drone that was never heard by then is told as lost
+START_NS: Final = nanoseconds(0.25)  #: pace of asking for navdata while none come
+SETUP_NS: Final = nanoseconds(6.0)  #: to set the drone up, before it is tried anew
+SETUP_PATIENCE_NS: Final = nanoseconds(3.0)  #: then flying is allowed without it, as far as that goes
+DEAF_NS: Final = nanoseconds(1.0)  #: a watchdog bit that stays so long says that our commands are not taken
+REPEATS: Final = 3  #: of a command that has no acknowledgement
+START_NAVDATA: Final = b"\x01\x00\x00\x00"
+
+Telling: TypeAlias = Callable[[Sink], None]
+_WATCHDOG: Final[Message] = ("COMWDG", ())
+
+
+class Session:
+    """The drone of one opened driver. Not thread-safe.
+
+    ``extra`` gives telemetry of others for feedback's ``native``, such as the video's counters.
+    """
+
+    def __init__(
+        self,
+        options: ArdroneOptions,
+        ids: Ids,
+        now_ns: int,
+        *,
+        extra: Callable[[], Mapping[str, Value]] = dict,
+    ) -> None:
+        self.options = options
+        self.version = options.version  #: None until the drone's configuration told it
+        self.pilot = Pilot()
+        self.configurator = Configurator()
+        self.reception = Reception()
+        self.due_ns = now_ns  #: when :meth:`tick` is to be called next
+        self.link_state: LinkState | None = None  #: as told
+        self.ready = False  #: whether the drone is set up and its configuration known
+        self.remembered: dict[str, str] = {}  #: keys that were written, and how the drone writes them
+        self._ids = ids
+        self._extra = extra
+        self._sequencer = Sequencer()
+        self._clock = DroneClock()
+        self._climb = ClimbMeter()
+        self._health = Health()
+        self._tellings: list[Telling] = []
+        self._opened_ns = now_ns
+        self._heard_ns: int | None = None  # None: not since it was opened or lost
+        self._setup_ns: int | None = None
+        self._setups_failed = 0
+        self._state = State(0)
+        self._said_ns = 0
+        self._started_ns = 0
+        self._published_ns = 0
+        self._deaf_since_ns: int | None = None
+        self._once: list[list[Message]] = []  # what is to be said at the next ticks, besides
+        self._unreachable = ""
+        self._place = f"{options.host}, UDP port {options.ports.navdata}"
+        self._tell_link(LinkState.CONNECTING, f"waiting for navdata from {self._place}")
+
+    @property
+    def is_heard(self) -> bool:
+        """Whether navdata come, or came until just now."""
+        return self._heard_ns is not None
+
+    # From the driver -------------------------------------------------------------------------------------------
+
+    def command(self, action: AnyAction, now_ns: int) -> AnyAction:
+        """Decide, and say it soon. Returns what is really applied; raises what :meth:`Pilot.take` raises."""
+        before = self.pilot.intent
+        applied = self.pilot.take(action, now_ns)
+        if self.pilot.intent != before:
+            self.due_ns = min(self.due_ns, max(now_ns, self._said_ns + HURRY_NS))
+        return applied
+
+    def say(self, message: Message, times: int = REPEATS) -> None:
+        """Say a command that has no acknowledgement, at this many ticks."""
+        while len(self._once) < times:
+            self._once.append([])
+        for at in range(times):
+            self._once[at].append(message)
+
+    def submit(self, exchange: Exchange) -> None:
+        """An exchange of the configuration."""
+        self.configurator.submit(exchange)
+        self.due_ns = 0
+
+    def tellings(self) -> list[Telling]:
+        """What is to be told to the sink since the last call, in order."""
+        for notice in self.pilot.notices():
+            self._notice(notice)
+        tellings, self._tellings = self._tellings, []
+        return tellings
+
+    def close(self) -> None:
+        """Nothing more will come."""
+        self.configurator.abandon("the driver was closed")
+
+    # From the sockets ------------------------------------------------------------------------------------------
+
+    def heard(self, datagram: bytes, now_ns: int) -> None:
+        """A datagram of the navdata port, whatever it holds. Never raises."""
+        navdata = self.reception.receive(datagram, now_ns)
+        if navdata is None:
+            return
+        state = navdata.state
+        demo = navdata.get(Demo)
+        self._notice_break(state)
+        self._state, self._heard_ns = state, now_ns
+        self.pilot.heard(Condition(state, control_state(demo) if demo is not None else None), now_ns)
+        if self.configurator.heard(bool(state & State.COMMAND_ACK)):
+            self.due_ns = 0
+        for notice in self._health.notices(state):
+            self._notice(notice)
+        if self._setup_ns is None:
+            self._begin_setup(now_ns)
+        elif self.link_state is LinkState.DEGRADED and self.ready:
+            self._tell_link(LinkState.UP)
+        if demo is not None:
+            self._publish(navdata, demo, now_ns)
+
+    def unreachable(self, reason: str) -> None:
+        """The host said that nobody listens, or this host has no way to it."""
+        self._unreachable = reason
+
+    def _notice_break(self, state: State) -> None:
+        """What the drone forgot meanwhile is not known, even if it was away for less time than we would notice."""
+        if not self.ready:
+            return
+        if state & State.BOOTSTRAP:
+            self._lose("the drone was started anew")
+        elif state & ~self._state & State.COMMUNICATION_LOST:
+            self._lose("the drone says that it lost its link to us")
+
+    def _publish(self, navdata: Navdata, demo: Demo, now_ns: int) -> None:
+        captured_ns = self._clock.captured_ns(navdata, now_ns)
+        climb = self._climb.climb(demo.altitude / 1000, captured_ns)
+        if self.options.full and now_ns - self._published_ns < 0.9e9 / self.options.rate_hz:
+            return
+        self._published_ns = now_ns
+        native = native_of(navdata, everything=self.options.full)
+        native.update(self.reception.telemetry())
+        native.update(self._extra())
+        feedback = feedback_of(navdata, demo, captured_ns, climb, native)
+        self._tellings.append(lambda sink: sink.feedback(feedback))
+
+    # Time ------------------------------------------------------------------------------------------------------
+
+    def tick(self, now_ns: int) -> bytes:
+        """The datagram for the AT port that is due now, empty if nothing is to be said."""
+        self._look_at_silence(now_ns)
+        self.due_ns, self._said_ns = now_ns + TICK_NS, now_ns
+        messages: list[Message] = []
+        if self._state & State.COMMUNICATION_WATCHDOG and self._heard_ns is not None:
+            messages.append(_WATCHDOG)
+            self._look_at_deafness(now_ns)
+        else:
+            self._deaf_since_ns = None
+        messages += self.pilot.messages(now_ns)
+        messages += self._once.pop(0) if self._once else []
+        messages += self.configurator.messages(now_ns)
+        return self._sequencer.datagram(messages)
+
+    def wants_start(self, now_ns: int) -> bool:
+        """Whether to ask for navdata now, because none come. True once a period."""
+        silent_ns = now_ns - (self._heard_ns if self._heard_ns is not None else 0)
+        if silent_ns < DEGRADED_NS or now_ns - self._started_ns < START_NS:
+            return False
+        self._started_ns = now_ns
+        return True
+
+    def _look_at_silence(self, now_ns: int) -> None:
+        if self._heard_ns is None:
+            if self.link_state is LinkState.CONNECTING and now_ns - self._opened_ns >= FIRST_WORD_NS:
+                self._tell_link(LinkState.LOST, self._no_navdata())
+            return
+        silent_ns = now_ns - self._heard_ns
+        if silent_ns >= LOST_NS:
+            self._lose(self._no_navdata(silent_ns))
+        elif silent_ns >= DEGRADED_NS and self.link_state is LinkState.UP:
+            self._tell_link(LinkState.DEGRADED, self._no_navdata(silent_ns))
+        elif not self.ready and self._setup_ns is not None and now_ns - self._setup_ns >= SETUP_PATIENCE_NS:
+            why = self.configurator.trouble or "the drone does not acknowledge"
+            self._tell_link(LinkState.DEGRADED, f"the drone's configuration is not known: {why}")
+
+    def _look_at_deafness(self, now_ns: int) -> None:
+        """The watchdog's bit goes when the drone takes our commands: else it may be past our sequence."""
+        if self._deaf_since_ns is None:
+            self._deaf_since_ns = now_ns
+        elif now_ns - self._deaf_since_ns >= DEAF_NS:
+            self._deaf_since_ns = now_ns
+            self._sequencer.restart()
+
+    def _no_navdata(self, silent_ns: int | None = None) -> str:
+        since = f" for {seconds(silent_ns):.2g} s" if silent_ns is not None else ""
+        why = f" ({self._unreachable})" if self._unreachable else ""
+        return f"no navdata{since} from {self._place}{why}"
+
+    # Losing and finding ----------------------------------------------------------------------------------------
+
+    def _lose(self, reason: str) -> None:
+        """From here on everything begins anew with the next datagram."""
+        self._heard_ns = self._setup_ns = None
+        self.ready = False
+        self._once.clear()
+        self.configurator.abandon(reason)
+        self.pilot.lost()
+        self.pilot.limits = None
+        self.reception.expect_restart()
+        self._sequencer.restart()
+        self._tell_link(LinkState.LOST, reason)
+
+    def _begin_setup(self, now_ns: int) -> None:
+        self._setup_ns = now_ns
+        self._unreachable = ""
+        self._sequencer.restart()
+        self._submit_setup(now_ns)
+
+    def _submit_setup(self, now_ns: int) -> None:
+        failed = self._setups_failed
+        options = replace(self.options, ids=False) if failed > 1 else self.options
+        # A drone that kept our ids ignores what does not name them, and one that lost them what does: take turns.
+        self.configurator.ids = self._ids if failed % 2 else None
+        setup = Setup(options, self.configurator, self._ids, self.remembered)
+        done = partial(self._setup_done, setup)
+        self.configurator.submit(Exchange(setup.steps(self._state), now_ns + SETUP_NS, done))
+        self.due_ns = 0
+
+    def _setup_done(self, setup: Setup, failure: str | None) -> None:
+        if self._setup_ns is None or self._heard_ns is None:
+            return  # it was lost meanwhile
+        if failure is not None:
+            self._setups_failed += 1
+            self.configurator.trouble = failure
+            self._submit_setup(self._heard_ns)
+            return
+        self._setups_failed = 0
+        self.version = setup.version or self.version
+        if setup.refused_ids:
+            text = "the drone keeps no settings of our own: they are shared with everybody who connects to it"
+            self._notice(Notice(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, {"reason": "ids_refused"}))
+        self.ready = True
+        self.read_limits()
+        if self.pilot.limits is None:
+            text = "the drone's configuration tells no limits: it takes no set-points"
+            self._notice(Notice(EventKind.DRIVER_ERROR, text, Severity.ERROR, {"where": "configuration"}))
+        self._tell_link(LinkState.UP)
+
+    def read_limits(self) -> None:
+        """The configuration was read anew."""
+        self.pilot.limits = limits_of(self.configurator.values)
+
+    # Telling ---------------------------------------------------------------------------------------------------
+
+    def _tell_link(self, state: LinkState, reason: str = "") -> None:
+        if state is not self.link_state:
+            self.link_state = state
+            self._tellings.append(lambda sink: sink.link(state, reason))
+
+    def _notice(self, notice: Notice) -> None:
+        self._tellings.append(lambda sink: sink.event(notice.kind, notice.text, notice.severity, **notice.data))

@@ -1,0 +1,44 @@
+"""A camera's intrinsics as options of a vehicle's address: ``fx``, ``fy``, ``cx``, ``cy`` [px] and ``distortion``."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from skyloop.drivers.uri import VehicleUri
+from skyloop.errors import UsageError
+from skyloop.messages import Intrinsics
+
+INTRINSICS_OPTIONS: Final = frozenset({"fx", "fy", "cx", "cy", "distortion"})
+
+
+def check_intrinsics(uri: VehicleUri) -> None:
+    """Raises :class:`UsageError` for intrinsics that make no sense."""
+    intrinsics_of(uri, 1, 1)
+
+
+def intrinsics_of(uri: VehicleUri, width: int, height: int) -> Intrinsics | None:
+    """Those of the address for pictures of this size; None unless it gives the focal length."""
+    distortion = _distortion(uri)
+    if "fx" not in uri.options:
+        for option in sorted(INTRINSICS_OPTIONS & uri.options.keys()):
+            raise UsageError(f"{uri}: option {option} needs fx as well")
+        return None
+    fx = uri.number("fx", 0.0, minimum=1e-3)
+    return Intrinsics(
+        fx=fx,
+        fy=uri.number("fy", fx, minimum=1e-3),
+        cx=uri.number("cx", (width - 1) / 2),
+        cy=uri.number("cy", (height - 1) / 2),
+        distortion=distortion,
+    )
+
+
+def _distortion(uri: VehicleUri) -> tuple[float, ...]:
+    given = uri.options.get("distortion", "")
+    try:
+        numbers = tuple(float(part) for part in given.split(",")) if given else ()
+    except ValueError:
+        numbers = (0.0,)
+    if len(numbers) not in (0, 4, 5, 8):
+        raise UsageError(f"{uri}: distortion is {given!r} and must be 4, 5 or 8 numbers: k1,k2,p1,p2[,k3[,k4,k5,k6]]")
+    return numbers

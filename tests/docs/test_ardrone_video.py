@@ -1,0 +1,13 @@
+"""What docs/ardrone.md says of the video is what the code does."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+from skyloop.drivers.ardrone.video import VideoCounters
+from tests.docs.pages import rows, section
+
+
+def test_the_table_of_counters() -> None:
+    table = rows(section("docs/ardrone.md", "## Video"))
+    assert [row[0] for row in table] == [f"`video.{field.name}`" for field in fields(VideoCounters)]

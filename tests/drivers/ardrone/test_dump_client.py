@@ -1,0 +1,133 @@
+"""The control port as the driver meets it: refusing, slow, broken off, and as it should be."""
+
+from __future__ import annotations
+
+import selectors
+import socket
+from collections.abc import Iterator
+
+import pytest
+
+from skyloop.clock import NS_PER_S
+from skyloop.drivers.ardrone.configuration import Configurator, Exchange, Read
+from skyloop.drivers.ardrone.dump_client import RETRY_NS, DumpClient
+
+DUMP = b"control:outdoor = TRUE\n\0"
+
+
+class Desk:
+    """A client, who serves it, and the drone's end of the connection."""
+
+    def __init__(self, *, listening: bool = True) -> None:
+        self.server = socket.create_server(("127.0.0.1", 0))
+        port = self.server.getsockname()[1]
+        if not listening:
+            self.server.close()
+        self.selector = selectors.DefaultSelector()
+        self.client = DumpClient(port, self.selector)
+        self.client.address = "127.0.0.1"
+        self.configurator = Configurator()
+        self.results: list[str | None] = []
+        self.now_ns = 10 * NS_PER_S
+        self.read()
+
+    def read(self) -> None:
+        self.configurator.submit(Exchange(iter((Read(),)), 99 * NS_PER_S, self.results.append))
+        self.configurator.messages(self.now_ns)
+
+    def follow(self) -> None:
+        self.client.follow(self.configurator, self.now_ns)
+
+    def serve(self) -> None:
+        """Wait until the connection wants to be served, and do it."""
+        assert self.selector.select(5.0)
+        self.client.serve(self.configurator)
+
+    def connected(self) -> socket.socket:
+        self.follow()
+        connection, _ = self.server.accept()
+        self.serve()
+        assert self.configurator.messages(self.now_ns) == [("CTRL", (4, 0))]
+        return connection
+
+    def close(self) -> None:
+        self.client.close()
+        self.selector.close()
+        self.server.close()
+
+
+@pytest.fixture
+def desk() -> Iterator[Desk]:
+    made = Desk()
+    yield made
+    made.close()
+
+
+def test_a_dump_in_pieces(desk: Desk) -> None:
+    with desk.connected() as drone:
+        drone.sendall(DUMP[:10])
+        desk.serve()
+        assert desk.results == []
+        drone.sendall(DUMP[10:])
+        desk.serve()
+        assert desk.results == [None]
+        assert desk.configurator.values == {"control:outdoor": "TRUE"}
+        assert drone.recv(1) == b"", "the connection is let go"
+
+
+def test_a_connection_that_ends_early_is_made_again(desk: Desk) -> None:
+    desk.connected().close()
+    desk.serve()
+    assert "the connection ended early" in desk.configurator.trouble
+    desk.follow()
+    assert not desk.selector.get_map(), "not at once"
+    desk.now_ns += RETRY_NS
+    with desk.connected() as drone:
+        drone.sendall(DUMP)
+        desk.serve()
+    assert desk.results == [None]
+    assert desk.configurator.trouble == ""
+
+
+def test_a_port_that_refuses() -> None:
+    desk = Desk(listening=False)
+    desk.follow()
+    if not desk.configurator.trouble:  # it may be known at once, or a moment later
+        desk.serve()
+    assert "Connection refused" in desk.configurator.trouble
+    assert f"TCP port {desk.client._port}" in desk.configurator.trouble
+    desk.close()
+
+
+def test_a_drone_without_an_address_yet(desk: Desk) -> None:
+    desk.client.address = "no address at all"
+    desk.follow()
+    assert desk.configurator.trouble
+    assert not desk.selector.get_map()
+
+
+def test_a_connection_that_is_not_wanted_any_more_is_let_go(desk: Desk) -> None:
+    with desk.connected() as drone:
+        desk.configurator.abandon("gone")
+        desk.follow()
+        assert drone.recv(1) == b""
+    desk.client.serve(desk.configurator)  # a late event does nothing
+
+
+def test_a_later_dump_gets_a_connection_of_its_own(desk: Desk) -> None:
+    with desk.connected() as old:
+        desk.configurator.abandon("gone")
+        desk.read()
+        with desk.connected() as new:
+            assert old.recv(1) == b""
+            new.sendall(DUMP)
+            desk.serve()
+    assert desk.results == ["gone", None]
+
+
+def test_a_connection_that_is_reset(desk: Desk) -> None:
+    drone = desk.connected()
+    drone.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\x01\x00\x00\x00\x00\x00\x00\x00")
+    drone.close()
+    desk.serve()
+    assert "reset" in desk.configurator.trouble

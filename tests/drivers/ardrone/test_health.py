@@ -1,0 +1,86 @@
+"""Events of the state bits: once per change, with the reasons."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skyloop.drivers.ardrone.health import Health, emergency_reason
+from skyloop.messages import EventKind, Severity
+from skyloop.wire.ardrone.navdata import State
+
+BITS = st.integers(0, 2**32 - 1).map(State)
+EVERY = State(0xFFFFFFFF)
+
+
+@pytest.mark.parametrize(
+    ("bits", "reason"),
+    [
+        (State.CUTOUT, "cutout"),
+        (State.ANGLES_OUT_OF_RANGE, "angles"),
+        (State.MOTORS_PROBLEM, "motors"),
+        (State.USER_EMERGENCY, "user"),
+        (State.ULTRASOUND_DEAF, "ultrasound"),
+        (State.BATTERY_LOW, "battery"),
+        (State.ANGLES_OUT_OF_RANGE | State.CUTOUT, "angles,cutout"),
+        (State(0), "unknown"),
+    ],
+)
+def test_an_emergency_and_why(bits: State, reason: str) -> None:
+    health = Health()
+    health.notices(State.FLYING)
+    first = health.notices(State.EMERGENCY | bits)[0]
+    assert (first.kind, first.severity, first.data) == (EventKind.EMERGENCY, Severity.ERROR, {"reason": reason})
+    assert reason in first.text
+    assert emergency_reason(bits) == reason
+
+
+def test_the_end_of_an_emergency() -> None:
+    health = Health()
+    health.notices(State.EMERGENCY)
+    (notice,) = health.notices(State(0))
+    assert (notice.kind, notice.data) == (EventKind.VEHICLE_MESSAGE, {"reason": "reset"})
+
+
+@pytest.mark.parametrize(
+    ("bit", "reason"),
+    [
+        (State.COMMUNICATION_LOST, "communication_lost"),
+        (State.BATTERY_LOW, "battery_low"),
+        (State.ULTRASOUND_DEAF, "ultrasound"),
+        (State.MOTORS_PROBLEM, "motors"),
+        (State.CUTOUT, "cutout"),
+    ],
+)
+def test_a_condition_begins_and_ends(bit: State, reason: str) -> None:
+    health = Health()
+    (begun,) = health.notices(bit)
+    assert begun.severity is not Severity.INFO
+    assert begun.data == {"reason": reason, "active": True}
+    assert health.notices(bit) == []
+    (ended,) = health.notices(State(0))
+    assert (ended.severity, ended.data) == (Severity.INFO, {"reason": reason, "active": False})
+
+
+def test_a_healthy_flight_is_no_news() -> None:
+    health = Health()
+    for state in (State.BOOTSTRAP, State.DEMO, State.DEMO | State.FLYING, State.COMMUNICATION_WATCHDOG, State(0)):
+        assert health.notices(state) == []
+
+
+@given(st.lists(BITS, max_size=10))
+def test_each_change_is_told_once(states: list[State]) -> None:
+    health = Health()
+    active: set[object] = set()
+    for state in states:
+        for notice in health.notices(state):
+            if "active" in notice.data:
+                reason = notice.data["reason"]
+                assert (reason in active) is not notice.data["active"]
+                active ^= {reason}
+        assert health.notices(state) == []
+
+
+def test_every_bit_may_be_set() -> None:
+    assert len(Health().notices(EVERY)) > 5

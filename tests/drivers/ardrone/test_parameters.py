@@ -1,0 +1,285 @@
+"""Keys as parameters, and the commands that are parameters."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skyloop.drivers.ardrone.animations import FLIGHT_ANIMATIONS, LED_ANIMATIONS
+from skyloop.drivers.ardrone.commands import Commands
+from skyloop.drivers.ardrone.parameters import active_camera, entries_of, taken, written
+from skyloop.drivers.ardrone.pilot import Condition, Pilot
+from skyloop.drivers.ardrone.sender import Message
+from skyloop.drivers.suite_parameters import mismatch
+from skyloop.errors import DecodeError, ParameterError, UnknownNameError
+from skyloop.messages import Parameter, ParameterType, Refusal, Value
+from skyloop.proxy.parameters import check
+from skyloop.wire.ardrone.configuration import format_value
+from skyloop.wire.ardrone.keys import keys_of
+from skyloop.wire.ardrone.navdata import ControlState, State
+
+DRONES = {version: {name: format_value(key.default) for name, key in keys_of(version).items()} for version in (1, 2)}
+GROUND = Condition(State(0), ControlState.LANDED)
+AIR = Condition(State.FLYING, ControlState.HOVERING)
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_every_parameter_fits_its_own_description(version: int) -> None:
+    entries = entries_of(DRONES[version], version)
+    assert len(entries) > len(DRONES[version])
+    for name, entry in entries.items():
+        parameter = entry.parameter
+        assert parameter.name == name
+        assert not mismatch(parameter, parameter.value), name
+        assert parameter.default is None or not mismatch(parameter, parameter.default), name
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_every_parameter_comes_back_as_it_is(version: int) -> None:
+    for name, entry in entries_of(DRONES[version], version).items():
+        if not entry.parameter.read_only:
+            same, text = written(entries_of(DRONES[version], version), name, entry.parameter.value)
+            assert taken(same, text, DRONES[version][entry.key]), name
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "key", "text"),
+    [
+        ("limits.tilt", 0.3, "control:euler_angle_max", "3.000000e-01"),
+        ("limits.climb", 1.5, "control:control_vz_max", "1.500000e+03"),
+        ("limits.yaw_rate", 2, "control:control_yaw", "2.000000e+00"),
+        ("limits.altitude", 2.0, "control:altitude_max", "2000"),
+        ("limits.outdoor.tilt", 0.3, "control:outdoor_euler_angle_max", "3.000000e-01"),
+        ("limits.indoor.climb", 0.5, "control:indoor_control_vz_max", "5.000000e+02"),
+        ("camera.fps", 20, "video:codec_fps", "20"),
+        ("camera.active", "bottom", "video:video_channel", "1"),
+        ("ardrone.control.altitude_max", 2000, "control:altitude_max", "2000"),
+        ("ardrone.control.outdoor", True, "control:outdoor", "TRUE"),
+        ("ardrone.general.ardrone_name", "Bee", "general:ardrone_name", "Bee"),
+    ],
+)
+def test_names_and_units(name: str, value: Value, key: str, text: str) -> None:
+    entry, said = written(entries_of(DRONES[2], 2), name, value)
+    assert (entry.key, said) == (key, text)
+    assert entry.from_text(text) == (pytest.approx(value) if isinstance(value, float) else value)
+    assert not entry.parameter.read_only
+
+
+@given(st.floats(0.2, 2.0))
+def test_a_limit_in_si_is_taken_as_it_was_written(value: float) -> None:
+    entry, text = written(entries_of(DRONES[2], 2), "limits.climb", value)
+    told = entry.from_text(text)
+    assert isinstance(told, float)
+    assert math.isclose(told, value, rel_tol=1e-5)
+    assert taken(entry, text, f"{value * 1000:.3f}")
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "ardrone.general.num_version_soft",
+        "ardrone.general.navdata_demo",
+        "ardrone.custom.session_id",
+        "ardrone.control.flight_anim",
+        "ardrone.leds.leds_anim",
+    ],
+)
+def test_what_can_only_be_read(name: str) -> None:
+    with pytest.raises(ParameterError, match="only be read") as caught:
+        written(entries_of(DRONES[2], 2), name, "x")
+    assert caught.value.code == Refusal.READ_ONLY
+
+
+def test_a_name_that_nobody_has() -> None:
+    with pytest.raises(UnknownNameError, match=r"limits\.tilt"):
+        written(entries_of(DRONES[2], 2), "limits.tild", 0.1)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("limits.tilt", "steep"),
+        ("limits.tilt", True),
+        ("limits.tilt", math.nan),
+        ("camera.active", "left"),
+        ("camera.active", 1),
+        ("ardrone.control.outdoor", 1),
+        ("ardrone.general.ardrone_name", 3),
+    ],
+)
+def test_values_of_another_type(name: str, value: Value) -> None:
+    with pytest.raises(ParameterError) as caught:
+        written(entries_of(DRONES[2], 2), name, value)
+    assert caught.value.code == Refusal.WRONG_TYPE
+
+
+def test_cameras_of_both_versions() -> None:
+    two = entries_of(DRONES[2], 2)["camera.active"].parameter
+    one = entries_of(DRONES[1], 1)["camera.active"].parameter
+    assert two.choices == ("front", "bottom")
+    assert one.choices == ("front", "bottom", "front_with_bottom", "bottom_with_front")
+    assert "camera.fps" not in entries_of(DRONES[1], 1)
+
+
+@pytest.mark.parametrize(
+    ("channel", "camera"), [("0", "front"), ("1", "bottom"), ("2", "front"), ("3", "bottom"), ("x", "front")]
+)
+def test_the_camera_that_is_on(channel: str, camera: str) -> None:
+    assert active_camera({"video:video_channel": channel}) == camera
+    assert active_camera({}) == "front"
+
+
+def test_what_a_drone_may_say_besides() -> None:
+    strange = {
+        **DRONES[2],
+        "general:something_new": "42",
+        "general:Bad Name": "1",
+        "control:altitude_max": "high",
+        "control:altitude_min": "10",
+        "video:video_channel": "7",
+        "detect:enemy_colors": "9",
+    }
+    entries = entries_of(strange, 2)
+    unknown = entries["ardrone.general.something_new"].parameter
+    assert (unknown.type, unknown.value, unknown.read_only) == (ParameterType.TEXT, "42", True)
+    assert "ardrone.general.bad name" not in entries
+    assert entries["ardrone.control.altitude_max"].parameter.type is ParameterType.TEXT
+    assert "limits.altitude" not in entries
+    assert "camera.active" not in entries
+    assert entries["ardrone.control.altitude_min"].parameter.minimum == 10, "its own range is wider"
+    assert 9 in entries["ardrone.detect.enemy_colors"].parameter.choices
+    for entry in entries.values():
+        assert not mismatch(entry.parameter, entry.parameter.value)
+
+
+def test_texts_that_a_parameter_cannot_be() -> None:
+    entry = entries_of(DRONES[2], 2)["camera.active"]
+    with pytest.raises(DecodeError, match="no number of"):
+        entry.from_text("7")
+    assert not taken(entry, "1", "bottom")
+
+
+# Commands --------------------------------------------------------------------------------------------------------
+
+
+class Desk:
+    """Commands with a pilot, and what they said."""
+
+    def __init__(self, condition: Condition | None, version: int | None = 2) -> None:
+        self.pilot = Pilot()
+        self.pilot.condition = condition
+        self.said: list[tuple[Message, int]] = []
+        self.commands = Commands(self.pilot, lambda message, times: self.said.append((message, times)))
+        self.version = version
+
+    def parameter(self, name: str) -> Parameter:
+        return next(p for p in self.commands.parameters(self.version) if p.name == name)
+
+    def write(self, name: str, value: Value) -> Value:
+        parameter = self.parameter(name)
+        assert check(parameter, value) == value, "the proxy would not let it through"
+        return self.commands.write(parameter, value)
+
+
+@pytest.mark.parametrize("version", [None, 1, 2])
+def test_commands_fit_their_own_description(version: int | None) -> None:
+    for parameter in Desk(GROUND, version).commands.parameters(version):
+        assert not mismatch(parameter, parameter.value)
+
+
+def test_flat_trim_on_the_ground() -> None:
+    desk = Desk(GROUND)
+    assert desk.write("ardrone.flat_trim", True) is True
+    assert desk.parameter("ardrone.flat_trim").value is True
+    assert desk.write("ardrone.flat_trim", False) is False
+    assert desk.said == [(("FTRIM", ()), 3)]
+
+
+def test_calibration_in_the_air() -> None:
+    desk = Desk(AIR)
+    desk.write("ardrone.calibrate_magnetometer", True)
+    assert desk.said == [(("CALIB", (0,)), 3)]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "condition", "says"),
+    [
+        ("ardrone.flat_trim", True, AIR, "land first"),
+        ("ardrone.flat_trim", True, None, "not heard"),
+        ("ardrone.calibrate_magnetometer", True, GROUND, "take off first"),
+        ("ardrone.flight_animation", "wave", GROUND, "take off first"),
+        ("ardrone.flight_animation", "wave", Condition(State.EMERGENCY), "take off first"),
+        ("leds.animation", "fire", None, "not heard"),
+    ],
+)
+def test_what_the_state_forbids(name: str, value: Value, condition: Condition | None, says: str) -> None:
+    desk = Desk(condition)
+    before = desk.parameter(name).value
+    with pytest.raises(ParameterError, match=says) as caught:
+        desk.write(name, value)
+    assert caught.value.code == Refusal.WRONG_STATE
+    assert desk.said == []
+    assert desk.parameter(name).value == before
+
+
+def test_lights() -> None:
+    desk = Desk(GROUND)
+    desk.write("leds.frequency", 4.0)
+    desk.write("leds.duration", 5.0)
+    assert desk.write("leds.animation", "snake_green_red") == "snake_green_red"
+    assert desk.write("leds.animation", "none") == "none"
+    assert desk.said == [(("LED", (4, 4.0, 5)), 3)]
+
+
+def test_flight_animations_are_said_once() -> None:
+    desk = Desk(AIR)
+    desk.write("ardrone.flight_animation", "flip_left")
+    desk.write("ardrone.flight_animation", "yaw_shake")
+    desk.write("ardrone.flight_animation", "none")
+    assert desk.said == [(("ANIM", (18, 15)), 1), (("ANIM", (8, 2000)), 1)]
+
+
+def test_numbers_of_animations() -> None:
+    assert len(LED_ANIMATIONS) == 21
+    assert LED_ANIMATIONS[20] == "blink_standard"
+    assert len(FLIGHT_ANIMATIONS) == 20
+    assert [duration for _, duration in FLIGHT_ANIMATIONS] == [1000] * 6 + [5000] * 2 + [2000] + [5000] * 7 + [15] * 4
+
+
+def test_what_an_ardrone_1_has_not() -> None:
+    names = {parameter.name for parameter in Desk(GROUND, 1).commands.parameters(1)}
+    assert "ardrone.calibrate_magnetometer" not in names
+    assert "ardrone.absolute_control" not in names
+    assert "flip_left" not in Desk(GROUND, 1).parameter("ardrone.flight_animation").choices
+
+
+def test_absolute_control() -> None:
+    desk = Desk(AIR)
+    assert desk.pilot.reference_rad is None
+    desk.write("ardrone.absolute_heading", math.pi)
+    assert desk.pilot.reference_rad is None
+    desk.write("ardrone.absolute_control", True)
+    assert desk.pilot.reference_rad == math.pi
+    desk.write("ardrone.absolute_control", False)
+    assert desk.pilot.reference_rad is None
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "code"),
+    [
+        ("leds.animation", "disco", Refusal.OUT_OF_RANGE),
+        ("leds.animation", 3, Refusal.WRONG_TYPE),
+        ("leds.frequency", 1000.0, Refusal.OUT_OF_RANGE),
+        ("leds.frequency", math.nan, Refusal.OUT_OF_RANGE),
+        ("leds.frequency", "fast", Refusal.WRONG_TYPE),
+        ("ardrone.flat_trim", 1, Refusal.WRONG_TYPE),
+    ],
+)
+def test_commands_check_for_themselves(name: str, value: Value, code: Refusal) -> None:
+    desk = Desk(GROUND)
+    with pytest.raises(ParameterError) as caught:
+        desk.commands.write(desk.parameter(name), value)
+    assert caught.value.code == code

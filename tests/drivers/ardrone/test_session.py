@@ -1,0 +1,459 @@
+"""From the first datagram on: setting up, losing, finding, telling. Without sockets, and with the time in hand."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from skyloop.drivers.ardrone.configuration import Exchange, Read, Write
+from skyloop.drivers.ardrone.options import ArdroneOptions
+from skyloop.errors import DriverError
+from skyloop.messages import Attitude, FlightState, Hover, Land, LinkState, Severity, Takeoff
+from skyloop.wire.ardrone.at import Ref
+from skyloop.wire.ardrone.navdata import State, encode
+from skyloop.wire.ardrone.options import Demo, Time
+from tests.drivers.ardrone.scripted import IDS, Rig, ScriptedDrone, ns
+
+RECORDED = (Path(__file__).parents[2] / "data" / "ardrone2" / "navdata-full-landed.bin").read_bytes()
+
+
+def links(rig: Rig) -> list[LinkState]:
+    return [state for state, _ in rig.sink.links]
+
+
+def newest_link(rig: Rig) -> tuple[LinkState, str]:
+    return rig.sink.links[-1]
+
+
+def test_an_ardrone_2_is_set_up_within_a_second() -> None:
+    rig = Rig()
+    rig.run(0.02)
+    assert links(rig) == [LinkState.CONNECTING]
+    assert rig.until(lambda: rig.session.ready, 1.0) < 1.0
+    rig.run(0.05)
+    assert links(rig) == [LinkState.CONNECTING, LinkState.UP]
+    assert rig.session.version == 2
+    assert rig.drone.state & State.DEMO
+    ids = ("custom:session_id", "custom:profile_id", "custom:application_id")
+    assert tuple(rig.drone.values[key] for key in ids) == (IDS.session, IDS.profile, IDS.application)
+    assert rig.session.pilot.limits is not None
+    assert rig.session.pilot.limits.tilt_rad == pytest.approx(0.2094395, rel=1e-6)
+    assert not rig.drone.state & State.COMMAND_ACK, "the acknowledge bit is cleared behind the last answer"
+
+
+def test_every_config_is_preceded_by_the_ids_in_force() -> None:
+    rig = Rig()
+    rig.ready()
+    commands = rig.drone.commands
+    before = [commands[at - 1] for at, command in enumerate(commands) if command.name == "CONFIG"][1:]
+    assert before, "the first one is the mode, when nothing is known of ids"
+    assert {command.name for command in before} == {"CONFIG_IDS"}
+    assert before[0].arguments == ("00000000",) * 3
+    assert before[-1].arguments == (IDS.session, IDS.profile, "00000000")
+
+
+def test_an_ardrone_1_is_known_by_its_firmware_and_gets_no_ids() -> None:
+    rig = Rig(drone=ScriptedDrone(version=1))
+    rig.ready()
+    assert rig.session.version == 1
+    assert "CONFIG_IDS" not in rig.drone.names
+
+
+def test_ids_can_be_declined() -> None:
+    rig = Rig(ArdroneOptions("drone", ids=False))
+    rig.ready()
+    assert "CONFIG_IDS" not in rig.drone.names
+
+
+def test_ids_that_the_drone_does_not_keep_are_told() -> None:
+    rig = Rig()
+    rig.drone.stubborn = {"custom:session_id"}
+    rig.ready()
+    rig.run(0.05)
+    assert any("settings of our own" in text for text in rig.texts)
+    assert rig.session.configurator.ids is not None
+    assert rig.session.configurator.ids.session == "00000000"
+
+
+def test_the_full_mode_and_its_options() -> None:
+    rig = Rig(ArdroneOptions("drone", full=True, navdata_options=0x4000401))
+    rig.ready()
+    assert not rig.drone.state & State.DEMO
+    assert rig.drone.values["general:navdata_options"] == 0x4000401
+
+
+def test_a_drone_that_is_in_its_mode_already_is_not_asked_for_it() -> None:
+    rig = Rig()
+    rig.drone.state = State.DEMO
+    rig.ready()
+    assert ("general:navdata_demo", "TRUE") not in [command.arguments for command in rig.drone.commands]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_set_up_with_a_third_of_the_datagrams_lost(seed: int) -> None:
+    rig = Rig()
+    chance = random.Random(seed)
+    rig.lost = lambda: chance.random() < 0.33
+    rig.until(lambda: rig.session.ready, 12.0)
+
+
+# The pace and the watchdog ---------------------------------------------------------------------------------------
+
+
+def test_commands_go_on_at_their_pace_whatever_the_application_does() -> None:
+    rig = Rig()
+    rig.ready()
+    rig.run(0.2)
+    rig.sent.clear()
+    rig.run(3.0)
+    assert len(rig.sent) == pytest.approx(100, abs=2)
+    assert all(b"AT*PCMD" in datagram and b"AT*REF" in datagram for datagram in rig.sent)
+
+
+def test_the_watchdog_is_cleared_while_its_bit_is_set() -> None:
+    rig = Rig()
+    rig.ready()
+    rig.drone.state |= State.COMMUNICATION_WATCHDOG
+    rig.until(lambda: not rig.drone.state & State.COMMUNICATION_WATCHDOG, 0.2)
+    rig.run(0.1)
+    rig.drone.commands.clear()
+    rig.run(0.5)
+    assert "COMWDG" not in rig.drone.names
+
+
+def test_a_new_decision_is_said_at_once() -> None:
+    rig = Rig()
+    rig.ready()
+    rig.run(0.1)
+    now_ns = rig.clock.now_ns
+    rig.session.tick(now_ns)
+    now_ns = rig.clock.advance(0.012)
+    rig.session.command(Takeoff(), now_ns)
+    assert rig.session.due_ns == now_ns
+    rig.session.tick(now_ns)
+    rig.session.command(Land(), rig.clock.advance(0.002))
+    assert rig.session.due_ns == now_ns + ns(0.01), "but not sooner than the drone can take it"
+
+
+def test_the_same_decision_hurries_nothing() -> None:
+    rig = Rig()
+    rig.ready()
+    rig.session.tick(rig.clock.now_ns)
+    due_ns = rig.session.due_ns
+    rig.session.command(Hover(), rig.clock.advance(0.015))
+    assert rig.session.due_ns == due_ns
+
+
+def test_the_sequence_begins_anew_when_the_drone_lost_us() -> None:
+    rig = Rig()
+    rig.ready()
+    rig.run(0.5)
+    rig.drone.commands.clear()
+    rig.drone.extra = State.COMMUNICATION_LOST
+    rig.run(0.1)
+    assert (LinkState.LOST, "the drone says that it lost its link to us") in rig.sink.links
+    assert 1 in [command.sequence for command in rig.drone.commands]
+    rig.until(lambda: rig.sink.link_state is LinkState.UP, 2.0)
+    rig.drone.extra = State(0)
+    rig.run(0.5)
+    assert rig.sink.link_state is LinkState.UP
+
+
+def test_the_sequence_begins_anew_when_our_commands_are_not_taken() -> None:
+    rig = Rig()
+    rig.ready()
+    rig.run(0.5)
+    rig.drone.heard_sequence = 1_000_000  # somebody else counted far
+    rig.drone.state |= State.COMMUNICATION_WATCHDOG
+    rig.until(lambda: not rig.drone.state & State.COMMUNICATION_WATCHDOG, 2.0)
+    assert rig.drone.stale > 0
+
+
+# Losing and finding ----------------------------------------------------------------------------------------------
+
+
+def test_silence_is_told_by_degrees() -> None:
+    rig = Rig()
+    rig.ready()
+    rig.run(0.1)
+    rig.switch_off()
+    rig.run(0.2)
+    assert rig.sink.link_state is LinkState.UP
+    rig.run(0.15)
+    state, reason = newest_link(rig)
+    assert state is LinkState.DEGRADED
+    assert "no navdata for 0." in reason
+    rig.run(0.9)
+    state, reason = newest_link(rig)
+    assert state is LinkState.LOST
+    assert "drone, UDP port 5554" in reason
+
+
+def test_a_short_silence_heals_without_ado() -> None:
+    rig = Rig()
+    rig.ready()
+    rig.run(0.1)
+    rig.on = False
+    rig.run(0.5)
+    rig.on = True
+    rig.run(0.1)
+    assert links(rig)[-2:] == [LinkState.DEGRADED, LinkState.UP]
+    assert rig.session.ready
+
+
+def test_a_drone_that_was_away_is_set_up_anew() -> None:
+    rig = Rig()
+    rig.ready()
+    rig.run(0.1)
+    rig.switch_off()
+    rig.run(2.0)
+    assert rig.session.pilot.limits is None
+    rig.drone.commands.clear()
+    rig.switch_on()
+    rig.until(lambda: rig.sink.link_state is LinkState.UP, 3.0)
+    assert rig.drone.heard_sequence < 200, "the sequence began anew"
+    assert rig.drone.values["custom:session_id"] == IDS.session
+    assert rig.session.pilot.limits is not None
+    assert rig.session.reception.counts["restarts"] == 1
+
+
+def test_a_drone_that_was_away_too_briefly_to_be_missed_is_set_up_anew() -> None:
+    rig = Rig()
+    rig.ready()
+    rig.run(0.2)
+    rig.drone.restart()
+    rig.until(lambda: rig.sink.links[-1] == (LinkState.LOST, "the drone was started anew"), 0.5)
+    rig.until(lambda: rig.sink.link_state is LinkState.UP, 2.0)
+
+
+def test_what_was_written_is_written_again_where_the_drone_forgot_it() -> None:
+    rig = Rig()
+    rig.ready()
+    rig.session.remembered["control:euler_angle_max"] = "3.000000e-01"
+    rig.drone.restart()
+    rig.run(0.3)
+    rig.until(lambda: rig.sink.link_state is LinkState.UP, 3.0)
+    assert rig.session.pilot.limits is not None
+    assert rig.session.pilot.limits.tilt_rad == pytest.approx(0.3)
+
+
+def test_nobody_there_is_told_and_tried_for_ever() -> None:
+    rig = Rig()
+    rig.on = False
+    rig.session.unreachable("No route to host")
+    rig.run(2.5)
+    assert rig.sink.links[-1] == (LinkState.LOST, "no navdata from drone, UDP port 5554 (No route to host)")
+    starts = sum(rig.session.wants_start(rig.clock.advance(0.05)) for _ in range(40))
+    assert starts == pytest.approx(8, abs=1)
+    rig.on = True
+    rig.until(lambda: rig.sink.link_state is LinkState.UP, 3.0)
+
+
+def test_a_configuration_that_cannot_be_read_leaves_landing_possible() -> None:
+    rig = Rig()
+    rig.port_open = False
+    rig.run(4.0)
+    state, reason = rig.sink.links[-1]
+    assert state is LinkState.DEGRADED
+    assert "connection refused" in reason
+    assert rig.session.command(Takeoff(), rig.clock.now_ns) == Takeoff()
+    rig.run(0.2)
+    assert rig.session.command(Attitude(pitch=0.1), rig.clock.now_ns) == Hover(), "no set-point is claimed"
+    rig.run(0.1)
+    assert any("limits are not known" in text for text in rig.texts)
+    rig.session.command(Land(), rig.clock.now_ns)
+    rig.run(0.2)
+    assert not rig.drone.state & State.FLYING
+    rig.port_open = True
+    rig.until(lambda: rig.sink.link_state is LinkState.UP, 8.0)
+
+
+def test_a_drone_that_acknowledges_nothing_is_told() -> None:
+    rig = Rig()
+    rig.drone.deaf = True
+    rig.run(4.0)
+    assert rig.sink.link_state is LinkState.DEGRADED
+    rig.drone.deaf = False
+    rig.until(lambda: rig.sink.link_state is LinkState.UP, 8.0)
+
+
+def test_a_configuration_without_limits_takes_no_set_points() -> None:
+    rig = Rig()
+    del rig.drone.values["control:control_yaw"]
+    rig.ready()
+    rig.run(0.1)
+    assert any("tells no limits" in text for text in rig.texts)
+    assert rig.session.command(Attitude(pitch=0.1), rig.clock.now_ns) == Hover()
+
+
+def test_a_drone_that_is_lost_while_it_is_set_up() -> None:
+    rig = Rig()
+    rig.run(0.1)
+    assert not rig.session.ready
+    rig.switch_off()
+    rig.until(lambda: rig.sink.link_state is LinkState.LOST, 3.0)
+    rig.switch_on()
+    rig.until(lambda: rig.sink.link_state is LinkState.UP, 3.0)
+
+
+# What it tells ---------------------------------------------------------------------------------------------------
+
+
+def test_feedback_comes_with_the_counts() -> None:
+    rig = Rig()
+    rig.ready()
+    rig.session.heard(b"garbage", rig.clock.now_ns)
+    rig.run(0.5)
+    feedback = rig.sink.newest
+    assert feedback is not None
+    assert (feedback.state, feedback.battery, feedback.altitude) == (FlightState.LANDED, 0.7, 0.0)
+    assert feedback.native is not None
+    assert feedback.native["navdata.damaged"] == 1
+    assert not rig.sink.problems
+
+
+def test_full_navdata_is_told_at_the_rate_asked_for() -> None:
+    rig = Rig(ArdroneOptions("drone", full=True, rate_hz=10.0))
+    rig.ready()
+    rig.run(0.1)
+    before = rig.sink.feedback_count
+    rig.run(2.0)
+    assert rig.sink.feedback_count - before == pytest.approx(20, abs=3)
+
+
+def test_each_change_of_health_is_told_once() -> None:
+    rig = Rig()
+    rig.ready()
+    rig.drone.extra = State.BATTERY_LOW
+    rig.run(0.5)
+    rig.drone.extra = State(0)
+    rig.run(0.5)
+    told = [event for event in rig.sink.events if event.data.get("reason") == "battery_low"]
+    assert [(event.severity, event.data["active"]) for event in told] == [
+        (Severity.WARNING, True),
+        (Severity.INFO, False),
+    ]
+
+
+def test_a_takeoff_that_is_refused_is_told_and_not_tried_for_ever() -> None:
+    rig = Rig()
+    rig.ready()
+    rig.drone.refuses_takeoff = True
+    rig.session.command(Takeoff(), rig.clock.now_ns)
+    rig.run(6.0)
+    assert any("did not take off" in text for text in rig.texts)
+    rig.drone.refuses_takeoff = False
+    rig.run(1.0)
+    assert not rig.drone.state & State.FLYING
+
+
+def test_a_flight_that_is_lost_is_not_taken_off_again_on_the_ground() -> None:
+    rig = Rig()
+    rig.ready()
+    rig.session.command(Takeoff(), rig.clock.now_ns)
+    rig.until(lambda: bool(rig.drone.state & State.FLYING), 0.5)
+    rig.switch_off()
+    rig.run(2.0)
+    rig.session.command(Hover(), rig.clock.now_ns)  # as the proxy's failsafe does
+    rig.drone.commands.clear()
+    rig.switch_on()
+    rig.until(lambda: rig.sink.link_state is LinkState.UP, 3.0)
+    rig.run(1.0)
+    assert not rig.drone.state & State.FLYING
+    with_takeoff = [c for c in rig.drone.commands if c.name == "REF" and int(c.arguments[0]) & Ref.TAKEOFF]
+    assert not with_takeoff
+
+
+def test_a_drone_that_flies_already_is_left_flying() -> None:
+    rig = Rig()
+    rig.drone.state = State.FLYING | State.DEMO
+    rig.ready()
+    rig.run(1.0)
+    assert rig.drone.state & State.FLYING
+
+
+def test_no_takeoff_without_navdata() -> None:
+    rig = Rig()
+    with pytest.raises(DriverError, match="not heard"):
+        rig.session.command(Takeoff(), rig.clock.now_ns)
+
+
+def test_commands_without_acknowledgement_are_repeated_as_often_as_wanted() -> None:
+    rig = Rig()
+    rig.ready()
+    rig.session.say(("FTRIM", ()))
+    rig.session.say(("ANIM", (18, 15)), 1)
+    rig.run(0.5)
+    assert rig.drone.names.count("FTRIM") == 3
+    assert rig.drone.names.count("ANIM") == 1
+
+
+def test_closing_ends_exchanges() -> None:
+    rig = Rig()
+    rig.ready()
+    failures: list[str | None] = []
+    steps = iter((Write("control:outdoor", "TRUE"), Read()))
+    rig.session.submit(Exchange(steps, rig.clock.now_ns + ns(9), failures.append))
+    rig.session.close()
+    assert failures == ["the driver was closed"]
+
+
+# Damage ----------------------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.binary(max_size=64) | st.integers(0, 8 * len(RECORDED) - 1) | st.just(RECORDED), max_size=30))
+def test_whatever_comes_is_counted_and_never_raises(pieces: list[bytes | int]) -> None:
+    rig = Rig()
+    damaged = 0
+    for piece in pieces:
+        datagram = piece if isinstance(piece, bytes) else _flipped(piece)
+        damaged += datagram != RECORDED
+        rig.session.heard(datagram, rig.clock.advance(0.005))
+        rig.session.tick(rig.clock.now_ns)
+    counts = rig.session.reception.counts
+    assert counts["damaged"] == damaged
+    assert counts["received"] + counts["late"] + damaged == len(pieces)
+    for telling in rig.session.tellings():
+        telling(rig.sink)
+    assert all(feedback.battery == 0.5 for feedback in rig.sink.feedbacks)
+
+
+def _flipped(bit: int) -> bytes:
+    datagram = bytearray(RECORDED)
+    datagram[bit // 8] ^= 1 << bit % 8
+    return bytes(datagram)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.permutations(range(1, 25)))
+def test_reordered_navdata_never_run_backwards(order: list[int]) -> None:
+    rig = Rig()
+    for sequence in order:
+        now_ns = rig.clock.advance(0.005)
+        battery = Demo(ctrl_state=0x20000, battery=sequence)
+        rig.session.heard(encode(State.DEMO, sequence, [battery, Time(sequence * 5000)]), now_ns)
+    for telling in rig.session.tellings():
+        telling(rig.sink)
+    batteries = [feedback.battery for feedback in rig.sink.feedbacks if feedback.battery is not None]
+    counts = rig.session.reception.counts
+    assert counts["received"] == len(batteries)
+    assert counts["received"] + counts["late"] == 24
+    if not counts["restarts"]:
+        assert batteries == sorted(batteries)
+    assert not [problem for problem in rig.sink.problems if "before the one" in problem]
+
+
+def test_the_recorded_datagram_goes_through() -> None:
+    rig = Rig(ArdroneOptions("drone", full=True))
+    rig.session.heard(RECORDED, rig.clock.now_ns)
+    for telling in rig.session.tellings():
+        telling(rig.sink)
+    feedback = rig.sink.newest
+    assert feedback is not None
+    assert (feedback.state, feedback.battery) == (FlightState.LANDED, 0.5)
+    assert not rig.sink.events, "it is in good health"

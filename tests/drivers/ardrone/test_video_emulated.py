@@ -1,0 +1,44 @@
+"""The receiver on the emulated drones' video."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+from skyloop.clock import seconds
+from skyloop.drivers.ardrone.video import Notice, VideoReceiver
+from skyloop.sim.firmware.ardrone import ArdroneFirmware, Ports
+from skyloop.sim.firmware.ardrone.settings import with_ardrones
+from skyloop.sim.host import SimHost
+from skyloop.sim.options import SimOptions
+from tests.drivers.ardrone.video_ports import HOST, Viewer
+
+
+@pytest.mark.parametrize(
+    ("version", "header_size", "size", "fps"),
+    [(1, 68, (320, 240), 15), (2, 64, (640, 360), 30), (2, 68, (640, 360), 30)],
+)
+def test_pictures_come_in_time_and_again_after_a_restart(
+    version: int, header_size: int, size: tuple[int, int], fps: int
+) -> None:
+    host = SimHost(with_ardrones(SimOptions(world="room", seed=1)))
+    viewer = Viewer()
+    with ArdroneFirmware(host, version=version, ports=Ports.free(), header_size=header_size) as firmware:
+        receiver = VideoReceiver(HOST, firmware.ports.video, version=version, show=viewer.show, told=viewer.told)
+        receiver.start()
+        viewer.wait(lambda: len(viewer.seen) >= 15, "15 pictures")
+        now_ns = time.monotonic_ns()
+        assert seconds(now_ns - viewer.seen[-1][1]) < 1.0
+        firmware.stop()
+        if version == 2:
+            viewer.wait(lambda: viewer.texts(Notice.LOST), "the loss")
+        before = len(viewer.seen)
+        firmware.start()
+        viewer.wait(lambda: len(viewer.seen) >= before + 15, "pictures after the restart")
+        receiver.stop()
+    assert viewer.sizes == {size}
+    assert receiver.counters.damaged <= 2  # what was under way when the drone was switched off, and a stale greeting
+    periods_s = np.diff([taken_ns for _, taken_ns, _ in viewer.seen[before:]]) / 1e9
+    assert np.median(periods_s) == pytest.approx(1 / fps, rel=0.3)

@@ -1,0 +1,81 @@
+"""An emulated AR.Drone 2 with the drone's own ports, for programs in which they can't be chosen."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import subprocess
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NoReturn
+
+import pytest
+
+from skyloop.errors import LinkError
+from skyloop.sim.firmware.ardrone import ArdroneFirmware
+from skyloop.sim.firmware.ardrone.settings import with_ardrones
+from skyloop.sim.host import SimHost
+from skyloop.sim.options import SimOptions
+
+HERE = Path(__file__).parent
+INSTALLED = HERE.parents[1] / ".third-party"
+PATIENCE_S = 90.0
+
+
+@dataclass
+class Emulated:
+    """The drone, where it listens, and where it really is."""
+
+    host: SimHost
+    address: str
+
+    def position_m(self) -> tuple[float, float, float]:
+        x, y, z = self.host.simulation.truth(0).position_m
+        return float(x), float(y), float(z)
+
+    def flown(self, command: list[str], **environment: str) -> tuple[dict[str, Any], float]:
+        """Let a program fly. What it says it saw; how far from its start the drone really is when it has landed [m]."""
+        start = self.position_m()
+        done = subprocess.run(
+            [*command, self.address],
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE_S,
+            env={**os.environ, **environment},
+            check=False,
+        )
+        assert done.returncode == 0, f"{done.stdout}\n{done.stderr}"
+        seen: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+        end = self.position_m()
+        assert end[2] == pytest.approx(start[2], abs=0.1)
+        return seen, math.dist(start[:2], end[:2])
+
+
+def absent(reason: str) -> NoReturn:
+    """Skips, or fails where somebody has promised that all is there."""
+    if os.environ.get("SKYLOOP_THIRD_PARTY") == "required":
+        pytest.fail(reason)
+    pytest.skip(reason)
+
+
+def private_address() -> str:
+    """One in 127.0.0.0/8 that no other run of the tests has."""
+    pid = os.getpid()
+    return f"127.77.{pid >> 8 & 0xFF}.{pid & 0xFF}"
+
+
+@pytest.fixture
+def drone() -> Iterator[Emulated]:
+    address = private_address()
+    host = SimHost(with_ardrones(SimOptions(world="room", seed=3)))
+    firmware = ArdroneFirmware(host, version=2, bind=address)
+    try:
+        firmware.start()
+    except LinkError as error:
+        absent(f"the drone's ports can't be had on {address}: {error}")
+    try:
+        yield Emulated(host, address)
+    finally:
+        firmware.stop()

@@ -1,0 +1,51 @@
+"""ar-drone 0.3.3 from npm, a program that we did not write, flies the emulated AR.Drone 2.
+
+Its quirks: its first line is CTRL with the sequence number 0, its REF lacks the five bits that should always be set (it
+is 512 for take-off), and it drops, and says nothing, each navdata datagram of the full mode whose option 27 has not 216
+bytes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.third_party.conftest import HERE, INSTALLED, Emulated, absent
+
+VERSION = "0.3.3"
+OPTIONS_OF_FULL_NAVDATA = {"rawMeasures", "physMeasures", "pwm", "altitude", "magneto", "windSpeed", "wifi", "gps"}
+
+pytestmark = pytest.mark.process
+
+
+@pytest.fixture
+def modules() -> Path:
+    """The folder of packages: SKYLOOP_NODE_MODULES, or where scripts/third-party.sh installs them."""
+    modules = Path(os.environ.get("SKYLOOP_NODE_MODULES", INSTALLED / "node_modules"))
+    package = modules / "ar-drone" / "package.json"
+    if shutil.which("node") is None or not package.exists():
+        absent("node or its package ar-drone is not installed (run scripts/third-party.sh)")
+    assert json.loads(package.read_text())["version"] == VERSION
+    return modules
+
+
+def test_it_takes_off_moves_sees_configures_and_lands(modules: Path, drone: Emulated) -> None:
+    seen, moved_m = drone.flown(["node", str(HERE / "fly_ar_drone.js")], NODE_PATH=str(modules))
+    assert seen["errors"] == []
+    assert seen["config"] == [["control:altitude_max", "acknowledged"], ["general:navdata_demo", "acknowledged"]]
+    states = [state.removeprefix("CTRL_") for state in seen["states"]]
+    assert states[:3] == ["LANDED", "TRANS_TAKEOFF", "HOVERING"]
+    assert states[-2:] == ["TRANS_LANDING", "LANDED"]
+    assert seen["navdata"] > 100
+    assert set(seen["options"]) >= {"demo", "visionDetect"} | OPTIONS_OF_FULL_NAVDATA
+    assert 50 < seen["battery"] <= 100
+    assert 0.5 < seen["highest"] < 2.0
+    assert seen["fastest"] > 200
+    assert seen["frames"] >= 30
+    assert seen["keyFrames"] >= 2
+    assert seen["sizes"] == ["640x360"]
+    assert moved_m > 0.5
