@@ -26,6 +26,7 @@ from skyloop.client.frame import Arrival
 from skyloop.client.logbook import Logbook
 from skyloop.client.reading import Wanted
 from skyloop.client.slots import Buffer
+from skyloop.drivers.uri import parse_uri
 from skyloop.errors import NoAnswerError, UsageError
 from skyloop.messages import (
     Annotation,
@@ -47,7 +48,11 @@ Callback = Callable[[T], object] | Callable[[T], Awaitable[object]]
 
 
 class connect:  # noqa: N801  (used like the function skyloop.connect)
-    """``async with connect(target, …) as drone``, or ``drone = await connect(…)``; see :func:`skyloop.connect`."""
+    """``async with connect(target, …) as drone``, or ``drone = await connect(…)``; see :func:`skyloop.connect`.
+
+    Raises :class:`UsageError` also for a replay in step (``speed=max``), whose time moves only while its application
+    waits with the calls of :class:`skyloop.client.Drone`.
+    """
 
     def __init__(self, target: str, **options: Any) -> None:
         self._target = target
@@ -68,6 +73,7 @@ class connect:  # noqa: N801  (used like the function skyloop.connect)
             await self._drone.__aexit__(kind, error, traceback)
 
     async def _connect(self) -> Drone:
+        _reject_in_step(self._target)
         sync = await _in_thread(lambda: client.connect(self._target, **self._options), abandoned=lambda d: d.close())
         return Drone(sync)
 
@@ -292,6 +298,15 @@ class Listener:
     @property
     def errors(self) -> int:
         return self._sync.errors
+
+
+def _reject_in_step(target: str) -> None:
+    """Raises :class:`UsageError` for a replay whose time would stand still here."""
+    if isinstance(target, str) and target.startswith("replay://") and parse_uri(target).options.get("speed") == "max":
+        raise UsageError(
+            f"{target}: speed=max is in step with the one thread that waits, which an event loop never does: use "
+            "skyloop.connect, or give a number, such as speed=10"
+        )
 
 
 def _on_loop(function: Callback[T]) -> Callable[[T], object]:

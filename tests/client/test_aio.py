@@ -68,6 +68,26 @@ def test_a_flight(proxy: ScriptedProxy) -> None:
     assert Land() in proxy.actions(), "the end of the block lands"
 
 
+@pytest.mark.parametrize("target", ["replay://none.mcap?speed=max", "replay:///a/b.mcap?start=3&speed=max"])
+def test_a_replay_in_step_is_refused_at_once(target: str) -> None:
+    async def begin() -> None:
+        with pytest.raises(UsageError, match=r"in step .* use skyloop\.connect, or give a number"):
+            await aio.connect(target)
+        with pytest.raises(UsageError, match=r"use skyloop\.connect"):
+            async with aio.connect(target):
+                pass
+
+    run(begin())
+
+
+def test_other_replays_are_not_refused_for_that(proxy: ScriptedProxy) -> None:
+    async def begin() -> None:
+        async with aio.connect("replay://none.mcap?speed=2") as drone:
+            assert drone.name == "scripted"
+
+    run(begin())
+
+
 def test_authority_and_emergency(proxy: ScriptedProxy) -> None:
     async def fly() -> None:
         drone = await aio.connect("me")

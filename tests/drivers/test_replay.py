@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import heapq
 import re
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import msgspec
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import Writer
 
 from skyloop.clock import ManualClock
 from skyloop.drivers.recording_sink import RecordingSink
@@ -18,8 +21,20 @@ from skyloop.drivers.replay import ReplayDriver
 from skyloop.drivers.replay.driver import _OPTIONS
 from skyloop.drivers.replay.tape import Tape, Timeline
 from skyloop.errors import ParameterError, UnknownNameError, UsageError
+from skyloop.logfile.layout import (
+    META_CLOCK,
+    META_RECORDING,
+    PROFILE,
+    VERSION,
+    ClockPair,
+    DroneRecord,
+    Start,
+    to_metadata,
+    to_plain,
+)
 from skyloop.logfile.reader import Recording
 from skyloop.messages import (
+    CameraInfo,
     Encoding,
     EventKind,
     Feedback,
@@ -30,7 +45,7 @@ from skyloop.messages import (
     Velocity,
 )
 from tests.docs.pages import rows, section
-from tests.recording.flights import BEGIN_NS, CAPABILITIES, MS, Plan, feedback_at, write_flight
+from tests.recording.flights import BEGIN_NS, CAPABILITIES, MS, UNIX_NS, Plan, feedback_at, write_flight
 
 WAIT_S = 10.0
 
@@ -195,6 +210,65 @@ def test_commands_are_taken_and_change_nothing(flight: Path) -> None:
         assert driver.apply(Velocity(forward=0.5)) == Velocity(forward=0.5)
         assert driver.failsafe(Land())
         assert driver.failsafe(Hover())
+
+
+def merged(path: Path, plans: list[Plan]) -> Path:
+    """One recording of several drones, by the times of their flights."""
+    with ExitStack() as stack:
+        parts = []
+        for plan in plans:
+            part = write_flight(path.with_name(f"{plan.drone}.mcap"), plan)
+            parts.append(make_reader(stack.enter_context(part.open("rb"))))
+        writer = Writer(stack.enter_context(path.open("wb")))
+        writer.start(PROFILE, "tests")
+        drones = tuple(DroneRecord(plan.drone, "sim://", to_plain(plan.capabilities)) for plan in plans)
+        writer.add_metadata(META_CLOCK, to_metadata(ClockPair(BEGIN_NS, UNIX_NS, 77)))
+        writer.add_metadata(META_RECORDING, to_metadata(Start(VERSION, "0.1.0", drones, UNIX_NS)))
+        channels: dict[str, int] = {}
+        in_turn = heapq.merge(*(part.iter_messages() for part in parts), key=lambda found: found[2].log_time)
+        for kind, channel, message in in_turn:
+            if channel.topic not in channels:
+                assert kind is not None
+                number = writer.register_schema(kind.name, kind.encoding, kind.data)
+                channels[channel.topic] = writer.register_channel(channel.topic, channel.message_encoding, number)
+            writer.add_message(
+                channels[channel.topic], message.log_time, message.data, message.publish_time, message.sequence
+            )
+        writer.finish()  # type: ignore[no-untyped-call]
+    return path
+
+
+def test_each_drone_of_a_recording_gives_its_own_samples(tmp_path: Path) -> None:
+    """They flew at the same time: one a circle, the other stood, slower to tell, with another camera and battery."""
+    camera = CameraInfo("bottom", 64, 48, 5.0)
+    standing = msgspec.structs.replace(CAPABILITIES, cameras=(camera,), description="the second one")
+
+    def stands(at_ms: int) -> Feedback:
+        flying = feedback_at(Plan(), at_ms, at_ms // 40 + 1)
+        return msgspec.structs.replace(flying, state=FlightState.LANDED, battery=0.25, position=(7.0, 8.0, 0.0))
+
+    beta = Plan(drone="beta", seconds=1.6, feedback_ms=40, frame_ms=0, command_ms=0, lossy=False, capabilities=standing)
+    beta.extra = stands
+    path = merged(tmp_path / "both.mcap", [Plan(lossy=False), beta])
+    seen = {}
+    for name in ("alpha", "beta"):
+        with played(path, f"?drone={name}&speed=20") as (driver, sink):
+            assert sink.wait(lambda sink=sink: sink.link_state is LinkState.CLOSED, WAIT_S)  # type: ignore[misc]
+            seen[name] = (driver.capabilities(), sink)
+    described, sink = seen["alpha"]
+    assert described.description == "recording of alpha: a simulated quadrotor"
+    assert (sink.feedback_count, sink.frame_counts) == (100, {"front": 20})
+    assert FlightState.FLYING in {feedback.state for feedback in sink.feedbacks}
+    assert all((feedback.battery or 0.0) >= 0.9 for feedback in sink.feedbacks)
+    assert "land" in {(feedback.native or {}).get("replay.asked") for feedback in sink.feedbacks}
+    described, sink = seen["beta"]
+    assert described.description == "recording of beta: the second one"
+    assert (sink.feedback_count, sink.frame_counts) == (40, {})
+    states = {(feedback.state, feedback.battery, feedback.position) for feedback in sink.feedbacks}
+    assert states == {(FlightState.LANDED, 0.25, (7.0, 8.0, 0.0))}
+    assert not any("replay.asked" in (feedback.native or {}) for feedback in sink.feedbacks), "commands are alpha's"
+    with played(path) as (driver, _):
+        assert driver.capabilities() == seen["alpha"][0], "the first one, if none is named"
 
 
 def test_capabilities(flight: Path, tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ def test_all_frames_reach_a_processor_and_a_controller_in_order() -> None:
         processor = drone.add_processor(lambda frame: processed.append(frame.seq))
         controller = Look(drone)
         controller.run(seconds=20)
-        eventually(lambda: len(processed) + processor.dropped >= FRAMES, "the processor is through as well")
+        eventually(lambda: len(processed) + processor.dropped >= FRAMES, "the processor is through as well", 30.0)
     assert processed == sorted(processed)
     assert controller.seen == sorted(controller.seen)
     # Both keep up with 30 frames a second, unless the machine takes their turn away for longer than a frame lasts.

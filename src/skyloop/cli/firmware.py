@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 PORT_BASE: Final = 5550
 PORTS_APART: Final = 10
+LOOK_UP_S: Final = 0.2
 
 
 class Firmware(StrEnum):
@@ -74,7 +75,8 @@ def _run(firmwares: Sequence[ArdroneFirmware]) -> None:
                 started.enter_context(firmware)
             for firmware in firmwares:
                 print(f"ready {describe(firmware)}", flush=True)
-            asked.wait()
+            while not asked.wait(LOOK_UP_S):  # a signal that another thread gets does not wake this one
+                pass
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -80,7 +80,9 @@ def run(proxies: Sequence[Proxy], *, parent_fd: int | None = None, land_within_s
             threading.Thread(target=_await_parent, args=(parent_fd, end), name="skyloop-parent", daemon=True).start()
         for proxy in proxies:
             _announce(f"ready {proxy.name}: {proxy.driver.uri} at {proxy.server.address}, process {os.getpid()}")
-        end.asked.wait()
+        # Looks up now and then: the kernel may hand a signal to any thread, and that does not wake this one.
+        while not end.asked.wait(_POLL_S):
+            pass
         _land(proxies, end, land_within_s)
 
 
