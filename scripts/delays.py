@@ -2,7 +2,7 @@
 
 ``python scripts/delays.py`` makes them anew from ``docs/measured``; ``python scripts/delays.py FOLDER`` takes new
 results from the folder that ``skyloop bench … --output FOLDER`` wrote: those of ``delays.json``, ``load.json`` and
-``loop.json`` that are there.
+``loop.json`` that are there. Pictures are drawn anew unless the new results have no ``delays.json``.
 """
 
 from __future__ import annotations
@@ -26,21 +26,22 @@ FILES = ("delays.json", "load.json", "loop.json")
 def main() -> None:
     if len(sys.argv) > 2:
         sys.exit(f"usage: {sys.argv[0]} [FOLDER]")
-    if len(sys.argv) == 2:
-        take(Path(sys.argv[1]))
+    taken = take(Path(sys.argv[1])) if len(sys.argv) == 2 else list(FILES)
     PAGE.write_text(fill(PAGE.read_text(), blocks(MEASURED)))
-    for file in draw(delays.load(MEASURED / "delays.json"), DOCS / "pictures"):
-        print(file)
+    if "delays.json" in taken:
+        for file in draw(delays.load(MEASURED / "delays.json"), DOCS / "pictures"):
+            print(file)
 
 
-def take(folder: Path) -> None:
-    """Keep the results of a run beside the page."""
+def take(folder: Path) -> list[str]:
+    """Keep the results of a run beside the page; their names."""
     found = [folder / name for name in FILES if (folder / name).exists()]
     if not found:
         sys.exit(f"{folder} holds none of {', '.join(FILES)}")
     MEASURED.mkdir(exist_ok=True)
     for file in found:
         shutil.copy(file, MEASURED)
+    return [file.name for file in found]
 
 
 def blocks(folder: Path) -> dict[str, str]:

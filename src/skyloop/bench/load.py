@@ -6,22 +6,23 @@ import os
 import signal
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import msgspec
 
 from skyloop.bench.contract import Arrivals
+from skyloop.bench.disk import small_disk
 from skyloop.bench.machine import Machine, cpu_time_s
-from skyloop.bench.onlookers import observe, record
+from skyloop.bench.onlookers import observe, record, show
 from skyloop.bench.ours import proxy_name
 from skyloop.bench.pair import Pair, since
 from skyloop.bench.schedule import CHANNELS, FRAME_PERIOD_S, MIDDLE, SMALL, Size, Turn
 from skyloop.bench.statistics import Summary, summarize
 from skyloop.bench.workers import STARTS_WITHIN_S, Worker, Workers
-from skyloop.errors import LinkError
+from skyloop.errors import LinkError, UsageError
 
 TURN_S: Final = 5.0
 RECORDED_PERIOD_S: Final = 1 / 30
@@ -30,9 +31,11 @@ _ANSWERS_WITHIN_S: Final = 20.0
 
 ALONE: Final = "nobody else"
 SLOW: Final = "a processor of 200 ms a frame"
-PARTS: Final = ("proxy", "pilot", "observers", "recorder")  #: whose processor time is measured
+#: Whose processor time is measured. The pages are without a browser: see :mod:`skyloop.cockpit.testing`.
+PARTS: Final = ("proxy", "pilot", "observers", "recorder", "cockpit", "pages")
 RECORDED: Final = "recorder"
 KILLED: Final = "recorder, killed half-way"
+FULL: Final = "recorder, disk full"
 
 Progress = Callable[[float, str], None]
 
@@ -46,6 +49,8 @@ class Case(NamedTuple):
     slow: bool = False
     recorder: bool = False
     killed: bool = False  #: the recorder, half-way through
+    disk_full: bool = False  #: the recorder's
+    pages: int = 0  #: of a cockpit
     size: Size = SMALL
     frame_period_s: float = FRAME_PERIOD_S
 
@@ -60,6 +65,8 @@ class CaseResult(msgspec.Struct, frozen=True):
     channels: dict[str, Summary]
     cpu: dict[str, float]  #: cores in use by each part: 1.0 is one core all the time
     recorder_lost: dict[str, int] | None = None  #: samples by channel that a recorder dropped or missed
+    recorder_stopped: str = ""  #: why a recorder stood still at the end of a turn, such as a full disk
+    pages: int = 0  #: of a cockpit; what they get is the channel ``video, pages``
 
 
 class Load(msgspec.Struct, frozen=True, tag_field="what", tag="load"):
@@ -68,11 +75,12 @@ class Load(msgspec.Struct, frozen=True, tag_field="what", tag="load"):
     machine: Machine
     seconds: float
     cases: list[CaseResult]
-    skipped: dict[str, str]
+    skipped: dict[str, str]  #: why a case was left out, by its name
 
-    def case(self, name: str, size: Size = SMALL) -> CaseResult | None:
+    def case(self, name: str, size: Size = SMALL, frame_period_s: float = FRAME_PERIOD_S) -> CaseResult | None:
         """None if it was not measured."""
-        return next((case for case in self.cases if case.case == name and case.size == str(size)), None)
+        wanted = (name, str(size), _rate(frame_period_s))
+        return next((case for case in self.cases if (case.case, case.size, case.frames_per_s) == wanted), None)
 
 
 def observers_name(number: int, *, stuck: bool = False) -> str:
@@ -80,8 +88,18 @@ def observers_name(number: int, *, stuck: bool = False) -> str:
     return f"{number} {noun}" + (", one of them stopped" if stuck else "")
 
 
+def pages_name(number: int) -> str:
+    return f"{number} cockpit page" + ("" if number == 1 else "s")
+
+
 def cases_of(
-    observers: Sequence[int], *, slow_processor: bool = True, stuck: bool = True, recorder: bool = True
+    observers: Sequence[int],
+    *,
+    slow_processor: bool = True,
+    stuck: bool = True,
+    recorder: bool = True,
+    disk_full: bool = True,
+    pages: int = 0,
 ) -> list[Case]:
     """What to measure. Pure."""
     cases = [Case(ALONE)]
@@ -94,9 +112,16 @@ def cases_of(
             cases.append(Case(observers_name(number, stuck=True), observers=number, stuck=True))
     if slow_processor:
         cases.append(Case(SLOW, slow=True))
+    if pages:
+        watched = Case(pages_name(pages), pages=pages, size=MIDDLE)
+        cases += [watched._replace(name=ALONE, pages=0), watched]
+    recorded = Case(RECORDED, recorder=True, size=MIDDLE, frame_period_s=RECORDED_PERIOD_S)
+    if recorder or disk_full:
+        cases.append(recorded._replace(name=ALONE, recorder=False))
     if recorder:
-        recorded = Case(RECORDED, recorder=True, size=MIDDLE, frame_period_s=RECORDED_PERIOD_S)
-        cases += [recorded._replace(name=ALONE, recorder=False), recorded, recorded._replace(name=KILLED, killed=True)]
+        cases += [recorded, recorded._replace(name=KILLED, killed=True)]
+    if disk_full:
+        cases.append(recorded._replace(name=FULL, disk_full=True))
     return cases
 
 
@@ -108,18 +133,31 @@ def measure(
     skipped: dict[str, str] | None = None,
     progress: Progress = lambda _share, _what: None,
 ) -> Load:
-    """Measure each case for ``seconds``, in turns. ``record_to``: the folder that the recorder writes to."""
+    """Measure each case for ``seconds``, in turns. ``record_to``: the folder that the recorder writes to.
+
+    Where there is no disk to fill that case is left out, and ``skipped`` of the result says why besides what the
+    caller knew.
+    """
     machine = Machine.here()
     rounds = max(1, round(seconds / TURN_S))
-    tallies = [_Tally(case) for case in cases]
-    with tempfile.TemporaryDirectory(prefix="bench-") as folder, Workers() as workers:
-        stage = _Stage(workers, folder, cases, record_to or Path(folder))
+    skipped = dict(skipped or {})
+    with ExitStack() as stack:
+        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="bench-"))
+        folders = {False: record_to or Path(folder)}
+        if any(case.disk_full for case in cases):
+            try:
+                folders[True] = stack.enter_context(small_disk(record_to))
+            except UsageError as error:
+                skipped[FULL] = str(error)
+                cases = [case for case in cases if not case.disk_full]
+        tallies = [_Tally(case) for case in cases]
+        stage = _Stage(stack.enter_context(Workers()), folder, cases, folders)
         for number in range(rounds):
             for index, tally in enumerate(tallies):
                 progress((number + index / len(cases)) / rounds, tally.case.name)
                 case = tally.case
                 stage.play(tally, Turn(number, seconds / rounds, case.size, case.frame_period_s))
-    return Load(machine, seconds, [tally.result() for tally in tallies], skipped or {})
+    return Load(machine, seconds, [tally.result() for tally in tallies], skipped)
 
 
 class _Tally:
@@ -132,6 +170,7 @@ class _Tally:
         self.cpu_s: dict[str, float] = {}
         self.seconds = 0.0
         self.recorder_lost: dict[str, int] | None = None
+        self.recorder_stopped = ""
         self._period_s: dict[str, float] = {}
 
     def add(self, turn: Turn, arrivals: Arrivals, *, of: str = "", times: int = 1) -> None:
@@ -143,6 +182,18 @@ class _Tally:
             self.delays_ns.setdefault(name, []).extend(heard - sent for sent, heard in pairs)
             self.sent[name] = self.sent.get(name, 0) + times * turn.count(kind)
 
+    def use(self, turn: Turn, before_s: Mapping[str, float], after_s: Mapping[str, float]) -> None:
+        """Processor time that the parts had used at both ends of a turn."""
+        self.seconds += turn.seconds
+        for part, used_s in after_s.items():
+            self.cpu_s[part] = self.cpu_s.get(part, 0.0) + used_s - before_s[part]
+
+    def recorded(self, samples: Mapping[str, int], stopped: str) -> None:
+        """Samples by channel that a recorder left out in a turn, and why it stood still in the end."""
+        self.recorder_stopped = stopped or self.recorder_stopped
+        before = self.recorder_lost or {}
+        self.recorder_lost = {name: before.get(name, 0) + samples.get(name, 0) for name in {*before, *samples}}
+
     def result(self) -> CaseResult:
         case = self.case
         for channel in CHANNELS:
@@ -151,7 +202,7 @@ class _Tally:
         return CaseResult(
             case=case.name,
             size=str(case.size),
-            frames_per_s=round(1 / case.frame_period_s, 1),
+            frames_per_s=_rate(case.frame_period_s),
             observers=case.observers,
             channels={
                 name: summarize(delays, sent=self.sent[name], period_s=self._period_s[name])
@@ -160,16 +211,19 @@ class _Tally:
             },
             cpu={part: used_s / self.seconds for part, used_s in self.cpu_s.items()},
             recorder_lost=self.recorder_lost,
+            recorder_stopped=self.recorder_stopped,
+            pages=case.pages,
         )
 
 
 class _Stage:
     """The processes of all cases; those that a case does not need are not connected meanwhile."""
 
-    def __init__(self, workers: Workers, folder: str, cases: Sequence[Case], record_to: Path) -> None:
+    def __init__(self, workers: Workers, folder: str, cases: Sequence[Case], folders: Mapping[bool, Path]) -> None:
+        """``folders``: for recordings, False: with room for them, True: that they fill."""
         self._workers = workers
         self._proxy = proxy_name(folder)
-        self._record_to = record_to
+        self._folders = folders
         modules = {case.slow: "skyloop.bench.slow" if case.slow else None for case in cases}
         self._pairs = {
             slow: Pair(workers, "skyloop.bench.ours", folder, application_module=module)
@@ -186,34 +240,40 @@ class _Stage:
         observers = self._observers[: case.observers]
         pair.open(turn)
         _tell(observers, "connect")
-        recorder = self._start_recorder(turn) if case.recorder else None
-        processes = ([pair.vehicle], [pair.application], observers, [] if recorder is None else [recorder])
-        parts = {part: workers for part, workers in zip(PARTS, processes, strict=True) if workers}
+        recorder = self._start_recorder(turn, fill=case.disk_full) if case.recorder else None
+        pages = self._workers.start(show, self._proxy, case.pages) if case.pages else None
+        parts = {
+            "proxy": [pair.vehicle.pid],
+            "pilot": [pair.application.pid],
+            "observers": [worker.pid for worker in observers],
+            "recorder": [] if recorder is None or case.killed else [recorder.pid],
+            "cockpit": [] if pages is None else [pages.answer(STARTS_WITHIN_S)],
+            "pages": [] if pages is None else [pages.pid],
+        }
         begin_ns = pair.begin()
         with _stopped(observers[-1:] if case.stuck else []):
             _sleep_until(begin_ns)
-            before_s = {part: _used_s(workers) for part, workers in parts.items()}
+            before_s = _used_s(parts)
             half_ns = round(turn.seconds * 0.5e9)
             _sleep_until(begin_ns + half_ns)
             if case.killed and recorder is not None:
                 os.kill(recorder.pid, signal.SIGKILL)
             _sleep_until(begin_ns + 2 * half_ns)
-            for part, workers in parts.items():
-                if not (case.killed and part == "recorder"):
-                    tally.cpu_s[part] = tally.cpu_s.get(part, 0.0) + _used_s(workers) - before_s[part]
-        tally.seconds += turn.seconds
+            tally.use(turn, before_s, _used_s(parts))
         tally.add(turn, pair.arrivals(turn, begin_ns))
         for worker in observers:
             worker.pipe.send("end")
         others = [worker.answer(_ANSWERS_WITHIN_S) for worker in observers]
         for arrivals in others[:-1] if case.stuck else others:
             tally.add(turn, since(arrivals, begin_ns), of="observers")
+        if pages is not None:
+            tally.add(turn, since(_end(pages), begin_ns), of="pages", times=case.pages)
         if recorder is not None and not case.killed:
-            recorder.pipe.send("end")
-            _add_losses(tally, recorder.answer(_ANSWERS_WITHIN_S))
+            tally.recorded(*_end(recorder))
 
-    def _start_recorder(self, turn: Turn) -> Worker:
-        worker = self._workers.start(record, self._proxy, str(self._record_to / f"bench-{turn.number}.mcap"))
+    def _start_recorder(self, turn: Turn, *, fill: bool) -> Worker:
+        file = self._folders[fill] / f"bench-{turn.number}.mcap"
+        worker = self._workers.start(record, self._proxy, str(file), fill)
         worker.answer(STARTS_WITHIN_S)
         return worker
 
@@ -238,17 +298,23 @@ def _stopped(workers: Sequence[Worker]) -> Iterator[None]:
             os.kill(worker.pid, signal.SIGCONT)
 
 
-def _used_s(workers: Sequence[Worker]) -> float:
-    return sum(cpu_time_s(worker.pid) for worker in workers)
+def _used_s(parts: Mapping[str, Sequence[int]]) -> dict[str, float]:
+    """Processor time so far of the processes of each part, without parts that have none."""
+    return {part: sum(map(cpu_time_s, pids)) for part, pids in parts.items() if pids}
+
+
+def _end(worker: Worker) -> Any:
+    """Let it end; what it has to say then."""
+    worker.pipe.send("end")
+    return worker.answer(_ANSWERS_WITHIN_S)
+
+
+def _rate(frame_period_s: float) -> float:
+    return round(1 / frame_period_s, 1)
 
 
 def _sleep_until(at_ns: int) -> None:
     time.sleep(max(0, at_ns - time.monotonic_ns()) / 1e9)
-
-
-def _add_losses(tally: _Tally, losses: dict[str, int]) -> None:
-    before = tally.recorder_lost or {}
-    tally.recorder_lost = {name: before.get(name, 0) + losses.get(name, 0) for name in {*before, *losses}}
 
 
 def load(path: Path) -> Load:

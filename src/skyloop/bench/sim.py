@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
+from skyloop.bench.contract import Image
 from skyloop.bench.machine import Machine
 from skyloop.bench.statistics import Spread, spread
 from skyloop.clock import monotonic_ns, nanoseconds
@@ -95,7 +96,7 @@ def measure_physics(world: str, drones: int, seconds: float, progress: Progress)
     """Step a world full of flying drones for so long."""
     simulation = _circling(world, drones)
     batches: list[int] = []
-    for _ in _rounds(seconds, progress):
+    for _ in rounds(seconds, progress):
         begin = monotonic_ns()
         simulation.step(BATCH_STEPS)
         batches.append(monotonic_ns() - begin)
@@ -107,10 +108,10 @@ def measure_physics(world: str, drones: int, seconds: float, progress: Progress)
 def measure_pair(factor: float, seconds: float, progress: Progress) -> list[DrawingRow]:
     """The two cameras of one drone in turn, in pictures ``factor`` times as wide as the usual ones."""
     models = [FRONT_CAMERA.scaled(factor), BOTTOM_CAMERA.scaled(factor)]
-    flight = _Flight(1, [(0, model) for model in models])
+    flight = Flight(1, [(0, model) for model in models])
     front: list[int] = []
     bottom: list[int] = []
-    for _ in _rounds(seconds, progress):
+    for _ in rounds(seconds, progress):
         front.append(flight.draw(0))
         bottom.append(flight.draw(1))
     together = [a + b for a, b in zip(front, bottom, strict=True)]
@@ -124,9 +125,9 @@ def measure_pair(factor: float, seconds: float, progress: Progress) -> list[Draw
 
 def measure_many(seconds: float, progress: Progress) -> DrawingRow:
     """The front cameras of ten drones that see one another."""
-    flight = _Flight(CAMERAS_AT_ONCE, [(drone, FRONT_CAMERA) for drone in range(CAMERAS_AT_ONCE)])
-    rounds = [sum(flight.draw(n) for n in range(CAMERAS_AT_ONCE)) for _ in _rounds(seconds, progress)]
-    return _drawing_row(f"{CAMERAS_AT_ONCE} × front", FRONT_CAMERA, CAMERAS_AT_ONCE, rounds)
+    flight = Flight(CAMERAS_AT_ONCE, [(drone, FRONT_CAMERA) for drone in range(CAMERAS_AT_ONCE)])
+    times = [sum(flight.draw(n) for n in range(CAMERAS_AT_ONCE)) for _ in rounds(seconds, progress)]
+    return _drawing_row(f"{CAMERAS_AT_ONCE} × front", FRONT_CAMERA, CAMERAS_AT_ONCE, times)
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +137,7 @@ class _Camera:
     effects: SensorEffects
 
 
-class _Flight:
+class Flight:
     """Drones that circle in the furnished room, and their cameras, which expose one after the other."""
 
     def __init__(self, drones: int, cameras: list[tuple[int, CameraModel]]) -> None:
@@ -145,6 +146,7 @@ class _Flight:
         self._cameras = [_Camera(drone, model, SensorEffects(model, n)) for n, (drone, model) in enumerate(cameras)]
         self._steps = max(1, math.floor(1.0 / (FRAMES_PER_S * STEP_S * len(cameras))))
         self._number = 0
+        self.picture: Image = np.empty(0, np.uint8)  #: drawn last, BGR, shape (height, width, 3)
         for at in range(len(cameras)):
             self.draw(at)  # the first picture of a lens makes its tables
 
@@ -159,7 +161,7 @@ class _Flight:
         begin = monotonic_ns()
         state = SceneState(positions, rotations, targets)
         pose = camera.model.pose(positions[camera.drone], rotations[camera.drone], camera.drone)
-        camera.effects.apply(self._renderer.render(state, pose, camera.model), self._number, rates)
+        self.picture = camera.effects.apply(self._renderer.render(state, pose, camera.model), self._number, rates)
         return monotonic_ns() - begin
 
 
@@ -173,7 +175,7 @@ def _circling(world: str, drones: int) -> Simulation:
     return simulation
 
 
-def _rounds(seconds: float, progress: Progress) -> Iterator[None]:
+def rounds(seconds: float, progress: Progress) -> Iterator[None]:
     """Goes round until the time is up, and at least :data:`LEAST_ROUNDS` times."""
     begin, limit = monotonic_ns(), nanoseconds(seconds)
     done = 0
@@ -184,10 +186,10 @@ def _rounds(seconds: float, progress: Progress) -> Iterator[None]:
 
 
 def _drawing_row(
-    cameras: str, model: CameraModel, pictures: int, rounds: list[int], target: float | None = None
+    cameras: str, model: CameraModel, pictures: int, times: list[int], target: float | None = None
 ) -> DrawingRow:
-    rate = pictures * len(rounds) / (sum(rounds) * 1e-9)
-    return DrawingRow(cameras, model.width, model.height, pictures, spread(rounds), rate, target)
+    rate = pictures * len(times) / (sum(times) * 1e-9)
+    return DrawingRow(cameras, model.width, model.height, pictures, spread(times), rate, target)
 
 
 @contextmanager

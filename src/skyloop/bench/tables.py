@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from skyloop.bench.delays import PAPER_MEAN_MS, Delays
 from skyloop.bench.load import PARTS, CaseResult, Load
@@ -12,6 +12,9 @@ from skyloop.bench.peers import FLOOR, OURS
 from skyloop.bench.schedule import CHANNELS, COMMAND, FEEDBACK, SMALL, VIDEO
 from skyloop.bench.statistics import Summary
 from skyloop.bench.targets import Verdict
+
+if TYPE_CHECKING:
+    from skyloop.bench.codecs import CodecResults  # which needs the simulator's parts
 
 UNKNOWN: Final = "–"
 
@@ -84,6 +87,7 @@ def load_table(results: Load) -> Table:
         ]
         for case in results.cases
     ]
+    rows += [[name, f"left out: {why}", *[""] * 4] for name, why in results.skipped.items()]
     columns = ["beside the pilot", "frames", "command", "feedback", "age of frames", "at the others"]
     return Table("The pilot's delays in µs: median (99th percentile)", columns, rows)
 
@@ -108,6 +112,24 @@ def loop_table(results: Loop) -> Table:
         ["stage", "until", *(size.size for size in results.sizes)],
         rows,
     )
+
+
+def codecs_table(results: CodecResults) -> Table:
+    """What each kind of work takes of the processor."""
+    rows = [
+        [
+            row.what,
+            row.of,
+            f"{row.size / 1e3:.1f} kB",
+            f"{_ms(row.once.median_us)} ({_ms(row.once.p99_us)})",
+            f"{row.per_s:.0f}",
+            "" if row.target is None else f"≥ {row.target:g}",
+        ]
+        for row in results.rows
+    ]
+    rows += [[name, f"left out: {why}", *[""] * 4] for name, why in results.skipped.items()]
+    columns = ["work", "of", "encoded", "time", "a second on one core", "target"]
+    return Table("Processor time in ms for one: median (99th percentile)", columns, rows)
 
 
 def verdict_table(verdicts: Sequence[Verdict]) -> Table:

@@ -1,4 +1,4 @@
-"""``skyloop bench``: measured delays, and how fast the simulator is here."""
+"""``skyloop bench``: measured delays, and how fast the simulator and the codecs are here."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import msgspec
 import typer
@@ -28,12 +28,14 @@ class What(StrEnum):
     LOAD = "load"
     LOOP = "loop"
     SIM = "sim"
+    CODECS = "codecs"
 
 
 LEAST_S = 0.5
 _WHAT_HELP = (
     "delays: the paper's experiment, and the same by a bare hand-over and by other libraries; load: what observers, a "
-    "slow processor and a recorder do to the pilot; loop: from a frame to its command, by stage; sim: the simulator"
+    "slow processor, a recorder and pages of the cockpit do to the pilot; loop: from a frame to its command, by stage; "
+    "sim: the simulator; codecs: the AR.Drones' video and navdata"
 )
 _ONLY = {  # options that mean something for one thing only
     "--peers": (What.DELAYS,),
@@ -43,7 +45,9 @@ _ONLY = {  # options that mean something for one thing only
     "--slow-processor": (What.LOAD,),
     "--stuck": (What.LOAD,),
     "--recorder": (What.LOAD,),
+    "--disk-full": (What.LOAD,),
     "--record-to": (What.LOAD,),
+    "--pages": (What.LOAD,),
 }
 
 
@@ -72,12 +76,21 @@ def bench(
     recorder: Annotated[
         bool | None, typer.Option("--recorder/--no-recorder", help="load: record 640x480 at 30 frames a second")
     ] = None,
+    disk_full: Annotated[
+        bool | None, typer.Option("--disk-full/--no-disk-full", help="load: the same onto a disk that fills up")
+    ] = None,
     record_to: Annotated[Path | None, typer.Option(help="load: the folder that the recorder writes to")] = None,
+    pages: Annotated[
+        int | None,
+        typer.Option(min=0, max=50, help="load: of a cockpit, on 640x480 at 15 frames a second [default: 10]"),
+    ] = None,
     output: Annotated[
         Path | None, typer.Option(help="A folder for the figures as JSON and, of delays, the diagrams (PNG and SVG)")
     ] = None,
 ) -> None:
-    """Measure delays, as medians and 99th percentiles, or how fast the simulator is, and compare with the targets.
+    """Measure delays, as medians and 99th percentiles, or how fast the simulator and the codecs are.
+
+    Targets stand beside the figures. Example: skyloop bench load --pages 10 --seconds 60 --output results
 
     load and the recorder's cases start up to 35 processes. Nothing else should run meanwhile.
     """
@@ -89,7 +102,9 @@ def bench(
         "--slow-processor": slow_processor,
         "--stuck": stuck,
         "--recorder": recorder,
+        "--disk-full": disk_full,
         "--record-to": record_to,
+        "--pages": pages,
     }
     check_options(what, given)
     if seconds is not None and minutes is not None:
@@ -107,12 +122,21 @@ def bench(
             case What.DELAYS:
                 results, shown = _delays(duration_s, sizes, peers, ros_python, progress)
             case What.LOAD:
-                settings = (slow_processor is not False, stuck is not False, recorder is not False)
-                results, shown = _load(duration_s, observers, settings, record_to, progress)
+                wanted = _LoadOptions(
+                    parse_numbers(observers),
+                    slow_processor is not False,
+                    stuck is not False,
+                    recorder is not False,
+                    disk_full is not False,
+                    10 if pages is None else pages,
+                )
+                results, shown = _load(duration_s, wanted, record_to, progress)
             case What.LOOP:
                 results, shown = _loop(duration_s, sizes, progress)
             case What.SIM:
                 results, shown = _sim(duration_s, progress)
+            case What.CODECS:
+                results, shown = _codecs(duration_s, progress)
     for table in shown:
         Console().print(table)
     if output is not None:
@@ -182,21 +206,33 @@ def _delays(
     )
 
 
-def _load(
-    seconds: float, observers: str | None, settings: tuple[bool, bool, bool], record_to: Path | None, progress: Any
-) -> tuple[Any, list[Table]]:
+class _LoadOptions(NamedTuple):
+    """As :func:`skyloop.bench.load.cases_of` takes them."""
+
+    observers: list[int]
+    slow_processor: bool
+    stuck: bool
+    recorder: bool
+    disk_full: bool
+    pages: int
+
+
+def _load(seconds: float, wanted: _LoadOptions, record_to: Path | None, progress: Any) -> tuple[Any, list[Table]]:
     from skyloop.bench import load, tables
-    from skyloop.bench.onlookers import recorder_problem
+    from skyloop.bench.onlookers import cockpit_problem, recorder_problem
     from skyloop.bench.targets import judge_load
 
-    slow, stuck, recorder = settings
     skipped = {}
-    if recorder and (problem := recorder_problem()):
-        recorder = False
-        skipped["recorder"] = problem
-        typer.echo(f"without the recorder: {problem}", err=True)
-    cases = load.cases_of(parse_numbers(observers), slow_processor=slow, stuck=stuck, recorder=recorder)
+    if (wanted.recorder or wanted.disk_full) and (problem := recorder_problem()):
+        wanted = wanted._replace(recorder=False, disk_full=False)
+        skipped[load.RECORDED] = problem
+    if wanted.pages and (problem := cockpit_problem()):
+        skipped[load.pages_name(wanted.pages)] = problem
+        wanted = wanted._replace(pages=0)
+    cases = load.cases_of(**wanted._asdict())
     results = load.measure(seconds, cases, record_to=record_to, skipped=skipped, progress=progress)
+    for name, why in results.skipped.items():
+        typer.echo(f"without {name}: {why}", err=True)
     return results, _rich(
         [tables.load_table(results), tables.cpu_table(results), tables.verdict_table(judge_load(results))],
         str(results.machine),
@@ -215,6 +251,15 @@ def _sim(seconds: float, progress: Any) -> tuple[Any, list[Table]]:
 
     results = sim.measure(seconds, progress)
     return results, [physics_table(results), drawing_table(results)]
+
+
+def _codecs(seconds: float, progress: Any) -> tuple[Any, list[Table]]:
+    from skyloop.bench import codecs, tables
+
+    results = codecs.measure(seconds, progress)
+    for name, why in results.skipped.items():
+        typer.echo(f"without {name}: {why}", err=True)
+    return results, _rich([tables.codecs_table(results)], str(results.machine))
 
 
 def _rich(found: Sequence[tables.Table], where: str) -> list[Table]:
