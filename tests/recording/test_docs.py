@@ -45,7 +45,7 @@ def test_the_topics_are_those_of_the_layout() -> None:
     expected = [f"/NAME/{channel}" + ("/CAMERA" if channel == "frames" else "") for channel in layout.Channel]
     assert own == expected
     shown = [names(row[0])[0] for row in rows(section(PAGE, "### For viewers"))]
-    makers = (layout.image_topic, layout.calibration_topic, layout.drawing_topic)
+    makers = (layout.image_topic, layout.video_topic, layout.calibration_topic, layout.drawing_topic)
     assert shown == [
         *(make("NAME", "CAMERA") for make in makers),
         layout.pose_topic("NAME"),
