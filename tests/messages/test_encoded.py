@@ -13,9 +13,11 @@ def test_a_chain_begins_at_a_key_and_breaks_at_a_gap() -> None:
     came = [(1, False), (2, True), (3, False), (4, False), (6, False), (7, False), (9, True), (10, False)]
     assert [number for number, key in came if chain.follows(number, key=key)] == [2, 3, 4, 9, 10]
     assert not chain.follows(10, key=False)  # a second time
+    assert chain.follows(11, key=False)
     chain.restart()
-    assert not chain.follows(11, key=False)
-    assert chain.follows(12, key=True)
+    assert not chain.follows(12, key=False)
+    assert chain.follows(13, key=True)
+    assert chain.follows(1, key=True)  # whoever counts them began anew
 
 
 @given(st.lists(st.tuples(st.booleans(), st.booleans()), max_size=40))

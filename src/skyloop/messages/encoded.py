@@ -41,7 +41,9 @@ class Chain:
         self._last: int | None = None  # None: wait for a key
 
     def follows(self, number: int, *, key: bool) -> bool:
-        """Whether this one, the next that came, can be decoded."""
+        """Whether this one, the next that came, can be decoded. One that came a second time is not wanted again."""
+        if number == self._last and not key:
+            return False
         whole = key or (self._last is not None and number == self._last + 1)
         self._last = number if whole else None
         return whole
