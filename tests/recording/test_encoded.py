@@ -204,6 +204,17 @@ def test_a_replay_that_begins_between_two_keys_shows_whole_pictures_at_once(kept
     assert all(np.array_equal(frame, expected) for (_, frame), expected in zip(seen, shown()[first:], strict=True))
 
 
+def test_a_file_that_was_cut_off_shows_what_is_there_and_can_be_mended(kept: Path, tmp_path: Path, log: Log) -> None:
+    cut = tmp_path / "cut.mcap"
+    data = kept.read_bytes()
+    cut.write_bytes(data[: len(data) * 2 // 3])
+    assert log("recover", cut, "-o", tmp_path / "mended.mcap").code == 0
+    for path in (cut, tmp_path / "mended.mcap"):
+        pictures = list(Recording.open(path).pictures("alpha", "front"))
+        assert 20 < len(pictures) < 240
+        assert np.array_equal(pictures[-1].pixels(), shown()[len(pictures) - 1])
+
+
 def test_looking_at_it(kept: Path, tmp_path: Path, log: Log) -> None:
     rows = {row.topic: row for row in summarise(Recording.open(kept)).rows}
     assert (rows[FRAMES].count, rows[VIDEO].count, rows[FRAMES].missing) == (240, 240, 0)
