@@ -22,6 +22,7 @@ from skyloop.drivers.video.player import LivePlayer, Screen
 from skyloop.drivers.video.sources import ContainerSource, Picture, Source
 from skyloop.errors import DriverError, FileFormatError, MissingExtraError, UnknownNameError, UsageError
 from skyloop.messages import Hover, LinkState
+from skyloop.wire.ardrone.pave import PaveParser
 
 DATA = Path(__file__).parents[1] / "data" / "ardrone2"
 FAST = "speed=1000"
@@ -75,6 +76,31 @@ def test_all_240_pictures_of_a_real_drone_come_in_order() -> None:
     assert newest is not None
     assert newest.native is not None
     assert (newest.native["video.frames"], newest.native["video.damaged"]) == (240, 0)
+
+
+def test_pictures_of_a_real_drone_are_handed_on_as_they_came() -> None:
+    sink = RecordingSink(watch=set(), record=True)  # which is why it begins: nobody looks
+    with playing(f"video://{DATA}/video-8s.pave?{FAST}", sink) as driver:
+        assert [camera.stream for camera in driver.capabilities().cameras] == ["h264"]
+        assert sink.wait(lambda: len(sink.pictures) == 240, 20.0)
+    sent = PaveParser().feed((DATA / "video-8s.pave").read_bytes())
+    assert [(seen.data, seen.key) for seen in sink.pictures] == [(frame.payload, frame.is_key) for frame in sent]
+    assert not sink.frames
+
+
+def test_who_comes_late_gets_pictures_from_the_next_key_on() -> None:
+    sink = RecordingSink(keep_pixels=False)
+    with playing(f"video://{DATA}/video-8s.pave?speed=20&fx=500", sink):
+        assert sink.wait(lambda: sink.frame_counts["front"] > 3, 20.0)
+        sink.record = True
+        assert sink.wait(lambda: len(sink.pictures) > 20, 20.0)
+    times = {frame.captured_ns: frame.intrinsics for frame in sink.frames}
+    assert all(times[seen.captured_ns] == seen.intrinsics for seen in sink.pictures if seen.captured_ns in times)
+    assert sink.pictures[0].key
+
+
+def test_a_clip_has_no_stream(clip: Path) -> None:
+    assert [camera.stream for camera in make_driver(f"video://{clip}").capabilities().cameras] == [""]
 
 
 def test_a_torn_start_is_waited_out() -> None:

@@ -11,6 +11,7 @@ from skyloop.messages import (
     Command,
     Done,
     EmergencyStop,
+    EncodedFrame,
     Encoding,
     Event,
     EventKind,
@@ -64,6 +65,7 @@ CAMERA = CameraInfo(
     INTRINSICS,
     (0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0),
     (0.1, 0.0, 0.02),
+    "h264",
 )
 TILT = Parameter(
     "limits.tilt", ParameterType.FLOAT, 0.2, "rad", 0.0, 0.6, 0.25, (), False, "largest roll and pitch of a set-point"
@@ -130,6 +132,18 @@ SAMPLES: dict[str, Sample] = {
     "log-text": LogEntry("follow.py", "found", 3_000_000_001, text="marker 7 ahead", severity=Severity.WARNING),
     "log-number": LogEntry("follow.py", "error", 3_000_000_002, number=0.25),
     "log-array": LogEntry("follow.py", "grid", 3_000_000_003, values=(1.0, 2.5, -3.0, 0.0, 5.0, 6.0), shape=(2, 3)),
+    "encoded": EncodedFrame(
+        "front",
+        40,
+        3_000_000_000,
+        3_000_400_000,
+        640,
+        360,
+        "h264",
+        True,
+        b"\0\0\0\1\x67\x42\0\0\0\1\x68\xce\0\0\0\1\x65\x88",
+        INTRINSICS,
+    ),
     "request-hello": Request(1, Hello("follow.py", Role.OBSERVER)),
     "request-authority": Request(2, RequestAuthority(3, False)),
     "request-release": Request(3, ReleaseAuthority()),

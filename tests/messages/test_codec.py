@@ -14,9 +14,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.errors import DecodeError
-from skyloop.messages import Attitude, Command, Event, EventKind, Kind, Sample, Velocity, decode, encode
+from skyloop.messages import (
+    Attitude,
+    Command,
+    EncodedFrame,
+    Event,
+    EventKind,
+    Intrinsics,
+    Kind,
+    Reply,
+    Sample,
+    Velocity,
+    Welcome,
+    decode,
+    encode,
+)
 from skyloop.messages.codec import HEADER, HEADER_SIZE, KINDS, MAX_BODY, SIGNATURE, VERSION
-from tests.messages.samples import SAMPLES
+from skyloop.messages.encoded import MAX_ENCODED
+from tests.messages.samples import CAMERA, SAMPLES
 
 PACKETS = Path(__file__).parents[1] / "data" / "packets"
 LONGEST_DECODE_S = 1.0
@@ -31,6 +46,24 @@ def test_golden_packets_decode_to_their_samples_and_back(name: str) -> None:
     golden = (PACKETS / "golden" / f"{name}.bin").read_bytes()
     assert decode(golden) == SAMPLES[name]
     assert encode(decode(golden)) == golden
+
+
+def test_a_camera_told_by_an_older_proxy_has_no_stream() -> None:
+    older = decode((PACKETS / "older" / "reply-welcome.bin").read_bytes())
+    assert isinstance(older, Reply)
+    assert isinstance(older.body, Welcome)
+    (camera,) = older.body.capabilities.cameras
+    assert camera == msgspec.structs.replace(CAMERA, stream="")
+
+
+def test_the_largest_picture_that_is_handed_on_fits_a_packet() -> None:
+    camera = "\N{GRINNING FACE}" * 64
+    last = 2**63 - 1
+    intrinsics = Intrinsics(0.1, 0.1, 0.1, 0.1, (0.1,) * 14, "fisheye")
+    picture = EncodedFrame(camera, last, last, last, 16384, 16384, "h264", True, bytes(MAX_ENCODED), intrinsics)
+    assert decode(encode(picture)) == picture
+    with pytest.raises(DecodeError, match="length"):
+        decode(encode(msgspec.structs.replace(picture, camera="front", data=bytes(MAX_ENCODED + 1))))
 
 
 def test_there_is_a_golden_packet_of_every_kind_action_request_and_reply() -> None:

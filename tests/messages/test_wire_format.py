@@ -12,7 +12,7 @@ import msgspec
 import pytest
 
 from skyloop import messages
-from skyloop.messages import annotation, codec, command, config
+from skyloop.messages import annotation, codec, command, config, encoded
 from skyloop.transport.base import MAX_PACKET, MAX_TOPIC
 from skyloop.transport.local import packets
 from skyloop.transport.local.connection import MAX_SUBSCRIPTIONS
@@ -55,6 +55,7 @@ def test_sizes_on_the_page() -> None:
     assert f"at most {codec.MAX_BODY:,}".replace(",", " ") in PAGE
     assert codec.SIGNATURE.hex(" ").upper() in PAGE
     assert codec.HEADER_SIZE == 12
+    assert f"| `data` | bin, ≤ {encoded.MAX_ENCODED:_} |".replace("_", " ") in PAGE
 
 
 LOCAL = PAGE.partition("\n## The local transport\n")[2]

@@ -9,6 +9,8 @@ import pytest
 
 import skyloop
 from skyloop.errors import UnsupportedError
+from skyloop.logfile.reader import Recording
+from skyloop.wire.ardrone.pave import PaveParser
 from tests.processes.conftest import eventually
 
 pytestmark = pytest.mark.process
@@ -47,3 +49,22 @@ def test_all_frames_reach_a_processor_and_a_controller_in_order() -> None:
     assert processor.dropped <= FRAMES // 50
     assert len(controller.seen) >= FRAMES - FRAMES // 50
     assert len(set(controller.brightness)) > FRAMES // 2  # they are not always the same picture
+
+
+def test_its_h264_reaches_a_recorder_in_a_process_of_its_own_as_it_was(tmp_path: Path) -> None:
+    pytest.importorskip("av", reason="reading recorded video needs PyAV: pip install 'skyloop[video]'")
+    path = tmp_path / "flight.mcap"
+    with (
+        skyloop.connect(f"video://{RECORDING}?speed=4") as drone,
+        skyloop.record(drone, path, min_free_mb=0) as recorder,
+    ):
+        drone.wait(lambda feedback: feedback.vehicle_link == "closed", timeout_s=20.0)
+        eventually(
+            lambda: recorder.status.messages > 2 * FRAMES and not recorder.status.waiting, "all of it came", 10.0
+        )
+    assert (recorder.dropped, recorder.missed) == ({}, {})
+    recording = Recording.open(path)
+    pictures = list(recording.pictures(recording.drone().name, "front"))
+    assert [picture.compressed for picture in pictures] == [
+        frame.payload for frame in PaveParser().feed(RECORDING.read_bytes())
+    ]

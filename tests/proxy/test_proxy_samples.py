@@ -15,6 +15,7 @@ from skyloop.messages import (
     Annotation,
     CameraInfo,
     Capabilities,
+    EncodedFrame,
     Encoding,
     EventKind,
     FlightState,
@@ -31,6 +32,7 @@ from skyloop.messages import (
     Velocity,
     encode,
 )
+from skyloop.messages.encoded import MAX_ENCODED
 from skyloop.proxy import Proxy
 from skyloop.transport.memory import MemoryServer
 from tests.proxy.fake import WAIT_S, App, Bench, FakeDriver
@@ -113,6 +115,34 @@ def test_frames_carry_their_number_time_and_intrinsics(bench: Bench) -> None:
     assert (header.camera, header.seq, header.captured_ns, header.published_ns) == ("front", 2, 6, bench.clock())
     assert (header.width, header.height, header.size, header.encoding) == (4, 3, 36, Encoding.BGR8)
     assert header.intrinsics == intrinsics
+
+
+def test_pictures_as_they_came_go_to_whoever_subscribed(bench: Bench) -> None:
+    app = bench.join("me")
+    sink = sink_of(bench)
+    assert not sink.wants_stream("front")
+    app.end.subscribe("video/front")
+    assert not sink.wants_stream("front")
+    app.end.subscribe("stream/front")
+    assert sink.wants_stream("front")
+    assert not sink.wants_stream("bottom")
+    intrinsics = Intrinsics(1.0, 1.0, 2.0, 1.5)
+    sink.stream("front", b"key", 5, width=4, height=3, key=True, intrinsics=intrinsics)
+    sink.stream("front", bytes(MAX_ENCODED + 1), 6, width=4, height=3, key=False)
+    sink.stream("front", b"next", 7, width=4, height=3, key=False)
+    app.sync()
+    first, second = [sample for sample in app.others if isinstance(sample, EncodedFrame)]
+    assert first == EncodedFrame("front", 1, 5, bench.clock(), 4, 3, "h264", True, b"key", intrinsics)
+    assert (second.seq, second.captured_ns, second.data) == (3, 7, b"next")  # there is a gap for who takes them
+    (told,) = app.told(EventKind.DRIVER_ERROR)
+    assert f"{MAX_ENCODED + 1} bytes" in told.text
+    statistics = app.ask(GetStatistics())
+    assert isinstance(statistics, Statistics)
+    names = ("received", "too_large", "published")
+    assert [statistics.counters[f"streams.front.{name}"] for name in names] == [3, 1, 2]
+    app.end.subscribe("stream/front", False)
+    app.sync()
+    assert not sink.wants_stream("front")
 
 
 def test_a_cameras_nominal_intrinsics_are_used_for_frames_of_its_size() -> None:

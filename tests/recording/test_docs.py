@@ -8,6 +8,7 @@ import re
 import skyloop
 from skyloop.cli.app import build
 from skyloop.logfile import layout
+from skyloop.messages.encoded import MAX_ENCODED
 from skyloop.recording.backlog import RESERVE
 from skyloop.recording.options import CHOICES, MB
 from skyloop.recording.status import RecorderState
@@ -45,7 +46,7 @@ def test_the_topics_are_those_of_the_layout() -> None:
     expected = [f"/NAME/{channel}" + ("/CAMERA" if channel == "frames" else "") for channel in layout.Channel]
     assert own == expected
     shown = [names(row[0])[0] for row in rows(section(PAGE, "### For viewers"))]
-    makers = (layout.image_topic, layout.calibration_topic, layout.drawing_topic)
+    makers = (layout.image_topic, layout.video_topic, layout.calibration_topic, layout.drawing_topic)
     assert shown == [
         *(make("NAME", "CAMERA") for make in makers),
         layout.pose_topic("NAME"),
@@ -53,6 +54,10 @@ def test_the_topics_are_those_of_the_layout() -> None:
         layout.TF,
         layout.LOG,
     ]
+
+
+def test_the_largest_picture_of_h264_is_that_of_the_wire() -> None:
+    assert f"more than {MAX_ENCODED:,} bytes".replace(",", " ") in section(PAGE, "### H.264 as it came")
 
 
 def test_the_metadata_are_those_of_the_layout() -> None:

@@ -70,6 +70,13 @@ class Bench:
             picture = Picture(FrameRecord(header, number, "jpeg"), bytes(range(256)) * (size // 256 + 1))
             self.backlog.put(Item(0, "video.front", Rank.FRAME, number, picture, size))
 
+    def pictures(self, *numbers: int, size: int = 1000) -> None:
+        """Of H.264: each tenth is a key."""
+        for number in numbers:
+            header = FrameHeader("front", number, number, number, 4, 3, Encoding.BGR8, 36)
+            record = FrameRecord(header, number, "h264", number % 10 == 0)
+            self.backlog.put(Item(0, "video.front", Rank.FRAME, number, Picture(record, bytes(size)), size))
+
     def step(self, seconds: float = 1.0) -> None:
         """A second later, when everything is due."""
         self.now_ns += round(seconds * NS_PER_S)
@@ -155,6 +162,62 @@ def test_rotation_by_time(make: Make, tmp_path: Path) -> None:
     bench.writer._end()
     assert [written(path)[-1] for path in bench.writer.files] == [10, 20, 25]
     assert written(*bench.writer.files) == list(range(1, 26))
+
+
+def test_each_file_of_a_rotation_begins_with_a_key_picture(make: Make, tmp_path: Path) -> None:
+    bench = make(tmp_path, Disk(), rotate_s=2)
+    for second in range(6):
+        bench.pictures(*range(7 * second, 7 * second + 7))
+        bench.commands(second)
+        bench.step()
+    bench.writer._end()
+    found = [written(path, topic="/alpha/camera/front/video") for path in bench.writer.files]
+    assert [number for numbers in found for number in numbers] == list(range(42))
+    assert [numbers[0] for numbers in found] == [0, 10, 30]
+    assert written(*bench.writer.files) == list(range(6))
+    assert bench.backlog.dropped == {}
+
+
+def test_a_rotation_does_not_wait_for_a_key_picture_for_ever(make: Make, tmp_path: Path) -> None:
+    bench = make(tmp_path, Disk(), rotate_s=10)
+    bench.pictures(0, 1)
+    for _ in range(14):
+        bench.step()
+    assert len(bench.writer.files) == 2
+    bench.pictures(2, 3, 10, 11)
+    bench.step()
+    bench.writer._end()
+    assert written(*bench.writer.files, topic="/alpha/frames/front") == [0, 1, 10, 11]
+    assert bench.backlog.dropped == {(0, "video.front"): 2}
+
+
+def test_after_pictures_that_were_dropped_the_next_key_is_waited_for(make: Make, tmp_path: Path) -> None:
+    bench = make(tmp_path, Disk(), buffer=6500)
+    bench.pictures(*range(12), *range(20, 23))  # ten and five are too many: 0 to 8 go, and 9 builds on them
+    bench.step()
+    bench.pictures(23, 25, 26, 30)  # 24 never came
+    bench.step()
+    bench.writer._end()
+    assert written(bench.path, topic="/alpha/frames/front") == [10, 11, 20, 21, 22, 23, 30]
+    assert bench.backlog.dropped == {(0, "video.front"): 12}
+
+
+def test_a_disk_that_is_full_when_a_file_should_end_loses_no_picture(make: Make, tmp_path: Path) -> None:
+    bench = make(tmp_path, Disk(), rotate_s=2)
+    bench.pictures(0, 1)
+    bench.step()
+    bench.disk.room = 0
+    bench.pictures(2, 10, 11)
+    bench.commands(1)
+    bench.step()
+    assert bench.writer.state.value == "paused"
+    bench.disk.room = 10**9
+    bench.step()
+    bench.step()
+    bench.writer._end()
+    assert written(*bench.writer.files, topic="/alpha/frames/front") == [0, 1, 10, 11]
+    assert bench.backlog.dropped == {(0, "video.front"): 1}  # 2 was not in the file that broke off
+    assert written(*bench.writer.files) == [1]
 
 
 @pytest.mark.parametrize("room", [0, 300, 2500])

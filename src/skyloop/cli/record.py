@@ -17,7 +17,7 @@ from skyloop.errors import SkyloopError
 
 if TYPE_CHECKING:
     from skyloop.recording import Recorder, Status
-    from skyloop.recording.options import Lossy
+    from skyloop.recording.options import VideoEncoding
 
 REFRESH_S: Final = 0.25  # on a terminal
 LINE_EVERY_S: Final = 1.0  # in a pipe
@@ -34,7 +34,12 @@ def record(
             metavar="LIST", help="Only these, with commas: commands, feedback, events, video, video.front, logs …"
         ),
     ] = None,
-    encoding: Annotated[str, typer.Option(metavar="jpeg|png", help="Of raw frames; png is without any loss")] = "jpeg",
+    encoding: Annotated[
+        str,
+        typer.Option(
+            metavar="auto|jpeg|png", help="Of frames; auto keeps H.264 as it came, else jpeg; png is without any loss"
+        ),
+    ] = "auto",
     quality: Annotated[int, typer.Option(min=1, max=100, help="Of JPEG")] = 90,
     rotate_mb: Annotated[float | None, typer.Option(metavar="MB", help="A new file after so much")] = None,
     rotate_s: Annotated[float | None, typer.Option(metavar="S", help="A new file after so long")] = None,
@@ -53,7 +58,7 @@ def record(
         names,
         output,
         channels=None if channels is None else [name.strip() for name in channels.split(",")],
-        encoding=cast("Lossy", encoding),  # which is checked there
+        encoding=cast("VideoEncoding", encoding),  # which is checked there
         quality=quality,
         rotate_mb=rotate_mb,
         rotate_s=rotate_s,

@@ -16,6 +16,7 @@ from skyloop.messages import (
     Annotation,
     AnyReply,
     Applied,
+    EncodedFrame,
     Event,
     Feedback,
     FrameHeader,
@@ -53,6 +54,7 @@ class Connection:
             Applied: user.applied,
             Annotation: user.annotation,
             LogEntry: user.log_entry,
+            EncodedFrame: user.encoded,
             Reply: self._reply,
         }
         self._take_feedback = user.feedback

@@ -19,6 +19,7 @@ from skyloop.messages import (
     AnyReply,
     AnyRequest,
     Applied,
+    EncodedFrame,
     Event,
     Feedback,
     FrameHeader,
@@ -70,6 +71,7 @@ class LinkUser(Protocol):
     def applied(self, applied: Applied, now_ns: int) -> None: ...
     def annotation(self, annotation: Annotation, now_ns: int) -> None: ...
     def log_entry(self, entry: LogEntry, now_ns: int) -> None: ...
+    def encoded(self, picture: EncodedFrame, now_ns: int) -> None: ...
 
 
 class Link:

@@ -17,6 +17,7 @@ from skyloop.messages import (
     Annotation,
     Applied,
     CameraInfo,
+    EncodedFrame,
     Event,
     EventKind,
     Feedback,
@@ -26,7 +27,7 @@ from skyloop.messages import (
     Severity,
     Welcome,
 )
-from skyloop.transport.base import ANNOTATIONS, COMMANDS, LOGS, Pixels, video
+from skyloop.transport.base import ANNOTATIONS, COMMANDS, LOGS, Pixels, stream, video
 
 if TYPE_CHECKING:
     from skyloop.client.config import Config
@@ -60,6 +61,8 @@ class VideoChannel:
         self._read: Arrival | None = None  # what next_frame() gave last
         self._link = link
         self.topic: Topic[Arrival] = Topic(self._wanted)
+        #: Pictures as the vehicle encoded them, for consumers that want them so; on the receiving thread.
+        self.stream: Topic[EncodedFrame] = Topic(lambda on: link.subscribe(stream(camera.name), on))
 
     @property
     def name(self) -> str:
@@ -211,6 +214,11 @@ class Reception:
 
     def log_entry(self, entry: LogEntry, now_ns: int) -> None:  # noqa: ARG002  (all are called alike)
         self.on_log.publish(entry)
+
+    def encoded(self, picture: EncodedFrame, now_ns: int) -> None:  # noqa: ARG002  (all are called alike)
+        channel = self.channels.get(picture.camera)
+        if channel is not None:
+            channel.stream.publish(picture)
 
     # For the drone ---------------------------------------------------------------------------------------------
 

@@ -58,6 +58,28 @@ class Sink(Protocol):
     def wants(self, camera: str) -> bool:
         """Whether anybody looks at this camera now: if not, a driver may save itself the work of decoding."""
 
+    def stream(
+        self,
+        camera: str,
+        data: bytes,
+        captured_ns: int,
+        *,
+        width: int,
+        height: int,
+        key: bool,
+        intrinsics: Intrinsics | None = None,
+    ) -> None:
+        """A picture as the vehicle encoded it, of a camera whose ``CameraInfo`` announces ``stream="h264"``.
+
+        ``data``: one access unit of H.264 in Annex B form, undamaged, with SPS and PPS if it is a key picture, and of
+        a stream without B pictures. One that is no ``key`` follows the picture that was given last: after a gap, and
+        after a while in which nobody wanted any, begin with a key. Size, intrinsics and time are those of the decoded
+        frame, which is given to :meth:`frame` all the same while somebody wants that.
+        """
+
+    def wants_stream(self, camera: str) -> bool:
+        """Whether anybody takes this camera's pictures as they come."""
+
     def link(self, state: LinkState, reason: str = "") -> None:
         """The hop to the vehicle changed. Call it with UP once the vehicle answers."""
 

@@ -33,6 +33,19 @@ class SeenFrame:
 
 
 @dataclass(frozen=True, slots=True)
+class SeenPicture:
+    """A picture as the vehicle encoded it."""
+
+    camera: str
+    data: bytes
+    captured_ns: int
+    width: int
+    height: int
+    key: bool
+    intrinsics: Intrinsics | None
+
+
+@dataclass(frozen=True, slots=True)
 class SeenEvent:
     kind: EventKind
     text: str
@@ -44,11 +57,15 @@ class RecordingSink:
     """Keeps the newest ``keep`` feedback samples and frames, every link state and event, and counts all.
 
     ``problems`` holds, in words, whatever broke the contract of :class:`skyloop.drivers.base.Sink`. Looks at every
-    camera unless ``watch`` names the ones to look at.
+    camera unless ``watch`` names the ones to look at; takes pictures as they come while ``record`` is set.
     """
 
-    def __init__(self, *, watch: set[str] | None = None, keep: int = 512, keep_pixels: bool = True) -> None:
+    def __init__(
+        self, *, watch: set[str] | None = None, keep: int = 512, keep_pixels: bool = True, record: bool = False
+    ) -> None:
         self.watch = watch
+        self.record = record
+        self.pictures: deque[SeenPicture] = deque(maxlen=keep)
         self.feedbacks: deque[Feedback] = deque(maxlen=keep)
         self.frames: deque[SeenFrame] = deque(maxlen=keep if not keep_pixels else min(keep, 64))
         self.links: list[tuple[LinkState, str]] = []
@@ -93,6 +110,30 @@ class RecordingSink:
 
     def wants(self, camera: str) -> bool:
         return self.watch is None or camera in self.watch
+
+    def stream(
+        self,
+        camera: str,
+        data: bytes,
+        captured_ns: int,
+        *,
+        width: int,
+        height: int,
+        key: bool,
+        intrinsics: Intrinsics | None = None,
+    ) -> None:
+        now_ns = monotonic_ns()
+        with self._changed:
+            self._check_time(f"picture of {camera}", captured_ns, now_ns)
+            if not key and all(seen.camera != camera for seen in self.pictures):
+                self.problems.append(f"picture of {camera}: the first one is no key picture")
+            if not data.startswith((b"\0\0\1", b"\0\0\0\1")):
+                self.problems.append(f"picture of {camera}: not H.264 in Annex B form")
+            self.pictures.append(SeenPicture(camera, data, captured_ns, width, height, key, intrinsics))
+            self._tell()
+
+    def wants_stream(self, camera: str) -> bool:  # noqa: ARG002  (of all cameras or of none)
+        return self.record
 
     def link(self, state: LinkState, reason: str = "") -> None:
         with self._changed:

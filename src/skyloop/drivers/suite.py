@@ -110,9 +110,9 @@ class DriverSuite:
         return self.make(parse_uri(self.uri))
 
     @contextmanager
-    def opened(self, *, watch: set[str] | None = None) -> Iterator[tuple[Driver, RecordingSink]]:
+    def opened(self, *, watch: set[str] | None = None, record: bool = False) -> Iterator[tuple[Driver, RecordingSink]]:
         """A driver whose link is up and its sink; closed at the end, and its sink's complaints raised."""
-        driver, sink = self.new_driver(), RecordingSink(watch=watch)
+        driver, sink = self.new_driver(), RecordingSink(watch=watch, record=record)
         driver.open(sink)
         try:
             up = sink.wait(lambda: sink.link_state is LinkState.UP, self.connect_timeout_s)
@@ -236,6 +236,21 @@ class DriverSuite:
             )
             ages_s.append((frame.arrived_ns - frame.captured_ns) / 1e9)
         assert statistics.median(ages_s) <= self.frame_age_s, f"frames are {statistics.median(ages_s):.2f} s old"
+
+    def test_pictures_as_they_come(self) -> None:
+        cameras = {camera.name: camera for camera in self.new_driver().capabilities().cameras if camera.stream}
+        if not cameras:
+            raise unittest.SkipTest("the vehicle has no camera whose pictures can be had as they come")
+        with self.opened(watch=set(), record=True) as (_, sink):
+            some = sink.wait(lambda: len(sink.pictures) >= 5, self.frame_timeout_s)
+            assert some, f"{len(sink.pictures)} pictures came as they were encoded within {self.frame_timeout_s} s"
+            pictures = list(sink.pictures)
+        for picture in pictures:
+            camera = cameras.get(picture.camera)
+            assert camera is not None, f"pictures of camera {picture.camera!r}, which announces no stream"
+            assert (picture.width, picture.height) == (camera.width, camera.height), (
+                f"{picture.camera}: {picture.width}×{picture.height} came, {camera.width}×{camera.height} is announced"
+            )
 
     def test_link_lost_and_found(self) -> None:
         with self.opened() as (_, sink):

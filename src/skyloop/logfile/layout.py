@@ -55,6 +55,7 @@ __all__ = [
     "schema_name",
     "to_metadata",
     "to_plain",
+    "video_topic",
 ]
 
 T = TypeVar("T")
@@ -192,11 +193,13 @@ class Channel(StrEnum):
 
 
 class FrameRecord(msgspec.Struct, frozen=True):
-    """A recorded frame. Its picture is the message on :func:`image_topic` of the same ``sequence`` and times."""
+    """A recorded frame. Its picture is the message on :func:`image_topic`, or of H.264 on :func:`video_topic`, of the
+    same ``sequence`` and times."""
 
     header: FrameHeader  #: as it came
     received_ns: int  #: on the recorder's monotonic clock
-    format: str  #: of the picture in the file: ``jpeg``, ``png``
+    format: str  #: of the picture in the file: ``jpeg``, ``png``, ``h264``
+    key: bool = True  #: it can be decoded without those before it, as all but some of ``h264`` can
 
 
 class Drops(msgspec.Struct, frozen=True):
@@ -246,6 +249,11 @@ def parse_topic(topic: str) -> Topic | None:
 def image_topic(drone: str, camera: str) -> str:
     """foxglove.CompressedImage."""
     return f"/{_quoted(drone)}/camera/{_quoted(camera)}/image"
+
+
+def video_topic(drone: str, camera: str) -> str:
+    """foxglove.CompressedVideo: pictures that are kept as they came."""
+    return f"/{_quoted(drone)}/camera/{_quoted(camera)}/video"
 
 
 def calibration_topic(drone: str, camera: str) -> str:

@@ -1,7 +1,8 @@
 """A recorded frame, and its pixels.
 
-The picture is the field ``data`` of a foxglove.CompressedImage, taken out of its Protocol Buffers encoding
-(https://protobuf.dev/programming-guides/encoding/, https://docs.foxglove.dev/docs/sdk/schemas/compressed-image).
+The picture is the field ``data`` of a foxglove.CompressedImage, or where the vehicle's H.264 was kept of a
+foxglove.CompressedVideo, taken out of its Protocol Buffers encoding (https://protobuf.dev/programming-guides/encoding/,
+https://docs.foxglove.dev/docs/sdk/schemas/compressed-image, …/compressed-video).
 """
 
 from __future__ import annotations
@@ -13,10 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.errors import FileFormatError, MissingExtraError
+from skyloop.logfile.h264 import Group
 from skyloop.logfile.layout import FrameRecord
 from skyloop.messages import Encoding, FrameHeader
+from skyloop.messages.encoded import H264
 
-_DATA: Final = 2  #: number of the field with the compressed picture
+_DATA: Final = 2  #: number of the field with the compressed picture,
+_VIDEO_DATA: Final = 3  #: and of the one with H.264
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  #: kinds of field
 _FIXED_SIZE: Final = {_FIXED64: 8, _FIXED32: 4}
 
@@ -29,7 +33,8 @@ class Picture:
     record: FrameRecord
     log_ns: int  #: when it was received, Unix time [ns]
     publish_ns: int  #: when it was captured, Unix time [ns]
-    message: bytes  #: foxglove.CompressedImage
+    message: bytes  #: foxglove.CompressedImage or CompressedVideo
+    group: tuple[Group, int] | None = None  #: of H.264 that can be decoded: where, and its place there
 
     @property
     def header(self) -> FrameHeader:
@@ -37,20 +42,34 @@ class Picture:
 
     @property
     def compressed(self) -> bytes:
-        """The picture's file, in ``record.format``. Raises :class:`FileFormatError`."""
-        return _field(self.message, _DATA)
+        """The picture's file, or access unit, in ``record.format``. Raises :class:`FileFormatError`."""
+        return compressed(self.message, self.record)
 
     def pixels(self) -> NDArray[np.uint8]:
         """BGR, shape (height, width, 3), uint8. Raises :class:`FileFormatError` for what can't be decoded."""
-        return decode_image(self.compressed, f"frame {self.header.seq} of {self.camera}", grey=False)
+        return self._decoded(grey=False)
 
     def as_recorded(self) -> tuple[NDArray[np.uint8], Encoding]:
         """The pixels in the encoding in which the vehicle gave them if that was raw, else BGR."""
         grey = self.header.encoding is Encoding.MONO8
-        image = decode_image(self.compressed, f"frame {self.header.seq} of {self.camera}", grey=grey)
+        image = self._decoded(grey=grey)
         if self.header.encoding is Encoding.RGB8:
             return np.ascontiguousarray(image[:, :, ::-1]), Encoding.RGB8
         return image, Encoding.MONO8 if grey else Encoding.BGR8
+
+    def _decoded(self, *, grey: bool) -> NDArray[np.uint8]:
+        what = f"frame {self.header.seq} of {self.camera}"
+        if self.record.format != H264:
+            return decode_image(self.compressed, what, grey=grey)
+        if self.group is None:
+            raise FileFormatError(f"{what} can't be decoded: pictures that it builds on are missing")
+        group, place = self.group
+        return group.pixels(place, what)
+
+
+def compressed(message: bytes, record: FrameRecord) -> bytes:
+    """A picture's file, or access unit, out of its message. Raises :class:`FileFormatError`."""
+    return _field(message, _VIDEO_DATA if record.format == H264 else _DATA)
 
 
 def decode_image(data: bytes, what: str, *, grey: bool) -> NDArray[np.uint8]:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
 from skyloop.clock import NS_PER_S
 from skyloop.errors import FileFormatError, UnknownNameError
+from skyloop.logfile.h264 import Groups
 from skyloop.logfile.layout import (
     META_CLOCK,
     META_END,
@@ -26,9 +28,11 @@ from skyloop.logfile.layout import (
     from_metadata,
     image_topic,
     parse_topic,
+    video_topic,
 )
-from skyloop.logfile.pictures import Picture
+from skyloop.logfile.pictures import Picture, compressed
 from skyloop.logfile.scan import Message, Piece, Scan, note, open_file, records, scan
+from skyloop.messages.encoded import H264
 
 #: Told how much of a file has been read, from 0 to 1.
 Progress = Callable[[float], object]
@@ -200,8 +204,7 @@ class Recording:
         progress: Progress | None = None,
     ) -> Iterator[Item | Picture]:
         """The same, with each frame as a :class:`Picture`, which is a :class:`FrameRecord` with what it shows."""
-        images = {image_topic(drone, camera): camera for camera in self.cameras(drone)}
-        return self._paired(self._topics(drone, channels), images, progress)
+        return self._paired(self._topics(drone, channels), _image_topics(drone, self.cameras(drone)), progress)
 
     def pictures(self, drone: str, camera: str, progress: Progress | None = None) -> Iterator[Picture]:
         """The frames of one camera."""
@@ -209,7 +212,7 @@ class Recording:
         if camera not in known:
             raise UnknownNameError(f"camera of {drone} in {self.path}", camera, known)
         frames = Topic(drone, Channel.FRAMES, camera)
-        found = self._paired({str(frames): frames}, {image_topic(drone, camera): camera}, progress)
+        found = self._paired({str(frames): frames}, _image_topics(drone, (camera,)), progress)
         return (picture for picture in found if isinstance(picture, Picture))
 
     def decoded(self, entry: Entry, channel: Channel) -> Any:
@@ -234,7 +237,7 @@ class Recording:
                 yield Entry(channel.topic, record.log_time, record.publish_time, record.sequence, record.data)
 
     def _paired(
-        self, topics: dict[str, Topic], images: dict[str, str], progress: Progress | None
+        self, topics: dict[str, Topic], images: dict[str, _Kind], progress: Progress | None
     ) -> Iterator[Item | Picture]:
         """Samples of some topics, with the pictures of others instead of their records."""
         pairs = _Pairs()
@@ -261,27 +264,44 @@ class Recording:
         }
 
 
+_Kind = tuple[str, bool]  # camera, and whether it is H.264 as the vehicle sent it
+
+
+def _image_topics(drone: str, cameras: Collection[str]) -> dict[str, _Kind]:
+    """Where pictures are."""
+    found: dict[str, _Kind] = {image_topic(drone, camera): (camera, False) for camera in cameras}
+    return found | {video_topic(drone, camera): (camera, True) for camera in cameras}
+
+
 class _Pairs:
     """Brings together each frame's record and its image, whichever comes first: both have the same sequence."""
 
     def __init__(self) -> None:
-        self._records: dict[str, tuple[Entry, FrameRecord]] = {}
-        self._images: dict[str, Entry] = {}
+        self._records: dict[_Kind, tuple[Entry, FrameRecord]] = {}
+        self._images: dict[_Kind, Entry] = {}
+        self._groups: dict[str, Groups] = {}
 
     def record(self, camera: str, entry: Entry, record: FrameRecord) -> Picture | None:
-        self._records[camera] = entry, record
-        return self._pair(camera)
+        kind = camera, record.format == H264
+        self._records[kind] = entry, record
+        return self._pair(kind)
 
-    def image(self, camera: str, entry: Entry) -> Picture | None:
-        self._images[camera] = entry
-        return self._pair(camera)
+    def image(self, kind: _Kind, entry: Entry) -> Picture | None:
+        self._images[kind] = entry
+        return self._pair(kind)
 
-    def _pair(self, camera: str) -> Picture | None:
-        image, known = self._images.get(camera), self._records.get(camera)
+    def _pair(self, kind: _Kind) -> Picture | None:
+        image, known = self._images.get(kind), self._records.get(kind)
         if image is None or known is None or image.sequence != known[0].sequence:
             return None
         entry, record = known
-        return Picture(camera, record, entry.log_ns, entry.publish_ns, image.data)
+        camera, encoded = kind
+        group = None
+        if encoded:
+            groups = self._groups.setdefault(camera, Groups())
+            with suppress(FileFormatError):  # it has no group then, and says so when it is looked at
+                group = groups.add(record.header.seq, compressed(image.data, record), key=record.key)
+        return Picture(camera, record, entry.log_ns, entry.publish_ns, image.data, group)
 
 
 def _foreign(found: Scan) -> str:

@@ -48,6 +48,7 @@ from skyloop.messages.config import (
     Statistics,
     Welcome,
 )
+from skyloop.messages.encoded import EncodedFrame
 from skyloop.messages.event import Event
 from skyloop.messages.feedback import Feedback, Value, Vector
 from skyloop.messages.frame import CameraInfo, FrameHeader, Intrinsics
@@ -81,6 +82,7 @@ __all__ = [
     "DEFAULT_PRIORITY",
     "Done",
     "EmergencyStop",
+    "EncodedFrame",
     "Encoding",
     "Event",
     "EventKind",

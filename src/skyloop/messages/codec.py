@@ -17,6 +17,7 @@ from skyloop.errors import DecodeError
 from skyloop.messages.annotation import Annotation
 from skyloop.messages.command import Applied, Command
 from skyloop.messages.config import Reply, Request
+from skyloop.messages.encoded import EncodedFrame
 from skyloop.messages.event import Event
 from skyloop.messages.feedback import Feedback
 from skyloop.messages.frame import FrameHeader
@@ -28,7 +29,7 @@ HEADER: Final = struct.Struct("<4sBBHI")
 HEADER_SIZE: Final = HEADER.size
 MAX_BODY: Final = 60_000  #: of a sample, so that a packet fits one datagram; pixels travel apart
 
-Sample = Command | Applied | Feedback | FrameHeader | Event | Request | Reply | Annotation | LogEntry
+Sample = Command | Applied | Feedback | FrameHeader | Event | Request | Reply | Annotation | LogEntry | EncodedFrame
 
 
 class Kind(IntEnum):
@@ -43,6 +44,7 @@ class Kind(IntEnum):
     ANNOTATION = 7
     APPLIED = 8
     LOG = 9
+    ENCODED = 10
 
 
 KINDS: Final[dict[type[Sample], Kind]] = {
@@ -55,6 +57,7 @@ KINDS: Final[dict[type[Sample], Kind]] = {
     Annotation: Kind.ANNOTATION,
     Applied: Kind.APPLIED,
     LogEntry: Kind.LOG,
+    EncodedFrame: Kind.ENCODED,
 }
 
 _encode_body = msgspec.msgpack.Encoder().encode

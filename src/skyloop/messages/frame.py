@@ -61,3 +61,4 @@ class CameraInfo(msgspec.Struct, frozen=True, array_like=True):
     #: rotation from the camera's optical axes (x right, y down, z forward) to the body's axes, row by row
     rotation: tuple[float, float, float, float, float, float, float, float, float] | None = None
     position: tuple[float, float, float] | None = None  #: of the optical centre in body axes [m]
+    stream: str = ""  #: codec in which its pictures can be had as they come, ``h264``; empty: as frames only

@@ -14,6 +14,7 @@ from skyloop.clock import NS_PER_S, Clock
 from skyloop.messages import (
     CameraInfo,
     Capabilities,
+    EncodedFrame,
     Encoding,
     EventKind,
     Feedback,
@@ -25,9 +26,10 @@ from skyloop.messages import (
     Value,
     encode,
 )
+from skyloop.messages.encoded import H264, MAX_ENCODED
 from skyloop.proxy.events import EventLog, Notice
 from skyloop.proxy.statistics import Counters
-from skyloop.transport.base import FEEDBACK, ServerEnd, video
+from skyloop.transport.base import FEEDBACK, ServerEnd, stream, video
 
 #: A vehicle silent for so long: the proxy publishes what it knows itself (authority, links), so at 4 Hz.
 KEEP_ALIVE_NS: Final = NS_PER_S // 4
@@ -71,6 +73,7 @@ class Vehicle:
         self._state = FlightState.UNKNOWN
         self._frame_lock = threading.Lock()
         self._frame_seq: dict[str, int] = {}
+        self._stream_seq: dict[str, int] = {}
         self._cameras: dict[str, CameraInfo] = {camera.name: camera for camera in capabilities.cameras}
         self._topics: dict[str, str] = {camera: video(camera) for camera in self._cameras}
 
@@ -178,6 +181,44 @@ class Vehicle:
         if topic is None:
             topic = self._topics[camera] = video(camera)
         return self._subscribers(topic) > 0
+
+    def stream(
+        self,
+        camera: str,
+        data: bytes,
+        captured_ns: int,
+        *,
+        width: int,
+        height: int,
+        key: bool,
+        intrinsics: Intrinsics | None = None,
+    ) -> None:
+        """A picture as the vehicle encoded it, from the driver."""
+        with self._frame_lock:
+            seq = self._stream_seq[camera] = self._stream_seq.get(camera, 0) + 1
+        self._counts[f"streams.{camera}.received"] += 1
+        if len(data) > MAX_ENCODED:
+            self._counts[f"streams.{camera}.too_large"] += 1
+            why = f"a picture of {camera} as it came has {len(data)} bytes, at most {MAX_ENCODED} are handed on"
+            self._fail("stream", f"{why}: the stream goes on with the next key picture that is smaller")
+            return
+        if intrinsics is None:
+            intrinsics = self._nominal_intrinsics(camera, width, height)
+        now_ns = self._clock()
+        sample = EncodedFrame(camera, seq, captured_ns, now_ns, width, height, H264, key, data, intrinsics)
+        try:
+            packet = encode(sample)
+        except (ValueError, TypeError, OverflowError) as error:
+            self._fail("stream", f"a picture of {camera} as it came cannot be published: {error}")
+            return
+        missed = self._publish(stream(camera), packet)
+        self._counts[f"streams.{camera}.published"] += 1
+        if missed:
+            self._counts[f"streams.{camera}.missed"] += missed
+
+    def wants_stream(self, camera: str) -> bool:
+        """Whether anybody takes this camera's pictures as they come."""
+        return self._subscribers(stream(camera)) > 0
 
     def _nominal_intrinsics(self, camera: str, width: int, height: int) -> Intrinsics | None:
         info = self._cameras.get(camera)

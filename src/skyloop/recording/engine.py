@@ -103,6 +103,7 @@ class Engine:
 
     def _tell_drops(self) -> None:
         for tap in self._taps:
+            tap.look()
             now = (tap.dropped(), tap.missed())
             before, self._told[tap] = self._told[tap], now
             if now == before:

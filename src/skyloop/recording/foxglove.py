@@ -13,11 +13,13 @@ from skyloop.errors import MissingExtraError
 from skyloop.logfile.layout import WORLD, optical_frame
 from skyloop.messages import Annotation, CameraInfo, Feedback, Intrinsics, Points, Polyline, Severity
 from skyloop.messages.annotation import Colour, Point, Shape, Text
+from skyloop.messages.encoded import H264
 
 try:
     from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
     from foxglove_schemas_protobuf.Color_pb2 import Color
     from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+    from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
     from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
     from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
     from foxglove_schemas_protobuf.Log_pb2 import Log
@@ -39,6 +41,7 @@ if TYPE_CHECKING:
 __all__ = [
     "CameraCalibration",
     "CompressedImage",
+    "CompressedVideo",
     "FrameTransform",
     "ImageAnnotations",
     "Log",
@@ -81,6 +84,14 @@ def image(drone: str, camera: str, captured_ns: int, data: bytes, format_: str) 
     """A picture as a file of the format named (``jpeg``, ``png``)."""
     message = CompressedImage(
         timestamp=timestamp(captured_ns), frame_id=optical_frame(drone, camera), data=data, format=format_
+    )
+    return message.SerializeToString()
+
+
+def video(drone: str, camera: str, captured_ns: int, data: bytes) -> bytes:
+    """One picture of H.264: an access unit in Annex B form, with SPS and PPS if it is a key picture."""
+    message = CompressedVideo(
+        timestamp=timestamp(captured_ns), frame_id=optical_frame(drone, camera), data=data, format=H264
     )
     return message.SerializeToString()
 

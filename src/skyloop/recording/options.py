@@ -12,8 +12,10 @@ import msgspec
 
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.logfile.layout import Channel
+from skyloop.messages import CameraInfo
+from skyloop.messages.encoded import H264
 
-Lossy = Literal["jpeg", "png"]
+VideoEncoding = Literal["auto", "jpeg", "png"]
 
 MB: Final = 1_000_000
 VIDEO: Final = "video"
@@ -25,7 +27,7 @@ class Options(msgspec.Struct, frozen=True):
     """How to record; see :func:`skyloop.record` for what each means. Raises :class:`UsageError`."""
 
     channels: tuple[str, ...] = CHOICES
-    encoding: Lossy = "jpeg"
+    encoding: VideoEncoding = "auto"
     quality: int = 90
     rotate_mb: float | None = None
     rotate_s: float | None = None
@@ -34,8 +36,9 @@ class Options(msgspec.Struct, frozen=True):
     overwrite: bool = False
 
     def __post_init__(self) -> None:
-        if self.encoding not in ("jpeg", "png"):
-            raise UsageError(f'encoding is {self.encoding!r} and must be "jpeg" or, without any loss, "png"')
+        if self.encoding not in ("auto", "jpeg", "png"):
+            known = '"auto", "jpeg" or, without any loss, "png"'
+            raise UsageError(f"encoding is {self.encoding!r} and must be {known}")
         if not isinstance(self.quality, int) or not 1 <= self.quality <= 100:
             raise UsageError(f"quality is {self.quality!r} and must be a whole number from 1 to 100 (best)")
         for name, least in (("rotate_mb", 1.0), ("rotate_s", 1.0), ("min_free_mb", 0.0), ("buffer_mb", 1.0)):
@@ -55,6 +58,10 @@ class Options(msgspec.Struct, frozen=True):
 
     def wants_camera(self, camera: str) -> bool:
         return VIDEO in self.channels or f"{VIDEO}.{camera}" in self.channels
+
+    def keeps_stream(self, camera: CameraInfo) -> bool:
+        """Whether a camera's pictures are recorded as the vehicle encodes them."""
+        return self.encoding == "auto" and camera.stream == H264
 
     def check_cameras(self, known: Iterable[str]) -> None:
         """Raises :class:`UnknownNameError` for a camera that no drone has."""

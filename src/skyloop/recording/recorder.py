@@ -12,7 +12,7 @@ from skyloop.errors import UsageError
 from skyloop.messages import EventKind
 from skyloop.recording.child import Order, RecorderProcess, check_installed
 from skyloop.recording.engine import Engine
-from skyloop.recording.options import Lossy, Options, channels_of, first_path
+from skyloop.recording.options import Options, VideoEncoding, channels_of, first_path
 from skyloop.recording.status import News, RecorderState, Status
 
 
@@ -127,7 +127,7 @@ def record(
     path: str | Path,
     *,
     channels: Iterable[str] | None = None,
-    encoding: Lossy = "jpeg",
+    encoding: VideoEncoding = "auto",
     quality: int = 90,
     rotate_mb: float | None = None,
     rotate_s: float | None = None,
@@ -141,8 +141,9 @@ def record(
     ``drones``: connected ones, or names of running proxies. ``path``: a file, or a folder in which a name is chosen.
     ``channels``: which ones (default: all), of ``commands``, ``feedback``, ``events``, ``parameters``, ``annotations``,
     ``logs``, ``video`` and ``video.CAMERA``. ``encoding``: of frames that come raw, ``"jpeg"`` with a ``quality`` from
-    1 to 100, or ``"png"`` without any loss; frames that come as JPEG are kept as such. ``rotate_mb``, ``rotate_s``:
-    begin a new file after so much or so long (``flight-0001.mcap``, …), each complete in itself. ``min_free_mb``: room
+    1 to 100, or ``"png"`` without any loss; frames that come as JPEG are kept as such. ``"auto"``: H.264 is kept as the
+    vehicle sent it where it sends that, else JPEG. ``rotate_mb``, ``rotate_s``: begin a new file after so much or so
+    long (``flight-0001.mcap``, …), each complete in itself, H.264 at a key picture. ``min_free_mb``: room
     to leave on the disk: below it frames are not recorded, below a quarter of it nothing. ``buffer_mb``: how much may
     wait for a slow disk before frames are dropped. ``overwrite``: an existing file. ``in_process``: record on threads
     of this process and not in one of its own (default: only if the drone can't be reached from another process).

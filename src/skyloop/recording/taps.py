@@ -14,11 +14,13 @@ from skyloop.client import Drone
 from skyloop.client.delivery import Listener
 from skyloop.client.frame import Arrival, to_bgr
 from skyloop.client.slots import Buffer
+from skyloop.clock import nanoseconds
 from skyloop.errors import MissingExtraError, SkyloopError
 from skyloop.logfile.layout import Channel, Drops, FrameRecord
 from skyloop.messages import (
     Annotation,
     Applied,
+    EncodedFrame,
     Encoding,
     Event,
     EventKind,
@@ -29,12 +31,14 @@ from skyloop.messages import (
     Parameter,
     Severity,
 )
+from skyloop.messages.encoded import H264, Chain
 from skyloop.recording.backlog import Backlog, Item, Rank
 from skyloop.recording.options import VIDEO, Options
 from skyloop.recording.translation import Picture
 
 _FRAMES_WAITING: Final = 2  # a third is being encoded, a fourth on the way: more are not lent to one application
 _SIZE: Final = 400  #: bytes of an ordinary sample, roughly
+_STREAM_GONE_NS: Final = nanoseconds(2.0)  # a stream of which nothing came for so long: frames are recorded
 _PARAMETERS_S: Final = 2.0  # after a change that this could not ask for, it is asked again
 
 Encode = Callable[[FrameHeader, "NDArray[np.uint8]"], bytes]
@@ -46,6 +50,10 @@ class Gaps:
     def __init__(self) -> None:
         self.missed = 0
         self._last: int | None = None
+
+    def restart(self) -> None:
+        """What is missing from here to the next number was not wanted."""
+        self._last = None
 
     def follow(self, number: int) -> None:
         last = self._last
@@ -111,8 +119,14 @@ class Tap:
 
     def missed(self) -> dict[str, int]:
         """By channel, what was never received."""
-        gaps = self._gaps | {video.channel: video.gaps for video in self._videos}
-        return {channel: gap.missed for channel, gap in gaps.items() if gap.missed}
+        found = {channel: gap.missed for channel, gap in self._gaps.items()}
+        found |= {video.channel: video.missed for video in self._videos}
+        return {channel: missed for channel, missed in found.items() if missed}
+
+    def look(self) -> None:
+        """Called each second: see what comes of video."""
+        for video in self._videos:
+            video.look(time.monotonic_ns())
 
     def put_drops(self, dropped: dict[str, int], missed: dict[str, int]) -> None:
         now_ns = time.monotonic_ns()
@@ -154,8 +168,57 @@ class Tap:
         self._put("logs", Rank.KEPT, entry, _SIZE + len(entry.text or "") + 10 * len(entry.values or ()))
 
 
+class Stream:
+    """One camera's pictures as the vehicle encoded them, from a key picture on."""
+
+    def __init__(self, put: Callable[..., None], drone: Drone, camera: str) -> None:
+        self.gaps = Gaps()
+        self.dropped = 0  #: pictures that can't be decoded because one before them is missing
+        self.newest_ns = 0  #: when the newest one came that can be decoded, or when it started
+        self._put = put
+        self._channel = f"{VIDEO}.{camera}"
+        self._topic = drone.channel(camera).stream
+        self._chain = Chain()
+        self._begun = False
+        self._sink = self._arrived
+
+    def start(self) -> None:
+        self.newest_ns = time.monotonic_ns()
+        self._topic.add(self._sink, lambda: 0)
+
+    def stop(self) -> None:
+        self._topic.remove(self._sink)
+
+    def _arrived(self, picture: EncodedFrame) -> None:
+        now_ns = time.monotonic_ns()
+        self.gaps.follow(picture.seq)
+        if picture.codec != H264 or not self._chain.follows(picture.seq, key=picture.key):
+            self.dropped += self._begun
+            return
+        self._begun = True
+        self.newest_ns = now_ns
+        width, height = picture.width, picture.height
+        header = FrameHeader(
+            picture.camera,
+            picture.seq,
+            picture.captured_ns,
+            picture.published_ns,
+            width,
+            height,
+            Encoding.BGR8,
+            width * height * 3,
+            picture.intrinsics,
+        )
+        record = FrameRecord(header, now_ns, H264, picture.key)
+        size = len(picture.data) + _SIZE
+        self._put(self._channel, Rank.FRAME, Picture(record, picture.data), size, now_ns)
+
+
 class Video:
-    """One camera's frames: encoded on a thread of their own, unless they come as JPEG."""
+    """One camera's frames: encoded on a thread of their own, unless they come as JPEG.
+
+    Where the vehicle's own encoding is to be kept, they are asked for only while nothing of that comes.
+    """
 
     def __init__(self, put: Callable[..., None], drone: Drone, camera: str, options: Options) -> None:
         self.channel = f"{VIDEO}.{camera}"
@@ -163,7 +226,10 @@ class Video:
         self._put = put
         self._topic = drone.channel(camera).topic
         self._encode = encoder(options)
-        self._format = options.encoding
+        self._format = "png" if options.encoding == "png" else "jpeg"
+        self._stream = Stream(put, drone, camera) if options.keeps_stream(drone.channel(camera).camera) else None
+        self._lock = threading.Lock()  # guards the subscription to frames
+        self._listening = self._ended = False
         self._failed = 0
         self._buffer: Buffer[Arrival] = Buffer(_FRAMES_WAITING)
         self._sink = self._arrived
@@ -171,19 +237,49 @@ class Video:
 
     @property
     def dropped(self) -> int:
-        """Frames that the encoder had no time for, or could make nothing of."""
-        return self._buffer.dropped + self._failed
+        """Frames that the encoder had no time for, could make nothing of, or that can't be decoded."""
+        return self._buffer.dropped + self._failed + (self._stream.dropped if self._stream is not None else 0)
+
+    @property
+    def missed(self) -> int:
+        """Frames that never came."""
+        return self.gaps.missed + (self._stream.gaps.missed if self._stream is not None else 0)
 
     def start(self) -> None:
         self._thread.start()
-        self._topic.add(self._sink, lambda: 0)
+        if self._stream is not None:
+            self._stream.start()
+        else:
+            self._listen(True)
 
     def stop(self) -> None:
-        self._topic.remove(self._sink)
+        if self._stream is not None:
+            self._stream.stop()
+        self._listen(False)
+        with self._lock:
+            self._ended = True
         self._buffer.close()
         self._thread.join()
 
+    def look(self, now_ns: int) -> None:
+        """Ask for frames while the vehicle's own encoding does not come: it may send another one than announced."""
+        if self._stream is not None:
+            self._listen(now_ns - self._stream.newest_ns > _STREAM_GONE_NS)
+
+    def _listen(self, on: bool) -> None:
+        with self._lock:
+            if on == self._listening or self._ended:
+                return
+            self._listening = on
+            if on:
+                self.gaps.restart()
+                self._topic.add(self._sink, lambda: 0)
+            else:
+                self._topic.remove(self._sink)
+
     def _arrived(self, arrival: Arrival) -> None:
+        if self._stream is not None and arrival.received_ns - self._stream.newest_ns < _STREAM_GONE_NS:
+            return  # what is recorded again is the stream
         header = arrival.header
         self.gaps.follow(header.seq)
         if header.encoding is Encoding.JPEG:

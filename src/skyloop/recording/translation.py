@@ -19,6 +19,7 @@ from skyloop.messages import (
     LogEntry,
     Parameter,
 )
+from skyloop.messages.encoded import H264
 from skyloop.recording import foxglove
 from skyloop.recording.backlog import Item
 from skyloop.recording.output import Message
@@ -170,8 +171,12 @@ class Translator:
                 yield from self._calibration(camera, *now, log_ns)
         topic = str(Topic(drone, Channel.FRAMES, camera))
         yield Message(topic, FrameRecord, layout.encode(record), log_ns, at_ns, sequence)
-        image = foxglove.image(drone, camera, at_ns, picture.data, record.format)
-        yield Message(layout.image_topic(drone, camera), foxglove.CompressedImage, image, log_ns, at_ns, sequence)
+        if record.format == H264:
+            unit = foxglove.video(drone, camera, at_ns, picture.data)
+            yield Message(layout.video_topic(drone, camera), foxglove.CompressedVideo, unit, log_ns, at_ns, sequence)
+        else:
+            image = foxglove.image(drone, camera, at_ns, picture.data, record.format)
+            yield Message(layout.image_topic(drone, camera), foxglove.CompressedImage, image, log_ns, at_ns, sequence)
 
     def _calibration(
         self, camera: str, width: int, height: int, intrinsics: Intrinsics, at_ns: int

@@ -15,15 +15,17 @@ from skyloop.clock import nanoseconds
 from skyloop.errors import UsageError
 from skyloop.logfile.layout import VERSION, ClockPair, DroneRecord, End, Start
 from skyloop.messages import Severity
+from skyloop.messages.encoded import H264, Chain
 from skyloop.recording.backlog import Backlog, Item, Rank
 from skyloop.recording.options import MB, Options, numbered
 from skyloop.recording.output import CHUNK, Opener, RecordingFile, open_target
 from skyloop.recording.status import RecorderState, Room, judge_room
-from skyloop.recording.translation import Translator
+from skyloop.recording.translation import Picture, Translator
 
 BEAT_S: Final = 0.05  #: what has come is taken this often, so that it need not wake anybody
 _COMMIT_NS: Final = nanoseconds(0.5)  #: what is older than this is in the file, if the disk can do it
 _REOPEN: Final = 4 * MB  #: bytes that must be free before another file is begun on a disk that was full
+_KEY_WAIT_NS: Final = nanoseconds(2.0)  #: so long a full file goes on, to end before a key picture
 _LOOK_NS: Final = nanoseconds(1.0)  #: how often the disk is looked at, and a file that can't be written tried again
 
 Tell = Callable[[str, Severity], None]
@@ -72,6 +74,8 @@ class FileWriter:
         self._closed_bytes = self._closed_messages = 0
         self._now_ns = clock.monotonic_ns
         self._opened_ns = self._commit_due_ns = self._look_due_ns = 0
+        self._due_ns = 0  # since when another file should have been begun
+        self._chains: dict[tuple[int, str], Chain] = {}  # H.264 of this file, by drone and channel
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="skyloop-recorder", daemon=True)
 
@@ -142,24 +146,45 @@ class FileWriter:
 
     def _write(self) -> None:
         """Translate and write all that waits, committing as it goes."""
-        file = self._file
-        assert file is not None
         while taken := self._backlog.take(CHUNK):
-            batch = [item for item in taken if self._admits(item)]
-            self._uncommitted += batch  # first, so that nothing of the batch is lost when the disk fails in its midst
-            for item in batch:
-                for message in self._translators[item.drone].messages(item):
-                    file.write(message)
-            if sum(item.size for item in self._uncommitted) >= CHUNK:
-                self._commit()
+            key = next((n for n, item in enumerate(taken) if _is_key(item)), None) if self._rotation_due() else None
+            if key is None:
+                self._write_batch(taken)
+                continue
+            try:
+                self._write_batch(taken[:key])
+                self._rotate()
+            except OSError:
+                self._backlog.put_back(taken[key:])
+                raise
+            self._write_batch(taken[key:])
         if self._now_ns >= self._commit_due_ns:
             self._commit()
 
+    def _write_batch(self, items: Sequence[Item]) -> None:
+        file = self._file
+        assert file is not None
+        batch = [item for item in items if self._admits(item)]
+        self._uncommitted += batch  # first, so that nothing of the batch is lost when the disk fails in its midst
+        for item in batch:
+            for message in self._translators[item.drone].messages(item):
+                file.write(message)
+        if sum(item.size for item in self._uncommitted) >= CHUNK:
+            self._commit()
+
     def _admits(self, item: Item) -> bool:
-        if item.rank is not Rank.FRAME or self.room is Room.ALL:
+        if item.rank is not Rank.FRAME or (self.room is Room.ALL and self._follows(item)):
             return True
         self._backlog.count(item)
         return False
+
+    def _follows(self, item: Item) -> bool:
+        """Whether a picture can be decoded from what is in this file."""
+        if not isinstance(item.sample, Picture) or item.sample.record.format != H264:
+            return True
+        record = item.sample.record
+        chain = self._chains.setdefault((item.drone, item.channel), Chain())
+        return chain.follows(record.header.seq, key=record.key)
 
     def _commit(self) -> None:
         assert self._file is not None
@@ -167,14 +192,25 @@ class FileWriter:
         self._uncommitted.clear()
         self._commit_due_ns = self._now_ns + _COMMIT_NS
 
-    def _rotate_when_due(self) -> None:
+    def _rotation_due(self) -> bool:
         file, options = self._file, self._options
         assert file is not None
         by_size = options.rotate_mb is not None and file.size >= options.rotate_mb * MB
-        by_time = options.rotate_s is not None and self._now_ns - self._opened_ns >= nanoseconds(options.rotate_s)
-        if by_size or by_time:
-            self._close("rotated")
-            self._open()
+        return by_size or (
+            options.rotate_s is not None and self._now_ns - self._opened_ns >= nanoseconds(options.rotate_s)
+        )
+
+    def _rotate_when_due(self) -> None:
+        """Where there is H.264, :meth:`_write` does it at a key picture, unless none comes."""
+        if not self._rotation_due():
+            return
+        self._due_ns = self._due_ns or self._now_ns
+        if not self._chains or self._now_ns - self._due_ns >= _KEY_WAIT_NS:
+            self._rotate()
+
+    def _rotate(self) -> None:
+        self._close("rotated")
+        self._open()
 
     # Files -----------------------------------------------------------------------------------------------------
 
@@ -196,6 +232,8 @@ class FileWriter:
             raise
         self._file = file
         self._opened_ns = self._now_ns
+        self._due_ns = 0
+        self._chains.clear()
         self.files.append(path)
         self.state, self.reason = RecorderState.RECORDING, ""
         self._tell(f"recording to {path}", Severity.INFO)
@@ -265,6 +303,12 @@ class FileWriter:
         except OSError as error:
             self._pause(_why(error))
         self.state = RecorderState.FAILED if self.state is RecorderState.PAUSED else RecorderState.CLOSED
+
+
+def _is_key(item: Item) -> bool:
+    """Whether a stream of pictures that build on one another can begin here."""
+    sample = item.sample
+    return isinstance(sample, Picture) and sample.record.format == H264 and sample.record.key
 
 
 def _why(error: OSError) -> str:

@@ -41,6 +41,11 @@ def video(camera: str) -> str:
     return f"video/{camera}"
 
 
+def stream(camera: str) -> str:
+    """The topic of a camera's pictures as the vehicle encoded them (EncodedFrame)."""
+    return f"stream/{camera}"
+
+
 _UINT8 = np.dtype(np.uint8)
 
 #: Bytes of a frame: shape (size,), uint8, not writeable. They stay as they are for as long as any view of them lives.

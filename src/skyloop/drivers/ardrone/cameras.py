@@ -13,6 +13,7 @@ import msgspec
 from skyloop.drivers.intrinsics import intrinsics_of
 from skyloop.drivers.uri import VehicleUri
 from skyloop.messages import CameraInfo, Intrinsics
+from skyloop.messages.encoded import H264
 
 Rotation = tuple[float, float, float, float, float, float, float, float, float]
 
@@ -28,8 +29,8 @@ _CAMERAS: Final = {
         CameraInfo("bottom", 176, 144, 60.0, rotation=_LOOKING_DOWN),
     ),
     2: (
-        CameraInfo("front", 640, 360, 30.0, intrinsics=_FRONT, rotation=_LOOKING_FORWARD),
-        CameraInfo("bottom", 640, 360, 30.0, intrinsics=_BOTTOM, rotation=_LOOKING_DOWN),
+        CameraInfo("front", 640, 360, 30.0, intrinsics=_FRONT, rotation=_LOOKING_FORWARD, stream=H264),
+        CameraInfo("bottom", 640, 360, 30.0, intrinsics=_BOTTOM, rotation=_LOOKING_DOWN, stream=H264),
     ),
 }
 

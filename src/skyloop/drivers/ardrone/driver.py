@@ -9,6 +9,7 @@ from skyloop.clock import monotonic_ns
 from skyloop.drivers.ardrone.cameras import cameras_of
 from skyloop.drivers.ardrone.commands import Commands
 from skyloop.drivers.ardrone.decoding import make_decoder
+from skyloop.drivers.ardrone.encoded import EncodedStream
 from skyloop.drivers.ardrone.link import Link
 from skyloop.drivers.ardrone.options import options_of
 from skyloop.drivers.ardrone.parameters import Entry, active_camera, entries_of, taken, written
@@ -23,6 +24,7 @@ from skyloop.messages import (
     AnyAction,
     Capabilities,
     EventKind,
+    Intrinsics,
     Parameter,
     Refusal,
     Severity,
@@ -151,16 +153,13 @@ class ArdroneDriver(Driver):
         options = self.options
 
         def show(picture: Picture) -> None:
-            intrinsics = None
-            if self._camera == "front":
-                intrinsics = intrinsics_of(self.uri, picture.width, picture.height)
             sink.frame(
                 self._camera,
                 picture.pixels,
                 picture.captured_ns,
                 width=picture.width,
                 height=picture.height,
-                intrinsics=intrinsics,
+                intrinsics=self._intrinsics(picture.width, picture.height),
             )
 
         def tell(notice: Notice, text: str) -> None:
@@ -174,11 +173,16 @@ class ArdroneDriver(Driver):
             show=show,
             told=tell,
             wants=lambda: sink.wants(self._camera),
+            came=EncodedStream(sink, lambda: self._camera, self._intrinsics).take if version == 2 else None,
         )
         try:
             self._video.start()
         except SkyloopError as error:
             sink.event(EventKind.DRIVER_ERROR, f"no video: {error}", Severity.ERROR, where="video")
+
+    def _intrinsics(self, width: int, height: int) -> Intrinsics | None:
+        """Of the camera that is shown, from the address; it tells those of the front camera."""
+        return intrinsics_of(self.uri, width, height) if self._camera == "front" else None
 
     def _video_telemetry(self) -> dict[str, Value]:
         if self._video is None:

@@ -77,9 +77,13 @@ class VideoReceiver:
         show: Callable[[Picture], None],
         told: Callable[[Notice, str], None],
         wants: Callable[[], bool] = lambda: True,
+        came: Callable[[Coded], None] | None = None,
         clock: Clock = monotonic_ns,
     ) -> None:
-        """No I/O. Raises :class:`UsageError` for a version other than 1 and 2."""
+        """No I/O. Raises :class:`UsageError` for a version other than 1 and 2.
+
+        ``came`` gets every whole frame as it came, on the reading thread.
+        """
         if version not in (1, 2):
             raise UsageError(f"there is an AR.Drone 1 and an AR.Drone 2, not {version}")
         self._address = host, port
@@ -87,6 +91,7 @@ class VideoReceiver:
         self._show = show
         self._told = told
         self._wants = wants
+        self._frame_came = came
         self._clock = clock
         self._stop = threading.Event()
         self._came = threading.Condition()  # guards the backlog and the counts of the reading thread
@@ -178,6 +183,9 @@ class VideoReceiver:
                         self._received += len(frames)
                         self._wanted = wanted
                         self._came.notify()
+                if self._frame_came is not None:
+                    for frame in frames:
+                        self._frame_came(frame)
         finally:
             stream.close()
             with self._came:

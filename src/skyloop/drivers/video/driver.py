@@ -113,7 +113,9 @@ class VideoDriver(Driver):
 
     def _describe(self, source: Source) -> CameraInfo:
         intrinsics = self._intrinsics(source.width, source.height)
-        return CameraInfo(self._camera, source.width, source.height, source.fps, intrinsics=intrinsics)
+        return CameraInfo(
+            self._camera, source.width, source.height, source.fps, intrinsics=intrinsics, stream=source.stream
+        )
 
     def _intrinsics(self, width: int, height: int) -> Intrinsics | None:
         """From the options; unknown (None) unless the focal length is given."""

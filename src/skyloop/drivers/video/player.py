@@ -15,6 +15,7 @@ from skyloop.drivers.video.pacing import FilePacer, LiveClock
 from skyloop.drivers.video.sources import Picture, Source
 from skyloop.errors import SkyloopError
 from skyloop.messages import EventKind, Feedback, Intrinsics, LinkState, Severity, Value
+from skyloop.wire.ardrone.pave import PaveFrame
 
 FEEDBACK_NS: Final = 50_000_000
 POLL_S: Final = 0.02
@@ -37,10 +38,16 @@ class Screen:
         self.stop = stop
         self._position_s = 0.0
         self._feedback_ns = 0
+        self._streaming = False  # pictures are handed on as they came
 
     @property
     def wanted(self) -> bool:
         return self.sink.wants(self._camera)
+
+    @property
+    def recorded(self) -> bool:
+        """Whether somebody wants the pictures as they come."""
+        return self.sink.wants_stream(self._camera)
 
     def wait_until(self, due_ns: int) -> bool:
         """Wait, with feedback meanwhile. False if the driver is being closed."""
@@ -72,6 +79,8 @@ class Screen:
             return False
         self.shown += 1
         self._position_s = picture.stamp_s
+        if picture.coded is not None:
+            self._hand_on(picture.coded, captured_ns)
         if pixels is not None:
             height, width = pixels.shape[:2]
             self.sink.frame(
@@ -83,6 +92,20 @@ class Screen:
                 intrinsics=self._intrinsics(width, height),
             )
         return not self.stop.is_set()
+
+    def _hand_on(self, coded: PaveFrame, captured_ns: int) -> None:
+        """As it came. Each that was decoded builds on the one decoded before it, or is a key."""
+        self._streaming = self.recorded and (self._streaming or coded.is_key)
+        if self._streaming:
+            self.sink.stream(
+                self._camera,
+                coded.payload,
+                captured_ns,
+                width=coded.width,
+                height=coded.height,
+                key=coded.is_key,
+                intrinsics=self._intrinsics(coded.width, coded.height),
+            )
 
 
 class FilePlayer:
@@ -98,7 +121,7 @@ class FilePlayer:
         """Until the end or until the driver is closed. ``wait``: start when somebody looks. Closes the source."""
         screen = self._screen
         screen.sink.link(LinkState.UP)
-        while wait and not screen.wanted:
+        while wait and not (screen.wanted or screen.recorded):
             if not screen.wait_until(monotonic_ns() + nanoseconds(POLL_S)):
                 break
         while True:

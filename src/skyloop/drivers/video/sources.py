@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 from skyloop.drivers.video.decoder import PaveDecoder, av, limit_memory
 from skyloop.errors import DriverError, FileFormatError, UsageError
-from skyloop.wire.ardrone.pave import PaveFrame, PaveParser
+from skyloop.messages.encoded import H264
+from skyloop.wire.ardrone.pave import Codec, PaveFrame, PaveParser
 
 if TYPE_CHECKING:
     from av.container import InputContainer
@@ -31,6 +32,7 @@ class Picture:
 
     stamp_s: float
     image: av.VideoFrame
+    coded: PaveFrame | None = None  #: what it was decoded from, if that is handed on as it came
 
 
 Late = Callable[[float], bool]
@@ -43,6 +45,7 @@ class Source(Protocol):
     height: int
     fps: float
     damaged: int  #: pieces that could not be decoded so far
+    stream: str  #: codec in which pictures can be had as they come, ``h264``, or empty
 
     def pictures(self, late: Late | None = None) -> Iterator[Picture]:
         """The pictures in order, until the stream ends. Raises :class:`DriverError` when a device fails.
@@ -91,6 +94,7 @@ class ContainerSource:
         self._name = name
         self._live = live
         self.damaged = 0
+        self.stream = ""
         try:
             self._container: InputContainer = av.open(name, format=format_name, options=options or {})
         except (FFmpegError, OSError, ValueError) as error:
@@ -164,6 +168,7 @@ class PaveSource:
         self._file.seek(0)
         self._parser = PaveParser()
         self.width, self.height, self.fps = first.width, first.height, DEFAULT_FPS
+        self.stream = H264 if first.codec == Codec.MPEG4_AVC else ""
 
     def pictures(self, late: Late | None = None) -> Iterator[Picture]:  # noqa: ARG002  every frame needs the one before
         decoder = PaveDecoder()
@@ -171,7 +176,7 @@ class PaveSource:
             image = decoder.decode(frame)
             self.damaged = decoder.damaged + self._parser.broken_frames
             if image is not None:
-                yield Picture(frame.timestamp_ms / 1000.0, image)
+                yield Picture(frame.timestamp_ms / 1000.0, image, frame if frame.codec == Codec.MPEG4_AVC else None)
 
     def close(self) -> None:
         self._file.close()

@@ -11,6 +11,7 @@ import numpy as np
 from skyloop.errors import FileFormatError, MissingExtraError
 from skyloop.logfile.pictures import Picture
 from skyloop.logfile.reader import Recording
+from skyloop.messages.encoded import H264
 from skyloop.recording.review.tables import Table
 
 WIDTH: Final = 360  #: of a thumbnail [px]
@@ -69,11 +70,12 @@ def _figure(picture: Picture, t_s: float, why: str) -> str:
 
 
 def thumbnail(picture: Picture) -> tuple[bytes, str]:
-    """A small picture and its format; as recorded where it can't be made smaller here. Empty if it is damaged."""
+    """A small picture and its format; as recorded where it can't be made smaller here. Empty if it is damaged,
+    or H.264 that nothing here decodes."""
     try:
         image = picture.pixels()
     except MissingExtraError:
-        return picture.compressed, picture.record.format
+        return (b"", "") if picture.record.format == H264 else (picture.compressed, picture.record.format)
     except FileFormatError:
         return b"", ""
     import cv2
