@@ -97,7 +97,7 @@ class UvlcHeader:
 
 def is_p264(packet: bytes | bytearray | memoryview) -> bool:
     """Whether a datagram begins like a picture of P264, the drone's other codec, which is not decoded here."""
-    return int.from_bytes(bytes(packet[:4]), "little") >> (32 - START_CODE_BITS) == P264_START
+    return len(packet) >= 4 and int.from_bytes(bytes(packet[:4]), "little") >> (32 - START_CODE_BITS) == P264_START
 
 
 def is_intra(packet: bytes | bytearray | memoryview) -> bool:
