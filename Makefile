@@ -4,11 +4,12 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 ARGS   ?=
 
-.PHONY: help demo test check format coverage pictures clean
+.PHONY: help demo test check format coverage page pictures clean
 help:
 	@echo "make demo [ARGS='--seconds 30 --headless']   a simulated drone that flies by its camera"
 	@echo "make test [ARGS='-k authority']              the tests"
 	@echo "make check                                   lint, format, types, import contracts"
+	@echo "make page                                    the cockpit's page anew from its sources, where node and npm are"
 	@echo "make format | coverage | pictures | clean"
 
 # One stamp for what the demo needs and one for what the tests need besides; both are made again when the project changes.
@@ -40,6 +41,9 @@ format: $(VENV)/.installed-dev
 
 coverage: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest --cov --cov-report=term $(ARGS)
+
+page:
+	cd cockpit-page && npm ci --no-audit --no-fund && npm run check && npm test && npm run build
 
 pictures: $(VENV)/.installed-dev
 	$(BIN)/python scripts/pictures.py

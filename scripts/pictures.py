@@ -1,34 +1,26 @@
-"""Makes the pictures of the README from real runs: ``make pictures``, or ``python scripts/pictures.py page`` for one.
+"""Makes the pictures of the README from real runs: ``make pictures``, or ``python scripts/pictures.py flight`` for one.
 
 =====================  ==============================================================================================
 ``flight-strip.jpg``   the camera of one simulated flight, with what the tracker drew: searching, found, following
 ``flight-plot.svg``    the same flight in figures: true distance to the marker, and both paths from above
-``cockpit.jpg``        the page of ``skyloop cockpit`` in a real browser; needs Chromium, and is left out without it
 ``three-drones.jpg``   three drones of one simulated world, from a camera at the wall
 =====================  ==============================================================================================
+
+``scripts/cockpit_pictures.py`` makes those of the cockpit.
 """
 
 from __future__ import annotations
 
-import os
-import subprocess
 import sys
-import tempfile
-import threading
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import browser
 import cv2
 import numpy as np
 from flight_plot import FlightLog, plot
 from numpy.typing import NDArray
 
 import skyloop
-from skyloop.cockpit.child import CockpitProcess
 from skyloop.control.follow import FollowMarker
 from skyloop.control.follow_law import Mode
 from skyloop.messages import Annotation
@@ -46,7 +38,7 @@ Picture = NDArray[np.uint8]
 
 
 def main() -> None:
-    makers = {"flight": flight, "page": page, "world": world}
+    makers = {"flight": flight, "world": world}
     wanted = sys.argv[1:] or list(makers)
     for name in wanted:
         if name not in makers:
@@ -146,61 +138,6 @@ def side_by_side(pictures: list[Picture], gap: int = 8, width: int = 480) -> Pic
         row += [cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA), white]
     joined: Picture = np.hstack(row[:-1])
     return joined
-
-
-# The page -------------------------------------------------------------------------------------------------------------
-
-
-def page() -> None:
-    """A flight with the page open in a browser, photographed when the marker has been followed for a while."""
-    chromium = browser.find()
-    if chromium is None:
-        print("cockpit.jpg: left out, because there is no Chromium here (Debian: apt install chromium)")
-        return
-    with (
-        named_proxy("sim://?seed=4", "alpha"),
-        skyloop.connect("alpha", name="follow.py") as drone,
-        CockpitProcess(drone.name) as cockpit,
-    ):
-        drone.takeoff()
-        follower = FollowMarker(drone, MARKER_ID)
-        with browser.Page(chromium, cockpit.address(), width=1280, height=840) as tab:
-            earliest_s = time.monotonic() + 12.0
-
-            def ready() -> bool:
-                return time.monotonic() > earliest_s and follower.mode is Mode.FOLLOWING
-
-            follower.run(seconds=40.0, until=ready)
-            photo = _while_flying(follower, tab)
-        drone.land()
-    save("cockpit.jpg", photo)
-
-
-def _while_flying(follower: FollowMarker, tab: browser.Page) -> Picture:
-    """Go on following while the browser draws."""
-    taken: list[bytes] = []
-    camera = threading.Thread(target=lambda: taken.append(tab.screenshot()))
-    camera.start()
-    follower.run(seconds=30.0, until=lambda: not camera.is_alive())
-    camera.join()
-    photo = cv2.imdecode(np.frombuffer(taken[0], np.uint8), cv2.IMREAD_COLOR)
-    assert photo is not None
-    return photo.astype(np.uint8)
-
-
-@contextmanager
-def named_proxy(uri: str, name: str) -> Iterator[None]:
-    """A proxy under a name, in a directory of sockets of its own."""
-    with tempfile.TemporaryDirectory(prefix="skyloop-") as folder:
-        os.environ["SKYLOOP_RUNTIME_DIR"] = f"{folder}/run"
-        command = [sys.executable, "-m", "skyloop", "proxy", uri, "--name", name]
-        with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
-            try:
-                assert process.stdout is not None
-                process.stdout.readline()  # says that it is ready
-                yield
-            finally:
-                process.terminate()
 
 
 # A world --------------------------------------------------------------------------------------------------------------

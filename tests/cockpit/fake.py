@@ -1,20 +1,38 @@
-"""A drone that is not there: hands the cockpit whatever a test puts in, through the client's own types."""
+"""Drones that are not there: one that hands the cockpit whatever a test puts in, through the client's own types, and a
+vehicle behind a real proxy that flies as it is told."""
 
 from __future__ import annotations
 
+import math
+import os
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
+from skyloop.client import Drone
 from skyloop.client.frame import Arrival, Frame
 from skyloop.client.history import FeedbackHistory
 from skyloop.client.statistics import ChannelStats, Distribution
-from skyloop.errors import NoAnswerError
+from skyloop.cockpit.access import Gate, OpenGate
+from skyloop.cockpit.app import create_app
+from skyloop.cockpit.finder import Found
+from skyloop.cockpit.fleet import Fleet
+from skyloop.cockpit.recordings import Recordings
+from skyloop.cockpit.security import own_names
+from skyloop.drivers.base import Driver, Sink
+from skyloop.drivers.uri import VehicleUri
+from skyloop.errors import LinkError, NoAnswerError
 from skyloop.messages import (
+    ACTION_NAMES,
     Annotation,
+    AnyAction,
+    Applied,
     CameraInfo,
     Capabilities,
     Encoding,
@@ -23,8 +41,23 @@ from skyloop.messages import (
     Feedback,
     FlightState,
     FrameHeader,
+    Intrinsics,
     LinkState,
+    LogEntry,
+    Role,
+    Velocity,
 )
+from skyloop.proxy.proxy import Proxy
+from skyloop.recording.status import RecorderState, Status
+from skyloop.transport.base import ClientEnd, ClientHandler
+from skyloop.transport.memory import MemoryServer
+from tests.cockpit.testclient import TestClient, WebSocketTestSession
+from tests.integration.fake_vehicle import NEXT
+
+OWN = "http://127.0.0.1:8123"
+SOCKETS = "ws://127.0.0.1:8123/ws"
+ORIGIN = {"origin": OWN}
+PATIENCE_S = 5.0
 
 
 class Listening:
@@ -57,6 +90,10 @@ class FakeDrone:
         self.processors: dict[str, list[Any]] = {"front": [], "bottom": []}
         self.event_listeners: list[Any] = []
         self.annotation_listeners: list[Any] = []
+        self.command_listeners: list[Any] = []
+        self.log_listeners: list[Any] = []
+        self.clock_offset_ns = 0
+        self.closed = False
         self._size = width, height
         self._seq = 0
 
@@ -74,18 +111,33 @@ class FakeDrone:
     def on_annotation(self, function: Callable[[Annotation], None]) -> Listening:
         return Listening(self.annotation_listeners, function)
 
+    def on_command(self, function: Callable[[Applied], None], inline: bool) -> Listening:
+        return Listening(self.command_listeners, function)
+
+    def on_log(self, function: Callable[[LogEntry], None], inline: bool) -> Listening:
+        return Listening(self.log_listeners, function)
+
+    def close(self) -> None:
+        self.closed = True
+
     def add_processor(self, function: Callable[[Frame], None], camera: str, name: str) -> Listening:
         return Listening(self.processors[camera], function)
 
     # What a test does ------------------------------------------------------------------------------------------
 
-    def show(self, shade: int = 0, camera: str = "front", image: np.ndarray | None = None) -> Frame:
+    def show(
+        self,
+        shade: int = 0,
+        camera: str = "front",
+        image: np.ndarray | None = None,
+        captured_ns: int | None = None,
+    ) -> Frame:
         """The camera takes a picture, all of one shade unless given."""
         width, height = self._size
         pixels = np.full((height, width, 3), shade, np.uint8) if image is None else image
         self._seq += 1
         now = time.monotonic_ns()
-        header = FrameHeader(camera, self._seq, now, now, width, height, Encoding.BGR8, pixels.size)
+        header = FrameHeader(camera, self._seq, captured_ns or now, now, width, height, Encoding.BGR8, pixels.size)
         frame = Arrival(header, pixels.reshape(-1), now, 0, FeedbackHistory()).frame()
         for function in list(self.processors[camera]):
             function(frame)
@@ -120,3 +172,165 @@ def flying(**values: Any) -> Feedback:
         "lease": 3,
     }
     return Feedback(**(known | values))
+
+
+class Flyer(Driver):
+    """A vehicle with a camera ``front`` that flies as it is told, at once, and knows where it is."""
+
+    PERIOD_S = 0.02
+
+    def __init__(self, *, position: bool = True) -> None:
+        super().__init__(VehicleUri("fake", text="fake://flyer"))
+        self.state = FlightState.LANDED
+        self.applied: list[AnyAction] = []
+        self.place = [0.0, 0.0, 0.0]
+        self.yaw = 0.0
+        self._velocity = Velocity()
+        self._knows_position = position
+        self._ended = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def capabilities(self) -> Capabilities:
+        return Capabilities("fake", frozenset(ACTION_NAMES.values()), (CameraInfo("front", 32, 24, 50.0),))
+
+    def _open(self, sink: Sink) -> None:
+        self._ended.clear()
+        sink.link(LinkState.UP)
+        self._thread = threading.Thread(target=self._run, args=(sink,), daemon=True, name="flyer")
+        self._thread.start()
+
+    def _close(self) -> None:
+        self._ended.set()
+        if self._thread is not None:
+            self._thread.join()
+
+    def _apply(self, action: AnyAction) -> AnyAction:
+        self.applied.append(action)
+        self.state = NEXT.get(type(action), self.state)
+        if ACTION_NAMES[type(action)] != "idle":
+            self._velocity = action if isinstance(action, Velocity) else Velocity()
+        return action
+
+    def _run(self, sink: Sink) -> None:
+        while not self._ended.wait(self.PERIOD_S):
+            v, c, s = self._velocity, math.cos(self.yaw), math.sin(self.yaw)
+            moved = (c * v.forward - s * v.left, s * v.forward + c * v.left, v.up)
+            self.place = [at + step * self.PERIOD_S for at, step in zip(self.place, moved, strict=True)]
+            self.yaw += v.yaw_rate * self.PERIOD_S
+            now_ns = time.monotonic_ns()
+            sink.feedback(
+                Feedback(
+                    captured_ns=now_ns,
+                    state=self.state,
+                    battery=0.9,
+                    yaw=self.yaw,
+                    velocity=(v.forward, v.left, v.up),
+                    position=(self.place[0], self.place[1], self.place[2]) if self._knows_position else None,
+                )
+            )
+            if sink.wants("front"):
+                picture = np.zeros((24, 32, 3), np.uint8)
+                sink.frame("front", picture, now_ns, width=32, height=24, intrinsics=Intrinsics(30, 30, 16, 12))
+
+
+class Node:
+    """A proxy in this process that can be killed and started again."""
+
+    def __init__(self, name: str = "alpha", **options: Any) -> None:
+        self.name = name
+        self.flyer = Flyer(**options)
+        self._server = MemoryServer(name)
+        self._proxy = Proxy(self.flyer, self._server, name=name)
+        self._proxy.start()
+        self.up = True
+
+    def dial(self, handler: ClientHandler) -> ClientEnd:
+        return self._server.dial(handler)
+
+    def connect(self, app: str, priority: int = 16, **options: Any) -> Drone:
+        return Drone(self.dial, app=app, **options).open(priority=priority)
+
+    def stop(self) -> None:
+        if self.up:
+            self.up = False
+            self._proxy.stop()
+
+    def restart(self) -> None:
+        self._proxy = Proxy(self.flyer, self._server, name=self.name)
+        self._proxy.start()
+        self.up = True
+
+
+class Nodes:
+    """Finds the nodes that are up."""
+
+    def __init__(self, *nodes: Node) -> None:
+        self.nodes = list(nodes)
+        self.wanted: list[str] = []
+
+    def __call__(self) -> list[Found]:
+        return [Found(node.name, "memory", node.dial) for node in self.nodes if node.up]
+
+    def also(self, name: str) -> None:
+        self.wanted.append(name)
+
+
+class FakeRecorder:
+    """Writes a small file, and says that it records."""
+
+    def __init__(self, drones: Sequence[str], folder: Path) -> None:
+        self.path = folder / f"{'-'.join(drones)}.mcap"
+        self.path.write_bytes(b"")
+        self.closed = False
+
+    @property
+    def status(self) -> Status:
+        state = RecorderState.CLOSED if self.closed else RecorderState.RECORDING
+        dropped = {"alpha": {"video.front": 2}}
+        return Status(state, path=str(self.path), files=(str(self.path),), seconds=1.5, bytes=1000, dropped=dropped)
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def this_user(role: Role = Role.PILOT) -> OpenGate:
+    """Everybody is this user."""
+    return OpenGate(role, uid_of=lambda *_: os.geteuid())
+
+
+def fake_fleet(drones: Mapping[str, FakeDrone]) -> Fleet:
+    """Of drones that are there at once, and for ever."""
+
+    def dial(_: ClientHandler) -> ClientEnd:
+        raise LinkError("nobody flies this one")
+
+    class Finder:
+        def __call__(self) -> list[Found]:
+            return [Found(name, "memory", dial) for name in drones]
+
+        def also(self, name: str) -> None: ...
+
+    return Fleet(Finder(), lambda found: drones[found.name])  # type: ignore[arg-type,return-value]
+
+
+@contextmanager
+def cockpit(
+    fleet: Fleet, gate: Gate | None = None, recordings: Recordings | None = None, **options: Any
+) -> Iterator[TestClient]:
+    """The cockpit's pages, without a server."""
+    names = own_names("127.0.0.1", 8123)
+    app = create_app(fleet, recordings or Recordings(Path("nowhere")), names, gate or this_user(), **options)
+    with TestClient(app, base_url=OWN) as client:
+        yield client
+
+
+def open_socket(client: TestClient, path: str, **headers: str) -> WebSocketTestSession:
+    return client.websocket_connect(f"{SOCKETS}/{path}", headers={**ORIGIN, **headers})
+
+
+def until(condition: Callable[[], Any], what: str = "it happened") -> None:
+    """Wait for what nothing signals."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline, f"waited {PATIENCE_S} s in vain until {what}"
+        time.sleep(0.002)

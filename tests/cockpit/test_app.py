@@ -6,7 +6,9 @@ import json
 import struct
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -14,15 +16,21 @@ import numpy as np
 import pytest
 from starlette.websockets import WebSocketDisconnect
 
-from skyloop.cockpit.app import STATIC, create_app
-from skyloop.cockpit.security import own_names
-from skyloop.messages import Annotation, LinkState, Points, Polyline, Severity, Text
-from tests.cockpit.fake import FakeDrone, flying
+from skyloop.messages import (
+    Annotation,
+    Applied,
+    CameraInfo,
+    Capabilities,
+    LinkState,
+    LogEntry,
+    Points,
+    Polyline,
+    Severity,
+    Text,
+    Velocity,
+)
+from tests.cockpit.fake import FakeDrone, cockpit, fake_fleet, flying, open_socket, until
 from tests.cockpit.testclient import TestClient, WebSocketTestSession
-
-OWN = "http://127.0.0.1:8123"
-SOCKETS = "ws://127.0.0.1:8123/ws/drones"
-ORIGIN = {"origin": OWN}
 
 
 @pytest.fixture
@@ -32,24 +40,16 @@ def drone() -> FakeDrone:
 
 @pytest.fixture
 def client(drone: FakeDrone) -> Iterator[TestClient]:
-    app = create_app({"alpha": drone}, own_names("127.0.0.1", 8123))  # type: ignore[dict-item]
-    with TestClient(app, base_url=OWN) as client:
+    with cockpit(fake_fleet({"alpha": drone})) as client:
         yield client
 
 
 def telemetry(client: TestClient) -> WebSocketTestSession:
-    return client.websocket_connect(f"{SOCKETS}/alpha/telemetry", headers=ORIGIN)
+    return open_socket(client, "drones/alpha/telemetry")
 
 
 def video(client: TestClient, camera: str = "front") -> WebSocketTestSession:
-    return client.websocket_connect(f"{SOCKETS}/alpha/video/{camera}", headers=ORIGIN)
-
-
-def until(condition: Any, timeout_s: float = 5.0) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, "it did not happen in time"
-        time.sleep(0.002)
+    return open_socket(client, f"drones/alpha/video/{camera}")
 
 
 def frame(message: bytes) -> tuple[dict[str, Any], np.ndarray]:
@@ -65,23 +65,20 @@ def statistics(client: TestClient) -> dict[str, Any]:
     return answer
 
 
-def test_page_and_everything_that_it_names_is_served(client: TestClient) -> None:
-    page = client.get("/")
-    assert page.status_code == 200
-    assert "Skyloop" in page.text
-    for file in STATIC.rglob("*.*"):
-        answer = client.get(f"/static/{file.relative_to(STATIC).as_posix()}")
-        assert answer.status_code == 200
-        if file.suffix == ".js":
-            assert "javascript" in answer.headers["content-type"]
-    assert client.get("/static/../app.py").status_code == 404
-    assert client.get("/nothing").status_code == 404
-
-
-def test_safety_states_are_labelled_for_screen_readers(client: TestClient) -> None:
-    page = client.get("/").text
-    for label in ('role="alert"', 'aria-label="Flight state"', 'aria-label="Battery"', "Who holds the authority"):
-        assert label in page
+def test_the_page_and_its_files_are_served(drone: FakeDrone, tmp_path: Path) -> None:
+    static = tmp_path / "static"
+    static.mkdir()
+    (tmp_path / "secret.txt").write_text("secret")
+    with cockpit(fake_fleet({"alpha": drone}), static=static) as client:
+        answer = client.get("/")
+        assert (answer.status_code, "not built" in answer.text) == (503, True)
+        (static / "index.html").write_text("<title>Cockpit</title>")
+        (static / "page.js").write_text("export {}")
+        assert "Cockpit" in client.get("/").text
+        assert "javascript" in client.get("/static/page.js").headers["content-type"]
+        for path in ("/static/../secret.txt", "/static/%2e%2e/secret.txt", "/static/nothing.js"):
+            assert client.get(path).status_code == 404
+        assert client.get("/nothing").status_code == 404
 
 
 def test_drones_are_listed(client: TestClient) -> None:
@@ -90,30 +87,139 @@ def test_drones_are_listed(client: TestClient) -> None:
     ]
 
 
+def follow(socket: WebSocketTestSession, enough: Callable[[dict[str, Any]], Any]) -> dict[str, Any]:
+    """The first state that is enough."""
+    deadline = time.monotonic() + 5
+    while time.monotonic() < deadline:
+        message: dict[str, Any] = socket.receive_json()
+        if message["type"] == "state" and enough(message):
+            return message
+    raise AssertionError("no such state came")
+
+
 def test_telemetry_flows(client: TestClient, drone: FakeDrone) -> None:
     drone.tell("authority to demo", app="demo")
     with telemetry(client) as socket:
         vehicle = socket.receive_json()
         assert (vehicle["type"], vehicle["name"], vehicle["can_fly"]) == ("vehicle", "alpha", True)
+        assert vehicle["priorities"] == [0, 31]
         first = socket.receive_json()
         assert first["feedback"] is None
-        assert first["channels"]["feedback"]["delay_s"]["median"] == pytest.approx(0.0002)
+        assert first["attitude"] is None
+        assert [event["text"] for event in first["events"]] == ["authority to demo"]
+        channels = follow(socket, lambda state: state["channels"])["channels"]
+        assert channels["feedback"]["delay_s"]["median"] == pytest.approx(0.0002)
         drone.newest = flying(battery=float("nan"))
         drone.link.vehicle = LinkState.LOST
         drone.tell("vehicle link lost", severity=Severity.ERROR)
-        told = [event["text"] for event in first["events"]]
-        state = first
-        while state["feedback"] is None or len(told) < 2:
-            state = socket.receive_json()
-            told += [event["text"] for event in state["events"]]
-        assert told == ["authority to demo", "vehicle link lost"]
+        state = follow(socket, lambda state: state["events"])
+        assert [event["text"] for event in state["events"]] == ["vehicle link lost"], "each is told once"
+        state = follow(socket, lambda state: state["feedback"])
         feedback = state["feedback"]
-        assert feedback["state"] == "flying"
-        assert feedback["owner"] == "demo"
+        assert feedback["state"] == state["flight"] == "flying"
+        assert feedback["owner"] == state["owner"] == "demo"
         assert feedback["battery"] is None, "NaN is no JSON"
-        assert feedback["altitude"] == pytest.approx(1.25)
+        assert state["altitude"] == pytest.approx(1.25)
+        assert state["attitude"] == {"roll": 0.1, "pitch": -0.05, "yaw": 1.0}
         assert feedback["age_s"] >= 0
-        assert state["link"]["vehicle"] == "lost"
+        assert state["link"]["vehicle"] == state["links"]["vehicle"] == "lost"
+        assert state["authority"] == {"holder": "demo", "priority": 16, "lease": 3, "me": False}
+        assert "link to the vehicle lost" in state["alarms"]
+
+
+def test_commands_and_logs_are_heard_while_somebody_looks(client: TestClient, drone: FakeDrone) -> None:
+    assert not drone.command_listeners
+    assert not drone.log_listeners
+    drone.newest = flying(native={"pwm": 3, "name": "x", "gyro": (1.0, 2.0)})
+    with telemetry(client) as socket:
+        follow(socket, lambda _: True)
+        now_ns = time.monotonic_ns()
+        drone.command_listeners[0](Applied(1, 3, 1, now_ns, now_ns, Velocity(forward=2.0), Velocity(forward=1.0)))
+        drone.log_listeners[0](LogEntry("demo", "range", now_ns, number=1.5))
+        drone.log_listeners[0](LogEntry("demo", "", now_ns, text="words are no number"))
+        places = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
+        drone.log_listeners[0](LogEntry("demo", "waypoints", now_ns, values=places, shape=(2, 3)))
+        state = follow(socket, lambda state: state["waypoints"])
+        values = state["values"]
+        assert values["log.range"] == 1.5
+        assert values["native.pwm"] == 3
+        assert values["native.gyro.1"] == 2.0
+        assert "native.name" not in values
+        assert values["velocity.forward"] == pytest.approx(0.3)
+        assert values["set_point.forward"] == 1.0, "as it was applied"
+        assert state["set_points"]["action"] == "velocity"
+        assert [one["position"] for one in state["waypoints"]] == [[1, 2, 3], [4, 5, 6]]
+    until(lambda: not drone.command_listeners and not drone.log_listeners)
+
+
+def test_another_vehicle_under_the_same_name_is_told(client: TestClient, drone: FakeDrone) -> None:
+    with telemetry(client) as socket:
+        assert socket.receive_json()["cameras"][0]["width"] == 64
+        socket.receive_json()
+        drone.capabilities = Capabilities("other", frozenset(), (CameraInfo("top", 32, 24, 15.0),))
+        message = socket.receive_json()
+        while message["type"] != "vehicle":
+            message = socket.receive_json()
+        assert message["cameras"] == [{"name": "top", "width": 32, "height": 24}]
+
+
+def test_overview_shows_all_drones() -> None:
+    alpha, beta = FakeDrone(), FakeDrone()
+    beta.newest = flying(battery=0.05, position=(1.0, 2.0, 3.0))
+    with (
+        cockpit(fake_fleet({"beta": beta, "alpha": alpha})) as client,
+        open_socket(client, "overview") as first,
+        open_socket(client, "overview") as second,
+    ):
+        message = first.receive_json()
+        assert message["type"] == "overview"
+        one, two = message["drones"]
+        assert (one["name"], one["state"], one["airborne"], one["position"]) == ("alpha", "unknown", False, None)
+        assert (two["name"], two["state"], two["airborne"], two["position"]) == ("beta", "flying", True, [1, 2, 3])
+        assert (two["owner"], two["me"], two["recording"]) == ("demo", False, False)
+        assert two["alarms"] == ["battery low: 5%"]
+        assert two["links"]["application"] == "up"
+        assert two["cameras"][1] == {"name": "bottom", "width": 64, "height": 48}
+        assert second.receive_json()["drones"][0]["name"] == "alpha"
+        alpha.link.application = LinkState.LOST
+        alpha.link.reason = "killed"
+        deadline = time.monotonic() + 5
+        while not (row := first.receive_json()["drones"][0])["alarms"]:
+            assert time.monotonic() < deadline
+        assert row["links"]["application"] == "lost"
+        assert row["alarms"] == ["link to the proxy lost: killed"]
+
+
+def test_stale_video_is_an_alarm(client: TestClient, drone: FakeDrone) -> None:
+    drone.newest = flying()
+    with video(client) as picture, telemetry(client) as socket:
+        until(lambda: drone.processors["front"])
+        assert follow(socket, lambda _: True)["alarms"] == []
+        old = drone.show(10, captured_ns=time.monotonic_ns() - 3_000_000_000)
+        head, _ = frame(picture.receive_bytes())
+        assert head["captured_ns"] == str(old.captured_ns)
+        drone.newest = flying()
+        state = follow(socket, lambda state: state["alarms"])
+        assert "video of front is 3." in state["alarms"][0]
+
+
+def wait_for_acknowledgements(client: TestClient, count: int) -> None:
+    until(lambda: statistics(client)["frames_acknowledged"] == count, f"{count} were acknowledged")
+
+
+def test_one_picture_is_made_for_all_pages(client: TestClient, drone: FakeDrone) -> None:
+    with ExitStack() as stack:
+        pages = [stack.enter_context(video(client)) for _ in range(10)]
+        until(lambda: drone.processors["front"])
+        for number in (1, 2, 3):
+            drone.show(number)
+            for page in pages:
+                head, _ = frame(page.receive_bytes())
+                page.send_json({"ack": head["ack"]})
+            wait_for_acknowledgements(client, 10 * number)
+        counts = statistics(client)
+        assert (counts["frames_sent"], counts["frames_encoded"]) == (30, 3)
+        assert len(drone.processors["front"]) == 1
 
 
 def test_telemetry_comes_steadily(client: TestClient, drone: FakeDrone) -> None:
@@ -177,7 +283,7 @@ def test_pages_are_independent_and_the_camera_rests_without_them(client: TestCli
                 head, image = frame(quick.receive_bytes())
                 assert image.mean() == pytest.approx(shade, abs=2)
                 quick.send_json({"ack": head["ack"]})
-                until(lambda n=head["ack"]: statistics(client)["frames_acknowledged"] == n)
+                wait_for_acknowledgements(client, head["ack"])
         assert len(drone.processors["front"]) == 1
     until(lambda: not drone.processors["front"])
 
@@ -243,10 +349,10 @@ def test_words_to_the_telemetry_stream_end_the_connection(client: TestClient) ->
         assert message["code"] == 1008
 
 
-@pytest.mark.parametrize("path", ["beta/telemetry", "beta/video/front", "alpha/video/rear"])
+@pytest.mark.parametrize("path", ["beta/telemetry", "beta/video/front", "alpha/video/rear", "beta/control"])
 def test_unknown_names_are_told(client: TestClient, path: str) -> None:
     with (
-        client.websocket_connect(f"{SOCKETS}/{path}", headers=ORIGIN) as socket,
+        open_socket(client, f"drones/{path}") as socket,
         pytest.raises(WebSocketDisconnect) as ended,
     ):
         socket.receive_json()
@@ -262,12 +368,12 @@ def test_pages_are_counted(client: TestClient, drone: FakeDrone) -> None:
 
 def test_everything_is_given_back(drone: FakeDrone) -> None:
     before = threading.active_count()
-    app = create_app({"alpha": drone}, own_names("127.0.0.1", 8123))  # type: ignore[dict-item]
-    with TestClient(app, base_url=OWN) as client, video(client) as socket:
+    with cockpit(fake_fleet({"alpha": drone})) as client, video(client) as socket:
         until(lambda: drone.processors["front"])
         drone.show(10)
         socket.receive_bytes()
     assert not drone.event_listeners
     assert not drone.annotation_listeners
     assert not drone.processors["front"]
+    assert drone.closed
     until(lambda: threading.active_count() <= before)

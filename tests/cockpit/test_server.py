@@ -1,46 +1,101 @@
-"""Starting and ending the cockpit: what goes wrong is told, and it goes away with its parent."""
+"""Starting and ending the cockpit: what goes wrong is told, who may come in, and it goes away with its parent."""
 
 from __future__ import annotations
 
+import asyncio
 import builtins
 import json
+import os
+import shutil
 import socket
+import ssl
+import subprocess
 import sys
+import threading
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
-from websockets.exceptions import InvalidStatus
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect as open_socket
 from websockets.typing import Origin
 
 from skyloop.client import connect
-from skyloop.cockpit import serve_cockpit
+from skyloop.cockpit import Access, serve_cockpit
 from skyloop.cockpit.__main__ import main
 from skyloop.cockpit.child import CockpitProcess
+from skyloop.cockpit.server import NICENESS
+from skyloop.cockpit.testing import PageClient, Pages
 from skyloop.errors import LinkError, MissingExtraError, UnknownNameError, UsageError
+from skyloop.messages import FlightState
+
+PILOT = "pilot-token-0123456789"
+OBSERVER = "observer-token-0123456789"
 
 
-def test_only_loopback() -> None:
-    with pytest.raises(UsageError, match="loopback"):
-        serve_cockpit("nobody-here", host="0.0.0.0")
+@pytest.fixture(autouse=True)
+def own_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Where recordings would go; and a directory of sockets for this test alone."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", str(tmp_path / "run"))
+
+
+@pytest.fixture
+def tokens(tmp_path: Path) -> Path:
+    path = tmp_path / "tokens"
+    path.write_text(f"pilot {PILOT} ann\nobserver {OBSERVER}\n")
+    path.chmod(0o600)
+    return path
+
+
+# What goes wrong ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "192.168.1.4", "::"])
+def test_beyond_loopback_not_everybody_may_come_in(host: str) -> None:
+    with pytest.raises(UsageError, match="--token-file"):
+        serve_cockpit(access=Access(host))
+
+
+def test_what_does_not_go_together_is_told(tmp_path: Path) -> None:
+    one = tmp_path / "one"
+    for given, said in (
+        ({"tls_cert": one}, "--tls-key"),
+        ({"tls_key": one}, "--tls-cert"),
+        ({"client_ca": one}, "need TLS"),
+        ({"client_ca": one, "tls_cert": one, "tls_key": one, "token_file": one}, "not from both"),
+    ):
+        with pytest.raises(UsageError, match=said):
+            Access(**given)  # type: ignore[arg-type]
+
+
+def test_files_that_can_not_be_used_are_told(tmp_path: Path, tokens: Path) -> None:
+    with pytest.raises(UsageError, match="can't be read"):
+        serve_cockpit(access=Access(token_file=tmp_path / "gone"))
+    with pytest.raises(UsageError, match="can't be used for TLS"):
+        serve_cockpit(access=Access(token_file=tokens, tls_cert=tmp_path / "gone", tls_key=tokens))
 
 
 def test_port_in_use() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(UsageError, match=f"port {port} of 127.0.0.1 is in use"):
-            serve_cockpit("nobody-here", port=port)
+            serve_cockpit(["nobody-here"], port=port)
 
 
 @pytest.mark.parametrize("port", [-1, 70000])
 def test_port_that_is_none(port: int) -> None:
     with pytest.raises(UsageError, match="can't be used"):
-        serve_cockpit("nobody-here", port=port)
+        serve_cockpit(port=port)
 
 
 def test_no_such_proxy(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(UnknownNameError, match="nobody-here"):
-        serve_cockpit("nobody-here")
+        serve_cockpit(["nobody-here"])
     assert main(["nobody-here"]) == 2
     assert "no proxy named 'nobody-here'" in capsys.readouterr().err
 
@@ -56,7 +111,7 @@ def test_missing_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "uvicorn", raising=False)
     monkeypatch.setattr(builtins, "__import__", refuse)
     with pytest.raises(MissingExtraError, match=r"skyloop\[cockpit\]"):
-        serve_cockpit("nobody-here")
+        serve_cockpit()
 
 
 @pytest.mark.process
@@ -65,9 +120,150 @@ def test_child_tells_why_it_did_not_start() -> None:
         page.address()
 
 
+# In this process ---------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def served(**options: Any) -> Iterator[str]:
+    """A cockpit on a thread, which alone becomes nicer; its address."""
+    ready, stop, told = threading.Event(), threading.Event(), []
+
+    def tell(address: str) -> None:
+        told.append(address)
+        ready.set()
+
+    thread = threading.Thread(target=serve_cockpit, kwargs={"on_ready": tell, "stop": stop, **options})
+    thread.start()
+    try:
+        assert ready.wait(10)
+        yield told[0].rstrip("/")
+    finally:
+        stop.set()
+        thread.join(10)
+    assert not thread.is_alive()
+
+
+def ask(address: str, path: str, token: str | None = None, tls: ssl.SSLContext | None = None) -> Any:
+    request = urllib.request.Request(f"{address}{path}")
+    if token is not None:
+        request.add_header("Authorization", f"Bearer {token}")
+    with urllib.request.urlopen(request, timeout=5, context=tls) as answer:
+        return json.load(answer)
+
+
+def test_tokens_on_the_network(tokens: Path) -> None:
+    with served(access=Access("0.0.0.0", token_file=tokens)) as address:
+        here = address.replace("0.0.0.0", "127.0.0.1")
+        assert ask(here, "/api/session")["login"]
+        assert ask(here, "/api/session", PILOT) == {"role": "pilot", "name": "ann", "login": True, "hint": ""}
+        assert ask(here, "/api/drones", OBSERVER) == []
+        for token in (None, "wrong-token-0123456789"):
+            with pytest.raises(urllib.error.HTTPError) as refused:
+                ask(here, "/api/drones", token)
+            assert refused.value.code == 401
+            refused.value.close()
+        with pytest.raises(LinkError, match="4401"):
+            asyncio.run(PageClient(here, "alpha").run())
+        with pytest.raises(LinkError, match="4404"):
+            asyncio.run(PageClient(here, "alpha", token=OBSERVER).run())
+        with pytest.raises(LinkError, match="did not open"), Pages(here, "alpha"):
+            pass
+
+
+def test_programs_of_this_user_are_let_in_without_a_word() -> None:
+    before = os.nice(0)
+    with served() as address:
+        assert ask(address, "/api/session") == {"role": "pilot", "name": "", "login": False, "hint": ""}
+        request = urllib.request.Request(f"{address}/api/session", headers={"X-Forwarded-For": "192.0.2.1"})
+        with urllib.request.urlopen(request, timeout=5) as answer:
+            assert json.load(answer)["role"] == "pilot", "who is there is asked of the kernel, not of a header"
+    assert os.nice(0) == before
+
+
+@pytest.fixture(scope="module")
+def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An authority, a server, a pilot, an observer, somebody without a role, and a pilot of another authority."""
+    if shutil.which("openssl") is None:
+        pytest.skip("makes certificates with openssl, which is not here")
+    folder = tmp_path_factory.mktemp("tls")
+
+    def openssl(*words: str) -> None:
+        subprocess.run(["openssl", *words], cwd=folder, check=True, capture_output=True, timeout=30)
+
+    key = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes")
+    for authority in ("ca", "other"):
+        openssl(
+            *("req", "-x509", *key, "-keyout", f"{authority}.key", "-out", f"{authority}.pem"),
+            *("-subj", f"/CN={authority}", "-days", "2"),
+        )
+    (folder / "server.ext").write_text("subjectAltName=IP:127.0.0.1\n")
+    for name, subject, authority in (
+        ("server", "/CN=server", "ca"),
+        ("pilot", "/OU=pilot/CN=Ann", "ca"),
+        ("observer", "/OU=observer/CN=Bob", "ca"),
+        ("nobody", "/OU=guest/CN=Eve", "ca"),
+        ("stranger", "/OU=pilot/CN=Mallory", "other"),
+    ):
+        openssl("req", *key, "-keyout", f"{name}.key", "-out", f"{name}.csr", "-subj", subject)
+        extra = ("-extfile", "server.ext") if name == "server" else ()
+        openssl(
+            *("x509", "-req", "-in", f"{name}.csr", "-CA", f"{authority}.pem", "-CAkey", f"{authority}.key"),
+            *("-out", f"{name}.pem", "-days", "2", "-CAcreateserial", *extra),
+        )
+    return folder
+
+
+def visitor(folder: Path, name: str | None) -> ssl.SSLContext:
+    context = ssl.create_default_context(cafile=str(folder / "ca.pem"))
+    if name is not None:
+        context.load_cert_chain(folder / f"{name}.pem", folder / f"{name}.key")
+    return context
+
+
+def test_certificates(certificates: Path) -> None:
+    access = Access(
+        "0.0.0.0",
+        tls_cert=certificates / "server.pem",
+        tls_key=certificates / "server.key",
+        client_ca=certificates / "ca.pem",
+    )
+    with served(access=access) as address:
+        assert address.startswith("https://")
+        here = address.replace("0.0.0.0", "127.0.0.1")
+        for name, person in (("pilot", ("pilot", "Ann")), ("observer", ("observer", "Bob")), ("nobody", (None, ""))):
+            told = ask(here, "/api/session", tls=visitor(certificates, name))
+            assert (told["role"], told["name"]) == person
+        for context in (visitor(certificates, None), visitor(certificates, "stranger")):
+            with pytest.raises(OSError, match=r"alert|certificate|closed|reset"):
+                ask(here, "/api/session", tls=context)
+        for name, code in (("nobody", 4401), ("observer", 4403), ("pilot", 4404)):
+            own, path = Origin(here), "/ws/drones/alpha/control"
+            with open_socket(f"ws{here[4:]}{path}", origin=own, ssl=visitor(certificates, name)) as opened:
+                with pytest.raises(ConnectionClosed):
+                    opened.recv(5)
+                assert opened.close_code == code
+        with pytest.raises(InvalidStatus):
+            open_socket(
+                f"ws{here[4:]}/ws/overview", origin=Origin(f"http{here[5:]}"), ssl=visitor(certificates, "pilot")
+            )
+
+
+def test_tokens_over_tls(certificates: Path, tokens: Path) -> None:
+    access = Access(token_file=tokens, tls_cert=certificates / "server.pem", tls_key=certificates / "server.key")
+    with served(access=access) as address:
+        body = json.dumps({"token": PILOT}).encode()
+        headers = {"Content-Type": "application/json", "Origin": address}
+        request = urllib.request.Request(f"{address}/api/login", body, headers)
+        with urllib.request.urlopen(request, timeout=5, context=visitor(certificates, None)) as answer:
+            assert "Secure" in answer.headers["Set-Cookie"]
+
+
+# As a process of its own --------------------------------------------------------------------------------------------
+
+
 @pytest.mark.process
-def test_page_of_a_real_drone() -> None:
-    with connect("sim://?cameras=front&width=64&fps=10") as drone, CockpitProcess(drone.name) as page:
+def test_page_of_a_real_drone(tmp_path: Path) -> None:
+    with connect("sim://?cameras=front&width=64&fps=10&position=1") as drone, CockpitProcess(drone.name) as page:
         own = page.address().rstrip("/")
         streams = f"{own.replace('http', 'ws')}/ws/drones/{drone.name}"
         with open_socket(f"{streams}/telemetry", origin=Origin(own)) as telemetry:
@@ -75,6 +271,7 @@ def test_page_of_a_real_drone() -> None:
             assert vehicle["cameras"] == [{"name": "front", "width": 64, "height": 48}]
             assert state["feedback"]["state"] == "landed"
             assert state["link"]["application"] == "up"
+            assert state["truth"]["position"]
         with open_socket(f"{streams}/video/front", origin=Origin(own)) as video:
             frame = video.recv(5)
             assert isinstance(frame, bytes)
@@ -84,8 +281,36 @@ def test_page_of_a_real_drone() -> None:
             video.send(json.dumps({"ack": 1}))
             assert isinstance(video.recv(5), bytes)
         for foreign in (Origin("http://evil.example"), None):
-            with pytest.raises(InvalidStatus) as refused:
-                open_socket(f"{streams}/telemetry", origin=foreign)
-            assert refused.value.response.status_code == 403
+            for path in ("telemetry", "control"):
+                with pytest.raises(InvalidStatus) as refused:
+                    open_socket(f"{streams}/{path}", origin=foreign)
+                assert refused.value.response.status_code == 403
         assert page.statistics()["frames_sent"] == 2
         assert drone.authority.state == "held", "who watches takes nothing away"
+        with Pages(own, drone.name, count=3) as pages:
+            for client in pages.clients:
+                while client.frames < 3:
+                    drone.next_frame()
+            assert pages.problem is None
+            assert pages.newest_age_s is not None
+        assert page.statistics()["frames_encoded"] <= drone.stats["video/front"].count + 5
+        with open_socket(f"{streams}/control", origin=Origin(own)) as control:
+            control.send('{"do":"take","priority":2}')
+            told: dict[str, Any] = {}
+            while told != {"type": "done", "do": "take"}:
+                told = json.loads(control.recv(5))
+            control.send('{"do":"takeoff"}')
+            drone.wait("taking_off", 5)
+        drone.wait(lambda feedback: feedback.owner_id == drone.app_id, 5)
+        assert drone.feedback().state is not FlightState.LANDED, "left as it was, for who is next"
+        assert not (tmp_path / "recordings").exists()
+
+
+@pytest.mark.process
+def test_the_process_makes_room_for_who_flies(tmp_path: Path) -> None:
+    with CockpitProcess(recordings=tmp_path / "here") as page:
+        page.address()
+        pid = page.pid
+        assert os.getpriority(os.PRIO_PROCESS, pid) == os.getpriority(os.PRIO_PROCESS, 0) + NICENESS
+        assert ask(page.address().rstrip("/"), "/api/recordings")["folder"] == str(tmp_path / "here")
+    assert not Path(f"/proc/{pid}").exists()

@@ -44,7 +44,7 @@ COMMANDS: Final = {
     ),
     "record": Entry("record", "record", "Record drones to an MCAP file", "record alpha -o flight.mcap"),
     "log": Entry("log", "log", "Look at recordings, export, compare and mend them", "log info flight.mcap"),
-    "cockpit": Entry("cockpit", "cockpit", "A page in the browser that watches a drone", "cockpit alpha"),
+    "cockpit": Entry("cockpit", "cockpit", "A page in the browser to watch and fly drones", "cockpit --port 8000"),
     "doctor": Entry("doctor", "doctor", "What of this machine works, and what to install", "doctor"),
     "bench": Entry("bench", "bench", "Measure the delays of each channel", "bench delays --seconds 30"),
 }

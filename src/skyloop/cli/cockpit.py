@@ -1,17 +1,46 @@
-"""``skyloop cockpit``: a page in the browser that watches a drone."""
+"""``skyloop cockpit``: a page in the browser to watch and fly drones."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from skyloop.messages import Role
+
 
 def cockpit(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="A running proxy; skyloop list shows them")],
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="NAME", help="Running proxies; without names: all, as they come and go"),
+    ] = None,
     port: Annotated[int, typer.Option(metavar="PORT", min=0, max=65535, help="Of the page; 0 takes a free one")] = 0,
+    host: Annotated[
+        str, typer.Option(metavar="ADDRESS", help="To listen on; beyond loopback tokens or certificates are needed")
+    ] = "127.0.0.1",
+    token_file: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Who may come in: lines of ROLE TOKEN [NAME]")
+    ] = None,
+    tls_cert: Annotated[Path | None, typer.Option(metavar="FILE", help="The page's certificate, PEM")] = None,
+    tls_key: Annotated[Path | None, typer.Option(metavar="FILE", help="Its key, PEM")] = None,
+    client_ca: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Let in whose certificate this authority signed; its OU is the role"),
+    ] = None,
+    role: Annotated[Role, typer.Option(help="Of everybody who asks, without tokens or certificates")] = Role.PILOT,
+    hostname: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="A name by which browsers reach this machine; repeatable")
+    ] = None,
+    recordings: Annotated[Path, typer.Option(metavar="FOLDER", help="Of recordings, made when needed")] = Path(
+        "recordings"
+    ),
 ) -> None:
-    """Serve a page on loopback with live video, attitude, authority and link health of one drone, until Ctrl-C."""
-    from skyloop.cockpit import serve_cockpit
+    """Serve a page to watch and fly drones: video, instruments, map, plots, parameters, recordings. Until Ctrl-C.
 
-    serve_cockpit(name, port=port)
+    It is open to programs of the same user on this machine only, unless tokens or certificates let others in.
+    """
+    from skyloop.cockpit import Access, serve_cockpit
+
+    access = Access(host, token_file, tls_cert, tls_key, client_ca, role, tuple(hostname or ()))
+    serve_cockpit(names or (), port=port, access=access, recordings=recordings)

@@ -1,13 +1,18 @@
-"""The cockpit: a page on loopback from which a person watches a drone. Needs the extra ``cockpit``.
+"""The cockpit: a page from which a person watches, flies and understands every drone. Needs the extra ``cockpit``.
 
-An observer application like any other, in a process of its own: ``python -m skyloop.cockpit NAME``.
+An application like any other, in a process of its own: ``skyloop cockpit`` or ``python -m skyloop.cockpit``. It
+observes; a page that takes control gets a pilot's connection of its own for as long as it has it.
 
-- ``server`` runs it, ``app`` has the routes, ``security`` decides who may ask;
-- ``feeds`` bring what the client delivers onto the event loop, ``telemetry`` is the view model, ``stream`` the senders,
-  one per open page;
-- ``static`` is the page: plain HTML, CSS and JavaScript modules, nothing fetched from elsewhere.
+- ``server`` runs it, ``app`` and ``api`` have the routes; ``security`` decides which requests are answered, ``access``
+  who asks (``peers``: whose program is at the other end of a loopback connection);
+- ``finder`` finds proxies, ``fleet`` keeps a ``station`` for each drone, with what all its pages share: ``feeds``
+  bring what the client delivers onto the event loop, ``telemetry``, ``values`` and ``alarms`` are the view model,
+  ``overview`` one row of it, made at a ``beat``; ``stream`` sends, one object per open page;
+- ``control`` flies for a page that took control, by ``orders``, with ``hands`` of its own; ``recordings`` records;
+- ``testing`` is a page without a browser, ``child`` runs the cockpit beside a program;
+- ``static`` is the page itself, built; nothing is fetched from elsewhere.
 """
 
-from skyloop.cockpit.server import serve_cockpit
+from skyloop.cockpit.server import Access, serve_cockpit
 
-__all__ = ["serve_cockpit"]
+__all__ = ["Access", "serve_cockpit"]

@@ -1,4 +1,4 @@
-"""``python -m skyloop.cockpit NAME``: the cockpit as a process of its own. Prints its address as the first line."""
+"""``python -m skyloop.cockpit [NAME …]``: the cockpit as a process of its own. Prints its address as the first line."""
 
 from __future__ import annotations
 
@@ -6,17 +6,18 @@ import argparse
 import os
 import sys
 import threading
+from pathlib import Path
 
-from skyloop.cockpit.server import serve_cockpit
+from skyloop.cockpit.server import RECORDINGS, serve_cockpit
 from skyloop.errors import SkyloopError
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Exit code 0; 2 with a line of explanation when it could not start."""
-    parser = argparse.ArgumentParser(prog="python -m skyloop.cockpit", description="A page that shows a drone live.")
-    parser.add_argument("name", help="of a running proxy")
-    parser.add_argument("--host", default="127.0.0.1", help="loopback address to listen on (default: %(default)s)")
+    parser = argparse.ArgumentParser(prog="python -m skyloop.cockpit", description="A page to watch and fly drones.")
+    parser.add_argument("names", metavar="name", nargs="*", help="of running proxies (default: all, as they come)")
     parser.add_argument("--port", type=int, default=0, help="0 takes a free one (default)")
+    parser.add_argument("--recordings", type=Path, default=RECORDINGS, help="folder for recordings")
     parser.add_argument("--parent-fd", type=int, help="end when this descriptor (the reading end of a pipe) ends")
     given = parser.parse_args(arguments)
     stop = threading.Event()
@@ -25,7 +26,11 @@ def main(arguments: list[str] | None = None) -> int:
         watcher.start()
     try:
         serve_cockpit(
-            given.name, given.host, given.port, on_ready=lambda address: print(address, flush=True), stop=stop
+            given.names,
+            port=given.port,
+            recordings=given.recordings,
+            on_ready=lambda address: print(address, flush=True),
+            stop=stop,
         )
     except SkyloopError as error:
         print(f"cockpit: {error}", file=sys.stderr)

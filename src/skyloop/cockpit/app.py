@@ -1,127 +1,133 @@
-"""The cockpit's routes. One page, a few questions answered in JSON, two WebSockets per drone and page.
+"""The cockpit's routes: one page, questions and orders in JSON, WebSockets for what moves. ``docs/cockpit.md`` has all.
 
 ======================================  ==================================================================
 ``/``, ``/static/…``                    the page
-``/api/drones``                         names of the drones and of their cameras
-``/api/statistics``                     what pages were sent: see :class:`skyloop.cockpit.stream.PageCounts`
-``/ws/drones/NAME/telemetry``           to the page: ``vehicle`` once, then ``state`` with new events, as JSON
+``/api/…``                              see :mod:`skyloop.cockpit.api`
+``/ws/overview``                        to the page: all drones, twice a second
+``/ws/drones/NAME/telemetry``           to the page: ``vehicle``, then ``state`` with new events, as JSON
 ``/ws/drones/NAME/video/CAMERA``        to the page: frames (binary) and drawings (JSON); back: ``{"ack": n}``
+``/ws/drones/NAME/control``             from the page: orders; to the page: what became of them, who has control
 ======================================  ==================================================================
 """
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Mapping
+import asyncio
+from collections.abc import AsyncIterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Final
 
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse
+from starlette.responses import FileResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
-from skyloop.cockpit.feeds import CameraFeed, NewsFeed
-from skyloop.cockpit.security import Guard
-from skyloop.cockpit.stream import PageCounts, TelemetrySender, VideoSender
-from skyloop.cockpit.telemetry import TelemetryView
-
-if TYPE_CHECKING:
-    from skyloop.client import Drone
+from skyloop.cockpit.access import Gate
+from skyloop.cockpit.api import Api
+from skyloop.cockpit.control import ControlSession
+from skyloop.cockpit.fleet import Fleet
+from skyloop.cockpit.overview import Overview
+from skyloop.cockpit.recordings import Recordings
+from skyloop.cockpit.security import NOT_ALLOWED, Guard, Names, person_of
+from skyloop.cockpit.station import Station
+from skyloop.cockpit.stream import UNKNOWN, BeatSender, PageCounts, TelemetrySender, VideoSender
+from skyloop.messages import Role
 
 STATIC = Path(__file__).with_name("static")
-_UNKNOWN = 4404  # close code: no such drone or camera
-
-
-class Station:
-    """One drone with what all its pages share. Made and closed on the event loop."""
-
-    def __init__(self, drone: Drone) -> None:
-        self.drone = drone
-        self.news = NewsFeed(drone)
-        self.view = TelemetryView(drone)
-        self.cameras = {info.name: CameraFeed(drone, info.name) for info in drone.capabilities.cameras}
-
-    def close(self) -> None:
-        self.news.close()
-        for feed in self.cameras.values():
-            feed.close()
+_THREADS: Final = 32  # for what waits: proxies that answer late, recorders that end
 
 
 class Cockpit:
-    """Answers the requests."""
+    """Answers what is no question in JSON."""
 
-    def __init__(self, drones: Mapping[str, Drone]) -> None:
-        self._drones = drones
-        self._stations: dict[str, Station] = {}
+    def __init__(self, fleet: Fleet, recordings: Recordings, static: Path) -> None:
         self.counts = PageCounts()
+        self._page = static / "index.html"
+        self._fleet = fleet
+        self._recordings = recordings
+        self._overview = Overview(fleet, recordings)
 
     @asynccontextmanager
     async def lifespan(self, _: Starlette) -> AsyncIterator[None]:
-        self._stations = {name: Station(drone) for name, drone in self._drones.items()}
+        asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(_THREADS, "cockpit"))
+        await self._fleet.start()
         try:
             yield
         finally:
-            for station in self._stations.values():
-                station.close()
+            self._overview.beat.end()
+            await self._recordings.close()
+            await self._fleet.close()
 
-    async def page(self, _: Request) -> FileResponse:
-        return FileResponse(STATIC / "index.html")
+    async def page(self, _: Request) -> Response:
+        if not self._page.is_file():
+            return PlainTextResponse(f"The page is not built: there is no {self._page}. Run make in the sources.", 503)
+        return FileResponse(self._page)
 
-    async def drones(self, _: Request) -> JSONResponse:
-        return JSONResponse(
-            [{"name": name, "uri": s.drone.uri, "cameras": list(s.cameras)} for name, s in self._stations.items()]
-        )
-
-    async def statistics(self, _: Request) -> JSONResponse:
-        counts = self.counts
-        return JSONResponse(
-            {
-                "pages": counts.pages,
-                "frames_sent": counts.frames_sent,
-                "frames_acknowledged": counts.frames_acknowledged,
-                "frames_skipped": counts.frames_skipped,
-                "sources": sorted(counts.sources),
-            }
-        )
+    async def overview(self, socket: WebSocket) -> None:
+        await socket.accept()
+        await BeatSender(socket, self._overview.beat).run()
 
     async def telemetry(self, socket: WebSocket) -> None:
-        station = self._stations.get(socket.path_params["name"])
-        await socket.accept()
+        station = await self._accept(socket)
         if station is None:
-            await socket.close(_UNKNOWN, "no such drone")
             return
         self.counts.pages += 1
         try:
-            await TelemetrySender(socket, station.view, station.news).run()
+            await TelemetrySender(socket, station).run()
         finally:
             self.counts.pages -= 1
 
     async def video(self, socket: WebSocket) -> None:
-        station = self._stations.get(socket.path_params["name"])
-        feed = station.cameras.get(socket.path_params["camera"]) if station is not None else None
-        await socket.accept()
-        if station is None or feed is None:
-            await socket.close(_UNKNOWN, "no such camera")
+        station = await self._accept(socket)
+        if station is None:
+            return
+        feed = station.camera(socket.path_params["camera"])
+        if feed is None:
+            await socket.close(UNKNOWN, "no such camera")
             return
         await VideoSender(socket, feed, station.news, self.counts).run()
 
+    async def control(self, socket: WebSocket) -> None:
+        station = await self._accept(socket)
+        if station is None:
+            return
+        person = person_of(socket.scope)
+        if person is None or not person.may(Role.PILOT):
+            await socket.close(NOT_ALLOWED, "this needs a pilot")
+            return
+        await ControlSession(socket, station, person.name).run()
 
-def create_app(drones: Mapping[str, Drone], names: frozenset[str]) -> Starlette:
-    """The cockpit over these drones (each connected as an observer), answering to these values of ``Host`` only."""
-    cockpit = Cockpit(drones)
+    async def _accept(self, socket: WebSocket) -> Station | None:
+        """The drone that is asked for; None, and told, if there is none of that name."""
+        station = self._fleet.stations.get(socket.path_params["name"])
+        await socket.accept()
+        if station is None:
+            await socket.close(UNKNOWN, "no such drone")
+        return station
+
+
+def create_app(fleet: Fleet, recordings: Recordings, names: Names, gate: Gate, *, static: Path = STATIC) -> Starlette:
+    """The cockpit over these drones, answering to these names only, and to whom the gate lets in.
+
+    ``static`` is the folder of the page.
+    """
+    cockpit = Cockpit(fleet, recordings, static)
+    api = Api(fleet, recordings, gate, cockpit.counts, names.scheme)
     return Starlette(
         routes=[
             Route("/", cockpit.page),
-            Route("/api/drones", cockpit.drones),
-            Route("/api/statistics", cockpit.statistics),
+            *api.routes(),
+            WebSocketRoute("/ws/overview", cockpit.overview),
             WebSocketRoute("/ws/drones/{name}/telemetry", cockpit.telemetry),
             WebSocketRoute("/ws/drones/{name}/video/{camera}", cockpit.video),
-            Mount("/static", StaticFiles(directory=STATIC)),
+            WebSocketRoute("/ws/drones/{name}/control", cockpit.control),
+            Mount("/static", StaticFiles(directory=static, check_dir=False)),
         ],
-        middleware=[Middleware(Guard, names=names)],
+        middleware=[Middleware(Guard, names=names, gate=gate)],
         lifespan=cockpit.lifespan,
     )

@@ -10,6 +10,7 @@ import sys
 import tempfile
 import time
 import urllib.request
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
@@ -20,16 +21,22 @@ _ASK_S = 2.0
 
 
 class CockpitProcess:
-    """Runs ``python -m skyloop.cockpit NAME``; the child ends with :meth:`close`, and with this process however that
+    """Runs ``python -m skyloop.cockpit [NAME]``; the child ends with :meth:`close`, and with this process however that
     ends. It has a session of its own: Ctrl-C in the terminal is for the parent."""
 
-    def __init__(self, name: str, port: int = 0) -> None:
-        """``name`` of the proxy, ``port`` of loopback (0 takes a free one). Returns at once: see :meth:`address`."""
+    def __init__(self, name: str | None = None, port: int = 0, recordings: Path | None = None) -> None:
+        """``name`` of the proxy to show (default: all), ``port`` of loopback (0 takes a free one), ``recordings``: the
+        folder for recordings. Returns at once: see :meth:`address`."""
         self._said = tempfile.TemporaryFile()  # noqa: SIM115  (closed by close())
         reading, self._alive = os.pipe()
+        names = [] if name is None else [name]
+        folder = [] if recordings is None else ["--recordings", str(recordings)]
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "skyloop.cockpit", name, "--port", str(port), "--parent-fd", str(reading)],
+                [
+                    *(sys.executable, "-m", "skyloop.cockpit", *names, *folder),
+                    *("--port", str(port), "--parent-fd", str(reading)),
+                ],
                 pass_fds=(reading,),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
@@ -43,6 +50,11 @@ class CockpitProcess:
         finally:
             os.close(reading)
         self._address: str | None = None
+
+    @property
+    def pid(self) -> int:
+        """Of the child."""
+        return self._process.pid
 
     def address(self, timeout_s: float = 15.0) -> str:
         """The page's address, once it is served. Raises :class:`LinkError` with what the child said if it is not."""

@@ -1,94 +1,179 @@
-"""Who may read the page and its sockets: browsers on this host that were sent to this address, and nobody else.
+"""Which requests are answered: from whose page, and by whom. Every route passes here.
 
-A page from elsewhere can make a browser on this host send requests here. Three things stop it: the ``Host`` header must
-be this server's own (or a foreign name was made to point at loopback: DNS rebinding); the ``Origin``, which browsers
-add to every WebSocket and cross-site request and pages can't forge, must be this page's; and the page may load
-nothing but its own files and can't be framed (Content-Security-Policy).
+A page from elsewhere can make a browser send requests here. Three things stop it: the ``Host`` header must be this
+server's own (or a foreign name was made to point at it: DNS rebinding); the ``Origin``, which browsers add to every
+WebSocket and to every request that changes something, and which pages can't forge, must be this page's; and the
+page may load nothing but its own files and can't be framed (Content-Security-Policy).
+
+Then the person's role decides (:mod:`skyloop.cockpit.access`). What a route needs is decided here for all of them: one
+that nobody thought of needs at least an observer, and one that changes something needs a pilot.
 """
 
 from __future__ import annotations
 
 import ipaddress
+import re
 from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from skyloop.cockpit.access import Gate, Person
 from skyloop.errors import UsageError
+from skyloop.messages import Role
+
+LOG_IN: Final = 4401  #: close code of a WebSocket: nobody known, log in
+NOT_ALLOWED: Final = 4403  #: close code: this needs a pilot
+_FOREIGN: Final = 1008  # close code: another page
+
+#: Answered without a role: the page itself, and what is needed to get one.
+_PUBLIC: Final = re.compile(r"/|/static/.*|/favicon\.ico|/api/session|/api/login|/api/logout")
+_CONTROL: Final = re.compile(r"/ws/drones/[^/]+/control")
+_READING: Final = ("GET", "HEAD")
+_ADDRESS: Final = re.compile(r"(\[[0-9a-f:.]+\]|[0-9.]+)(?::(\d{1,5}))?")
+_USUAL_PORT: Final = {"http": 80, "https": 443}
 
 
-def loopback_address(host: str) -> str:
-    """The address to bind to. Raises :class:`UsageError` if ``host`` is not of this machine's loopback."""
+def bind_address(host: str) -> tuple[str, bool]:
+    """The address to bind to, and whether it is of this machine's loopback. Raises :class:`UsageError`."""
     if host == "localhost":
-        return "127.0.0.1"
+        return "127.0.0.1", True
     try:
         address = ipaddress.ip_address(host.strip("[]"))
     except ValueError:
-        raise UsageError(f"host is {host!r} and must be a loopback address: 127.0.0.1, ::1 or localhost") from None
-    if not address.is_loopback:
         raise UsageError(
-            f"host is {host!r}: the cockpit has no passwords and listens on loopback only (127.0.0.1 or ::1); "
-            "to watch from another machine, forward the port over SSH"
-        )
-    return str(address)
+            f"host is {host!r} and must be an address to listen on: 127.0.0.1 or ::1 for this machine only, 0.0.0.0 "
+            "or :: for the network"
+        ) from None
+    return str(address), address.is_loopback
 
 
-def own_names(address: str, port: int) -> frozenset[str]:
-    """What a browser may have in ``Host`` when it really means this server."""
-    bare = {"localhost", f"[{address}]" if ":" in address else address}
-    return frozenset(f"{name}:{port}" for name in bare) | (frozenset(bare) if port == 80 else frozenset())
+@dataclass(frozen=True, slots=True)
+class Names:
+    """What a browser may have in ``Host`` when it really means this server.
+
+    ``any_address``: any IP address with the right port too, for a server that listens on all of the machine's: nobody
+    can make an address point elsewhere, as they can a name.
+    """
+
+    exact: frozenset[str]
+    scheme: str
+    port: int
+    any_address: bool = False
+
+    def own(self, host: str) -> bool:
+        """Whether a value of ``Host``, in lower case, is this server's."""
+        if host in self.exact:
+            return True
+        found = _ADDRESS.fullmatch(host) if self.any_address else None
+        if found is None or int(found[2] or _USUAL_PORT[self.scheme]) != self.port:
+            return False
+        try:
+            ipaddress.ip_address(found[1].strip("[]"))
+        except ValueError:
+            return False
+        return True
 
 
-def refusal(kind: str, headers: Iterable[tuple[bytes, bytes]], names: frozenset[str]) -> str | None:
-    """Why a request (``kind`` is ``http`` or ``websocket``) is refused; None if it may pass."""
+def own_names(address: str, port: int, more: Iterable[str] = (), scheme: str = "http") -> Names:
+    """The names of a server that listens on an address; ``more``: host names by which browsers reach it."""
+    known = ipaddress.ip_address(address)
+    bare = {name.lower() for name in more}
+    if known.is_loopback:
+        bare.add("localhost")
+    if not known.is_unspecified:
+        bare.add(f"[{address}]" if known.version == 6 else address)
+    exact = {f"{name}:{port}" for name in bare} | (bare if port == _USUAL_PORT[scheme] else set())
+    return Names(frozenset(exact), scheme, port, known.is_unspecified)
+
+
+def foreign(kind: str, method: str, headers: Iterable[tuple[bytes, bytes]], names: Names) -> str:
+    """Why a request is of no page of ours; empty if it may be. ``kind`` is ``http`` or ``websocket``."""
     given: dict[str, list[str]] = {"host": [], "origin": []}
     for name, value in headers:
         if (key := name.decode("latin-1").lower()) in given:
             given[key].append(value.decode("latin-1").lower())
-    if len(given["host"]) != 1 or given["host"][0] not in names:
+    if len(given["host"]) != 1 or not names.own(given["host"][0]):
         return "this server answers to its own address only"
     if not given["origin"]:
-        return "a WebSocket must tell its origin" if kind == "websocket" else None
-    if given["origin"] != [f"http://{given['host'][0]}"]:
+        must = kind == "websocket" or method not in _READING
+        return "a WebSocket, and a request that changes something, must tell its origin" if must else ""
+    if given["origin"] != [f"{names.scheme}://{given['host'][0]}"]:
         return "requests from other pages are refused"
-    return None
+    return ""
+
+
+def needed(kind: str, method: str, path: str) -> Role | None:
+    """The role that a request needs; None if everybody may."""
+    if kind == "websocket":
+        return Role.PILOT if _CONTROL.fullmatch(path) else Role.OBSERVER
+    if _PUBLIC.fullmatch(path):
+        return None
+    return Role.OBSERVER if method in _READING else Role.PILOT
 
 
 class Guard:
-    """ASGI middleware: refuses what :func:`refusal` says, and puts the protecting headers on every answer."""
+    """ASGI middleware: refuses what :func:`foreign` and :func:`needed` say, tells the others in ``scope["person"]`` who
+    asks (None: not known), and puts the protecting headers on every answer."""
 
-    def __init__(self, app: ASGIApp, names: frozenset[str]) -> None:
+    def __init__(self, app: ASGIApp, names: Names, gate: Gate) -> None:
         self._app = app
         self._names = names
+        self._gate = gate
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         kind = scope["type"]
         if kind not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
-        reason = refusal(kind, scope["headers"], self._names)
-        if reason is None and kind == "websocket":
-            await self._app(scope, receive, send)
-        elif reason is None:
-            await self._app(scope, receive, _protected(send, _host(scope)))
-        elif kind == "websocket":
-            await receive()
-            await send({"type": "websocket.close", "code": 1008, "reason": reason})
+        method = scope.get("method", "")
+        if kind == "http":
+            send = _protected(send, self._policy(scope))
+        if reason := foreign(kind, method, scope["headers"], self._names):
+            await _refuse(kind, receive, send, 403, _FOREIGN, reason)
+            return
+        role = needed(kind, method, scope["path"])
+        person = self._gate.person(scope)
+        if role is not None and person is None:
+            await _refuse(kind, receive, send, 401, LOG_IN, self._gate.hint)
+        elif role is not None and person is not None and not person.may(role):
+            await _refuse(kind, receive, send, 403, NOT_ALLOWED, "this needs a pilot, and you are an observer")
         else:
-            headers = [(b"content-type", b"text/plain; charset=utf-8")]
-            await send({"type": "http.response.start", "status": 403, "headers": headers})
-            await send({"type": "http.response.body", "body": reason.encode()})
+            scope["person"] = person
+            await self._app(scope, receive, send)
+
+    def _policy(self, scope: Scope) -> str:
+        hosts = [value.decode("latin-1") for name, value in scope["headers"] if name.lower() == b"host"]
+        socket = "wss" if self._names.scheme == "https" else "ws"
+        # What is no host of ours gets no answer that a browser would show.
+        host = hosts[0] if len(hosts) == 1 and self._names.own(hosts[0].lower()) else ""
+        connect = f"connect-src 'self' {socket}://{host}; " if host else ""
+        return (
+            "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
+            f"{connect}base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+        )
 
 
-def _host(scope: Scope) -> str:
-    value: bytes = next(value for name, value in scope["headers"] if name.lower() == b"host")
-    return value.decode("latin-1")
+def person_of(scope: Scope) -> Person | None:
+    """Who sent this request, as the guard has found."""
+    person: Person | None = scope["person"]
+    return person
 
 
-def _protected(send: Send, host: str) -> Send:
-    policy = (
-        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; "
-        f"connect-src 'self' ws://{host}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-    )
+async def _refuse(kind: str, receive: Receive, send: Send, status: int, code: int, reason: str) -> None:
+    if kind == "http":
+        headers = [(b"content-type", b"text/plain; charset=utf-8")]
+        await send({"type": "http.response.start", "status": status, "headers": headers})
+        await send({"type": "http.response.body", "body": reason.encode()})
+        return
+    await receive()
+    if code != _FOREIGN:  # our own page is told why; a browser hides that of a socket that was not opened
+        await send({"type": "websocket.accept"})
+    await send({"type": "websocket.close", "code": code, "reason": reason})
+
+
+def _protected(send: Send, policy: str) -> Send:
     protecting = [
         (b"content-security-policy", policy.encode("latin-1")),
         (b"x-content-type-options", b"nosniff"),
@@ -100,7 +185,9 @@ def _protected(send: Send, host: str) -> Send:
 
     async def sending(message: Message) -> None:
         if message["type"] == "http.response.start":
-            message = {**message, "headers": [*message.get("headers", []), *protecting]}
+            own = list(message.get("headers", []))
+            told = {name.lower() for name, _ in own}
+            message = {**message, "headers": own + [pair for pair in protecting if pair[0] not in told]}
         await send(message)
 
     return sending

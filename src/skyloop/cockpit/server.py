@@ -1,41 +1,85 @@
-"""Runs the cockpit: connects as an observer of the lowest priority, binds to loopback, serves until told to stop."""
+"""Runs the cockpit: binds, finds drones, serves until told to stop."""
 
 from __future__ import annotations
 
 import asyncio
 import errno
+import os
 import signal
 import socket
+import ssl
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from skyloop.errors import MissingExtraError, UsageError
-from skyloop.messages import LOWEST_PRIORITY
+from skyloop.errors import MissingExtraError, UnknownNameError, UsageError
+from skyloop.messages import Role
 
 if TYPE_CHECKING:
     import uvicorn
+    from starlette.applications import Starlette
 
-    from skyloop.client import Drone
+    from skyloop.cockpit.access import Gate
 
-_LARGEST_MESSAGE = 4096  # bytes from a page: acknowledgements only
+NICENESS = 10  #: of the serving thread and of those that it starts: whoever flies comes first
+RECORDINGS = Path("recordings")  #: where recordings go if nothing else is said
+_LARGEST_MESSAGE = 4096  # bytes from a page
 _LOOK_S = 0.05  # how often it is asked whether to end
+_PING_S = 10.0  # a connection whose other end does not answer for this long is ended
+
+
+@dataclass(frozen=True, slots=True)
+class Access:
+    """Who may come in, and from where. The defaults: this user, on this machine, as a pilot.
+
+    ``host``: the address to listen on; one that is not of this machine's loopback needs ``token_file`` or
+    ``client_ca``. ``token_file``: lines of ``ROLE TOKEN [NAME]``. ``tls_cert``, ``tls_key``: PEM files of the server's
+    certificate and key, for TLS. ``client_ca``: PEM file of the authority that signed the certificates of those who
+    may come in; their OU is the role. ``role``: of everybody, where neither tokens nor certificates tell it.
+    ``hostnames``: names by which browsers reach this machine, where they don't use its address.
+    """
+
+    host: str = "127.0.0.1"
+    token_file: Path | None = None
+    tls_cert: Path | None = None
+    tls_key: Path | None = None
+    client_ca: Path | None = None
+    role: Role = Role.PILOT
+    hostnames: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if (self.tls_cert is None) != (self.tls_key is None):
+            raise UsageError("TLS needs both a certificate and its key: --tls-cert FILE and --tls-key FILE")
+        if self.client_ca is not None and self.tls_cert is None:
+            raise UsageError("certificates of clients need TLS: give --tls-cert and --tls-key too")
+        if self.client_ca is not None and self.token_file is not None:
+            raise UsageError("roles come from tokens or from certificates, not from both")
+
+    @property
+    def scheme(self) -> str:
+        return "http" if self.tls_cert is None else "https"
 
 
 def serve_cockpit(
-    name: str,
-    host: str = "127.0.0.1",
-    port: int = 0,
+    names: Sequence[str] = (),
     *,
+    port: int = 0,
+    access: Access | None = None,
+    recordings: Path = RECORDINGS,
     on_ready: Callable[[str], None] | None = None,
     stop: threading.Event | None = None,
 ) -> None:
-    """Serve the page for the drone of a running proxy, until ``stop`` is set or a signal (Ctrl-C, SIGTERM) comes.
+    """Serve the page until ``stop`` is set or a signal (Ctrl-C, SIGTERM) comes; the calling thread becomes nicer.
 
-    ``host`` is a loopback address; ``port`` 0 takes a free one. ``on_ready`` is called once on this thread with the
-    page's address (default: it is printed). Raises :class:`UsageError` for another host or a port in use,
-    :class:`UnknownNameError` if no such proxy runs, :class:`MissingExtraError` if the cockpit's parts are missing.
+    ``names`` of the drones to show; none: all that there are, as they come and go. ``port`` 0 takes a free one.
+    ``recordings``: the folder for recordings, made when it is needed. ``on_ready`` is called once on this thread with
+    the page's address (default: it is printed).
+
+    Raises :class:`UsageError` for an address, port, or file that can't be used, :class:`UnknownNameError` if there is
+    no proxy of a name given, :class:`MissingExtraError` if the cockpit's parts are missing.
     """
     try:
         import cv2  # noqa: F401
@@ -44,15 +88,60 @@ def serve_cockpit(
         import websockets  # noqa: F401
     except ImportError as error:
         raise MissingExtraError("the cockpit", "cockpit", cause=str(error)) from error
-    from skyloop.client import connect
-    from skyloop.cockpit.security import loopback_address
+    from skyloop.cockpit.security import bind_address
 
-    listening = _bind(loopback_address(host), port)
+    access = access or Access()
+    address, loopback = bind_address(access.host)
+    if not loopback and access.token_file is None and access.client_ca is None:
+        raise UsageError(
+            f"{access.host} can be reached by others: give --token-file, or --tls-cert, --tls-key and --client-ca, so "
+            "that not everybody can watch and fly; or listen on loopback (127.0.0.1) and forward the port over SSH"
+        )
+    tls = None if access.tls_cert is None else _tls(access)
+    listening = _bind(address, port)
     try:
-        with connect(name, access="observe", priority=LOWEST_PRIORITY, name="cockpit") as drone:
-            _serve(drone, listening, on_ready or _tell, stop)
+        gate = _gate(access, listening.getsockname()[1])
+        _check_names(names)
+        _serve(names, access, gate, tls, recordings, listening, on_ready or _tell, stop)
     finally:
         listening.close()
+
+
+def _check_names(names: Sequence[str]) -> None:
+    from skyloop.transport.local import list_names
+
+    known = [proxy.name for proxy in list_names()] if names else []
+    for name in names:
+        if name not in known:
+            raise UnknownNameError("proxy", name, known)
+
+
+def _gate(access: Access, port: int) -> Gate:
+    from skyloop.cockpit.access import CertificateGate, OpenGate, TokenGate, read_tokens
+
+    if access.client_ca is not None:
+        return CertificateGate()
+    if access.token_file is not None:
+        # Browsers don't tell cookies of one port from those of another.
+        return TokenGate(read_tokens(access.token_file), f"skyloop-cockpit-{port}")
+    return OpenGate(access.role)
+
+
+def _tls(access: Access) -> ssl.SSLContext:
+    """Raises :class:`UsageError` for files that can't be used."""
+    assert access.tls_cert is not None
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    try:
+        context.load_cert_chain(access.tls_cert, access.tls_key)
+    except (OSError, ssl.SSLError) as error:
+        raise UsageError(f"{access.tls_cert} and {access.tls_key} can't be used for TLS: {error}") from None
+    if access.client_ca is not None:
+        try:
+            context.load_verify_locations(access.client_ca)
+        except (OSError, ssl.SSLError) as error:
+            raise UsageError(f"{access.client_ca} can't be used to check certificates: {error}") from None
+        context.verify_mode = ssl.CERT_REQUIRED
+    return context
 
 
 def _bind(address: str, port: int) -> socket.socket:
@@ -69,32 +158,70 @@ def _bind(address: str, port: int) -> socket.socket:
 
 
 def _serve(
-    drone: Drone, listening: socket.socket, on_ready: Callable[[str], None], stop: threading.Event | None
+    names: Sequence[str],
+    access: Access,
+    gate: Gate,
+    tls: ssl.SSLContext | None,
+    recordings: Path,
+    listening: socket.socket,
+    on_ready: Callable[[str], None],
+    stop: threading.Event | None,
 ) -> None:
-    import uvicorn
-
     from skyloop.cockpit.app import create_app
-    from skyloop.cockpit.security import own_names
+    from skyloop.cockpit.finder import LocalFinder
+    from skyloop.cockpit.fleet import Fleet
+    from skyloop.cockpit.recordings import Recordings
+    from skyloop.cockpit.security import bind_address, own_names
 
     address, port = listening.getsockname()[:2]
-    app = create_app({drone.name: drone}, own_names(address, port))
-    config = uvicorn.Config(
-        app, log_level="warning", access_log=False, server_header=False, ws_max_size=_LARGEST_MESSAGE, lifespan="on"
-    )
-    # What a page that stopped reading leaves in buffers must not hold up the end.
-    config.timeout_graceful_shutdown = 2
-    asyncio.run(_run(_quiet_server(config), listening, lambda: on_ready(_page_address(address, port)), stop))
+    own_name = () if bind_address(address)[1] else (socket.gethostname(),)
+    hosts = own_names(address, port, (*access.hostnames, *own_name), access.scheme)
+    app = create_app(Fleet(LocalFinder(names), kept=names), Recordings(recordings), hosts, gate)
+    server = quiet_server(app, tls)
+    page = f"{access.scheme}://{f'[{address}]' if ':' in address else address}:{port}/"
+    os.nice(NICENESS)
+    asyncio.run(_run(server, listening, lambda: on_ready(page), stop))
 
 
-def _quiet_server(config: uvicorn.Config) -> uvicorn.Server:
-    """One that leaves signals alone: uvicorn raises them anew at its end, which would cut short our own."""
+def quiet_server(app: Starlette, tls: ssl.SSLContext | None = None) -> uvicorn.Server:
+    """A server for the cockpit that leaves signals alone: uvicorn raises them anew at its end, which would cut short
+    our own."""
     import uvicorn
+    from uvicorn.protocols.http.h11_impl import H11Protocol
+
+    from skyloop.cockpit.access import CERTIFICATE
+
+    class Protocol(H11Protocol):
+        """Tells the application the certificate of the other end, which uvicorn keeps to itself."""
+
+        def connection_made(self, transport: Any) -> None:
+            super().connection_made(transport)
+            connection = transport.get_extra_info("ssl_object")
+            certificate = None if connection is None else connection.getpeercert()
+            self.app_state = {**self.app_state, CERTIFICATE: certificate}
 
     class QuietServer(uvicorn.Server):
         @contextmanager
         def capture_signals(self) -> Iterator[None]:
             yield
 
+    config = uvicorn.Config(
+        app,
+        http=Protocol,
+        log_level="warning",
+        access_log=False,
+        server_header=False,
+        proxy_headers=False,  # who is at the other end is asked of the kernel, not of a header
+        ws_max_size=_LARGEST_MESSAGE,
+        ws_ping_interval=_PING_S,
+        ws_ping_timeout=_PING_S,
+        ws_per_message_deflate=False,  # pictures are packed already
+        lifespan="on",
+        # What a page that stopped reading leaves in buffers must not hold up the end.
+        timeout_graceful_shutdown=2,
+    )
+    config.load()
+    config.ssl = tls
     return QuietServer(config)
 
 
@@ -119,7 +246,3 @@ async def _run(
 
 def _tell(page: str) -> None:
     print(f"cockpit: {page}", flush=True)
-
-
-def _page_address(address: str, port: int) -> str:
-    return f"http://[{address}]:{port}/" if ":" in address else f"http://{address}:{port}/"

@@ -1,7 +1,7 @@
 """The senders: one object per open page and stream. A page that does not keep up gets less, never anything older.
 
 Video: one frame is on its way at a time; the page acknowledges it when it has drawn it, and only then gets the newest.
-Telemetry: the newest state about twenty times a second, as far as the socket takes it.
+Telemetry: the newest state about twenty times a second, as far as the socket takes it; made once for all pages.
 """
 
 from __future__ import annotations
@@ -15,13 +15,15 @@ from typing import Any
 import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from skyloop.cockpit.beat import Beat
 from skyloop.cockpit.feeds import CameraFeed, NewsFeed
-from skyloop.cockpit.telemetry import TelemetryView
+from skyloop.cockpit.station import Station
+from skyloop.cockpit.telemetry import encode_json
 from skyloop.messages import Annotation, Points, Polyline, Text
 
-TELEMETRY_HZ = 18.0
 _LENGTH = struct.Struct(">I")
 _BAD_MESSAGE = 1008
+UNKNOWN = 4404  #: close code: no such drone or camera
 
 
 @dataclass(slots=True)
@@ -144,40 +146,64 @@ class VideoSender:
                 await self._socket.send_text(json.dumps(drawing_values(annotation), separators=(",", ":")))
 
 
-class TelemetrySender:
-    """Sends a drone's state and events to one page until the page goes away."""
+class BeatSender:
+    """Sends what a beat makes to one page until the page goes away."""
 
-    def __init__(self, socket: WebSocket, view: TelemetryView, news: NewsFeed, rate_hz: float = TELEMETRY_HZ) -> None:
+    def __init__(self, socket: WebSocket, beat: Beat) -> None:
         self._socket = socket
-        self._view = view
-        self._news = news
-        self._period_s = 1.0 / rate_hz
+        self._beat = beat
+        self._wake = asyncio.Event()
 
     async def run(self) -> None:
         """Returns when the page is gone."""
-        listening = asyncio.create_task(self._until_gone())
+        gone = asyncio.create_task(self._until_gone())
+        gone.add_done_callback(lambda _: self._wake.set())
+        wake = self._wake.set  # the same object to join and to leave with
+        self._beat.join(wake)
         try:
-            await self._send(self._view.vehicle())
-            told = 0
-            while not listening.done():
-                fresh = self._news.events_after(told)
-                told = fresh[-1][0] if fresh else told
-                await self._send({**await self._view.state(), "events": self._view.events(fresh)})
-                await asyncio.wait([listening], timeout=self._period_s)
-            if listening.result() != "websocket.disconnect":
+            while not gone.done() and not self._beat.ended:
+                await self._wake.wait()
+                self._wake.clear()
+                if not gone.done() and not self._beat.ended:
+                    await self._send()
+            if not gone.done():
+                await self._socket.close(UNKNOWN, "it is not here any more")
+            elif gone.result() != "websocket.disconnect":
                 await self._socket.close(_BAD_MESSAGE, "nothing is expected here")
         except WebSocketDisconnect:
             pass  # while sending: the page went away
         finally:
-            listening.cancel()
-            await asyncio.gather(listening, return_exceptions=True)
+            self._beat.leave(wake)
+            gone.cancel()
+            await asyncio.gather(gone, return_exceptions=True)
+
+    async def _send(self) -> None:
+        await self._socket.send_text(self._beat.made.decode())
 
     async def _until_gone(self) -> str:
         """Nothing is expected from the page here: returns the type of whatever comes."""
         return str((await self._socket.receive())["type"])
 
-    async def _send(self, message: dict[str, Any]) -> None:
-        await self._socket.send_text(json.dumps(message, separators=(",", ":")))
+
+class TelemetrySender(BeatSender):
+    """Sends a drone's state and events; before them the vehicle, whenever it is another one."""
+
+    def __init__(self, socket: WebSocket, station: Station) -> None:
+        super().__init__(socket, station.beat)
+        self._station = station
+        self._vehicle: dict[str, Any] | None = None
+        self._told = 0  # number of the last event
+
+    async def _send(self) -> None:
+        view = self._station.view
+        vehicle = view.vehicle()
+        if vehicle != self._vehicle:
+            self._vehicle = vehicle
+            await self._socket.send_text(encode_json(vehicle).decode())
+        fresh = self._station.news.events_after(self._told)
+        self._told = fresh[-1][0] if fresh else self._told
+        events = encode_json(view.events(fresh))
+        await self._socket.send_text((self._beat.made + b',"events":' + events + b"}").decode())
 
 
 class _Ack(msgspec.Struct):

@@ -1,137 +1,177 @@
-"""The view model: what a page is told of a drone, as plain JSON values. SI units and radians; the page converts."""
+"""The view model: what pages are told of a drone, made once for all of them. SI units and radians; pages convert."""
 
 from __future__ import annotations
 
 import asyncio
-import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+import msgspec
 
 from skyloop.clock import Clock, monotonic_ns, seconds
-from skyloop.errors import NoAnswerError
-from skyloop.messages import Event, Feedback
+from skyloop.cockpit.alarms import alarms
+from skyloop.cockpit.values import (
+    Json,
+    channel_values,
+    event_values,
+    feedback_values,
+    flat_values,
+    motion_values,
+    number,
+    set_point_values,
+    target_values,
+    truth_values,
+    vector,
+)
+from skyloop.errors import LinkError
+from skyloop.messages import HIGHEST_PRIORITY, LOWEST_PRIORITY, Event, Feedback
 
 if TYPE_CHECKING:
-    from skyloop.client import Drone
-    from skyloop.client.statistics import ChannelStats
+    from skyloop.cockpit.station import Station
 
-Json = dict[str, Any]
-
-_STATE_S = 0.02  # pages that ask within this time share one answer
 _CHANNELS_S = 0.5  # statistics cost sorting, and nobody reads faster
+
+encode_json = msgspec.json.Encoder().encode
 
 
 class TelemetryView:
-    """Looks at one drone for all pages, and remembers for a moment what it saw. Used on the event loop."""
+    """Looks at one drone for all pages. Used on the event loop."""
 
-    def __init__(self, drone: Drone, clock: Clock = monotonic_ns) -> None:
-        self._drone = drone
+    def __init__(self, station: Station, clock: Clock = monotonic_ns) -> None:
+        self._station = station
         self._clock = clock
-        self._state: tuple[int, Json] | None = None
-        self._channels: tuple[int, Json] | None = None
+        self._channels: dict[str, Json] = {}
+        self._looked_ns: int | None = None
         self._looking: asyncio.Task[None] | None = None
 
     def vehicle(self) -> Json:
-        """What does not change: told once to each page."""
-        capabilities = self._drone.capabilities
+        """What changes only when the vehicle is another one."""
+        station, capabilities = self._station, self._station.drone.capabilities
         return {
             "type": "vehicle",
-            "name": self._drone.name,
-            "uri": self._drone.uri,
+            "name": station.found.name,
+            "uri": station.drone.uri,
+            "transport": station.found.transport,
             "vehicle": capabilities.vehicle,
             "description": capabilities.description,
             "can_fly": bool(capabilities.actions),
             "why_not": capabilities.why_not,
             "cameras": [{"name": c.name, "width": c.width, "height": c.height} for c in capabilities.cameras],
+            "priorities": [HIGHEST_PRIORITY, LOWEST_PRIORITY],
         }
 
-    async def state(self) -> Json:
-        """The newest of everything that moves."""
-        await self._refresh_channels()
-        now = self._clock()
-        if self._state is None or seconds(now - self._state[0]) >= _STATE_S:
-            self._state = now, self._look(now)
-        return self._state[1]
+    def state(self) -> bytes:
+        """The newest of everything that moves, as a JSON object without its last brace."""
+        self._refresh_channels()
+        return encode_json(self._look(self._clock()))[:-1]
+
+    def overview(self) -> Json:
+        """The drone in one row."""
+        feedback = self._feedback()
+        vehicle = self.vehicle()
+        motion = motion_values(feedback)
+        return {
+            **{key: vehicle[key] for key in ("name", "uri", "vehicle", "transport", "can_fly", "why_not", "cameras")},
+            **{key: motion[key] for key in ("airborne", "battery", "position", "altitude")},
+            "state": motion["flight"],
+            "yaw": None if feedback is None else number(feedback.yaw),
+            "owner": None if feedback is None else feedback.owner,
+            "me": self.is_mine(feedback),
+            "links": self._links(),
+            "alarms": self.alarms(feedback),
+        }
 
     def events(self, events: Sequence[tuple[int, Event]]) -> list[Json]:
         """Events with their numbers, for a page."""
-        now = self._clock()
-        return [
-            {
-                "n": number,
-                "kind": str(event.kind),
-                "severity": str(event.severity),
-                "text": event.text,
-                "app": event.app,
-                "age_s": seconds(now - event.at_ns),
-            }
-            for number, event in events
-        ]
+        now_ns = self._clock() + self._station.drone.clock_offset_ns
+        return [event_values(number_, event, now_ns) for number_, event in events]
+
+    def alarms(self, feedback: Feedback | None) -> list[str]:
+        """What a person must know at once."""
+        drone = self._station.drone
+        age_s = None if feedback is None else self._age_s(feedback.captured_ns)
+        ages = {name: feed.age_s for name, feed in self._station.cameras.items()}
+        return alarms(drone.link, feedback, age_s, {name: age for name, age in ages.items() if age is not None})
+
+    def is_mine(self, feedback: Feedback | None) -> bool:
+        """Whether a page of this cockpit holds the authority."""
+        return feedback is not None and any(hands.app_id == feedback.owner_id for hands in self._station.hands)
+
+    # Inside ----------------------------------------------------------------------------------------------------
 
     def _look(self, now_ns: int) -> Json:
-        link = self._drone.link
-        try:
-            feedback: Feedback | None = self._drone.feedback()
-        except NoAnswerError:
-            feedback = None
+        station, listening, feedback = self._station, self._station.listening, self._feedback()
+        links, applied = self._links(), listening.applied
+        native = None if feedback is None else feedback.native
+        proxy_ns = now_ns + station.drone.clock_offset_ns
         return {
             "type": "state",
-            "link": {"application": str(link.application), "vehicle": str(link.vehicle), "reason": link.reason},
-            "feedback": None if feedback is None else feedback_values(feedback, now_ns),
-            "channels": {} if self._channels is None else self._channels[1],
+            "link": links,
+            "links": links,
+            "feedback": None if feedback is None else feedback_values(feedback, proxy_ns),
+            **motion_values(feedback),
+            "owner": None if feedback is None else feedback.owner,
+            "authority": self._authority(feedback),
+            "channels": self._channels,
+            "alarms": self.alarms(feedback),
+            "values": flat_values(feedback, listening.numbers(), None if applied is None else applied.applied),
+            "set_points": None
+            if applied is None
+            else set_point_values(applied.applied, self._age_s(applied.applied_ns)),
+            "truth": truth_values(native),
+            "targets": target_values(native),
+            "waypoints": self._waypoints(),
         }
 
-    async def _refresh_channels(self) -> None:
-        """Have the statistics looked up anew if they are old; waits for it only the first time."""
-        fresh = self._channels is not None and seconds(self._clock() - self._channels[0]) < _CHANNELS_S
-        if not fresh and self._looking is None:
+    def _feedback(self) -> Feedback | None:
+        try:
+            return self._station.drone.feedback()
+        except LinkError:
+            return None  # none yet, or closed
+
+    def _links(self) -> Json:
+        link = self._station.drone.link
+        return {"application": str(link.application), "vehicle": str(link.vehicle), "reason": link.reason}
+
+    def _authority(self, feedback: Feedback | None) -> Json:
+        if feedback is None or not feedback.owner_id:
+            return {"holder": None, "priority": None, "lease": 0, "me": False}
+        return {
+            "holder": feedback.owner,
+            "priority": feedback.owner_priority,
+            "lease": feedback.lease,
+            "me": self.is_mine(feedback),
+        }
+
+    def _waypoints(self) -> list[Json]:
+        """Where pages fly it to, then what controllers have logged."""
+        goals = [
+            {"position": vector(goal.position), "yaw": number(goal.yaw), "app": app}
+            for app, goal in self._station.goals.items()
+        ]
+        logged = [
+            {"position": vector(row[:3]), "yaw": number(row[3]) if len(row) > 3 else None, "app": None}
+            for row in self._station.listening.waypoints()
+        ]
+        return goals + logged
+
+    def _age_s(self, captured_ns: int) -> float:
+        """Of what is stamped on the proxy's clock."""
+        return seconds(self._clock() + self._station.drone.clock_offset_ns - captured_ns)
+
+    def _refresh_channels(self) -> None:
+        """Have the statistics looked up anew if they are old; waits for nothing."""
+        now_ns = self._clock()
+        if self._looking is None and (self._looked_ns is None or seconds(now_ns - self._looked_ns) >= _CHANNELS_S):
+            self._looked_ns = now_ns
             self._looking = asyncio.create_task(self._look_up_channels())
-        if self._channels is None and self._looking is not None:
-            await asyncio.shield(self._looking)
 
     async def _look_up_channels(self) -> None:
         # On another thread: for the command delay the drone asks the proxy, and waits for its answer.
         try:
-            stats = await asyncio.to_thread(lambda: self._drone.stats)
-            self._channels = self._clock(), {name: channel_values(one) for name, one in stats.items()}
+            stats = await asyncio.to_thread(lambda: self._station.drone.stats)
+            self._channels = {name: channel_values(one) for name, one in stats.items()}
+        except LinkError:
+            pass  # closed meanwhile
         finally:
             self._looking = None
-
-
-def feedback_values(feedback: Feedback, now_ns: int) -> Json:
-    """A feedback as JSON values; what is not known, or not finite, is null."""
-    velocity = feedback.velocity
-    return {
-        "age_s": seconds(now_ns - feedback.captured_ns),
-        "state": str(feedback.state),
-        "battery": _number(feedback.battery),
-        "battery_v": _number(feedback.battery_v),
-        "roll": _number(feedback.roll),
-        "pitch": _number(feedback.pitch),
-        "yaw": _number(feedback.yaw),
-        "altitude": _number(feedback.altitude),
-        "velocity": None if velocity is None else [_number(v) for v in velocity],
-        "position": None if feedback.position is None else [_number(v) for v in feedback.position],
-        "failsafe": str(feedback.failsafe),
-        "owner": feedback.owner,
-        "owner_priority": feedback.owner_priority,
-        "lease": feedback.lease,
-    }
-
-
-def channel_values(stats: ChannelStats) -> Json:
-    """One channel's figures; delays in seconds."""
-    delay = stats.delay_s
-    return {
-        "count": stats.count,
-        "rate_hz": stats.rate_hz,
-        "lost": stats.lost,
-        "dropped": stats.dropped,
-        "malformed": stats.malformed,
-        "age_s": stats.age_s,
-        "delay_s": None if delay is None else {"median": delay.median, "p99": delay.p99},
-    }
-
-
-def _number(value: float | None) -> float | None:
-    return None if value is None or not math.isfinite(value) else float(value)

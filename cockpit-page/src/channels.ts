@@ -1,0 +1,50 @@
+// What comes how fast, how late, how old, and what is missing; as the cockpit receives it.
+
+import { h, setText } from "./dom.js";
+import { figure, type Known } from "./format.js";
+import type { Channel, State } from "./model.js";
+
+const COLUMNS: readonly (readonly [string, string])[] = [
+  ["/s", "samples a second over the last two seconds"],
+  ["delay", "from sending to receiving, median, in milliseconds"],
+  ["p99", "99 of 100 samples took less, in milliseconds"],
+  ["age", "since the newest sample was captured, in milliseconds; s: seconds"],
+  ["lost", "missing by the gaps in the numbers"],
+  ["drop", "received and not used, as newer ones were there"],
+];
+
+export class Channels {
+  readonly element: HTMLElement;
+  private readonly body = h("tbody");
+
+  constructor() {
+    const columns = COLUMNS.map(([name, title]) => h("th", { scope: "col" }, h("abbr", { title }, name)));
+    const head = h("tr", {}, h("th", { scope: "col" }, "Channel"), ...columns);
+    const label = "Channels: rates, delays in milliseconds, ages and drops";
+    this.element = h("section", { class: "channels scroll", tabindex: 0, "aria-label": label }, h("table", {}, h("thead", {}, head), this.body));
+  }
+
+  update(state: State): void {
+    const names = Object.keys(state.channels).sort();
+    const rows = this.body.rows;
+    if (names.join() !== [...rows].map((row) => row.dataset["name"]).join()) {
+      this.body.replaceChildren(...names.map((name) => h("tr", { "data-name": name }, h("th", { scope: "row" }, name), ...COLUMNS.map(() => h("td")))));
+    }
+    names.forEach((name, place) => {
+      const cells = cellsOf(state.channels[name] as Channel);
+      [...(rows[place] as HTMLTableRowElement).cells].slice(1).forEach((cell, column) => setText(cell, cells[column] as string));
+    });
+  }
+}
+
+/** Milliseconds with one decimal while it matters. */
+export function milliseconds(seconds: Known): string {
+  if (seconds === null || seconds === undefined) return "–";
+  if (Math.abs(seconds) >= 10) return `${figure(seconds, 0)} s`;
+  return figure(seconds * 1000, Math.abs(seconds) < 0.01 ? 1 : 0);
+}
+
+function cellsOf(channel: Channel): string[] {
+  const { rate_hz, delay_s, age_s, lost, dropped } = channel;
+  return [figure(rate_hz, 0), milliseconds(delay_s?.median), milliseconds(delay_s?.p99), milliseconds(age_s), String(lost), String(dropped)];
+}

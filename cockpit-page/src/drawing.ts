@@ -1,0 +1,76 @@
+// Draws the shapes that controllers and processors published, over the picture that they belong to.
+
+import type { Shape } from "./model.js";
+
+/** From pixels of the frame to pixels of the canvas. */
+export interface Fit {
+  scale: number;
+  x: number;
+  y: number;
+  width: number;
+  height: number;
+  density: number;
+}
+
+/** Where a picture lies in a box that it fills as far as its shape lets it. */
+export function contain(width: number, height: number, box: { width: number; height: number }, density: number): Fit {
+  const scale = Math.min(box.width / width, box.height / height);
+  const [w, h] = [width * scale, height * scale];
+  return { scale, x: (box.width - w) / 2, y: (box.height - h) / 2, width: w, height: h, density };
+}
+
+const rgb = ([red, green, blue]: readonly number[]): string => `rgb(${red} ${green} ${blue})`;
+const EDGE = "rgb(0 0 0 / 55%)"; // below lines and dots: they are to be seen on any picture
+
+export function draw(pen: CanvasRenderingContext2D, shapes: readonly Shape[], fit: Fit): void {
+  pen.lineJoin = pen.lineCap = "round";
+  const at = ([x, y]: readonly [number, number]): [number, number] => [fit.x + (x + 0.5) * fit.scale, fit.y + (y + 0.5) * fit.scale];
+  for (const shape of shapes) {
+    if (shape.kind === "text") label(pen, shape.text, at(shape.at), rgb(shape.colour), fit);
+    else if (shape.kind === "points") dots(pen, shape.points.map(at), rgb(shape.colour), fit.density);
+    else line(pen, shape.points.map(at), shape.closed, rgb(shape.colour), fit.density);
+  }
+}
+
+function line(pen: CanvasRenderingContext2D, points: [number, number][], closed: boolean, ink: string, density: number): void {
+  if (points.length === 0) return;
+  pen.beginPath();
+  for (const point of points) pen.lineTo(...point);
+  if (closed) pen.closePath();
+  pen.strokeStyle = EDGE;
+  pen.lineWidth = 4.5 * density;
+  pen.stroke();
+  pen.strokeStyle = ink;
+  pen.lineWidth = 2.25 * density;
+  pen.stroke();
+}
+
+function dots(pen: CanvasRenderingContext2D, points: [number, number][], ink: string, density: number): void {
+  pen.fillStyle = ink;
+  pen.strokeStyle = EDGE;
+  pen.lineWidth = 1.5 * density;
+  for (const [x, y] of points) {
+    pen.beginPath();
+    pen.arc(x, y, 3.5 * density, 0, 2 * Math.PI);
+    pen.fill();
+    pen.stroke();
+  }
+}
+
+function label(pen: CanvasRenderingContext2D, text: string, at: [number, number], ink: string, fit: Fit): void {
+  const { density } = fit;
+  pen.font = `600 ${13 * density}px system-ui, sans-serif`;
+  pen.textBaseline = "middle";
+  const width = pen.measureText(text).width;
+  const inset = 7 * density;
+  // Kept inside the picture, and below the line that tells its age.
+  const within = (value: number, least: number, most: number): number => Math.max(least, Math.min(value, most));
+  const x = within(at[0], fit.x + 2 * inset, fit.x + fit.width - width - 2 * inset);
+  const y = within(at[1], fit.y + 48 * density, fit.y + fit.height - 15 * density);
+  pen.fillStyle = "rgb(6 10 15 / 68%)";
+  pen.beginPath();
+  pen.roundRect(x - inset, y - 11 * density, width + 2 * inset, 22 * density, 5 * density);
+  pen.fill();
+  pen.fillStyle = ink;
+  pen.fillText(text, x, y + density);
+}

@@ -1,0 +1,68 @@
+// The events of a drone.
+
+import { h, type Tone } from "./dom.js";
+import { words } from "./format.js";
+import type { DroneEvent } from "./model.js";
+
+const MOST_EVENTS = 300;
+const TONES: Readonly<Record<string, Tone>> = { info: "quiet", warning: "warn", error: "bad" };
+
+/** The newest first; words and severity choose what is shown. */
+export class Events {
+  readonly element: HTMLElement;
+  private readonly list = h("ol", { class: "events", tabindex: 0, "aria-label": "Events, newest first" });
+  private readonly words = h("input", { type: "search", placeholder: "Filter", "aria-label": "Filter events by words", oninput: () => this.filter() });
+  private readonly severity = h("select", { "aria-label": "Severity", onchange: () => this.filter() }, h("option", { value: "" }, "All"), h("option", { value: "warning" }, "Warnings"), h("option", { value: "error" }, "Errors"));
+  private readonly none = h("p", { class: "empty" }, "No events");
+  private readonly shown: { event: DroneEvent; row: HTMLElement }[] = [];
+  private heard = 0;
+
+  constructor() {
+    this.element = h("div", { class: "filling" }, h("div", { class: "filters" }, this.words, this.severity), this.list, this.none);
+  }
+
+  /** Returns those that are new. */
+  add(events: readonly DroneEvent[]): DroneEvent[] {
+    const fresh = events.filter((event) => event.n > this.heard);
+    for (const event of fresh) {
+      this.heard = event.n;
+      const row = rowOf(event);
+      this.list.prepend(row);
+      this.shown.push({ event, row });
+      if (this.shown.length > MOST_EVENTS) this.shown.shift()?.row.remove();
+    }
+    if (fresh.length) this.filter();
+    return fresh;
+  }
+
+  /** The cockpit was started anew and numbers them from 1. */
+  restart(): void {
+    this.heard = 0;
+    this.shown.length = 0;
+    this.list.replaceChildren();
+  }
+
+  private filter(): void {
+    const needle = this.words.value.trim().toLowerCase();
+    let any = false;
+    for (const { event, row } of this.shown) {
+      row.hidden = !passes(event, needle, this.severity.value);
+      any ||= !row.hidden;
+    }
+    this.none.hidden = any;
+  }
+}
+
+/** Whether an event is among those asked for. */
+export function passes(event: DroneEvent, needle: string, severity: string): boolean {
+  const grades = ["info", "warning", "error"];
+  if (grades.indexOf(event.severity) < grades.indexOf(severity || "info")) return false;
+  return !needle || `${event.kind} ${words(event.kind)} ${event.text} ${event.app}`.toLowerCase().includes(needle);
+}
+
+function rowOf(event: DroneEvent): HTMLElement {
+  const at = new Date(Date.now() - event.age_s * 1000);
+  const time = h("time", { datetime: at.toISOString() }, at.toLocaleTimeString("en-GB"));
+  const text = h("span", { class: "what" }, event.text || words(event.kind), event.app ? h("span", { class: "who" }, ` ${event.app}`) : null);
+  return h("li", { "data-tone": TONES[event.severity] ?? "quiet", "data-kind": event.kind, title: words(event.kind) }, time, h("i", { class: "dot" }), text);
+}

@@ -1,0 +1,97 @@
+// Keys, gamepad and thumbs fly the selected drone; nothing else of the page does.
+
+import { connected, GamepadReader } from "./gamepad.js";
+import { type Deed, Keys } from "./keys.js";
+import type { Sticks } from "./model.js";
+import { type Pilot, STEER_MS } from "./pilot.js";
+import { CENTRED, isCentred, merge, PACES, type Pace, ramp, scale } from "./sticks.js";
+
+/** Whom the keys fly, and what else they do. */
+export interface Cabin {
+  /** Of all drones that are open here. */
+  pilots(): Pilot[];
+  /** Of the one that keys and gamepad are for. */
+  selected(): Pilot | null;
+  /** A deed by key or gamepad, for the selected drone. */
+  act(deed: Deed): void;
+  /** What the inputs look like now. */
+  inputs(view: InputView): void;
+}
+
+export interface InputView {
+  gamepad: string | null;
+  typing: boolean;
+  focused: boolean;
+  sticks: Sticks;
+}
+
+const TAKES_KEYS = "input, select, textarea, [contenteditable]";
+
+export class Flying {
+  pace: Pace = PACES[1] as Pace;
+  /** What thumbs on the screen do. */
+  thumbs: Sticks = { ...CENTRED };
+  private readonly keys = new Keys();
+  private readonly pad = new GamepadReader();
+  private ramped: Sticks = { ...CENTRED };
+  private flown: Pilot | null = null;
+  private held = false;
+
+  constructor(private readonly cabin: Cabin) {
+    // Seen before anything else on the page can keep a key to itself.
+    window.addEventListener("keydown", (event) => this.down(event), { capture: true });
+    window.addEventListener("keyup", (event) => this.keys.up(event.code), { capture: true });
+    window.addEventListener("blur", () => this.rest());
+    window.addEventListener("pagehide", () => this.rest());
+    document.addEventListener("visibilitychange", () => document.hidden && this.rest());
+    document.addEventListener("focusin", () => this.typing() && this.keys.clear());
+    setInterval(() => this.round(), STEER_MS);
+  }
+
+  /** Nothing that is held counts any longer, and what was under way hovers. */
+  rest(): void {
+    this.keys.clear();
+    this.pad.reset();
+    this.thumbs = { ...CENTRED };
+    this.ramped = { ...CENTRED };
+    for (const pilot of this.cabin.pilots()) pilot.rest();
+  }
+
+  private down(event: KeyboardEvent): void {
+    const modified = event.ctrlKey || event.altKey || event.metaKey;
+    const press = { code: event.code, repeat: event.repeat, modified, typing: this.typing(), at_ms: event.timeStamp };
+    const meant = this.keys.down(press);
+    if (meant === null) return;
+    if (meant === "stick") {
+      // Arrows scroll the page while there is nothing to fly.
+      if (this.cabin.selected()?.mine) event.preventDefault();
+      return;
+    }
+    if (event.code !== "Escape") event.preventDefault();
+    this.cabin.act(meant);
+  }
+
+  private typing(): boolean {
+    return document.activeElement?.matches(TAKES_KEYS) ?? false;
+  }
+
+  private round(): void {
+    const selected = this.cabin.selected();
+    const reading = this.pad.read(connected());
+    const focused = document.hasFocus() && !document.hidden;
+    const mine = selected?.mine ?? false;
+    // Sticks that are pushed when control begins, or another drone is selected, must come back to the centre first.
+    if (selected !== this.flown || mine !== this.held) this.pad.reset();
+    if (reading.lost) this.rest();
+    this.flown = selected;
+    this.held = mine;
+    if (focused) for (const deed of reading.deeds) this.cabin.act(deed);
+    const held = this.keys.sticks();
+    this.ramped = ramp(this.ramped, held, STEER_MS / 1000);
+    const sticks = focused ? merge(this.ramped, reading.sticks, this.thumbs) : { ...CENTRED };
+    for (const pilot of this.cabin.pilots()) {
+      pilot.steer(pilot === selected && !isCentred(sticks) ? scale(sticks, this.pace) : CENTRED);
+    }
+    this.cabin.inputs({ gamepad: reading.name, typing: this.typing(), focused, sticks });
+  }
+}

@@ -1,0 +1,57 @@
+// The map of keys and of the gamepad, and what the inputs do now.
+
+import { h, setAttribute, setText, setTone } from "./dom.js";
+import type { Flying, InputView } from "./flying.js";
+import { GAMEPAD_MAP, KEY_MAP } from "./keys.js";
+import { isCentred, PACES } from "./sticks.js";
+
+type Row = { keys: string[]; does: string };
+
+export class Help {
+  readonly element: HTMLDialogElement;
+  readonly chip = h("button", { type: "button", class: "small inputs", "data-tone": "quiet", onclick: () => this.toggle() });
+  private readonly keys = h("span", {}, "Keys");
+  private readonly dot = h("i", { class: "dot" });
+  private readonly pad = h("p", { class: "note", role: "status" });
+
+  constructor(flying: () => Flying) {
+    const paces = h("div", { class: "choices", role: "group", "aria-label": "How fast keys and sticks fly" });
+    PACES.forEach((pace, place) => {
+      const button = h("button", { type: "button", class: "small", "aria-pressed": String(place === 1), title: `${pace.speed} m/s, up and down ${pace.climb} m/s, turning ${pace.turn} rad/s` }, pace.name);
+      button.addEventListener("click", () => {
+        flying().pace = pace;
+        for (const one of paces.children) setAttribute(one, "aria-pressed", String(one === button));
+      });
+      paces.append(button);
+    });
+    this.chip.append(this.dot, this.keys);
+    this.element = h(
+      "dialog",
+      { class: "help", "aria-label": "Keys and gamepad" },
+      h("header", {}, h("h2", {}, "Keys and gamepad"), h("button", { type: "button", class: "bare", "aria-label": "Close", onclick: () => this.element.close() }, "×")),
+      h("div", { class: "help-columns" }, table("Keyboard", KEY_MAP), table("Gamepad", GAMEPAD_MAP)),
+      this.pad,
+      h("p", { class: "note" }, "They fly the drone that is marked, while you have control of it. It hovers when keys and sticks are let go, when this page loses the focus or its connection, and when the gamepad goes away. The emergency stop needs no control."),
+      h("div", { class: "pace" }, h("span", {}, "Pace"), paces),
+    );
+  }
+
+  toggle(): void {
+    if (this.element.open) this.element.close();
+    else this.element.show(); // not modal: the controls stay in reach
+  }
+
+  update(view: InputView, mine: boolean): void {
+    const moving = !isCentred(view.sticks);
+    const text = !view.focused ? "Keys: no focus" : view.typing ? "Keys: typing" : mine ? (moving ? "Flying" : "Keys fly") : "Keys";
+    setText(this.keys, view.gamepad ? `${text} · pad` : text);
+    setTone(this.dot, !mine ? "quiet" : view.focused && !view.typing ? (moving ? "busy" : "ok") : "warn");
+    setAttribute(this.chip, "aria-label", `Keys and gamepad: ${text}. Show the list.`);
+    setText(this.pad, view.gamepad ? `Gamepad: ${view.gamepad}` : "No gamepad: connect one and press a button.");
+  }
+}
+
+function table(title: string, rows: readonly Row[]): HTMLElement {
+  const keys = (row: Row): HTMLElement[] => row.keys.map((key) => h("kbd", {}, key));
+  return h("section", {}, h("h3", {}, title), h("dl", { class: "keymap" }, ...rows.map((row) => h("div", {}, h("dt", {}, ...keys(row)), h("dd", {}, row.does)))));
+}

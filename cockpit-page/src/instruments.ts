@@ -1,0 +1,99 @@
+// Beside the pictures: the flight display, figures, who has control, and the links from this page to the vehicle.
+
+import { h, setHidden, setText, setTone, type Tone } from "./dom.js";
+import { degrees, duration, figure, headingText, words } from "./format.js";
+import { Horizon } from "./horizon.js";
+import type { Authority, State } from "./model.js";
+
+const LINK_TONES: Readonly<Record<string, Tone>> = { up: "ok", degraded: "warn", connecting: "busy", lost: "bad", closed: "bad" };
+const FIGURES = ["Altitude", "Climb", "Speed", "Heading", "Roll", "Nose up"] as const;
+const UNITS = ["m", "m/s", "m/s", "°", "°", "°"] as const;
+const SLOW_S = 0.25;
+
+class Hop {
+  readonly element: HTMLElement;
+  private readonly text = h("span", {}, "–");
+
+  constructor(name: string) {
+    this.element = h("li", { class: "hop", "data-tone": "quiet", "data-hop": name }, h("i", { class: "wire" }), this.text);
+  }
+
+  show(text: string, tone: Tone): void {
+    setTone(this.element, tone);
+    setText(this.text, text);
+  }
+}
+
+export class Instruments {
+  readonly element: HTMLElement;
+  private readonly horizon = new Horizon();
+  private readonly outputs = FIGURES.map((name) => h("output", { "data-figure": name }, "–"));
+  private readonly page = new Hop("page");
+  private readonly application = new Hop("application");
+  private readonly vehicle = new Hop("vehicle");
+  private readonly reason = h("p", { class: "note" });
+  private readonly command = h("p", { class: "note command" });
+
+  constructor() {
+    const node = (name: string): HTMLElement => h("li", { class: "node" }, name);
+    this.element = h(
+      "section",
+      { class: "side", "aria-label": "Instruments" },
+      this.horizon.element,
+      h("dl", { class: "figures" }, ...FIGURES.map((name, place) => h("div", {}, h("dt", {}, name), h("dd", {}, this.outputs[place] as Node, h("span", {}, UNITS[place] as string))))),
+      this.command,
+      h("ol", { class: "hops", "aria-label": "Links, from this page to the vehicle" }, node("Page"), this.page.element, node("Cockpit"), this.application.element, node("Proxy"), this.vehicle.element, node("Vehicle")),
+      this.reason,
+    );
+  }
+
+  update(state: State | null, connected: boolean, round_trip_s: number | null): void {
+    this.horizon.update(state);
+    const [roll, pitch] = [state?.attitude?.roll ?? null, state?.attitude?.pitch ?? null];
+    const values = [
+      figure(state?.altitude, 2),
+      figure(state?.velocity?.[2], 2),
+      figure(state?.speed, 2),
+      headingText(state?.attitude?.yaw),
+      figure(roll === null ? null : degrees(roll), 1),
+      figure(pitch === null ? null : -degrees(pitch), 1),
+    ];
+    this.outputs.forEach((output, place) => setText(output, values[place] as string));
+    setText(this.command, commandText(state));
+    this.links(state, connected, round_trip_s);
+  }
+
+  /** The proxy does not answer: nothing else is known, but why. */
+  lost(state: State): void {
+    this.links(state, true, null);
+  }
+
+  private links(state: State | null, connected: boolean, round_trip_s: number | null): void {
+    const slow = round_trip_s !== null && round_trip_s > SLOW_S;
+    this.page.show(connected ? (round_trip_s === null ? "up" : `${Math.max(1, Math.round(round_trip_s * 1000))} ms`) : "lost", connected ? (slow ? "warn" : "ok") : "bad");
+    const hop = (name: string | undefined): [string, Tone] => (connected && name ? [name, LINK_TONES[name] ?? "quiet"] : ["not known", "quiet"]);
+    this.application.show(...hop(state?.links.application));
+    this.vehicle.show(...hop(state?.links.vehicle));
+    setText(this.reason, connected ? (state?.links.reason ?? "") : "");
+    setHidden(this.reason, !this.reason.textContent);
+  }
+}
+
+/** The command that was applied last, in words. */
+export function commandText(state: State | null): string {
+  const applied = state?.set_points;
+  if (!applied) return "No command heard yet";
+  const values = Object.entries(applied.values).filter(([, value]) => value !== null && value !== 0);
+  const shown = values.map(([name, value]) => `${words(name)} ${figure(value, 2)}`).join(", ");
+  const age_s = applied.age_s ?? 0;
+  return `Applied: ${words(applied.action)}${shown ? ` · ${shown}` : ""}${age_s > 1 ? ` · ${duration(age_s)} ago` : ""}`;
+}
+
+/** Who has control, in words; `authority` is what this page's own line says, where there is one. */
+export function holderText(state: State | null, authority: Authority | null): { who: string; more: string; tone: Tone } {
+  if (authority?.mine) return { who: "You", more: `have control, priority ${authority.priority ?? "–"}`, tone: "busy" };
+  const { holder = null, priority = null } = authority?.holder ? authority : (state?.authority ?? {});
+  if (!holder) return { who: "Nobody", more: "has control", tone: "quiet" };
+  const waits = authority?.state === "queued" || authority?.state === "preempted" ? ", you are in line" : "";
+  return { who: holder, more: `has control, priority ${priority ?? "–"}${waits}`, tone: "ok" };
+}

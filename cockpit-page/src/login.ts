@@ -1,0 +1,42 @@
+// Who asks: a session that is there, or a token that is asked for once.
+
+import { get, post, told } from "./api.js";
+import { h, setText } from "./dom.js";
+import type { Session } from "./model.js";
+
+/** Resolves when somebody is known. What is needed until then is shown in `place`. */
+export async function session(place: HTMLElement): Promise<Session> {
+  for (;;) {
+    try {
+      const found = await get<Session>("/api/session");
+      if (found.role !== null) return found;
+      if (!found.login) {
+        place.replaceChildren(h("main", { class: "gate" }, h("h1", {}, "Skyloop cockpit"), h("p", {}, found.hint)));
+        await new Promise((later) => setTimeout(later, 3000));
+      } else await ask(place);
+    } catch (error) {
+      place.replaceChildren(h("main", { class: "gate" }, h("h1", {}, "Skyloop cockpit"), h("p", { role: "alert" }, told(error))));
+      await new Promise((later) => setTimeout(later, 1000));
+    }
+  }
+}
+
+async function ask(place: HTMLElement): Promise<void> {
+  const token = h("input", { type: "password", id: "token", autocomplete: "current-password", required: true, maxlength: 256 });
+  const problem = h("p", { class: "answer", role: "alert", "data-tone": "bad" });
+  const form = h("form", { class: "gate" }, h("h1", {}, "Skyloop cockpit"), h("label", { for: "token" }, "Token"), token, h("button", { type: "submit", class: "primary" }, "Enter"), problem);
+  place.replaceChildren(h("main", {}, form));
+  token.focus();
+  await new Promise<void>((done) => {
+    form.addEventListener("submit", async (event) => {
+      event.preventDefault();
+      try {
+        await post("/api/login", { token: token.value });
+        done();
+      } catch (error) {
+        setText(problem, told(error));
+        token.select();
+      }
+    });
+  });
+}

@@ -1,0 +1,201 @@
+// What the cockpit's server says and is told: docs/cockpit.md. SI units and radians; what is not known is null.
+
+export type Vector = [number, number, number];
+
+export interface Camera {
+  name: string;
+  width: number;
+  height: number;
+}
+
+export interface Links {
+  application: string;
+  vehicle: string;
+  reason: string;
+}
+
+/** A row of the overview. */
+export interface DroneRow {
+  name: string;
+  uri: string;
+  vehicle: string;
+  transport: string;
+  state: string;
+  airborne: boolean;
+  battery: number | null;
+  owner: string | null;
+  me: boolean;
+  links: Links;
+  alarms: string[];
+  cameras: Camera[];
+  can_fly: boolean;
+  why_not: string;
+  recording: boolean;
+  position: Vector | null;
+  altitude: number | null;
+  yaw: number | null;
+}
+
+export interface Vehicle {
+  type: "vehicle";
+  name: string;
+  uri: string;
+  transport: string;
+  vehicle: string;
+  description: string;
+  can_fly: boolean;
+  why_not: string;
+  cameras: Camera[];
+  priorities: [number, number];
+}
+
+export interface Channel {
+  count: number;
+  rate_hz: number | null;
+  lost: number;
+  dropped: number;
+  malformed: number;
+  age_s: number | null;
+  delay_s: { median: number | null; p99: number | null } | null;
+}
+
+export interface DroneEvent {
+  n: number;
+  kind: string;
+  severity: string;
+  text: string;
+  app: string;
+  age_s: number;
+}
+
+export interface Place {
+  position: Vector;
+  yaw: number | null;
+}
+
+export interface State {
+  type: "state";
+  links: Links;
+  feedback: { age_s: number | null; failsafe: string } | null;
+  attitude: { roll: number | null; pitch: number | null; yaw: number | null } | null;
+  altitude: number | null;
+  velocity: Vector | null;
+  speed: number | null;
+  position: Vector | null;
+  battery: number | null;
+  flight: string;
+  airborne: boolean;
+  owner: string | null;
+  authority: { holder: string | null; priority: number | null; lease: number; me: boolean };
+  channels: Record<string, Channel>;
+  alarms: string[];
+  values: Record<string, number | null>;
+  set_points: { action: string; values: Record<string, number | null>; age_s: number | null } | null;
+  truth: Place | null;
+  targets: (Place & { name: string })[];
+  waypoints: (Place & { app: string | null })[];
+  events: DroneEvent[];
+}
+
+export type Value = boolean | number | string | number[];
+
+export interface Parameter {
+  name: string;
+  type: string;
+  value: Value | null;
+  unit: string;
+  minimum: number | null;
+  maximum: number | null;
+  default: Value | null;
+  choices: Value[];
+  read_only: boolean;
+  description: string;
+}
+
+export interface Authority {
+  type: "authority";
+  state: "none" | "queued" | "held" | "preempted";
+  holder: string | null;
+  priority: number | null;
+  mine: boolean;
+}
+
+export type Told =
+  | Authority
+  | { type: "done"; do: string; name?: string; value?: Value }
+  | { type: "refused"; do: string; why: string }
+  | { type: "pong"; n: number };
+
+export interface Sticks {
+  forward: number;
+  left: number;
+  up: number;
+  yaw_rate: number;
+}
+
+export type Order =
+  | { do: "take"; priority: number }
+  | { do: "release" | "takeoff" | "hover" | "land" | "stop" | "reset" }
+  | ({ do: "fly" } & Sticks)
+  | { do: "goto"; x: number; y: number; z: number; yaw?: number }
+  | { do: "set"; name: string; value: Value }
+  | { do: "ping"; n: number };
+
+export interface Session {
+  role: "pilot" | "observer" | null;
+  name: string;
+  login: boolean;
+  hint: string;
+}
+
+export interface RunningRecording {
+  id: string;
+  drones: string[];
+  path: string;
+  state: string;
+  reason: string;
+  seconds: number;
+  bytes: number;
+  /** By drone and channel: what was received and left out, and what never came. */
+  dropped: Record<string, Record<string, number>>;
+  missed: Record<string, Record<string, number>>;
+}
+
+export interface PastRecording {
+  name: string;
+  size: number;
+  started: number | null;
+  drones: string[];
+  seconds: number | null;
+  problem: string | null;
+}
+
+export interface Recordings {
+  folder: string;
+  running: RunningRecording[];
+  past: PastRecording[];
+}
+
+export type Shape =
+  | { kind: "line"; points: [number, number][]; closed: boolean; colour: Vector }
+  | { kind: "points"; points: [number, number][]; colour: Vector }
+  | { kind: "text"; text: string; at: [number, number]; colour: Vector };
+
+export interface Drawing {
+  type: "drawing";
+  source: string;
+  captured_ns: string;
+  width: number;
+  height: number;
+  shapes: Shape[];
+}
+
+export interface FrameHead {
+  ack: number;
+  camera: string;
+  seq: number;
+  captured_ns: string;
+  age_s: number;
+  width: number;
+  height: number;
+}

@@ -1,0 +1,245 @@
+// One drone, opened: everything that is seen of it and done with it.
+
+import { post, told as problemOf } from "./api.js";
+import { Battery } from "./battery.js";
+import { Channels } from "./channels.js";
+import { Deck } from "./deck.js";
+import { h, setAttribute, setHidden, setText, setTone, type Tone } from "./dom.js";
+import { Events } from "./events.js";
+import { words } from "./format.js";
+import { History, Trail } from "./history.js";
+import { Instruments } from "./instruments.js";
+import type { Deed } from "./keys.js";
+import { MapView } from "./map.js";
+import type { DroneRow, State, Sticks, Vehicle } from "./model.js";
+import { Parameters } from "./parameters.js";
+import { Pilot } from "./pilot.js";
+import { Plots } from "./plots.js";
+import type { SceneView } from "./scene.js";
+import { LastingSocket } from "./socket.js";
+import { Strip } from "./strip.js";
+import { Thumbs } from "./thumbs.js";
+import { Stage } from "./video.js";
+import type { Body, Scene } from "./world.js";
+
+export interface PaneHost {
+  /** Of the last overview. */
+  rows(): readonly DroneRow[];
+  select(name: string): void;
+  close(name: string): void;
+  push(name: string, sticks: Sticks): void;
+  help(): void;
+}
+
+const NOTICE_MS = 9000;
+const FLIGHT_TONES: Readonly<Record<string, Tone>> = { landed: "quiet", unknown: "quiet", emergency: "bad", landing: "busy", taking_off: "busy", hovering: "ok", flying: "ok" };
+const now_s = (): number => performance.now() / 1000;
+
+export class Pane {
+  readonly element: HTMLElement;
+  readonly pilot: Pilot | null;
+  private vehicle: Vehicle | null = null;
+  private state: State | null = null;
+  private connected = false;
+  private absent = "";
+  private news = false;
+  private readonly socket: LastingSocket;
+  private readonly history = new History();
+  private readonly trail = new Trail();
+  private readonly battery = new Battery();
+  private readonly kind = h("span", { class: "kind" });
+  private readonly endReplay = h("button", { type: "button", class: "small", hidden: true, onclick: () => void this.stopReplay() }, "End replay");
+  private readonly flight = h("span", {}, "no feedback yet");
+  private readonly pill = h("p", { class: "pill", role: "status", "aria-label": "Flight state", "data-tone": "quiet" }, h("i", { class: "dot" }), this.flight);
+  private readonly alarms = h("div", { class: "banner alarms", role: "alert", "data-tone": "bad" });
+  private readonly notice = h("p", { class: "banner notice", role: "alert", "data-tone": "warn" });
+  private readonly stage: Stage;
+  private readonly instruments = new Instruments();
+  private readonly strip: Strip;
+  private readonly thumbs: Thumbs;
+  private readonly map: MapView;
+  private readonly space = h("div", { class: "filling" });
+  private readonly plots: Plots;
+  private readonly events = new Events();
+  private readonly channels = new Channels();
+  private readonly parameters: Parameters;
+  private scene: SceneView | null = null;
+  private readonly decks: Record<"space" | "plots" | "lists", Deck>;
+  private noticed_ms = Number.NEGATIVE_INFINITY;
+
+  constructor(
+    readonly name: string,
+    pilots: boolean,
+    private readonly host: PaneHost,
+  ) {
+    const base = `/ws/drones/${encodeURIComponent(name)}`;
+    this.stage = new Stage(name);
+    this.strip = new Strip((deed) => this.act(deed));
+    this.thumbs = new Thumbs((sticks) => host.push(name, sticks));
+    this.map = new MapView(() => this.world(), (x, y, z) => this.pilot?.goTo(x, y, z));
+    this.plots = new Plots(this.history, now_s);
+    this.parameters = new Parameters(name, (parameter, value) => this.pilot?.write(parameter, value));
+    this.decks = {
+      space: new Deck("space", [{ name: "Map", element: this.map.element }, { name: "3-D", element: this.space, opened: () => void this.openSpace() }], "Map and space"),
+      plots: new Deck("plots", [{ name: "Plots", element: this.plots.element }], "Plots"),
+      lists: new Deck("lists", [{ name: "Events", element: this.events.element }, { name: "Parameters", element: this.parameters.element, opened: () => void this.parameters.load() }], "Events and parameters"),
+    };
+    this.element = this.build();
+    this.socket = new LastingSocket(`${base}/telemetry`, {
+      message: (data) => this.hear(JSON.parse(data as string) as Vehicle | State),
+      state: (open, code) => this.linked(open, code),
+    });
+    this.pilot = pilots ? new Pilot((handlers) => new LastingSocket(`${base}/control`, handlers), this.listener()) : null;
+    this.update();
+  }
+
+  close(): void {
+    this.pilot?.close();
+    this.socket.close();
+    this.stage.close();
+    this.scene?.close();
+    this.element.remove();
+  }
+
+  selected(selected: boolean): void {
+    setAttribute(this.element, "data-selected", String(selected));
+  }
+
+  act(deed: Deed | "reset"): void {
+    this.host.select(this.name);
+    if (deed === "help") this.host.help();
+    else if (this.pilot === null) this.say("you may watch, not fly", "warn");
+    else if (deed === "take") this.pilot.take(this.strip.wanted);
+    else if (deed === "release") this.pilot.release();
+    // Escape hovers what this page flies; pressed by who does not fly it does nothing yet.
+    else if (deed !== "hover" || this.pilot.mine) this.pilot.act(deed);
+  }
+
+  tick(now_ms: number): void {
+    if (this.news) this.update();
+    this.stage.update(now_ms);
+    if (this.decks.space.shown === "Map") this.map.draw(now_ms);
+    else this.scene?.draw(now_ms);
+    this.plots.draw(now_ms);
+    if (now_ms - this.noticed_ms > NOTICE_MS) setText(this.notice, "");
+  }
+
+  /** Colours have changed. */
+  repaint(): void {
+    this.map.repaint();
+    this.plots.repaint();
+    this.scene?.repaint();
+  }
+
+  private build(): HTMLElement {
+    const close = h("button", { type: "button", class: "bare close", "aria-label": `Close ${this.name}`, onclick: () => this.host.close(this.name) }, "×");
+    const head = h("header", { class: "pane-head" }, h("h2", {}, this.name), this.kind, this.endReplay, this.pill, this.battery.element, close);
+    const body = h("div", { class: "pane-body" }, this.stage.element, this.decks.space.element, this.instruments.element, this.decks.plots.element, this.decks.lists.element, this.channels.element);
+    const element = h("article", { class: "pane", "data-drone": this.name, "aria-label": `Drone ${this.name}`, tabindex: -1 }, head, this.alarms, this.notice, body, this.thumbs.element, this.strip.element);
+    element.addEventListener("pointerdown", () => this.host.select(this.name), { capture: true });
+    element.addEventListener("focusin", () => this.host.select(this.name));
+    return element;
+  }
+
+  private listener(): ConstructorParameters<typeof Pilot>[1] {
+    return {
+      changed: () => this.update(),
+      refused: (order, why) => {
+        if (order === "set" && this.parameters.refused(why)) return;
+        this.say(order ? `${words(order)}: ${why}` : why, "warn");
+      },
+      done: (order, name, value) => {
+        if (order === "set" && name !== undefined && value !== undefined) this.parameters.done(name, value);
+        if (order === "stop") this.say("emergency stop sent", "bad");
+        if (order === "goto") this.say("the waypoint is reached", "ok");
+      },
+    };
+  }
+
+  private linked(open: boolean, code: number): void {
+    this.connected = open;
+    if (open) this.events.restart();
+    this.absent = code === 4404 ? `${this.name} is not there; it is shown when it comes back` : "";
+    this.update();
+  }
+
+  private hear(told: Vehicle | State): void {
+    if (told.type === "vehicle") {
+      this.vehicle = told;
+      this.stage.cameras(told.cameras);
+      setHidden(this.endReplay, this.pilot === null || !told.uri.startsWith("replay:"));
+    } else {
+      this.state = told;
+      this.absent = "";
+      this.history.add(now_s(), told.values);
+      const place = told.position ?? told.truth?.position;
+      if (place) this.trail.add(now_s(), place);
+      this.events.add(told.events);
+    }
+    this.news = true; // shown with the next tick
+  }
+
+  private update(): void {
+    this.news = false;
+    const { state, vehicle, pilot } = this;
+    // What came before the link broke is no news.
+    const live = this.connected && state?.links.application !== "lost" ? state : null;
+    setText(this.kind, vehicle ? vehicle.description || vehicle.vehicle : "");
+    setText(this.flight, live ? words(live.flight) : "not known");
+    setTone(this.pill, live ? (FLIGHT_TONES[live.flight] ?? "quiet") : "quiet");
+    this.battery.show(live?.battery ?? null);
+    this.instruments.update(live, this.connected, pilot?.round_trip_s ?? null);
+    if (live) this.channels.update(live);
+    if (this.connected && state && !live) this.instruments.lost(state);
+    this.strip.update(vehicle, state, pilot);
+    const [mine, placed] = [pilot?.mine ?? false, (live?.position ?? null) !== null];
+    const inAir = live?.airborne ?? false;
+    this.map.allow(mine && placed && inAir, !placed ? "Position not known." : !mine ? "Take control to fly to a place." : "It must be in the air to fly to a place.");
+    this.parameters.allow(mine, "Take control to change them.");
+    const told = !this.connected ? [this.absent || `no news of ${this.name} from the cockpit: what is shown is old`] : (state?.alarms ?? []);
+    setText(this.alarms, told.join(" · "));
+    setHidden(this.alarms, told.length === 0);
+    setAttribute(this.element, "data-lost", String(!live));
+    setAttribute(this.element, "data-mine", String(mine));
+  }
+
+  private say(text: string, tone: Tone): void {
+    setTone(this.notice, tone);
+    setText(this.notice, text);
+    this.noticed_ms = performance.now();
+  }
+
+  private async stopReplay(): Promise<void> {
+    try {
+      await post(`/api/replays/${encodeURIComponent(this.name)}/stop`);
+      this.host.close(this.name);
+    } catch (error) {
+      this.say(problemOf(error), "warn");
+    }
+  }
+
+  private world(): Scene {
+    const { state } = this;
+    const { roll = null, pitch = null, yaw = null } = state?.attitude ?? {};
+    const body = (name: string, position: Body["position"], turn: number | null): Body => ({ name, position, roll: 0, pitch: 0, yaw: turn });
+    return {
+      own: state?.position ? { ...body(this.name, state.position, yaw), roll: roll ?? 0, pitch: pitch ?? 0 } : null,
+      truth: state?.truth ? { ...body("truth", state.truth.position, state.truth.yaw), roll: roll ?? 0, pitch: pitch ?? 0 } : null,
+      others: this.host.rows().flatMap((row) => (row.name !== this.name && row.position ? [body(row.name, row.position, row.yaw)] : [])),
+      targets: (state?.targets ?? []).map((target) => body(target.name, target.position, target.yaw)),
+      waypoints: (state?.waypoints ?? []).map((one) => ({ position: one.position, own: one.app !== null })),
+      trail: this.trail,
+    };
+  }
+
+  private async openSpace(): Promise<void> {
+    if (this.scene) return;
+    try {
+      const { SceneView } = await import("./scene.js");
+      this.scene = new SceneView(() => this.world());
+      this.space.append(this.scene.element);
+    } catch (error) {
+      this.space.replaceChildren(h("p", { class: "empty" }, `No 3-D view here: ${problemOf(error)}`));
+    }
+  }
+}

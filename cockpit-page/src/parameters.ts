@@ -1,0 +1,142 @@
+// Parameters: read when somebody looks, written with the drone's own answer beside them.
+
+import { get, told } from "./api.js";
+import { h, setDisabled, setHidden, setText, setTone } from "./dom.js";
+import type { Parameter, Value } from "./model.js";
+import { parse, rangeText, valueText } from "./values.js";
+
+type Editor = HTMLInputElement | HTMLSelectElement;
+
+interface Row {
+  parameter: Parameter;
+  element: HTMLElement;
+  editor: Editor;
+  button: HTMLButtonElement;
+  answer: HTMLElement;
+}
+
+export class Parameters {
+  readonly element: HTMLElement;
+  private readonly words = h("input", { type: "search", placeholder: "Filter", "aria-label": "Filter parameters by words", oninput: () => this.filter() });
+  private readonly list = h("div", { class: "parameters", tabindex: 0, role: "region", "aria-label": "Parameters" });
+  private readonly note = h("p", { class: "note" }, "");
+  private rows = new Map<string, Row>();
+  private writing: string | null = null;
+  private can = false;
+
+  constructor(
+    private readonly drone: string,
+    private readonly write: (name: string, value: Value) => void,
+  ) {
+    const again = h("button", { type: "button", class: "small", onclick: () => void this.load() }, "Read again");
+    this.element = h("div", { class: "filling" }, h("div", { class: "filters" }, this.words, again), this.note, this.list);
+  }
+
+  /** Whether they can be written now; `why` not. */
+  allow(can: boolean, why: string): void {
+    this.can = can;
+    setText(this.note, can ? "" : why);
+    setHidden(this.note, can);
+    for (const row of this.rows.values()) this.enable(row);
+  }
+
+  async load(): Promise<void> {
+    try {
+      const parameters = await get<Parameter[]>(`/api/drones/${encodeURIComponent(this.drone)}/parameters`);
+      this.rows = new Map(parameters.map((parameter) => [parameter.name, this.row(parameter)]));
+      this.list.replaceChildren(...[...this.rows.values()].map((row) => row.element));
+      if (!parameters.length) this.list.append(h("p", { class: "empty" }, "No parameters"));
+      this.filter();
+    } catch (error) {
+      this.list.replaceChildren(h("p", { class: "empty" }, `Not read: ${told(error)}`));
+    }
+  }
+
+  /** The drone's answer to what was written here. */
+  done(name: string, value: Value): void {
+    const row = this.rows.get(name);
+    this.writing = null;
+    if (!row) return;
+    row.parameter.value = value;
+    row.editor.value = valueText(value);
+    this.say(row, "ok", "written");
+    this.enable(row);
+  }
+
+  /** Returns whether the refusal was of something written here. */
+  refused(why: string): boolean {
+    const row = this.writing === null ? undefined : this.rows.get(this.writing);
+    this.writing = null;
+    if (!row) return false;
+    this.say(row, "bad", why);
+    row.editor.setAttribute("aria-invalid", "true");
+    return true;
+  }
+
+  private row(parameter: Parameter): Row {
+    const editor = editorOf(parameter);
+    const button = h("button", { type: "submit", class: "small" }, "Set");
+    const answer = h("p", { class: "answer", role: "status" });
+    const standard = parameter.default === null ? "" : `default ${valueText(parameter.default)}`;
+    const facts = [parameter.type, rangeText(parameter), standard, parameter.read_only ? "read only" : ""].filter(Boolean).join(" · ");
+    const element = h(
+      "form",
+      { class: "parameter", "data-parameter": parameter.name, novalidate: true },
+      h("div", { class: "about" }, h("b", {}, parameter.name), h("span", { class: "facts" }, facts)),
+      h("div", { class: "edit" }, editor, h("span", { class: "unit" }, parameter.unit), button),
+      parameter.description ? h("p", { class: "description" }, parameter.description) : null,
+      answer,
+    );
+    const row = { parameter, element, editor, button, answer };
+    element.addEventListener("submit", (event) => {
+      event.preventDefault();
+      this.submit(row);
+    });
+    editor.addEventListener("input", () => this.enable(row));
+    this.enable(row);
+    return row;
+  }
+
+  private submit(row: Row): void {
+    const parsed = parse(row.parameter, row.editor.value);
+    row.editor.removeAttribute("aria-invalid");
+    if ("problem" in parsed) {
+      this.say(row, "bad", parsed.problem);
+      row.editor.setAttribute("aria-invalid", "true");
+      return;
+    }
+    this.say(row, "busy", "…");
+    this.writing = row.parameter.name;
+    this.write(row.parameter.name, parsed.value);
+  }
+
+  private say(row: Row, tone: "ok" | "bad" | "busy", text: string): void {
+    setTone(row.answer, tone);
+    setText(row.answer, text);
+  }
+
+  private enable(row: Row): void {
+    const may = this.can && !row.parameter.read_only;
+    setDisabled(row.editor, !may);
+    setDisabled(row.button, !may || row.editor.value === valueText(row.parameter.value));
+  }
+
+  private filter(): void {
+    const needle = this.words.value.trim().toLowerCase();
+    for (const { parameter, element } of this.rows.values()) {
+      element.hidden = !`${parameter.name} ${parameter.description}`.toLowerCase().includes(needle);
+    }
+  }
+}
+
+function editorOf(parameter: Parameter): Editor {
+  const label = { "aria-label": parameter.unit ? `${parameter.name} in ${parameter.unit}` : parameter.name };
+  const choices = parameter.type === "bool" ? [true, false] : parameter.choices;
+  if (choices.length) {
+    const editor = h("select", label, ...choices.map((choice) => h("option", {}, valueText(choice))));
+    editor.value = valueText(parameter.value);
+    return editor;
+  }
+  const numeric = parameter.type === "int" || parameter.type === "float";
+  return h("input", { ...label, type: "text", inputmode: numeric ? "decimal" : "text", autocomplete: "off", spellcheck: "false", value: valueText(parameter.value) });
+}

@@ -1,0 +1,90 @@
+// A WebSocket that comes back by itself, with a growing pause up to two seconds.
+
+export const FIRST_PAUSE_MS = 200;
+export const LONGEST_PAUSE_MS = 2000;
+
+export interface Handlers {
+  message: (data: string | ArrayBuffer) => void;
+  /** Whether it is open, when that changes; with the server's words when it was closed with a reason. */
+  state?: (open: boolean, code: number, reason: string) => void;
+}
+
+/** As much of a WebSocket as is used. */
+export interface Wire {
+  binaryType: string;
+  readyState: number;
+  bufferedAmount: number;
+  onopen: ((event: never) => void) | null;
+  onmessage: ((event: { data: string | ArrayBuffer }) => void) | null;
+  onclose: ((event: { code: number; reason: string }) => void) | null;
+  send(text: string): void;
+  close(): void;
+}
+
+export interface Surroundings {
+  connect: (path: string) => Wire;
+  later: (act: () => void, ms: number) => unknown;
+  cancel: (timer: unknown) => void;
+}
+
+const browser: Surroundings = {
+  connect: (path) => new WebSocket(`${location.protocol.replace("http", "ws")}//${location.host}${path}`) as unknown as Wire,
+  later: (act, ms) => setTimeout(act, ms),
+  cancel: (timer) => clearTimeout(timer as number),
+};
+
+const OPEN = 1;
+/** Close codes of the server after which trying again at once makes no sense: not logged in, not allowed. */
+const REFUSED = new Set([4401, 4403]);
+
+export class LastingSocket {
+  private wire!: Wire;
+  private pause = FIRST_PAUSE_MS;
+  private closed = false;
+  private timer: unknown;
+
+  constructor(
+    private readonly path: string,
+    private readonly handlers: Handlers,
+    private readonly around: Surroundings = browser,
+  ) {
+    this.open();
+  }
+
+  get isOpen(): boolean {
+    return !this.closed && this.wire.readyState === OPEN;
+  }
+
+  /** False if it could not be sent; then it never will be: what is old must not be flown. */
+  send(message: object): boolean {
+    if (!this.isOpen) return false;
+    this.wire.send(JSON.stringify(message));
+    return true;
+  }
+
+  close(): void {
+    this.closed = true;
+    this.around.cancel(this.timer);
+    this.wire.close();
+  }
+
+  private open(): void {
+    const wire = this.around.connect(this.path);
+    wire.binaryType = "arraybuffer";
+    wire.onopen = () => {
+      this.pause = FIRST_PAUSE_MS;
+      this.handlers.state?.(true, 0, "");
+    };
+    wire.onmessage = (event) => {
+      if (!this.closed) this.handlers.message(event.data);
+    };
+    wire.onclose = (event) => {
+      if (this.closed) return;
+      this.handlers.state?.(false, event.code, event.reason);
+      const pause = REFUSED.has(event.code) ? LONGEST_PAUSE_MS : this.pause;
+      this.timer = this.around.later(() => this.open(), pause);
+      this.pause = Math.min(LONGEST_PAUSE_MS, this.pause * 1.6);
+    };
+    this.wire = wire;
+  }
+}

@@ -1,0 +1,79 @@
+// From keys, gamepad and thumbs to one set of sticks. Pure.
+//
+// Body axes as in Skyloop: forward, left, up, counter-clockwise; each from −1 to 1 until it is scaled.
+
+import type { Sticks } from "./model.js";
+
+export const CENTRED: Readonly<Sticks> = { forward: 0, left: 0, up: 0, yaw_rate: 0 };
+export const DEAD_BAND = 0.12;
+/** So long keys take from nothing to all [s]: a tap is a nudge. */
+export const RAMP_S = 0.3;
+
+const AXES = ["forward", "left", "up", "yaw_rate"] as const;
+
+/** Nothing within the band, all of the range beyond it: the output has no step at its edge. */
+export function deadBand(value: number, band: number = DEAD_BAND): number {
+  if (!Number.isFinite(value)) return 0;
+  const size = Math.min(1, Math.abs(value));
+  return size <= band ? 0 : (Math.sign(value) * (size - band)) / (1 - band);
+}
+
+export const isCentred = (sticks: Sticks): boolean => AXES.every((axis) => sticks[axis] === 0);
+
+/** Of several inputs the one that is pushed furthest, axis by axis. */
+export function merge(...inputs: Sticks[]): Sticks {
+  const merged = { ...CENTRED };
+  for (const input of inputs) {
+    for (const axis of AXES) if (Math.abs(input[axis]) > Math.abs(merged[axis])) merged[axis] = input[axis];
+  }
+  return merged;
+}
+
+/** Towards `wanted` within `seconds`; back to the centre, and across it, at once. */
+export function ramp(now: Sticks, wanted: Sticks, seconds: number): Sticks {
+  const next = { ...wanted };
+  for (const axis of AXES) {
+    const [from, to] = [now[axis] * wanted[axis] > 0 ? now[axis] : 0, wanted[axis]];
+    if (Math.abs(to) > Math.abs(from)) next[axis] = Math.sign(to) * Math.min(Math.abs(to), Math.abs(from) + seconds / RAMP_S);
+  }
+  return next;
+}
+
+export interface Pace {
+  name: string;
+  /** [m/s], horizontal and vertical; [rad/s]. */
+  speed: number;
+  climb: number;
+  turn: number;
+}
+
+export const PACES: readonly Pace[] = [
+  { name: "Gentle", speed: 0.4, climb: 0.3, turn: 0.6 },
+  { name: "Normal", speed: 0.8, climb: 0.5, turn: 1.0 },
+  { name: "Brisk", speed: 1.6, climb: 0.8, turn: 1.6 },
+];
+
+/** Sticks as a velocity: [m/s] and [rad/s]. */
+export function scale(sticks: Sticks, pace: Pace): Sticks {
+  return {
+    forward: sticks.forward * pace.speed,
+    left: sticks.left * pace.speed,
+    up: sticks.up * pace.climb,
+    yaw_rate: sticks.yaw_rate * pace.turn,
+  };
+}
+
+/** A stick that was already pushed when control began counts for nothing until it has been let go. */
+export class Latch {
+  private open = false;
+
+  /** Ask for the centre again. */
+  reset(): void {
+    this.open = false;
+  }
+
+  pass(sticks: Sticks): Sticks {
+    this.open ||= isCentred(sticks);
+    return this.open ? sticks : { ...CENTRED };
+  }
+}

@@ -1,0 +1,34 @@
+// Parameters' values as people write and read them. Pure.
+
+import { plain } from "./format.js";
+import type { Parameter, Value } from "./model.js";
+
+export function valueText(value: Value | null): string {
+  if (value === null) return "–";
+  if (Array.isArray(value)) return value.map((one) => String(one)).join(", ");
+  return String(value);
+}
+
+/** What was written, as the parameter's type; words that say what is wrong instead. Ranges are the drone's own affair. */
+export function parse(parameter: Pick<Parameter, "type">, text: string): { value: Value } | { problem: string } {
+  const written = text.trim();
+  if (parameter.type === "text") return { value: text };
+  if (parameter.type === "bool") {
+    return written === "true" || written === "false" ? { value: written === "true" } : { problem: "true or false is needed" };
+  }
+  const parts = parameter.type === "vector" ? written.split(/\s*,\s*|\s+/) : [written];
+  const numbers = parts.map((one) => (one === "" ? Number.NaN : Number(one)));
+  if (!numbers.every(Number.isFinite)) return { problem: parameter.type === "vector" ? "numbers with commas between are needed" : "a number is needed" };
+  if (parameter.type === "vector") return { value: numbers };
+  const value = numbers[0] as number;
+  if (parameter.type === "int" && !Number.isInteger(value)) return { problem: "a whole number is needed" };
+  return { value };
+}
+
+export function rangeText(parameter: Pick<Parameter, "minimum" | "maximum" | "choices">): string {
+  if (parameter.choices.length) return parameter.choices.map(valueText).join(" | ");
+  const { minimum, maximum } = parameter;
+  if (minimum !== null && maximum !== null) return `${plain(minimum)} … ${plain(maximum)}`;
+  if (minimum !== null) return `≥ ${plain(minimum)}`;
+  return maximum === null ? "" : `≤ ${plain(maximum)}`;
+}

@@ -1,0 +1,197 @@
+// One camera: shows the newest frame, tells how old it is, and draws what was published about it.
+
+import { fit, h, setAttribute, setHidden, setText, setTone } from "./dom.js";
+import { contain, draw } from "./drawing.js";
+import { duration } from "./format.js";
+import type { Camera, Drawing, FrameHead } from "./model.js";
+import { NewestFrame, type Received, unpack } from "./newest.js";
+import { LastingSocket } from "./socket.js";
+
+const REACH_NS = 300_000_000n; // drawings of a frame further away than this are not shown
+const LATE_S = 0.25;
+const STALE_S = 1;
+const RATE_MS = 2000;
+const TELL_MS = 90;
+
+interface Shown extends FrameHead {
+  captured: bigint;
+  received_ms: number;
+}
+
+export class VideoView {
+  readonly element: HTMLElement;
+  overlay = true;
+  private readonly canvas: HTMLCanvasElement;
+  private readonly sheet = h("canvas", { class: "overlay", "aria-hidden": "true" });
+  private readonly age = h("span");
+  private readonly ageChip = h("p", { class: "chip age", "data-tone": "quiet" }, h("i", { class: "dot" }), this.age);
+  private readonly rate = h("p", { class: "chip rate" });
+  private readonly nothing = h("p", { class: "nothing" }, "Waiting for the first picture…");
+  private readonly drawings = new Map<string, Drawing>();
+  private socket: LastingSocket | null = null;
+  private frames: NewestFrame<ImageBitmap> | null = null;
+  private shown: Shown | null = null;
+  private arrivals: number[] = [];
+  private readonly hide = (): void => this.reopen();
+
+  constructor(
+    private readonly drone: string,
+    readonly camera: Camera,
+  ) {
+    this.canvas = h("canvas", { class: "video", role: "img", width: camera.width, height: camera.height });
+    this.element = h("figure", { class: "camera", "data-camera": camera.name }, this.canvas, this.sheet, this.ageChip, this.rate, this.nothing);
+    // A page that nobody sees asks for no pictures.
+    document.addEventListener("visibilitychange", this.hide);
+    this.reopen();
+  }
+
+  close(): void {
+    document.removeEventListener("visibilitychange", this.hide);
+    this.socket?.close();
+    this.frames?.end();
+  }
+
+  /** Age of what is on the screen now [s]: its age when it was sent, and the time since it came. */
+  age_s(now_ms: number): number | null {
+    return this.shown && this.shown.age_s + (now_ms - this.shown.received_ms) / 1000;
+  }
+
+  /** Tell age and rate. */
+  update(now_ms: number): void {
+    const age_s = this.age_s(now_ms);
+    while (this.arrivals[0] !== undefined && this.arrivals[0] < now_ms - RATE_MS) this.arrivals.shift();
+    if (age_s === null || this.shown === null) return;
+    const stale = age_s > STALE_S;
+    setTone(this.ageChip, stale ? "bad" : age_s > LATE_S ? "warn" : "ok");
+    setText(this.age, stale ? `${duration(age_s)} old` : `${(age_s * 1000).toFixed(0)} ms`);
+    setAttribute(this.element, "data-age-ms", (age_s * 1000).toFixed(0));
+    setAttribute(this.element, "data-seq", String(this.shown.seq));
+    setAttribute(this.element, "data-stale", String(stale));
+    setHidden(this.nothing, !stale);
+    setText(this.nothing, "No new picture");
+    const { width, height } = this.shown;
+    setText(this.rate, `${this.camera.name} · ${width} × ${height} · ${((this.arrivals.length * 1000) / RATE_MS).toFixed(0)} fps`);
+    setAttribute(this.canvas, "aria-label", `Camera ${this.camera.name}: ${stale ? "no new picture" : "live picture"}`);
+  }
+
+  redraw(): void {
+    const density = fit(this.sheet);
+    const pen = this.sheet.getContext("2d");
+    if (!pen || !this.shown) return;
+    pen.clearRect(0, 0, this.sheet.width, this.sheet.height);
+    if (!this.overlay) return;
+    for (const drawing of this.drawings.values()) {
+      const apart = this.shown.captured - BigInt(drawing.captured_ns);
+      if (apart < REACH_NS && apart > -REACH_NS) draw(pen, drawing.shapes, contain(drawing.width, drawing.height, this.sheet, density));
+    }
+  }
+
+  private reopen(): void {
+    this.socket?.close();
+    this.frames?.end();
+    this.socket = null;
+    if (document.hidden) return;
+    const socket = new LastingSocket(`/ws/drones/${encodeURIComponent(this.drone)}/video/${encodeURIComponent(this.camera.name)}`, {
+      message: (data) => this.hear(data),
+    });
+    this.socket = socket;
+    this.frames = new NewestFrame(
+      (jpeg) => createImageBitmap(new Blob([jpeg], { type: "image/jpeg" })),
+      (frame, picture) => this.show(frame, picture),
+      (ack) => socket.send({ ack }),
+    );
+  }
+
+  private hear(data: string | ArrayBuffer): void {
+    if (typeof data === "string") {
+      const drawing = JSON.parse(data) as Drawing;
+      this.drawings.set(drawing.source, drawing);
+      this.redraw();
+    } else {
+      this.frames?.put({ ...unpack(data), received_ms: performance.now() });
+    }
+  }
+
+  private show({ head, received_ms }: Received, picture: ImageBitmap): void {
+    if (this.canvas.width !== head.width) this.canvas.width = head.width;
+    if (this.canvas.height !== head.height) this.canvas.height = head.height;
+    this.canvas.getContext("2d", { alpha: false })?.drawImage(picture, 0, 0);
+    this.shown = { ...head, captured: BigInt(head.captured_ns), received_ms };
+    this.arrivals.push(received_ms);
+    this.redraw();
+  }
+}
+
+/** The cameras of a drone: each can be shown and hidden, the first one is. */
+export class Stage {
+  readonly element: HTMLElement;
+  private readonly choices = h("div", { class: "choices", role: "group", "aria-label": "Cameras" });
+  private readonly pictures = h("div", { class: "pictures" });
+  private readonly overlay = h("button", { type: "button", class: "small", "aria-pressed": "true", onclick: () => this.toggle() }, "Overlay");
+  private readonly nothing = h("p", { class: "empty" }, "No camera");
+  private readonly views = new Map<string, VideoView>();
+  private known = "";
+  private told_ms = 0;
+
+  constructor(private readonly drone: string) {
+    this.element = h("section", { class: "stage", "aria-label": "Cameras" }, h("header", { class: "deck-head" }, this.choices, this.overlay), this.pictures);
+    this.pictures.append(this.nothing);
+  }
+
+  cameras(cameras: readonly Camera[]): void {
+    if (JSON.stringify(cameras) === this.known) return;
+    this.known = JSON.stringify(cameras);
+    for (const name of [...this.views.keys()]) this.hide(name);
+    this.choices.replaceChildren(
+      ...cameras.map((camera) => h("button", { type: "button", class: "small", "aria-pressed": "false", "data-camera": camera.name, onclick: () => this.choose(camera) }, camera.name)),
+    );
+    if (cameras[0]) this.choose(cameras[0]);
+    setHidden(this.overlay, cameras.length === 0);
+  }
+
+  update(now_ms: number): void {
+    if (now_ms - this.told_ms < TELL_MS) return;
+    this.told_ms = now_ms;
+    for (const view of this.views.values()) view.update(now_ms);
+  }
+
+  close(): void {
+    for (const view of this.views.values()) view.close();
+  }
+
+  private choose(camera: Camera): void {
+    const shown = this.views.has(camera.name);
+    if (shown) this.hide(camera.name);
+    else {
+      const view = new VideoView(this.drone, camera);
+      view.overlay = this.overlay.getAttribute("aria-pressed") === "true";
+      this.views.set(camera.name, view);
+      this.pictures.append(view.element);
+    }
+    const button = this.choices.querySelector(`[data-camera="${CSS.escape(camera.name)}"]`);
+    if (button) setAttribute(button, "aria-pressed", String(!shown));
+    this.arrange();
+  }
+
+  private hide(name: string): void {
+    const view = this.views.get(name);
+    view?.close();
+    view?.element.remove();
+    this.views.delete(name);
+    this.arrange();
+  }
+
+  private arrange(): void {
+    setAttribute(this.pictures, "data-count", String(this.views.size));
+    setHidden(this.nothing, this.views.size > 0);
+  }
+
+  private toggle(): void {
+    const on = this.overlay.getAttribute("aria-pressed") !== "true";
+    setAttribute(this.overlay, "aria-pressed", String(on));
+    for (const view of this.views.values()) {
+      view.overlay = on;
+      view.redraw();
+    }
+  }
+}

@@ -1,0 +1,239 @@
+// What the page does with its connections: newest frame wins, sockets come back, the pilot's line is safe.
+
+import assert from "node:assert/strict";
+import { test } from "node:test";
+import type { Authority, FrameHead } from "../src/model.js";
+import { NewestFrame, unpack } from "../src/newest.js";
+import { Pilot } from "../src/pilot.js";
+import { FIRST_PAUSE_MS, type Handlers, LastingSocket, LONGEST_PAUSE_MS, type Wire } from "../src/socket.js";
+import { CENTRED } from "../src/sticks.js";
+
+const head = (ack: number): FrameHead => ({ ack, camera: "front", seq: ack, captured_ns: "1", age_s: 0, width: 4, height: 3 });
+const frame = (ack: number) => ({ head: head(ack), jpeg: new Uint8Array([ack]), received_ms: 0 });
+const settle = (): Promise<void> => new Promise((done) => setImmediate(done));
+
+test("a frame's message is taken apart", () => {
+  const text = new TextEncoder().encode(JSON.stringify(head(7)));
+  const message = new Uint8Array(4 + text.length + 2);
+  new DataView(message.buffer).setUint32(0, text.length);
+  message.set(text, 4);
+  message.set([0xff, 0xd8], 4 + text.length);
+  const { head: told, jpeg } = unpack(message.buffer);
+  assert.equal(told.ack, 7);
+  assert.deepEqual([...jpeg], [0xff, 0xd8]);
+  assert.throws(() => unpack(message.buffer.slice(0, 10)), RangeError);
+});
+
+test("while one is decoded only the newest is kept, and each is acknowledged once", async () => {
+  const waiting: (() => void)[] = [];
+  const [shown, acknowledged]: [number[], number[]] = [[], []];
+  const frames = new NewestFrame(
+    (jpeg) => new Promise<{ close(): void; number: number }>((done) => waiting.push(() => done({ close: () => undefined, number: jpeg[0] as number }))),
+    (_, picture) => shown.push(picture.number),
+    (ack) => acknowledged.push(ack),
+  );
+  for (const ack of [1, 2, 3]) frames.put(frame(ack));
+  assert.deepEqual(acknowledged, [2], "left out, as 3 is newer");
+  waiting.shift()?.();
+  await settle();
+  waiting.shift()?.();
+  await settle();
+  assert.deepEqual(shown, [1, 3]);
+  assert.deepEqual(acknowledged, [2, 1, 3]);
+  assert.equal(frames.skipped, 1);
+});
+
+test("a picture that can't be decoded does not stop the next one; nothing is shown after the end", async () => {
+  const [shown, acknowledged]: [number[], number[]] = [[], []];
+  const decode = async (jpeg: Uint8Array): Promise<{ close(): void }> => {
+    if (jpeg[0] === 1) throw new Error("no picture");
+    return { close: () => undefined };
+  };
+  const frames = new NewestFrame(decode, (one) => shown.push(one.head.ack), (ack) => acknowledged.push(ack));
+  frames.put(frame(1));
+  await settle();
+  frames.put(frame(2));
+  await settle();
+  assert.deepEqual([shown, acknowledged], [[2], [1, 2]]);
+  frames.put(frame(3));
+  frames.end();
+  await settle();
+  assert.deepEqual(shown, [2]);
+});
+
+class FakeWire implements Wire {
+  binaryType = "";
+  readyState = 0;
+  bufferedAmount = 0;
+  onopen: Wire["onopen"] = null;
+  onmessage: Wire["onmessage"] = null;
+  onclose: Wire["onclose"] = null;
+  sent: string[] = [];
+  send(text: string): void {
+    this.sent.push(text);
+  }
+  close(): void {
+    this.readyState = 3;
+  }
+  open(): void {
+    this.readyState = 1;
+    this.onopen?.(undefined as never);
+  }
+  end(code = 1006): void {
+    this.readyState = 3;
+    this.onclose?.({ code, reason: "" });
+  }
+}
+
+function lasting(): { socket: LastingSocket; wires: FakeWire[]; pauses: number[]; later: () => void; states: boolean[]; heard: unknown[] } {
+  const [wires, pauses, states, heard]: [FakeWire[], number[], boolean[], unknown[]] = [[], [], [], []];
+  let act: () => void = () => undefined;
+  const around = {
+    connect: () => {
+      wires.push(new FakeWire());
+      return wires.at(-1) as FakeWire;
+    },
+    later: (what: () => void, ms: number) => {
+      pauses.push(ms);
+      act = what;
+    },
+    cancel: () => {
+      act = () => undefined;
+    },
+  };
+  const socket = new LastingSocket("/ws", { message: (data) => heard.push(data), state: (open) => states.push(open) }, around);
+  return { socket, wires, pauses, later: () => act(), states, heard };
+}
+
+test("a socket comes back, with longer and longer pauses, and short ones again after it was open", () => {
+  const { wires, pauses, later, states } = lasting();
+  for (let number = 0; number < 12; number += 1) {
+    wires.at(-1)?.end();
+    later();
+  }
+  assert.equal(pauses[0], FIRST_PAUSE_MS);
+  assert.equal(pauses.at(-1), LONGEST_PAUSE_MS);
+  wires.at(-1)?.open();
+  wires.at(-1)?.end();
+  assert.equal(pauses.at(-1), FIRST_PAUSE_MS);
+  assert.deepEqual(states.slice(-2), [true, false]);
+  later();
+  wires.at(-1)?.end(4403);
+  assert.equal(pauses.at(-1), LONGEST_PAUSE_MS, "not allowed: no hurry");
+});
+
+test("nothing is sent or kept while it is not open; closed is closed", () => {
+  const { socket, wires, later, heard } = lasting();
+  assert.equal(socket.send({ do: "stop" }), false);
+  wires[0]?.open();
+  assert.equal(socket.send({ do: "stop" }), true);
+  assert.deepEqual(wires[0]?.sent, ['{"do":"stop"}']);
+  socket.close();
+  wires[0]?.onmessage?.({ data: "late" });
+  wires[0]?.end();
+  later();
+  assert.equal(wires.length, 1);
+  assert.deepEqual(heard, []);
+});
+
+function flown(): { pilot: Pilot; sent: Record<string, unknown>[]; told: string[]; hear: (message: object) => void; link: (open: boolean) => void; at: (ms: number) => void } {
+  const [sent, told]: [Record<string, unknown>[], string[]] = [[], []];
+  let [now_ms, open] = [0, false];
+  let handlers: Handlers | null = null;
+  const pilot = new Pilot(
+    (given) => {
+      handlers = given;
+      return { get isOpen() { return open; }, send: (message) => open && sent.push(message as Record<string, unknown>) > 0, close: () => undefined };
+    },
+    { changed: () => undefined, refused: (order, why) => told.push(`${order}: ${why}`), done: (order) => told.push(`done ${order}`) },
+    () => now_ms,
+  );
+  return {
+    pilot, sent, told,
+    hear: (message) => handlers?.message(JSON.stringify(message)),
+    link: (up) => {
+      open = up;
+      handlers?.state?.(up, 0, "");
+    },
+    at: (ms) => {
+      now_ms = ms;
+    },
+  };
+}
+
+const held = (mine: boolean, holder: string | null = mine ? "cockpit 1" : null): Authority => ({ type: "authority", state: mine ? "held" : "none", holder, priority: 8, mine });
+const doings = (sent: Record<string, unknown>[]): unknown[] => sent.map((message) => message["do"]).filter((one) => one !== "ping");
+const FORWARD = { ...CENTRED, forward: 0.5 };
+
+test("sticks fly only with the authority, and hover once when they are let go", () => {
+  const { pilot, sent, hear, link } = flown();
+  link(true);
+  pilot.steer(FORWARD);
+  assert.deepEqual(doings(sent), []);
+  hear(held(true));
+  pilot.steer(FORWARD);
+  pilot.steer(FORWARD);
+  pilot.steer(CENTRED);
+  pilot.steer(CENTRED);
+  assert.deepEqual(doings(sent), ["fly", "fly", "hover"]);
+});
+
+test("a page that loses the focus hovers what it has under way, and nothing else", () => {
+  const { pilot, sent, hear, link } = flown();
+  link(true);
+  hear(held(true));
+  pilot.rest();
+  assert.deepEqual(doings(sent), []);
+  pilot.steer(FORWARD);
+  pilot.rest();
+  pilot.goTo(1, 2, 3);
+  pilot.rest();
+  assert.deepEqual(doings(sent), ["fly", "hover", "goto", "hover"]);
+  pilot.goTo(1, 2, 3);
+  hear({ type: "done", do: "goto" });
+  pilot.rest();
+  assert.deepEqual(doings(sent).slice(4), ["goto"], "there already");
+});
+
+test("while it holds control it tells that it is there, and measures how long that takes", () => {
+  const { pilot, sent, hear, link, at } = flown();
+  link(true);
+  hear(held(true));
+  for (let ms = 0; ms <= 1000; ms += 50) {
+    at(ms);
+    pilot.steer(CENTRED);
+  }
+  const pings = sent.filter((message) => message["do"] === "ping");
+  assert.ok(pings.length >= 6, `${pings.length} pings in a second: the cockpit waits 0.5 s`);
+  at(1004);
+  hear({ type: "pong", n: pings.at(-1)?.["n"] });
+  assert.ok(pilot.round_trip_s !== null && pilot.round_trip_s <= 0.154 && pilot.round_trip_s >= 0.004);
+});
+
+test("an emergency stop needs no control; without a connection it is told that it was not sent", () => {
+  const { pilot, sent, told, link } = flown();
+  pilot.act("stop");
+  assert.match(told[0] ?? "", /stop: not sent/);
+  link(true);
+  pilot.act("stop");
+  assert.deepEqual(doings(sent), ["stop"]);
+});
+
+test("who loses control is told to whom; after a broken connection nothing is flown on", () => {
+  const { pilot, sent, told, hear, link } = flown();
+  link(true);
+  pilot.take(8);
+  hear(held(true));
+  pilot.steer(FORWARD);
+  hear(held(false, "follow.py"));
+  assert.match(told.at(-1) ?? "", /follow\.py has control/);
+  pilot.steer(FORWARD);
+  hear(held(true));
+  pilot.steer(FORWARD);
+  link(false);
+  assert.equal(pilot.mine, false);
+  assert.match(told.at(-1) ?? "", /connection to the cockpit broke/);
+  link(true);
+  pilot.steer(FORWARD);
+  assert.deepEqual(doings(sent), ["take", "fly", "fly"]);
+});

@@ -1,0 +1,193 @@
+// The parts of the page that need no browser.
+
+import assert from "node:assert/strict";
+import { test } from "node:test";
+import { passes } from "../src/events.js";
+import { bytes, clock, duration, figure, heading, headingText, plain, short } from "../src/format.js";
+import { GamepadReader, type Pad } from "../src/gamepad.js";
+import { History, Trail } from "../src/history.js";
+import { type Press, Keys, TWICE_MS } from "../src/keys.js";
+import type { Sticks } from "../src/model.js";
+import { grouped } from "../src/plots.js";
+import { lacking } from "../src/recordings.js";
+import { CENTRED, DEAD_BAND, deadBand, isCentred, Latch, merge, PACES, type Pace, ramp, RAMP_S, scale } from "../src/sticks.js";
+import { parse, rangeText } from "../src/values.js";
+import { around, gridStep, toMetres, toPixels, zoomed } from "../src/view.js";
+
+const near = (value: number, wanted: number): void => assert.ok(Math.abs(value - wanted) < 1e-9, `${value} is not ${wanted}`);
+const push = (sticks: Partial<Sticks>): Sticks => ({ ...CENTRED, ...sticks });
+
+test("dead band: nothing within, no step at its edge, all at the end", () => {
+  for (const value of [0, 0.05, DEAD_BAND, -DEAD_BAND, Number.NaN]) assert.equal(Math.abs(deadBand(value)), 0);
+  near(deadBand(DEAD_BAND + 1e-6), 1e-6 / (1 - DEAD_BAND));
+  assert.equal(deadBand(1), 1);
+  assert.equal(deadBand(-1.4), -1);
+  for (let value = -1; value < 1; value += 0.05) assert.ok(deadBand(value) <= deadBand(value + 0.05));
+});
+
+test("keys ramp up, and let go at once", () => {
+  const half = ramp(CENTRED, push({ forward: 1 }), RAMP_S / 2);
+  near(half.forward, 0.5);
+  near(ramp(half, push({ forward: 1 }), RAMP_S).forward, 1);
+  assert.equal(ramp(half, CENTRED, 0.05).forward, 0);
+  assert.ok(ramp(push({ left: 1 }), push({ left: -1 }), 0.05).left < 0, "across the centre without a pause");
+});
+
+test("of several inputs the one pushed furthest counts", () => {
+  assert.deepEqual(merge(push({ up: 0.2, left: -1 }), push({ up: -0.5 })), push({ up: -0.5, left: -1 }));
+  const pace = PACES[0] as Pace;
+  assert.deepEqual(scale(push({ forward: 1, yaw_rate: -1 }), pace), { forward: pace.speed, left: 0, up: 0, yaw_rate: -pace.turn });
+  assert.ok(isCentred(CENTRED));
+});
+
+test("a stick that is pushed already must come back first", () => {
+  const latch = new Latch();
+  assert.ok(isCentred(latch.pass(push({ up: 1 }))));
+  latch.pass(CENTRED);
+  assert.equal(latch.pass(push({ up: 1 })).up, 1);
+  latch.reset();
+  assert.ok(isCentred(latch.pass(push({ up: 1 }))));
+});
+
+const press = (code: string, more: Partial<Press> = {}): Press => ({ code, repeat: false, modified: false, typing: false, at_ms: 0, ...more });
+
+test("keys: sticks by place, deeds once, nothing while somebody types", () => {
+  const keys = new Keys();
+  assert.equal(keys.down(press("KeyW")), "stick");
+  assert.equal(keys.down(press("ArrowLeft")), "stick");
+  assert.deepEqual(keys.sticks(), push({ forward: 1, yaw_rate: 1 }));
+  keys.down(press("KeyS"));
+  assert.equal(keys.sticks().forward, 0, "opposite keys cancel");
+  keys.up("KeyW");
+  assert.equal(keys.sticks().forward, -1);
+  keys.clear();
+  assert.ok(isCentred(keys.sticks()));
+  assert.equal(keys.down(press("KeyT")), "takeoff");
+  assert.equal(keys.down(press("KeyT", { repeat: true })), null);
+  assert.equal(keys.down(press("KeyT", { typing: true })), null);
+  assert.equal(keys.down(press("KeyR", { modified: true })), null, "Ctrl+R is the browser's");
+  assert.ok(isCentred(keys.sticks()));
+});
+
+test("Escape hovers, twice it stops, also while somebody types; too late is not twice", () => {
+  const keys = new Keys();
+  assert.equal(keys.down(press("Escape", { typing: true })), "hover");
+  assert.equal(keys.down(press("Escape", { repeat: true, at_ms: 200 })), null, "a held key is one press");
+  assert.equal(keys.down(press("Escape", { modified: true, at_ms: 300 })), "stop");
+  assert.equal(keys.down(press("Escape", { at_ms: 400 })), "stop", "who goes on pressing means it");
+  assert.equal(keys.down(press("Escape", { at_ms: 401 + TWICE_MS })), "hover");
+});
+
+const pad = (axes: number[], pressed: number[] = []): Pad => ({
+  id: "Test pad",
+  mapping: "standard",
+  connected: true,
+  axes,
+  buttons: Array.from({ length: 17 }, (_, number) => ({ pressed: pressed.includes(number) })),
+});
+
+test("gamepad: sticks after they were centred, buttons once, and told when it goes away", () => {
+  const reader = new GamepadReader();
+  assert.ok(isCentred(reader.read(pad([0, -1, 0, 0])).sticks), "pushed from the start");
+  assert.ok(isCentred(reader.read(pad([0.05, -0.1, 0, 0.02])).sticks), "dead band");
+  assert.deepEqual(reader.read(pad([1, 0, -1, -1])).sticks, push({ yaw_rate: -1, left: 1, forward: 1 }));
+  assert.deepEqual(reader.read(pad([0, 0, 0, 0], [9])).deeds, ["takeoff"]);
+  assert.deepEqual(reader.read(pad([0, 0, 0, 0], [9])).deeds, []);
+  assert.deepEqual(reader.read(pad([0, 0, 0, 0], [4])).deeds, [], "one bumper alone does nothing");
+  assert.deepEqual(reader.read(pad([0, 0, 0, 0], [4, 5])).deeds, ["stop"]);
+  assert.equal(reader.read(null).lost, true);
+  assert.equal(reader.read(null).lost, false);
+  assert.ok(isCentred(reader.read(pad([1, 0, 0, 0])).sticks), "after it came back it must be centred again");
+});
+
+test("figures for people", () => {
+  assert.equal(figure(-0.04, 1), "0.0");
+  assert.equal(figure(-1.25, 1), "−1.3");
+  assert.equal(figure(null, 1), "–");
+  assert.equal(figure(Number.NaN, 1), "–");
+  near(heading(0), 90);
+  near(heading(Math.PI / 2), 0);
+  assert.equal(headingText(Math.PI), "270");
+  assert.equal(headingText(Math.PI / 2 + 0.001), "000");
+  assert.equal(duration(0.0012), "1.20 ms");
+  assert.equal(duration(0.25), "250 ms");
+  assert.equal(duration(125), "2:05");
+  assert.equal(clock(3725), "1:02:05");
+  assert.equal(bytes(1234), "1.2 kB");
+  assert.equal(bytes(999_600), "1.0 MB");
+  assert.equal(bytes(12), "12 B");
+  assert.equal(short(0.012345), "0.0123");
+  assert.equal(short(-1234.5), "−1235");
+  assert.equal(plain(0.1), "0.1");
+});
+
+test("history keeps numbers by time, and holes as holes", () => {
+  const history = new History();
+  history.add(1, { a: 1 });
+  history.add(2, { a: 2, b: 5 });
+  history.add(3, { b: null });
+  assert.deepEqual(history.since(0, ["a", "b", "unknown"]), [[1, 2, 3], [1, 2, null], [null, 5, null], [null, null, null]]);
+  assert.deepEqual(history.since(2, ["a"]), [[2, 3], [2, null]]);
+  assert.equal(history.newest("b"), null);
+  for (let number = 4; number < 6000; number += 1) history.add(number, { a: number });
+  const [times, values] = history.since(0, ["a"]);
+  assert.equal(times?.length, 4096);
+  assert.equal(times?.at(-1), 5999);
+  assert.equal(values?.[0], times?.[0]);
+});
+
+test("a trail takes steps, not noise, and forgets", () => {
+  const trail = new Trail(10, 0.1);
+  trail.add(0, [0, 0, 0]);
+  trail.add(1, [0.05, 0, 0]);
+  trail.add(2, [0.2, 0, 0]);
+  assert.equal(trail.points.length, 2);
+  trail.add(11.5, [1, 0, 0]);
+  assert.equal(trail.points.length, 2);
+});
+
+test("the map's view: there and back, and a zoom that keeps its point", () => {
+  const size = { width: 400, height: 300 };
+  const view = { east: 1, north: 2, scale: 50 };
+  assert.deepEqual(toPixels(view, size, 1, 2), [200, 150]);
+  assert.ok(toPixels(view, size, 1, 3)[1] < 150, "north is up");
+  const [east, north] = toMetres(view, size, ...toPixels(view, size, -3.5, 4.25));
+  near(east, -3.5);
+  near(north, 4.25);
+  const closer = zoomed(view, size, 2, 30, 40);
+  toMetres(view, size, 30, 40).forEach((value, axis) => near(toMetres(closer, size, 30, 40)[axis] as number, value));
+  const all = around([[0, 0], [10, 2]], size);
+  assert.ok(all);
+  for (const [x, y] of [[0, 0], [10, 2]] as const) {
+    const [px, py] = toPixels(all, size, x, y);
+    assert.ok(px > 0 && px < 400 && py > 0 && py < 300);
+  }
+  assert.equal(around([], size), null);
+  assert.equal(gridStep(50), 1);
+  assert.equal(gridStep(200), 0.5);
+});
+
+test("parameters as they are written", () => {
+  assert.deepEqual(parse({ type: "float" }, " 1.5 "), { value: 1.5 });
+  assert.deepEqual(parse({ type: "vector" }, "1, 2 -3"), { value: [1, 2, -3] });
+  assert.deepEqual(parse({ type: "bool" }, "false"), { value: false });
+  assert.deepEqual(parse({ type: "text" }, " a "), { value: " a " });
+  for (const [type, text] of [["float", "fast"], ["float", ""], ["int", "1.5"], ["bool", "yes"], ["vector", "1,,2"]] as const) {
+    assert.ok("problem" in parse({ type }, text), `${type} ${text}`);
+  }
+  assert.equal(rangeText({ minimum: 0.1, maximum: 3600, choices: [] }), "0.1 … 3600");
+  assert.equal(rangeText({ minimum: null, maximum: null, choices: ["a", "b"] }), "a | b");
+});
+
+test("events by words and severity", () => {
+  const event = { n: 1, kind: "battery_low", severity: "warning", text: "18 %", app: "", age_s: 0 };
+  assert.ok(passes(event, "battery low", ""));
+  assert.ok(passes(event, "", "warning"));
+  assert.ok(!passes(event, "", "error"));
+  assert.ok(!passes(event, "landing", ""));
+});
+
+test("numbers to plot are grouped; what a recording lacks is added up", () => {
+  assert.deepEqual([...grouped(["log.b", "yaw", "log.a"])], [["log", ["log.a", "log.b"]], ["vehicle", ["yaw"]]]);
+  assert.equal(lacking({ dropped: { a: { video: 2 } }, missed: { a: { feedback: 1 }, b: { video: 4 } } }), 7);
+});

@@ -1,0 +1,199 @@
+"""Photographs the cockpit: ``python scripts/cockpit_pictures.py``, or with ``one`` or ``swarm`` for a part of them.
+
+=======================================  ===========================================================================
+``cockpit-one-dark.png``, ``…-light``    one simulated drone that follows a marker, with what its controller draws; once
+                                         with the map and the events, once with the 3-D view and the parameters
+``cockpit-swarm-dark.png``, ``…-light``  three in one world, each on a round of waypoints that its controller logs
+``cockpit-phone-dark.png``, ``…-light``  the first one again, on a telephone
+=======================================  ===========================================================================
+
+Needs Chromium and ``pip install playwright pillow``.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import browser
+from PIL import Image
+from playwright.sync_api import Browser, Page, sync_playwright
+
+import skyloop
+from skyloop.cockpit.child import CockpitProcess
+from skyloop.control.follow import FollowMarker
+from skyloop.control.waypoint import Waypoint, reached, velocity_to
+
+PICTURES = Path(__file__).parents[1] / "docs" / "pictures"
+MARKER_ID = 7
+DESK = {"width": 1440, "height": 900}
+WALL = {"width": 1680, "height": 1020}
+PHONE = {"width": 390, "height": 844}
+MOST_BYTES = 300_000
+ROUND_M = 1.1
+SCHEMES = ("dark", "light")
+#: The colours of the page that mean something, as six hexadecimal digits each.
+INKS = """() => {
+  const names = ["accent", "ok", "warn", "bad", "stop", "target", "series-1", "series-2"];
+  const own = names.map((name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim());
+  const onPictures = ["#3fcf83", "#f2b14a", "#ffd23f", "#ffffff", "#24c24a", "#ff9800"];
+  return [...own, ...onPictures].map((ink) => ink.slice(1));
+}"""
+Fly = Callable[[threading.Event], None]
+
+
+def main() -> None:
+    makers = {"one": one, "swarm": swarm}
+    wanted = sys.argv[1:] or list(makers)
+    for name in wanted:
+        if name not in makers:
+            sys.exit(f"there is no picture {name!r}: choose from {', '.join(makers)}")
+        makers[name]()
+
+
+# What is seen ---------------------------------------------------------------------------------------------------------
+
+
+def one() -> None:
+    """A marker is followed; the page at a desk and on a telephone."""
+
+    def follow(stop: threading.Event) -> None:
+        with skyloop.connect("alpha", name="follow.py") as drone:
+            drone.takeoff()
+            FollowMarker(drone, MARKER_ID).run(seconds=120.0, until=stop.is_set)
+            drone.land(wait=False)
+
+    command = ["sim", "--name", "alpha", "--seed", "4"]
+    command += [word for option in ("width=640", "fps=15", "position=1") for word in ("--option", option)]
+    with flight(command, [follow]) as (chromium, address):
+        for scheme in SCHEMES:
+            page = open_page(chromium, f"{address}#alpha", DESK, scheme)
+            if scheme == "light":
+                page.get_by_role("button", name="3-D").click()
+                page.get_by_role("button", name="Parameters").click()
+            settle(page, ["alpha"], 16.0)
+            save(page, f"cockpit-one-{scheme}.png")
+        for scheme in SCHEMES:
+            page = open_page(chromium, f"{address}#alpha", PHONE, scheme)
+            settle(page, ["alpha"], 5.0)
+            save(page, f"cockpit-phone-{scheme}.png")
+
+
+def swarm() -> None:
+    """Three on rounds of their own."""
+    names = [f"d{number}" for number in (1, 2, 3)]
+    command = ["sim", "--drones", "3", "--name", "d", "--seed", "1"]
+    # Small pictures: three renderers and a browser share this machine.
+    command += [word for option in ("width=320", "fps=10", "position=1") for word in ("--option", option)]
+    fliers = [rounds(name, number) for number, name in enumerate(names)]
+    with flight(command, fliers) as (chromium, address):
+        for scheme in SCHEMES:
+            page = open_page(chromium, f"{address}#{','.join(names)}", WALL, scheme)
+            settle(page, names, 12.0)
+            save(page, f"cockpit-swarm-{scheme}.png")
+
+
+def rounds(name: str, number: int) -> Fly:
+    """A triangle about where it took off, at a height of its own; its corners are logged for whoever looks."""
+
+    def fly(stop: threading.Event) -> None:
+        with skyloop.connect(name, name=f"rounds.py {number + 1}") as drone:
+            drone.takeoff()
+            x, y, _ = drone.feedback().position or (0.0, 0.0, 0.0)
+            turns = [2 * math.pi * (corner / 3 + number / 9) for corner in range(3)]
+            corners = [
+                (x + ROUND_M * math.cos(turn), y + 0.5 * ROUND_M * math.sin(turn), 1.0 + 0.25 * number)
+                for turn in turns
+            ]
+            corner = 0
+            while not stop.wait(0.05):
+                goal = Waypoint(*corners[corner % 3])
+                feedback = drone.feedback()
+                drone.log.array("waypoints", corners)
+                drone.log.number("distance_m", math.dist(goal.position, feedback.position or goal.position))
+                if reached(goal, feedback):
+                    corner += 1
+                drone.command(velocity_to(goal, feedback))
+            drone.land(wait=False)
+
+    return fly
+
+
+# How it is photographed -----------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def flight(command: list[str], fliers: list[Fly]) -> Iterator[tuple[Browser, str]]:
+    """A world, its controllers, the cockpit and Chromium."""
+    chromium = browser.find()
+    if chromium is None:
+        sys.exit("there is no Chromium here (Debian: apt install chromium)")
+    stop = threading.Event()
+    with ExitStack() as stack:
+        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="skyloop-"))
+        os.environ["SKYLOOP_RUNTIME_DIR"] = f"{folder}/run"
+        world = stack.enter_context(
+            subprocess.Popen([sys.executable, "-m", "skyloop", *command], stdout=subprocess.PIPE)
+        )
+        stack.callback(world.terminate)
+        assert world.stdout is not None
+        for _ in fliers:
+            world.stdout.readline()  # says that it is ready
+        cockpit = stack.enter_context(CockpitProcess(recordings=Path(folder) / "recordings"))
+        threads = [threading.Thread(target=fly, args=(stop,)) for fly in fliers]
+        stack.callback(lambda: [thread.join() for thread in threads])
+        stack.callback(stop.set)
+        for thread in threads:
+            thread.start()
+        playwright = stack.enter_context(sync_playwright())
+        arguments = ["--enable-unsafe-swiftshader"] + (["--no-sandbox"] if os.geteuid() == 0 else [])
+        opened = playwright.chromium.launch(executable_path=chromium, args=arguments)
+        stack.callback(opened.close)
+        yield opened, cockpit.address()
+
+
+def open_page(chromium: Browser, address: str, size: dict[str, int], scheme: str) -> Page:
+    for context in chromium.contexts:
+        context.close()
+    context = chromium.new_context(viewport=size, color_scheme=scheme, has_touch=size is PHONE)  # type: ignore[arg-type]
+    page = context.new_page()
+    page.goto(address)
+    return page
+
+
+def settle(page: Page, names: list[str], seconds: float) -> None:
+    """Wait until all are in the air, and then so that plots and paths have something to show."""
+    for name in names:
+        page.locator(f'.pane[data-drone="{name}"] .pill', has_text="flying").wait_for(timeout=60_000)
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        page.wait_for_timeout(100)
+
+
+def save(page: Page, name: str) -> None:
+    """As a PNG of 256 colours: what is too large for a page of documentation is an error."""
+    picture = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
+    target = PICTURES / name
+    PICTURES.mkdir(parents=True, exist_ok=True)
+    # Lamps and lines have few pixels, and their colours mean something: they are kept as they are.
+    kept = [part for ink in page.evaluate(INKS) for part in bytes.fromhex(ink)]
+    common = picture.quantize(256 - len(kept) // 3, dither=Image.Dither.NONE).getpalette() or []
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(common[: 768 - len(kept)] + kept)
+    picture.quantize(palette=palette, dither=Image.Dither.NONE).save(target, optimize=True)
+    print(f"{name}: {picture.width}×{picture.height}, {target.stat().st_size:,} bytes")
+    if target.stat().st_size > MOST_BYTES:
+        sys.exit(f"{name} is larger than {MOST_BYTES:,} bytes")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,160 @@
+"""Feedback, commands and statistics as plain JSON values. Pure. SI units and radians; what is not known is null."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+from skyloop.clock import seconds
+from skyloop.messages import ACTION_NAMES, AnyAction, Event, Feedback, Value
+
+if TYPE_CHECKING:
+    from skyloop.client.statistics import ChannelStats
+
+Json = dict[str, Any]
+
+#: Names of a vector's parts: body axes (x forward, y left, z up), or world axes.
+_PARTS = {
+    "velocity": ("forward", "left", "up"),
+    "angular_velocity": ("x", "y", "z"),
+    "acceleration": ("x", "y", "z"),
+    "position": ("x", "y", "z"),
+}
+_NUMBERS = ("battery", "battery_v", "roll", "pitch", "yaw", "altitude")
+
+
+def number(value: float | None) -> float | None:
+    """A number for JSON, to seven digits; None for what is not known or not finite."""
+    return None if value is None or not math.isfinite(value) else float(f"{value:.7g}")
+
+
+def vector(values: tuple[float, ...] | None) -> list[float | None] | None:
+    return None if values is None else [number(value) for value in values]
+
+
+def feedback_values(feedback: Feedback, now_ns: int) -> Json:
+    """A feedback as JSON values."""
+    return {
+        "age_s": number(seconds(now_ns - feedback.captured_ns)),
+        "captured_ns": str(feedback.captured_ns),  # too large for JavaScript's numbers
+        "state": str(feedback.state),
+        **{name: number(getattr(feedback, name)) for name in _NUMBERS},
+        "velocity": vector(feedback.velocity),
+        "position": vector(feedback.position),
+        "failsafe": str(feedback.failsafe),
+        "owner": feedback.owner,
+        "owner_priority": feedback.owner_priority,
+        "lease": feedback.lease,
+    }
+
+
+def motion_values(feedback: Feedback | None) -> Json:
+    """What instruments show, each known by itself."""
+    if feedback is None:
+        names = ("attitude", "angular_velocity", "altitude", "velocity", "speed", "position", "battery")
+        return {**dict.fromkeys(names), "flight": "unknown", "airborne": False}
+    velocity = feedback.velocity
+    return {
+        "attitude": {name: number(getattr(feedback, name)) for name in ("roll", "pitch", "yaw")},
+        "angular_velocity": vector(feedback.angular_velocity),
+        "altitude": number(feedback.altitude),
+        "velocity": vector(velocity),
+        "speed": None if velocity is None else number(math.hypot(*velocity)),
+        "position": vector(feedback.position),
+        "battery": number(feedback.battery),
+        "flight": str(feedback.state),
+        "airborne": feedback.state.airborne,
+    }
+
+
+def flat_values(
+    feedback: Feedback | None, logged: Mapping[str, float], set_point: AnyAction | None
+) -> dict[str, float | None]:
+    """Everything that is a number under a name of its own, for plots: ``yaw``, ``velocity.forward``, ``native.…``,
+    ``log.…`` and ``set_point.…``. What is not known is left out."""
+    found: dict[str, float | None] = {}
+    if feedback is not None:
+        found |= {name: number(getattr(feedback, name)) for name in _NUMBERS if getattr(feedback, name) is not None}
+        for name, parts in _PARTS.items():
+            values = getattr(feedback, name)
+            if values is not None:
+                found |= {f"{name}.{part}": number(value) for part, value in zip(parts, values, strict=True)}
+        for name, value in (feedback.native or {}).items():
+            found |= _numbers(f"native.{name}", value)
+    found |= {f"log.{name}": number(value) for name, value in logged.items()}
+    if set_point is not None:
+        found |= {f"set_point.{name}": number(value) for name, value in _fields(set_point)}
+    return found
+
+
+def set_point_values(action: AnyAction, age_s: float) -> Json:
+    """A command as it was applied."""
+    return {
+        "action": ACTION_NAMES[type(action)],
+        "values": {name: number(value) for name, value in _fields(action)},
+        "age_s": number(age_s),
+    }
+
+
+def truth_values(native: Mapping[str, Value] | None) -> Json | None:
+    """Where a simulated vehicle really is: ``native``'s ``truth.x``, ``.y``, ``.z`` [m] and ``.yaw`` [rad]."""
+    return None if native is None else _place(native, "truth")
+
+
+def target_values(native: Mapping[str, Value] | None) -> list[Json]:
+    """The moving targets of a simulated world: ``truth.target``, ``truth.target2``, …"""
+    if native is None:
+        return []
+    names = sorted({key.rpartition(".")[0] for key in native if key.startswith("truth.target")})
+    places = ((name.removeprefix("truth."), _place(native, name)) for name in names)
+    return [{"name": name, **place} for name, place in places if place is not None]
+
+
+def event_values(number_: int, event: Event, now_ns: int) -> Json:
+    """An event with the number that the cockpit gave it."""
+    return {
+        "n": number_,
+        "kind": str(event.kind),
+        "severity": str(event.severity),
+        "text": event.text,
+        "app": event.app,
+        "age_s": number(seconds(now_ns - event.at_ns)),
+        "at_ns": str(event.at_ns),
+    }
+
+
+def channel_values(stats: ChannelStats) -> Json:
+    """One channel's figures; delays in seconds."""
+    delay = stats.delay_s
+    return {
+        "count": stats.count,
+        "rate_hz": number(stats.rate_hz),
+        "lost": stats.lost,
+        "dropped": stats.dropped,
+        "malformed": stats.malformed,
+        "age_s": number(stats.age_s),
+        "delay_s": None if delay is None else {"median": number(delay.median), "p99": number(delay.p99)},
+    }
+
+
+def _place(native: Mapping[str, Value], name: str) -> Json | None:
+    values = [native.get(f"{name}.{part}") for part in ("x", "y", "z")]
+    if not all(isinstance(value, int | float) for value in values):
+        return None
+    yaw = native.get(f"{name}.yaw")
+    known = yaw if isinstance(yaw, int | float) else None
+    return {"position": [number(value) for value in values], "yaw": number(known)}  # type: ignore[arg-type]
+
+
+def _numbers(name: str, value: Value) -> dict[str, float | None]:
+    if isinstance(value, int | float):
+        return {name: number(value)}
+    if isinstance(value, tuple):
+        return {f"{name}.{place}": number(one) for place, one in enumerate(value)}
+    return {}
+
+
+def _fields(action: AnyAction) -> Iterator[tuple[str, float]]:
+    for name in action.__struct_fields__:
+        yield name, getattr(action, name)

@@ -1,0 +1,143 @@
+"""The cockpit's page in a real browser, against real proxies: fixtures for the tests of the page."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from skyloop.cockpit.child import CockpitProcess
+from tests.processes.conftest import Process
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
+
+CHROMIUM = next(
+    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
+)
+PATIENCE_S = 10.0
+WATCHED = "sim://?world=empty&cameras=front&width=320&fps=15&position=1"
+
+
+class Deck:
+    """A cockpit, its browser, and proxies that are started for one test."""
+
+    def __init__(self, browser: Browser, address: str) -> None:
+        self.address = address
+        self._browser = browser
+        self._processes: list[Process] = []
+        self._contexts: list[Any] = []
+
+    def proxy(self, name: str, uri: str = WATCHED) -> Process:
+        """A proxy that serves; ended with the test."""
+        process = Process("-m", "skyloop", "proxy", uri, "--name", name)
+        self._processes.append(process)
+        process.until("ready")
+        return process
+
+    def cockpit(self, *options: str) -> str:
+        """Another cockpit, with options of ``skyloop cockpit``; its address."""
+        process = Process("-m", "skyloop", "cockpit", *options)
+        self._processes.append(process)
+        process.until("/\n")
+        return process.text.split("cockpit: ")[1].strip()
+
+    def page(self, *names: str, prepare: str = "", **options: Any) -> DronePage:
+        """The page with these drones opened, once it shows the last of them. ``prepare``: a script that runs first."""
+        context = self._browser.new_context(viewport={"width": 1280, "height": 860}, **options)
+        self._contexts.append(context)
+        if prepare:
+            context.add_init_script(prepare)
+        page = context.new_page()
+        shown = DronePage(page, names[-1])
+        page.goto(f"{self.address}#{','.join(names)}")
+        page.locator(f'.pane[data-drone="{names[-1]}"][data-lost="false"]').wait_for(timeout=PATIENCE_S * 1000)
+        return shown
+
+    def end(self) -> None:
+        for context in self._contexts:
+            context.close()
+        for process in self._processes:
+            process.end()
+
+
+class DronePage:
+    """One open page, and what it shows of one drone."""
+
+    def __init__(self, page: Page, drone: str) -> None:
+        self.page = page
+        self.problems: list[str] = []  #: what went wrong in it, as the browser says
+        self.pane = page.locator(f'.pane[data-drone="{drone}"]')
+        page.on("pageerror", lambda error: self.problems.append(str(error)))
+        page.on("console", lambda said: self.problems.append(said.text) if said.type == "error" else None)
+
+    def press(self, *keys: str) -> None:
+        for key in keys:
+            self.page.keyboard.press(key)
+
+    def until(self, condition: Callable[[], bool], what: str, timeout_s: float = PATIENCE_S) -> None:
+        """Wait while the browser goes on, never longer than this."""
+        deadline = time.monotonic() + timeout_s
+        while not condition():
+            assert time.monotonic() < deadline, (
+                f"not within {timeout_s} s: {what}; the page's problems: {self.problems}"
+            )
+            self.page.wait_for_timeout(20)
+
+    def says(self, selector: str) -> str:
+        """The text of a part of the drone's pane."""
+        return self.pane.locator(selector).first.text_content() or ""
+
+    def wait_for_text(self, selector: str, text: str) -> None:
+        self.until(lambda: text in self.says(selector), f"{selector} says {text!r}, not {self.says(selector)!r}")
+
+    def attribute(self, selector: str, name: str) -> str:
+        return self.pane.locator(selector).first.get_attribute(name) or ""
+
+    def wait_for_new_picture(self) -> None:
+        first = self.attribute(".camera", "data-seq")
+        self.until(lambda: self.attribute(".camera", "data-seq") not in ("", first), "another picture")
+
+    def take_control(self) -> None:
+        self.press("c")
+        self.until(lambda: self.pane.get_attribute("data-mine") == "true", "this page has control")
+
+    def take_off(self) -> None:
+        """Take control, and wait until it hovers."""
+        self.take_control()
+        self.press("t")
+        self.wait_for_text(".pill", "hovering")
+
+
+@contextmanager
+def runtime() -> Iterator[None]:
+    """A directory of sockets for these tests alone; with a short path, as those of sockets must be."""
+    with tempfile.TemporaryDirectory(prefix="skyloop-") as folder, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SKYLOOP_RUNTIME_DIR", str(Path(folder) / "run"))
+        yield
+
+
+@contextmanager
+def browser_and_cockpit() -> Iterator[tuple[Browser, str]]:
+    """Chromium, and the address of a cockpit that shows every proxy as it comes."""
+    from playwright.sync_api import sync_playwright
+
+    arguments = ["--enable-unsafe-swiftshader"]  # three dimensions without a graphics card
+    if os.geteuid() == 0:
+        arguments.append("--no-sandbox")  # Chromium has no sandbox for the superuser
+    with (
+        runtime(),
+        tempfile.TemporaryDirectory(prefix="skyloop-recordings-") as folder,
+        CockpitProcess(recordings=Path(folder)) as cockpit,
+        sync_playwright() as playwright,
+    ):
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=arguments)
+        yield browser, cockpit.address()
+        browser.close()

@@ -1,0 +1,223 @@
+"""Tokens, certificates, and whose program is at the other end."""
+
+from __future__ import annotations
+
+import os
+import socket
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as some
+
+from skyloop.clock import ManualClock
+from skyloop.cockpit.access import (
+    CERTIFICATE,
+    MAX_SESSIONS,
+    SESSION_S,
+    CertificateGate,
+    OpenGate,
+    Person,
+    Token,
+    TokenGate,
+    person_of,
+    read_tokens,
+)
+from skyloop.cockpit.peers import peer_uid, uid_in
+from skyloop.errors import FileFormatError, UsageError
+from skyloop.messages import Role
+
+ANN = Token(Person(Role.PILOT, "ann"), b"0123456789abcdef")
+BOB = Token(Person(Role.OBSERVER), b"fedcba9876543210")
+
+HEAD = "  sl  local_address rem_address   st tx_queue rx_queue tr tm->when retrnsmt   uid  timeout inode\n"
+
+
+def entry(local: str, remote: str, uid: int = 1000, inode: int = 4711, state: str = "01") -> str:
+    return f"   0: {local} {remote} {state} 00000000:00000000 00:00000000 00000000  {uid}        0 {inode} 1 0\n"
+
+
+def test_roles() -> None:
+    pilot, observer = Person(Role.PILOT), Person(Role.OBSERVER)
+    assert pilot.may(Role.PILOT)
+    assert pilot.may(Role.OBSERVER)
+    assert observer.may(Role.OBSERVER)
+    assert not observer.may(Role.PILOT)
+
+
+# The file of tokens ------------------------------------------------------------------------------------------------
+
+
+def written(folder: Path, text: str, mode: int = 0o600) -> Path:
+    path = folder / "tokens"
+    path.write_text(text)
+    path.chmod(mode)
+    return path
+
+
+def test_tokens_are_read(tmp_path: Path) -> None:
+    path = written(tmp_path, "# who may\n\npilot 0123456789abcdef  Ann B. \nobserver fedcba9876543210\n")
+    tokens = read_tokens(path)
+    assert [token.person for token in tokens] == [Person(Role.PILOT, "Ann B."), Person(Role.OBSERVER, "")]
+    assert tokens[0].secret == b"0123456789abcdef"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "has no token"),
+        ("# nothing\n", "has no token"),
+        ("pilot\n", "line 1: ROLE TOKEN"),
+        ("\nadmin 0123456789abcdef\n", "line 2: ROLE TOKEN"),
+        ("pilot short\n", "16 to 256 characters"),
+        ("pilot " + "x" * 257, "16 to 256 characters"),
+        ("pilot " + "ä" * 20, "16 to 256 characters of ASCII"),
+        ("pilot 0123456789abcdef\nobserver 0123456789abcdef\n", "line 2: this token is in the file already"),
+    ],
+)
+def test_what_is_wrong_with_a_file_of_tokens_is_told(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(FileFormatError, match=said):
+        read_tokens(written(tmp_path, text))
+
+
+@pytest.mark.parametrize("mode", [0o644, 0o640, 0o606])
+def test_a_file_that_others_may_read_is_refused(tmp_path: Path, mode: int) -> None:
+    with pytest.raises(UsageError, match="chmod 600"):
+        read_tokens(written(tmp_path, "pilot 0123456789abcdef\n", mode))
+
+
+def test_a_file_that_is_not_there_or_no_text(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="can't be read"):
+        read_tokens(tmp_path / "nowhere")
+    path = written(tmp_path, "")
+    path.write_bytes(b"\xff\xfe\xff")
+    with pytest.raises(UsageError, match="can't be read"):
+        read_tokens(path)
+
+
+# Sessions ----------------------------------------------------------------------------------------------------------
+
+
+def scope(**headers: str) -> dict[str, Any]:
+    return {"headers": [(name.encode(), value.encode("latin-1")) for name, value in headers.items()]}
+
+
+def test_a_token_with_each_request() -> None:
+    gate = TokenGate([ANN, BOB], "c")
+    assert gate.person(scope(authorization="Bearer 0123456789abcdef")) == ANN.person
+    assert gate.person(scope(authorization="bearer fedcba9876543210")) == BOB.person
+    for wrong in ("Basic 0123456789abcdef", "0123456789abcdef", "Bearer", "Bearer ", "Bearer 0123456789abcdeg"):
+        assert gate.person(scope(authorization=wrong)) is None
+    two = {"headers": [(b"authorization", b"Bearer 0123456789abcdef")] * 2}
+    assert gate.person(two) is None, "two of them are none"
+
+
+@given(some.text(max_size=300))
+def test_what_is_no_token_lets_nobody_in(text: str) -> None:
+    gate = TokenGate([ANN, BOB], "c")
+    assert gate.known(text) is None or text.encode() in (ANN.secret, BOB.secret)
+
+
+def test_a_session_lasts_for_its_time() -> None:
+    clock = ManualClock()
+    gate = TokenGate([ANN], "c", clock)
+    cookie = gate.begin(ANN.person)
+    assert gate.person(scope(cookie=f"x=1; c={cookie}")) == ANN.person
+    assert gate.person(scope(cookie=f"d={cookie}")) is None
+    assert gate.person(scope(cookie=f"c={cookie}x")) is None
+    assert gate.person(scope(cookie="c=")) is None
+    clock.advance(SESSION_S - 1)
+    assert gate.person(scope(cookie=f"c={cookie}")) == ANN.person
+    clock.advance(2)
+    assert gate.person(scope(cookie=f"c={cookie}")) is None
+
+
+def test_a_session_can_be_ended_and_there_are_not_too_many() -> None:
+    gate = TokenGate([ANN], "c")
+    first, second = gate.begin(ANN.person), gate.begin(ANN.person)
+    gate.end(scope(cookie=f"c={first}"))
+    assert gate.person(scope(cookie=f"c={first}")) is None
+    assert gate.person(scope(cookie=f"c={second}")) == ANN.person
+    for _ in range(MAX_SESSIONS):
+        newest = gate.begin(ANN.person)
+    assert gate.person(scope(cookie=f"c={second}")) is None, "the oldest made room"
+    assert gate.person(scope(cookie=f"c={newest}")) == ANN.person
+
+
+# Certificates ------------------------------------------------------------------------------------------------------
+
+
+def certificate(*subject: tuple[str, str]) -> dict[str, Any]:
+    return {"subject": tuple((pair,) for pair in subject)}
+
+
+@pytest.mark.parametrize(
+    ("told", "person"),
+    [
+        (certificate(("organizationalUnitName", "pilot"), ("commonName", "Ann")), Person(Role.PILOT, "Ann")),
+        (certificate(("organizationalUnitName", "Observer")), Person(Role.OBSERVER, "")),
+        (certificate(("organizationalUnitName", "lab"), ("organizationalUnitName", "pilot")), Person(Role.PILOT)),
+        (certificate(("organizationalUnitName", "observer"), ("organizationalUnitName", "pilot")), None),
+        (certificate(("organizationalUnitName", "admin"), ("commonName", "pilot")), None),
+        (certificate(("commonName", "pilot")), None),
+        ({}, None),
+        (None, None),
+    ],
+)
+def test_the_unit_of_a_certificate_is_the_role(told: dict[str, Any] | None, person: Person | None) -> None:
+    assert person_of(told) == person
+    assert CertificateGate().person({"state": {CERTIFICATE: told}}) == person
+    assert CertificateGate().person({}) is None
+
+
+# Whose program ------------------------------------------------------------------------------------------------------
+
+
+def test_the_table_of_sockets() -> None:
+    table = HEAD + entry("0100007F:1F90", "0100007F:D431", 0) + entry("0100007F:D431", "0100007F:1F90", 1001)
+    assert uid_in(table, ("127.0.0.1", 0xD431), ("127.0.0.1", 0x1F90)) == 1001, "the client's end, not the server's"
+    assert uid_in(table, ("127.0.0.1", 0xD432), ("127.0.0.1", 0x1F90)) is None
+    assert uid_in(table, ("127.0.0.2", 0xD431), ("127.0.0.1", 0x1F90)) is None
+    assert uid_in("", ("127.0.0.1", 1), ("127.0.0.1", 2)) is None
+    assert uid_in(HEAD + "cut off\n", ("127.0.0.1", 1), ("127.0.0.1", 2)) is None
+
+
+def test_a_socket_that_its_program_has_closed_is_nobodys() -> None:
+    """It stands there as the superuser's: a stranger who sends and hangs up must not pass for that."""
+    table = HEAD + entry("0100007F:D431", "0100007F:1F90", 0, inode=0, state="04")
+    assert uid_in(table, ("127.0.0.1", 0xD431), ("127.0.0.1", 0x1F90)) is None
+
+
+def test_addresses_of_the_other_family() -> None:
+    mapped = "0000000000000000FFFF00000100007F"
+    table = HEAD + entry(f"{mapped}:D431", f"{mapped}:1F90", 7)
+    assert uid_in(table, ("127.0.0.1", 0xD431), ("127.0.0.1", 0x1F90)) == 7
+    loopback = "00000000000000000000000001000000"
+    assert uid_in(HEAD + entry(f"{loopback}:0001", f"{loopback}:0002", 8), ("::1", 1), ("::1", 2)) == 8
+
+
+@pytest.mark.parametrize("family", [socket.AF_INET, socket.AF_INET6])
+def test_the_kernel_knows_who_calls(family: socket.AddressFamily) -> None:
+    host = "127.0.0.1" if family == socket.AF_INET else "::1"
+    with socket.create_server((host, 0), family=family) as server:
+        here = server.getsockname()[:2]
+        with socket.create_connection(here) as client:
+            there = client.getsockname()[:2]
+            assert peer_uid(there, here) == os.geteuid()
+        assert peer_uid(there, here) is None
+
+
+def test_only_this_user_and_the_superuser_are_let_in() -> None:
+    asked: list[Any] = []
+
+    def uid_of(client: tuple[str, int], server: tuple[str, int]) -> int | None:
+        asked.append((client, server))
+        return answers.pop()
+
+    gate = OpenGate(Role.OBSERVER, uid_of)
+    ends = {"client": ["127.0.0.1", 5], "server": ("127.0.0.1", 8123)}
+    answers: list[int | None] = [None, 12345, 0, os.geteuid()]
+    assert [gate.person(ends) for _ in range(4)] == [Person(Role.OBSERVER)] * 2 + [None] * 2
+    assert asked[0] == (("127.0.0.1", 5), ("127.0.0.1", 8123))
+    assert gate.person({"client": None, "server": None}) is None

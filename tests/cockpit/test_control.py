@@ -1,0 +1,492 @@
+"""Flying from a page: a real proxy over the memory transport, a vehicle that does what it is told."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, Self
+
+import pytest
+from starlette.websockets import WebSocketDisconnect
+
+from skyloop.client import AuthorityStatus, Drone
+from skyloop.cockpit.control import SILENT_S
+from skyloop.cockpit.fleet import Fleet
+from skyloop.cockpit.orders import decode_order
+from skyloop.control import Controller
+from skyloop.control.follow import FollowMarker
+from skyloop.errors import DecodeError
+from skyloop.messages import AnyAction, EmergencyStop, Feedback, FlightState, Hover, Land, Role, Takeoff, Velocity
+from tests.cockpit.fake import Node, Nodes, cockpit, open_socket, this_user, until
+from tests.cockpit.testclient import TestClient, WebSocketTestSession
+
+
+def links() -> int:
+    """Connections of this process to proxies."""
+    return sum(thread.name == "skyloop-link" for thread in threading.enumerate())
+
+
+class Page:
+    """A page's control socket."""
+
+    def __init__(self, socket: WebSocketTestSession) -> None:
+        self.socket = socket
+        self.told: list[dict[str, Any]] = []
+
+    def say(self, do: str, **values: Any) -> None:
+        self.socket.send_json({"do": do, **values})
+
+    def wait(self, kind: str, **values: Any) -> dict[str, Any]:
+        """The next message of that kind with these values."""
+        deadline = time.monotonic() + 5
+        while time.monotonic() < deadline:
+            message: dict[str, Any] = self.socket.receive_json()
+            self.told.append(message)
+            if message["type"] == kind and values.items() <= message.items():
+                return message
+        raise AssertionError(f"no {kind} {values} but {self.told}")
+
+    def take_off(self) -> None:
+        self.say("takeoff")
+        self.wait("done", do="takeoff")
+
+    def take(self, priority: int = 4) -> Self:
+        self.say("take", priority=priority)
+        self.wait("authority", mine=True)
+        return self
+
+
+@contextmanager
+def page(client: TestClient, drone: str = "alpha") -> Iterator[Page]:
+    with open_socket(client, f"drones/{drone}/control") as socket:
+        yield Page(socket)
+
+
+def count(node: Node, action: AnyAction) -> int:
+    return list(node.flyer.applied).count(action)
+
+
+def test_a_flight_from_the_page(client: TestClient, node: Node) -> None:
+    with page(client) as pilot:
+        assert pilot.wait("authority")["state"] == "none"
+        told = pilot.take(7).told[-1]
+        assert told["state"] == "held"
+        assert told["priority"] == 7
+        assert told["holder"].startswith("cockpit ")
+        pilot.take_off()
+        pilot.say("fly", forward=0.4, yaw_rate=-0.2)
+        until(lambda: count(node, Velocity(forward=0.4, yaw_rate=-0.2)))
+        pilot.say("hover")
+        pilot.wait("done", do="hover")
+        until(lambda: node.flyer.applied[-1] == Hover())
+        pilot.say("land")
+        pilot.wait("done", do="land")
+        assert node.flyer.state is FlightState.LANDED
+        pilot.say("release")
+        assert pilot.wait("authority", mine=False)["holder"] is None
+        pilot.say("ping", n=3)
+        assert pilot.wait("pong")["n"] == 3
+    assert node.flyer.applied[0] == Takeoff()
+    assert count(node, Land())
+
+
+def test_without_control_nothing_is_flown(client: TestClient, node: Node) -> None:
+    with page(client) as pilot:
+        for order in ("takeoff", "hover", "land", "reset"):
+            pilot.say(order)
+            assert pilot.wait("refused", do=order)["why"] == "take control first"
+        pilot.say("goto", x=1, y=1, z=1)
+        pilot.wait("refused", do="goto")
+        pilot.say("set", name="limits.tilt", value=0.2)
+        pilot.wait("refused", do="set")
+        for _ in range(5):
+            pilot.say("fly", forward=1.0)
+        pilot.say("ping")
+        pilot.wait("pong")
+        assert sum(told.get("do") == "fly" for told in pilot.told) == 1, "sticks are not refused twenty times a second"
+        assert not node.flyer.applied
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[]",
+        "{}",
+        '{"do":"loop"}',
+        '{"do":"take"}',
+        '{"do":"take","priority":32}',
+        '{"do":"take","priority":-1}',
+        '{"do":"take","priority":1.5}',
+        '{"do":"fly","forward":NaN}',
+        '{"do":"fly","forward":"1"}',
+        '{"do":"fly","sideways":1}',
+        '{"do":"goto","x":1,"y":2}',
+        '{"do":"set","name":"","value":1}',
+        '{"do":"set","name":"a","value":{}}',
+        "[" * 4000,
+    ],
+)
+def test_what_makes_no_sense_is_no_order(text: str) -> None:
+    with pytest.raises(DecodeError, match="not understood"):
+        decode_order(text)
+
+
+def test_nonsense_is_refused_and_flies_nothing(client: TestClient, node: Node) -> None:
+    with page(client) as pilot:
+        pilot.take()
+        pilot.socket.send_text("{")
+        assert "not understood" in pilot.wait("refused")["why"]
+        pilot.socket.send_text('{"do":"fly","forward":1e999}')
+        pilot.wait("refused")
+        pilot.socket.send_bytes(b"\xff\xfe")
+        assert "not understood" in pilot.wait("refused")["why"]
+        pilot.say("ping")
+        pilot.wait("pong")
+        assert not node.flyer.applied
+
+
+def test_a_refusal_of_the_proxy_is_told_with_its_reason(client: TestClient, node: Node) -> None:
+    with page(client) as pilot:
+        pilot.take().say("fly", forward=0.5)
+        assert "landed" in pilot.wait("refused", do="fly")["why"]
+        pilot.say("reset")
+        pilot.wait("done", do="reset")
+        assert pilot.wait("refused", do="reset")["why"]
+
+
+def test_a_silent_page_leaves_a_hovering_drone(client: TestClient, node: Node) -> None:
+    with page(client) as pilot:
+        pilot.take().take_off()
+        begin = time.monotonic()
+        for _ in range(3):
+            pilot.say("fly", forward=0.4)
+            pilot.say("ping")
+        told = pilot.wait("refused", do="fly")
+        assert "silent" in told["why"]
+        assert SILENT_S * 0.9 < time.monotonic() - begin < SILENT_S + 0.4
+        until(lambda: node.flyer.state is FlightState.HOVERING)
+        pilot.say("fly", forward=0.3)
+        until(lambda: count(node, Velocity(forward=0.3)), "a page that speaks again flies again")
+
+
+def test_who_was_pre_empted_is_not_told_of_a_silence(client: TestClient, node: Node) -> None:
+    with page(client) as first, page(client) as second:
+        first.take(10).take_off()
+        first.say("fly", forward=0.3)
+        second.take(5)
+        first.wait("authority", state="preempted")
+        second.say("fly", up=0.1)
+        second.wait("refused", do="fly")  # the second page is the silent one: longer than the first could be
+        first.say("ping")
+        first.wait("pong")
+        assert not [told for told in first.told if "silent" in told.get("why", "")]
+
+
+def test_a_page_that_dies_in_flight_leaves_a_hovering_drone(client: TestClient, node: Node) -> None:
+    with node.connect("watcher", access="observe") as watcher:
+        with page(client) as pilot:
+            pilot.take().take_off()
+            pilot.say("fly", forward=0.4)
+            until(lambda: node.flyer.state is FlightState.FLYING)
+            hovers = count(node, Hover())
+        until(lambda: count(node, Hover()) > hovers)
+        watcher.wait(lambda feedback: feedback.owner is None, 5)
+        assert watcher.feedback().state is FlightState.HOVERING
+        # The proxy's ladder goes on from here: nobody is heard, so it lands.
+        with node.connect("me") as owner:
+            owner.config["failsafe.land_after_s"] = 0.1
+        watcher.wait("landed", 5)
+
+
+def test_emergency_stop_asks_nobody(client: TestClient, node: Node) -> None:
+    with node.connect("demo", priority=0, on_exit="hover") as demo:
+        demo.takeoff()
+        with page(client) as pilot:
+            pilot.say("stop")
+            pilot.wait("done", do="stop")
+            until(lambda: node.flyer.state is FlightState.EMERGENCY)
+            assert demo.authority.state == "held"
+    assert count(node, EmergencyStop())
+
+
+def test_emergency_stop_of_who_flies(client: TestClient, node: Node) -> None:
+    with page(client) as pilot:
+        pilot.take().take_off()
+        pilot.say("fly", forward=0.4)
+        pilot.say("stop")
+        pilot.wait("done", do="stop")
+        until(lambda: node.flyer.state is FlightState.EMERGENCY)
+        pilot.say("reset")
+        pilot.wait("done", do="reset")
+        until(lambda: node.flyer.state is FlightState.LANDED)
+
+
+def test_flying_to_a_place(client: TestClient, node: Node) -> None:
+    with page(client) as pilot:
+        pilot.take().say("goto", x=0.3, y=-0.2, z=0.3, yaw=0.3)
+        assert "take off first" in pilot.wait("refused", do="goto")["why"]
+        pilot.take_off()
+        with open_socket(client, "drones/alpha/telemetry") as telemetry:
+            pilot.say("goto", x=0.3, y=-0.2, z=0.3, yaw=0.3)
+            state: dict[str, Any] = {}
+            while not state.get("waypoints"):
+                state = telemetry.receive_json()
+            assert state["waypoints"][0]["position"] == [0.3, -0.2, 0.3]
+        alive = threading.Event()
+
+        def stay() -> None:
+            while not alive.wait(0.1):
+                pilot.say("ping")
+
+        pinging = threading.Thread(target=stay)
+        pinging.start()
+        try:
+            pilot.wait("done", do="goto")
+        finally:
+            alive.set()
+            pinging.join()
+        assert math.dist(node.flyer.place, (0.3, -0.2, 0.3)) < 0.2
+        assert node.flyer.yaw == pytest.approx(0.3, abs=0.15)
+        until(lambda: node.flyer.state is FlightState.HOVERING)
+
+
+def test_a_page_that_falls_silent_on_the_way_stops_there(client: TestClient, node: Node) -> None:
+    with page(client) as pilot:
+        pilot.take().take_off()
+        pilot.say("goto", x=50, y=0, z=1)
+        assert "silent" in pilot.wait("refused", do="goto")["why"]
+        until(lambda: node.flyer.state is FlightState.HOVERING)
+        assert node.flyer.place[0] < 2.0
+
+
+def test_sticks_end_the_way_to_a_place(client: TestClient, node: Node) -> None:
+    with page(client) as pilot:
+        pilot.take().take_off()
+        pilot.say("goto", x=50, y=0, z=1)
+        until(lambda: node.flyer.state is FlightState.FLYING)
+        pilot.say("fly", left=0.1)
+        until(lambda: count(node, Velocity(left=0.1)))
+        pilot.say("hover")
+        until(lambda: node.flyer.applied[-1] == Hover())
+        pilot.say("ping")
+        pilot.wait("pong")
+        assert node.flyer.applied[-1] == Hover()
+
+
+def test_no_place_without_a_position() -> None:
+    blind = Node(position=False)
+    try:
+        with cockpit(Fleet(Nodes(blind))) as client, page(client) as pilot:
+            pilot.take().say("goto", x=1, y=1, z=1)
+            assert "does not tell its position" in pilot.wait("refused", do="goto")["why"]
+    finally:
+        blind.stop()
+
+
+def test_parameters_are_read_written_and_refused(client: TestClient, node: Node) -> None:
+    listed = {one["name"]: one for one in client.get("/api/drones/alpha/parameters").json()}
+    tilt = listed["limits.tilt"]
+    assert (tilt["type"], tilt["unit"], tilt["minimum"], tilt["maximum"]) == ("float", "rad", 0.02, 1.0)
+    assert (tilt["default"], tilt["read_only"], tilt["choices"]) == (0.35, False, [])
+    assert "tilt" in tilt["description"]
+    assert client.get("/api/drones/beta/parameters").status_code == 404
+    with page(client) as pilot:
+        pilot.take().say("set", name="limits.tilt", value=0.2)
+        assert pilot.wait("done", do="set") == {"type": "done", "do": "set", "name": "limits.tilt", "value": 0.2}
+        pilot.say("set", name="limits.tilt", value=9)
+        assert "at most" in pilot.wait("refused", do="set")["why"]
+        pilot.say("set", name="limits.tilt", value="steep")
+        pilot.wait("refused", do="set")
+        pilot.say("set", name="limits.tlt", value=1)
+        assert "did you mean 'limits.tilt'" in pilot.wait("refused", do="set")["why"]
+    listed = {one["name"]: one for one in client.get("/api/drones/alpha/parameters").json()}
+    assert listed["limits.tilt"]["value"] == 0.2
+
+
+# Authority ------------------------------------------------------------------------------------------------------
+
+
+def test_a_lower_priority_is_refused_and_takes_nothing(client: TestClient, node: Node) -> None:
+    with node.connect("demo", priority=4) as demo, page(client) as pilot:
+        assert not pilot.wait("authority", holder="demo", priority=4, state="none")["mine"]
+        pilot.say("take", priority=4)
+        assert "demo has control with priority 4" in pilot.wait("refused", do="take")["why"]
+        assert demo.authority.state == "held"
+        pilot.take(3)
+        assert demo.wait(lambda feedback: feedback.owner != "demo", 5).owner_priority == 3
+
+
+def test_who_is_pre_empted_is_told_and_gets_it_back(client: TestClient, node: Node) -> None:
+    with page(client) as first, page(client) as second:
+        first.take(10).take_off()
+        first.say("fly", forward=0.3)
+        until(lambda: node.flyer.state is FlightState.FLYING)
+        second.take(5)
+        told = first.wait("authority", mine=False, state="preempted")
+        assert told["holder"].startswith("cockpit")
+        assert told["priority"] == 5
+        until(lambda: node.flyer.state is FlightState.HOVERING, "it hovers before it changes hands")
+        first.say("fly", forward=0.3)
+        assert "has control" in first.wait("refused", do="fly")["why"]
+        second.say("release")
+        first.wait("authority", mine=True)
+        assert node.flyer.applied[-1] != Velocity(forward=0.3), "nothing old is resumed by itself"
+        first.say("fly", forward=0.2)
+        until(lambda: count(node, Velocity(forward=0.2)))
+
+
+class Turning(Controller):
+    """Turns all the time, and remembers what it was told."""
+
+    def __init__(self, drone: Drone) -> None:
+        super().__init__(drone)
+        self.told: list[AuthorityStatus] = []
+
+    def on_feedback(self, feedback: Feedback) -> None:
+        self.drone.velocity(yaw_rate=0.25)
+
+    def on_authority(self, status: AuthorityStatus) -> None:
+        self.told.append(status)
+
+
+class Following(FollowMarker):
+    """The demo's controller, which sees no marker here and searches."""
+
+    def __init__(self, drone: Drone) -> None:
+        super().__init__(drone)
+        self.told: list[AuthorityStatus] = []
+
+    def on_authority(self, status: AuthorityStatus) -> None:
+        self.told.append(status)
+
+
+@pytest.mark.parametrize("kind", [Turning, Following])
+def test_a_controller_is_told_when_a_person_takes_over_and_goes_on_afterwards(
+    client: TestClient, node: Node, kind: type[Turning] | type[Following]
+) -> None:
+    with node.connect("demo") as drone, page(client) as pilot:
+        drone.takeoff()
+        controller = kind(drone)
+        running = threading.Thread(target=controller.run)
+        running.start()
+        try:
+            until(lambda: node.flyer.state is FlightState.FLYING)
+            pilot.take(4)
+            until(lambda: controller.told, "the controller was told")
+            assert controller.told[0].state == "preempted"
+            assert controller.told[0].holder == pilot.told[-1]["holder"]
+            pilot.say("hover")
+            pilot.wait("done", do="hover")
+            until(lambda: node.flyer.state is FlightState.HOVERING)
+            taken = len(node.flyer.applied)
+            pilot.say("fly", up=0.1)
+            until(lambda: count(node, Velocity(up=0.1)))
+            others = {type(action) for action in node.flyer.applied[taken:] if action != Velocity(up=0.1)}
+            assert others <= {Hover}, "the controller's commands are refused meanwhile"
+            pilot.say("release")
+            until(lambda: len(controller.told) == 2, "the controller was told again")
+            assert controller.told[1].state == "held"
+            until(lambda: node.flyer.state is FlightState.FLYING, "it flies on")
+            assert running.is_alive()
+        finally:
+            controller.stop()
+            running.join(5)
+        assert not running.is_alive()
+        drone.wait(lambda feedback: feedback.owner == "demo", 5)
+
+
+def test_a_controller_that_ends_while_a_person_flies_leaves_the_drone_to_the_person(
+    client: TestClient, node: Node
+) -> None:
+    with page(client) as pilot:
+        with node.connect("demo") as drone:
+            drone.takeoff()
+            controller = Turning(drone)
+            running = threading.Thread(target=controller.run)
+            running.start()
+            until(lambda: node.flyer.state is FlightState.FLYING)
+            pilot.take(4)
+            until(lambda: controller.told)
+            controller.stop()
+            running.join(5)
+        pilot.say("fly", up=0.1)
+        until(lambda: count(node, Velocity(up=0.1)))
+        assert not count(node, Land())
+
+
+# Lost and found -------------------------------------------------------------------------------------------------
+
+
+def test_a_killed_proxy_comes_back_and_the_page_flies_on(client: TestClient, node: Node) -> None:
+    with page(client) as pilot, open_socket(client, "drones/alpha/telemetry") as telemetry:
+        pilot.take()
+        node.stop()
+        pilot.wait("authority", mine=False)
+        message: dict[str, Any] = {"type": ""}
+        while message["type"] != "state" or message["links"]["application"] != "lost":
+            message = telemetry.receive_json()
+        assert message["alarms"][0].startswith("link to the proxy lost")
+        pilot.say("takeoff")
+        pilot.wait("refused", do="takeoff")
+        node.restart()
+        pilot.wait("authority", mine=True)
+        while message["type"] != "state" or message["links"]["application"] != "up":
+            message = telemetry.receive_json()
+        pilot.take_off()
+
+
+def test_a_stop_over_a_lost_link_says_so(client: TestClient, node: Node) -> None:
+    with node.connect("watcher", access="observe") as watcher, page(client) as pilot:
+        until(lambda: any("cockpit stop connected" in event.text for event in watcher.recent_events()))
+        for _ in range(3):
+            watcher.next_feedback()
+        node.stop()
+        pilot.say("stop")
+        assert "not sent" in pilot.wait("refused", do="stop")["why"]
+
+
+def test_what_was_refused_is_told_once_and_does_not_happen_later(client: TestClient, node: Node) -> None:
+    with page(client) as pilot, node.connect("watcher", access="observe") as watcher:
+        pilot.take().say("stop")
+        watcher.wait("emergency", 5)
+        pilot.say("takeoff")
+        assert "emergency" in pilot.wait("refused", do="takeoff")["why"]
+        node.flyer.state = FlightState.LANDED
+        watcher.wait("landed", 5)
+        pilot.say("ping")
+        pilot.wait("pong")
+        assert watcher.next_feedback().state is FlightState.LANDED
+        assert not count(node, Takeoff())
+        assert sum(told.get("do") == "takeoff" for told in pilot.told) == 1
+
+
+def test_an_observer_gets_no_controls(node: Node) -> None:
+    with (
+        cockpit(Fleet(Nodes(node)), this_user(Role.OBSERVER)) as client,
+        open_socket(client, "drones/alpha/control") as socket,
+    ):
+        socket.send_json({"do": "take", "priority": 0})
+        socket.send_json({"do": "stop"})
+        with pytest.raises(WebSocketDisconnect) as ended:
+            socket.receive_json()
+        assert ended.value.code == 4403
+    assert not node.flyer.applied
+
+
+def test_connections_of_pilots_are_given_back(client: TestClient, node: Node) -> None:
+    with node.connect("watcher", access="observe") as watcher:
+        before = links()
+        with page(client) as pilot:
+            pilot.take()
+            pilot.say("release")
+            pilot.wait("done", do="release")
+        until(lambda: links() == before, "no thread is left")
+
+        def gone() -> int:
+            return sum("ended" in event.text for event in watcher.recent_events())
+
+        until(lambda: gone() == 2, "the pilot's connection is gone, and the one for emergency stops")

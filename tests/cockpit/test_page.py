@@ -1,0 +1,346 @@
+"""What a person sees and does on the cockpit's page: Chromium, a real cockpit, real proxies of simulated drones."""
+
+from __future__ import annotations
+
+import re
+import signal
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+import skyloop
+from skyloop.messages import FlightState
+from tests.cockpit.browser import CHROMIUM, Deck, DronePage, browser_and_cockpit
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
+sync_api = pytest.importorskip("playwright.sync_api", reason="the tests of the page need: pip install playwright")
+pytestmark = [
+    pytest.mark.process,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here (Debian: apt install chromium)"),
+]
+
+MAX_AGE_MS = 200.0
+
+
+@pytest.fixture(scope="module")
+def open_cockpit() -> Iterator[tuple[Browser, str]]:
+    with browser_and_cockpit() as opened:
+        yield opened
+
+
+@pytest.fixture
+def deck(open_cockpit: tuple[Browser, str]) -> Iterator[Deck]:
+    deck = Deck(*open_cockpit)
+    yield deck
+    deck.end()
+
+
+def observe(name: str) -> skyloop.Drone:
+    """What the drone itself says, besides the page."""
+    return skyloop.connect(name, access="observe", name="test")
+
+
+def rotation(page: DronePage) -> float:
+    """How far the horizon is turned on the page [degrees]."""
+    found = re.search(r"rotate\((-?[\d.]+)\)", page.attribute(".horizon .roll", "transform"))
+    assert found is not None
+    return float(found[1])
+
+
+def test_video_moves_and_is_young(deck: Deck) -> None:
+    deck.proxy("video")
+    page = deck.page("video")
+    page.until(lambda: bool(page.attribute(".camera", "data-seq")), "a first picture")
+    first = int(page.attribute(".camera", "data-seq"))
+    ages: list[float] = []
+
+    def moved() -> bool:
+        ages.append(float(page.attribute(".camera", "data-age-ms")))
+        return int(page.attribute(".camera", "data-seq")) >= first + 20
+
+    page.until(moved, "twenty more pictures")
+    # The page's own figure: age when it was sent, and the time since. Its median: this machine is shared.
+    assert sorted(ages)[len(ages) // 2] < MAX_AGE_MS
+    pixels = "canvas => [...canvas.getContext('2d').getImageData(0, 0, 320, 240).data].reduce((a, b) => a + b, 0)"
+    assert page.pane.locator(".video").evaluate(pixels) > 0
+    assert page.problems == []
+
+
+def test_horizon_follows_the_attitude(deck: Deck) -> None:
+    deck.proxy("roll")
+    page = deck.page("roll")
+    with skyloop.connect("roll", name="sideways.py") as drone:
+        drone.takeoff()
+        for left in (-1.5, 1.5):
+            drone.velocity(left=left)
+
+            def tilts_as_the_drone(sign: float = left) -> bool:
+                # Right side down is positive roll; seen from within, the horizon then turns to the left.
+                return rotation(page) * sign > 1.5 * abs(sign)
+
+            page.until(tilts_as_the_drone, f"the horizon turns for {left} m/s to the left")
+        drone.hover()
+
+        def agree() -> bool:
+            roll = drone.feedback().roll
+            return roll is not None and abs(rotation(page) + roll * 57.29578) < 1.0
+
+        page.until(agree, "horizon and feedback agree")
+        drone.land(wait=False)
+
+
+def test_keyboard_flight(deck: Deck) -> None:
+    deck.proxy("keys")
+    page = deck.page("keys")
+    with observe("keys") as drone:
+        page.take_off()
+        before = drone.feedback().position
+        page.page.keyboard.down("w")
+        page.until(lambda: (drone.feedback().velocity or (0,))[0] > 0.4, "it flies forward")
+        page.until(
+            lambda: float(page.says('[data-figure="Speed"]').replace("−", "-")) > 0.4, "the page shows its speed"
+        )
+        page.wait_for_text(".command", "forward 0.80")
+        page.page.keyboard.up("w")
+        page.until(lambda: drone.feedback().state is FlightState.HOVERING, "it hovers when the key is let go")
+        after = drone.feedback().position
+        assert before is not None
+        assert after is not None
+        assert after[0] > before[0] + 0.1
+        # Nothing flies while somebody writes, and none of it is lost when the page loses the focus.
+        page.pane.locator('input[aria-label="Filter events by words"]').click()
+        page.page.keyboard.type("www")
+        assert drone.feedback().state is FlightState.HOVERING
+        page.pane.locator(".pane-head").click()
+        page.page.keyboard.down("w")
+        page.until(lambda: drone.feedback().state is FlightState.FLYING, "it flies again")
+        page.page.evaluate("window.dispatchEvent(new Event('blur'))")
+        page.until(lambda: drone.feedback().state is FlightState.HOVERING, "it hovers when the focus is lost")
+        page.press("l")
+        page.wait_for_text(".pill", "landed")
+        assert page.problems == []
+
+
+def test_authority_passes_from_a_controller_to_a_person_and_back(deck: Deck) -> None:
+    deck.proxy("passes")
+    page = deck.page("passes")
+    with skyloop.connect("passes", name="follow.py", priority=16) as drone:
+        page.wait_for_text(".holder", "follow.py")
+        page.take_control()
+        assert "You" in page.says(".holder")
+        page.until(lambda: drone.authority.state == "preempted", "the controller is told")
+        assert (drone.authority.holder or "").startswith("cockpit")
+        with pytest.raises(skyloop.AuthorityError, match="cockpit"):
+            drone.velocity(forward=0.1)
+        page.press("r")
+        page.until(lambda: drone.authority.state == "held", "the controller has it back")
+        page.wait_for_text(".holder", "follow.py")
+        assert page.pane.get_attribute("data-mine") == "false"
+
+
+def test_a_lower_priority_is_refused_with_its_reason(deck: Deck) -> None:
+    deck.proxy("busy")
+    page = deck.page("busy")
+    with skyloop.connect("busy", name="first.py", priority=2):
+        page.wait_for_text(".holder", "first.py")
+        page.press("c")
+        page.wait_for_text(".notice", "first.py has control with priority 2")
+
+
+def test_emergency_stops_the_motors(deck: Deck) -> None:
+    deck.proxy("stop")
+    page = deck.page("stop")
+    with skyloop.connect("stop", name="flies.py") as drone:
+        drone.takeoff()
+        page.until(lambda: not page.pane.locator(".strip .stop").is_disabled(), "the line is open")
+        page.wait_for_text(".holder", "flies.py")
+        page.press("Escape", "Escape")  # without control, and nothing is asked
+        page.until(lambda: drone.feedback().state is FlightState.EMERGENCY, "the motors are off")
+        page.wait_for_text(".pill", "emergency")
+        page.wait_for_text(".alarms", "motors are off")
+
+
+def test_parameters(deck: Deck) -> None:
+    deck.proxy("config")
+    page = deck.page("config")
+    page.pane.get_by_role("button", name="Parameters").click()
+    row = page.pane.locator('[data-parameter="limits.speed"]')
+    row.wait_for()
+    assert "float" in (row.text_content() or "")
+    assert row.locator("input").is_disabled(), "without control it can't be changed"
+    page.take_control()
+
+    def write(value: str) -> None:
+        row.locator("input").fill(value)
+        row.get_by_role("button", name="Set").click()
+
+    with observe("config") as drone:
+        write("1.5")
+        page.wait_for_text('[data-parameter="limits.speed"] .answer', "written")
+        assert drone.config["limits.speed"] == 1.5
+        write("-4")
+        page.until(lambda: row.locator(".answer").get_attribute("data-tone") == "bad", "it is refused")
+        assert "must be at least 0.1" in page.says('[data-parameter="limits.speed"] .answer'), "the drone's own words"
+        assert drone.config["limits.speed"] == 1.5
+        write("fast")
+        page.wait_for_text('[data-parameter="limits.speed"] .answer', "a number is needed")
+
+
+def test_two_watch_while_one_flies(deck: Deck) -> None:
+    deck.proxy("watched")
+    flies, *watch = [deck.page("watched") for _ in range(3)]
+    flies.take_off()
+    for page in watch:
+        page.wait_for_text(".pill", "hovering")
+        page.wait_for_text(".holder", "cockpit")
+        page.wait_for_new_picture()
+        page.press("l")  # lands nothing without control
+    with observe("watched") as drone:
+        assert drone.feedback().state.airborne
+        assert (drone.feedback().owner or "").startswith("cockpit")
+        flies.press("l")
+        watch[0].wait_for_text(".pill", "landed")
+
+
+FREEZE = "setTimeout(() => { const end = Date.now() + 4000; while (Date.now() < end); }, 0)"
+
+
+@pytest.mark.parametrize("crashes", [True, False], ids=["crashes", "hangs"])
+def test_a_page_that_dies_in_flight_leaves_a_hovering_drone(deck: Deck, crashes: bool) -> None:
+    deck.proxy("dies")
+    page = deck.page("dies")
+    witness = deck.page("dies")
+    with observe("dies") as drone:
+        page.page.bring_to_front()
+        page.take_off()
+        page.page.keyboard.down("w")
+        page.until(lambda: drone.feedback().state is FlightState.FLYING, "it flies")
+        if crashes:
+            with suppress(sync_api.Error):
+                page.page.goto("chrome://crash", timeout=200)
+        else:
+            page.page.evaluate(FREEZE)
+        witness.until(lambda: drone.feedback().state is FlightState.HOVERING, "it hovers", timeout_s=2.0)
+        witness.wait_for_text(".pill", "hovering")
+        if crashes:
+            assert drone.feedback().owner is None, "the authority was given back"
+
+
+def test_a_killed_proxy_is_shown_as_lost_and_comes_back(deck: Deck) -> None:
+    proxy = deck.proxy("killed")
+    page = deck.page("killed")
+    proxy.signal(signal.SIGKILL)
+    page.until(lambda: page.pane.get_attribute("data-lost") == "true", "it is lost")
+    page.wait_for_text(".alarms", "lost")
+    page.until(lambda: "lost" in (page.page.locator('.card[data-drone="killed"]').text_content() or ""), "in the list")
+    proxy.end()
+    deck.proxy("killed")
+    page.until(lambda: page.pane.get_attribute("data-lost") == "false", "it is back")
+    page.wait_for_text(".pill", "landed")
+    page.wait_for_new_picture()
+
+
+PAD = """
+window.pad = {id: "Test pad", mapping: "standard", connected: true, axes: [0, 0, 0, 0],
+              buttons: Array.from({length: 17}, () => ({pressed: false}))};
+navigator.getGamepads = () => [window.pad];
+"""
+
+
+def test_gamepad(deck: Deck) -> None:
+    deck.proxy("pad")
+    page = deck.page("pad", prepare=PAD)
+    with observe("pad") as drone:
+        page.take_control()
+        page.page.evaluate("window.pad.buttons[9].pressed = true")
+        page.wait_for_text(".pill", "hovering")
+        page.page.evaluate("window.pad.axes = [0, 0, 0, -1]")
+        page.until(lambda: (drone.feedback().velocity or (0,))[0] > 0.3, "the right stick flies forward")
+        page.page.evaluate("window.pad = null")
+        page.until(lambda: drone.feedback().state is FlightState.HOVERING, "it hovers when the gamepad goes away")
+
+
+def test_a_click_on_the_map_is_a_waypoint(deck: Deck) -> None:
+    deck.proxy("place")
+    page = deck.page("place")
+    with observe("place") as drone:
+        page.take_off()
+        canvas = page.pane.locator(".map.clickable")
+        canvas.wait_for()
+        box = canvas.bounding_box()
+        assert box is not None
+        start = drone.feedback().position
+        canvas.click(position={"x": box["width"] * 0.75, "y": box["height"] / 2})
+        page.wait_for_text(".notice", "waypoint is reached")
+        there = drone.feedback().position
+        assert start is not None
+        assert there is not None
+        assert there[0] > start[0] + 0.3, "to the right is east"
+        assert abs(there[1] - start[1]) < 0.3
+
+
+def test_plots_space_and_recordings_work_under_the_pages_policy(deck: Deck) -> None:
+    deck.proxy("all")
+    page = deck.page("all")
+    page.pane.get_by_role("button", name="3-D").click()
+    page.pane.locator(".scene canvas").wait_for()
+    page.pane.locator(".plots select").first.select_option("battery")
+    page.until(lambda: "battery" in page.says(".legend"), "the number that was picked")
+    page.pane.locator(".uplot canvas").wait_for()
+    page.page.get_by_role("button", name="Record", exact=True).click()
+    page.page.locator(".running li").wait_for()
+    page.until(lambda: "none dropped" in (page.page.locator(".running li").text_content() or ""), "length and size")
+    page.page.get_by_role("button", name="Stop recording all").click()
+    page.page.locator(".past li").wait_for()
+    assert "all" in (page.page.locator(".past li").text_content() or "")
+    assert page.page.locator(".past a").get_attribute("href"), "its report"
+    page.page.locator(".past li").get_by_role("button", name="Replay").click()
+    replay = page.page.locator('.pane:not([data-drone="all"])')
+    replay.get_by_role("button", name="End replay").click()
+    page.until(lambda: replay.count() == 0, "the replay is closed")
+    assert page.problems == []
+
+
+@pytest.mark.parametrize("scheme", ["dark", "light"])
+def test_a_phone(deck: Deck, scheme: str) -> None:
+    deck.proxy("phone")
+    page = deck.page("phone", color_scheme=scheme, has_touch=True)
+    page.page.set_viewport_size({"width": 390, "height": 844})
+    assert page.page.locator("html").get_attribute("data-theme") == scheme
+    assert page.page.evaluate("document.documentElement.scrollWidth") <= 390, "nothing beside the screen"
+    for name in ("Take control", "Take off", "Hover", "Land", "Motors off"):
+        assert page.pane.locator(".strip").get_by_role("button", name=name).is_visible()
+    box = page.pane.locator(".strip .stop").bounding_box()
+    assert box is not None
+    assert box["y"] + box["height"] <= 844, "in reach without scrolling"
+
+
+def test_a_token_lets_in_as_an_observer_or_a_pilot(
+    open_cockpit: tuple[Browser, str], deck: Deck, tmp_path: Path
+) -> None:
+    tokens = tmp_path / "tokens"
+    tokens.write_text("pilot 0123456789abcdefP ann\nobserver 0123456789abcdefO bob\n")
+    tokens.chmod(0o600)
+    deck.proxy("asked")
+    address = deck.cockpit("--token-file", str(tokens), "--recordings", str(tmp_path))
+    browser, _ = open_cockpit
+    with browser.new_context() as context:
+        page = context.new_page()
+        page.goto(f"{address}#asked")
+        page.get_by_label("Token").fill("not a token of this cockpit")
+        page.get_by_role("button", name="Enter").click()
+        page.get_by_text("this token is not known here").wait_for()
+        page.get_by_label("Token").fill("0123456789abcdefO")
+        page.get_by_role("button", name="Enter").click()
+        page.get_by_text("You may watch, not fly.").wait_for()
+        assert page.get_by_role("button", name="Motors off").count() == 0
+        page.get_by_role("button", name="Log out").click()
+        page.get_by_label("Token").fill("0123456789abcdefP")
+        page.get_by_role("button", name="Enter").click()
+        page.get_by_role("button", name="Take control").wait_for()
+        assert "ann" in (page.locator(".person").text_content() or "")
