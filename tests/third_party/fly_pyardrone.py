@@ -6,6 +6,7 @@ Writes what it saw as one line of JSON. Runs with the Python of an environment t
 from __future__ import annotations
 
 import json
+import os
 import sys
 import threading
 import time
@@ -108,3 +109,5 @@ def main(host: str) -> None:
 
 if __name__ == "__main__":
     main(sys.argv[1])
+    sys.stdout.flush()
+    os._exit(0)  # its threads may be in OpenCV still, which the interpreter's own way out does not survive
