@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Installs programs that we did not write and that fly the emulated AR.Drone in tests/third_party, into .third-party/.
+# Installs programs that we did not write and that fly the emulated drones in tests/third_party, into .third-party/.
 # Nothing of Skyloop needs them; without them those tests are skipped. Needs a Python with venv, and node with npm.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -8,6 +8,20 @@ python=.third-party/pyardrone/bin/python
 if ! "$python" -c 'import cv2, pyardrone' 2>/dev/null; then
   "${PYTHON:-python3}" -m venv .third-party/pyardrone
   "$python" -m pip install --quiet --disable-pip-version-check pyardrone==0.6.1 'opencv-python-headless>=4.10,<5'
+fi
+
+for package in mavsdk==4.1.0 mavproxy==1.8.75; do
+  python=.third-party/${package%%==*}/bin/python
+  if ! "$python" -m pip show --quiet "${package%%==*}" 2>/dev/null; then
+    "${PYTHON:-python3}" -m venv ".third-party/${package%%==*}"
+    "$python" -m pip install --quiet --disable-pip-version-check "$package" setuptools
+  fi
+done
+
+python=.third-party/djitellopy/bin/python
+if ! "$python" -c 'import djitellopy' 2>/dev/null; then
+  "${PYTHON:-python3}" -m venv .third-party/djitellopy
+  "$python" -m pip install --quiet --disable-pip-version-check djitellopy==2.5.0
 fi
 
 if [[ ! -e .third-party/node_modules/ar-drone/package.json ]]; then

@@ -28,7 +28,11 @@ if TYPE_CHECKING:
         Listener,
         Logbook,
         Processor,
+        Result,
+        Swarm,
+        TakeoverRequest,
         connect,
+        swarm,
     )
     from skyloop.control import Controller, RunSummary
     from skyloop.errors import (
@@ -44,6 +48,7 @@ if TYPE_CHECKING:
         ParameterError,
         RefusedError,
         SkyloopError,
+        SwarmError,
         UnknownNameError,
         UnsupportedError,
         UsageError,
@@ -75,6 +80,7 @@ if TYPE_CHECKING:
         Text,
         Velocity,
     )
+    from skyloop.motion_capture import MotionCapture, mocap
     from skyloop.recording import Recorder, record
 
 _HOMES = {
@@ -88,7 +94,11 @@ _HOMES = {
         "Listener",
         "Logbook",
         "Processor",
+        "Result",
+        "Swarm",
+        "TakeoverRequest",
         "connect",
+        "swarm",
     ),
     "skyloop.control": ("Controller", "RunSummary"),
     "skyloop.errors": (
@@ -104,6 +114,7 @@ _HOMES = {
         "ParameterError",
         "RefusedError",
         "SkyloopError",
+        "SwarmError",
         "UnknownNameError",
         "UnsupportedError",
         "UsageError",
@@ -135,6 +146,7 @@ _HOMES = {
         "Text",
         "Velocity",
     ),
+    "skyloop.motion_capture": ("MotionCapture", "mocap"),
     "skyloop.recording": ("Recorder", "record"),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
@@ -176,6 +188,7 @@ __all__ = [
     "LogEntry",
     "Logbook",
     "MissingExtraError",
+    "MotionCapture",
     "NameTakenError",
     "NoAnswerError",
     "Parameter",
@@ -185,17 +198,23 @@ __all__ = [
     "Processor",
     "Recorder",
     "RefusedError",
+    "Result",
     "RunSummary",
     "Severity",
     "SkyloopError",
+    "Swarm",
+    "SwarmError",
     "Takeoff",
+    "TakeoverRequest",
     "Text",
     "UnknownNameError",
     "UnsupportedError",
     "UsageError",
     "Velocity",
     "connect",
+    "mocap",
     "record",
+    "swarm",
 ]
 
 __version__: str

@@ -19,13 +19,16 @@ import inspect
 import threading
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import Any, TypeVar, Unpack
 
 from skyloop import client
 from skyloop.client.frame import Arrival
 from skyloop.client.logbook import Logbook
-from skyloop.client.reading import Wanted
+from skyloop.client.reading import VideoOptions, Wanted
+from skyloop.client.result_reading import silence
+from skyloop.client.results import ResultSlot, checked_age
 from skyloop.client.slots import Buffer
+from skyloop.client.takeover import TakeoverAnswer
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import NoAnswerError, UsageError
 from skyloop.messages import (
@@ -184,8 +187,14 @@ class Drone:
     def command(self, action: AnyAction) -> bool:
         return self.sync.command(action)
 
-    async def request_authority(self, priority: int | None = None, *, wait_s: float = 0.0) -> client.AuthorityStatus:
-        return await _in_thread(lambda: self.sync.request_authority(priority, wait_s=wait_s))
+    async def request_authority(self, priority: int | None = None, **options: Any) -> client.AuthorityStatus:
+        return await _in_thread(lambda: self.sync.request_authority(priority, **options))
+
+    def on_takeover(
+        self, function: Callable[[client.TakeoverRequest], TakeoverAnswer | Awaitable[TakeoverAnswer]]
+    ) -> Listener:
+        """See :meth:`skyloop.client.Drone.on_takeover`; runs on the event loop."""
+        return Listener(self.sync.on_takeover(_on_loop(function)))
 
     async def release_authority(self) -> None:
         await _in_thread(self.sync.release_authority)
@@ -207,9 +216,14 @@ class Drone:
     async def wait(self, state: Wanted, timeout_s: float = 10.0) -> Feedback:
         return await _in_thread(lambda: self.sync.wait(state, timeout_s))
 
-    async def frames(self, camera: str | None = None, *, timeout_s: float = 5.0) -> AsyncIterator[client.Frame]:
-        """Each newest frame, until the drone is closed. Raises :class:`NoAnswerError`."""
-        channel = self.sync.channel(camera)
+    async def frames(
+        self, camera: str | None = None, *, timeout_s: float = 5.0, **how: Unpack[VideoOptions]
+    ) -> AsyncIterator[client.Frame]:
+        """Each newest frame, until the drone is closed; ``how``: as of a drone without asyncio.
+
+        Raises :class:`NoAnswerError`.
+        """
+        channel = self.sync.channel(camera, **how)
         buffer: Buffer[Arrival] = Buffer()
         came = asyncio.Event()
         loop = asyncio.get_running_loop()
@@ -239,6 +253,39 @@ class Drone:
         finally:
             channel.topic.remove(sink)
 
+    def result(self, processor: str, *, max_age_s: float | None = None) -> client.Result | None:
+        return self.sync.result(processor, max_age_s=max_age_s)
+
+    async def results(
+        self, processor: str, *, max_age_s: float | None = None, timeout_s: float = 5.0
+    ) -> AsyncIterator[client.Result]:
+        """Each newest result of a processor, until the drone is closed. Raises :class:`NoAnswerError`."""
+        topic = self.sync.result_channel(processor).topic
+        slot = ResultSlot(checked_age(max_age_s))
+        came = asyncio.Event()
+        loop = asyncio.get_running_loop()
+
+        def sink(result: client.Result) -> None:
+            slot.put(result)
+            with contextlib.suppress(RuntimeError):  # the loop has ended
+                loop.call_soon_threadsafe(came.set)
+
+        topic.add(sink, lambda: slot.dropped)
+        try:
+            deadline = loop.time() + timeout_s
+            while not self.sync.closed:
+                try:
+                    await asyncio.wait_for(came.wait(), deadline - loop.time())
+                except TimeoutError:
+                    raise NoAnswerError(silence(processor, timeout_s, slot.expired)) from None
+                came.clear()
+                result = slot.take()
+                if result is not None:
+                    yield result
+                    deadline = loop.time() + timeout_s
+        finally:
+            topic.remove(sink)
+
     # Listening -------------------------------------------------------------------------------------------------
 
     def on_feedback(self, function: Callback[Feedback]) -> Listener:
@@ -258,6 +305,11 @@ class Drone:
 
     def on_log(self, function: Callback[LogEntry]) -> Listener:
         return Listener(self.sync.on_log(_on_loop(function)))
+
+    def on_result(
+        self, function: Callback[client.Result], processor: str | None = None, *, max_age_s: float | None = None
+    ) -> Listener:
+        return Listener(self.sync.on_result(_on_loop(function), processor, max_age_s=max_age_s))
 
     def add_processor(
         self, function: Callable[[client.Frame], object], camera: str | None = None, **options: Any
@@ -309,18 +361,16 @@ def _reject_in_step(target: str) -> None:
         )
 
 
-def _on_loop(function: Callback[T]) -> Callable[[T], object]:
+def _on_loop(function: Callback[T]) -> Callable[[T], Any]:
     """The function, to be called from another thread, run on this event loop and waited for."""
     loop = asyncio.get_running_loop()
 
-    async def call(sample: T) -> None:
+    async def call(sample: T) -> object:
         result = function(sample)
-        if inspect.isawaitable(result):
-            await result
+        return await result if inspect.isawaitable(result) else result
 
-    def from_thread(sample: T) -> None:
-        if not loop.is_closed():
-            asyncio.run_coroutine_threadsafe(call(sample), loop).result()
+    def from_thread(sample: T) -> object:
+        return None if loop.is_closed() else asyncio.run_coroutine_threadsafe(call(sample), loop).result()
 
     return from_thread
 

@@ -16,6 +16,7 @@
     ├── LinkError                         an end of a link is not there or stopped answering
     │   ├── NoAnswerError (also TimeoutError)  nothing came within the time given
     │   └── ClosedError                   this end was closed by its own user
+    ├── SwarmError                        some drones of a swarm failed; carries the ``errors`` by name
     └── DriverError                       the vehicle's driver failed; carries what the vehicle said
 
 Leaves say who is at fault and in which phase; catch the branch that you can do something about.
@@ -24,7 +25,7 @@ Leaves say who is at fault and in which phase; catch the branch that you can do 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 
 class SkyloopError(Exception):
@@ -42,6 +43,7 @@ class UnknownNameError(UsageError, KeyError):
         choices = sorted(set(known))
         self.kind = kind
         self.name = name
+        self.known = choices
         self.suggestions: list[str] = difflib.get_close_matches(name, choices, n=3, cutoff=0.5)
         if self.suggestions:
             hint = "did you mean " + " or ".join(repr(s) for s in self.suggestions) + "?"
@@ -108,6 +110,19 @@ class NoAnswerError(LinkError, TimeoutError):
 
 class ClosedError(LinkError):
     """The object was closed by its own user and can't be used any more."""
+
+
+class SwarmError(SkyloopError):
+    """Something went wrong at some drones of a swarm. ``errors`` has what, by the drones' names; ``total`` of how many.
+
+    The message names all of them, one a line.
+    """
+
+    def __init__(self, what: str, errors: Mapping[str, Exception], total: int) -> None:
+        self.errors = dict(errors)
+        self.total = total
+        lines = "".join(f"\n  {name}: {type(error).__name__}: {error}" for name, error in self.errors.items())
+        super().__init__(f"{what} failed for {len(self.errors)} of {total} drones:{lines}")
 
 
 class DriverError(SkyloopError):

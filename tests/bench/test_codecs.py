@@ -12,8 +12,8 @@ from typer.testing import CliRunner
 
 from skyloop.bench import codecs, tables
 from skyloop.cli.app import build
-from skyloop.drivers.ardrone.backlog import Coded
 from skyloop.drivers.ardrone.decoding import PaveVideo
+from skyloop.drivers.backlog import Coded
 from skyloop.wire.ardrone import navdata
 from skyloop.wire.ardrone.options import LAYOUTS
 

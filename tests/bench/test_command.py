@@ -39,7 +39,7 @@ def test_numbers_of_observers() -> None:
 
 def test_options_of_other_measurements_are_refused() -> None:
     check_options(What.DELAYS, {"--peers": "all", "--observers": None})
-    with pytest.raises(UsageError, match="--observers is for bench load, not for bench delays"):
+    with pytest.raises(UsageError, match="--observers is for bench load and swarm, not for bench delays"):
         check_options(What.DELAYS, {"--observers": "1"})
     with pytest.raises(UsageError, match="--sizes is for bench delays and loop, not for bench sim"):
         check_options(What.SIM, {"--sizes": "1x1"})

@@ -10,7 +10,7 @@ from types import ModuleType
 import pytest
 
 from skyloop.cli import doctor
-from skyloop.cli.doctor import Finding, Health, as_text
+from skyloop.cli.findings import Finding, Health, as_text
 from tests.cli.conftest import Run
 
 

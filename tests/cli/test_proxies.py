@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import platform
 import signal
 import subprocess
 import sys
@@ -44,8 +45,8 @@ def answers() -> bool:
 def test_the_list_shows_what_runs_and_who_flies(run: Run, alpha: Process) -> None:
     with skyloop.connect("alpha", name="the pilot"):
         shown = run("list").out.splitlines()
-        assert shown[0].split() == ["NAME", "STATE", "BATTERY", "PILOT", "LINK", "ADDRESS"]
-        assert shown[1].startswith("alpha  landed  ")
+        assert shown[0].split() == ["NAME", "HOST", "BY", "STATE", "BATTERY", "PILOT", "LINK", "ADDRESS"]
+        assert shown[1].split()[:4] == ["alpha", platform.node(), "local", "landed"]
         assert "the pilot" in shown[1]
         (row,) = json.loads(run("list", "--json").out)
         assert (row["name"], row["pid"], row["uri"], row["owner"], row["vehicle_link"], row["problem"]) == (
@@ -177,7 +178,7 @@ def test_a_process_that_simulates_makes_room_for_commands(run: Run, monkeypatch:
     done: list[object] = []
     monkeypatch.setattr("skyloop.cli.simulating.settle", lambda options: done.append(options.world))
     monkeypatch.setattr("skyloop.proxy.serve.serve", lambda *given, **options: done.append(given))
-    monkeypatch.setattr("skyloop.proxy.serve.run", lambda proxies: done.append([proxy.name for proxy in proxies]))
+    monkeypatch.setattr("skyloop.proxy.serve.run", lambda proxies, **_: done.append([proxy.name for proxy in proxies]))
     run("proxy", "sim://?world=gates", "--name", "beta")
     run("proxy", "video://x.mp4")
     run("sim", "--world", "windy", "--option", "cameras=none", "--name", "gamma")

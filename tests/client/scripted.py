@@ -188,6 +188,8 @@ class ScriptedProxy:
     def peer_joined(self, peer: Peer) -> None:
         self._peers[peer.id] = (peer, "")
 
+    def refused(self, peer: Peer, reason: str) -> None: ...
+
     def peer_left(self, peer: Peer, reason: str) -> None:
         self._peers.pop(peer.id, None)
         if self.owner is not None and self.owner[0] == peer.id:

@@ -13,7 +13,9 @@ import skyloop.client
 from skyloop import aio
 from skyloop.errors import ClosedError, NoAnswerError, UsageError
 from skyloop.messages import Encoding, EventKind, FlightState, Hover, Land, Takeoff
+from skyloop.transport.base import results
 from tests.client.scripted import QUICK, WAIT_S, ScriptedProxy, background, scripted
+from tests.client.test_results import Sender
 
 
 @pytest.fixture
@@ -189,6 +191,32 @@ def test_listeners_run_on_the_loop(proxy: ScriptedProxy) -> None:
             assert EventKind.CALLBACK_ERROR in [event.kind for event in drone.recent_events()]
 
     run(listen())
+
+
+def test_results(proxy: ScriptedProxy) -> None:
+    async def read() -> None:
+        async with aio.connect("me", access="observe") as drone:
+            got: list[int] = []
+            listener = drone.on_result(lambda result: got.append(result.seq), "detector", max_age_s=60.0)
+            assert drone.result("detector") is None
+            await drone.wait(lambda _: proxy.server.subscribers(results("detector")) == 1)
+            sender = Sender(proxy)
+            coming = drone.results("detector", max_age_s=60.0, timeout_s=WAIT_S)
+            task = asyncio.ensure_future(anext(coming))
+            await asyncio.sleep(0)  # it listens from here on
+            sender.send(1, age_s=90.0)
+            sender.send(2, {"x": 1})
+            assert (await task).value == {"x": 1}
+            await drone.wait(lambda _: got == [2])
+            newest = drone.result("detector")
+            assert newest is not None
+            assert newest.seq == 2
+            listener.cancel()
+            with pytest.raises(NoAnswerError, match="no result of processor detector came"):
+                await anext(drone.results("detector", timeout_s=0.02))
+            await coming.aclose()  # type: ignore[attr-defined]
+
+    run(read())
 
 
 def test_processors_are_plain_functions(proxy: ScriptedProxy) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from skyloop.client.authority import Authority
-from skyloop.messages import Event, EventKind, Feedback, Value
+from skyloop.messages import Event, EventKind, Feedback, RequestAuthority, Value
 
 NOW = 10_000_000_000
 LATER = NOW + 2_000_000_000
@@ -23,7 +23,7 @@ def owned(owner_id: int = 0, lease: int = 0, owner: str | None = None) -> Feedba
 def authority() -> Authority:
     authority = Authority("me")
     authority.connected(3)
-    authority.asked(16)
+    authority.asked(RequestAuthority(16))
     return authority
 
 
@@ -37,7 +37,7 @@ def test_granted_by_reply_event_or_feedback() -> None:
     for way in ("reply", "event", "feedback"):
         authority = Authority("me")
         authority.connected(3)
-        authority.asked(7)
+        authority.asked(RequestAuthority(7))
         assert authority.pending
         changed = {
             "reply": lambda a=authority: a.granted(5, NOW),
@@ -107,6 +107,38 @@ def test_lost_by_silence(held: Authority) -> None:
     held.granted(6, LATER)
     assert held.event(event(EventKind.AUTHORITY_LOST, app_id=3, lease=6, reason="silent"), LATER)
     assert held.status.state == "none"
+
+
+def test_lost_by_silence_and_the_event_was_lost_too(held: Authority) -> None:
+    kept = owned(3, 0, "me")  # the name stays on the vehicle, without a lease
+    assert not held.feedback(kept, NOW + 1), "it may be from before the grant"
+    assert held.feedback(kept, LATER)
+    assert (held.status.state, held.wanted) == ("none", True)
+
+
+def test_the_time_it_was_asked_for_and_the_expected_wait(authority: Authority) -> None:
+    assert authority.queued(2, "other", 40.0)
+    assert authority.status.expected_wait_s == 40.0
+    assert authority.event(event(EventKind.AUTHORITY_QUEUED, app_id=3, position=1, wait_s=10.0), NOW)
+    assert (authority.status.position, authority.status.expected_wait_s) == (1, 10.0)
+    assert authority.event(event(EventKind.AUTHORITY_GRANTED, app_id=3, lease=7, until_ns=99), NOW)
+    assert authority.status.until_ns == 99
+    assert not authority.granted(7, NOW), "told again without the time"
+    assert authority.status.until_ns == 99
+
+
+def test_who_lost_it_because_the_time_is_over_does_not_ask_again(held: Authority) -> None:
+    assert held.event(event(EventKind.AUTHORITY_LOST, app_id=3, lease=5, reason="expired", by="other"), NOW)
+    assert (held.status.state, held.wanted) == ("none", False)
+
+
+def test_that_the_holder_declined_is_remembered_until_it_is_asked_again(authority: Authority) -> None:
+    assert not authority.event(Event(EventKind.AUTHORITY_DECLINED, "not yet", 0, data={"app_id": 4}), NOW)
+    assert authority.declined == ""
+    assert not authority.event(Event(EventKind.AUTHORITY_DECLINED, "not yet", 0, data={"app_id": 3}), NOW)
+    assert authority.declined == "not yet"
+    authority.asked(RequestAuthority())
+    assert authority.declined == ""
 
 
 def test_given_back_and_refused(held: Authority) -> None:

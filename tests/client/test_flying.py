@@ -125,7 +125,7 @@ def test_take_off_that_does_not_happen(proxy: ScriptedProxy, drone: Drone) -> No
     thread = threading.Thread(target=vehicle)
     thread.start()
     with pytest.raises(NoAnswerError, match="landed; me: no GPS"):
-        drone.takeoff(timeout_s=0.4)
+        drone.takeoff(timeout_s=1.5)
     thread.join(WAIT_S)
 
 
@@ -145,6 +145,8 @@ def test_take_off_that_is_refused_for_good(
     with pytest.raises(error, match="me: never"):
         drone.takeoff(timeout_s=WAIT_S)
     thread.join(WAIT_S)
+    after = len(proxy.commands)
+    proxy.until(lambda: Idle() in proxy.actions()[after:], "what was refused is asked for no longer")
 
 
 def test_closing_or_losing_the_authority_ends_a_take_off(proxy: ScriptedProxy, drone: Drone) -> None:

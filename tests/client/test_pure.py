@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from skyloop.client.history import FeedbackHistory, interpolate
 from skyloop.client.statistics import DEPTH, ChannelCounter, distribution
-from skyloop.client.timing import OffsetEstimator
+from skyloop.client.timing import MAX_DRIFT, OffsetEstimator
 from skyloop.messages import Feedback, FlightState
 
 angles = st.floats(-math.pi, math.pi)
@@ -28,7 +28,47 @@ def test_offset_is_true_to_its_uncertainty(offset_ns: int, trips: list[tuple[int
         best = estimator.add(now_ns, now_ns + there_ns + offset_ns, now_ns + there_ns + back_ns)
         assert abs(best.ns - offset_ns) <= best.uncertainty_ns
         now_ns += 10**9
-    assert best.uncertainty_ns <= min(there + back for there, back in trips[-16:]) // 2 + 1
+    newest_there, newest_back = trips[-1]
+    assert best.uncertainty_ns <= (newest_there + newest_back) * (0.5 + MAX_DRIFT) + 3
+
+
+@given(
+    st.integers(-(10**15), 10**15),
+    st.floats(-MAX_DRIFT, MAX_DRIFT),
+    st.lists(st.tuples(st.integers(0, 10**8), st.integers(0, 10**8), st.integers(0, 10**10)), min_size=1, max_size=60),
+)
+def test_offset_follows_a_clock_that_drifts(offset_ns: int, drift: float, trips: list[tuple[int, int, int]]) -> None:
+    def true_ns(at_ns: int) -> int:
+        return offset_ns + round(drift * (at_ns - 10**12))
+
+    estimator = OffsetEstimator()
+    now_ns = 10**12
+    for there_ns, back_ns, pause_ns in trips:
+        answered_ns = now_ns + there_ns
+        best = estimator.add(now_ns, answered_ns + true_ns(answered_ns), answered_ns + back_ns)
+        now_ns = answered_ns + back_ns
+        assert abs(best.ns - true_ns(now_ns)) <= best.uncertainty_ns
+        now_ns += pause_ns
+        later = estimator.at(now_ns)
+        assert abs(later.ns - true_ns(now_ns)) <= later.uncertainty_ns
+        assert later.uncertainty_ns >= best.uncertainty_ns
+
+
+def test_the_best_answer_serves_until_drift_may_have_made_it_worse() -> None:
+    estimator = OffsetEstimator()
+    estimator.add(0, 500_000, 1_000_000)  # known to 0.5 ms
+    for second in range(1, 4):
+        slow = estimator.add(second * 10**9, second * 10**9 + 500_000, second * 10**9 + 20_000_000)
+        assert slow.uncertainty_ns < 1_500_000
+    assert estimator.at(60 * 10**9).uncertainty_ns > 10_000_000
+
+
+def test_a_clock_that_was_set_is_believed_at_once() -> None:
+    estimator = OffsetEstimator()
+    for second in range(5):
+        estimator.add(second * 10**9, second * 10**9, second * 10**9 + 1000)
+    jumped = estimator.add(5 * 10**9, 65 * 10**9, 5 * 10**9 + 1000)
+    assert abs(jumped.ns - 60 * 10**9) <= jumped.uncertainty_ns < 2000
 
 
 def test_the_state_between_two_samples() -> None:

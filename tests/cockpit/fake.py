@@ -274,6 +274,8 @@ class Nodes:
     def also(self, name: str) -> None:
         self.wanted.append(name)
 
+    def close(self) -> None: ...
+
 
 class FakeRecorder:
     """Writes a small file, and says that it records."""
@@ -309,6 +311,8 @@ def fake_fleet(drones: Mapping[str, FakeDrone]) -> Fleet:
             return [Found(name, "memory", dial) for name in drones]
 
         def also(self, name: str) -> None: ...
+
+        def close(self) -> None: ...
 
     return Fleet(Finder(), lambda found: drones[found.name])  # type: ignore[arg-type,return-value]
 

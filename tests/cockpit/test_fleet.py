@@ -41,6 +41,8 @@ class Hangar:
 
     def also(self, name: str) -> None: ...
 
+    def close(self) -> None: ...
+
     def connect(self, found: Found) -> Any:
         self.connected.append(found.name)
         if found.name in self.fails:

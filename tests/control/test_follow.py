@@ -13,7 +13,17 @@ from skyloop.client.history import FeedbackHistory
 from skyloop.control.follow import FollowMarker, FollowScore
 from skyloop.control.follow_law import Mode
 from skyloop.errors import UnknownNameError
-from skyloop.messages import CameraInfo, Capabilities, Encoding, Feedback, FrameHeader, Polyline, Text
+from skyloop.messages import (
+    CameraInfo,
+    Capabilities,
+    Encoding,
+    EventKind,
+    Feedback,
+    FrameHeader,
+    Polyline,
+    Severity,
+    Text,
+)
 from tests.vision.draw import INTRINSICS, facing, picture
 
 FORWARD = (0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0)
@@ -28,12 +38,16 @@ class Recorder:
         self.velocities: list[dict[str, float]] = []
         self.hovers = 0
         self.drawn: list[list[Any]] = []
+        self.told: list[tuple[str, Severity]] = []
 
     def velocity(self, **values: float) -> None:
         self.velocities.append(values)
 
     def hover(self) -> None:
         self.hovers += 1
+
+    def tell(self, kind: EventKind, text: str, severity: Severity) -> None:
+        self.told.append((text, severity))
 
     def annotate(self, frame: Frame, shapes: list[Any], source: str) -> None:
         self.drawn.append(shapes)

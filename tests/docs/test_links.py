@@ -42,7 +42,7 @@ def test_files_that_are_named_exist(page: Path) -> None:
 
 def test_pictures_are_small_and_all_are_shown() -> None:
     shown = {(page.parent / target).resolve() for page in PAGES for target in links(page)}
-    pictures = list((ROOT / "docs" / "pictures").iterdir())
+    pictures = [path for path in (ROOT / "docs" / "pictures").rglob("*") if path.is_file()]
     assert pictures
     for picture in pictures:
         assert picture in shown, f"{picture.name} is shown nowhere"

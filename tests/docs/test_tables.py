@@ -39,7 +39,10 @@ def test_the_extras() -> None:
 def test_the_proxys_parameters() -> None:
     table = rows(section("docs/proxy.md", "## Parameters"))
     assert table == [
-        [f"`{p.name}`", f"{p.value:g}", p.unit, f"{p.minimum:g} to {p.maximum:g}", p.description] for p in OWN
+        [f"`{p.name}`", f"{p.value:g}", p.unit, f"{p.minimum:g} to {p.maximum:g}", p.description]
+        if isinstance(p.value, float)
+        else [f"`{p.name}`", str(p.value), p.unit, "", p.description]
+        for p in OWN
     ]
 
 

@@ -75,6 +75,7 @@ def in_the_air(driver: SimDriver, sink: RecordingSink) -> None:
         ("sim://?native=hover", "leaves no set-point"),
         ("sim://?native=velocity,takeoff", "takeoff and land go together"),
         ("sim://?quality=ultra", "quality of pictures"),
+        ("sim://?vehicle=ardron", "simulated vehicle"),
         ("sim://?battery=2", "option battery"),
         ("sim://?width=3", "option width"),
     ],

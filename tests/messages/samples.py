@@ -1,7 +1,10 @@
 """One sample of everything, with no field left at its default: for the golden packets and the round trips."""
 
+import numpy as np
+
 from skyloop.messages import (
     Annotation,
+    AnswerTakeover,
     Applied,
     Attitude,
     AuthorityGranted,
@@ -25,6 +28,7 @@ from skyloop.messages import (
     Hover,
     Idle,
     Intrinsics,
+    JoinProcessor,
     Land,
     LinkState,
     ListParameters,
@@ -37,6 +41,8 @@ from skyloop.messages import (
     Points,
     Polyline,
     Pong,
+    ProcessorResult,
+    ProcessorShare,
     Refusal,
     Refused,
     ReleaseAuthority,
@@ -50,10 +56,13 @@ from skyloop.messages import (
     Severity,
     Statistics,
     Takeoff,
+    Takeover,
     Text,
+    VehiclePose,
     Velocity,
     Welcome,
 )
+from skyloop.messages.payload import pack
 
 INTRINSICS = Intrinsics(fx=280.5, fy=281.5, cx=160.0, cy=120.0, distortion=(-0.1, 0.01, 0.0, 0.0, 0.001))
 CAMERA = CameraInfo(
@@ -144,14 +153,30 @@ SAMPLES: dict[str, Sample] = {
         b"\0\0\0\1\x67\x42\0\0\0\1\x68\xce\0\0\0\1\x65\x88",
         INTRINSICS,
     ),
+    "result": ProcessorResult(
+        "detector",
+        "front",
+        12,
+        3_000_000_000,
+        3_040_000_000,
+        35_000_000,
+        4,
+        pack({"boxes": np.array([[1.5, 2.0]], np.float32), "score": float("nan"), "seen": True}),
+        3,
+    ),
+    "share": ProcessorShare("detector", "front", 1, 3, 4),
+    "pose": VehiclePose(3_000_000_000, (1.5, -0.25, 1.1), (0.0, 0.0, 0.6, 0.8), 0.001, 0.01),
+    "pose-minimal": VehiclePose(3_000_000_001, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)),
     "request-hello": Request(1, Hello("follow.py", Role.OBSERVER)),
-    "request-authority": Request(2, RequestAuthority(3, False)),
+    "request-authority": Request(2, RequestAuthority(3, False, 120.0, Takeover.ASK)),
     "request-release": Request(3, ReleaseAuthority()),
     "request-get": Request(4, GetParameter("limits.tilt")),
     "request-set": Request(5, SetParameter("limits.tilt", 0.2, 7)),
     "request-list": Request(6, ListParameters(40)),
     "request-ping": Request(7, Ping(5_000_000_000)),
     "request-statistics": Request(8, GetStatistics()),
+    "request-join-processor": Request(9, JoinProcessor("detector", "Detector 0123456789abcdef", "front", False, False)),
+    "request-answer": Request(9, AnswerTakeover(7, 3, False, "landing just now")),
     "reply-welcome": Reply(
         1,
         Welcome(
@@ -164,8 +189,8 @@ SAMPLES: dict[str, Sample] = {
             Capabilities("sim", frozenset({"takeoff"}), (CAMERA,), "a simulated quadrotor", "never mind"),
         ),
     ),
-    "reply-granted": Reply(2, AuthorityGranted(7)),
-    "reply-queued": Reply(2, AuthorityQueued(1, "alice", 0)),
+    "reply-granted": Reply(2, AuthorityGranted(7, 126_000_000_000)),
+    "reply-queued": Reply(2, AuthorityQueued(1, "alice", 0, 42.5, True)),
     "reply-value": Reply(4, ParameterValue(TILT)),
     "reply-page": Reply(6, ParameterPage(41, 40, (TILT,))),
     "reply-pong": Reply(7, Pong(5_000_000_000, 6_000_000_000)),

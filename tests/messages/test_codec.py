@@ -16,6 +16,8 @@ from hypothesis import strategies as st
 from skyloop.errors import DecodeError
 from skyloop.messages import (
     Attitude,
+    AuthorityGranted,
+    AuthorityQueued,
     Command,
     EncodedFrame,
     Event,
@@ -23,6 +25,8 @@ from skyloop.messages import (
     Intrinsics,
     Kind,
     Reply,
+    Request,
+    RequestAuthority,
     Sample,
     Velocity,
     Welcome,
@@ -54,6 +58,24 @@ def test_a_camera_told_by_an_older_proxy_has_no_stream() -> None:
     assert isinstance(older.body, Welcome)
     (camera,) = older.body.capabilities.cameras
     assert camera == msgspec.structs.replace(CAMERA, stream="")
+
+
+@pytest.mark.parametrize(
+    ("name", "known"),
+    [
+        ("request-authority", Request(2, RequestAuthority(3, False))),
+        ("reply-granted", Reply(2, AuthorityGranted(7))),
+        ("reply-queued", Reply(2, AuthorityQueued(1, "alice", 0))),
+    ],
+)
+def test_what_an_older_end_says_of_the_authority(name: str, known: Sample) -> None:
+    assert decode((PACKETS / "older" / f"{name}.bin").read_bytes()) == known
+
+
+@pytest.mark.parametrize("for_s", [0.0, -1.0, 86_401.0, math.nan, math.inf])
+def test_a_time_that_makes_no_sense_is_refused(for_s: float) -> None:
+    with pytest.raises(DecodeError, match=r"86400|Expected"):
+        decode(encode(Request(1, RequestAuthority(for_s=for_s))))
 
 
 def test_the_largest_picture_that_is_handed_on_fits_a_packet() -> None:

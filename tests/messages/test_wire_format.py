@@ -58,7 +58,7 @@ def test_sizes_on_the_page() -> None:
     assert f"| `data` | bin, ≤ {encoded.MAX_ENCODED:_} |".replace("_", " ") in PAGE
 
 
-LOCAL = PAGE.partition("\n## The local transport\n")[2]
+LOCAL, _, FABRIC = PAGE.partition("\n## The local transport\n")[2].partition("\n## The fabric transport\n")
 LOCAL_ROWS = {
     int(number, 16): (name, body)
     for number, name, body in re.findall(r"^\| (0x\w+) \| (\w+) \| [^|]+ \| ([^|]+) \|$", LOCAL, re.MULTILINE)

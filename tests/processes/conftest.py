@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import IO
 
@@ -27,12 +27,15 @@ def sockets(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 class Process:
-    """A child whose lines can be waited for. Ended by its own number, whatever happens."""
+    """A child whose lines can be waited for. Ended by its own number, whatever happens.
 
-    def __init__(self, *arguments: str) -> None:
+    ``prefix`` is put before the interpreter and becomes it, such as what enters a namespace.
+    """
+
+    def __init__(self, *arguments: str, prefix: Sequence[str] = ()) -> None:
         self.started_s = time.monotonic()
         self._popen = subprocess.Popen(
-            [sys.executable, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env={**os.environ}
+            [*prefix, sys.executable, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, env={**os.environ}
         )
         self.text = ""
 

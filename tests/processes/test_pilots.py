@@ -111,6 +111,26 @@ def test_one_flies_priority_takes_over_and_no_command_of_an_old_lease_is_ever_ex
         bob.land()
 
 
+def test_a_pilot_that_hangs_keeps_its_name_on_a_drone_that_fails_safe_until_somebody_asks(
+    proxy: Callable[..., Process], start: Callable[..., Process]
+) -> None:
+    proxy()
+    with skyloop.connect("alpha", access="observe") as observer:
+        pilot = start(PILOTS, "fly", "alpha", "4")
+        pilot.until("flying")
+        observer.wait("flying", timeout_s=10.0)
+        pilot.signal(signal.SIGSTOP)
+        kept = observer.wait(lambda feedback: not feedback.lease, timeout_s=10.0)
+        assert (kept.owner, kept.owner_priority) == ("doomed", 4)
+        assert kept.failsafe is not Failsafe.NONE
+        with skyloop.connect("alpha", name="alice", priority=31, on_exit="hover") as alice:  # of lower priority
+            assert alice.authority.state == "held"
+            observer.wait(lambda feedback: feedback.owner == "alice", timeout_s=5.0)
+            pilot.signal(signal.SIGCONT)  # it asks for a new lease by itself, with its higher priority
+            observer.wait(lambda feedback: feedback.owner == "doomed", timeout_s=10.0)
+            eventually(lambda: alice.authority.holder == "doomed", "alice knows")
+
+
 def forge(drone: skyloop.Drone, lease: int, action: Velocity | Land) -> None:
     """Send a command under another lease over this application's own connection."""
     pilot = drone._pilot

@@ -48,7 +48,7 @@ from skyloop.messages import (
     encode,
 )
 from skyloop.proxy import Proxy
-from skyloop.transport.base import ANNOTATIONS, COMMANDS, EVENTS, FEEDBACK, ClientEnd, Dialer, Pixels
+from skyloop.transport.base import ANNOTATIONS, COMMANDS, EVENTS, FEEDBACK, ClientEnd, Dialer, Pixels, ServerEnd
 from skyloop.transport.memory import MemoryServer
 
 WAIT_S = 10.0
@@ -162,7 +162,7 @@ class App:
         else:
             self.others.append(sample)
 
-    def frame(self, header: FrameHeader, pixels: Pixels) -> None:
+    def frame(self, header: FrameHeader, pixels: Pixels, topic: str = "") -> None:
         self.frames.append((header, pixels.tobytes()))
 
     def closed(self, reason: str) -> None:
@@ -228,12 +228,32 @@ class App:
 class Bench:
     """A proxy with a fake vehicle, stepped by hand."""
 
-    def __init__(self, actions: Iterable[str] = ALL, parameters: Iterable[Parameter] = ()) -> None:
+    def __init__(
+        self,
+        actions: Iterable[str] = ALL,
+        parameters: Iterable[Parameter] = (),
+        transport: tuple[ServerEnd, Dialer] | None = None,
+    ) -> None:
         self.clock = ManualClock(1000 * 10**9)
-        self.server = MemoryServer("bench")
+        if transport is None:
+            memory = MemoryServer("bench")
+            transport = memory, memory.dial
+        self.server, self.dial = transport
         self.driver = FakeDriver(self.clock, actions, parameters)
         self.proxy = Proxy(self.driver, self.server, name="bench", clock=self.clock, ticker=False)
         self.apps: list[App] = []
+        self.events: list[Event] = []  #: published, whether or not they arrive anywhere
+        self._publish, self.proxy.events._publish = self.proxy.events._publish, self._publish_event
+
+    def _publish_event(self, topic: str, packet: bytes) -> int:
+        event = decode(packet)
+        assert isinstance(event, Event)
+        self.events.append(event)
+        return self._publish(topic, packet)
+
+    def published(self, kind: EventKind) -> list[Event]:
+        """The events of a kind so far."""
+        return [event for event in self.events if event.kind is kind]
 
     def __enter__(self) -> Bench:
         self.proxy.start()
@@ -246,7 +266,7 @@ class Bench:
 
     def stranger(self) -> App:
         """A connection without Hello."""
-        app = App(self.server.dial, self.clock)
+        app = App(self.dial, self.clock)
         self.apps.append(app)
         return app
 

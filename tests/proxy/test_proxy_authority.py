@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from skyloop.messages import (
+    AnswerTakeover,
     AuthorityGranted,
     AuthorityQueued,
     Done,
@@ -16,6 +17,7 @@ from skyloop.messages import (
     ReleaseAuthority,
     RequestAuthority,
     Role,
+    Takeover,
     Velocity,
 )
 from tests.proxy.fake import Bench
@@ -44,7 +46,7 @@ def test_two_pilots_and_three_observers(bench: Bench) -> None:
     for app in (alice, *observers):
         (preempted,) = app.told(EventKind.AUTHORITY_PREEMPTED)
         assert preempted.app == "alice"
-        assert preempted.data == {"app_id": 1, "lease": 1, "by": "bob", "by_id": 2, "by_priority": 4}
+        assert preempted.data == {"app_id": 1, "lease": 1, "by": "bob", "by_id": 2, "by_priority": 4, "granted": False}
         bench.tick()
         feedback = app.last_feedback()
         assert (feedback.owner, feedback.owner_id, feedback.owner_priority) == ("bob", bob.app_id, 4)
@@ -149,3 +151,125 @@ def test_a_hand_over_on_the_ground_tells_the_vehicle_nothing(bench: Bench) -> No
     bench.run(1.0)
     assert bench.driver.told == []
     assert bench.proxy.helm.state is FlightState.LANDED
+
+
+def test_a_silent_holder_keeps_its_name_on_the_vehicle_which_fails_safe(bench: Bench) -> None:
+    alice, bob = bench.airborne("alice", 4), bench.join("bob")
+    alice.command(Velocity(0.5))
+    bench.run(2.1)
+    (lost,) = bob.told(EventKind.AUTHORITY_LOST)
+    assert (lost.app, lost.data["reason"], lost.data["by"]) == ("alice", "silent", "")
+    assert "until somebody asks" in lost.text
+    feedback = bob.last_feedback()
+    assert (feedback.owner, feedback.owner_id, feedback.owner_priority) == ("alice", alice.app_id, 4)
+    assert (feedback.lease, feedback.failsafe) == (0, "hover")
+    alice.command(Velocity(0.7))
+    assert alice.refusals()[-1] == Refusal.FOREIGN_LEASE
+    assert bench.driver.told == [Velocity(0.5), Hover()]
+    bench.run(3.0)
+    assert bench.driver.told == [Velocity(0.5), Hover(), Land()]
+    assert bob.last_feedback().owner == "alice"
+
+    assert bob.ask(RequestAuthority(31)) == AuthorityGranted(2)
+    bench.tick()
+    assert bob.last_feedback().owner == "bob"
+    assert bob.told(EventKind.AUTHORITY_PREEMPTED) == []
+
+
+def test_the_name_of_a_silent_holder_goes_with_its_connection(bench: Bench) -> None:
+    alice, bob = bench.pilot("alice"), bench.join("bob")
+    bench.run(2.1)
+    assert bob.last_feedback().owner == "alice"
+    alice.end.close()
+    bob.sync()
+    bench.tick()
+    assert bob.last_feedback().owner is None
+
+
+def test_a_line_of_people_who_said_for_how_long(bench: Bench) -> None:
+    alice, bob, carol = bench.airborne("alice"), bench.join("bob"), bench.join("carol")
+    now_ns = bench.clock()
+    assert alice.ask(RequestAuthority(for_s=60.0)) == AuthorityGranted(alice.lease, now_ns + 60 * 10**9)
+    assert bob.ask(RequestAuthority(for_s=30.0)) == AuthorityQueued(1, "alice", 16, 60.0)
+    assert carol.ask(RequestAuthority()) == AuthorityQueued(2, "alice", 16, 90.0)
+    queued = carol.told(EventKind.AUTHORITY_QUEUED)[-1]
+    assert (queued.app, queued.data["position"], queued.data["wait_s"]) == ("carol", 2, 90.0)
+    bench.run(59.9, lambda: alice.command(Idle(), repeat=True))
+    assert carol.told(EventKind.AUTHORITY_LOST) == []
+    alice.command(Velocity(0.5))
+    bench.run(0.2)
+    (lost,) = carol.told(EventKind.AUTHORITY_LOST)
+    assert (lost.app, lost.data["reason"], lost.data["by"]) == ("alice", "expired", "bob")
+    granted = carol.told(EventKind.AUTHORITY_GRANTED)[-1]
+    assert (granted.app, granted.data["until_ns"]) == ("bob", bench.clock() + 30 * 10**9 - 100_000_000)
+    assert "for 30 s" in granted.text
+    assert bench.driver.told == [Velocity(0.5), Hover()]
+    moved = carol.told(EventKind.AUTHORITY_QUEUED)[-1]
+    assert (moved.app, moved.data["position"], moved.data["wait_s"]) == ("carol", 1, 30.0)
+
+
+def test_a_holder_whose_time_is_over_is_told_and_goes_on(bench: Bench) -> None:
+    alice = bench.pilot("alice")
+    alice.ask(RequestAuthority(for_s=1.0))
+    bench.run(1.5, lambda: alice.command(Idle(), repeat=True))
+    (expired,) = alice.told(EventKind.AUTHORITY_EXPIRED)
+    assert expired.data == {"app_id": alice.app_id, "lease": alice.lease}
+    assert alice.last_feedback().lease == alice.lease
+
+
+def test_a_holder_is_asked_and_hands_over(bench: Bench) -> None:
+    alice, bob = bench.airborne("alice"), bench.join("bob")
+    alice.command(Velocity(0.5))
+    request = RequestAuthority(4, for_s=20.0, takeover=Takeover.ASK)
+    assert bob.ask(request) == AuthorityQueued(1, "alice", 16, 10.0, True)
+    (asked,) = alice.told(EventKind.AUTHORITY_ASKED)
+    assert asked.data == {
+        "app_id": alice.app_id,
+        "lease": alice.lease,
+        "by": "bob",
+        "by_id": bob.app_id,
+        "by_priority": 4,
+        "within_s": 10.0,
+        "for_s": 20.0,
+    }
+    assert bench.driver.told == [Velocity(0.5)]
+    assert alice.ask(AnswerTakeover(alice.lease, bob.app_id, False, "landing")) == Done()
+    (declined,) = bob.told(EventKind.AUTHORITY_DECLINED)
+    assert (declined.app, declined.data["by"], declined.data["reason"]) == ("bob", "alice", "landing")
+    assert "landing" in declined.text
+    assert alice.ask(AnswerTakeover(alice.lease, bob.app_id, True)) == Done()
+    (handed,) = bob.told(EventKind.AUTHORITY_PREEMPTED)
+    assert (handed.app, handed.data["by"], handed.data["granted"]) == ("alice", "bob", True)
+    assert bench.driver.told == [Velocity(0.5), Hover()]
+    bench.tick()
+    assert bob.last_feedback().owner == "bob"
+    assert bob.told(EventKind.AUTHORITY_GRANTED)[-1].data["identity"] == "this process"
+    assert alice.told(EventKind.AUTHORITY_QUEUED)[-1].data["position"] == 1
+
+
+def test_a_holder_that_does_not_answer_is_pre_empted_after_the_time_to_ask(bench: Bench) -> None:
+    alice, bob = bench.pilot("alice"), bench.join("bob")
+    bob.ask(RequestAuthority(4, takeover=Takeover.ASK))
+    bench.run(9.9, lambda: alice.command(Idle(), repeat=True))
+    assert bob.told(EventKind.AUTHORITY_PREEMPTED) == []
+    bench.run(0.2, lambda: alice.command(Idle(), repeat=True))
+    (preempted,) = bob.told(EventKind.AUTHORITY_PREEMPTED)
+    assert preempted.data["granted"] is False
+
+
+def test_who_does_not_wait_can_not_ask_first(bench: Bench) -> None:
+    bench.pilot("alice")
+    bob = bench.join("bob")
+    refused = bob.ask(RequestAuthority(4, queue=False, takeover=Takeover.ASK))
+    assert isinstance(refused, Refused)
+    assert refused.code is Refusal.BUSY
+    assert bob.told(EventKind.AUTHORITY_ASKED) == []
+
+
+def test_only_the_holder_answers(bench: Bench) -> None:
+    alice, bob, carol = bench.pilot("alice"), bench.join("bob"), bench.join("carol")
+    bob.ask(RequestAuthority(4, takeover=Takeover.ASK))
+    refused = carol.ask(AnswerTakeover(alice.lease, bob.app_id, True))
+    assert isinstance(refused, Refused)
+    assert refused.code is Refusal.FOREIGN_LEASE
+    assert bob.told(EventKind.AUTHORITY_PREEMPTED) == []

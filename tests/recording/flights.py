@@ -26,6 +26,7 @@ from skyloop.logfile.layout import (
     Drops,
     End,
     FrameRecord,
+    ResultRecord,
     Start,
     Topic,
     encode,
@@ -230,6 +231,9 @@ def _moment(tape: Tape, plan: Plan, at_ms: int) -> None:
         tape.own(Channel.LOGS, LogEntry("pilot.py", "error", at_ns, number=0.25), at_ms + 0.1, at_ms)
         tape.own(Channel.LOGS, LogEntry("pilot.py", "", at_ns, text="half way"), at_ms + 0.1, at_ms)
         tape.own(Channel.LOGS, LogEntry("pilot.py", "gains", at_ns, values=(1.0, 2.0), shape=(2,)), at_ms + 0.1, at_ms)
+        found = {"score": 0.5, "boxes": [[1, 2]]}
+        result = ResultRecord("detector", 4, 1, "front", 3, at_ns - 30 * MS, at_ns, 20 * MS, found)
+        tape.own(Channel.RESULTS, result, at_ms + 0.1, at_ms - 30)
         if plan.lossy:
             tape.own(Channel.DROPS, Drops(at_ns, {"video.front": 2}, {"feedback": 4}), at_ms, at_ms)
 

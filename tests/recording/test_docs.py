@@ -50,6 +50,7 @@ def test_the_topics_are_those_of_the_layout() -> None:
     assert shown == [
         *(make("NAME", "CAMERA") for make in makers),
         layout.pose_topic("NAME"),
+        layout.mocap_topic("NAME"),
         layout.path_topic("NAME"),
         layout.TF,
         layout.LOG,

@@ -18,7 +18,7 @@ from skyloop.client import Drone
 from skyloop.drivers.base import Sink
 from skyloop.errors import MissingExtraError, SkyloopError, UnknownNameError, UsageError
 from skyloop.logfile import layout
-from skyloop.logfile.layout import META_END, META_RECORDING, End, FrameRecord, Start
+from skyloop.logfile.layout import META_END, META_RECORDING, End, FrameRecord, ResultRecord, Start
 from skyloop.messages import (
     Annotation,
     Applied,
@@ -122,12 +122,14 @@ def test_everything_is_in_the_file(fly: Fly, tmp_path: Path) -> None:
         drone.velocity(forward=0.25)
         frame = drone.next_frame(timeout_s=WAIT_S)
         assert drone.annotate(frame, [Polyline(((1.0, 1.0), (5.0, 5.0)))], source="tracker")
+        membership = drone.join_processor("detector", code="Detector 1")
+        assert membership.publish(frame, {"score": 0.5})
         assert drone.log.text("found it", severity="warning")
         assert drone.log.numbers(error=0.25, gain=2)
         assert drone.log.array("grid", np.arange(6).reshape(2, 3))
         drone.config["limits.tilt"] = 0.2
         drone.land()
-        for topic in ("annotations", "frames/front", "path"):
+        for topic in ("annotations", "frames/front", "path", "results"):
             until_has(path, f"/alpha/{topic}")
         until_has(path, "/alpha/logs", 4)
         files.until(lambda: len(tilts(path)) == 2, "the parameter that changed")
@@ -161,6 +163,8 @@ def check_own(path: Path, drone: Drone) -> None:
     assert {one.app_id for one in applied} == {drone.app_id}
     events: list[Event] = samples("events", Event)
     assert {EventKind.STATE_CHANGED, EventKind.PARAMETER_CHANGED, EventKind.RECORDING} <= {one.kind for one in events}
+    (result,) = samples("results", ResultRecord)
+    assert (result.processor, result.worker, result.value) == ("detector", drone.app_id, {"score": 0.5})
     (annotation,) = samples("annotations", Annotation)
     assert (annotation.source, annotation.camera) == ("tracker", "front")
     logs: list[LogEntry] = [one for one in samples("logs", LogEntry) if one.name != "recording"]

@@ -20,7 +20,7 @@ from tests.cli.conftest import Ended
 from tests.recording.flights import BEGIN_NS, MS, Plan, write_flight
 
 Log = Callable[..., Ended]
-TABLES = {"feedback", "commands", "events", "parameters", "logs", "frames.front", "drops"}
+TABLES = {"feedback", "commands", "events", "parameters", "logs", "results", "frames.front", "drops"}
 
 
 def test_tables_hold_every_sample(flight: Path) -> None:
@@ -32,6 +32,7 @@ def test_tables_hold_every_sample(flight: Path) -> None:
         "events": 7,
         "parameters": 3,
         "logs": 3,
+        "results": 1,
         "frames.front": 20,
         "drops": 1,
     }
@@ -49,6 +50,8 @@ def test_tables_hold_every_sample(flight: Path) -> None:
     assert commands["applied_forward"][flying] == pytest.approx(0.4)
     assert np.isnan(commands["applied_forward"][~flying]).all()
     assert found["logs"]["values"].tolist().count("1 2") == 1
+    assert found["results"]["value.score"].tolist() == [0.5]
+    assert found["results"]["value.boxes"].tolist() == ["[[1,2]]"]
     assert np.nanmax(found["events"].numbers("data.speed_m_s")) == 0.3
 
 

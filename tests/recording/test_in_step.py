@@ -32,6 +32,8 @@ class ServerSide:
             raise ZeroDivisionError("a mistake")
         self.server.send(peer, b"re " + packet)
 
+    def refused(self, peer: Peer, reason: str) -> None: ...
+
     def peer_left(self, peer: Peer, reason: str) -> None:
         self.heard.append(("left", reason))
 
@@ -45,7 +47,7 @@ class ClientSide:
     def packet(self, packet: bytes) -> None:
         self.heard.append(packet)
 
-    def frame(self, header: FrameHeader, pixels: Pixels) -> None:
+    def frame(self, header: FrameHeader, pixels: Pixels, topic: str = "") -> None:
         self.heard.append((header.seq, pixels.tolist()))
 
     def closed(self, reason: str) -> None:

@@ -21,6 +21,7 @@ from skyloop.logfile.layout import (
     Drops,
     End,
     FrameRecord,
+    ResultRecord,
     Start,
     Topic,
     decode,
@@ -50,6 +51,7 @@ assert isinstance(header, FrameHeader)
 ALL: dict[str, msgspec.Struct] = {
     **{name: sample for name, sample in SAMPLES.items() if type(sample) in TYPES.values()},
     "frame": FrameRecord(header, 17, "jpeg"),
+    "result": ResultRecord("detector", 3, 4, "front", 12, 3_000_000_000, 3_040_000_000, 35_000_000, {"boxes": [[1.5]]}),
     "parameter": TILT,
     "parameter-vector": Parameter("gains", ParameterType.VECTOR, (1.0, 2.0), choices=((1.0, 2.0), (3.0, 4.0))),
     "parameter-text": Parameter("mode", ParameterType.TEXT, "free", default="home", choices=("free", "home")),

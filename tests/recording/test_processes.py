@@ -84,7 +84,9 @@ def test_a_flight_is_recorded_and_the_file_is_complete(tmp_path: Path) -> None:
         drone.wait(lambda _: count(path, f"/{name}/logs") > 0)
         taken_off_ns = time.monotonic_ns()
     assert recorder.state.value == "closed"
-    assert (recorder.dropped, recorder.files) == ({}, [path])
+    assert recorder.files == [path]
+    left_out = {channel for channels in recorder.dropped.values() for channel in channels}
+    assert left_out <= {"video.front"}, "a slow disk or encoder costs frames first"
     assert files.is_complete(path)
     found = files.metadata(path)
     assert layout.from_metadata(found[META_END], End).reason == "closed"

@@ -2,10 +2,26 @@
 
 from __future__ import annotations
 
+import math
+
+import msgspec
+import numpy as np
+
 from skyloop.logfile import layout
-from skyloop.logfile.layout import Channel, ClockPair, FrameRecord
-from skyloop.messages import CameraInfo, Capabilities, Encoding, Feedback, FrameHeader, Intrinsics, LogEntry, Parameter
+from skyloop.logfile.layout import Channel, ClockPair, FrameRecord, ResultRecord
+from skyloop.messages import (
+    CameraInfo,
+    Capabilities,
+    Encoding,
+    Feedback,
+    FrameHeader,
+    Intrinsics,
+    LogEntry,
+    Parameter,
+    ProcessorResult,
+)
 from skyloop.messages import ParameterType as Type
+from skyloop.messages.payload import pack
 from skyloop.recording.backlog import Item, Rank
 from skyloop.recording.output import Message
 from skyloop.recording.translation import Path, Picture, Translator
@@ -76,6 +92,18 @@ def test_logged_numbers_are_not_lines_for_people() -> None:
     assert topics(messages(translator(), number)) == ["/alpha/logs"]
     text = LogEntry("me", "mode", 7_000, text="searching")
     assert topics(messages(translator(), text)) == ["/alpha/logs", layout.LOG]
+
+
+def test_results_are_json_whatever_is_in_them() -> None:
+    value = {"boxes": np.array([[1.5, math.nan]]), 7: [b"x", None], "seen": True}
+    sample = ProcessorResult("detector", "front", 12, 7_000, 8_000, 500, 4, pack(value), 3)
+    (message,) = messages(translator(), sample)
+    assert (message.topic, message.publish_ns, message.sequence) == ("/alpha/results", UNIX + 2_000, 12)
+    record = layout.decode(message.data, ResultRecord)
+    assert record.value == {"boxes": [[1.5, None]], "7": ["eA==", None], "seen": True}
+    assert (record.processor, record.worker, record.made_ns, record.took_ns) == ("detector", 3, 8_000, 500)
+    (unknown,) = messages(translator(), msgspec.structs.replace(sample, payload=b"\xc1"))
+    assert layout.decode(unknown.data, ResultRecord).value is None
 
 
 def test_every_channel_of_our_own_can_be_translated() -> None:

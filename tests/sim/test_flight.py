@@ -375,3 +375,26 @@ def test_poses_are_those_of_the_truth() -> None:
         assert rotations[drone].T @ rotations[drone] == pytest.approx(np.eye(3))
         assert rotations[drone][2, 2] == pytest.approx(1 - 2 * (x * x + y * y))
         assert rotations[drone][1, 0] == pytest.approx(2 * (x * y + w * z))
+
+
+def test_a_flying_drone_can_be_put_elsewhere_and_holds_that_place() -> None:
+    simulation = Simulation(load_world("empty"), 2, seed=1)
+    with pytest.raises(UsageError, match="only one that flies"):
+        simulation.put(0, (1.0, 2.0, 2.0))
+    for drone in (0, 1):
+        simulation.command(drone, Takeoff())
+    simulation.step(2000)
+    other = simulation.truth(1).position_m
+    simulation.put(0, (3.0, -2.0, 2.5), 1.0, charge=0.5)
+    put = simulation.truth(0)
+    assert put.position_m == (3.0, -2.0, 2.5)
+    assert put.velocity_m_s == (0.0, 0.0, 0.0)
+    assert put.battery == 0.5
+    simulation.step(1000)
+    after = simulation.truth(0)
+    assert math.dist(after.position_m, (3.0, -2.0, 2.5)) < 0.3
+    assert after.yaw_rad == pytest.approx(1.0, abs=0.05)
+    assert math.dist(simulation.truth(1).position_m, other) < 0.5, "the other one stays where it was"
+    for wrong in ((math.nan, 0.0, 1.0), (0.0, 1.0)):
+        with pytest.raises(UsageError, match="three finite numbers"):
+            simulation.put(0, wrong)  # type: ignore[arg-type]

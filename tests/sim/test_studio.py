@@ -80,10 +80,10 @@ def test_a_forgotten_camera_is_shown_nothing_more() -> None:
 
 
 def test_a_renderer_that_cannot_be_made_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(_: Studio) -> None:
+    def refuse(*_: object) -> None:
         raise RuntimeError("no scene")
 
-    monkeypatch.setattr(Studio, "_make_renderer", refuse)
+    monkeypatch.setattr("skyloop.sim.studio.make_renderer", refuse)
     wall, studio = Wall(), Studio(load_world("empty"), 1, "planar", "fast")
     studio.expose([exposure(camera(wall), monotonic_ns())])
     with drawing(studio):

@@ -15,7 +15,7 @@ BOX = "[[box]]\nstands_at = [1, 1]\nsize = [1, 1, 1]\n"
 BOARD = "[[target]]\nname = 'b'\nid = 1\nmarker_size = 0.2\n"
 
 
-@pytest.mark.parametrize("name", ["empty", "gates", "room", "windy"])
+@pytest.mark.parametrize("name", ["empty", "gates", "pillars", "platform", "room", "windy"])
 def test_shipped_worlds_load_and_can_be_flown_in(name: str) -> None:
     assert name in shipped_worlds()
     world = load_world(name, seed=3)

@@ -21,8 +21,8 @@ from skyloop.bench.schedule import SMALL
 from skyloop.bench.sim import Flight, Progress, rounds
 from skyloop.bench.statistics import Spread, spread
 from skyloop.bench.workers import STARTS_WITHIN_S, Workers
-from skyloop.drivers.ardrone.backlog import Coded
 from skyloop.drivers.ardrone.decoding import PaveVideo
+from skyloop.drivers.backlog import Coded
 from skyloop.errors import MissingExtraError
 from skyloop.sim.camera import FRONT_CAMERA
 from skyloop.sim.firmware.ardrone.encoders import GROUP, H264_360P, Encoder

@@ -63,7 +63,9 @@ def vehicle_side(pipe: Pipe, module: str, address: str) -> None:
         end: VehicleEnd = contender.Vehicle(address, recorder.heard)
         try:
             pipe.send("open")
-            produce(end, turn, pipe.recv())
+            if (begin_ns := pipe.recv()) is None:
+                return
+            produce(end, turn, begin_ns)
             time.sleep(SETTLE_S)
         finally:
             end.close()

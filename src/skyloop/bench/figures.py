@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -17,7 +18,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _COLOURS: Final = {"command": "#0b6e99", "feedback": "#d9730d", "video": "#4d8c57"}
-_OTHERS: Final = {"floor": "#9a9a9a", "skyloop": "#0b6e99", "zeromq": "#c29243", "zenoh": "#7b5ea7", "ros2": "#b8463d"}
+_OTHERS: Final = {
+    "floor": "#9a9a9a",
+    "skyloop": "#0b6e99",
+    "fabric": "#4f9da6",
+    "zeromq": "#c29243",
+    "zenoh": "#7b5ea7",
+    "ros2": "#b8463d",
+}
 _PAPER: Final = "#b8463d"
 _BINS: Final = 60
 _SHOWN: Final = 99.5  #: percentile up to which a distribution is drawn; how many lie beyond is said
@@ -33,21 +41,29 @@ _SETTINGS: Final[Any] = {
 
 def draw(results: Delays, folder: Path) -> list[Path]:
     """All figures of a run into ``folder``; returns the files. Raises :class:`MissingExtraError`."""
-    try:
-        import matplotlib as mpl
-    except ImportError as error:
-        raise MissingExtraError("drawing the figures", "bench", cause=str(error)) from None
+    return save(lambda: {**paper_figures(results), "delays-comparison": comparison(results)}, folder)
+
+
+def paper_figures(results: Delays) -> dict[str, Figure]:
+    """The paper's figures 3, 4 and 5, by the names of their files."""
     series = {one.channel: one for one in results.series}
+    return {
+        "delays-command": distribution(series[COMMAND], f"Delay of commands, {_where(results)}"),
+        "delays-video": distribution(series[VIDEO], f"Delay of {results.sizes[0]} frames, {_where(results)}"),
+        "delays-evolution": evolution(results),
+    }
+
+
+def save(make: Callable[[], dict[str, Figure]], folder: Path, endings: Sequence[str] = ("png", "svg")) -> list[Path]:
+    """Make figures in the pages' style and write them by their names; returns the files. Raises
+    :class:`MissingExtraError`."""
+    check_installed()
+    import matplotlib as mpl
+
     files: list[Path] = []
     with mpl.rc_context(_SETTINGS):
-        figures: dict[str, Figure] = {
-            "delays-command": distribution(series[COMMAND], f"Delay of commands, {_where(results)}"),
-            "delays-video": distribution(series[VIDEO], f"Delay of {results.sizes[0]} frames, {_where(results)}"),
-            "delays-evolution": evolution(results),
-            "delays-comparison": comparison(results),
-        }
-        for name, figure in figures.items():
-            for ending in ("png", "svg"):
+        for name, figure in make().items():
+            for ending in endings:
                 file = folder / f"{name}.{ending}"
                 metadata: dict[str, Any] = {"Date": None} if ending == "svg" else {}
                 figure.savefig(file, dpi=110, bbox_inches="tight", metadata=metadata)
@@ -55,9 +71,17 @@ def draw(results: Delays, folder: Path) -> list[Path]:
     return files
 
 
+def check_installed() -> None:
+    """Raises :class:`MissingExtraError` if figures can't be drawn here."""
+    try:
+        import matplotlib  # noqa: F401
+    except ImportError as error:
+        raise MissingExtraError("drawing the figures", "bench", cause=str(error)) from None
+
+
 def distribution(series: Series, title: str) -> Figure:
     """How often which delay occurred; as the paper's figures 3 and 4."""
-    figure, axes = _figure(7.2, 3.2)
+    figure, axes = new_figure(7.2, 3.2)
     delays_us = np.asarray(series.delay_us)
     shown = delays_us[delays_us <= np.percentile(delays_us, _SHOWN)]
     axes.hist(shown, bins=_BINS, color=_COLOURS[series.channel], weights=np.full(shown.size, 100 / delays_us.size))
@@ -82,7 +106,7 @@ def distribution(series: Series, title: str) -> Figure:
 
 def evolution(results: Delays) -> Figure:
     """All three channels over the time of the run; as the paper's figure 5."""
-    figure, axes = _figure(7.2, 3.6)
+    figure, axes = new_figure(7.2, 3.6)
     for series in results.series:
         axes.plot(
             series.at_s,
@@ -105,7 +129,7 @@ def comparison(results: Delays) -> Figure:
     """Medians of everybody, with the 99th percentile as a whisker."""
     groups = [(results.sizes[0], channel) for channel in CHANNELS if channel != VIDEO]
     groups += [(size, VIDEO) for size in results.sizes]
-    figure, axes = _figure(7.2, 3.6)
+    figure, axes = new_figure(7.2, 3.6)
     names = [name for name in (FLOOR.name, OURS.name, *results.contenders) if name in results.contenders]
     names = list(dict.fromkeys(names))
     width = 0.8 / len(names)
@@ -143,7 +167,8 @@ def _label_decades(axes: Axes) -> None:
     axes.yaxis.set_major_formatter("{x:g}")
 
 
-def _figure(width: float, height: float) -> tuple[Figure, Axes]:
+def new_figure(width: float, height: float) -> tuple[Figure, Axes]:
+    """Of so many inches, with one diagram."""
     from matplotlib.figure import Figure
 
     figure = Figure((width, height))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -19,7 +18,7 @@ from skyloop.bench.machine import Machine, cpu_time_s
 from skyloop.bench.onlookers import observe, record, show
 from skyloop.bench.ours import proxy_name
 from skyloop.bench.pair import Pair, since
-from skyloop.bench.schedule import CHANNELS, FRAME_PERIOD_S, MIDDLE, SMALL, Size, Turn
+from skyloop.bench.schedule import CHANNELS, FRAME_PERIOD_S, MIDDLE, SMALL, Size, Turn, sleep_until
 from skyloop.bench.statistics import Summary, summarize
 from skyloop.bench.workers import STARTS_WITHIN_S, Worker, Workers
 from skyloop.errors import LinkError, UsageError
@@ -252,13 +251,13 @@ class _Stage:
         }
         begin_ns = pair.begin()
         with _stopped(observers[-1:] if case.stuck else []):
-            _sleep_until(begin_ns)
+            sleep_until(begin_ns)
             before_s = _used_s(parts)
             half_ns = round(turn.seconds * 0.5e9)
-            _sleep_until(begin_ns + half_ns)
+            sleep_until(begin_ns + half_ns)
             if case.killed and recorder is not None:
                 os.kill(recorder.pid, signal.SIGKILL)
-            _sleep_until(begin_ns + 2 * half_ns)
+            sleep_until(begin_ns + 2 * half_ns)
             tally.use(turn, before_s, _used_s(parts))
         tally.add(turn, pair.arrivals(turn, begin_ns))
         for worker in observers:
@@ -311,10 +310,6 @@ def _end(worker: Worker) -> Any:
 
 def _rate(frame_period_s: float) -> float:
     return round(1 / frame_period_s, 1)
-
-
-def _sleep_until(at_ns: int) -> None:
-    time.sleep(max(0, at_ns - time.monotonic_ns()) / 1e9)
 
 
 def load(path: Path) -> Load:

@@ -68,6 +68,12 @@ def cpu_time_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
+def memory_bytes(pid: int) -> int:
+    """Memory that a process shares with no other; 0 if it is gone."""
+    found = re.findall(r"^Private_(?:Clean|Dirty):\s+(\d+) kB$", _read(f"/proc/{pid}/smaps_rollup"), re.MULTILINE)
+    return 1024 * sum(map(int, found))
+
+
 def _read(path: str) -> str:
     try:
         return Path(path).read_text()

@@ -8,9 +8,11 @@ from skyloop.bench.contract import Heard, Image
 from skyloop.bench.schedule import FEEDBACK, VIDEO
 from skyloop.bench.vehicle import CAMERA, BenchVehicle, stamped
 from skyloop.bench.waypoints import Setpoint
-from skyloop.client import Frame, connect
+from skyloop.client import Drone, Frame, connect
+from skyloop.client.reading import VideoOptions
 from skyloop.messages import Feedback
 from skyloop.proxy import Proxy
+from skyloop.transport.base import ServerEnd
 from skyloop.transport.local import LocalServer
 
 
@@ -23,10 +25,15 @@ class Vehicle:
     """The proxy's process."""
 
     def __init__(self, address: str, heard: Heard) -> None:
-        name = proxy_name(address)
+        name, server = self._server(address)
         self._vehicle = BenchVehicle(heard)
-        self._proxy = Proxy(self._vehicle, LocalServer(name), name=name)
+        self._proxy = Proxy(self._vehicle, server, name=name)
         self._proxy.start()
+
+    def _server(self, address: str) -> tuple[str, ServerEnd]:
+        """What it is called, and where it serves."""
+        name = proxy_name(address)
+        return name, LocalServer(name)
 
     def feedback(self, sent_ns: int) -> None:
         self._vehicle.tell(sent_ns)
@@ -57,11 +64,18 @@ class Listening:
 class Application:
     """The pilot."""
 
+    looks = True  #: at the video
+    video = VideoOptions()  #: how it wants that
+
     def __init__(self, address: str, heard: Heard) -> None:
-        self._drone = connect(proxy_name(address), name="bench", on_exit="hover")
+        self._drone = self._connect(address)
         listening = Listening(heard)
         self._drone.on_feedback(listening.feedback, inline=True)
-        self._drone.add_processor(listening.frame, camera=CAMERA, inline=True)
+        if self.looks:
+            self._drone.add_processor(listening.frame, camera=CAMERA, inline=True, **self.video)
+
+    def _connect(self, address: str) -> Drone:
+        return connect(proxy_name(address), name="bench", on_exit="hover")
 
     def command(self, sent_ns: int, setpoint: Setpoint) -> None:
         forward, left, yaw_rate = setpoint

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Sequence
 from typing import Final
 
 from skyloop.bench.contract import Arrivals, application_side, vehicle_side
@@ -16,7 +17,8 @@ _AHEAD_NS: Final = 50_000_000
 
 class Pair:
     """``module`` holds the contender's ends (see :mod:`skyloop.bench.contract`), and ``address`` is a folder of its own
-    for its sockets. ``python`` is the interpreter that it runs under.
+    for its sockets. ``python`` is the interpreter that it runs under. ``prefixes``: put before it, for the vehicle's
+    side and the application's.
     """
 
     def __init__(
@@ -27,9 +29,13 @@ class Pair:
         *,
         python: str = sys.executable,
         application_module: str | None = None,
+        prefixes: tuple[Sequence[str], Sequence[str]] = ((), ()),
     ) -> None:
-        self.vehicle = workers.start(vehicle_side, module, address, python=python)
-        self.application = workers.start(application_side, application_module or module, address, python=python)
+        there, here = prefixes
+        self.vehicle = workers.start(vehicle_side, module, address, python=python, prefix=there)
+        self.application = workers.start(
+            application_side, application_module or module, address, python=python, prefix=here
+        )
         for worker in (self.vehicle, self.application):
             worker.answer(STARTS_WITHIN_S)
 

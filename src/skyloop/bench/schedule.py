@@ -79,3 +79,8 @@ def paced(
         if wait_ns > 0:
             sleep(wait_ns / 1e9)
         yield
+
+
+def sleep_until(at_ns: int) -> None:
+    """Until this time on the monotonic clock; not at all if it has passed."""
+    time.sleep(max(0, at_ns - time.monotonic_ns()) / 1e9)

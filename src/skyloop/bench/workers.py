@@ -6,7 +6,7 @@ import contextlib
 import multiprocessing
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
 from types import TracebackType
@@ -32,11 +32,12 @@ class Pipe(Protocol):
 class Worker:
     """A process that does ``work(pipe, *arguments)``."""
 
-    def __init__(self, python: str, work: Callable[..., None], arguments: tuple[Any, ...]) -> None:
+    def __init__(self, command: Sequence[str], work: Callable[..., None], arguments: tuple[Any, ...]) -> None:
+        """``command`` starts the interpreter."""
         self.pipe, theirs = multiprocessing.Pipe()
         with theirs:
             number = theirs.fileno()
-            self._process = subprocess.Popen([python, "-c", _BOOT, str(_PACKAGES), str(number)], pass_fds=[number])
+            self._process = subprocess.Popen([*command, "-c", _BOOT, str(_PACKAGES), str(number)], pass_fds=[number])
         self.pid = self._process.pid
         self._what = " ".join([work.__name__, *map(str, arguments[:1])])
         self.pipe.send((work.__module__, work.__qualname__, arguments))
@@ -72,9 +73,14 @@ class Workers:
     def __init__(self) -> None:
         self._running: list[Worker] = []
 
-    def start(self, work: Callable[..., None], *arguments: Any, python: str = sys.executable) -> Worker:
-        """Start ``work(pipe, *arguments)``, a function of a module; it says ``"ready"`` first."""
-        worker = Worker(python, work, arguments)
+    def start(
+        self, work: Callable[..., None], *arguments: Any, python: str = sys.executable, prefix: Sequence[str] = ()
+    ) -> Worker:
+        """Start ``work(pipe, *arguments)``, a function of a module; it says ``"ready"`` first.
+
+        ``prefix``: put before the interpreter, such as what makes it run on another host.
+        """
+        worker = Worker([*prefix, python], work, arguments)
         self._running.append(worker)
         return worker
 

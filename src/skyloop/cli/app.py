@@ -32,8 +32,12 @@ COMMANDS: Final = {
         "sim", "sim", "Simulated drones in one world, with a proxy each", "sim --drones 3 --world room --seed 1"
     ),
     "proxy": Entry("proxy", "proxy", "Serve one vehicle under a name", "proxy sim:// --name alpha"),
+    "router": Entry(
+        "router", "router", "Join proxies and programs of several networks", "router --connect other-site.example:7447"
+    ),
     "list": Entry("listing", "list_proxies", "The running proxies and who flies", "list"),
     "fly": Entry("fly", "fly", "Fly a controller from a Python file", "fly my_controller.py --on alpha --seconds 30"),
+    "teleop": Entry("teleop", "teleop", "Fly a drone by the keys of the terminal", "teleop alpha --speed 0.5"),
     "watch": Entry("watch", "watch", "What a drone does, live in the terminal", "watch alpha"),
     "param": Entry(
         "param",
@@ -42,10 +46,21 @@ COMMANDS: Final = {
         "param alpha limits.tilt 0.2",
         {"ignore_unknown_options": True},  # a value may begin with a minus
     ),
+    "audit": Entry("audit", "audit", "Who flew which drone when", "audit alpha --last 20"),
     "record": Entry("record", "record", "Record drones to an MCAP file", "record alpha -o flight.mcap"),
+    "process": Entry(
+        "process",
+        "process",
+        "Run a class of yours on a drone's frames",
+        "process detector.py --drone alpha",
+    ),
     "log": Entry("log", "log", "Look at recordings, export, compare and mend them", "log info flight.mcap"),
+    "keys": Entry("keys", "keys", "Who may join the network: make, issue, revoke keys", "keys issue jane --role pilot"),
+    "camera": Entry("camera", "camera", "Print a board, and calibrate a camera by it", "camera calibrate alpha"),
     "cockpit": Entry("cockpit", "cockpit", "A page in the browser to watch and fly drones", "cockpit --port 8000"),
-    "doctor": Entry("doctor", "doctor", "What of this machine works, and what to install", "doctor"),
+    "doctor": Entry(
+        "doctor", "doctor", "What of this machine works, what to install", "doctor mavlink://tcp:127.0.0.1:5760"
+    ),
     "bench": Entry("bench", "bench", "Measure the delays of each channel", "bench delays --seconds 30"),
 }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
@@ -29,25 +30,33 @@ class What(StrEnum):
     LOOP = "loop"
     SIM = "sim"
     CODECS = "codecs"
+    NETWORK = "network"
+    SWARM = "swarm"
+    SCALE = "scale"
 
 
 LEAST_S = 0.5
 _WHAT_HELP = (
     "delays: the paper's experiment, and the same by a bare hand-over and by other libraries; load: what observers, a "
     "slow processor, a recorder and pages of the cockpit do to the pilot; loop: from a frame to its command, by stage; "
-    "sim: the simulator; codecs: the AR.Drones' video and navdata"
+    "sim: the simulator; codecs: the AR.Drones' video and navdata; network: two hosts with a lossy path between (needs "
+    "root); swarm: drones over the network whose users fail; scale: more and more proxies and observers"
 )
 _ONLY = {  # options that mean something for one thing only
     "--peers": (What.DELAYS,),
     "--ros-python": (What.DELAYS,),
     "--sizes": (What.DELAYS, What.LOOP),
-    "--observers": (What.LOAD,),
+    "--observers": (What.LOAD, What.SWARM),
     "--slow-processor": (What.LOAD,),
     "--stuck": (What.LOAD,),
     "--recorder": (What.LOAD,),
     "--disk-full": (What.LOAD,),
     "--record-to": (What.LOAD,),
     "--pages": (What.LOAD,),
+    "--losses": (What.NETWORK,),
+    "--drones": (What.SWARM,),
+    "--users": (What.SWARM,),
+    "--counts": (What.SCALE,),
 }
 
 
@@ -61,13 +70,14 @@ def bench(
         str | None, typer.Option(help="delays, loop: of the frames, such as 320x240,640x480 [default: 320x240]")
     ] = None,
     peers: Annotated[
-        str | None, typer.Option(help="delays: compare with ros2, zenoh, zeromq, several with commas, or all")
+        str | None, typer.Option(help="delays: compare with fabric, ros2, zenoh, zeromq, several with commas, or all")
     ] = None,
     ros_python: Annotated[
         str | None, typer.Option(help="delays: the Python that has rclpy [default: $SKYLOOP_ROS_PYTHON or this one]")
     ] = None,
     observers: Annotated[
-        str | None, typer.Option(help="load: how many, one case for each number [default: 1,8,32]")
+        str | None,
+        typer.Option(help="load: how many, one case for each number [default: 1,8,32]; swarm: how many [default: 0]"),
     ] = None,
     slow_processor: Annotated[
         bool | None, typer.Option("--slow-processor/--no-slow-processor", help="load: 200 ms a frame")
@@ -84,8 +94,18 @@ def bench(
         int | None,
         typer.Option(min=0, max=50, help="load: of a cockpit, on 640x480 at 15 frames a second [default: 10]"),
     ] = None,
+    losses: Annotated[
+        str | None, typer.Option(help="network: shares of the packets that are lost [default: 0,0.01,0.1,0.3]")
+    ] = None,
+    drones: Annotated[int | None, typer.Option(min=1, max=50, help="swarm: how many [default: 10]")] = None,
+    users: Annotated[
+        int | None, typer.Option(min=1, max=10, help="swarm: processes that share the drones [default: 1]")
+    ] = None,
+    counts: Annotated[
+        str | None, typer.Option(help="scale: of proxies, and of observers [default: 1,2,5,10,20,50]")
+    ] = None,
     output: Annotated[
-        Path | None, typer.Option(help="A folder for the figures as JSON and, of delays, the diagrams (PNG and SVG)")
+        Path | None, typer.Option(help="A folder for the figures as JSON and, of delays and scale, the diagrams")
     ] = None,
 ) -> None:
     """Measure delays, as medians and 99th percentiles, or how fast the simulator and the codecs are.
@@ -105,6 +125,10 @@ def bench(
         "--disk-full": disk_full,
         "--record-to": record_to,
         "--pages": pages,
+        "--losses": losses,
+        "--drones": drones,
+        "--users": users,
+        "--counts": counts,
     }
     check_options(what, given)
     if seconds is not None and minutes is not None:
@@ -137,6 +161,13 @@ def bench(
                 results, shown = _sim(duration_s, progress)
             case What.CODECS:
                 results, shown = _codecs(duration_s, progress)
+            case What.NETWORK:
+                results, shown = _network(duration_s, parse_shares(losses), progress)
+            case What.SWARM:
+                looking_on = parse_numbers(observers, "0")[0]
+                results, shown = _swarm(duration_s, drones or 10, users or 1, looking_on, progress)
+            case What.SCALE:
+                results, shown = _scale(duration_s, parse_numbers(counts, "1,2,5,10,20,50", "--counts"), progress)
     for table in shown:
         Console().print(table)
     if output is not None:
@@ -169,23 +200,45 @@ def parse_sizes(text: str | None) -> list[Size]:
     return list(dict.fromkeys(sizes))
 
 
-def parse_numbers(text: str | None) -> list[int]:
-    """Numbers of observers such as ``1,8,32``. Raises :class:`UsageError`."""
-    words = ["1", "8", "32"] if text is None else [word.strip() for word in text.split(",")]
+def parse_numbers(text: str | None, default: str = "1,8,32", option: str = "--observers") -> list[int]:
+    """Numbers such as ``1,8,32``. Raises :class:`UsageError`."""
+    words = [word.strip() for word in (default if text is None else text).split(",")]
     if not all(word.isdecimal() and int(word) <= 100 for word in words):
-        raise UsageError(f"--observers is {text!r} and must be numbers up to 100 with commas, such as 1,8,32")
+        raise UsageError(f"{option} is {text!r} and must be numbers up to 100 with commas, such as 1,8,32")
     return [int(word) for word in words]
 
 
+def parse_shares(text: str | None) -> list[float]:
+    """Shares such as ``0,0.1``. Raises :class:`UsageError`."""
+    from skyloop.bench.network import LOSSES
+
+    if text is None:
+        return list(LOSSES)
+    try:
+        shares = [float(word) for word in text.split(",")]
+    except ValueError:
+        shares = [math.nan]
+    if not all(0.0 <= share < 1.0 for share in shares):
+        raise UsageError(f"--losses is {text!r} and must be shares from 0 to below 1 with commas, such as 0,0.1,0.3")
+    return list(dict.fromkeys(shares))
+
+
 def write(what: What, results: Any, folder: Path) -> list[Path]:
-    """The results as JSON, and the diagrams of delays. Raises :class:`MissingExtraError` after the JSON is written."""
+    """The results as JSON, and the diagrams of delays and scale.
+
+    Raises :class:`MissingExtraError` after the JSON is written.
+    """
     file = folder / f"{what.value}.json"
     file.write_bytes(msgspec.json.encode(results) + b"\n")
-    if what is not What.DELAYS:
-        return [file]
-    from skyloop.bench.figures import draw
+    if what is What.DELAYS:
+        from skyloop.bench.figures import draw
 
-    return [file, *draw(results, folder)]
+        return [file, *draw(results, folder)]
+    if what is What.SCALE:
+        from skyloop.bench.scale_figure import draw as draw_scale
+
+        return [file, *draw_scale(results, folder)]
+    return [file]
 
 
 def _delays(
@@ -260,6 +313,33 @@ def _codecs(seconds: float, progress: Any) -> tuple[Any, list[Table]]:
     for name, why in results.skipped.items():
         typer.echo(f"without {name}: {why}", err=True)
     return results, _rich([tables.codecs_table(results)], str(results.machine))
+
+
+def _network(seconds: float, losses: Sequence[float], progress: Any) -> tuple[Any, list[Table]]:
+    from skyloop.bench import network, network_tables
+
+    results = network.measure(seconds, losses, progress=progress)
+    found = [network_tables.network_table(results), network_tables.path_table(results)]
+    return results, _rich(found, str(results.machine))
+
+
+def _swarm(seconds: float, drones: int, users: int, observers: int, progress: Any) -> tuple[Any, list[Table]]:
+    from skyloop.bench import network_tables, swarm
+
+    if users > drones:
+        raise UsageError(f"--users is {users}, and there are only {drones} drones to share")
+    results = swarm.measure(seconds, drones, users, observers, progress)
+    return results, _rich([network_tables.swarm_table([results])], str(results.machine))
+
+
+def _scale(seconds: float, counts: Sequence[int], progress: Any) -> tuple[Any, list[Table]]:
+    from skyloop.bench import network_tables, scale
+
+    results = scale.measure(seconds, scale.cases_of(counts), progress)
+    for name, why in results.skipped.items():
+        typer.echo(f"without {name}: {why}", err=True)
+    found = [network_tables.scale_table(results, many) for many in ("proxies", "observers")]
+    return results, _rich(found, str(results.machine))
 
 
 def _rich(found: Sequence[tables.Table], where: str) -> list[Table]:

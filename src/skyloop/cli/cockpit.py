@@ -35,12 +35,19 @@ def cockpit(
     recordings: Annotated[Path, typer.Option(metavar="FOLDER", help="Of recordings, made when needed")] = Path(
         "recordings"
     ),
+    network: Annotated[
+        str | None,
+        typer.Option(metavar="WHERE", help="Drones there too: multicast, or addresses with commas [SKYLOOP_NETWORK]"),
+    ] = None,
+    keys: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder of an identity [SKYLOOP_KEYS]")] = None,
 ) -> None:
     """Serve a page to watch and fly drones: video, instruments, map, plots, parameters, recordings. Until Ctrl-C.
 
     It is open to programs of the same user on this machine only, unless tokens or certificates let others in.
     """
+    from skyloop.client.by_name import network_settings
     from skyloop.cockpit import Access, serve_cockpit
 
     access = Access(host, token_file, tls_cert, tls_key, client_ca, role, tuple(hostname or ()))
-    serve_cockpit(names or (), port=port, access=access, recordings=recordings)
+    settings = network_settings(network, keys)
+    serve_cockpit(names or (), port=port, access=access, recordings=recordings, network=settings)

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import signal
 import time
-import webbrowser
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, field
-from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
 from urllib.parse import urlencode
 
@@ -17,8 +14,10 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
+from skyloop.cli.demo_paper import PAPER_EXAMPLE, paper
+from skyloop.cli.demo_parts import interrupted_by_signals, land, show_page
 from skyloop.cli.demo_report import DemoReport, TruthMeter
-from skyloop.errors import LinkError
+from skyloop.errors import LinkError, UsageError
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
@@ -30,8 +29,13 @@ ENOUGH_IN_VIEW = 0.9
 _FIRST_PICTURE_S = 10.0
 _REFRESH_HZ = 4
 
+demo = typer.Typer(invoke_without_command=True, rich_markup_mode=None)
+demo.command("paper", short_help="The paper's test flight and its figures", epilog=PAPER_EXAMPLE)(paper)
 
-def demo(
+
+@demo.callback()
+def follow(
+    context: typer.Context,
     seconds: Annotated[
         float | None, typer.Option(min=0.0, help="How long to follow; until Ctrl-C if not given")
     ] = None,
@@ -44,7 +48,16 @@ def demo(
     browser: Annotated[bool, typer.Option(help="Open the page in the browser")] = False,
     name: Annotated[str, typer.Option(help="Who flies, for those who watch")] = "demo",
 ) -> None:
-    """Take off in a simulated room, find the marker, follow it at 1.5 m by the camera. Ctrl-C lands."""
+    """Take off in a simulated room, find the marker, follow it at 1.5 m by the camera. Ctrl-C lands.
+
+    skyloop demo paper flies another one: the paper's experiment, with its table and figures.
+    """
+    if context.invoked_subcommand is not None:
+        for given in context.params:
+            source = context.get_parameter_source(given)
+            if source is not None and source.name == "COMMANDLINE":
+                raise UsageError(f"--{given} stands before {context.invoked_subcommand}: give its options after it")
+        return
     console = Console(highlight=False)
     report = _Demo(console, name, seconds).fly(_address(world, seed), None if headless else port, browser)
     console.print(report.table())
@@ -77,18 +90,18 @@ class _Demo:
         report = DemoReport()
         with ExitStack() as stack:
             drone = stack.enter_context(connect(uri, name=self.name))
-            stack.enter_context(_interrupted_by_signals(self._stop))
+            stack.enter_context(interrupted_by_signals(self._stop))
             self.console.print(f"[bold]{uri}[/] is up as [bold]{drone.name}[/]")
             page = None if port is None else stack.enter_context(CockpitProcess(drone.name, port))
             drone.next_frame(timeout_s=_FIRST_PICTURE_S)
             report.first_picture_s = time.monotonic() - self.started_s
             if page is not None:
-                self._show(page, browser)
+                show_page(page, self.console, browser)
             follower = FollowMarker(drone, MARKER_ID)
             with TruthMeter(drone, follower) as truth:
                 self._follow(drone, follower)
             report.take(drone, follower.score, truth, None if page is None else _page_counts(page))
-            self._land(drone)
+            land(drone, self.console)
             report.collisions = sum(event.kind == "collision" for event in drone.recent_events())
         return report
 
@@ -111,52 +124,11 @@ class _Demo:
         ):
             follower.run(seconds=self.seconds, until=lambda: self._stopped)
 
-    def _land(self, drone: Drone) -> None:
-        status = drone.authority
-        if status.state != "held":
-            self.console.print(f"[yellow]{status.holder or 'somebody else'} took over: the drone is left to them[/]")
-            return
-        self.console.print("landing")
-        drone.land()
-
     def _stop(self) -> None:
         """First Ctrl-C: end the flight in good order. The second one is the user's impatience, and Python's."""
         self._stopped = True
         if self._on_stop is not None:
             self._on_stop()
-
-    def _show(self, page: CockpitProcess, browser: bool) -> None:
-        """A demo without its page is still a demo."""
-        try:
-            address = page.address()
-        except LinkError as error:
-            self.console.print(f"[yellow]no page:[/] {error}")
-            return
-        self.console.print(f"watch it at [bold cyan]{address}[/]")
-        if browser:
-            webbrowser.open(address)
-
-
-@contextmanager
-def _interrupted_by_signals(stop: Callable[[], None]) -> Iterator[None]:
-    """SIGINT and SIGTERM call ``stop``; a second one of either acts as it did before."""
-    before: dict[int, Any] = {}
-
-    def put_back() -> None:
-        while before:
-            number, handler = before.popitem()
-            signal.signal(number, handler)
-
-    def handle(_number: int, _frame: FrameType | None) -> None:
-        put_back()
-        stop()
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        before[number] = signal.signal(number, handle)
-    try:
-        yield
-    finally:
-        put_back()
 
 
 def _page_counts(page: CockpitProcess) -> dict[str, Any] | None:

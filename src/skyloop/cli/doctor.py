@@ -1,4 +1,4 @@
-"""``skyloop doctor``: what of this machine works with Skyloop, and what to install for the rest."""
+"""``skyloop doctor``: what of this machine works with Skyloop, and what to install for the rest; or one vehicle."""
 
 from __future__ import annotations
 
@@ -10,63 +10,45 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from enum import StrEnum
-from typing import Final
+from typing import Annotated, Final
 
 import typer
 from rich.console import Console
-from rich.text import Text
+
+from skyloop.cli.findings import Finding, Health, as_text
 
 IMPORT_BUDGET_S: Final = 0.3
 
 #: Each optional part: the extra's name, what it is for, and the modules that it needs.
 EXTRAS: Final = (
     ("sim", "simulator's cameras", ("cv2",)),
-    ("vision", "markers and other vision", ("cv2",)),
+    ("vision", "markers and other vision", ("cv2", "PIL")),
     ("video", "recorded video, H.264", ("av",)),
+    ("control", "poses and splines", ("scipy",)),
+    ("mavlink", "ArduCopter and PX4", ("pymavlink", "serial")),
     ("cockpit", "page in the browser", ("starlette", "uvicorn", "websockets", "cv2")),
 )
 
 
-class Health(StrEnum):
-    GOOD = "good"
-    MISSING = "missing"  #: works without it
-    BAD = "bad"
+def doctor(
+    address: Annotated[
+        str, typer.Argument(metavar="[ADDRESS]", help="Of a vehicle to be looked at instead; nothing is flown")
+    ] = "",
+) -> None:
+    """Check Python, the local transport, the optional parts, the drivers and the running proxies; or one vehicle.
 
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One line of the report, and one of advice where there is any."""
-
-    what: str
-    health: Health
-    detail: str
-    advice: str = ""
-
-
-MARKS: Final = {Health.GOOD: ("✓", "green"), Health.MISSING: ("–", "yellow"), Health.BAD: ("✗", "red")}
-
-
-def doctor() -> None:
-    """Check Python, the local transport, the optional parts, the drivers and the running proxies.
-
-    Marks: ✓ works, – optional and not there, ✗ broken. The exit code is 1 if something is broken.
+    Marks: ✓ works, – optional and not there, or a vehicle's safety net that is off, ✗ broken. The exit code is 1 if
+    something is broken.
     """
+    from skyloop.cli.checkup import examine_vehicle
+
     console = Console(soft_wrap=True)
     findings = []
-    for finding in examine():
+    for finding in examine_vehicle(address) if address else examine():
         console.print(as_text(finding))
         findings.append(finding)
     if any(finding.health is Health.BAD for finding in findings):
         raise typer.Exit(1)
-
-
-def as_text(finding: Finding) -> Text:
-    """For people."""
-    mark, colour = MARKS[finding.health]
-    text = Text.assemble((mark, colour), f" {finding.what}: {finding.detail}")
-    return text.append(f"\n  → {finding.advice}", "bold") if finding.advice else text
 
 
 def examine() -> Iterator[Finding]:
@@ -103,7 +85,7 @@ def _local_transport() -> Iterator[Finding]:
             "local transport",
             Health.BAD,
             f"needs Linux, and this is {platform.system()}",
-            "run proxies and applications on Linux; the network transport to come will do without",
+            "run proxies on Linux; programs elsewhere reach them over the network: SKYLOOP_NETWORK=multicast",
         )
         return
     from skyloop.transport.local.directory import DIRECTORY_VARIABLE, find_directory

@@ -1,20 +1,26 @@
-"""What ``skyloop sim --firmware`` does: simulated drones that are AR.Drones on the network."""
+"""What ``skyloop sim --firmware`` does: simulated drones that are real vehicles' firmware on the network."""
 
 from __future__ import annotations
 
+import ipaddress
 import signal
 import threading
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import astuple
+from dataclasses import astuple, dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
-    from skyloop.sim.firmware.ardrone import ArdroneFirmware, Faults, Ports
+    from skyloop.sim.firmware.ardrone import ArdroneFirmware, Ports
+    from skyloop.sim.firmware.mavlink import MavlinkFirmware
+    from skyloop.sim.firmware.tello import TelloFirmware
     from skyloop.sim.options import SimOptions
+    from skyloop.transport.faults import Faults
+
+    Emulated: TypeAlias = ArdroneFirmware | MavlinkFirmware | TelloFirmware
 
 PORT_BASE: Final = 5550
 PORTS_APART: Final = 10
@@ -26,28 +32,111 @@ class Firmware(StrEnum):
 
     ARDRONE1 = "ardrone1"
     ARDRONE2 = "ardrone2"
+    ARDUCOPTER = "arducopter"
+    PX4 = "px4"
+    TELLO = "tello"
 
 
-def serve(
-    options: SimOptions, drones: int, firmware: Firmware, *, bind: str, port_base: int, faults: Faults, delay_s: float
-) -> None:
+MAVLINK: Final = (Firmware.ARDUCOPTER, Firmware.PX4)
+
+
+@dataclass(frozen=True, slots=True)
+class Serving:
+    """How the emulated drones are reached, and what befalls their datagrams."""
+
+    bind: str
+    port_base: int | None  #: None: the usual ports
+    faults: Faults
+    delay_s: float
+    video_port: int | None = None  #: of autopilots: where pictures are sent; None: nowhere
+
+
+def serve(options: SimOptions, drones: int, firmware: Firmware, serving: Serving) -> None:
     """Run the drones until SIGINT or SIGTERM. On the main thread.
 
     Writes one line that begins with ``ready`` for each drone when all of them listen. Raises :class:`UsageError`, and
     :class:`skyloop.errors.LinkError` for a port that is taken.
     """
+    if firmware in MAVLINK:
+        _run(_autopilots(options, drones, firmware, serving))
+    elif serving.video_port is not None:
+        raise UsageError("--video-port is for --firmware arducopter and px4: the others have a port of their own")
+    elif firmware is Firmware.TELLO:
+        _run(_tellos(options, drones, serving))
+    else:
+        _run(_ardrones(options, drones, firmware, serving))
+
+
+def _ardrones(options: SimOptions, drones: int, firmware: Firmware, serving: Serving) -> list[ArdroneFirmware]:
     from skyloop.sim.firmware.ardrone import ArdroneFirmware, with_ardrones
     from skyloop.sim.host import SimHost
 
     host = SimHost(with_ardrones(options), drones)
-    version = 1 if firmware is Firmware.ARDRONE1 else 2
-    all_ports = [ports_from(port_base, drone) for drone in range(drones)]
-    _run(
-        [
-            ArdroneFirmware(host, drone, version=version, bind=bind, ports=ports, faults=faults, delay_s=delay_s)
-            for drone, ports in enumerate(all_ports)
-        ]
-    )
+    base = PORT_BASE if serving.port_base is None else serving.port_base
+    all_ports = [ports_from(base, drone) for drone in range(drones)]
+    return [
+        ArdroneFirmware(
+            host,
+            drone,
+            version=1 if firmware is Firmware.ARDRONE1 else 2,
+            bind=serving.bind,
+            ports=ports,
+            faults=serving.faults,
+            delay_s=serving.delay_s,
+        )
+        for drone, ports in enumerate(all_ports)
+    ]
+
+
+def _autopilots(options: SimOptions, drones: int, firmware: Firmware, serving: Serving) -> list[MavlinkFirmware]:
+    from skyloop.sim.firmware.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
+    from skyloop.sim.host import SimHost
+
+    kind, video = Kind(firmware.value), serving.video_port
+    host = SimHost(with_multirotors(options), drones)
+    all_ports = [Ports.counted(kind, serving.port_base, drone) for drone in range(drones)]
+    return [
+        MavlinkFirmware(
+            host,
+            drone,
+            kind=kind,
+            bind=serving.bind,
+            ports=ports,
+            faults=serving.faults,
+            delay_s=serving.delay_s,
+            video=None if video is None else ("127.0.0.1", video + drone),
+        )
+        for drone, ports in enumerate(all_ports)
+    ]
+
+
+def _tellos(options: SimOptions, drones: int, serving: Serving) -> list[TelloFirmware]:
+    from skyloop.sim.firmware.tello import TelloFirmware, with_tellos
+    from skyloop.sim.host import SimHost
+    from skyloop.wire.tello.commands import PORT
+
+    host = SimHost(with_tellos(options), drones)
+    return [
+        TelloFirmware(
+            host,
+            drone,
+            bind=address_from(serving.bind, drone),
+            port=PORT if serving.port_base is None else serving.port_base,
+            faults=serving.faults,
+            delay_s=serving.delay_s,
+        )
+        for drone in range(drones)
+    ]
+
+
+def address_from(base: str, drone: int) -> str:
+    """Of a Tello: all have the same port, and each further one the next address. Raises :class:`UsageError`."""
+    if drone == 0:
+        return base
+    try:
+        return str(ipaddress.IPv4Address(base) + drone)
+    except ValueError:
+        raise UsageError(f"--bind {base}: several Tellos need an IPv4 address to count their own from") from None
 
 
 def ports_from(base: int, drone: int) -> Ports:
@@ -66,7 +155,7 @@ def ports_from(base: int, drone: int) -> Ports:
     return ports
 
 
-def _run(firmwares: Sequence[ArdroneFirmware]) -> None:
+def _run(firmwares: Sequence[Emulated]) -> None:
     asked = threading.Event()
     before = {number: signal.signal(number, lambda *_: asked.set()) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
@@ -82,8 +171,16 @@ def _run(firmwares: Sequence[ArdroneFirmware]) -> None:
             signal.signal(number, handler)
 
 
-def describe(firmware: ArdroneFirmware) -> str:
+def describe(firmware: Emulated) -> str:
     """One line: where it listens."""
+    from skyloop.sim.firmware.ardrone import ArdroneFirmware
+    from skyloop.sim.firmware.tello import TelloFirmware
+
+    if isinstance(firmware, TelloFirmware):
+        tello = firmware.settings
+        return f"tello drone {firmware.drone} on {tello.bind}: commands udp {firmware.port}, SDK {tello.sdk}"
+    if not isinstance(firmware, ArdroneFirmware):
+        return firmware.description
     ports, settings = firmware.ports, firmware.settings
     video = "udp" if settings.version == 1 else "tcp"
     return (

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import inspect
 import signal
-import traceback
+import sys
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from skyloop.errors import SkyloopError, UsageError
+from skyloop.cli.flight import Flight
+from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
     from skyloop.control import Controller
+    from skyloop.control.reloading import Reloader
 
 ADVICE = "wait in line with --wait SECONDS, or take over with a higher --priority (a lower number, 0 is the highest)"
 
@@ -36,17 +38,24 @@ def fly(
     priority: Annotated[int, typer.Option(metavar="P", min=0, max=31, help="0 is the highest, 31 the lowest")] = 16,
     wait: Annotated[float, typer.Option(metavar="S", min=0.0, help="How long to wait in line for the authority")] = 0.0,
     takeoff: Annotated[bool, typer.Option(help="Take off first, or leave that to the controller")] = True,
+    reload: Annotated[
+        bool, typer.Option("--reload", help="Fly the file anew when it is saved; after an error hover until then")
+    ] = False,
 ) -> None:
-    """Take off, run a controller, land. Ctrl-C lands too, and so does an error in the controller."""
+    """Take off, run a controller, land. Ctrl-C lands too, and so does an error in the controller without --reload."""
     from skyloop.cli.piloting import connect_pilot
     from skyloop.control.loading import load_controller
+    from skyloop.control.reloading import Reloader
 
+    if reload:  # a neighbour saved twice within a second would come from Python's cache
+        sys.dont_write_bytecode = True
     controller_class = load_controller(file, class_name)
+    reloader = Reloader(file, class_name) if reload else None
     for number in (signal.SIGINT, signal.SIGTERM):  # the first is ignored where a shell runs this in the background
         signal.signal(number, _interrupt)
     with connect_pilot(on, ADVICE, name=file.name[:64], priority=priority, wait_s=wait) as drone:
         controller = make(controller_class, drone)
-        worked = _run(controller, drone, seconds, takeoff=takeoff)
+        worked = _run(Flight(drone, controller, _say), drone, seconds, reloader, takeoff=takeoff)
         _land(drone)
     if not worked:
         raise typer.Exit(1)
@@ -67,36 +76,16 @@ def make(controller_class: type[Controller], drone: Drone) -> Controller:
     return controller
 
 
-def what_failed(error: Exception) -> str:
-    """What a person needs to mend it: the traceback without Skyloop's own lines.
-
-    An error that Skyloop raised on purpose with no line of the user in it is one line; any other is told in full.
-    """
-    home = str(Path(__file__).parents[1])
-    told = traceback.TracebackException.from_exception(error)
-    if all(line.filename.startswith(home) for line in told.stack):
-        return f"skyloop: {error}" if isinstance(error, SkyloopError) else "".join(told.format()).rstrip()
-    part: traceback.TracebackException | None = told
-    while part is not None:
-        theirs = [line for line in part.stack if not line.filename.startswith(home)]
-        part.stack = traceback.StackSummary.from_list(theirs)
-        part = part.__cause__ or part.__context__
-    return "".join(told.format()).rstrip()
-
-
-def _run(controller: Controller, drone: Drone, seconds: float | None, *, takeoff: bool) -> bool:
+def _run(flight: Flight, drone: Drone, seconds: float | None, reloader: Reloader | None, *, takeoff: bool) -> bool:
     """Whether it ended as it should. Errors of the take-off come out; those of the controller are shown."""
     try:
         if takeoff and drone.capabilities.actions and not drone.feedback().state.airborne:
             _say(f"taking off with {drone.name}")
             drone.takeoff()
-        try:
-            summary = controller.run(seconds=seconds)
-        except Exception as error:  # noqa: BLE001  the user's code may raise anything
-            _say(what_failed(error))
-            _say("the controller failed")
-            return False
-        _say(str(summary))
+        if reloader is None:
+            return flight.run(seconds)
+        with reloader:
+            return flight.run_reloading(seconds, reloader, lambda found: make(found, drone))
     except KeyboardInterrupt:
         _say("stopped by Ctrl-C")
     return True

@@ -1,16 +1,21 @@
-"""``skyloop list``: the proxies of this host."""
+"""``skyloop list``: the proxies of this host, and those that can be reached over the network."""
 
 from __future__ import annotations
 
+import platform
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 import typer
 
 from skyloop.cli.text import columns
 from skyloop.errors import SkyloopError
+
+if TYPE_CHECKING:
+    from skyloop.transport.fabric import FabricSettings
 
 ANSWER_WITHIN_S = 1.0
 
@@ -19,8 +24,9 @@ class Row(msgspec.Struct, frozen=True):
     """One proxy as ``list`` shows it."""
 
     name: str
-    transport: str = "local"
+    transport: str = "local"  #: ``local``, ``fabric`` (the network) or both
     pid: int | None = None
+    host: str = ""
     vehicle: str = ""
     uri: str = ""
     state: str = ""
@@ -32,39 +38,82 @@ class Row(msgspec.Struct, frozen=True):
 
 def list_proxies(
     json: Annotated[bool, typer.Option("--json", help="For programs: one JSON array")] = False,
+    network: Annotated[
+        str | None,
+        typer.Option(metavar="WHERE", help="Look there too: multicast, or addresses with commas [SKYLOOP_NETWORK]"),
+    ] = None,
+    keys: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder of an identity [SKYLOOP_KEYS]")] = None,
 ) -> None:
-    """Show the running proxies, what they fly, in which state, and who holds the authority."""
-    rows = running()
+    """Show the running proxies, where they run, what they fly, in which state, and who holds the authority.
+
+    Those of this host, and with --network those that can be reached over the network.
+    """
+    from skyloop.client.by_name import network_settings
+
+    settings = network_settings(network, keys)
+    rows = running(settings)
     if json:
         typer.echo(msgspec.json.encode(rows).decode())
     elif not rows:
-        typer.echo("No proxy is running on this host. Start one: skyloop proxy sim:// --name alpha")
+        also = "" if settings is None else f" or can be reached over the network ({settings.reach})"
+        typer.echo(f"No proxy is running on this host{also}. Start one: skyloop proxy sim:// --name alpha")
     else:
         for line in lines(rows):
             typer.echo(line)
 
 
-def running() -> list[Row]:
-    """All proxies of this host, by name, asked at the same time: one that is stopped delays the list once."""
+def running(settings: FabricSettings | None = None) -> list[Row]:
+    """All proxies of this host and, with settings for it, of the network, by name.
+
+    They are asked at the same time: one that is stopped delays the list once.
+    """
     from skyloop.transport.local import list_names
 
-    proxies = list_names()
-    if not proxies:
+    here = platform.node()
+    found = [Row(proxy.name, pid=proxy.pid, host=here) for proxy in list_names()]
+    if settings is not None:
+        found = merged(found, settings)
+    if not found:
         return []
-    with ThreadPoolExecutor(max_workers=min(32, len(proxies))) as pool:
-        return list(pool.map(lambda proxy: describe(proxy.name, proxy.pid), proxies))
+    with ThreadPoolExecutor(max_workers=min(32, len(found))) as pool:
+        return list(pool.map(lambda row: described(row, settings), found))
 
 
-def describe(name: str, pid: int | None = None) -> Row:
+def merged(near: list[Row], settings: FabricSettings) -> list[Row]:
+    """With those of the network; one that is reached both ways has one row."""
+    from skyloop.transport.fabric import list_proxies as far
+
+    rows = {(row.host, row.pid, row.name): row for row in near}
+    for proxy in far(settings):
+        key = (proxy.host, proxy.pid, proxy.name)
+        way = "local, fabric" if key in rows else "fabric"
+        rows[key] = Row(proxy.name, way, proxy.pid, proxy.host, uri=proxy.vehicle)
+    return sorted(rows.values(), key=lambda row: (row.name, row.host))
+
+
+def describe(name: str) -> Row:
+    """What the proxy with this name says of itself, wherever it is."""
+    from skyloop.client.by_name import network_settings
+
+    return described(Row(name, transport=""), network_settings())
+
+
+def described(row: Row, settings: FabricSettings | None) -> Row:
     """What a proxy says of itself; one that does not answer is described by the reason."""
     from skyloop.client import connect
 
+    far = "local" not in row.transport
     try:
-        with connect(name, access="observe", name="skyloop list", timeout_s=ANSWER_WITHIN_S) as drone:
+        with connect(
+            row.name,
+            access="observe",
+            name="skyloop list",
+            timeout_s=ANSWER_WITHIN_S,
+            network=(settings or False) if far else False,
+        ) as drone:
             feedback = drone.feedback()
-            return Row(
-                name,
-                pid=pid,
+            return msgspec.structs.replace(
+                row,
                 vehicle=drone.capabilities.vehicle,
                 uri=drone.uri,
                 state=feedback.state.value,
@@ -73,15 +122,17 @@ def describe(name: str, pid: int | None = None) -> Row:
                 vehicle_link=feedback.vehicle_link.value,
             )
     except SkyloopError as error:
-        return Row(name, pid=pid, problem=str(error))
+        return msgspec.structs.replace(row, problem=str(error))
 
 
 def lines(rows: Iterable[Row]) -> list[str]:
     """As a table of text, the address last because it may be long."""
-    cells = [("NAME", "STATE", "BATTERY", "PILOT", "LINK", "ADDRESS")]
+    cells = [("NAME", "HOST", "BY", "STATE", "BATTERY", "PILOT", "LINK", "ADDRESS")]
     cells += [
         (
             row.name,
+            row.host,
+            row.transport,
             row.state or "?",
             "" if row.battery is None else f"{row.battery:.0%}",
             row.owner or ("?" if row.problem else "nobody"),

@@ -2,9 +2,22 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from skyloop.cli.network import (
+    ConnectOption,
+    KeysOption,
+    ListenOption,
+    MulticastOption,
+    NetworkOption,
+    key_news,
+    server_ends,
+    settings_of,
+    warn_if_open,
+)
 
 
 def proxy(
@@ -13,16 +26,30 @@ def proxy(
     group: Annotated[
         str | None, typer.Option(metavar="GROUP", help="A group of users whose members may connect too")
     ] = None,
+    network: NetworkOption = False,
+    listen: ListenOption = None,
+    connect: ConnectOption = None,
+    multicast: MulticastOption = True,
+    keys: KeysOption = None,
+    audit: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Where who flew when is written [the user's directory of state]")
+    ] = None,
     parent_fd: Annotated[int | None, typer.Option(hidden=True)] = None,
 ) -> None:
-    """Serve one vehicle to the applications of this host, until Ctrl-C, which lands it first."""
+    """Serve one vehicle to applications, until Ctrl-C, which lands it first.
+
+    They are of this host, and with --network of others too.
+    """
     from skyloop.drivers.uri import parse_uri
     from skyloop.proxy.serve import serve
 
+    settings = settings_of(network, listen, connect, multicast, keys)
     vehicle = parse_uri(uri)
     if vehicle.scheme == "sim":
         from skyloop.cli.simulating import settle
         from skyloop.drivers.sim import options_of
 
         settle(options_of(vehicle))
-    serve(uri, name, group=group, parent_fd=parent_fd)
+    warn_if_open(settings, [name])
+    make_end = server_ends(settings, group)
+    serve(uri, name, make_end=make_end, parent_fd=parent_fd, look=key_news(settings), audit=audit)

@@ -1,5 +1,5 @@
-"""``skyloop sim``: several simulated drones in one world, each with a proxy of its own, or each an AR.Drone for other
-people's programs."""
+"""``skyloop sim``: several simulated drones in one world, each with a proxy of its own, or each the firmware of a real
+one for other people's programs."""
 
 from __future__ import annotations
 
@@ -8,10 +8,24 @@ from urllib.parse import urlencode
 
 import typer
 
-from skyloop.cli.firmware import PORT_BASE, Firmware, serve
+from skyloop.cli.firmware import Firmware, Serving, serve
+from skyloop.cli.network import (
+    ConnectOption,
+    KeysOption,
+    ListenOption,
+    MakeEnd,
+    MulticastOption,
+    NetworkOption,
+    key_news,
+    server_ends,
+    settings_of,
+    warn_if_open,
+)
 from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from skyloop.drivers.uri import VehicleUri
     from skyloop.sim.options import SimOptions
 
@@ -35,9 +49,14 @@ def sim(
         list[str] | None,
         typer.Option(metavar="KEY=VALUE", help="Any other option of sim://, e.g. cameras=front; may be repeated"),
     ] = None,
+    network: NetworkOption = False,
+    listen: ListenOption = None,
+    connect: ConnectOption = None,
+    multicast: MulticastOption = True,
+    keys: KeysOption = None,
     firmware: Annotated[
         Firmware | None,
-        typer.Option(help="Be an AR.Drone for other programs instead, e.g. --firmware ardrone2 --lose 0.1"),
+        typer.Option(help="Be a real drone for other programs instead, e.g. --firmware px4 --lose 0.1"),
     ] = None,
     bind: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help=f"Of the firmware: where it listens [{LOOPBACK}]")
@@ -45,7 +64,7 @@ def sim(
     port_base: Annotated[
         int | None,
         typer.Option(
-            metavar="P", min=0, max=65000, help=f"Of the firmware: its ports count from here [{PORT_BASE}]; 0 any free"
+            metavar="P", min=0, max=65000, help="Of the firmware: its ports count from here, not the usual; 0 any free"
         ),
     ] = None,
     lose: Annotated[
@@ -62,13 +81,17 @@ def sim(
         float | None,
         typer.Option(metavar="SHARE", min=0, max=1, help="Of the firmware: datagrams that come after the next"),
     ] = None,
+    video_port: Annotated[
+        int | None,
+        typer.Option(metavar="P", min=1, max=65000, help="Of arducopter and px4: where the camera's pictures are sent"),
+    ] = None,
     fault_seed: Annotated[
         int | None, typer.Option(metavar="S", min=0, help="Of the firmware: the same one, the same faults [0]")
     ] = None,
 ) -> None:
     """Simulate drones that see one another in one world, each with a proxy of its own, until Ctrl-C.
 
-    With --firmware each is an AR.Drone on the network instead, for any program that flies the real one.
+    With --firmware each is a real drone's firmware on the network instead, for any program that flies the real one.
     """
     from skyloop.cli.simulating import settle
     from skyloop.drivers.sim import options_of
@@ -84,27 +107,26 @@ def sim(
         "--repeat": repeat,
         "--reorder": reorder,
         "--fault-seed": fault_seed,
+        "--video-port": video_port,
     }
     if firmware is None:
         given = [word for word, value in settings.items() if value is not None]
         if given:
             raise UsageError(f"{given[0]} is for --firmware: say --firmware {Firmware.ARDRONE2} as well")
+        network_settings = settings_of(network, listen, connect, multicast, keys)
         settle(options)
-        _serve_proxies(uri, options, drones, name)
+        names = [name] if drones == 1 else [f"{name}{number}" for number in range(1, drones + 1)]
+        warn_if_open(network_settings, names)
+        _serve_proxies(uri, options, names, server_ends(network_settings), key_news(network_settings))
         return
+    if network:
+        raise UsageError("--network is for proxies, and with --firmware there is none: say --bind ADDRESS instead")
     _refuse_for_firmware(name, uri)
     from skyloop.sim.firmware.ardrone import Faults
 
     settle(options)
-    serve(
-        options,
-        drones,
-        firmware,
-        bind=bind or LOOPBACK,
-        port_base=PORT_BASE if port_base is None else port_base,
-        faults=Faults(seed=fault_seed or 0, drop=lose or 0.0, duplicate=repeat or 0.0, reorder=reorder or 0.0),
-        delay_s=delay or 0.0,
-    )
+    faults = Faults(seed=fault_seed or 0, drop=lose or 0.0, duplicate=repeat or 0.0, reorder=reorder or 0.0)
+    serve(options, drones, firmware, Serving(bind or LOOPBACK, port_base, faults, delay or 0.0, video_port))
 
 
 def _refuse_for_firmware(name: str, uri: VehicleUri) -> None:
@@ -115,17 +137,18 @@ def _refuse_for_firmware(name: str, uri: VehicleUri) -> None:
         raise UsageError(f"--option {fixed[0]} can't be chosen with --firmware: the emulated drone has its own")
 
 
-def _serve_proxies(uri: VehicleUri, options: SimOptions, drones: int, name: str) -> None:
+def _serve_proxies(
+    uri: VehicleUri, options: SimOptions, names: list[str], make_end: MakeEnd, look: Callable[[], list[str]] | None
+) -> None:
     from skyloop.drivers.sim import SimDriver
     from skyloop.proxy import Proxy
     from skyloop.proxy.serve import run
     from skyloop.sim.host import SimHost
-    from skyloop.transport.local import LocalServer
 
-    host = SimHost(options, drones)
-    names = [name] if drones == 1 else [f"{name}{number}" for number in range(1, drones + 1)]
-    drivers = [SimDriver(uri, host=host, drone=index) for index in range(drones)]
-    run([Proxy(driver, LocalServer(each), name=each) for driver, each in zip(drivers, names, strict=True)])
+    host = SimHost(options, len(names))
+    drivers = [SimDriver(uri, host=host, drone=index) for index in range(len(names))]
+    proxies = [Proxy(driver, make_end(each, str(uri)), name=each) for driver, each in zip(drivers, names, strict=True)]
+    run(proxies, look=look)
 
 
 def address(world: str, seed: int, speed: float, others: list[str]) -> str:

@@ -117,15 +117,21 @@ def _event_json(event: Event) -> str:
 
 def picture(drone: Drone) -> Group:
     """All that is shown at one time."""
+    return Group(state_panel(drone), channels(drone), *events(drone, EVENTS_SHOWN))
+
+
+def state_panel(drone: Drone) -> Panel:
+    """What the drone and its links are doing."""
+    return Panel(_state(drone), title=Text(f"{drone.name} · {drone.uri}"), title_align="left")
+
+
+def events(drone: Drone, count: int) -> list[Text]:
+    """The newest events, a line each."""
     newest_ns = drone.feedback().captured_ns
-    return Group(
-        Panel(_state(drone), title=Text(f"{drone.name} · {drone.uri}"), title_align="left"),
-        _channels(drone),
-        *[
-            Text.assemble((f"{(event.at_ns - newest_ns) / 1e9:+7.1f} s", COLOURS[event.severity]), f" {event.text}")
-            for event in drone.recent_events()[-EVENTS_SHOWN:]
-        ],
-    )
+    return [
+        Text.assemble((f"{(event.at_ns - newest_ns) / 1e9:+7.1f} s", COLOURS[event.severity]), f" {event.text}")
+        for event in drone.recent_events()[-count:]
+    ]
 
 
 def _state(drone: Drone) -> Table:
@@ -139,7 +145,8 @@ def _state(drone: Drone) -> Table:
     return table
 
 
-def _channels(drone: Drone) -> Table:
+def channels(drone: Drone) -> Table:
+    """Rates, delays and ages, a line a channel."""
     table = Table("channel", "rate", "delay median", "p99", "age", "lost", "dropped", box=None)
     for name, channel in drone.stats.items():
         delay = channel.delay_s

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from skyloop.clock import nanoseconds
-from skyloop.messages import DEFAULT_PRIORITY, Event, EventKind, Feedback
+from skyloop.messages import DEFAULT_PRIORITY, Event, EventKind, Feedback, RequestAuthority
 
 AuthorityState = Literal["none", "queued", "held", "preempted"]
 
@@ -20,7 +20,9 @@ class AuthorityStatus:
 
     ``none``: not asked for, or given back; ``queued``: waiting in line; ``held``: may fly; ``preempted``: taken away by
     a higher priority, and waiting to have it back. ``lease`` is its number while held, else 0; ``position`` the place
-    in line (1 is next), 0 if not known. ``holder`` names who flies now.
+    in line (1 is next), 0 if not known. ``holder`` names who flies now. ``expected_wait_s``: how long it will take if
+    each ahead in the line keeps to the time that it said; None: not known. ``until_ns``: when the time is over that
+    this application asked for, on the proxy's clock; None: not limited.
     """
 
     state: AuthorityState = "none"
@@ -28,6 +30,8 @@ class AuthorityStatus:
     priority: int = DEFAULT_PRIORITY
     holder: str | None = None
     position: int = 0
+    expected_wait_s: float | None = None
+    until_ns: int | None = None
 
 
 class Authority:
@@ -42,6 +46,8 @@ class Authority:
         self.wanted = False  #: the application asked for it and has not given it back
         self.pending = False  #: asked for on this connection, and not answered yet
         self.status = AuthorityStatus()
+        self.wish = RequestAuthority()  #: how it is asked for, also anew on another connection
+        self.declined = ""  #: what was told when the holder declined
         self._lease = 0  #: the newest lease that was ever ours on this connection
         self._granted_ns = 0
 
@@ -59,24 +65,28 @@ class Authority:
         self.pending = False
         return self._set(AuthorityStatus("none", priority=self.status.priority))
 
-    def asked(self, priority: int) -> None:
+    def asked(self, wish: RequestAuthority) -> None:
         """The authority is being asked for."""
         self.wanted = self.pending = True
-        self.status = replace(self.status, priority=priority)
+        self.wish = wish
+        self.declined = ""
+        self.status = replace(self.status, priority=wish.priority)
 
-    def granted(self, lease: int, now_ns: int) -> bool:
+    def granted(self, lease: int, now_ns: int, until_ns: int | None = None) -> bool:
         """By reply, by event or seen in feedback."""
         self.pending = False
         if lease <= self._lease and not self.held:
             return False  # an old lease, told again: it was lost since
+        if until_ns is None and lease == self._lease:
+            until_ns = self.status.until_ns  # told before, and not again
         self._lease, self._granted_ns = lease, now_ns
-        return self._set(AuthorityStatus("held", lease, self.status.priority, self._name))
+        return self._set(AuthorityStatus("held", lease, self.status.priority, self._name, until_ns=until_ns))
 
-    def queued(self, position: int, holder: str) -> bool:
+    def queued(self, position: int, holder: str, expected_wait_s: float | None = None) -> bool:
         """In line."""
         self.pending = False
         state: AuthorityState = "preempted" if self.status.state == "preempted" else "queued"
-        return self._set(AuthorityStatus(state, 0, self.status.priority, holder, position))
+        return self._set(AuthorityStatus(state, 0, self.status.priority, holder, position, expected_wait_s))
 
     def given_back(self) -> bool:
         """Released by the application, or refused for good."""
@@ -92,14 +102,20 @@ class Authority:
         data = event.data
         ours = data.get("app_id") == self.app_id
         if event.kind is EventKind.AUTHORITY_GRANTED and ours:
-            return self.granted(_whole(data.get("lease")), now_ns)
+            return self.granted(_whole(data.get("lease")), now_ns, _whole(data.get("until_ns")) or None)
         if event.kind is EventKind.AUTHORITY_QUEUED and ours and self.status.state in ("queued", "preempted"):
-            return self._set(replace(self.status, position=_whole(data.get("position"))))
+            position, wait_s = _whole(data.get("position")), data.get("wait_s")
+            expected = wait_s if isinstance(wait_s, float) else None
+            return self._set(replace(self.status, position=position, expected_wait_s=expected))
+        if event.kind is EventKind.AUTHORITY_DECLINED and ours:
+            self.declined = event.text
         if not ours or not self.held or _whole(data.get("lease")) < self.status.lease:
             return False
         if event.kind is EventKind.AUTHORITY_PREEMPTED:
             return self._lost(str(data.get("by", "")) or None)
         if event.kind is EventKind.AUTHORITY_LOST:
+            if data.get("reason") == "expired":  # its time is over: it is not asked for again by itself
+                return self.given_back()
             return self._lost(None)
         return False
 
@@ -113,8 +129,8 @@ class Authority:
             )
         if self.held:
             newer = feedback.lease > self.status.lease
-            nobody = not feedback.owner_id and now_ns - self._granted_ns > self.SETTLE_NS
-            return (newer or nobody) and self._lost(feedback.owner)
+            nobody = not feedback.lease and now_ns - self._granted_ns > self.SETTLE_NS
+            return (newer or nobody) and self._lost(feedback.owner if feedback.lease else None)
         if self.status.state in ("queued", "preempted") and feedback.owner != self.status.holder:
             return self._set(replace(self.status, holder=feedback.owner))
         return False

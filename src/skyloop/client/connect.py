@@ -7,12 +7,16 @@ import sys
 import time
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from skyloop.client.drone import Access, Drone, OnExit
 from skyloop.client.pace import Way
+from skyloop.client.takeover import TakeoverWay, authority_wish
 from skyloop.errors import UsageError
-from skyloop.messages import DEFAULT_PRIORITY, HIGHEST_PRIORITY, LOWEST_PRIORITY
+from skyloop.messages import DEFAULT_PRIORITY
+
+if TYPE_CHECKING:
+    from skyloop.transport.fabric.environment import Network
 
 NAME_TIMEOUT_S: Final = 5.0
 START_TIMEOUT_S: Final = 20.0  #: for a private proxy and its vehicle
@@ -31,24 +35,34 @@ def connect(
     rate_hz: float = 32.0,
     stall_s: float = 1.0,
     on_exit: OnExit = "land",
+    network: Network = None,
+    keys: Path | str | None = None,
+    for_s: float | None = None,
+    takeover: TakeoverWay = "now",
+    stay: bool = False,
 ) -> Drone:
     """Connect to a drone; returns when its state is known and, with ``access="pilot"``, when it may be commanded.
 
-    ``target``: the name of a running proxy of this host, or a vehicle's address such as ``sim://?seed=3`` or
+    ``target``: the name of a running proxy, or a vehicle's address such as ``sim://?seed=3`` or
     ``video://flight.mp4``, for which a private proxy is started that ends with the drone and with this process.
+    A name is looked for on this host first and then, if ``network`` says so, on the network: True searches by
+    multicast, ``"10.0.0.5:7447"`` calls an address (several: with commas, and ``multicast`` among them to search as
+    well), False stays on this host; default: the variable ``SKYLOOP_NETWORK``, without which nothing leaves this host.
+    ``keys``: the folder of an identity for the network (default: the variable ``SKYLOOP_KEYS``).
     ``access``: ``"pilot"`` requests the authority, ``"observe"`` only looks on. ``priority``: 0 is the highest, 31 the
     lowest; a higher one takes over. ``name``: of this application (default: of its script). ``wait_s``: how long to
     wait in line while somebody else flies. ``timeout_s``: for the proxy to answer (default 5 s, with an address 20 s).
     ``rate_hz``: of repeated commands. ``stall_s``: without a call for this long a velocity or attitude decays to hover
     (``math.inf``: never). ``on_exit``: what an airborne vehicle does at the block's end, ``"land"`` or ``"hover"``.
+    ``for_s``, ``takeover``, ``stay``: for how long the authority is wanted, whether its holder is asked first, and
+    whether to stay in line without it; see :meth:`Drone.request_authority`.
 
     Raises :class:`UnknownNameError` (no such proxy), :class:`NoAnswerError`, :class:`AuthorityError` (naming who
     flies), :class:`LinkError`, :class:`UsageError`.
     """
     if not isinstance(target, str) or not target:
         raise UsageError(f"{target!r} is neither the name of a proxy nor a vehicle's address such as sim://")
-    if not isinstance(priority, int) or not HIGHEST_PRIORITY <= priority <= LOWEST_PRIORITY:
-        raise UsageError(f"priority is {priority!r} and must be a whole number from 0 (highest) to 31 (lowest)")
+    authority_wish(priority, for_s, takeover)
     for what, seconds in (("wait_s", wait_s), ("timeout_s", timeout_s)):
         if seconds is not None and not (0.0 <= seconds < math.inf):
             raise UsageError(f"{what} is {seconds!r} and must be a number of seconds")
@@ -58,9 +72,11 @@ def connect(
         way = _way(target)
         dial, end, reach, pace = way.dialer(deadline), way.close, way.reach, way.pace
     else:
-        from skyloop.transport.local import dial as local_dial
+        from skyloop.client.by_name import dial_by_name
 
-        dial, end, reach, pace = local_dial(target), None, target, None
+        # Another process finds it by the name alone only where it would look by itself.
+        others_find_it = keys is None and (network is None or network is False)
+        dial, end, reach, pace = dial_by_name(target, network, keys), None, target if others_find_it else None, None
     try:
         drone = Drone(
             dial,
@@ -77,7 +93,8 @@ def connect(
         if end is not None:
             end()
         raise
-    return drone.open(priority=priority, wait_s=wait_s, timeout_s=deadline - time.monotonic())
+    left_s = deadline - time.monotonic()
+    return drone.open(priority=priority, wait_s=wait_s, timeout_s=left_s, for_s=for_s, takeover=takeover, stay=stay)
 
 
 def _way(uri: str) -> Way:

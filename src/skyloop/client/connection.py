@@ -23,17 +23,23 @@ from skyloop.messages import (
     LogEntry,
     Ping,
     Pong,
+    ProcessorResult,
+    ProcessorShare,
     Reply,
     Sample,
+    VideoRequest,
     Welcome,
     decode,
 )
-from skyloop.transport.base import ClientEnd, Dialer, Pixels
+from skyloop.transport.base import ClientEnd, Dialer, Pixels, video
 
 if TYPE_CHECKING:
     from skyloop.client.link import LinkUser
 
+_VIDEO: Final = video("")
 _PING_CLOCK_NS: Final = nanoseconds(1.0)  #: how often a proxy on another clock is asked for its time
+_PING_FIRST_NS: Final = nanoseconds(0.1)  #: the same at first, until there are some answers to choose from
+_FIRST: Final = 5
 
 
 class Connection:
@@ -49,12 +55,15 @@ class Connection:
         self._up = False
         self._pinged_ns = 0
         self._trips = OffsetEstimator()
+        self._users: dict[str, set[str]] = {}  # requests for video that a camera's plain frames are to meet
         self._handlers: dict[type, Callable[..., None]] = {
             Event: user.event,
             Applied: user.applied,
             Annotation: user.annotation,
             LogEntry: user.log_entry,
             EncodedFrame: user.encoded,
+            ProcessorResult: user.result,
+            ProcessorShare: user.share,
             Reply: self._reply,
         }
         self._take_feedback = user.feedback
@@ -62,7 +71,6 @@ class Connection:
         self.monitor = LinkMonitor(thresholds, clock())
         self.requests = Requests(self.send)
         self.offset_ns = 0  #: the proxy's clock less ours
-        self.uncertainty_ns = 0
         self.closed_reason: str | None = None  #: why it ended, once it has
         self.receiver = 0  #: identity of the receiving thread
         self.look_ns = 0  #: when to judge its state next; kept here for the link
@@ -112,8 +120,19 @@ class Connection:
         return end is not None and not self._quiet and end.send(packet)
 
     def subscribe(self, topic: str, on: bool) -> None:
-        if self._end is not None:
-            self._end.subscribe(topic, on)
+        end = self._end
+        if end is None:
+            return
+        if not end.variants and topic.startswith(_VIDEO):
+            # All frames come as they are here, and who wants them otherwise sees to that on this side.
+            plain = VideoRequest.parse(topic).plain.topic
+            users = self._users.setdefault(plain, set())
+            had_users = bool(users)
+            (users.add if on else users.discard)(topic)
+            topic, on = plain, bool(users)
+            if on == had_users:
+                return
+        end.subscribe(topic, on)
 
     def tick(self, now_ns: int) -> None:
         """Questions that are due again, and a ping where one is needed."""
@@ -122,7 +141,8 @@ class Connection:
         if end is None:
             return
         silent = now_ns - self.monitor.heard_ns > self._late_ns
-        if (silent or not end.same_clock) and now_ns - self._pinged_ns > (self._late_ns if silent else _PING_CLOCK_NS):
+        usual_ns = _PING_CLOCK_NS if len(self._trips) >= _FIRST else _PING_FIRST_NS
+        if (silent or not end.same_clock) and now_ns - self._pinged_ns > (self._late_ns if silent else usual_ns):
             self._pinged_ns = now_ns
             self.requests.ask(Ping(now_ns), self._ponged, 1.0, now_ns)
 
@@ -136,7 +156,15 @@ class Connection:
             self._take_offset(self._trips.add(answer.sent_ns, answer.now_ns, self._clock()))
 
     def _take_offset(self, offset: Offset) -> None:
-        self.offset_ns, self.uncertainty_ns = offset.ns, offset.uncertainty_ns
+        self.offset_ns = offset.ns
+
+    @property
+    def uncertainty_ns(self) -> int:
+        """How wrong :attr:`offset_ns` may be by now; 0 where both ends read one clock."""
+        if not self._trips:
+            return 0
+        now = self._trips.at(self._clock())
+        return now.uncertainty_ns + abs(now.ns - self.offset_ns)
 
     # What the transport calls ----------------------------------------------------------------------------------
 
@@ -163,7 +191,7 @@ class Connection:
         self.monitor.heard_ns = now_ns
         handler(sample, now_ns)
 
-    def frame(self, header: FrameHeader, pixels: Pixels) -> None:
+    def frame(self, header: FrameHeader, pixels: Pixels, topic: str = "") -> None:
         now_ns = self._clock()
         if self._quiet:
             return
@@ -171,7 +199,7 @@ class Connection:
             self._malformed()
             return
         self.monitor.heard_ns = now_ns
-        self._user.frame(header, pixels, now_ns)
+        self._user.frame(header, pixels, now_ns, topic)
 
     def closed(self, reason: str) -> None:
         self.closed_reason = reason

@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from types import TracebackType
-from typing import Final, Generic, Protocol, TypeVar
+from typing import Final, Generic, Protocol, Self, TypeVar
 
 from skyloop.client.slots import Buffer
 from skyloop.messages import EventKind, Severity
@@ -104,7 +104,7 @@ class Listener(Generic[T]):
         self._thread = None if inline else threading.Thread(target=self._run, name=f"skyloop-{name}", daemon=True)
         if self._thread is not None:
             self._thread.start()
-        topic.add(self._sink, lambda: self._buffer.dropped)
+        topic.add(self._sink, lambda: self.dropped)
 
     @property
     def delivered(self) -> int:
@@ -126,7 +126,7 @@ class Listener(Generic[T]):
         if wait and thread is not None and thread is not threading.current_thread():
             thread.join(JOIN_S)
 
-    def __enter__(self) -> Listener[T]:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(

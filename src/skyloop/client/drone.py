@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -11,16 +12,28 @@ from typing import Literal, Self
 
 from skyloop.client.commander import Commander
 from skyloop.client.config import Config
+from skyloop.client.delivery import Listener
 from skyloop.client.flying import Flying
 from skyloop.client.link import Link, RedialPolicy
 from skyloop.client.logbook import Logbook
 from skyloop.client.pace import Pace
 from skyloop.client.pilot import Pilot
-from skyloop.client.reading import Reading
 from skyloop.client.reception import LinkStatus, Reception
+from skyloop.client.result_reading import ResultReading
 from skyloop.client.statistics import ChannelStats, Distribution
-from skyloop.errors import LinkError, NoAnswerError, SkyloopError, UsageError
-from skyloop.messages import Event, GetStatistics, Hello, LinkState, Role, Statistics
+from skyloop.client.takeover import TakeoverAnswer, TakeoverRequest, TakeoverWay, answering
+from skyloop.errors import AuthorityError, LinkError, NoAnswerError, SkyloopError, UsageError
+from skyloop.messages import (
+    Event,
+    GetStatistics,
+    Hello,
+    LinkState,
+    Role,
+    Statistics,
+    Vector,
+    VehiclePose,
+    encode,
+)
 from skyloop.transport.base import EVENTS, FEEDBACK, Dialer
 
 Access = Literal["pilot", "observe"]
@@ -28,7 +41,7 @@ OnExit = Literal["land", "hover"]
 _log = logging.getLogger("skyloop")
 
 
-class Drone(Flying, Reading):
+class Drone(Flying, ResultReading):
     """One vehicle, connected; made by :func:`skyloop.connect`. A context manager; every method may be called from any
     thread.
 
@@ -70,6 +83,7 @@ class Drone(Flying, Reading):
         self._link = reception.link = Link(
             dial, Hello(app, role), reception, policy=policy, clock=pace.clock, begin=pace.begin
         )
+        reception.results.link = self._link
         self.config = reception.config = Config(self._link, lambda: self._pilot.status.lease, reception.tell)
         self.log = Logbook(self._link, app, self._now_ns)
         self._pilot = reception.pilot = Pilot(
@@ -85,7 +99,16 @@ class Drone(Flying, Reading):
         for topic in (EVENTS, FEEDBACK):
             self._link.subscribe(topic)
 
-    def open(self, *, priority: int = 16, wait_s: float = 0.0, timeout_s: float = 5.0) -> Self:
+    def open(
+        self,
+        *,
+        priority: int = 16,
+        wait_s: float = 0.0,
+        timeout_s: float = 5.0,
+        for_s: float | None = None,
+        takeover: TakeoverWay = "now",
+        stay: bool = False,
+    ) -> Self:
         """Connect, and wait for feedback and (as a pilot) for the authority. What :func:`skyloop.connect` calls."""
         try:
             deadline = time.monotonic() + timeout_s
@@ -94,12 +117,41 @@ class Drone(Flying, Reading):
             if not self._reception.bell.wait_for(self._known, left_s):
                 raise NoAnswerError(f"{self.name} answered, but told nothing of its vehicle within {timeout_s:g} s")
             if self._role is Role.PILOT:
-                self.request_authority(priority, wait_s=wait_s)
+                self.request_authority(priority, wait_s=wait_s, for_s=for_s, takeover=takeover, stay=stay)
             self._reception.pace.opened()
         except BaseException:
             self.close()
             raise
         return self
+
+    # For vehicles that fly by what others see ------------------------------------------------------------------
+
+    def tell_pose(
+        self,
+        position: Vector,
+        quaternion: tuple[float, float, float, float],
+        *,
+        at_ns: int | None = None,
+        position_std_m: float | None = None,
+        attitude_std_rad: float | None = None,
+    ) -> bool:
+        """Tell the vehicle itself where it was seen from outside: for an autopilot that flies by that, without GPS.
+
+        ``position``: x east, y north, z up [m]; ``quaternion``: x, y, z, w, from body axes (x forward, y left, z up) to
+        the world's; ``at_ns``: when, on the proxy's clock (default: now); standard deviations if they are known. Any
+        thread; nothing waits, and the authority is not needed. Returns whether it was handed over; a vehicle that
+        takes none is told of by an event (``command_refused``).
+
+        Raises :class:`AuthorityError` for an observer and :class:`UsageError` for what is no pose.
+        """
+        if self._role is not Role.PILOT:
+            raise AuthorityError('tell_pose: this application observes; connect with access="pilot"', code="observer")
+        numbers = (*position, *quaternion, position_std_m or 0.0, attitude_std_rad or 0.0)
+        if len(position) != 3 or len(quaternion) != 4 or not all(map(math.isfinite, numbers)):
+            raise UsageError(f"a pose has three and four finite numbers, not {position!r} and {quaternion!r}")
+        known_ns = self._now_ns() if at_ns is None else at_ns
+        pose = VehiclePose(known_ns, position, quaternion, position_std_m, attitude_std_rad)
+        return self._link.transmit(encode(pose))
 
     # What it is ------------------------------------------------------------------------------------------------
 
@@ -119,6 +171,11 @@ class Drone(Flying, Reading):
         return self._link.offset_ns
 
     @property
+    def clock_uncertainty_ns(self) -> int:
+        """How wrong :attr:`clock_offset_ns` may be [ns], and with it each age and delay; 0 on the proxy's own host."""
+        return self._link.uncertainty_ns
+
+    @property
     def app_id(self) -> int:
         """This application's number in this run of the proxy."""
         return self._pilot.app_id
@@ -136,12 +193,14 @@ class Drone(Flying, Reading):
 
     @property
     def stats(self) -> dict[str, ChannelStats]:
-        """Statistics by channel: ``command``, ``feedback``, ``video/<camera>``.
+        """Statistics by channel: ``command``, ``feedback``, ``video/<camera>``, ``results/<processor>``.
 
         The command delay is that of this application's echoes while somebody listens to them (:meth:`on_command`),
         else what the proxy measured over all pilots, for which it is asked.
         """
         found = self._reception.stats()
+        uncertainty_s = self.clock_uncertainty_ns / 1e9
+        found = {name: replace(stats, uncertainty_s=uncertainty_s) for name, stats in found.items()}
         if found["command"].delay_s is None and self._link.connected and not self._link.receiving:
             found["command"] = _with_delay(found["command"], self._proxy_statistics())
         return found
@@ -149,6 +208,14 @@ class Drone(Flying, Reading):
     def recent_events(self) -> list[Event]:
         """The last 256 events, oldest first."""
         return list(self._reception.recent)
+
+    def on_takeover(self, function: Callable[[TakeoverRequest], TakeoverAnswer]) -> Listener[Event]:
+        """Call when another application asks for the authority that this one holds, on a thread of its own.
+
+        The function returns True to hand it over, False or a text (the reason) to decline, None to leave it to the
+        proxy: after its ``authority.ask_s`` a strictly higher priority wins in any case.
+        """
+        return self.on_event(answering(function, self._pilot))
 
     # The end ---------------------------------------------------------------------------------------------------
 
@@ -182,13 +249,24 @@ class Drone(Flying, Reading):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
+        problem = self.leave()
+        if problem is not None:
+            _log.warning("%s could not be left as it should: %s", self.name, problem)
+
+    def leave(self) -> SkyloopError | None:
+        """What the end of a block does: land what this application flies (or hover, as ``on_exit`` said), and close.
+
+        Waits until it has landed. Returns what went wrong on the way, None if nothing did. Idempotent.
+        """
+        problem = None
         try:
             if not self._closed and self._flies():
-                self._leave()
-        except SkyloopError as problem:
-            _log.warning("%s could not be left as it should: %s", self.name, problem)
+                self._end_flight()
+        except SkyloopError as error:
+            problem = error
         finally:
             self.close()
+        return problem
 
     def __repr__(self) -> str:
         return f"<Drone {self.name or '?'} ({self._link.state.value}, authority {self.authority.state})>"
@@ -207,7 +285,7 @@ class Drone(Flying, Reading):
         airborne = newest is not None and newest.state.airborne
         return self._pilot.status.state == "held" and (airborne or self._pilot.wants_flight)
 
-    def _leave(self) -> None:
+    def _end_flight(self) -> None:
         if self._on_exit == "land":
             self.land()
         else:

@@ -11,6 +11,7 @@ from typing import Final
 from skyloop.client.authority import AuthorityStatus
 from skyloop.client.handle import Handle
 from skyloop.client.pilot import Pilot
+from skyloop.client.takeover import TakeoverWay, authority_wish
 from skyloop.errors import AuthorityError, ClosedError, NoAnswerError, RefusedError, UnsupportedError, UsageError
 from skyloop.messages import (
     ACTION_NAMES,
@@ -58,16 +59,27 @@ class Flying(Handle):
         """This application's right to command, as of now."""
         return self._pilot.status
 
-    def request_authority(self, priority: int | None = None, *, wait_s: float = 0.0) -> AuthorityStatus:
+    def request_authority(
+        self,
+        priority: int | None = None,
+        *,
+        wait_s: float = 0.0,
+        for_s: float | None = None,
+        takeover: TakeoverWay = "now",
+        stay: bool = False,
+    ) -> AuthorityStatus:
         """Ask for the right to command, with a priority from 0 (highest) to 31; default: the one asked for before.
 
-        A lower holder is pre-empted at once; behind others this waits in line for ``wait_s`` and then raises
-        :class:`AuthorityError` naming the holder. Once held it is kept: after a lost link it is asked for again, and
-        after a pre-emption it comes back when it is given back.
+        A lower holder is pre-empted at once, or with ``takeover="ask"`` asked first and pre-empted when it grants or
+        after the proxy's ``authority.ask_s``; with ``"ask"`` one that is not lower is asked too, and may say no. Behind
+        others this waits in line for ``wait_s`` and then raises :class:`AuthorityError` naming the holder, or with
+        ``stay`` stays in line and returns, with the place and the expected wait in the status. ``for_s``: for how long
+        it is wanted, up to a day; when that time is over it goes to whoever wants it. Once held it is kept: after a
+        lost link it is asked for again, and after a pre-emption it comes back when it is given back.
         """
         self._check_open()
-        known = self._pilot.status.priority
-        return self._pilot.request(known if priority is None else priority, wait_s)
+        wish = authority_wish(self._pilot.status.priority if priority is None else priority, for_s, takeover)
+        return self._pilot.request(wish, wait_s, stay=stay)
 
     def release_authority(self) -> None:
         """Give the right to command back, or leave the line."""
@@ -78,11 +90,12 @@ class Flying(Handle):
 
     def command(self, action: AnyAction) -> bool:
         """Make any action the newest set-point."""
-        if type(action) not in _ACTIONS:
-            raise UsageError(f"a command is one of {', '.join(sorted(ACTION_NAMES.values()))}, not {action!r}")
-        if not action.finite:
-            raise UsageError(f"{action!r} has a number that is NaN or infinite")
-        return self._command(action)
+        return self._command(checked(action))
+
+    @property
+    def open_ns(self) -> int:
+        """From when on a new set-point goes out at once, on this process's clock: a few milliseconds after the last."""
+        return self._pilot.open_ns
 
     def takeoff(self, *, wait: bool = True, timeout_s: float = 15.0) -> bool:
         """Take off and hover; waits until it hovers. Raises :class:`NoAnswerError` with its state and why not."""
@@ -103,18 +116,14 @@ class Flying(Handle):
     def velocity(self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, yaw_rate: float = 0.0) -> bool:
         """Fly with this velocity in the body's levelled axes [m/s], turning counter-clockwise [rad/s]."""
         return self._command(
-            Velocity(
-                _number("forward", forward), _number("left", left), _number("up", up), _number("yaw_rate", yaw_rate)
-            )
+            Velocity(number("forward", forward), number("left", left), number("up", up), number("yaw_rate", yaw_rate))
         )
 
     def attitude(self, *, roll: float = 0.0, pitch: float = 0.0, climb: float = 0.0, yaw_rate: float = 0.0) -> bool:
         """Hold this attitude: ``roll`` right side down, ``pitch`` nose down [rad], ``climb`` up [m/s], ``yaw_rate``
         counter-clockwise [rad/s]. Positive pitch accelerates forward, positive roll to the right."""
         return self._command(
-            Attitude(
-                _number("roll", roll), _number("pitch", pitch), _number("climb", climb), _number("yaw_rate", yaw_rate)
-            )
+            Attitude(number("roll", roll), number("pitch", pitch), number("climb", climb), number("yaw_rate", yaw_rate))
         )
 
     def emergency_stop(self) -> bool:
@@ -161,6 +170,7 @@ class Flying(Handle):
         if not reception.bell.wait_for(look, deadline - time.monotonic()):
             raise NoAnswerError(self._not_reached(action, timeout_s, asked_ns))
         if done[0] is not None:
+            pilot.drop(action)  # what was refused now must not be done later, to everybody's surprise
             raise done[0]
         return sent
 
@@ -198,7 +208,16 @@ def _concerns(refusal: Event, seq: int) -> bool:
     return isinstance(refused, int) and refused >= seq
 
 
-def _number(name: str, value: object) -> float:
+def checked(action: AnyAction) -> AnyAction:
+    """The action, if it is one that can be commanded. Raises :class:`UsageError`."""
+    if type(action) not in _ACTIONS:
+        raise UsageError(f"a command is one of {', '.join(sorted(ACTION_NAMES.values()))}, not {action!r}")
+    if not action.finite:
+        raise UsageError(f"{action!r} has a number that is NaN or infinite")
+    return action
+
+
+def number(name: str, value: object) -> float:
     """A finite float. Raises :class:`UsageError` naming the argument."""
     if type(value) is not float and (isinstance(value, bool) or not isinstance(value, numbers.Real)):
         raise UsageError(f"{name} is {value!r:.60} and must be a number")

@@ -7,12 +7,14 @@ import time
 import weakref
 from typing import TYPE_CHECKING, Any, Final, Literal, NoReturn
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import Clock
 from skyloop.errors import DecodeError, MissingExtraError
 from skyloop.messages import Encoding, Feedback, FrameHeader, Intrinsics
+from skyloop.transport.pictures import resized, scaled_header
 
 if TYPE_CHECKING:
     from skyloop.client.history import FeedbackHistory
@@ -170,11 +172,15 @@ class Arrival:
                 self._frame = weakref.ref(frame)  # the frame refers to us: no circle that only the collector breaks
             return frame
 
+    def _picture(self) -> NDArray[np.uint8]:
+        """As BGR. Raises :class:`DecodeError`."""
+        assert self._pixels is not None
+        return to_bgr(self.header, self._pixels)
+
     def _make(self) -> Frame:
         image = self._image
         if image is None:
-            assert self._pixels is not None
-            image = self._image = to_bgr(self.header, self._pixels)
+            image = self._image = self._picture()
             if image.flags.writeable:
                 image.flags.writeable = False
             self._pixels = None
@@ -190,6 +196,36 @@ class Arrival:
         if final:
             self._state = feedback, reach_s
         return feedback, reach_s
+
+
+class SmallArrival(Arrival):
+    """A frame that came larger than this consumer wants it, and is made smaller when somebody looks."""
+
+    __slots__ = ("_full",)
+
+    def __init__(
+        self,
+        header: FrameHeader,
+        pixels: Pixels,
+        received_ns: int,
+        offset_ns: int,
+        history: FeedbackHistory,
+        clock: Clock,
+        scale: float,
+    ) -> None:
+        small = msgspec.structs.replace(scaled_header(header, scale), encoding=Encoding.BGR8)
+        small = msgspec.structs.replace(small, size=small.width * small.height * 3)
+        super().__init__(small, pixels, received_ns, offset_ns, history, clock)
+        self._full = header
+
+    def as_came(self) -> Pixels | None:
+        """None: it did not come so."""
+        return None
+
+    def _picture(self) -> NDArray[np.uint8]:
+        assert self._pixels is not None
+        picture: NDArray[np.uint8] = resized(to_bgr(self._full, self._pixels), self.header)
+        return picture
 
 
 def size_error(header: FrameHeader, size: int) -> str:

@@ -26,6 +26,8 @@ from skyloop.messages import (
     Hello,
     LinkState,
     LogEntry,
+    ProcessorResult,
+    ProcessorShare,
     Refused,
     Welcome,
 )
@@ -66,12 +68,14 @@ class LinkUser(Protocol):
         """Called while connected, at the time that it returned last [ns] or earlier."""
 
     def feedback(self, sample: Feedback, now_ns: int) -> None: ...
-    def frame(self, header: FrameHeader, pixels: Pixels, now_ns: int) -> None: ...
+    def frame(self, header: FrameHeader, pixels: Pixels, now_ns: int, topic: str = "") -> None: ...
     def event(self, event: Event, now_ns: int) -> None: ...
     def applied(self, applied: Applied, now_ns: int) -> None: ...
     def annotation(self, annotation: Annotation, now_ns: int) -> None: ...
     def log_entry(self, entry: LogEntry, now_ns: int) -> None: ...
     def encoded(self, picture: EncodedFrame, now_ns: int) -> None: ...
+    def result(self, result: ProcessorResult, now_ns: int) -> None: ...
+    def share(self, share: ProcessorShare, now_ns: int) -> None: ...
 
 
 class Link:
@@ -162,6 +166,12 @@ class Link:
         """The proxy's clock less ours."""
         connection = self._connection
         return 0 if connection is None else connection.offset_ns
+
+    @property
+    def uncertainty_ns(self) -> int:
+        """How wrong :attr:`offset_ns` may be; 0 where both ends read one clock."""
+        connection = self._connection
+        return 0 if connection is None else connection.uncertainty_ns
 
     def poke(self) -> None:
         """Let the link's thread look now what there is to do."""

@@ -52,8 +52,9 @@ class Logbook:
         known = [(_named(name), _finite(name, value)) for name, value in values.items()]
         return sum(self._send(name, number=value) for name, value in known) == len(known)
 
-    def array(self, name: str, values: ArrayLike) -> bool:
-        """An array of at most 4096 real numbers in up to 8 dimensions, of the series ``name``."""
+    def array(self, name: str, values: ArrayLike, *, at_ns: int | None = None) -> bool:
+        """An array of at most 4096 real numbers in up to 8 dimensions, of the series ``name``; ``at_ns``: when it was
+        so, on the proxy's clock (default: now)."""
         try:
             array = np.asarray(values, dtype=np.float64)
         except (TypeError, ValueError):
@@ -65,10 +66,11 @@ class Logbook:
             )
         if not np.isfinite(array).all():
             raise UsageError(f"{name} holds numbers that are not finite")
-        return self._send(_named(name), values=tuple(array.ravel().tolist()), shape=array.shape)
+        return self._send(_named(name), at_ns, values=tuple(array.ravel().tolist()), shape=array.shape)
 
-    def _send(self, name: str, **fields: Any) -> bool:
-        return self._link.transmit(encode(LogEntry(self._source, name, self._now_ns(), **fields)))
+    def _send(self, name: str, at_ns: int | None = None, **fields: Any) -> bool:
+        known_ns = self._now_ns() if at_ns is None else at_ns
+        return self._link.transmit(encode(LogEntry(self._source, name, known_ns, **fields)))
 
 
 def _named(name: object) -> str:

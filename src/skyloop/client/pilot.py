@@ -12,10 +12,9 @@ from skyloop.client.delivery import Tell
 from skyloop.client.link import Link
 from skyloop.client.pace import Pace
 from skyloop.client.statistics import ChannelCounter
-from skyloop.errors import AuthorityError, LinkError, NoAnswerError, UsageError
+from skyloop.errors import AuthorityError, LinkError, NoAnswerError
 from skyloop.messages import (
-    HIGHEST_PRIORITY,
-    LOWEST_PRIORITY,
+    AnswerTakeover,
     AnyAction,
     AnyReply,
     AuthorityGranted,
@@ -31,6 +30,7 @@ from skyloop.messages import (
     Role,
     encode,
 )
+from skyloop.messages.config import MAX_REASON
 
 ANSWER_S: Final = 2.0  #: how long the proxy may take to answer a request for the authority
 _LATER_NS: Final = 1_000_000_000
@@ -84,6 +84,11 @@ class Pilot:
         return self._seq
 
     @property
+    def open_ns(self) -> int:
+        """From when on a new set-point goes out at once, on our clock."""
+        return self._commander.open_ns
+
+    @property
     def wants_flight(self) -> bool:
         """Whether the newest intent keeps, or brings, the vehicle in the air."""
         return self._commander.wants_flight
@@ -114,14 +119,18 @@ class Pilot:
         self.link.poke()  # a moment later, on the link's thread: the last one went out just before
         return True
 
-    def request(self, priority: int, wait_s: float) -> AuthorityStatus:
+    def drop(self, action: AnyAction) -> None:
+        """Want this no longer, if it is the newest set-point."""
+        with self._lock:
+            if self._commander.action is action:
+                self._commander.clear()
+
+    def request(self, wish: RequestAuthority, wait_s: float, *, stay: bool = False) -> AuthorityStatus:
         """Ask for the authority and wait for it. See :meth:`skyloop.client.drone.Drone.request_authority`."""
-        if not isinstance(priority, int) or not HIGHEST_PRIORITY <= priority <= LOWEST_PRIORITY:
-            raise UsageError(f"priority is {priority!r} and must be a whole number from 0 (highest) to 31 (lowest)")
         if self._role is Role.OBSERVER:
             raise AuthorityError('this application observes: connect with access="pilot" to fly', code="observer")
         with self._lock:
-            self._authority.asked(priority)
+            self._authority.asked(wish)
             self._refusal = None
             self._ask_now = True
         self.link.poke()
@@ -130,12 +139,16 @@ class Pilot:
             raise NoAnswerError(f"the proxy did not answer the request for the authority within {ANSWER_S:g} s")
         self.bell.wait_for(lambda: self._authority.held or not self._authority.wanted, max(0.0, wait_s))
         status, refusal = self.status, self._refusal
-        if status.state == "held":
+        if status.state == "held" or (stay and status.state in ("queued", "preempted")):
             return status
         self.release(wait=False)
         if refusal is not None:
             raise AuthorityError(f"the authority was refused: {refusal.message}", code=refusal.code.value)
-        raise AuthorityError(_busy(status, wait_s), code="busy")
+        raise AuthorityError(_busy(status, wait_s, self._authority.declined), code="busy")
+
+    def answer(self, lease: int, app_id: int, grant: bool, reason: str) -> None:
+        """Answer an application that asks for the authority. Too late an answer changes nothing."""
+        self.link.ask(AnswerTakeover(lease, app_id, grant, reason[:MAX_REASON]), lambda _: None, ANSWER_S)
 
     def release(self, *, wait: bool = True) -> None:
         """Give the authority back, or leave the line. Does nothing for who has and wants none."""
@@ -186,19 +199,19 @@ class Pilot:
 
     def tick(self, now_ns: int) -> int:
         """Send what is due; returns when to call again."""
-        priority, stalled, due_ns = None, False, now_ns + _LATER_NS
+        wish, stalled, due_ns = None, False, now_ns + _LATER_NS
         with self._lock:
             authority = self._authority
             if authority.wanted and (self._ask_now or (authority.status.state == "none" and not authority.pending)):
                 self._ask_now = False
-                priority = authority.status.priority
-                authority.asked(priority)
+                wish = authority.wish
+                authority.asked(wish)
             if authority.held or isinstance(self._commander.action, EmergencyStop):
                 if self._commander.due_ns <= now_ns:
                     stalled = self._decay(now_ns)
                 due_ns = self._commander.due_ns
-        if priority is not None:
-            self.link.ask(RequestAuthority(priority), self._answered, ANSWER_S)
+        if wish is not None:
+            self.link.ask(wish, self._answered, ANSWER_S)
         if stalled:
             text = "the application made no call for too long: its set-point decayed to hover"
             self._tell(EventKind.FAILSAFE, text, step="hover", reason="stalled")
@@ -233,9 +246,9 @@ class Pilot:
             if not self._authority.wanted:
                 return  # given back in the meantime
             if isinstance(answer, AuthorityGranted):
-                changed = self._authority.granted(answer.lease, now_ns)
+                changed = self._authority.granted(answer.lease, now_ns, answer.until_ns or None)
             elif isinstance(answer, AuthorityQueued):
-                changed = self._authority.queued(answer.position, answer.holder)
+                changed = self._authority.queued(answer.position, answer.holder, answer.wait_s)
             elif isinstance(answer, Refused):
                 self._refusal = answer
                 changed = self._authority.refused()
@@ -285,9 +298,12 @@ class Pilot:
         return AuthorityError(f"{action.name}: call request_authority() first", code="no_authority")
 
 
-def _busy(status: AuthorityStatus, wait_s: float) -> str:
+def _busy(status: AuthorityStatus, wait_s: float, declined: str) -> str:
     waited = f" and did not give it back within {wait_s:g} s" if wait_s > 0 else ""
+    expected = status.expected_wait_s
+    words = f" (number {status.position} in line, expected wait {expected:.0f} s)" if expected is not None else ""
+    said = f"; {declined}" if declined else ""
     return (
-        f"{status.holder or 'another application'} holds the authority{waited}: wait longer (wait_s), ask with a "
-        'higher priority (a lower number, 0 is the highest), or look on with access="observe"'
+        f"{status.holder or 'another application'} holds the authority{waited}{words}{said}: wait longer (wait_s), ask "
+        'with a higher priority (a lower number, 0 is the highest), or look on with access="observe"'
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, Final, TypeVar
+from typing import Any, Final, Protocol, TypedDict, TypeVar, Unpack
 
 import msgspec
 import numpy as np
@@ -14,14 +14,31 @@ from skyloop.client.frame import Arrival, Frame
 from skyloop.client.handle import Handle
 from skyloop.client.inbox import Inbox
 from skyloop.client.reception import LinkStatus, VideoChannel
+from skyloop.client.results import ResultSlot, checked_age, checked_name
 from skyloop.client.slots import Buffer
 from skyloop.errors import ClosedError, NoAnswerError, UnknownNameError, UnsupportedError, UsageError
 from skyloop.messages import Annotation, Applied, Event, EventKind, Feedback, FlightState, LogEntry, Severity, encode
 from skyloop.messages.annotation import Shape
+from skyloop.messages.video import DEFAULT_QUALITY, VideoEncoding, VideoRequest
 
 T = TypeVar("T")
 #: What :meth:`Reading.wait` waits for: a flight state (or its name), one of several, or a predicate on feedback.
 Wanted = FlightState | str | Iterable[FlightState | str] | Callable[[Feedback], bool]
+
+
+class _Closable(Protocol):
+    def close(self) -> None: ...
+
+
+class VideoOptions(TypedDict, total=False):
+    """How frames are to come; see :meth:`Reading.frames`."""
+
+    encoding: VideoEncoding
+    quality: int
+    max_fps: float
+    scale: float
+    part: tuple[int, int]
+
 
 EVENT_DEPTH: Final = 256  #: events, and other things of which none should be missed, that wait for a slow listener
 
@@ -32,7 +49,7 @@ class Reading(Handle):
     def __init__(self) -> None:
         super().__init__()
         self._listeners: list[Listener[Any]] = []
-        self._buffers: list[Buffer[Arrival]] = []
+        self._buffers: list[_Closable] = []  # at which somebody may wait
         self._read: Feedback | None = None  # what next_feedback() gave last
 
     # Reading ---------------------------------------------------------------------------------------------------
@@ -44,11 +61,15 @@ class Reading(Handle):
         if newest is None:
             raise NoAnswerError("no feedback has come yet")
         if max_age_s is not None:
-            age_s = (self._now_ns() - newest.captured_ns) / 1e9
+            age_s = self.age_s(newest)
             if age_s > max_age_s:
                 raise NoAnswerError(f"the newest feedback is {age_s:.3f} s old, {max_age_s:g} s were allowed")
         self._read = newest
         return newest
+
+    def age_s(self, sample: Feedback | Frame) -> float:
+        """Time since the sample's capture [s], true to ``clock_uncertainty_ns`` on whichever host it was taken."""
+        return (self._now_ns() - sample.captured_ns) / 1e9
 
     def next_feedback(self, timeout_s: float = 1.0) -> Feedback:
         """The newest feedback that was not read before, waited for. Raises :class:`NoAnswerError`."""
@@ -81,9 +102,21 @@ class Reading(Handle):
                 return frame
         raise NoAnswerError(f"no frame of {channel.camera.name} came within {timeout_s:g} s")
 
-    def frames(self, camera: str | None = None, *, timeout_s: float = 5.0) -> Iterator[Frame]:
-        """Each newest frame, until the drone is closed; slow loops skip frames. Raises :class:`NoAnswerError`."""
-        channel = self.channel(camera)
+    def frames(
+        self,
+        camera: str | None = None,
+        *,
+        timeout_s: float = 5.0,
+        **how: Unpack[VideoOptions],
+    ) -> Iterator[Frame]:
+        """Each newest frame, until the drone is closed; slow loops skip frames. Raises :class:`NoAnswerError`.
+
+        ``max_fps``: at most so many a second; ``scale``: width and height times this, up to 1; ``part``: (k, n), only
+        every n-th frame, for n workers with k from 0 that share them. ``encoding``: how they travel over a network,
+        ``"jpeg"`` (of ``quality`` 1 to 100, default 80) or ``"raw"``; on one host all travel raw. Raises
+        :class:`UsageError` for values that make no sense.
+        """
+        channel = self.channel(camera, **how)
         buffer: Buffer[Arrival] = Buffer(bell=self._reception.pace.bell())
         sink = buffer.put
         self._buffers.append(buffer)
@@ -108,7 +141,7 @@ class Reading(Handle):
         """
         self._check_open()
         self._check_may_wait()
-        wanted, what = _predicate(state)
+        wanted, what = as_predicate(state)
         met: list[Feedback] = []
 
         def look() -> bool:
@@ -164,11 +197,15 @@ class Reading(Handle):
         name: str | None = None,
         depth: int = 1,
         inline: bool = False,
+        **how: Unpack[VideoOptions],
     ) -> Processor[Arrival]:
-        """Call with frames, on a thread of its own that takes the newest ``depth``, or inline on the receiving one."""
+        """Call with frames, on a thread of its own that takes the newest ``depth``, or inline on the receiving one.
+
+        ``how``: as for :meth:`frames`.
+        """
         if depth < 1:
             raise UsageError(f"depth is {depth!r} and must be at least 1 frame")
-        channel = self.channel(camera)
+        channel = self.channel(camera, **how)
 
         def process(arrival: Arrival) -> None:
             frame = channel.picture(arrival)
@@ -178,9 +215,30 @@ class Reading(Handle):
         label = name or getattr(function, "__name__", "processor")
         return self._listen(channel.topic, process, f"processor {label}", depth=depth, inline=inline)
 
-    def inbox(self, *, feedback: bool = True, frames: bool = True, camera: str | None = None) -> Inbox:
-        """Newest feedback and frames for one thread to wait for together; what controllers run on."""
-        return Inbox(self._reception, feedback=feedback, channel=self.channel(camera) if frames else None)
+    def inbox(
+        self,
+        *,
+        feedback: bool = True,
+        frames: bool = True,
+        camera: str | None = None,
+        results: bool = False,
+        processors: Iterable[str] | None = None,
+        max_age_s: float | None = None,
+    ) -> Inbox:
+        """Newest feedback, frames and results for one thread to wait for together; what controllers run on.
+
+        ``processors``: whose results, None: everybody's; ``max_age_s``: how old they may be.
+        """
+        channels = self._reception.results
+        named = None if processors is None else [checked_name(one) for one in processors]
+        topics = [channels.everything] if named is None else [channels.channel(one).topic for one in named]
+        return Inbox(
+            self._reception,
+            feedback=feedback,
+            channel=self.channel(camera) if frames else None,
+            results=topics if results else [],
+            slot=ResultSlot(checked_age(max_age_s), self._reception.pace.bell()),
+        )
 
     def annotate(self, frame: Frame, shapes: Iterable[Shape], source: str | None = None) -> bool:
         """Publish what was seen in a frame, in its pixels, for the cockpit and recorders; False if it was not sent.
@@ -207,19 +265,38 @@ class Reading(Handle):
         """Now, on the proxy's clock."""
         return self._reception.pace.clock() + self._link.offset_ns
 
-    def channel(self, camera: str | None = None) -> VideoChannel:
-        """The channel of a camera (None: the first). Raises :class:`UnknownNameError`, or :class:`UnsupportedError`
-        for a vehicle that has none."""
+    def channel(
+        self,
+        camera: str | None = None,
+        *,
+        encoding: VideoEncoding | None = None,
+        quality: int | None = None,
+        max_fps: float | None = None,
+        scale: float = 1.0,
+        part: tuple[int, int] | None = None,
+    ) -> VideoChannel:
+        """The channel of a camera (None: the first), of its frames as they are asked for; see :meth:`frames`.
+
+        Raises :class:`UnknownNameError`, or :class:`UnsupportedError` for a vehicle that has none.
+        """
         self._check_open()
         channels = self._reception.channels
         if not channels:
             raise UnsupportedError("no camera: this vehicle gives no pictures")
-        if camera is None:
-            return next(iter(channels.values()))
-        channel = channels.get(camera)
+        channel = next(iter(channels.values())) if camera is None else channels.get(camera)
         if channel is None:
-            raise UnknownNameError("camera", camera, channels)
-        return channel
+            raise UnknownNameError("camera", str(camera), channels)
+        if encoding == "raw" and quality is not None:
+            raise UsageError(f'quality={quality!r} is of encoding="jpeg", and the encoding is "raw"')
+        request = VideoRequest(
+            channel.camera.name,
+            encoding="jpeg" if encoding is None else encoding,
+            quality=DEFAULT_QUALITY if quality is None else quality,
+            max_fps=max_fps,
+            scale=scale,
+            part=part,
+        )
+        return channel if request == channel.request else self._reception.asked(channel.camera, request)
 
     def _listen(
         self,
@@ -230,15 +307,18 @@ class Reading(Handle):
         depth: int = 1,
         inline: bool = False,
     ) -> Listener[T]:
-        self._check_open()
-        if not callable(function):
-            raise UsageError(f"{function!r:.80} can't be called: a function with one argument is needed")
+        self._check_listener(function)
         inline = inline or self._reception.pace.in_step
         listener = Listener(
             function, topic, self._report, name=name, depth=depth, inline=inline, on_cancel=self._cancelled
         )
         self._listeners.append(listener)
         return listener
+
+    def _check_listener(self, function: Callable[[Any], object]) -> None:
+        self._check_open()
+        if not callable(function):
+            raise UsageError(f"{function!r:.80} can't be called: a function with one argument is needed")
 
     def _cancelled(self, listener: Listener[Any]) -> None:
         if listener in self._listeners:
@@ -256,10 +336,11 @@ def _from_numpy(value: Any) -> Any:
     raise TypeError(f"{type(value).__name__} is neither a shape nor a number")
 
 
-def _predicate(wanted: Wanted) -> tuple[Callable[[Feedback], bool], str]:
+def as_predicate(wanted: Wanted) -> tuple[Callable[[Feedback], bool], str]:
     """The test and its name for people."""
     if callable(wanted):
-        return wanted, getattr(wanted, "__name__", "as wanted")
+        name = getattr(wanted, "__name__", "<lambda>")
+        return wanted, "as wanted" if name == "<lambda>" else name
     names = [wanted] if isinstance(wanted, str) else list(wanted)
     known = {state.value for state in FlightState}
     for name in names:

@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from skyloop.client.delivery import Topic
-from skyloop.client.frame import Arrival, Frame
+from skyloop.client.frame import Arrival, Frame, SmallArrival
 from skyloop.client.history import FeedbackHistory
 from skyloop.client.monitor import StallWatch
 from skyloop.client.pace import Pace
+from skyloop.client.results import ResultChannels
 from skyloop.client.statistics import ChannelCounter, ChannelStats
 from skyloop.errors import DecodeError
 from skyloop.messages import (
@@ -24,9 +25,13 @@ from skyloop.messages import (
     FrameHeader,
     LinkState,
     LogEntry,
+    ProcessorResult,
+    ProcessorShare,
     Severity,
+    VideoRequest,
     Welcome,
 )
+from skyloop.messages.video import FrameFilter
 from skyloop.transport.base import ANNOTATIONS, COMMANDS, LOGS, Pixels, stream, video
 
 if TYPE_CHECKING:
@@ -48,25 +53,27 @@ class LinkStatus:
 
 
 class VideoChannel:
-    """One camera's frames. The first consumer subscribes to it, the last one that goes ends that."""
+    """One camera's frames as one request wants them. The first consumer subscribes to it, the last one that goes ends
+    that."""
 
-    def __init__(self, camera: CameraInfo, link: Link, pace: Pace) -> None:
+    def __init__(self, camera: CameraInfo, link: Link, pace: Pace, request: VideoRequest | None = None) -> None:
         self.camera = camera
+        self.request = request or usual(camera.name)
+        #: Of its statistics: the camera's plain topic for frames as they usually come.
+        self.name = video(camera.name) if self.request == usual(camera.name) else self.request.topic
+        self.filter = FrameFilter(self.request)
         self.newest: Arrival | None = None
         self.bell = pace.bell()
         self.counter = ChannelCounter()
         self.undecodable = 0
-        self.watch = StallWatch(max(1.0, 5.0 / camera.fps if camera.fps > 0 else 1.0), pace.clock())
+        self.watch = StallWatch(max(1.0, 5.0 * self._period_s(camera.fps)), pace.clock())
         self.keep = False  #: subscribed for good, by ``frame()`` or ``next_frame()``
+        self.subscribed = False
         self._read: Arrival | None = None  # what next_frame() gave last
         self._link = link
         self.topic: Topic[Arrival] = Topic(self._wanted)
         #: Pictures as the vehicle encoded them, for consumers that want them so; on the receiving thread.
         self.stream: Topic[EncodedFrame] = Topic(lambda on: link.subscribe(stream(camera.name), on))
-
-    @property
-    def name(self) -> str:
-        return video(self.camera.name)
 
     @property
     def unread(self) -> bool:
@@ -81,8 +88,8 @@ class VideoChannel:
     def keep_newest(self) -> None:
         """Subscribe for good."""
         if not self.keep:
-            self.keep = True
-            self._link.subscribe(self.name)
+            self.keep = self.subscribed = True
+            self._link.subscribe(self.request.topic)
 
     def picture(self, arrival: Arrival) -> Frame | None:
         """The frame; None, and counted, if its pixels can't be understood."""
@@ -94,7 +101,20 @@ class VideoChannel:
 
     def _wanted(self, wanted: bool) -> None:
         if not self.keep:
-            self._link.subscribe(self.name, wanted)
+            self.subscribed = wanted
+            self._link.subscribe(self.request.topic, wanted)
+
+    def _period_s(self, fps: float) -> float:
+        """Time between two frames of this request, as far as is known."""
+        most = self.request.max_fps
+        rate = min(fps, most) if fps > 0.0 and most is not None else fps or most or 0.0
+        parts = 1 if self.request.part is None else self.request.part[1]
+        return parts / rate if rate > 0.0 else 0.0
+
+
+def usual(camera: str) -> VideoRequest:
+    """How a camera's frames come to those who ask for nothing in particular: as JPEG where they travel far."""
+    return VideoRequest(camera, encoding="jpeg")
 
 
 class Reception:
@@ -115,7 +135,8 @@ class Reception:
         self.refusal: Event | None = None  #: the last command of ours that was refused
         self.recent: deque[Event] = deque(maxlen=RECENT_EVENTS)
         self.status = LinkStatus(LinkState.CONNECTING, LinkState.CONNECTING)
-        self.channels: dict[str, VideoChannel] = {}
+        self.channels: dict[str, VideoChannel] = {}  #: by camera: frames as they usually come
+        self.variants: dict[str, VideoChannel] = {}  #: the same, and frames as anybody asked for them, by topic
         self.counter = ChannelCounter()
         self.echoes = ChannelCounter()
         self.on_feedback: Topic[Feedback] = Topic()
@@ -124,6 +145,9 @@ class Reception:
         self.on_command: Topic[Applied] = Topic(lambda on: self.link.subscribe(COMMANDS, on))
         self.on_annotation: Topic[Annotation] = Topic(lambda on: self.link.subscribe(ANNOTATIONS, on))
         self.on_log: Topic[LogEntry] = Topic(lambda on: self.link.subscribe(LOGS, on))
+        self.on_share: Topic[ProcessorShare] = Topic()
+        self.on_welcome: Topic[Welcome] = Topic()  #: a proxy was connected; on the link's thread
+        self.results = ResultChannels(self.pace, self.history)
 
     # What the link calls ---------------------------------------------------------------------------------------
 
@@ -131,13 +155,16 @@ class Reception:
         self.welcome = welcome
         now_ns = self._clock()
         self.counter.last_seq = None
-        for channel in self.channels.values():
+        for channel in self.variants.values():
             channel.counter.last_seq = None
             channel.watch.heard_ns = now_ns
         for camera in welcome.capabilities.cameras:
             if camera.name not in self.channels:
-                self.channels[camera.name] = VideoChannel(camera, self.link, self.pace)
+                channel = self.channels[camera.name] = VideoChannel(camera, self.link, self.pace)
+                self.variants[channel.request.topic] = channel
+        self.results.restart()
         self.pilot.connected(welcome.app_id)
+        self.on_welcome.publish(welcome)
 
     def disconnected(self, reason: str) -> None:  # noqa: ARG002  (told by link_changed)
         self.config.disconnected()
@@ -151,9 +178,9 @@ class Reception:
 
     def tick(self, now_ns: int) -> int:
         flows = self.link.state is LinkState.UP
-        for channel in self.channels.values():
+        for channel in tuple(self.variants.values()):
             if channel.watch.stalled(flows, now_ns):
-                self.link.resubscribe(channel.name)
+                self.link.resubscribe(channel.request.topic)
         return self.pilot.tick(now_ns)
 
     def feedback(self, sample: Feedback, now_ns: int) -> None:
@@ -176,16 +203,30 @@ class Reception:
         if sample.vehicle_link is not self.status.vehicle:
             self._status_changed(replace(self.status, vehicle=sample.vehicle_link, reason=self._vehicle_reason()))
 
-    def frame(self, header: FrameHeader, pixels: Pixels, now_ns: int) -> None:
-        channel = self.channels.get(header.camera)
-        if channel is None:
-            return  # a camera that the proxy did not announce: nobody can have asked for it
+    def frame(self, header: FrameHeader, pixels: Pixels, now_ns: int, topic: str = "") -> None:
+        if topic:
+            channel = self.variants.get(topic)
+            if channel is not None:
+                self._arrived(channel, header, pixels, now_ns, as_asked=True)
+            return
+        for channel in tuple(self.variants.values()):
+            mine = channel.subscribed and channel.camera.name == header.camera
+            if mine and channel.filter.wants(header.seq, header.captured_ns):
+                self._arrived(channel, header, pixels, now_ns, as_asked=False)
+
+    def _arrived(
+        self, channel: VideoChannel, header: FrameHeader, pixels: Pixels, now_ns: int, *, as_asked: bool
+    ) -> None:
+        """A frame for one channel; ``as_asked``: it was made for this request by the proxy."""
         counter = channel.counter
         last = counter.last_seq
         if last is not None and header.seq <= last:
             return  # repeated or overtaken
-        offset_ns = self.link.offset_ns
-        arrival = Arrival(header, pixels, now_ns, offset_ns, self.history, self._clock)
+        offset_ns, scale = self.link.offset_ns, channel.request.scale
+        if as_asked or scale == 1.0:
+            arrival = Arrival(header, pixels, now_ns, offset_ns, self.history, self._clock)
+        else:
+            arrival = SmallArrival(header, pixels, now_ns, offset_ns, self.history, self._clock, scale)
         # First whoever waits for it, then the books. The frame before is let go of last: giving its memory back to the
         # proxy takes longer than all of this.
         before, channel.newest = channel.newest, arrival
@@ -195,6 +236,13 @@ class Reception:
         counter.follow(header.seq)
         counter.add(now_ns + offset_ns - header.published_ns, header.captured_ns - offset_ns, now_ns)
         channel.watch.heard_ns = now_ns
+
+    def asked(self, camera: CameraInfo, request: VideoRequest) -> VideoChannel:
+        """The channel of a request, made if nobody asked so before."""
+        channel = self.variants.get(request.topic)
+        if channel is None:
+            channel = self.variants[request.topic] = VideoChannel(camera, self.link, self.pace, request)
+        return channel
 
     def event(self, event: Event, now_ns: int) -> None:
         self.recent.append(event)
@@ -220,6 +268,12 @@ class Reception:
         if channel is not None:
             channel.stream.publish(picture)
 
+    def result(self, result: ProcessorResult, now_ns: int) -> None:
+        self.results.arrived(result, now_ns)
+
+    def share(self, share: ProcessorShare, now_ns: int) -> None:  # noqa: ARG002  (all are called alike)
+        self.on_share.publish(share)
+
     # For the drone ---------------------------------------------------------------------------------------------
 
     def tell(self, kind: EventKind, text: str, severity: Severity = Severity.WARNING, **data: str) -> None:
@@ -238,17 +292,22 @@ class Reception:
             "command": replace(self.pilot.sends.stats(now_ns, ages=False), delay_s=echoes.delay_s),
             "feedback": self.counter.stats(now_ns, dropped=self.on_feedback.dropped, malformed=link.malformed),
         }
-        for channel in self.channels.values():
+        for channel in tuple(self.variants.values()):
             found[channel.name] = channel.counter.stats(
                 now_ns, dropped=channel.topic.dropped, malformed=channel.undecodable
             )
+        for results in self.results.all():
+            dropped = results.topic.dropped + results.overtaken
+            found[results.name] = results.counter.stats(now_ns, dropped=dropped)
         return found
 
     def wake_all(self) -> None:
         """Let everybody who waits look again."""
         self.bell.ring()
-        for channel in self.channels.values():
+        for channel in tuple(self.variants.values()):
             channel.bell.ring()
+        for results in self.results.all():
+            results.bell.ring()
 
     def _status_changed(self, status: LinkStatus) -> None:
         self.status = status

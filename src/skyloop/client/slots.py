@@ -103,6 +103,11 @@ class Buffer(Generic[T]):
             self.delivered += 1
             return self._items.popleft()
 
+    def peek(self) -> T | None:
+        """What :meth:`take` would give, left where it is."""
+        with self._lock:
+            return self._items[0] if self._items else None
+
     def wait(self, timeout_s: float | None = None) -> T | None:
         """Like :meth:`take`, but waits; None if nothing came in time or the buffer was closed."""
         self.bell.wait_for(lambda: bool(self._items) or self.closed, timeout_s)

@@ -30,7 +30,8 @@ class ChannelStats:
     gaps in their numbers (for video this includes what the proxy left out); ``dropped``: pushed out by newer ones
     before their consumer took them (commands: could not be handed to the link); ``malformed``: not to be understood.
     ``delay_s``: from publishing (sending, for commands) to receiving, of the last 1024; ``age_s``: from the newest
-    sample's capture until now. None where nothing is known.
+    sample's capture until now. None where nothing is known. ``uncertainty_s``: how wrong both may be because two
+    computers' clocks had to be compared; 0 on one host.
     """
 
     count: int = 0
@@ -40,6 +41,7 @@ class ChannelStats:
     malformed: int = 0
     delay_s: Distribution | None = None
     age_s: float | None = None
+    uncertainty_s: float = 0.0
 
 
 def distribution(delays_ns: NDArray[np.int64]) -> Distribution | None:

@@ -8,6 +8,7 @@ import sys
 import threading
 from pathlib import Path
 
+from skyloop.client.by_name import network_settings
 from skyloop.cockpit.server import RECORDINGS, serve_cockpit
 from skyloop.errors import SkyloopError
 
@@ -31,6 +32,7 @@ def main(arguments: list[str] | None = None) -> int:
             recordings=given.recordings,
             on_ready=lambda address: print(address, flush=True),
             stop=stop,
+            network=network_settings(),
         )
     except SkyloopError as error:
         print(f"cockpit: {error}", file=sys.stderr)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from skyloop.clock import Clock, monotonic_ns, seconds
 from skyloop.messages import Annotation, Applied, Event, LogEntry
+from skyloop.messages.log import MOCAP as SERIES
 
 if TYPE_CHECKING:
     from skyloop.client import Drone, Frame
@@ -23,6 +24,7 @@ JPEG_QUALITY = 80
 KEPT_EVENTS = 256
 MAX_SERIES = 256  #: logged numbers that are shown of one drone
 WAYPOINTS = "waypoints"  #: name under which a controller logs where it flies to
+MOCAP_S = 0.5  #: a pose of motion capture that is older is not shown
 
 Wake = Callable[[], None]
 
@@ -164,6 +166,7 @@ class Listening:
         self._clock = clock
         self._numbers: dict[str, tuple[int, float]] = {}  # when it came, and the value
         self._waypoints: tuple[int, tuple[tuple[float, ...], ...]] | None = None
+        self._mocap: tuple[int, tuple[float, ...]] | None = None
         self._listeners: list[_Cancellable] = []
 
     def want(self, wanted: bool) -> None:
@@ -177,7 +180,7 @@ class Listening:
             for listener in self._listeners:
                 listener.cancel()
             self._listeners = []
-            self._numbers, self._waypoints, self.applied = {}, None, None
+            self._numbers, self._waypoints, self._mocap, self.applied = {}, None, None, None
 
     def numbers(self) -> dict[str, float]:
         """The newest value of each series that was logged lately."""
@@ -189,6 +192,11 @@ class Listening:
         told = self._waypoints
         return told[1] if told is not None and seconds(self._clock() - told[0]) <= self.KEPT_S else ()
 
+    def mocap(self) -> tuple[float, ...] | None:
+        """Where motion capture sees it now: x, y, z [m], quaternion x, y, z, w; None if it does not."""
+        told = self._mocap
+        return told[1] if told is not None and seconds(self._clock() - told[0]) <= MOCAP_S else None
+
     def _command(self, applied: Applied) -> None:
         self.applied = applied
 
@@ -196,6 +204,8 @@ class Listening:
         if entry.number is not None:
             if entry.name in self._numbers or len(self._numbers) < MAX_SERIES:
                 self._numbers[entry.name] = self._clock(), entry.number
+        elif entry.values is not None and entry.name == SERIES and len(entry.values) >= 7:
+            self._mocap = self._clock(), entry.values
         elif (
             entry.values is not None and entry.name == WAYPOINTS and len(entry.shape) == 2 and entry.shape[1] in (3, 4)
         ):

@@ -27,6 +27,9 @@ class Finder(Protocol):
     def also(self, name: str) -> None:
         """Find this one too, though only others were asked for."""
 
+    def close(self) -> None:
+        """Give back what looking needs. Idempotent."""
+
 
 class LocalFinder:
     """The proxies of this host that this user may reach: all, or those with a name that is wanted."""
@@ -40,9 +43,13 @@ class LocalFinder:
     def also(self, name: str) -> None:
         self._also.add(name)
 
+    def close(self) -> None:
+        """It holds nothing."""
+
     def __call__(self) -> list[Found]:
         from skyloop.transport.local import dial
-        from skyloop.transport.local.directory import NAME, find_directory, is_live
+        from skyloop.transport.local.directory import find_directory, is_live
+        from skyloop.transport.names import NAME
 
         folder = find_directory().path
         try:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from skyloop.client import AuthorityStatus, Drone
 
 
@@ -13,9 +15,9 @@ class Hands(Drone):
 
     _armed = False
 
-    def request_authority(self, priority: int | None = None, *, wait_s: float = 0.0) -> AuthorityStatus:
+    def request_authority(self, priority: int | None = None, **options: Any) -> AuthorityStatus:
         """Nothing until :meth:`take` was called."""
-        return super().request_authority(priority, wait_s=wait_s) if self._armed else self.authority
+        return super().request_authority(priority, **options) if self._armed else self.authority
 
     def take(self, priority: int) -> AuthorityStatus:
         """Ask for the authority, now. Raises :class:`AuthorityError` naming who has it."""

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from starlette.applications import Starlette
 
     from skyloop.cockpit.access import Gate
+    from skyloop.cockpit.finder import Finder
+    from skyloop.transport.fabric import FabricSettings
 
 NICENESS = 10  #: of the serving thread and of those that it starts: whoever flies comes first
 RECORDINGS = Path("recordings")  #: where recordings go if nothing else is said
@@ -71,12 +73,13 @@ def serve_cockpit(
     recordings: Path = RECORDINGS,
     on_ready: Callable[[str], None] | None = None,
     stop: threading.Event | None = None,
+    network: FabricSettings | None = None,
 ) -> None:
     """Serve the page until ``stop`` is set or a signal (Ctrl-C, SIGTERM) comes; the calling thread becomes nicer.
 
     ``names`` of the drones to show; none: all that there are, as they come and go. ``port`` 0 takes a free one.
     ``recordings``: the folder for recordings, made when it is needed. ``on_ready`` is called once on this thread with
-    the page's address (default: it is printed).
+    the page's address (default: it is printed). ``network``: show drones that can be reached over it too.
 
     Raises :class:`UsageError` for an address, port, or file that can't be used, :class:`UnknownNameError` if there is
     no proxy of a name given, :class:`MissingExtraError` if the cockpit's parts are missing.
@@ -101,19 +104,31 @@ def serve_cockpit(
     listening = _bind(address, port)
     try:
         gate = _gate(access, listening.getsockname()[1])
-        _check_names(names)
-        _serve(names, access, gate, tls, recordings, listening, on_ready or _tell, stop)
+        finder = _finder(names, network)
+        try:
+            _check_names(names, finder)
+            _serve(finder, names, access, gate, tls, recordings, listening, on_ready or _tell, stop)
+        finally:
+            finder.close()
     finally:
         listening.close()
 
 
-def _check_names(names: Sequence[str]) -> None:
+def _finder(names: Sequence[str], network: FabricSettings | None) -> Finder:
+    from skyloop.cockpit.far import NetworkFinder
+    from skyloop.cockpit.finder import LocalFinder
+
+    near = LocalFinder(names)
+    return near if network is None else NetworkFinder(near, network, frozenset(names))
+
+
+def _check_names(names: Sequence[str], finder: Finder) -> None:
     from skyloop.transport.local import list_names
 
-    known = [proxy.name for proxy in list_names()] if names else []
+    known = {found.name for found in finder()} if names else set()
     for name in names:
         if name not in known:
-            raise UnknownNameError("proxy", name, known)
+            raise UnknownNameError("proxy", name, known | {proxy.name for proxy in list_names()})
 
 
 def _gate(access: Access, port: int) -> Gate:
@@ -158,6 +173,7 @@ def _bind(address: str, port: int) -> socket.socket:
 
 
 def _serve(
+    finder: Finder,
     names: Sequence[str],
     access: Access,
     gate: Gate,
@@ -168,7 +184,6 @@ def _serve(
     stop: threading.Event | None,
 ) -> None:
     from skyloop.cockpit.app import create_app
-    from skyloop.cockpit.finder import LocalFinder
     from skyloop.cockpit.fleet import Fleet
     from skyloop.cockpit.recordings import Recordings
     from skyloop.cockpit.security import bind_address, own_names
@@ -176,7 +191,7 @@ def _serve(
     address, port = listening.getsockname()[:2]
     own_name = () if bind_address(address)[1] else (socket.gethostname(),)
     hosts = own_names(address, port, (*access.hostnames, *own_name), access.scheme)
-    app = create_app(Fleet(LocalFinder(names), kept=names), Recordings(recordings), hosts, gate)
+    app = create_app(Fleet(finder, kept=names), Recordings(recordings), hosts, gate)
     server = quiet_server(app, tls)
     page = f"{access.scheme}://{f'[{address}]' if ':' in address else address}:{port}/"
     os.nice(NICENESS)

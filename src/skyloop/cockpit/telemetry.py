@@ -16,6 +16,7 @@ from skyloop.cockpit.values import (
     event_values,
     feedback_values,
     flat_values,
+    mocap_values,
     motion_values,
     number,
     set_point_values,
@@ -118,7 +119,7 @@ class TelemetryView:
             "set_points": None
             if applied is None
             else set_point_values(applied.applied, self._age_s(applied.applied_ns)),
-            "truth": truth_values(native),
+            "truth": mocap_values(listening.mocap()) or truth_values(native),
             "targets": target_values(native),
             "waypoints": self._waypoints(),
         }

@@ -97,6 +97,14 @@ def set_point_values(action: AnyAction, age_s: float) -> Json:
     }
 
 
+def mocap_values(pose: tuple[float, ...] | None) -> Json | None:
+    """Where motion capture sees it: from position and quaternion x, y, z, w."""
+    if pose is None:
+        return None
+    x, y, z, w = pose[3:7]
+    return {"position": vector(pose[:3]), "yaw": number(math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))}
+
+
 def truth_values(native: Mapping[str, Value] | None) -> Json | None:
     """Where a simulated vehicle really is: ``native``'s ``truth.x``, ``.y``, ``.z`` [m] and ``.yaw`` [rad]."""
     return None if native is None else _place(native, "truth")

@@ -1,5 +1,53 @@
-"""Controllers: an application's own control loop as a class."""
+"""Controllers: an application's own control loop as a class; what they are made of, and ready ones."""
 
+from skyloop.control.approach import ApproachMarker, OrbitMarker, OrbitPlace
+from skyloop.control.avoid import SeeAndAvoid
+from skyloop.control.behaviour import Behaviour
 from skyloop.control.controller import Controller, RunSummary
+from skyloop.control.flow_hover import FlowHover
+from skyloop.control.follow import FollowMarker
+from skyloop.control.gates import FIVE_GATES, FlyThroughGates, GateKind
+from skyloop.control.heading import AlongPath, FixedYaw, LookAt, YawMode
+from skyloop.control.image_servo import ImageServo
+from skyloop.control.landing import LandOnMarker
+from skyloop.control.path import Circle, FunctionPath, Lemniscate, Path, Polyline, Spline
+from skyloop.control.path_following import FollowPath, TrackingError, Waypoints
+from skyloop.control.path_law import PathLaw, PathSettings
+from skyloop.control.position import DeadReckoning, Fix, PositionSource
+from skyloop.control.waypoint import Waypoint
 
-__all__ = ["Controller", "RunSummary"]
+__all__ = [
+    "AlongPath",
+    "ApproachMarker",
+    "Behaviour",
+    "Circle",
+    "Controller",
+    "DeadReckoning",
+    "FIVE_GATES",
+    "Fix",
+    "FixedYaw",
+    "FlowHover",
+    "FlyThroughGates",
+    "FollowMarker",
+    "FollowPath",
+    "FunctionPath",
+    "GateKind",
+    "ImageServo",
+    "LandOnMarker",
+    "Lemniscate",
+    "LookAt",
+    "OrbitMarker",
+    "OrbitPlace",
+    "Path",
+    "PathLaw",
+    "PathSettings",
+    "Polyline",
+    "PositionSource",
+    "RunSummary",
+    "SeeAndAvoid",
+    "Spline",
+    "TrackingError",
+    "Waypoint",
+    "Waypoints",
+    "YawMode",
+]

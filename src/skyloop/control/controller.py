@@ -15,6 +15,7 @@ from skyloop.messages import LinkState
 if TYPE_CHECKING:
     from skyloop.client import AuthorityStatus, Drone, Frame
     from skyloop.client.inbox import Inbox
+    from skyloop.client.results import Result
     from skyloop.messages import Feedback
 
 Reason = Literal["time", "until", "stopped", "closed"]
@@ -32,22 +33,34 @@ class RunSummary:
     overruns: int  #: callbacks that took so long that something was dropped meanwhile
     seconds: float
     reason: Reason  #: why it ended
+    results: int = 0  #: calls of ``on_result``
+    results_dropped: int = 0  #: results that newer ones replaced
+    results_expired: int = 0  #: results that were older than ``result_max_age_s`` when their turn came
 
     def __str__(self) -> str:
         return (
             f"{self.seconds:.1f} s until {self.reason}: {self.frames} frames ({self.frames_dropped} dropped), "
-            f"{self.feedback} feedback samples ({self.feedback_dropped} dropped), {self.overruns} overruns"
+            f"{self.feedback} feedback samples ({self.feedback_dropped} dropped), "
+            f"{self._results()}{self.overruns} overruns"
         )
+
+    def _results(self) -> str:
+        if not (self.results or self.results_dropped or self.results_expired):
+            return ""
+        return f"{self.results} results ({self.results_dropped} dropped, {self.results_expired} too old), "
 
 
 class Controller:
-    """Write ``on_feedback`` or ``on_frame``, or both, and call :meth:`run`.
+    """Write ``on_feedback``, ``on_frame`` or ``on_result``, or several, and call :meth:`run`.
 
     Each is called with the newest sample, one call at a time, on the thread that called :meth:`run`; what comes while
     a call is running is replaced by what is newer. ``camera`` names whose frames come; None: the vehicle's first.
+    ``processors`` names whose results come, None: everybody's; older ones than ``result_max_age_s`` are left out.
     """
 
     camera: str | None = None
+    processors: tuple[str, ...] | None = None
+    result_max_age_s: float | None = 1.0
 
     def __init__(self, drone: Drone) -> None:
         self.drone = drone
@@ -62,8 +75,16 @@ class Controller:
     def on_frame(self, frame: Frame) -> None:
         """Called with the newest frame: BGR, shape (height, width, 3), uint8, read-only."""
 
+    def on_result(self, result: Result) -> None:
+        """Called with the newest result of each processor; ``result.age_s`` is the time since its frame's capture."""
+
     def on_authority(self, status: AuthorityStatus) -> None:
         """Called once when a command failed because somebody else took over, and once when it is given back."""
+
+    def on_reload(self, before: Controller) -> None:
+        """Called once before the first sample, when this one takes the place of ``before`` in flight because its file
+        was saved (``skyloop fly --reload``): take over here what the older one knows, ``self.target = before.target``.
+        """
 
     # To be called ----------------------------------------------------------------------------------------------
 
@@ -84,8 +105,16 @@ class Controller:
             raise UsageError(f"seconds is {seconds!r} and must be 0 or more")
         own = type(self)
         wants_frames = own.on_frame is not Controller.on_frame
-        wants_feedback = own.on_feedback is not Controller.on_feedback or not wants_frames
-        inbox = self.drone.inbox(feedback=wants_feedback, frames=wants_frames, camera=self.camera)
+        wants_results = own.on_result is not Controller.on_result
+        wants_feedback = own.on_feedback is not Controller.on_feedback or not (wants_frames or wants_results)
+        inbox = self.drone.inbox(
+            feedback=wants_feedback,
+            frames=wants_frames,
+            camera=self.camera,
+            results=wants_results,
+            processors=self.processors,
+            max_age_s=self.result_max_age_s,
+        )
         self._stopped.clear()
         try:
             with inbox:
@@ -105,6 +134,7 @@ class _Run:
         self._stopped = stopped
         self._frames = 0
         self._feedback = 0
+        self._results = 0
         self._overruns = 0
         self._lost = False  # somebody took over, and the controller was told
 
@@ -128,6 +158,9 @@ class _Run:
             self._overruns,
             (self._inbox.clock() - started_ns) / NS_PER_S,
             reason,
+            self._results,
+            self._inbox.results_dropped,
+            self._inbox.results_expired,
         )
 
     def _over(self, deadline_ns: int | None, until: Callable[[], bool] | None) -> Reason | None:
@@ -153,9 +186,13 @@ class _Run:
         if frame is not None:
             self._frames += 1
             self._call(self._controller.on_frame, frame)
+        result = None if self._stopped.is_set() else self._inbox.result()
+        if result is not None:
+            self._results += 1
+            self._call(self._controller.on_result, result)
 
     def _call(self, callback: Callable[[Any], None], sample: Any) -> None:
-        dropped = self._inbox.frames_dropped + self._inbox.feedback_dropped
+        dropped = self._dropped()
         try:
             if self._lost and self._drone.authority.state == "held":
                 self._lost = False
@@ -164,8 +201,11 @@ class _Run:
         except BaseException:
             self._hover()
             raise
-        if self._inbox.frames_dropped + self._inbox.feedback_dropped > dropped:
+        if self._dropped() > dropped:
             self._overruns += 1
+
+    def _dropped(self) -> int:
+        return self._inbox.frames_dropped + self._inbox.feedback_dropped + self._inbox.results_dropped
 
     def _guarded(self, callback: Callable[[Any], None], sample: Any) -> None:
         try:

@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from skyloop.clock import nanoseconds
-from skyloop.control.controller import Controller
+from skyloop.control.behaviour import Behaviour
 from skyloop.control.follow_law import FollowLaw, FollowSettings, Mode
-from skyloop.errors import UnknownNameError
-from skyloop.messages import CameraInfo, Feedback, Points, Polyline, Text
+from skyloop.messages import Points, Polyline, Text
+from skyloop.messages.annotation import Colour, Shape
 from skyloop.vision import MarkerDetector, MarkerSighting
 
 if TYPE_CHECKING:
     from skyloop.client import Drone, Frame
 
-_BLIND_S = 0.5  # with no picture for so long, it holds its place rather than turn or fly on
-
-_COLOURS = {Mode.FOLLOWING: (64, 220, 100), Mode.RECOVERING: (255, 180, 60), Mode.SEARCHING: (120, 190, 255)}
-_OTHER = (150, 150, 150)
+_COLOURS: dict[Mode, Colour] = {
+    Mode.FOLLOWING: (64, 220, 100),
+    Mode.RECOVERING: (255, 180, 60),
+    Mode.SEARCHING: (120, 190, 255),
+}
+_OTHER: Colour = (150, 150, 150)
 
 
 @dataclass(slots=True)
@@ -55,11 +57,14 @@ class FollowScore:
             self.frames += 1
 
 
-class FollowMarker(Controller):
+class FollowMarker(Behaviour):
     """Finds a marker and follows it. The vehicle must be airborne when :meth:`run` is called.
 
     ``mode`` tells what it is doing, ``score`` how well it went; every frame is annotated with what was seen.
     """
+
+    name = "follow"
+    losses = frozenset({Mode.RECOVERING, Mode.SEARCHING})
 
     def __init__(
         self,
@@ -76,57 +81,50 @@ class FollowMarker(Controller):
         Raises :class:`UnknownNameError` for a camera or dictionary that is not there, :class:`MissingExtraError`
         without OpenCV.
         """
-        super().__init__(drone)
-        self.camera = camera
         self.marker_id = marker_id
         self.score = FollowScore()
-        self._law = FollowLaw(settings)
+        self._follow_law = FollowLaw(settings)
         self._detector = MarkerDetector(dictionary, size_m)
-        self._mounting = _mounting(drone, camera)
-        self._frame_ns: int | None = None  # capture of the newest frame
+        super().__init__(drone, self._follow_law, camera)
 
     @property
     def mode(self) -> Mode:
         """What it is doing: searching, following or recovering."""
-        return self._law.mode
+        return self._follow_law.mode
+
+    @property
+    def phase(self) -> Mode:
+        """The same as :attr:`mode`, by the name that all behaviours have for it."""
+        return self.mode
 
     @property
     def distance_m(self) -> float:
         """How far from the marker it wants to be."""
-        return self._law.settings.distance_m
+        return self._follow_law.settings.distance_m
 
-    def on_feedback(self, feedback: Feedback) -> None:
-        """Keep track of the vehicle's own motion; hold the place when pictures stop coming."""
-        self._law.feedback(feedback)
-        if self._frame_ns is not None and feedback.captured_ns - self._frame_ns > nanoseconds(_BLIND_S):
-            self.drone.hover()
-
-    def on_frame(self, frame: Frame) -> None:
-        """Look, decide, command, and draw what was seen."""
-        self._frame_ns = frame.captured_ns
+    def look(self, frame: Frame) -> list[Shape]:
+        """Take the marker if it is there, and count."""
         seen = self._detector.detect(frame)
         mine = next((one for one in seen if one.id == self.marker_id), None)
         self.score.count(frame.captured_ns, None if mine is None else self._use(mine, frame))
-        wanted = self._law.step(frame.captured_ns + nanoseconds(frame.age_s))
-        self.drone.velocity(forward=wanted.forward, left=wanted.left, up=wanted.up, yaw_rate=wanted.yaw_rate)
-        self.drone.annotate(frame, self._drawing(frame, seen, mine), source="follow")
+        return self._drawing(frame, seen, mine)
 
     def _use(self, sighting: MarkerSighting, frame: Frame) -> float:
         """Tell the law; returns how much too far the marker is [m]."""
         place = sighting.position_in_body(self._mounting)
         if frame.feedback is not None:
             normal = sighting.normal_in_body(self._mounting)
-            self._law.see(place, normal, frame.feedback, frame.captured_ns, trust=1.0 - sighting.ambiguity)
+            self._follow_law.see(place, normal, frame.feedback, frame.captured_ns, trust=1.0 - sighting.ambiguity)
         return math.hypot(*place) - self.distance_m
 
-    def _drawing(self, frame: Frame, seen: list[MarkerSighting], mine: MarkerSighting | None) -> list[Any]:
+    def _drawing(self, frame: Frame, seen: list[MarkerSighting], mine: MarkerSighting | None) -> list[Shape]:
         height, width = frame.shape[:2]
         colour = _COLOURS[self.mode]
-        shapes: list[Any] = [Polyline(_points(one), True, _OTHER) for one in seen if one is not mine]
+        shapes: list[Shape] = [Polyline(one.outline, True, _OTHER) for one in seen if one is not mine]
         if mine is None:
             shapes.append(Text(f"{self.mode} marker {self.marker_id}", (8.0, 16.0), colour))
             return shapes
-        outline = _points(mine)
+        outline = mine.outline
         centre = (sum(x for x, _ in outline) / 4, sum(y for _, y in outline) / 4)
         below = (min(x for x, _ in outline), max(y for _, y in outline) + 14.0)
         return [
@@ -136,16 +134,3 @@ class FollowMarker(Controller):
             Points((outline[0], centre), colour),
             Text(f"marker {mine.id}  {math.hypot(*mine.position_in_body(self._mounting)):.2f} m", below, colour),
         ]
-
-
-def _points(sighting: MarkerSighting) -> tuple[tuple[float, float], ...]:
-    return tuple((float(x), float(y)) for x, y in sighting.corners)
-
-
-def _mounting(drone: Drone, camera: str | None) -> CameraInfo:
-    cameras = {info.name: info for info in drone.capabilities.cameras}
-    if camera is None and cameras:
-        return next(iter(cameras.values()))
-    if camera not in cameras:
-        raise UnknownNameError("camera", camera or "", cameras)
-    return cameras[camera]

@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
+from skyloop.control.limiting import SetpointLimiter, SetpointLimits, clamped, shortened
+from skyloop.control.search import TurningSearch
 from skyloop.control.target import Motion, Odometry, TargetFilter
 from skyloop.messages import Feedback, Velocity
 from skyloop.messages.geometry import wrap_angle
@@ -38,8 +40,10 @@ class FollowSettings:
     range_gain: float = 1.1  #: [1/s]
     height_gain: float = 1.2  #: [1/s]
     yaw_gain: float = 2.2  #: [1/s]
+    #: Share of the velocity's error that is asked for on top: gusts push a vehicle with a soft velocity loop less far.
+    velocity_gain: float = 0.7
     aside_gain: float = 1.2  #: how fast to come round to the marker's front [1/s]
-    aside_rad: float = 0.3  #: seen from less than this aside, it stays where it is
+    aside_rad: float = 0.3  #: nearer than this to its station it stays where it is
     speed_m_s: float = 1.2  #: greatest, horizontally
     climb_m_s: float = 0.6
     turn_rad_s: float = 1.8
@@ -58,13 +62,21 @@ class FollowLaw:
     def __init__(self, settings: FollowSettings | None = None) -> None:
         self.settings = settings or FollowSettings()
         self.mode = Mode.SEARCHING
+        #: Where to be around the marker: how far counter-clockwise, seen from above, of straight before its face [rad];
+        #: and how fast that changes [rad/s].
+        self.station_rad = 0.0
+        self.station_rate_rad_s = 0.0
+        self.off_m: float | None = None  #: of distance and height together, as of the last step; None while searching
+        self.aside_rad: float | None = None  #: where it is, the same way; None while the face is not known
         self._odometry = Odometry()
         self._target = TargetFilter()
         self._face: Array | None = None  # which way the marker looks, horizontal part, odometry axes
         self._seen_ns: int | None = None
         self._altitude: float | None = None
-        self._search = _Search(self.settings)
-        self._last: tuple[int, Array] | None = None  # when and what was asked for last: forward, left, up, yaw rate
+        s = self.settings
+        self._search = TurningSearch(s.search_rad_s, s.search_heights_m, s.lowest_m, s.highest_m)
+        self._limiter = SetpointLimiter(SetpointLimits(speed_m_s=s.speed_m_s, acceleration_m_s2=s.acceleration_m_s2))
+        self._last_ns: int | None = None  # when something was asked for last
 
     def feedback(self, feedback: Feedback) -> None:
         """Take the vehicle's newest state."""
@@ -97,7 +109,7 @@ class FollowLaw:
         ahead = motion.moved_to(now_ns + nanoseconds(self.settings.lead_s))
         unseen_s = math.inf if self._seen_ns is None else seconds(now_ns - self._seen_ns)
         if unseen_s > self.settings.recovering_s:
-            self.mode = Mode.SEARCHING
+            self.mode, self.off_m = Mode.SEARCHING, None
             wanted = self._search.step(motion.yaw, self._altitude)
         else:
             self.mode = Mode.FOLLOWING if unseen_s <= self.settings.following_s else Mode.RECOVERING
@@ -117,78 +129,39 @@ class FollowLaw:
         sight = offset[:2] / across
         aside = np.array([-sight[1], sight[0]])  # to the left of the line of sight
         away = float(np.linalg.norm(offset)) - s.distance_m
+        self.off_m = math.hypot(away, float(offset[2]))
         horizontal = speed[:2] + sight * (s.range_gain * away) + aside * self._come_round(sight, across)
-        horizontal = _shortened(horizontal * fade, s.speed_m_s)
+        horizontal = shortened(horizontal * fade, s.speed_m_s)
         up = fade * s.height_gain * offset[2] + speed[2]
         error = wrap_angle(math.atan2(offset[1], offset[0]) - own.yaw)
         sweep = float((speed[:2] - own.velocity[:2]) @ aside) / across
         turn = s.yaw_gain * error + fade * 0.8 * sweep
-        c, si = math.cos(own.yaw), math.sin(own.yaw)
-        forward, left = c * horizontal[0] + si * horizontal[1], c * horizontal[1] - si * horizontal[0]
-        return np.array([forward, left, self._within_heights(up), max(-s.turn_rad_s, min(s.turn_rad_s, turn))])
+        velocity = own.stiffened(np.array([*horizontal, up]), s.velocity_gain)
+        up = self._within_heights(float(velocity[2]))
+        return np.array([*own.to_body(velocity[:2]), up, clamped(turn, s.turn_rad_s)])
 
     def _come_round(self, sight: Array, across: float) -> float:
-        """Speed to the left of the line of sight [m/s] that brings the vehicle before the marker's face."""
+        """Speed to the left of the line of sight [m/s] that brings the vehicle to its station around the marker."""
         s = self.settings
         if self._face is None or float(np.hypot(*self._face)) < 0.3:  # looks up or down, or every way in turn
+            self.aside_rad = None
             return 0.0
         # From the direction marker-to-vehicle round to where the marker looks, counter-clockwise.
         turned = float(self._face[0] * sight[1] - self._face[1] * sight[0])
-        angle = math.atan2(turned, -float(self._face @ sight))
-        excess = math.copysign(max(0.0, abs(angle) - s.aside_rad), angle)
-        return max(-0.9, min(0.9, -s.aside_gain * excess * across))
+        self.aside_rad = -math.atan2(turned, -float(self._face @ sight))
+        off = wrap_angle(self.station_rad - self.aside_rad)
+        excess = math.copysign(max(0.0, abs(off) - s.aside_rad), off)
+        return clamped(-(s.aside_gain * excess + self.station_rate_rad_s) * across, 0.9)
 
     def _within_heights(self, up: float) -> float:
         s = self.settings
         if self._altitude is not None:
             up = max(0.0, up) if self._altitude < s.lowest_m else up
             up = min(0.0, up) if self._altitude > s.highest_m else up
-        return max(-s.climb_m_s, min(s.climb_m_s, up))
+        return clamped(up, s.climb_m_s)
 
     def _smooth(self, wanted: Array, now_ns: int) -> Velocity:
         """Limits how fast the set-point changes."""
-        if self._last is not None:
-            before_ns, before = self._last
-            dt = max(0.0, min(0.2, seconds(now_ns - before_ns)))
-            change = wanted - before
-            change[:2] = _shortened(change[:2], self.settings.acceleration_m_s2 * dt)
-            wanted = before + change
-        self._last = (now_ns, wanted)
-        forward, left, up, yaw_rate = (float(v) for v in wanted)
-        return Velocity(forward=forward, left=left, up=up, yaw_rate=yaw_rate)
-
-
-class _Search:
-    """Turns on the spot; after each full turn goes to the next height."""
-
-    def __init__(self, settings: FollowSettings) -> None:
-        self._settings = settings
-        self._direction = 1.0
-        self._turned = 0.0
-        self._yaw: float | None = None
-        self._base: float | None = None
-
-    def restart(self, *, turning: float) -> None:
-        """The next search begins the way the vehicle is turning now [rad/s]."""
-        if abs(turning) > 0.05:
-            self._direction = math.copysign(1.0, turning)
-        self._turned, self._yaw, self._base = 0.0, None, None
-
-    def step(self, yaw: float, altitude: float | None) -> Array:
-        s = self._settings
-        if self._yaw is not None:
-            self._turned += abs(wrap_angle(yaw - self._yaw))
-        self._yaw = yaw
-        up = 0.0
-        if altitude is not None:
-            self._base = altitude if self._base is None else self._base
-            sweep = int(self._turned / (2 * math.pi))
-            goal = self._base + s.search_heights_m[sweep % len(s.search_heights_m)]
-            goal = max(s.lowest_m, min(s.highest_m, goal))
-            up = max(-0.4, min(0.4, 0.8 * (goal - altitude)))
-        return np.array([0.0, 0.0, up, self._direction * s.search_rad_s])
-
-
-def _shortened(vector: Array, longest: float) -> Array:
-    length = float(np.hypot(vector[0], vector[1]))
-    return vector if length <= longest else vector * (longest / length)
+        dt_s = 0.0 if self._last_ns is None else seconds(now_ns - self._last_ns)
+        self._last_ns = now_ns
+        return self._limiter.step(wanted, dt_s)

@@ -5,8 +5,9 @@ from __future__ import annotations
 import importlib.util
 import inspect
 import sys
+from importlib.machinery import SourceFileLoader
 from pathlib import Path
-from types import ModuleType
+from types import CodeType, ModuleType
 
 from skyloop.control.controller import Controller
 from skyloop.errors import FileFormatError, UnknownNameError, UsageError
@@ -20,11 +21,7 @@ def load_controller(path: str | Path, class_name: str | None = None) -> type[Con
     :class:`UnknownNameError` for a class that it lacks; :class:`UsageError` for a missing file or several classes.
     """
     file = Path(path)
-    if file.is_dir():
-        raise UsageError(f"{file} is a directory: give a Python file in it")
-    if not file.exists():
-        raise UsageError(f"there is no file {file}: give a Python file with a class derived from skyloop.Controller")
-    module = _run(file)
+    module = load_module(file, "a class derived from skyloop.Controller")
     found = {
         name: value
         for name, value in vars(module).items()
@@ -34,11 +31,22 @@ def load_controller(path: str | Path, class_name: str | None = None) -> type[Con
     return _choose(own or found, found, class_name, file)
 
 
+class _FreshLoader(SourceFileLoader):
+    """Compiles what the file holds now: Python's cache takes a file of the same second and size for the same one."""
+
+    def get_code(self, fullname: str) -> CodeType:
+        path = self.get_filename(fullname)
+        return self.source_to_code(self.get_data(path), path)
+
+
 def _run(file: Path) -> ModuleType:
     module_name = f"skyloop_user_{file.stem}"
-    spec = importlib.util.spec_from_file_location(module_name, file.resolve())
-    if spec is None or spec.loader is None:
+    if file.suffix != ".py":
         raise FileFormatError(f"{file} is not a Python file: its name must end in .py")
+    path = file.resolve()
+    spec = importlib.util.spec_from_file_location(module_name, path, loader=_FreshLoader(module_name, str(path)))
+    if spec is None or spec.loader is None:
+        raise FileFormatError(f"{file} can't be loaded as a Python module")
     module = importlib.util.module_from_spec(spec)
     folder = str(file.resolve().parent)
     if folder not in sys.path:
@@ -86,3 +94,15 @@ def _line_of(error: BaseException, file: Path) -> str:
 
 def _is(name: str | None, file: Path) -> bool:
     return name is not None and Path(name).resolve() == file.resolve()
+
+
+def load_module(file: Path, what: str) -> ModuleType:
+    """A Python file, run as a module of its own. ``what``: it should hold, for people.
+
+    Raises :class:`FileFormatError` for one that can't be read or run (with the line), :class:`UsageError` for none.
+    """
+    if file.is_dir():
+        raise UsageError(f"{file} is a directory: give a Python file in it")
+    if not file.exists():
+        raise UsageError(f"there is no file {file}: give a Python file with {what}")
+    return _run(file)

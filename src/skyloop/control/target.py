@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import seconds
+from skyloop.control.kalman import ConstantVelocityFilter
 from skyloop.messages import Feedback
 from skyloop.messages.geometry import rotation_from_euler, wrap_angle
 
@@ -41,6 +42,15 @@ class Motion:
         yaw = wrap_angle(self.yaw + self.yaw_rate * dt)
         return Motion(at_ns, self.position + self.velocity * dt, self.velocity, yaw, self.yaw_rate)
 
+    def to_body(self, horizontal: Array) -> tuple[float, float]:
+        """Forward and left, along the levelled body, of a horizontal vector (2,) in odometry axes."""
+        c, s = math.cos(self.yaw), math.sin(self.yaw)
+        return float(c * horizontal[0] + s * horizontal[1]), float(c * horizontal[1] - s * horizontal[0])
+
+    def stiffened(self, wanted: Array, share: float) -> Array:
+        """A wanted velocity (3,) in odometry axes, and this share of what the present one lacks of it on top."""
+        return wanted + share * (wanted - self.velocity)
+
 
 class Odometry:
     """Integrates feedback's velocity and keeps the last three seconds, so that a picture's capture can be placed."""
@@ -65,6 +75,11 @@ class Odometry:
         while seconds(feedback.captured_ns - self._history[0].at_ns) > _HISTORY_S:
             self._history.popleft()
 
+    @property
+    def newest(self) -> Motion | None:
+        """As of the last sample; None before the first."""
+        return self._history[-1] if self._history else None
+
     def at(self, at_ns: int) -> Motion | None:
         """The vehicle's motion at a time, from the nearest sample; None before the first sample."""
         if not self._history:
@@ -78,54 +93,30 @@ class Odometry:
 
 
 class TargetFilter:
-    """A constant-velocity Kalman filter of a point seen now and then; one covariance serves all three axes.
+    """A point that is carried about and seen now and then: a constant-velocity filter that begins anew after a jump."""
 
-    Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001, section 6.3.2
-    (discretised white-noise acceleration).
-    """
-
-    def __init__(self, *, acceleration_m_s2: float = 1.0, speed_m_s: float = 0.7) -> None:
-        """``acceleration_m_s2``: how hard the target is expected to change its velocity; ``speed_m_s``: how fast it
-        may be when first seen (both standard deviations)."""
-        self._acceleration = acceleration_m_s2
-        self._speed = speed_m_s
-        self._state = np.zeros((2, 3))  # position, velocity
-        self._covariance = np.zeros((2, 2))
-        self._at_ns: int | None = None
+    def __init__(self) -> None:
+        self._filter = ConstantVelocityFilter(3, intensity_m2_s3=0.1, speed_m_s=0.7, gate=math.inf)
 
     def see(self, position: Array, deviation_m: float, at_ns: int) -> None:
         """Take a measured position (3,) with its standard deviation. One older than the last is passed over.
 
         After two seconds unseen, or when the target is more than a metre (and five deviations) off, it starts anew.
         """
-        if self._at_ns is None:
-            self._restart(position, deviation_m, at_ns)
-            return
-        dt = seconds(at_ns - self._at_ns)
-        if dt < 0:
-            return
-        move = np.array([[1.0, dt], [0.0, 1.0]])
-        gain_in = np.array([dt * dt / 2, dt]) * self._acceleration
-        state = move @ self._state
-        covariance = move @ self._covariance @ move.T + np.outer(gain_in, gain_in)
-        spread = covariance[0, 0] + deviation_m**2
-        innovation = position - state[0]
-        if dt > 2.0 or float(np.linalg.norm(innovation)) > max(1.0, 5 * math.sqrt(spread)):
-            self._restart(position, deviation_m, at_ns)
-            return
-        gain = covariance[:, 0] / spread
-        self._state = state + np.outer(gain, innovation)
-        self._covariance = covariance - np.outer(gain, covariance[0])
-        self._at_ns = at_ns
+        newest = self._filter.newest
+        if newest is None or self._jumped(position, deviation_m, at_ns):
+            self._filter.start(position, deviation_m, at_ns)
+        else:
+            self._filter.update(position, deviation_m, at_ns)
 
     def at(self, at_ns: int, *, longest_s: float = 1.0) -> tuple[Array, Array]:
         """Predicted position (3,) [m] and velocity (3,) [m/s]; the motion is carried on for ``longest_s`` at most."""
-        if self._at_ns is None:
-            raise ValueError("the target was never seen")
-        dt = max(0.0, min(longest_s, seconds(at_ns - self._at_ns)))
-        return self._state[0] + self._state[1] * dt, self._state[1].copy()
+        estimate = self._filter.at(at_ns, longest_s=longest_s)
+        return estimate.position, estimate.velocity
 
-    def _restart(self, position: Array, deviation_m: float, at_ns: int) -> None:
-        self._state = np.vstack([position, np.zeros(3)])
-        self._covariance = np.diag([deviation_m**2, self._speed**2])
-        self._at_ns = at_ns
+    def _jumped(self, position: Array, deviation_m: float, at_ns: int) -> bool:
+        expected = self._filter.at(at_ns)
+        unseen_s = 0.0 if self._filter.newest is None else seconds(at_ns - self._filter.newest.at_ns)
+        spread = expected.covariance[0, 0] + deviation_m**2
+        off = float(np.linalg.norm(position - expected.position))
+        return unseen_s > 2.0 or (unseen_s >= 0.0 and off > max(1.0, 5 * math.sqrt(spread)))

@@ -14,8 +14,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from skyloop.drivers.seams import ExternalPose, Remark
 from skyloop.drivers.uri import VehicleUri
-from skyloop.errors import ParameterError, UnknownNameError, UsageError
+from skyloop.errors import ParameterError, UnknownNameError, UnsupportedError, UsageError
 from skyloop.messages import (
     AnyAction,
     Capabilities,
@@ -165,6 +166,20 @@ class Driver(ABC):
                 sink.event(EventKind.DRIVER_ERROR, f"failsafe {action.name} failed: {error!r}", Severity.ERROR)
             return False
         return True
+
+    # What some vehicles can do besides ---------------------------------------------------------------------------
+
+    def external_pose(self, pose: ExternalPose) -> None:  # noqa: ARG002
+        """Tell the vehicle where motion capture saw it, for flight without GPS. Any thread; returns at once.
+
+        Raises :class:`UnsupportedError` for a vehicle that takes none, :class:`skyloop.errors.DriverError` while it
+        can't be told.
+        """
+        raise UnsupportedError(f"{self.uri.scheme}:// takes no poses from outside")
+
+    def checkup(self) -> list[Remark]:
+        """What of the vehicle's settings wants attention before flying, for ``skyloop doctor ADDRESS``. While open."""
+        return []
 
     # To be written by a driver ---------------------------------------------------------------------------------
 

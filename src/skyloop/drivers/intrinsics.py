@@ -1,23 +1,32 @@
-"""A camera's intrinsics as options of a vehicle's address: ``fx``, ``fy``, ``cx``, ``cy`` [px] and ``distortion``."""
+"""A camera's intrinsics as options of a vehicle's address: ``calibration``, the file of one, or ``fx``, ``fy``, ``cx``,
+``cy`` [px] and ``distortion``."""
 
 from __future__ import annotations
 
 from typing import Final
 
+from skyloop.calibration import Calibration, load_calibration
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import UsageError
 from skyloop.messages import Intrinsics
 
-INTRINSICS_OPTIONS: Final = frozenset({"fx", "fy", "cx", "cy", "distortion"})
+INTRINSICS_OPTIONS: Final = frozenset({"calibration", "fx", "fy", "cx", "cy", "distortion"})
 
 
 def check_intrinsics(uri: VehicleUri) -> None:
     """Raises :class:`UsageError` for intrinsics that make no sense."""
-    intrinsics_of(uri, 1, 1)
+    if "calibration" in uri.options:
+        _calibration(uri)
+    else:
+        intrinsics_of(uri, 1, 1)
 
 
 def intrinsics_of(uri: VehicleUri, width: int, height: int) -> Intrinsics | None:
-    """Those of the address for pictures of this size; None unless it gives the focal length."""
+    """Those of the address for pictures of this size; None unless it gives the focal length, or a calibration of
+    pictures of this shape."""
+    if "calibration" in uri.options:
+        calibration = _calibration(uri)
+        return calibration.intrinsics_for(width, height) if calibration.fits(width, height) else None
     distortion = _distortion(uri)
     if "fx" not in uri.options:
         for option in sorted(INTRINSICS_OPTIONS & uri.options.keys()):
@@ -31,6 +40,12 @@ def intrinsics_of(uri: VehicleUri, width: int, height: int) -> Intrinsics | None
         cy=uri.number("cy", (height - 1) / 2),
         distortion=distortion,
     )
+
+
+def _calibration(uri: VehicleUri) -> Calibration:
+    for option in sorted(INTRINSICS_OPTIONS & uri.options.keys() - {"calibration"}):
+        raise UsageError(f"{uri}: option {option} does not go with calibration, which has it already")
+    return load_calibration(uri.options["calibration"])
 
 
 def _distortion(uri: VehicleUri) -> tuple[float, ...]:

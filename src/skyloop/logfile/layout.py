@@ -37,6 +37,7 @@ __all__ = [
     "Drops",
     "End",
     "FrameRecord",
+    "ResultRecord",
     "Start",
     "TYPES",
     "Topic",
@@ -50,6 +51,7 @@ __all__ = [
     "optical_frame",
     "parse_topic",
     "path_topic",
+    "mocap_topic",
     "pose_topic",
     "schema",
     "schema_name",
@@ -188,6 +190,7 @@ class Channel(StrEnum):
     PARAMETERS = "parameters"
     ANNOTATIONS = "annotations"
     LOGS = "logs"
+    RESULTS = "results"
     FRAMES = "frames"
     DROPS = "drops"
 
@@ -200,6 +203,20 @@ class FrameRecord(msgspec.Struct, frozen=True):
     received_ns: int  #: on the recorder's monotonic clock
     format: str  #: of the picture in the file: ``jpeg``, ``png``, ``h264``
     key: bool = True  #: it can be decoded without those before it, as all but some of ``h264`` can
+
+
+class ResultRecord(msgspec.Struct, frozen=True):
+    """What a processor made of a frame: a ``ProcessorResult`` with its value in JSON, NumPy's arrays as lists."""
+
+    processor: str
+    worker: int
+    number: int
+    camera: str
+    seq: int  #: of the frame
+    captured_ns: int  #: of the frame
+    made_ns: int  #: when the result was there, on the proxy's clock
+    took_ns: int
+    value: Any = None
 
 
 class Drops(msgspec.Struct, frozen=True):
@@ -218,6 +235,7 @@ TYPES: Final[dict[Channel, type[msgspec.Struct]]] = {
     Channel.PARAMETERS: Parameter,
     Channel.ANNOTATIONS: Annotation,
     Channel.LOGS: LogEntry,
+    Channel.RESULTS: ResultRecord,
     Channel.FRAMES: FrameRecord,
     Channel.DROPS: Drops,
 }
@@ -269,6 +287,11 @@ def drawing_topic(drone: str, camera: str) -> str:
 def pose_topic(drone: str) -> str:
     """foxglove.PoseInFrame."""
     return f"/{_quoted(drone)}/pose"
+
+
+def mocap_topic(drone: str) -> str:
+    """foxglove.PoseInFrame, as motion capture sees it."""
+    return f"/{_quoted(drone)}/mocap"
 
 
 def path_topic(drone: str) -> str:

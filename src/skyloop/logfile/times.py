@@ -25,6 +25,9 @@ def told_ns(value: Any) -> int | None:
         return value.at_ns
     if isinstance(value, Annotation):
         return value.captured_ns
+    made_ns = getattr(value, "made_ns", None)  # of a result's record
+    if made_ns is not None:
+        return int(made_ns)
     header = getattr(value, "header", None)  # of a frame's record or picture
     return None if header is None else int(header.published_ns)
 

@@ -24,7 +24,9 @@ from skyloop.messages.command import (
 from skyloop.messages.config import (
     DEFAULT_PRIORITY,
     HIGHEST_PRIORITY,
+    LONGEST_TERM_S,
     LOWEST_PRIORITY,
+    AnswerTakeover,
     AnyReply,
     AnyRequest,
     AuthorityGranted,
@@ -34,6 +36,7 @@ from skyloop.messages.config import (
     GetParameter,
     GetStatistics,
     Hello,
+    JoinProcessor,
     ListParameters,
     ParameterPage,
     ParameterValue,
@@ -61,14 +64,19 @@ from skyloop.messages.kinds import (
     Refusal,
     Role,
     Severity,
+    Takeover,
 )
 from skyloop.messages.log import LogEntry
 from skyloop.messages.parameter import Parameter, ParameterType
+from skyloop.messages.pose import VehiclePose
+from skyloop.messages.result import ProcessorResult, ProcessorShare
+from skyloop.messages.video import VideoRequest
 
 __all__ = [
     "ACTION_NAMES",
     "Action",
     "Annotation",
+    "AnswerTakeover",
     "AnyAction",
     "AnyReply",
     "AnyRequest",
@@ -97,7 +105,9 @@ __all__ = [
     "Hover",
     "Idle",
     "Intrinsics",
+    "JoinProcessor",
     "Kind",
+    "LONGEST_TERM_S",
     "LOWEST_PRIORITY",
     "Land",
     "LinkState",
@@ -111,6 +121,8 @@ __all__ = [
     "Points",
     "Polyline",
     "Pong",
+    "ProcessorResult",
+    "ProcessorShare",
     "Refusal",
     "Refused",
     "ReleaseAuthority",
@@ -124,10 +136,13 @@ __all__ = [
     "Severity",
     "Statistics",
     "Takeoff",
+    "Takeover",
     "Text",
     "Value",
     "Vector",
+    "VehiclePose",
     "Velocity",
+    "VideoRequest",
     "Welcome",
     "decode",
     "encode",

@@ -22,6 +22,8 @@ from skyloop.messages.event import Event
 from skyloop.messages.feedback import Feedback
 from skyloop.messages.frame import FrameHeader
 from skyloop.messages.log import LogEntry
+from skyloop.messages.pose import VehiclePose
+from skyloop.messages.result import ProcessorResult, ProcessorShare
 
 SIGNATURE: Final = b"SKYL"
 VERSION: Final = 1
@@ -29,7 +31,21 @@ HEADER: Final = struct.Struct("<4sBBHI")
 HEADER_SIZE: Final = HEADER.size
 MAX_BODY: Final = 60_000  #: of a sample, so that a packet fits one datagram; pixels travel apart
 
-Sample = Command | Applied | Feedback | FrameHeader | Event | Request | Reply | Annotation | LogEntry | EncodedFrame
+Sample = (
+    Command
+    | Applied
+    | Feedback
+    | FrameHeader
+    | Event
+    | Request
+    | Reply
+    | Annotation
+    | LogEntry
+    | EncodedFrame
+    | ProcessorResult
+    | ProcessorShare
+    | VehiclePose
+)
 
 
 class Kind(IntEnum):
@@ -45,6 +61,9 @@ class Kind(IntEnum):
     APPLIED = 8
     LOG = 9
     ENCODED = 10
+    RESULT = 11
+    SHARE = 12
+    POSE = 13
 
 
 KINDS: Final[dict[type[Sample], Kind]] = {
@@ -58,6 +77,9 @@ KINDS: Final[dict[type[Sample], Kind]] = {
     Applied: Kind.APPLIED,
     LogEntry: Kind.LOG,
     EncodedFrame: Kind.ENCODED,
+    ProcessorResult: Kind.RESULT,
+    ProcessorShare: Kind.SHARE,
+    VehiclePose: Kind.POSE,
 }
 
 _encode_body = msgspec.msgpack.Encoder().encode

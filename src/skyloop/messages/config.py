@@ -9,10 +9,15 @@ import msgspec
 from skyloop.messages.command import Count
 from skyloop.messages.feedback import Value
 from skyloop.messages.frame import CameraInfo, Name
-from skyloop.messages.kinds import Refusal, Role
+from skyloop.messages.kinds import Refusal, Role, Takeover
 from skyloop.messages.parameter import Parameter, ParameterName
+from skyloop.messages.result import MAX_CODE, ProcessorName
 
 Priority = Annotated[int, msgspec.Meta(ge=0, le=31)]
+LONGEST_TERM_S = 86_400.0
+Term = Annotated[float, msgspec.Meta(gt=0, le=LONGEST_TERM_S)]
+MAX_REASON = 200  #: characters of why a holder declines
+Reason = Annotated[str, msgspec.Meta(max_length=MAX_REASON)]
 
 HIGHEST_PRIORITY = 0
 DEFAULT_PRIORITY = 16
@@ -42,6 +47,8 @@ class Hello(msgspec.Struct, frozen=True, array_like=True, tag=1):
 class RequestAuthority(msgspec.Struct, frozen=True, array_like=True, tag=2):
     priority: Priority = DEFAULT_PRIORITY
     queue: bool = True  #: wait in line when somebody else holds it; else be refused at once
+    for_s: Term | None = None  #: for how long it is wanted, from the grant on; nil: until it is given back
+    takeover: Takeover = Takeover.NOW
 
 
 class ReleaseAuthority(msgspec.Struct, frozen=True, array_like=True, tag=3):
@@ -74,8 +81,39 @@ class GetStatistics(msgspec.Struct, frozen=True, array_like=True, tag=8):
     """Asks for the proxy's counters."""
 
 
+class JoinProcessor(msgspec.Struct, frozen=True, array_like=True, tag=16):
+    """Be a worker of a processor, or go on being one: asked again some times a second for as long as it works.
+
+    Answered by :class:`Done`; the worker's share of the frames comes as a :class:`ProcessorShare`.
+    """
+
+    processor: ProcessorName
+    code: Annotated[str, msgspec.Meta(max_length=MAX_CODE)]  #: of all workers of a processor the same
+    camera: Name
+    shared: bool = True  #: each frame to one worker; else all get all
+    ready: bool = True  #: False: frames are for others to take, for this one can't just now
+
+
+class AnswerTakeover(msgspec.Struct, frozen=True, array_like=True, tag=9):
+    """The holder's answer to an application that asks for the authority."""
+
+    lease: Count  #: the holder's own
+    app_id: Count  #: who asked
+    grant: bool  #: hand it over now; else: not yet
+    reason: Reason = ""  #: why not, for a person
+
+
 AnyRequest = (
-    Hello | RequestAuthority | ReleaseAuthority | GetParameter | SetParameter | ListParameters | Ping | GetStatistics
+    Hello
+    | RequestAuthority
+    | ReleaseAuthority
+    | GetParameter
+    | SetParameter
+    | ListParameters
+    | Ping
+    | GetStatistics
+    | JoinProcessor
+    | AnswerTakeover
 )
 
 
@@ -101,6 +139,7 @@ class Welcome(msgspec.Struct, frozen=True, array_like=True, tag=1):
 
 class AuthorityGranted(msgspec.Struct, frozen=True, array_like=True, tag=2):
     lease: Count
+    until_ns: int = 0  #: when the time is over for which it was wanted, on the proxy's clock; 0: it is not limited
 
 
 class AuthorityQueued(msgspec.Struct, frozen=True, array_like=True, tag=3):
@@ -109,6 +148,8 @@ class AuthorityQueued(msgspec.Struct, frozen=True, array_like=True, tag=3):
     position: Count  #: 1 is next
     holder: str
     holder_priority: int
+    wait_s: float | None = None  #: expected, by what the others said for how long they want it; nil: not known
+    asked: bool = False  #: the holder is being asked to hand it over
 
 
 class ParameterValue(msgspec.Struct, frozen=True, array_like=True, tag=4):

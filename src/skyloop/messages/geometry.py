@@ -22,6 +22,19 @@ def rotation_from_euler(roll: float, pitch: float, yaw: float) -> NDArray[np.flo
     )
 
 
+def quaternion_from_euler(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
+    """Body-to-world as a unit quaternion (w, x, y, z): the rotation of :func:`rotation_from_euler`."""
+    cr, sr = math.cos(roll / 2), math.sin(roll / 2)
+    cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
+    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
+
+
 def euler_from_rotation(rotation: NDArray[np.float64]) -> tuple[float, float, float]:
     """(roll, pitch, yaw) in rad of a body-to-world rotation, shape (3, 3); pitch within ±π/2."""
     pitch = math.asin(max(-1.0, min(1.0, -float(rotation[2, 0]))))

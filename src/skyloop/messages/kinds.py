@@ -59,6 +59,13 @@ class Role(StrEnum):
     OBSERVER = "observer"  #: read-only for as long as it is connected
 
 
+class Takeover(StrEnum):
+    """How somebody who asks for the authority takes it from a holder of lower priority."""
+
+    NOW = "now"  #: at once
+    ASK = "ask"  #: the holder is asked first, and after a time the higher priority wins
+
+
 class Severity(StrEnum):
     INFO = "info"
     WARNING = "warning"
@@ -70,10 +77,13 @@ class EventKind(StrEnum):
 
     APPLICATION_LINK = "application_link"  #: hop application–proxy changed; data: state, reason
     VEHICLE_LINK = "vehicle_link"  #: hop proxy–vehicle changed; data: state, reason
-    AUTHORITY_GRANTED = "authority_granted"  #: data: app_id, priority, lease
-    AUTHORITY_QUEUED = "authority_queued"  #: an application waits; data: app_id, priority, position
-    AUTHORITY_LOST = "authority_lost"  #: data: app_id, lease, reason (released, silent, gone), by (app name)
-    AUTHORITY_PREEMPTED = "authority_preempted"  #: data: app_id, lease, by, by_id, by_priority
+    AUTHORITY_GRANTED = "authority_granted"  #: data: app_id, priority, lease, identity; until_ns if for a time
+    AUTHORITY_QUEUED = "authority_queued"  #: waits, or has moved up; data: app_id, priority, position; wait_s if known
+    AUTHORITY_LOST = "authority_lost"  #: data: app_id, lease, reason (released, silent, gone, expired), by (app name)
+    AUTHORITY_PREEMPTED = "authority_preempted"  #: data: app_id, lease, by, by_id, by_priority, granted
+    AUTHORITY_ASKED = "authority_asked"  #: the holder is asked for it; data: app_id, lease, by, by_id, by_priority …
+    AUTHORITY_DECLINED = "authority_declined"  #: and said no; data: app_id (who asked), by (the holder), reason
+    AUTHORITY_EXPIRED = "authority_expired"  #: the holder's time is over, and nobody waits; data: app_id, lease
     FAILSAFE = "failsafe"  #: a step of the ladder was taken or left; data: step, reason
     COMMAND_REFUSED = "command_refused"  #: data: reason (a Refusal), seq, count
     COMMAND_CLAMPED = "command_clamped"  #: a set-point was beyond a limit; data: limit, asked, applied
@@ -88,6 +98,8 @@ class EventKind(StrEnum):
     SAMPLES_LOST = "samples_lost"  #: events that a slow application did not get; data: count
     CALLBACK_ERROR = "callback_error"  #: an application's own listener or processor raised; data: where
     RECORDING = "recording"  #: a recorder started, ended, dropped samples or can't write; data: state, path
+    PROCESSOR = "processor"  #: a worker joined, left, or gave up its share for a time; data: processor, state, app_id
+    KEYS = "keys"  #: of the network: one ends within a week, or the roster has changed
     PROXY_CLOSING = "proxy_closing"  #: the proxy ends on purpose
 
 
@@ -111,4 +123,5 @@ class Refusal(StrEnum):
     READ_ONLY = "read_only"
     DRIVER_FAILED = "driver_failed"
     BUSY = "busy"  #: somebody of at least the same priority holds the authority
+    NAME_TAKEN = "name_taken"  #: other code, or another way to share, goes by that name
     PROTOCOL = "protocol"  #: a request out of place, or of another protocol version

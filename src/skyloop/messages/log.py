@@ -15,6 +15,9 @@ from skyloop.messages.kinds import Severity
 
 MAX_TEXT: Final = 4096  #: characters
 MAX_VALUES: Final = 4096  #: numbers of an array
+#: The series of poses from motion capture, in world axes: arrays of x, y, z [m], quaternion x, y, z, w, and velocity
+#: x, y, z [m/s] if it is known.
+MOCAP: Final = "mocap"
 
 
 class LogEntry(msgspec.Struct, frozen=True, array_like=True):

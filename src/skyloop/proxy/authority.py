@@ -1,15 +1,16 @@
 """Who may command: numbered leases, priorities, a line of waiting pilots. Pure: the time is an argument.
 
 Priority 0 is the highest, 31 the lowest. At any time at most one application *holds* the authority, under a lease
-whose number was never used before in this run. A strictly higher priority takes over at once, and the pilot who was
-pre-empted goes on waiting with the place that its priority and first arrival give it. The rules in words are in
+whose number was never used before in this run. A strictly higher priority takes over at once, or after the holder was
+asked, and the pilot who was pre-empted goes on waiting with the place that its priority and first arrival give it. Who
+says for how long it is wanted is relieved when that time is over and somebody waits. The rules in words are in
 ``docs/proxy.md``.
 """
 
 from __future__ import annotations
 
 from bisect import insort
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from skyloop.clock import nanoseconds
 
@@ -21,6 +22,13 @@ class Claim:
     priority: int  #: 0 is the highest
     arrival: int  #: number of its first request since it last held or wanted nothing
     app_id: int
+    term_ns: int | None = field(default=None, compare=False)  #: for how long it is wanted, from the grant; None: open
+    #: Until when the holder is asked before it is pre-empted; None: it is not asked (any more).
+    asks_until_ns: int | None = field(default=None, compare=False)
+
+    def asks(self, now_ns: int) -> bool:
+        """Whether the holder is still being asked."""
+        return self.asks_until_ns is not None and now_ns < self.asks_until_ns
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,11 +38,12 @@ class Granted:
     app_id: int
     priority: int
     lease: int
+    until_ns: int | None = None  #: when its time is over
 
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """The lease ended: ``released``, ``silent`` or ``gone``."""
+    """The lease ended: ``released``, ``silent``, ``gone``, or ``expired`` because its time is over and others wait."""
 
     app_id: int
     lease: int
@@ -43,37 +52,79 @@ class Lost:
 
 @dataclass(frozen=True, slots=True)
 class Preempted:
-    """The lease ended because somebody of strictly higher priority wants it; the loser waits in line."""
+    """The lease ended because somebody of strictly higher priority wants it, or it was ``granted`` to who asked for it;
+    the loser waits in line."""
 
     app_id: int
     lease: int
     by_id: int
     by_priority: int
+    granted: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Queued:
-    """An application waits in line, ``position`` 1 being next."""
+    """An application waits in line or has moved in it, ``position`` 1 being next."""
 
     app_id: int
     priority: int
     position: int
+    wait_ns: int | None = None  #: expected; None: not known
 
 
-Effect = Granted | Lost | Preempted | Queued
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """The holder is asked to hand the authority over."""
+
+    app_id: int  #: the holder
+    lease: int
+    by_id: int
+    by_priority: int
+    until_ns: int  #: when ``by_id`` wins if its priority is strictly higher
+    term_ns: int | None = None  #: for how long it is wanted
+
+
+@dataclass(frozen=True, slots=True)
+class Declined:
+    """The holder does not hand it over to ``app_id``, who waits on."""
+
+    app_id: int
+    holder_id: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Expired:
+    """The holder's time is over; it keeps the authority until somebody wants it. Told once."""
+
+    app_id: int
+    lease: int
+
+
+Effect = Granted | Lost | Preempted | Queued | Asked | Declined | Expired
 
 
 class Authority:
     """The state of the right to command one vehicle. Every method returns what changed, in order."""
 
-    def __init__(self, timeout_s: float = 2.0) -> None:
+    def __init__(self, timeout_s: float = 2.0, ask_s: float = 10.0) -> None:
         self.timeout_ns = nanoseconds(timeout_s)  #: a holder silent for so long loses the lease
+        self.ask_ns = nanoseconds(ask_s)  #: how long a holder that is asked may wait before the higher priority wins
         self.holder: Claim | None = None
         self.lease = 0  #: the lease in force; 0 for none
         self.heard_ns = 0  #: when the holder sent its last valid command, or got the lease
+        self.until_ns: int | None = None  #: when the holder's time is over
+        self.silent: Claim | None = None  #: who lost the lease by silence and keeps the name on it until somebody asks
         self._last_lease = 0
         self._arrivals = 0
         self._waiting: list[Claim] = []
+        self._told_places: dict[int, int] = {}
+        self._told_expired = False
+
+    @property
+    def owner(self) -> Claim | None:
+        """Whose name is on it: the holder's, or that of one who lost the lease by silence and whom nobody followed."""
+        return self.holder or self.silent
 
     @property
     def waiting(self) -> tuple[Claim, ...]:
@@ -84,24 +135,74 @@ class Authority:
         """Place in the line from 1; 0 for an application that does not wait."""
         return next((place for place, claim in enumerate(self._waiting, 1) if claim.app_id == app_id), 0)
 
-    def request(self, app_id: int, priority: int, queue: bool, now_ns: int) -> list[Effect]:
-        """Ask for the authority, or change the priority of a claim.
+    def asking(self, app_id: int, now_ns: int) -> bool:
+        """Whether this application waits while the holder is asked to hand it over."""
+        return any(claim.app_id == app_id and claim.asks(now_ns) for claim in self._waiting)
 
-        ``queue`` False: do not wait in line. Afterwards the application holds the authority, or has a
+    def wait_ns(self, app_id: int, now_ns: int) -> int | None:
+        """How long an application in line will wait if each keeps to what it said; None: somebody said nothing."""
+        if self.holder is None or not self._waiting:
+            return None
+        wait_ns = None if self.until_ns is None else max(0, self.until_ns - now_ns)
+        first = self._waiting[0]
+        if first.asks_until_ns is not None and first.priority < self.holder.priority:
+            asked_ns = max(0, first.asks_until_ns - now_ns)
+            wait_ns = asked_ns if wait_ns is None else min(wait_ns, asked_ns)
+        for claim in self._waiting:
+            if claim.app_id == app_id:
+                return wait_ns
+            wait_ns = None if wait_ns is None or claim.term_ns is None else wait_ns + claim.term_ns
+        return None
+
+    # What applications do --------------------------------------------------------------------------------------
+
+    def request(
+        self,
+        app_id: int,
+        priority: int,
+        queue: bool,
+        now_ns: int,
+        *,
+        term_ns: int | None = None,
+        ask: bool = False,
+    ) -> list[Effect]:
+        """Ask for the authority, or change the priority or the time of a claim.
+
+        ``queue`` False: do not wait in line. ``term_ns``: for how long it is wanted; None: until it is given back.
+        ``ask``: let the holder be asked first. Afterwards the application holds the authority, or has a
         :meth:`position`, or was refused because somebody of at least the same priority holds it.
         """
         if self.holder is not None and self.holder.app_id == app_id:
             self.holder = replace(self.holder, priority=priority)
+            self._change_term(term_ns, now_ns)
             return self._settle(now_ns)
-        claim = self._take_claim(app_id, priority)
-        if not queue and self.holder is not None and self.holder.priority <= priority:
-            return []
-        insort(self._waiting, claim)
+        claim, asked_before = self._take_claim(app_id, priority, term_ns, ask, now_ns)
+        if queue or self._may_be_taken(claim, now_ns):
+            insort(self._waiting, claim)
+            self._told_places.pop(app_id, None)
         effects = self._settle(now_ns)
-        position = self.position(app_id)
-        if position:
-            effects.append(Queued(app_id, priority, position))
+        if not queue and claim in self._waiting:  # somebody of higher priority was in line
+            self._waiting.remove(claim)
+            effects = [effect for effect in effects if not (isinstance(effect, Queued) and effect.app_id == app_id)]
+        if claim.asks_until_ns is not None and not asked_before and claim in self._waiting and self.holder is not None:
+            effects.append(Asked(self.holder.app_id, self.lease, app_id, priority, claim.asks_until_ns, term_ns))
         return effects
+
+    def answer(self, app_id: int, lease: int, by_id: int, grant: bool, reason: str, now_ns: int) -> list[Effect]:
+        """The holder answers who asks. Does nothing if ``app_id`` is not the holder, or ``by_id`` does not ask.
+
+        Granting is to step back: the first in line gets it, and the holder waits, with no higher priority than that one
+        has. Declining is told, and a strictly higher priority wins all the same when the time to ask is over.
+        """
+        holder = self.holder
+        asker = next((claim for claim in self._waiting if claim.app_id == by_id), None)
+        if holder is None or (holder.app_id, self.lease) != (app_id, lease):
+            return []
+        if asker is None or asker.asks_until_ns is None:
+            return []
+        if not grant:
+            return [Declined(by_id, app_id, reason)]
+        return self._pre_empt(now_ns, granted=True) + self._moves(now_ns)
 
     def release(self, app_id: int, now_ns: int) -> list[Effect]:
         """Give the authority back, or leave the line. Does nothing for an application that does neither."""
@@ -112,40 +213,113 @@ class Authority:
         return self._drop(app_id, "gone", now_ns)
 
     def tick(self, now_ns: int) -> list[Effect]:
-        """Take the lease from a holder that sent no valid command for the time-out."""
-        if self.holder is None or now_ns - self.heard_ns < self.timeout_ns:
+        """What goes by time: a silent holder's lease ends, and so does that of one whose time is over while others
+        wait; who was asked for long enough is pre-empted."""
+        holder = self.holder
+        if holder is None:
             return []
-        return self._drop(self.holder.app_id, "silent", now_ns)
+        if now_ns - self.heard_ns >= self.timeout_ns:
+            effects = self._drop(holder.app_id, "silent", now_ns)
+            if self.holder is None:
+                self.silent = holder
+            return effects
+        effects = self._settle(now_ns)
+        if self._is_over(now_ns) and not self._told_expired:  # nobody waits, or it would have been relieved
+            self._told_expired = True
+            effects.append(Expired(holder.app_id, self.lease))
+        return effects
 
-    def _take_claim(self, app_id: int, priority: int) -> Claim:
-        for claim in self._waiting:
-            if claim.app_id == app_id:
-                self._waiting.remove(claim)
-                return replace(claim, priority=priority)
-        self._arrivals += 1
-        return Claim(priority, self._arrivals, app_id)
+    # Inside ----------------------------------------------------------------------------------------------------
+
+    def _take_claim(
+        self, app_id: int, priority: int, term_ns: int | None, ask: bool, now_ns: int
+    ) -> tuple[Claim, bool]:
+        """The application's claim, out of the line; and whether the holder was asked for it before."""
+        known = next((claim for claim in self._waiting if claim.app_id == app_id), None)
+        asked_before = known is not None and known.asks(now_ns)
+        if known is not None:
+            self._waiting.remove(known)
+            arrival = known.arrival
+        else:
+            self._arrivals += 1
+            arrival = self._arrivals
+        asks_until_ns = known.asks_until_ns if known is not None and asked_before else now_ns + self.ask_ns
+        return Claim(priority, arrival, app_id, term_ns, asks_until_ns if ask else None), asked_before
+
+    def _may_be_taken(self, claim: Claim, now_ns: int) -> bool:
+        """Whether this claim need not wait."""
+        holder = self.holder
+        if holder is None or self._is_over(now_ns):
+            return True
+        return claim.priority < holder.priority and not claim.asks(now_ns)
+
+    def _is_over(self, now_ns: int) -> bool:
+        return self.holder is not None and self.until_ns is not None and now_ns >= self.until_ns
+
+    def _change_term(self, term_ns: int | None, now_ns: int) -> None:
+        """The holder wants it for so long from now; no longer than before while others wait. None: as before."""
+        if term_ns is None:
+            return
+        until_ns = now_ns + term_ns
+        if self._waiting and self.until_ns is not None:
+            until_ns = min(until_ns, self.until_ns)
+        self.until_ns, self._told_expired = until_ns, False
+
+    def _pre_empt(self, now_ns: int, *, granted: bool = False) -> list[Effect]:
+        """Give it to the first in line; the holder waits, with what is left of its time, and with no higher priority
+        than who has it now, or it would take it back."""
+        holder, lease = self.holder, self.lease
+        assert holder is not None
+        left_ns = None if self.until_ns is None else max(1, self.until_ns - now_ns)
+        grant = self._grant(now_ns)
+        priority = max(holder.priority, grant.priority)
+        insort(self._waiting, replace(holder, priority=priority, term_ns=left_ns))
+        return [Preempted(holder.app_id, lease, grant.app_id, grant.priority, granted), grant]
+
+    def _vacate(self) -> None:
+        self.holder, self.lease, self.until_ns, self._told_expired = None, 0, None, False
 
     def _drop(self, app_id: int, reason: str, now_ns: int) -> list[Effect]:
         self._waiting = [claim for claim in self._waiting if claim.app_id != app_id]
-        if self.holder is None or self.holder.app_id != app_id:
-            return []
-        lost = Lost(app_id, self.lease, reason)
-        self.holder, self.lease = None, 0
-        return [lost, *self._settle(now_ns)]
+        if self.silent is not None and self.silent.app_id == app_id:
+            self.silent = None
+        effects: list[Effect] = []
+        if self.holder is not None and self.holder.app_id == app_id:
+            effects.append(Lost(app_id, self.lease, reason))
+            self._vacate()
+        return effects + self._settle(now_ns)
 
     def _settle(self, now_ns: int) -> list[Effect]:
-        """Give the authority to the first in line if nobody holds it, or somebody of lower priority does."""
-        if not self._waiting:
-            return []
-        first = self._waiting[0]
+        """Give the authority to the first in line if nobody holds it, the holder's time is over, or somebody of
+        strictly higher priority need not ask any longer; then tell who has moved in the line."""
         effects: list[Effect] = []
-        if self.holder is not None:
-            if self.holder.priority <= first.priority:
-                return []
-            effects.append(Preempted(self.holder.app_id, self.lease, first.app_id, first.priority))
-            insort(self._waiting, self.holder)
-        self._waiting.remove(first)
+        holder = self.holder
+        if holder is not None and self._waiting:
+            if self._is_over(now_ns):
+                effects.append(Lost(holder.app_id, self.lease, "expired"))
+                self._vacate()
+            elif any(claim.priority < holder.priority and not claim.asks(now_ns) for claim in self._waiting):
+                effects += self._pre_empt(now_ns)
+        if self.holder is None and self._waiting:
+            effects.append(self._grant(now_ns))
+        return effects + self._moves(now_ns)
+
+    def _grant(self, now_ns: int) -> Granted:
+        first = self._waiting.pop(0)
         self._last_lease += 1
-        self.holder, self.lease, self.heard_ns = first, self._last_lease, now_ns
-        effects.append(Granted(first.app_id, first.priority, self.lease))
-        return effects
+        self.holder, self.lease, self.heard_ns = replace(first, asks_until_ns=None), self._last_lease, now_ns
+        self.until_ns = None if first.term_ns is None else now_ns + first.term_ns
+        self._told_expired = False
+        self.silent = None
+        return Granted(first.app_id, first.priority, self.lease, self.until_ns)
+
+    def _moves(self, now_ns: int) -> list[Effect]:
+        """Whoever's place in the line is another one than was told last."""
+        places = {claim.app_id: place for place, claim in enumerate(self._waiting, 1)}
+        moved: list[Effect] = [
+            Queued(claim.app_id, claim.priority, places[claim.app_id], self.wait_ns(claim.app_id, now_ns))
+            for claim in self._waiting
+            if self._told_places.get(claim.app_id) != places[claim.app_id]
+        ]
+        self._told_places = places
+        return moved

@@ -76,6 +76,7 @@ class EventLog:
         self._seq = 0
         self._repeats = Repeats()
         self._missed = 0
+        self.listener: Callable[[Event], None] | None = None  #: called with each event; must be quick and never raise
 
     def tell(
         self,
@@ -118,6 +119,8 @@ class EventLog:
         except (ValueError, TypeError, OverflowError) as error:  # a driver's data may be anything
             _log.error("event %s had particulars that cannot be sent: %s", kind, error)
             packet = encode(Event(kind, event.text, event.at_ns, severity, self._seq, app))
+        if self.listener is not None:
+            self.listener(event)
         missed = self._publish(EVENTS, packet)
         self._counts["events.published"] += 1
         if missed:

@@ -32,6 +32,7 @@ from skyloop.proxy.sessions import Session
 from skyloop.proxy.statistics import Counters
 from skyloop.proxy.vehicle import Vehicle
 from skyloop.proxy.watch import REASONS, Watch
+from skyloop.proxy.zones import Safety
 from skyloop.transport.base import COMMANDS, ServerEnd
 
 #: What an echo says of a command that made the vehicle do nothing new: refused, or held.
@@ -53,6 +54,8 @@ class Flight:
         clock: Clock,
     ) -> None:
         self.limits = Limits()
+        self.safety: Safety | None = None  #: the safety box and zones; None: there are none
+        self._blind = False  # they are there and the position is not known
         self.max_age_ns = 0
         self._applied_ns = 0  # when the driver had taken the command at hand; when it came, if that got none
         self._watch = watch
@@ -125,6 +128,11 @@ class Flight:
             elif is_set_point:
                 feedback = vehicle.feedback_now
                 action, clamps = self.limits.clamp(action, feedback.altitude if feedback else None)  # type: ignore[arg-type]
+                if self.safety is not None:
+                    action, held, known = self.safety.clamp(action, feedback, now_ns)
+                    clamps += held
+                    if known is self._blind:
+                        self._tell_blind(not known)
                 if clamps:
                     self._tell_clamps(session, clamps, now_ns)
             try:
@@ -159,6 +167,14 @@ class Flight:
             text = f"{session.name}: {clamp.limit} made {clamp.applied:.3g} of {clamp.asked:.3g}"
             data: dict[str, Value] = {"limit": clamp.limit, "asked": clamp.asked, "applied": clamp.applied}
             self._events.tell(EventKind.COMMAND_CLAMPED, text, app=session.name, data=data)
+
+    def _tell_blind(self, blind: bool) -> None:
+        self._blind = blind
+        text = "the safety box and zones are " + (
+            "not enforced: the vehicle's position is not known" if blind else "enforced: its position is known again"
+        )
+        severity = Severity.WARNING if blind else Severity.INFO
+        self._events.tell(EventKind.VEHICLE_MESSAGE, text, severity, data={"reason": "safety", "enforced": not blind})
 
     def _stop_motors(self, session: Session, command: Command, now_ns: int) -> AnyAction:
         """The emergency stop of any pilot: no lease, no matter how old or out of order."""

@@ -16,6 +16,7 @@ import msgspec
 from skyloop.errors import ParameterError, UnknownNameError
 from skyloop.messages import Parameter, ParameterPage, ParameterType, Refusal, Value
 from skyloop.messages.codec import MAX_BODY
+from skyloop.proxy.zones import BOX, FAR_M, ZONES, check_written
 
 MAX_TEXT: Final = 1024  #: characters of a text value
 MAX_PARAMETER: Final = 8192  #: bytes of one encoded parameter: a driver's larger one is left out
@@ -31,6 +32,7 @@ def _own(name: str, value: float, unit: str, minimum: float, maximum: float, des
 
 #: The proxy's own parameters. ``docs/proxy.md`` shows them as a table.
 OWN: Final[tuple[Parameter, ...]] = (
+    _own("authority.ask_s", 10.0, "s", 0.0, 600.0, "A holder that is asked and does not answer keeps it for so long"),
     _own(
         "authority.timeout_s", 2.0, "s", 0.1, 3600.0, "A holder that sent no valid command for so long loses the lease"
     ),
@@ -59,6 +61,14 @@ OWN: Final[tuple[Parameter, ...]] = (
     _own("limits.speed", 2.0, "m/s", 0.05, 30.0, "Greatest horizontal speed of a velocity set-point"),
     _own("limits.tilt", 0.35, "rad", 0.02, 1.0, "Greatest tilt of an attitude set-point, roll and pitch together"),
     _own("limits.yaw_rate", 1.75, "rad/s", 0.05, 10.0, "Greatest yaw rate"),
+    *(
+        _own(f"{BOX}.{axis}_{end}", value, "m", -FAR_M, FAR_M, f"{side} wall of the safety box; {value:g}: none")
+        for axis, sides in (("x", ("West", "East")), ("y", ("South", "North")), ("z", ("Lower", "Upper")))
+        for end, value, side in zip(("high", "low"), (FAR_M, -FAR_M), reversed(sides), strict=True)
+    ),
+    _own("safety.deceleration", 1.0, "m/s²", 0.1, 10.0, "At which the vehicle can be relied on to stop at a wall"),
+    _own("safety.reaction_s", 0.3, "s", 0.0, 3.0, "How long it goes on before it begins to stop"),
+    Parameter(ZONES, ParameterType.TEXT, "", default="", description="No-fly zones, see below"),
 )
 
 
@@ -165,6 +175,12 @@ class Parameters:
         assert isinstance(own, float)
         return own
 
+    def text(self, name: str) -> str:
+        """The value in force of one of the proxy's own parameters that is a text."""
+        value = self._own[name].value
+        assert isinstance(value, str)
+        return value
+
     def set(self, name: str, value: Value) -> Parameter:
         """Write one parameter and return it as it is now.
 
@@ -174,6 +190,8 @@ class Parameters:
         value = check(parameter, value)
         with self._lock:
             is_driver = name in self._driver
+        if not is_driver:
+            check_written(name, value, self.number)
         if is_driver and self._write_driver is not None:
             value = self._write_driver(name, value)
         written = msgspec.structs.replace(parameter, value=value)

@@ -22,12 +22,16 @@ from skyloop.messages import (
     EventKind,
     LinkState,
     LogEntry,
+    ProcessorResult,
+    Refusal,
     Request,
     Severity,
     Value,
+    VehiclePose,
     Welcome,
     decode,
 )
+from skyloop.proxy.audit import AuditTrail
 from skyloop.proxy.autopilot import PERIOD_S, AutopilotSettings
 from skyloop.proxy.events import EventLog, Notice
 from skyloop.proxy.failsafe import LadderSettings
@@ -35,11 +39,14 @@ from skyloop.proxy.flight import Flight
 from skyloop.proxy.helm import Helm
 from skyloop.proxy.limits import Limits
 from skyloop.proxy.parameters import Parameters
+from skyloop.proxy.poses import Poses
+from skyloop.proxy.processors import Processors
 from skyloop.proxy.requests import Requests
 from skyloop.proxy.sessions import MAX_MALFORMED, Session
 from skyloop.proxy.statistics import Counters
 from skyloop.proxy.vehicle import Vehicle
 from skyloop.proxy.watch import Watch
+from skyloop.proxy.zones import ZONES, safety_of
 from skyloop.transport.base import ANNOTATIONS, LOGS, Peer, ServerEnd
 
 MAX_NAME: Final = 64  #: characters of a proxy's name
@@ -64,6 +71,7 @@ class Proxy:
         self.driver = driver
         self.server = server_end
         self.clock = clock
+        self.run_id = secrets.randbits(63)  #: another number in each run
         self.capabilities = driver.capabilities()
         self._sessions: dict[int, Session] = {}
         self._counters = Counters()
@@ -74,18 +82,21 @@ class Proxy:
         self.watch = Watch(self.helm, self.vehicle, self.events, server_end, clock, self._sessions)
         self.flight = Flight(self.watch, self.helm, self.vehicle, self.events, self._counters, server_end, clock)
         self.parameters = Parameters(driver.parameters, driver.set_parameter)
+        self.processors = Processors(server_end, self.events, self._counters)
+        self.poses = Poses(driver, self.events, self._counters)
         self.requests = self._make_requests()
         self.vehicle.on_link_up = self.requests.refresh_parameters
         self._ticker = threading.Thread(target=self._run, name="skyloop-ticker", daemon=True) if ticker else None
         self._stopping = threading.Event()
         self._life_lock = threading.Lock()
         self._started = self._stopped = False
+        self._trail: AuditTrail | None = None
         self._decode = decode
         self._command = self.flight.command
 
     def _make_requests(self) -> Requests:
         uri = str(self.driver.uri)
-        welcome = Welcome(0, self.name, secrets.randbits(63), os.getpid(), uri, 0, self.capabilities)
+        welcome = Welcome(0, self.name, self.run_id, os.getpid(), uri, 0, self.capabilities)
         return Requests(
             self.server,
             self.watch,
@@ -97,10 +108,16 @@ class Proxy:
             welcome,
             self._configure,
             self._applications,
+            self.processors,
         )
 
     def _applications(self) -> int:
         return sum(session.role is not None for session in list(self._sessions.values()))
+
+    def keep_trail(self, trail: AuditTrail) -> None:
+        """Write who flies when to this trail, which ends with the proxy. To be called before :meth:`start`."""
+        self._trail = trail
+        self.events.listener = trail.note
 
     # Life cycle ------------------------------------------------------------------------------------------------
 
@@ -116,7 +133,11 @@ class Proxy:
             self.server.start(self)
         except BaseException:
             self._stopped = True
+            if self._trail is not None:
+                self._trail.close()
             raise
+        if self._trail is not None:
+            self._trail.begin(str(self.driver.uri))
         self.requests.start()
         try:
             self.driver.open(self.vehicle)
@@ -154,6 +175,8 @@ class Proxy:
             self.driver.close()
         finally:
             self.server.stop()
+            if self._trail is not None:
+                self._trail.close()
 
     def __enter__(self) -> Proxy:
         self.start()
@@ -188,8 +211,28 @@ class Proxy:
             self._relay_annotation(session, packet, now_ns)
         elif kind is LogEntry:
             self._relay(session, packet, now_ns, LOGS)
+        elif isinstance(sample, ProcessorResult):
+            self._relay_result(session, sample, now_ns)
+        elif isinstance(sample, VehiclePose):
+            self.poses.take(session, sample)
         else:
             self._malformed(session, f"{kind.__name__} is for the proxy to send", now_ns)
+
+    def refused(self, peer: Peer, reason: str) -> None:
+        """Somebody sent what its keys give it no right to, or what nobody that is connected may send."""
+        session = self._sessions.get(peer.id)
+        name = None if session is None else session.name
+        code = Refusal.PROTOCOL if session is None else Refusal.OBSERVER
+        self._counts["packets.refused"] += 1
+        self.events.repeated(
+            (peer.id, "refused"),
+            lambda: Notice(
+                EventKind.COMMAND_REFUSED,
+                reason if name is None else f"{name}: {reason}",
+                app=name,
+                data={"reason": code.value, "app_id": peer.id},
+            ),
+        )
 
     def peer_left(self, peer: Peer, reason: str) -> None:
         """An application's connection ended."""
@@ -202,6 +245,7 @@ class Proxy:
             self.events.tell(EventKind.APPLICATION_LINK, text, Severity.WARNING, app=session.name, data=data)
         if not self._stopping.is_set():  # else everybody leaves, and the driver may be closed already
             self.watch.gone(session, self.clock())
+        self.processors.gone(session)
         del self._sessions[peer.id]
 
     def _relay_annotation(self, session: Session, packet: bytes, now_ns: int) -> None:
@@ -218,6 +262,12 @@ class Proxy:
         else:
             self._counts[f"{topic}.relayed"] += 1
             self.server.publish(topic, packet)
+
+    def _relay_result(self, session: Session, result: ProcessorResult, now_ns: int) -> None:
+        if session.role is None:
+            self._malformed(session, "a result came before Hello", now_ns)
+        else:
+            self.processors.relay(session, result)
 
     def _malformed(self, session: Session, reason: str, now_ns: int) -> None:
         self._counts["packets.malformed"] += 1
@@ -241,6 +291,7 @@ class Proxy:
         """What goes by time: authority, failsafe, software autopilot, feedback of a silent vehicle, sums of events."""
         self.watch.tick(now_ns)
         self.vehicle.keep_alive(now_ns)
+        self.processors.tick(now_ns)
         self.events.tick(now_ns)
 
     def _run(self) -> None:
@@ -280,10 +331,13 @@ class Proxy:
             velocity_i=number("autopilot.velocity_i"),
             tilt=limits.tilt,
         )
+        safety = safety_of(number, self.parameters.text(ZONES))
         with self.watch.lock:
             self.flight.limits = limits
+            self.flight.safety = safety
             self.flight.max_age_ns = nanoseconds(number("command.max_age_s"))
             self.watch.authority.timeout_ns = nanoseconds(number("authority.timeout_s"))
+            self.watch.authority.ask_ns = nanoseconds(number("authority.ask_s"))
             self.watch.ladder.settings = ladder
             if self.helm.autopilot is not None:
                 self.helm.autopilot.settings = autopilot

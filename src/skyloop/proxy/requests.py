@@ -17,11 +17,13 @@ import msgspec
 from skyloop.clock import Clock
 from skyloop.errors import ParameterError, UnknownNameError
 from skyloop.messages import (
+    AnswerTakeover,
     AnyReply,
     EventKind,
     GetParameter,
     GetStatistics,
     Hello,
+    JoinProcessor,
     LinkState,
     ListParameters,
     Parameter,
@@ -43,6 +45,7 @@ from skyloop.messages import (
 )
 from skyloop.proxy.events import EventLog
 from skyloop.proxy.parameters import Parameters
+from skyloop.proxy.processors import Processors
 from skyloop.proxy.sessions import Session
 from skyloop.proxy.statistics import Counters
 from skyloop.proxy.vehicle import Vehicle
@@ -70,6 +73,7 @@ class Requests:
         welcome: Welcome,
         configure: Callable[[], None],
         applications: Callable[[], int],
+        processors: Processors,
     ) -> None:
         self._server = server
         self._watch = watch
@@ -81,6 +85,7 @@ class Requests:
         self._welcome = welcome
         self._configure = configure
         self._applications = applications
+        self._processors = processors
         self._work: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self._pending_lock = threading.Lock()
         self._thread = threading.Thread(target=self._run, name="skyloop-requests", daemon=True)
@@ -137,9 +142,13 @@ class Requests:
         if isinstance(body, Ping):
             return Pong(body.sent_ns, self._clock())
         if isinstance(body, RequestAuthority):
-            return self._watch.request_authority(session, body.priority, body.queue, now_ns)
+            return self._watch.request_authority(session, body, now_ns)
+        if isinstance(body, AnswerTakeover):
+            return self._watch.answer_takeover(session, body, now_ns)
         if isinstance(body, ReleaseAuthority):
             return self._watch.release_authority(session, now_ns)
+        if isinstance(body, JoinProcessor):
+            return self._processors.join(session, body, now_ns)
         return None
 
     def _greet(self, session: Session, hello: Hello, now_ns: int) -> AnyReply:

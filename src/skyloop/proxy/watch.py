@@ -10,8 +10,9 @@ import threading
 from collections.abc import Mapping
 from typing import Final
 
-from skyloop.clock import Clock
+from skyloop.clock import Clock, nanoseconds, seconds
 from skyloop.messages import (
+    AnswerTakeover,
     AnyAction,
     AnyReply,
     Applied,
@@ -24,9 +25,10 @@ from skyloop.messages import (
     Hover,
     Refusal,
     Refused,
+    RequestAuthority,
     Role,
     Severity,
-    Value,
+    Takeover,
     encode,
 )
 from skyloop.proxy import authority as rights
@@ -35,6 +37,7 @@ from skyloop.proxy.authority import Authority
 from skyloop.proxy.events import EventLog
 from skyloop.proxy.failsafe import Ladder, View
 from skyloop.proxy.helm import Helm
+from skyloop.proxy.rights_told import Scene, tell
 from skyloop.proxy.sessions import Session
 from skyloop.proxy.vehicle import Vehicle
 from skyloop.transport.base import COMMANDS, ServerEnd
@@ -43,6 +46,7 @@ REASONS: Final = {
     "silent": "the pilot is silent",
     "gone": "the pilot's connection ended",
     "released": "the pilot released the authority",
+    "expired": "the pilot's time is over",
     "none": "nobody is in command",
     "vehicle_link": "the link to the vehicle is lost",
     "battery": "the battery is nearly empty",
@@ -82,21 +86,38 @@ class Watch:
 
     # Authority -------------------------------------------------------------------------------------------------
 
-    def request_authority(self, session: Session, priority: int, queue: bool, now_ns: int) -> AnyReply:
+    def request_authority(self, session: Session, request: RequestAuthority, now_ns: int) -> AnyReply:
         """Give the authority, or a place in the line, or say who holds it."""
         if session.role is not Role.PILOT:
             return Refused(Refusal.OBSERVER, "observers get no authority: connect as a pilot")
+        term_ns = None if request.for_s is None else nanoseconds(request.for_s)
+        ask = request.takeover is Takeover.ASK
+        app_id, authority = session.app_id, self.authority
         with self.lock:
-            self._take_rights(self.authority.request(session.app_id, priority, queue, now_ns), now_ns)
-            holder = self.authority.holder
+            effects = authority.request(app_id, request.priority, request.queue, now_ns, term_ns=term_ns, ask=ask)
+            self._take_rights(effects, now_ns)
+            holder = authority.holder
             assert holder is not None  # a request leaves somebody in command
-            if holder.app_id == session.app_id:
-                return AuthorityGranted(self.authority.lease)
-            name, position = self._name(holder.app_id), self.authority.position(session.app_id)
+            if holder.app_id == app_id:
+                return AuthorityGranted(authority.lease, authority.until_ns or 0)
+            name, position = self._name(holder.app_id), authority.position(app_id)
+            wait_ns, asked = authority.wait_ns(app_id, now_ns), authority.asking(app_id, now_ns)
         if position:
-            return AuthorityQueued(position, name, holder.priority)
+            wait_s = None if wait_ns is None else seconds(wait_ns)
+            return AuthorityQueued(position, name, holder.priority, wait_s, asked)
         why = f"{name} holds the authority with priority {holder.priority}: ask with a higher one (0 is the highest)"
         return Refused(Refusal.BUSY, why)
+
+    def answer_takeover(self, session: Session, answer: AnswerTakeover, now_ns: int) -> AnyReply:
+        """The holder grants or declines what it was asked for."""
+        with self.lock:
+            if not self.holds(session, answer.lease):
+                return Refused(Refusal.FOREIGN_LEASE, "only the holder can answer, under its own lease")
+            effects = self.authority.answer(
+                session.app_id, answer.lease, answer.app_id, answer.grant, answer.reason, now_ns
+            )
+            self._take_rights(effects, now_ns)
+        return Done()
 
     def release_authority(self, session: Session, now_ns: int) -> AnyReply:
         """Give the authority back or leave the line."""
@@ -127,47 +148,34 @@ class Watch:
         self._stamp()
         ended = [effect for effect in effects if isinstance(effect, (rights.Lost, rights.Preempted))]
         for effect in ended:
-            self._tell_right(effect)
+            self._tell_right(effect, now_ns)
         self._climb(now_ns)  # which hovers, before anybody hears that he has the authority
         for effect in effects:
             if effect not in ended:
-                self._tell_right(effect)
+                self._tell_right(effect, now_ns)
 
-    def _tell_right(self, effect: rights.Effect) -> None:
-        name = self._name(effect.app_id)
-        data: dict[str, Value] = {"app_id": effect.app_id}
-        severity = Severity.INFO
-        if isinstance(effect, rights.Granted):
-            kind = EventKind.AUTHORITY_GRANTED
-            text = f"{name} has the authority (priority {effect.priority}, lease {effect.lease})"
-            data |= {"priority": effect.priority, "lease": effect.lease}
-        elif isinstance(effect, rights.Queued):
-            kind = EventKind.AUTHORITY_QUEUED
-            text = f"{name} waits for the authority, number {effect.position} in line"
-            data |= {"priority": effect.priority, "position": effect.position}
-        elif isinstance(effect, rights.Lost):
-            kind, severity = EventKind.AUTHORITY_LOST, Severity.WARNING
-            heir = self.authority.holder
-            text = f"{name} lost the authority: {effect.reason}"
-            by = self._name(heir.app_id) if heir is not None else ""
-            data |= {"lease": effect.lease, "reason": effect.reason, "by": by}
-        else:
-            kind, severity, by = EventKind.AUTHORITY_PREEMPTED, Severity.WARNING, self._name(effect.by_id)
-            text = f"{by} (priority {effect.by_priority}) took the authority over from {name}"
-            data |= {"lease": effect.lease, "by": by, "by_id": effect.by_id, "by_priority": effect.by_priority}
-        self._tell(kind, text, severity, app=name, data=data)
+    def _tell_right(self, effect: rights.Effect, now_ns: int) -> None:
+        holder = self.authority.holder
+        scene = Scene(now_ns, self._name, self._identity, "" if holder is None else self._name(holder.app_id))
+        notice = tell(effect, scene)
+        self._tell(notice.kind, notice.text, notice.severity, app=notice.app, data=notice.data)
+
+    def _identity(self, app_id: int) -> str:
+        """What the transport knows of who this is."""
+        session = self._sessions.get(app_id)
+        return "" if session is None else session.peer.address
 
     def _name(self, app_id: int) -> str:
         session = self._sessions.get(app_id)
         return session.name if session is not None else f"application {app_id}"
 
     def _stamp(self) -> None:
-        holder = self.authority.holder
+        owner = self.authority.owner
         self._vehicle.stamp(
             {
-                "owner": self._name(holder.app_id) if holder is not None else None,
-                "owner_id": holder.app_id if holder is not None else 0,
-                "owner_priority": holder.priority if holder is not None else None,
+                "owner": self._name(owner.app_id) if owner is not None else None,
+                "owner_id": owner.app_id if owner is not None else 0,
+                "owner_priority": owner.priority if owner is not None else None,
                 "lease": self.authority.lease,
                 "failsafe": self.ladder.step,
             }

@@ -147,6 +147,12 @@ def quaternion(roll: float, pitch: float, yaw: float) -> Quaternion:
     )
 
 
+def pose_of(values: Sequence[float]) -> Pose:
+    """From position and quaternion x, y, z, w."""
+    x, y, z, qx, qy, qz, qw = values[:7]
+    return Pose(position=Vector3(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
+
+
 def pose_in_world(at_ns: int, place: Pose) -> bytes:
     return PoseInFrame(timestamp=timestamp(at_ns), frame_id=WORLD, pose=place).SerializeToString()
 

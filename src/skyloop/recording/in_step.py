@@ -238,7 +238,7 @@ class InStepClient(ClientEnd):
         if not self._closing:
             self._handler.packet(packet)
 
-    def frame(self, header: FrameHeader, pixels: Pixels) -> None:
+    def frame(self, header: FrameHeader, pixels: Pixels, topic: str = "") -> None:  # noqa: ARG002
         if not self._closing:
             self._handler.frame(header, pixels)
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import Final, Protocol
 
 from skyloop.client.link import Link
 from skyloop.client.pace import Pace
@@ -54,7 +54,7 @@ class Lockstep:
             server = InStepServer(self._world)
             name = Path(driver.uri.place).stem[:64] or "replay"
             self._proxy = Proxy(driver, server, name=name, clock=clock, ticker=False)
-            self.pace = StepPace(clock, self._world, self._proxy, driver, tape.begin_ns)
+            self.pace = StepPace(clock, self._world, self._proxy, lambda: driver.steps, tape.begin_ns)
             self._proxy.start()
         except BaseException:
             self._world.end()
@@ -72,17 +72,35 @@ class Lockstep:
             self._world.end()
 
 
+class Moments(Protocol):
+    """What the time goes on to: the samples of a recording, or the steps of a simulated world."""
+
+    @property
+    def due_ns(self) -> int | None:
+        """When the next one is; None after the last."""
+
+    def step(self) -> None:
+        """Let it happen: its time is now."""
+
+
 class StepPace(Pace):
     """The time of the recording. Waiting is what makes it go on."""
 
     in_step = True
 
-    def __init__(self, clock: ManualClock, world: World, proxy: Proxy, driver: ReplayDriver, begin_ns: int) -> None:
+    def __init__(
+        self,
+        clock: ManualClock,
+        world: World,
+        proxy: Proxy,
+        moments: Callable[[], Moments | None],
+        begin_ns: int,
+    ) -> None:
         super().__init__(clock)
         self._time = clock
         self._world = world
         self._proxy = proxy
-        self._driver = driver
+        self._moments = moments
         self._begin_ns = begin_ns
         self._link: Link | None = None
         self._link_due_ns = 0
@@ -133,7 +151,7 @@ class StepPace(Pace):
 
     def _step(self, until_ns: int) -> bool:
         """Do what comes next; False if that is later than the time given, or if nothing comes any more."""
-        link, steps, time = self._link, self._driver.steps, self._time
+        link, steps, time = self._link, self._moments(), self._time
         if link is not None and (link.poked or self._link_due_ns <= time.now_ns):
             self._attend(link)
             return True

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from skyloop.client import Drone
+from skyloop.client import Drone, Result
 from skyloop.client.delivery import Listener
 from skyloop.client.frame import Arrival, to_bgr
 from skyloop.client.slots import Buffer
@@ -88,6 +88,7 @@ class Tap:
             (Channel.COMMANDS, drone.on_command, self._applied),
             (Channel.ANNOTATIONS, drone.on_annotation, self._annotation),
             (Channel.LOGS, drone.on_log, self._log),
+            (Channel.RESULTS, drone.on_result, self._result),
         )
         for channel, subscribe, sink in listen:
             if wants(channel):
@@ -166,6 +167,9 @@ class Tap:
 
     def _log(self, entry: LogEntry) -> None:
         self._put("logs", Rank.KEPT, entry, _SIZE + len(entry.text or "") + 10 * len(entry.values or ()))
+
+    def _result(self, result: Result) -> None:
+        self._put("results", Rank.STATE, result.header, _SIZE + len(result.header.payload))
 
 
 class Stream:

@@ -5,8 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any, Final
 
+import numpy as np
+
+from skyloop.errors import DecodeError
 from skyloop.logfile import layout
-from skyloop.logfile.layout import Channel, ClockPair, Drops, FrameRecord, Topic
+from skyloop.logfile.layout import Channel, ClockPair, Drops, FrameRecord, ResultRecord, Topic
 from skyloop.messages import (
     Annotation,
     Applied,
@@ -18,8 +21,11 @@ from skyloop.messages import (
     Intrinsics,
     LogEntry,
     Parameter,
+    ProcessorResult,
 )
 from skyloop.messages.encoded import H264
+from skyloop.messages.log import MOCAP
+from skyloop.messages.payload import unpack
 from skyloop.recording import foxglove
 from skyloop.recording.backlog import Item
 from skyloop.recording.output import Message
@@ -80,6 +86,7 @@ class Translator:
             Parameter: self._parameter,
             Annotation: self._annotation,
             LogEntry: self._log,
+            ProcessorResult: self._result,
             Picture: self._picture,
             Drops: self._drops,
         }
@@ -150,10 +157,31 @@ class Translator:
     def _log(self, entry: LogEntry, log_ns: int) -> Iterator[Message]:
         at_ns = self._unix(entry.at_ns)
         yield self._own(Channel.LOGS, entry, log_ns, at_ns)
+        if entry.name == MOCAP and entry.values is not None and len(entry.values) >= 7:
+            pose = foxglove.pose_in_world(at_ns, foxglove.pose_of(entry.values))
+            yield Message(layout.mocap_topic(self._drone), foxglove.PoseInFrame, pose, log_ns, at_ns)
         if entry.text is not None:
             text = f"{entry.name}: {entry.text}" if entry.name else entry.text
             line = foxglove.log(self._drone, at_ns, entry.severity, text, entry.source)
             yield Message(layout.LOG, foxglove.Log, line, log_ns, at_ns)
+
+    def _result(self, result: ProcessorResult, log_ns: int) -> Iterator[Message]:
+        try:
+            value = _listed(unpack(result.payload))
+        except DecodeError:
+            value = None  # what nobody can understand is no value
+        record = ResultRecord(
+            result.processor,
+            result.worker,
+            result.number,
+            result.camera,
+            result.seq,
+            result.captured_ns,
+            result.made_ns,
+            result.took_ns,
+            value,
+        )
+        yield self._own(Channel.RESULTS, record, log_ns, self._unix(result.captured_ns), result.seq)
 
     def _drops(self, drops: Drops, log_ns: int) -> Iterator[Message]:
         yield self._own(Channel.DROPS, drops, log_ns, log_ns)
@@ -188,3 +216,14 @@ class Translator:
         transform = foxglove.drone_to_camera(self._drone, camera, at_ns)
         if transform is not None:
             yield Message(layout.TF, foxglove.FrameTransform, transform, at_ns, at_ns)
+
+
+def _listed(value: Any) -> Any:
+    """As JSON can hold it: arrays as lists, keys as texts."""
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, dict):
+        return {str(key): _listed(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_listed(one) for one in value]
+    return value

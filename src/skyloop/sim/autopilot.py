@@ -83,6 +83,11 @@ class Autopilot:
             return self._advance(drone, Happening.SET_POINT, clamped, time_s)
         return Idle()
 
+    def hover_here(self, drone: int, altitude_m: float, time_s: float) -> None:
+        """A drone in the air was put somewhere else: it holds that place, and has learnt nothing of the wind there."""
+        self._loops.start(drone, altitude_m)
+        self._advance(drone, Happening.HOVER, Hover(), time_s)
+
     def supervise(self, time_s: float) -> None:
         """Once a period of the loops: see who has reached the height of take-off."""
         for drone, height in list(self._rising.items()):

@@ -91,6 +91,16 @@ class Bodies:
         """Running motors hold the attitude again, or the legs on the ground do."""
         self._stiff[:, drone] = self._stiff_running[:, drone]
 
+    def put(self, drone: int, position_m: Floats, yaw_rad: float, thrust: float) -> None:
+        """Level and at rest somewhere else, shape (3,) [m]; ``thrust`` is an acceleration [m/s²]."""
+        self.position[:, drone] = position_m
+        for still in (self.velocity, self.velocity_before, self.angles, self.rates):
+            still[:, drone] = 0.0
+        self.angles[2, drone] = yaw_rad
+        self.thrust[drone] = self.thrust_command[drone] = thrust
+        np.sin(self.angles, out=self.sin)
+        np.cos(self.angles, out=self.cos)
+
     def step(self) -> None:
         """Go on by :data:`STEP_S`, as if nothing were in the way."""
         self._turn()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Protocol
 
@@ -18,7 +19,7 @@ from skyloop.sim.world import TargetState, Wind
 
 if TYPE_CHECKING:
     from skyloop.sim.camera import CameraModel
-    from skyloop.sim.studio import Camera, Screen, Studio
+    from skyloop.sim.studio import Camera, Exposing, Screen
 
 TICK_S: Final = 0.008  #: of the clock: steps are done in bunches of so much
 
@@ -67,7 +68,7 @@ class SimHost:
         )
         self._lock = threading.Lock()
         self._passengers: dict[int, tuple[Passenger, tuple[Camera, ...]]] = {}  # replaced as a whole, never changed
-        self._runner: _Runner | None = None
+        self._runner: Runner | None = None
 
     @property
     def drones(self) -> int:
@@ -94,7 +95,7 @@ class SimHost:
             cameras = self._cameras(drone, screen, models)
             self._passengers = {**self._passengers, drone: (passenger, cameras)}
             if self._runner is None:
-                self._runner = _Runner(self)
+                self._runner = self._make_runner()
             return cameras
 
     def leave(self, drone: int, passenger: Passenger) -> None:
@@ -118,6 +119,9 @@ class SimHost:
         """Who is told about which drone, and its cameras."""
         return self._passengers
 
+    def _make_runner(self) -> Runner:
+        return _Threads(self)
+
     def _cameras(self, drone: int, screen: Screen, models: list[CameraModel]) -> tuple[Camera, ...]:
         if not models:
             return ()
@@ -133,51 +137,28 @@ class SimHost:
         return tuple(cameras)
 
 
-class _Runner:
-    """The threads of a host: one steps the world and tells, one draws."""
+class Runner(Protocol):
+    """What moves a host's world while somebody is aboard."""
 
-    def __init__(self, host: SimHost) -> None:
-        self._host = host
-        self._simulation = host.simulation
-        self._speed = host.options.speed
-        self._pacer = Pacer(self._simulation.step, speed=self._speed)
-        self._begun_s = self._simulation.time_s
-        self._period_ns = nanoseconds(1.0 / host.options.rate_hz)
-        self._report_ns = 0
-        self._studio: Studio | None = None
-        self._stop = threading.Event()
-        self._telling = threading.Lock()
-        self._thread = threading.Thread(target=self._run, name="skyloop-sim", daemon=True)
-        self._thread.start()
-
-    def stop(self) -> None:
-        self._stop.set()
-        if self._thread is not threading.current_thread():
-            self._thread.join()
-        if self._studio is not None:
-            self._studio.stop()
+    def stop(self) -> None: ...
 
     def forget(self, cameras: tuple[Camera, ...]) -> None:
         """When this returns the round of telling that was under way is over, and no picture of these cameras comes."""
-        if self._thread is not threading.current_thread():
-            with self._telling:
-                pass
-        if self._studio is not None:
-            self._studio.forget(cameras)
 
-    def _run(self) -> None:
-        try:
-            while not self._stop.wait(max(self._pacer.run_due(), TICK_S)):
-                with self._telling:
-                    self._tell()
-        except Exception as error:  # noqa: BLE001  told to every driver; a thread that dies in silence helps nobody
-            for passenger, _ in self._host.passengers.values():
-                passenger.failed(error)
 
-    def _tell(self) -> None:
-        simulation, passengers = self._simulation, self._host.passengers
-        now_s = simulation.time_s
-        captured_ns = self._pacer.clock_ns(now_s - self._begun_s)
+class Teller:
+    """What the passengers of a host are told, and which pictures are taken, after each bunch of steps."""
+
+    def __init__(self, host: SimHost, make_studio: Callable[[], Exposing]) -> None:
+        self.studio: Exposing | None = None  #: made when the first picture is wanted
+        self._host = host
+        self._make_studio = make_studio
+        self._period_ns = nanoseconds(1.0 / host.options.rate_hz)
+        self._report_ns = 0
+
+    def tell(self, captured_ns: int) -> None:
+        """``captured_ns``: what it is on the passengers' clock."""
+        simulation, passengers = self._host.simulation, self._host.passengers
         for occurrence in simulation.take_occurrences():
             if occurrence.drone in passengers:
                 passengers[occurrence.drone][0].happened(occurrence)
@@ -187,7 +168,7 @@ class _Runner:
             for drone, (passenger, _) in passengers.items():
                 report = Report(simulation.feedback(drone), simulation.truth(drone), targets, captured_ns)
                 passenger.report(report)
-        self._expose(now_s, captured_ns)
+        self._expose(simulation.time_s, captured_ns)
 
     def _expose(self, now_s: float, captured_ns: int) -> None:
         due = [
@@ -199,13 +180,59 @@ class _Runner:
         if not due:
             return
         from skyloop.sim.render import SceneState
-        from skyloop.sim.studio import Studio, expose
+        from skyloop.sim.studio import expose
 
-        if self._studio is None:
-            options = self._host.options
-            self._studio = Studio(self._simulation.world, self._host.drones, options.renderer, options.quality)
-            self._studio.start()
-        positions, rotations = self._simulation.poses()
-        state = SceneState(positions, rotations, self._simulation.target_states())
-        rates = {camera.drone: np.array(self._simulation.truth(camera.drone).angular_velocity_rad_s) for camera in due}
-        self._studio.expose([expose(camera, state, rates[camera.drone], captured_ns, self._speed) for camera in due])
+        if self.studio is None:
+            self.studio = self._make_studio()
+        simulation = self._host.simulation
+        positions, rotations = simulation.poses()
+        state = SceneState(positions, rotations, simulation.target_states())
+        rates = {camera.drone: np.array(simulation.truth(camera.drone).angular_velocity_rad_s) for camera in due}
+        speed = self._host.options.speed
+        self.studio.expose([expose(camera, state, rates[camera.drone], captured_ns, speed) for camera in due])
+
+
+class _Threads:
+    """A world in real time: one thread steps it and tells, one draws."""
+
+    def __init__(self, host: SimHost) -> None:
+        self._host = host
+        self._simulation = host.simulation
+        self._pacer = Pacer(self._simulation.step, speed=host.options.speed)
+        self._begun_s = self._simulation.time_s
+        self._teller = Teller(host, self._start_studio)
+        self._stop = threading.Event()
+        self._telling = threading.Lock()
+        self._thread = threading.Thread(target=self._run, name="skyloop-sim", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._stop.set()
+        if self._thread is not threading.current_thread():
+            self._thread.join()
+        if self._teller.studio is not None:
+            self._teller.studio.stop()
+
+    def forget(self, cameras: tuple[Camera, ...]) -> None:
+        if self._thread is not threading.current_thread():
+            with self._telling:
+                pass
+        if self._teller.studio is not None:
+            self._teller.studio.forget(cameras)
+
+    def _run(self) -> None:
+        try:
+            while not self._stop.wait(max(self._pacer.run_due(), TICK_S)):
+                with self._telling:
+                    self._teller.tell(self._pacer.clock_ns(self._simulation.time_s - self._begun_s))
+        except Exception as error:  # noqa: BLE001  told to every driver; a thread that dies in silence helps nobody
+            for passenger, _ in self._host.passengers.values():
+                passenger.failed(error)
+
+    def _start_studio(self) -> Exposing:
+        from skyloop.sim.studio import Studio
+
+        options = self._host.options
+        studio = Studio(self._simulation.world, self._host.drones, options.renderer, options.quality)
+        studio.start()
+        return studio

@@ -6,7 +6,6 @@ attitude are worked out when somebody looks, from noise that belongs to the step
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -92,16 +91,3 @@ class Sensors:
 
 def _rows(parameters: Sequence[VehicleParameters], values: Sequence[_Value]) -> Floats:
     return np.array([column(parameters, value) for value in values])
-
-
-def quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
-    """The attitude as a unit quaternion (w, x, y, z), world from body."""
-    cr, sr = math.cos(roll / 2), math.sin(roll / 2)
-    cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
-    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
-    return (
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-    )

@@ -14,7 +14,7 @@ import numpy as np
 
 from skyloop.errors import UsageError
 from skyloop.messages import Action, AnyAction, FlightState
-from skyloop.messages.geometry import wrap_angle
+from skyloop.messages.geometry import quaternion_from_euler, wrap_angle
 from skyloop.sim.autopilot import Autopilot
 from skyloop.sim.battery import Batteries
 from skyloop.sim.collisions import Collisions
@@ -23,7 +23,7 @@ from skyloop.sim.dynamics import STEP_S, Bodies, body_rates, rotations
 from skyloop.sim.parameters import GRAVITY_M_S2, Limits, VehicleParameters
 from skyloop.sim.placement import place
 from skyloop.sim.reports import Occurrence, VehicleFeedback, VehicleTruth
-from skyloop.sim.sensors import Sensors, quaternion
+from skyloop.sim.sensors import Sensors
 from skyloop.sim.solids import Solids
 from skyloop.sim.streams import Floats
 from skyloop.sim.targets import TargetTrack
@@ -161,6 +161,23 @@ class Simulation:
         with self._lock:
             self._batteries.charge[self._number(drone)] = charge
 
+    def put(self, drone: int, position_m: Vec3, yaw_rad: float = 0.0, *, charge: float = 1.0) -> None:
+        """Put a drone that flies somewhere else, hovering, level and at rest, with a battery of this charge: the begin
+        of another try in one simulation. ``position_m``: of its centre, world axes.
+
+        Raises :class:`UsageError` for a drone that does not fly, and for a place that is no place.
+        """
+        place = np.array(position_m, dtype=float)
+        if place.shape != (3,) or not np.isfinite(place).all() or not np.isfinite(yaw_rad):
+            raise UsageError(f"a place is three finite numbers and a heading, not {position_m!r}, {yaw_rad!r}")
+        self.set_charge(drone, charge)
+        with self._lock:
+            if self._autopilot.states[self._number(drone)] not in (FlightState.HOVERING, FlightState.FLYING):
+                raise UsageError(f"drone {drone} is {self._autopilot.states[drone]}: only one that flies can be put")
+            self._bodies.put(drone, place, wrap_angle(yaw_rad), GRAVITY_M_S2)
+            altitude = position_m[2] - self.parameters[drone].half_height_m
+            self._autopilot.hover_here(drone, altitude, self.time_s)
+
     # Looking ---------------------------------------------------------------------------------------------------
 
     def state(self, drone: int) -> FlightState:
@@ -200,7 +217,7 @@ class Simulation:
                 roll_rad=roll,
                 pitch_rad=pitch,
                 yaw_rad=wrap_angle(yaw),
-                quaternion=quaternion(roll, pitch, yaw),
+                quaternion=quaternion_from_euler(roll, pitch, yaw),
                 angular_velocity_rad_s=_vec3(body_rates(bodies)[:, i]),
                 thrust=float(bodies.thrust[i]) / GRAVITY_M_S2,
                 wind_m_s=_vec3(bodies.air[:, i]),

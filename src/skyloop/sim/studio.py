@@ -27,6 +27,16 @@ class Screen(Protocol):
     def failed(self, error: Exception) -> None: ...
 
 
+class Exposing(Protocol):
+    """What turns exposures into pictures, and hands them out when they are due."""
+
+    def expose(self, exposures: list[Exposure]) -> None: ...
+
+    def forget(self, cameras: tuple[Camera, ...]) -> None: ...
+
+    def stop(self) -> None: ...
+
+
 class Shutter:
     """Says when a camera exposes, by absolute times of the simulation. Pure."""
 
@@ -87,7 +97,7 @@ class Studio:
         self._world = world
         self._drones = drones
         self._renderer = renderer
-        self._quality = Quality(quality)
+        self._quality = quality
         self._changed = threading.Condition()
         self._waiting: dict[Camera, Exposure] = {}  # oldest camera first
         self._finished: list[tuple[int, int, Exposure, NDArray[np.uint8]]] = []  # a heap by due time
@@ -125,7 +135,7 @@ class Studio:
 
     def _run(self) -> None:
         try:
-            renderer = self._make_renderer()
+            renderer = make_renderer(self._world, self._drones, self._renderer, self._quality)
         except Exception as error:  # noqa: BLE001  told to the drivers: there will be no pictures
             with self._changed:
                 screens = {camera.screen for camera in self._waiting}
@@ -140,14 +150,6 @@ class Studio:
                 exposure.camera.screen.failed(error)
             else:
                 heapq.heappush(self._finished, (exposure.due_ns, next(self._order), exposure, picture))
-
-    def _make_renderer(self) -> Renderer:
-        """On the thread that draws, which what it makes belongs to."""
-        if self._renderer == "mujoco":
-            from skyloop.sim.render.mujoco import MujocoRenderer
-
-            return MujocoRenderer(self._world, self._drones)
-        return PlanarRenderer(Scene(self._world, self._drones), self._quality)
 
     def _next(self) -> Exposure | None:
         """The next exposure to draw, handing out meanwhile what is due; None to stop."""
@@ -170,6 +172,46 @@ class Studio:
             with self._handing:
                 if not exposure.camera.gone:
                     exposure.camera.screen.show(exposure.model, picture, exposure.captured_ns)
+
+
+class StepStudio:
+    """Draws each exposure at once, and hands out what is due when it is asked to: for a world whose time stands still
+    between two steps. One thread."""
+
+    def __init__(self, world: World, drones: int, renderer: str, quality: str) -> None:
+        self._renderer = make_renderer(world, drones, renderer, quality)
+        self._finished: list[tuple[int, int, Exposure, NDArray[np.uint8]]] = []  # a heap by due time
+        self._order = itertools.count()
+
+    def expose(self, exposures: list[Exposure]) -> None:
+        for exposure in exposures:
+            picture = self._renderer.render(exposure.state, exposure.pose, exposure.model)
+            picture = exposure.camera.finish(picture, exposure.number, exposure.rates_rad_s)
+            heapq.heappush(self._finished, (exposure.due_ns, next(self._order), exposure, picture))
+
+    def hand_out(self, now_ns: int) -> None:
+        """Show what is due by then."""
+        while self._finished and self._finished[0][0] <= now_ns:
+            _, _, exposure, picture = heapq.heappop(self._finished)
+            if not exposure.camera.gone:
+                exposure.camera.screen.show(exposure.model, picture, exposure.captured_ns)
+
+    def forget(self, cameras: tuple[Camera, ...]) -> None:
+        for camera in cameras:
+            camera.gone = True
+
+    def stop(self) -> None:
+        """Pictures that were not handed out yet are lost."""
+        self._finished.clear()
+
+
+def make_renderer(world: World, drones: int, renderer: str, quality: str) -> Renderer:
+    """To be called on the thread that draws, which what it makes belongs to."""
+    if renderer == "mujoco":
+        from skyloop.sim.render.mujoco import MujocoRenderer
+
+        return MujocoRenderer(world, drones)
+    return PlanarRenderer(Scene(world, drones), Quality(quality))
 
 
 def require_renderer(name: str) -> None:

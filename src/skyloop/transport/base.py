@@ -32,7 +32,8 @@ EVENTS = "events"
 COMMANDS = "commands"  #: echoes (Applied) of all commands that the proxy received
 ANNOTATIONS = "annotations"
 LOGS = "logs"  #: what applications log (LogEntry)
-MAX_TOPIC = 80  #: characters
+MAX_TOPIC = 200  #: characters
+RESULTS = "results"  #: what all processors find (ProcessorResult)
 MAX_PACKET = HEADER_SIZE + MAX_BODY  #: bytes
 
 
@@ -44,6 +45,11 @@ def video(camera: str) -> str:
 def stream(camera: str) -> str:
     """The topic of a camera's pictures as the vehicle encoded them (EncodedFrame)."""
     return f"stream/{camera}"
+
+
+def results(processor: str) -> str:
+    """The topic of what one processor finds (ProcessorResult)."""
+    return f"{RESULTS}/{processor}"
 
 
 _UINT8 = np.dtype(np.uint8)
@@ -60,6 +66,9 @@ class Peer:
     address: str  #: for people: process id and user, or host and port
 
 
+NOBODY = Peer(0, "nobody that is connected")
+
+
 class ServerHandler(Protocol):
     """What a server end calls."""
 
@@ -68,6 +77,12 @@ class ServerHandler(Protocol):
 
     def packet(self, peer: Peer, packet: bytes) -> None:
         """A packet came. It may be anything: the transport does not look inside."""
+
+    def refused(self, peer: Peer, reason: str) -> None:
+        """A packet came that this application has no right to send, by the keys that it has; it was not handed on.
+
+        ``peer`` is :data:`NOBODY` where none is known.
+        """
 
     def peer_left(self, peer: Peer, reason: str) -> None:
         """The connection ended; called once per ``peer_joined``, after its last packet."""
@@ -119,8 +134,10 @@ class ClientHandler(Protocol):
     def packet(self, packet: bytes) -> None:
         """A packet came."""
 
-    def frame(self, header: FrameHeader, pixels: Pixels) -> None:
-        """A frame came. Keep ``pixels`` (or any view) for as long as needed: it costs only this application."""
+    def frame(self, header: FrameHeader, pixels: Pixels, topic: str = "") -> None:
+        """A frame came; ``topic`` is the one by which it was asked for where :attr:`ClientEnd.variants` is true.
+
+        Keep ``pixels`` (or any view) for as long as needed: it costs only this application."""
 
     def closed(self, reason: str) -> None:
         """The connection ended, by whichever end; called once, last."""
@@ -151,6 +168,12 @@ class ClientEnd(ABC):
     @abstractmethod
     def same_clock(self) -> bool:
         """Whether both ends read the same monotonic clock (one host), so that no offset needs estimating."""
+
+    @property
+    def variants(self) -> bool:
+        """Whether frames come as each topic asks (:class:`skyloop.messages.VideoRequest`); else all come as they are,
+        and only the plain topic of a camera may be subscribed to."""
+        return False
 
     @property
     @abstractmethod

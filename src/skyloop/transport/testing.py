@@ -17,7 +17,7 @@ import numpy as np
 from skyloop.messages import Encoding, FrameHeader
 from skyloop.transport.base import ClientEnd, Peer, Pixels
 
-PATIENCE_S: Final = 5.0
+PATIENCE_S: Final = 15.0
 FRONT: Final = "front"
 
 
@@ -45,6 +45,7 @@ class ServerLog:
         self.joined: list[Peer] = []
         self.packets: list[tuple[Peer, bytes]] = []
         self.left: list[tuple[Peer, str]] = []
+        self.refusals: list[tuple[Peer, str]] = []
         self.on_packet: Callable[[Peer, bytes], None] | None = None
 
     def peer_joined(self, peer: Peer) -> None:
@@ -54,6 +55,9 @@ class ServerLog:
         self.packets.append((peer, packet))
         if self.on_packet is not None:
             self.on_packet(peer, packet)
+
+    def refused(self, peer: Peer, reason: str) -> None:
+        self.refusals.append((peer, reason))
 
     def peer_left(self, peer: Peer, reason: str) -> None:
         self.left.append((peer, reason))
@@ -83,7 +87,7 @@ class ClientLog:
         if self.on_packet is not None:
             self.on_packet(packet)
 
-    def frame(self, header: FrameHeader, pixels: Pixels) -> None:
+    def frame(self, header: FrameHeader, pixels: Pixels, topic: str = "") -> None:  # noqa: ARG002
         self.gate.wait(PATIENCE_S)
         if self.keep:
             self.frames.append((header, pixels))

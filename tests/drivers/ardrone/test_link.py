@@ -191,7 +191,7 @@ def test_an_error_of_our_own_is_told_and_does_not_end_the_flight(monkeypatch: py
     with firmware() as drone, opened(drone.ports, "&video=0") as (_, sink):
         wait_up(sink)
         failures = [event for event in sink.events if event.kind is EventKind.DRIVER_ERROR]
-        assert [event.text for event in failures] == ["the link to the drone failed: RuntimeError('a fault')"]
+        assert [event.text for event in failures] == ["the link to the vehicle failed: RuntimeError('a fault')"]
 
 
 def test_nobody_there() -> None:

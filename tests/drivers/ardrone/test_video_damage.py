@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skyloop.drivers.ardrone.assembly import PaveAssembly
-from skyloop.drivers.ardrone.backlog import Coded
 from skyloop.drivers.ardrone.decoding import PaveVideo
+from skyloop.drivers.backlog import Coded
 from skyloop.errors import UnsupportedError
 from skyloop.sim.firmware.ardrone.encoders import MP4_360P, Encoder
 from skyloop.wire.ardrone.pave import Codec, FrameType, PaveFrame

@@ -8,9 +8,9 @@ import socket
 import pytest
 
 from skyloop.clock import ManualClock
-from skyloop.drivers.ardrone.backlog import Coded
 from skyloop.drivers.ardrone.encoded import EncodedStream
 from skyloop.drivers.ardrone.video import VideoReceiver
+from skyloop.drivers.backlog import Coded
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.messages import Intrinsics
 from skyloop.wire.ardrone.pave import Codec, FrameType

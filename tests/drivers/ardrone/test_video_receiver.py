@@ -11,8 +11,8 @@ from contextlib import contextmanager
 import pytest
 
 from skyloop.clock import ManualClock
-from skyloop.drivers.ardrone.backlog import LATE_NS
 from skyloop.drivers.ardrone.video import Notice, VideoCounters, VideoReceiver
+from skyloop.drivers.backlog import LATE_NS
 from skyloop.errors import MissingExtraError, UsageError
 from tests.drivers.ardrone.video_ports import (
     HOST,

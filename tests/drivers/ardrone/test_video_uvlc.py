@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from skyloop.clock import ManualClock
-from skyloop.drivers.ardrone.backlog import Coded
 from skyloop.drivers.ardrone.decoding import UvlcVideo
 from skyloop.drivers.ardrone.streams import WAKE
 from skyloop.drivers.ardrone.video import Notice
+from skyloop.drivers.backlog import Coded
 from skyloop.sim.firmware.uvlc import encode
 from skyloop.wire.ardrone.uvlc import UvlcDecoder, is_intra, is_p264
 from tests.drivers.ardrone.video_ports import HOST, PATIENCE_S, Viewer, digest, receiver_of

@@ -48,6 +48,7 @@ PEERS: Final = {
         "pip install ros-rclpy ros-rmw-fastrtps-cpp ros-sensor-msgs, in an environment of its own, "
         "whose interpreter --ros-python names",
     ),
+    "fabric": Peer("Skyloop over the network", "zenoh", "eclipse-zenoh", "pip install 'skyloop[network]'"),
     "zenoh": Peer("Zenoh", "zenoh", "eclipse-zenoh", "pip install 'skyloop[bench]'"),
     "zeromq": Peer("ZeroMQ", "zmq", "pyzmq", "pip install 'skyloop[bench]'"),
 }

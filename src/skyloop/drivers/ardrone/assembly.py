@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from skyloop.drivers.ardrone.backlog import Coded
 from skyloop.drivers.ardrone.stamps import DroneStamps
+from skyloop.drivers.backlog import Coded
 from skyloop.wire.ardrone.pave import PaveFrame, PaveParser
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from skyloop.drivers.ardrone.backlog import Coded
+from skyloop.drivers.backlog import Coded
+from skyloop.drivers.live_video import Decoded, Decoder
 from skyloop.errors import DecodeError, MissingExtraError, UnsupportedError
 from skyloop.wire.ardrone.pave import Codec, PaveFrame
 from skyloop.wire.ardrone.uvlc import UvlcDecoder, UvlcPicture, is_p264
@@ -15,29 +15,6 @@ from skyloop.wire.ardrone.uvlc import UvlcDecoder, UvlcPicture, is_p264
 REORDERED: Final = 64  #: a number further back than this is not a late picture but a drone that was started again,
 OLD_RUN: Final = 4  #: and so are this many pictures in a row that are older than the newest
 _DECODED: Final = (Codec.MPEG4_VISUAL, Codec.MPEG4_AVC)
-
-Decoded = tuple[int, NDArray[np.uint8]]  # the drone's number of the picture; BGR, (height, width, 3), C-contiguous
-
-
-class Decoder(Protocol):
-    """Decodes the frames of one connection after the other."""
-
-    @property
-    def waited(self) -> int:
-        """Frames left out because what they build on was never seen, or because a newer one was shown before."""
-
-    @property
-    def damaged(self) -> int:
-        """Frames that could not be decoded."""
-
-    def restart(self) -> None:
-        """What comes next does not continue what came before."""
-
-    def decode(self, coded: Coded, *, show: bool) -> Decoded | None:
-        """The picture of this frame; None if there is none, or it is not to be shown.
-
-        Raises :class:`UnsupportedError` for a codec that is not decoded here, and nothing else for what a frame holds.
-        """
 
 
 class PaveVideo:

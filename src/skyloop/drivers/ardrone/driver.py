@@ -15,9 +15,10 @@ from skyloop.drivers.ardrone.options import options_of
 from skyloop.drivers.ardrone.parameters import Entry, active_camera, entries_of, taken, written
 from skyloop.drivers.ardrone.session import Session, Telling
 from skyloop.drivers.ardrone.setup import own_ids
-from skyloop.drivers.ardrone.video import Notice, Picture, VideoReceiver
+from skyloop.drivers.ardrone.video import VideoReceiver
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.intrinsics import intrinsics_of
+from skyloop.drivers.live_video import Notice, Picture
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import DriverError, ParameterError, SkyloopError
 from skyloop.messages import (

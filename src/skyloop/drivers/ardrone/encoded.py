@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from skyloop.drivers.ardrone.backlog import Coded
+from skyloop.drivers.backlog import Coded
 from skyloop.drivers.base import Sink
 from skyloop.messages import Intrinsics
 from skyloop.messages.encoded import Chain

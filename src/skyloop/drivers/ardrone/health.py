@@ -2,22 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import Final
 
+from skyloop.drivers.notices import Notice
 from skyloop.messages import EventKind, Severity, Value
 from skyloop.wire.ardrone.navdata import State
-
-
-@dataclass(frozen=True, slots=True)
-class Notice:
-    """Something for the sink's ``event``."""
-
-    kind: EventKind
-    text: str
-    severity: Severity = Severity.INFO
-    data: dict[str, Value] = field(default_factory=dict)
-
 
 #: Bit, its name in events' data, what it means while it is set.
 _CONDITIONS: Final = (

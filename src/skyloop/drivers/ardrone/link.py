@@ -9,7 +9,6 @@ import selectors
 import socket
 import threading
 from collections.abc import Callable
-from contextlib import suppress
 from functools import partial
 from typing import Final
 
@@ -17,9 +16,9 @@ from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
 from skyloop.drivers.ardrone.configuration import Exchange, Read, Write
 from skyloop.drivers.ardrone.dump_client import DumpClient
 from skyloop.drivers.ardrone.sender import Message
-from skyloop.drivers.ardrone.session import REPEATS, START_NAVDATA, TICK_NS, Session, Telling
-from skyloop.drivers.base import Sink
-from skyloop.messages import AnyAction, EventKind, Severity
+from skyloop.drivers.ardrone.session import REPEATS, START_NAVDATA, Session, Telling
+from skyloop.drivers.link_thread import LinkThread, tell_failure
+from skyloop.messages import AnyAction
 
 MAX_DATAGRAM: Final = 65_536
 BURST: Final = 32  #: datagrams that are read before AT commands get their turn
@@ -28,36 +27,22 @@ RENEW_NS: Final = nanoseconds(2.0)  #: pace of new sockets while nothing is hear
 _CLOSE_S: Final = 2.0
 
 
-class Link:
+class Link(LinkThread):
     """Serves a session from :meth:`start` to :meth:`stop`. ``deliver`` gets its tellings, on the link's thread."""
 
     def __init__(self, session: Session, deliver: Callable[[list[Telling]], None], clock: Clock = monotonic_ns) -> None:
+        super().__init__("skyloop-ardrone", close_s=_CLOSE_S)
         self.session = session
-        self.lock = threading.Lock()  #: to be held by whoever touches the session
         self._deliver = deliver
         self._clock = clock
-        self._stopping = threading.Event()
-        self._selector = selectors.DefaultSelector()
-        self._awake, self._waker = socket.socketpair()
         self._navdata: socket.socket | None = None
         self._at: socket.socket | None = None
         self._renewed_ns = -RENEW_NS
         self._dump = DumpClient(session.options.ports.control, self._selector)
-        self._thread = threading.Thread(target=self._run, name="skyloop-ardrone", daemon=True)
-
-    def start(self) -> None:
-        """Begin."""
-        self._awake.setblocking(False)
-        self._waker.setblocking(False)
-        self._selector.register(self._awake, selectors.EVENT_READ)
-        self._thread.start()
 
     def stop(self) -> None:
         """End, and give everything back. Exchanges that go on fail."""
-        self._stopping.set()
-        self._wake()
-        if self._thread is not threading.current_thread():
-            self._thread.join(_CLOSE_S)
+        self.join()
         with self.lock:
             self.session.close()
 
@@ -72,7 +57,7 @@ class Link:
             if due_ns <= now_ns:
                 self._say(now_ns)
         if now_ns < due_ns:
-            self._wake()
+            self.wake()
         return applied
 
     def say(self, message: Message, times: int = REPEATS) -> None:
@@ -92,32 +77,20 @@ class Link:
         with self.lock:
             deadline_ns = self._clock() + nanoseconds(WRITE_S)
             self.session.submit(Exchange(iter((Write(key, text), Read())), deadline_ns, end))
-        self._wake()
+        self.wake()
         if not done.wait(WRITE_S + 0.1):
             return "the driver did not get to it"
         return failures[0]
 
-    def _wake(self) -> None:
-        with suppress(OSError):  # it is awake, or it ended
-            self._waker.send(b"\0")
-
     # On the link's thread --------------------------------------------------------------------------------------
 
-    def _run(self) -> None:
-        try:
-            while not self._stopping.is_set():
-                try:
-                    self._step()
-                except Exception as error:  # noqa: BLE001  whatever happens, the drone must be told what to do
-                    self._deliver([partial(_tell_failure, error)])
-                    self._stopping.wait(seconds(TICK_NS))
-        finally:
-            with self.lock:
-                self._close_sockets()
-            self._dump.close()
-            self._selector.close()
-            self._awake.close()
-            self._waker.close()
+    def _fail(self, error: Exception) -> None:
+        self._deliver([partial(tell_failure, error)])
+
+    def _release(self) -> None:
+        with self.lock:
+            self._close_sockets()
+        self._dump.close()
 
     def _step(self) -> None:
         now_ns = self._clock()
@@ -127,7 +100,7 @@ class Link:
         self._renew_sockets()
         for key, _ in ready:
             if key.fileobj is self._awake:
-                self._drain(self._awake)
+                self._slept()
             elif key.fileobj is self._navdata:
                 self._receive(self._navdata)
             elif key.fileobj is self._at:
@@ -222,7 +195,3 @@ class Link:
                 self._selector.unregister(connection)
                 connection.close()
         self._navdata = self._at = None
-
-
-def _tell_failure(error: Exception, sink: Sink) -> None:
-    sink.event(EventKind.DRIVER_ERROR, f"the link to the drone failed: {error!r}", Severity.ERROR, where="link")

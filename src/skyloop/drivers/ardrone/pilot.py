@@ -12,9 +12,9 @@ from enum import Enum, auto
 from typing import Final
 
 from skyloop.clock import nanoseconds
-from skyloop.drivers.ardrone.health import Notice
 from skyloop.drivers.ardrone.sender import Message
 from skyloop.drivers.ardrone.set_points import Stick, StickLimits, motion, stick_of
+from skyloop.drivers.notices import Notice
 from skyloop.errors import DriverError
 from skyloop.messages import (
     AnyAction,

@@ -14,7 +14,7 @@ from typing import Final, TypeAlias
 from skyloop.clock import nanoseconds, seconds
 from skyloop.drivers.ardrone.configuration import Configurator, Exchange, Ids
 from skyloop.drivers.ardrone.feedback import ClimbMeter, control_state, feedback_of
-from skyloop.drivers.ardrone.health import Health, Notice
+from skyloop.drivers.ardrone.health import Health
 from skyloop.drivers.ardrone.native import native_of
 from skyloop.drivers.ardrone.options import ArdroneOptions
 from skyloop.drivers.ardrone.pilot import Condition, Pilot
@@ -23,6 +23,7 @@ from skyloop.drivers.ardrone.sender import Message, Sequencer
 from skyloop.drivers.ardrone.set_points import limits_of
 from skyloop.drivers.ardrone.setup import Setup
 from skyloop.drivers.base import Sink
+from skyloop.drivers.notices import Notice
 from skyloop.messages import AnyAction, EventKind, LinkState, Severity, Value
 from skyloop.wire.ardrone.navdata import Navdata, State
 from skyloop.wire.ardrone.options import Demo

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import socket
-from typing import Final, Protocol
+from typing import Final
 
 from skyloop.clock import Clock, nanoseconds
 from skyloop.drivers.ardrone.assembly import PaveAssembly
-from skyloop.drivers.ardrone.backlog import Coded
+from skyloop.drivers.backlog import Coded
+from skyloop.drivers.live_video import Stream
 from skyloop.wire.ardrone.uvlc import is_intra
 
 CONNECT_S: Final = 1.0
@@ -16,23 +17,6 @@ SILENT_S: Final = 3.0  #: without a whole frame for so long, a connection is giv
 KEEP_ALIVE_S: Final = 0.5
 WAKE: Final = b"\x01\x00\x00\x00"  #: to an AR.Drone 1: any small datagram starts the video and keeps it up
 _CHUNK: Final = 1 << 16
-
-
-class Stream(Protocol):
-    """One connection to the drone's video port."""
-
-    @property
-    def broken(self) -> int:
-        """Frames that were begun and broken off, or stale."""
-
-    @property
-    def lost_bytes(self) -> int:
-        """Bytes that belong to no whole frame."""
-
-    def read(self) -> list[Coded]:
-        """The frames that came, after :data:`POLL_S` at most. Raises OSError once the connection is lost."""
-
-    def close(self) -> None: ...
 
 
 class PaveStream:

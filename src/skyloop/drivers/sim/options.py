@@ -7,7 +7,7 @@ charge at the start, 0 to 1 (1); ``renderer`` what draws the pictures, ``planar`
 ``quality`` of the planar ones, ``fast``, ``smooth`` or ``best`` (``smooth``); ``native`` the actions that the vehicle
 itself takes, the others being left to the proxy (all); ``position`` whether the vehicle knows its place, as with an
 indoor positioning system (0); ``truth`` whether feedback carries the true state besides (1); ``rate`` of feedback
-[1/s] (40).
+[1/s] (40); ``vehicle`` whose response it has, ``quadrotor`` or ``ardrone``, as identified (``quadrotor``).
 """
 
 from __future__ import annotations
@@ -19,15 +19,17 @@ from skyloop.drivers.base import reject_unknown_options
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.sim.camera import BOTTOM_CAMERA, FRONT_CAMERA, CameraModel
-from skyloop.sim.options import EVERY_ACTION, SimOptions
+from skyloop.sim.options import EVERY_ACTION, STANDARD_VEHICLE, SimOptions
+from skyloop.sim.vehicles import AR_DRONE
 
 CAMERAS: Final = {camera.name: camera for camera in (FRONT_CAMERA, BOTTOM_CAMERA)}
 QUALITIES: Final = ("fast", "smooth", "best")
 RENDERERS: Final = ("planar", "mujoco")
+VEHICLES: Final = {"quadrotor": STANDARD_VEHICLE, "ardrone": AR_DRONE}
 ALWAYS_NATIVE: Final = frozenset({"idle", "emergency_stop", "reset_emergency"})
 _KNOWN: Final = {
     *("world", "seed", "speed", "cameras", "width", "height", "fps", "latency", "noise", "wind", "battery"),
-    *("renderer", "quality", "native", "position", "truth", "rate"),
+    *("renderer", "quality", "native", "position", "truth", "rate", "vehicle"),
 }
 
 
@@ -43,6 +45,9 @@ def options_of(uri: VehicleUri) -> SimOptions:
     renderer = options.get("renderer", "planar")
     if renderer not in RENDERERS:
         raise UnknownNameError("renderer", renderer, RENDERERS)
+    vehicle = options.get("vehicle", "quadrotor")
+    if vehicle not in VEHICLES:
+        raise UnknownNameError("simulated vehicle", vehicle, VEHICLES)
     noise = uri.number("noise", 1.0, minimum=0.0, maximum=20.0)
     return SimOptions(
         world=options.get("world", "room"),
@@ -58,6 +63,7 @@ def options_of(uri: VehicleUri) -> SimOptions:
         position=uri.flag("position"),
         truth=uri.flag("truth", default=True),
         rate_hz=uri.number("rate", 40.0, minimum=1.0, maximum=200.0),
+        parameters=VEHICLES[vehicle],
     )
 
 

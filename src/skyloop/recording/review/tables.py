@@ -6,11 +6,12 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import NS_PER_S
-from skyloop.logfile.layout import Channel, Drops, FrameRecord
+from skyloop.logfile.layout import Channel, Drops, FrameRecord, ResultRecord
 from skyloop.logfile.reader import Item, Progress, Recording
 from skyloop.logfile.times import Course
 from skyloop.messages import (
@@ -170,6 +171,11 @@ def row(item: Item) -> dict[str, Cell]:
     elif isinstance(value, Drops):
         cells = {f"dropped.{name}": count for name, count in value.dropped.items()}
         cells |= {f"missed.{name}": count for name, count in value.missed.items()}
+    elif isinstance(value, ResultRecord):
+        cells = {"processor": value.processor, "worker": value.worker, "camera": value.camera, "seq": value.seq}
+        cells |= {"captured_ns": value.captured_ns, "made_ns": value.made_ns, "took_ns": value.took_ns}
+        parts = value.value.items() if isinstance(value.value, dict) else [("", value.value)]
+        cells |= {f"value.{name}" if name else "value": _flat(one) for name, one in parts}
     else:
         cells = {"source": value.source, "camera": value.camera, "captured_ns": value.captured_ns}
         cells["shapes"] = len(value.shapes)
@@ -193,6 +199,12 @@ def _feedback(feedback: Feedback) -> dict[str, Cell]:
 def _action(prefix: str, action: AnyAction) -> dict[str, Cell]:
     numbers: dict[str, Cell] = {f"{prefix}_{name}": getattr(action, name, None) for name in ACTION_FIELDS}
     return {prefix: action.name, **numbers}
+
+
+def _flat(value: Any) -> Cell:
+    """What has parts, as JSON."""
+    cell: Cell = msgspec.json.encode(value).decode() if isinstance(value, list | dict) else value
+    return cell
 
 
 def _cell(value: Any) -> Cell:

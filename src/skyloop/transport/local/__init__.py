@@ -58,5 +58,5 @@ def _check_platform() -> None:
     if sys.platform != "linux":
         raise UnsupportedError(
             f"the local transport needs Linux (sealed shared memory and SOCK_SEQPACKET), and this is {sys.platform}: "
-            "run proxy and application on Linux; the network transport to come will do without"
+            "run proxy and application on Linux; a program may reach it over the network (network=True) from anywhere"
         )

@@ -16,7 +16,6 @@ import errno
 import fcntl
 import grp
 import os
-import re
 import socket
 import stat
 import struct
@@ -28,8 +27,8 @@ from typing import Final, NamedTuple
 
 from skyloop.errors import LinkError, NameTakenError, UsageError
 from skyloop.transport.local.sockets import Socket, credentials, user_name
+from skyloop.transport.names import NAME, check_name
 
-NAME: Final = re.compile(r"[a-z0-9][a-z0-9_.-]{0,47}")
 DIRECTORY_VARIABLE: Final = "SKYLOOP_RUNTIME_DIR"
 GROUP_VARIABLE: Final = "SKYLOOP_GROUP"
 MAX_PATH: Final = 107  #: bytes that Linux allows in the path of a socket
@@ -198,15 +197,6 @@ def _default_path() -> Path:
         # It warns where there is no XDG_RUNTIME_DIR; that the fallback is safe is checked here.
         warnings.simplefilter("ignore")
         return Path(platformdirs.user_runtime_dir("skyloop", appauthor=False))
-
-
-def check_name(name: str) -> None:
-    """Raise :class:`UsageError` for what cannot be the name of a proxy."""
-    if not NAME.fullmatch(name):
-        raise UsageError(
-            f"{name!r} cannot be the name of a proxy: 1 to 48 lower-case letters, digits, '_', '-' and '.', "
-            "the first one a letter or a digit"
-        )
 
 
 def is_live(path: Path) -> bool:

@@ -25,11 +25,12 @@ from skyloop.transport.base import (
 )
 from skyloop.transport.local import packets
 from skyloop.transport.local.connection import MAX_SUBSCRIPTIONS, ServerConnection
-from skyloop.transport.local.directory import check_name, find_directory
+from skyloop.transport.local.directory import find_directory
 from skyloop.transport.local.frames import FrameExchange
 from skyloop.transport.local.packets import KNOCK, OWN
 from skyloop.transport.local.slots import check_support
 from skyloop.transport.local.sockets import Socket, credentials, may_connect
+from skyloop.transport.names import check_name
 
 MAX_CLIENTS: Final = 128
 _RETRY_ACCEPT_S: Final = 0.2

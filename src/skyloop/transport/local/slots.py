@@ -52,8 +52,7 @@ def check_support() -> None:
         if error.errno not in (errno.EINVAL, errno.ENOSYS, errno.EPERM):
             raise LinkError(f"cannot make shared memory for frames: {error.strerror}") from None
         raise UnsupportedError(
-            f"this kernel has no sealed shared memory ({error.strerror}): the local transport needs Linux 5.1 or "
-            "later; the network transport to come will do without"
+            f"this kernel has no sealed shared memory ({error.strerror}): the local transport needs Linux 5.1 or later"
         ) from None
 
 

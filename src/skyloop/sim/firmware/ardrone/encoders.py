@@ -22,11 +22,7 @@ GROUP: Final = 15  #: pictures from one key frame to the next
 _SPS, _PPS, _IDR, _SLICE = 7, 8, 5, 1  # types of NAL units
 _START_CODE: Final = b"\0\0\0\1"
 _ANY_START_CODE: Final = re.compile(rb"\x00{2,3}\x01")
-_X264: Final = {
-    "preset": "ultrafast",
-    "tune": "zerolatency",
-    "x264-params": f"keyint={GROUP}:min-keyint={GROUP}:scenecut=0:sliced-threads=0:threads=1:repeat-headers=1",
-}
+_X264: Final = {"preset": "ultrafast", "tune": "zerolatency"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,9 +63,20 @@ class Encoded:
 
 
 class Encoder:
-    """One stream's. Raises :class:`MissingExtraError` without PyAV."""
+    """One stream's, with ``group`` pictures from one key frame to the next. ``buffer_s``: no more than the bitrate over
+    so long is sent at once; without it single pictures may have any size. Raises :class:`MissingExtraError` without
+    PyAV."""
 
-    def __init__(self, form: Format, fps: float, bitrate_kbps: int) -> None:
+    def __init__(
+        self,
+        form: Format,
+        fps: float,
+        bitrate_kbps: int,
+        *,
+        group: int = GROUP,
+        profile: str = "Baseline",
+        buffer_s: float | None = None,
+    ) -> None:
         require_encoder()
         import av
 
@@ -79,11 +86,14 @@ class Encoder:
         context.framerate = Fraction(fps).limit_denominator(1000)
         context.time_base = 1 / context.framerate
         context.bit_rate = bitrate_kbps * 1000
-        context.gop_size = GROUP
+        context.gop_size = group
         context.thread_count = 1
         if name == "libx264":
-            context.options = dict(_X264)
-            context.profile = "Baseline"
+            keys = f"keyint={group}:min-keyint={group}:scenecut=0"
+            if buffer_s is not None:
+                keys += f":vbv-maxrate={bitrate_kbps}:vbv-bufsize={round(bitrate_kbps * buffer_s)}"
+            context.options = {**_X264, "x264-params": f"{keys}:sliced-threads=0:threads=1:repeat-headers=1"}
+            context.profile = profile
         else:
             context.max_b_frames = 0
         self._context = context
@@ -120,9 +130,9 @@ def as_the_drone_does(stream: bytes) -> Encoded:
     )
 
 
-def require_encoder() -> None:
+def require_encoder(what: str = "the video of an emulated AR.Drone 2") -> None:
     """Raises :class:`MissingExtraError` where PyAV is not installed."""
     try:
         import av  # noqa: F401
     except ImportError as error:
-        raise MissingExtraError("the video of an emulated AR.Drone 2", "video", cause=str(error)) from error
+        raise MissingExtraError(what, "video", cause=str(error)) from error

@@ -6,17 +6,15 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Final
 
-from skyloop.wire.ardrone.pave import PaveFrame
-
 LATE_NS: Final = 50_000_000  #: a frame that waited longer than this since it came is late
-MAX_FRAMES: Final = 120  #: 4 s; key frames of the drone are half a second apart
+MAX_FRAMES: Final = 120  #: 4 s; key frames of the vehicles are half a second or a second apart
 
 
 @dataclass(frozen=True, slots=True)
 class Coded:
     """A frame as it came."""
 
-    data: PaveFrame | bytes  #: of an AR.Drone 2, or the datagram of an AR.Drone 1
+    data: object  #: what the vehicle's decoder takes
     is_key: bool  #: whether decoding can begin here
     captured_ns: int  #: on this host's clock
     arrived_ns: int

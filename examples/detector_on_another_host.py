@@ -1,0 +1,54 @@
+"""A detector that runs anywhere, and a controller that turns towards what it finds.
+
+skyloop proxy sim:// --name alpha                                             # on the host of the drone
+skyloop process examples/detector_on_another_host.py:Detector --drone alpha   # on another, as often as you like
+python examples/detector_on_another_host.py alpha                             # on a third
+"""
+
+import sys
+from dataclasses import dataclass
+
+import skyloop
+from skyloop.processing import Output
+from skyloop.vision import MarkerDetector
+
+
+@dataclass
+class Sighting:
+    right: float  # metres, from the camera
+    ahead: float
+
+
+class Detector:
+    """Looks for markers in each frame. Imagine something here that needs the GPU of another machine."""
+
+    def __init__(self):
+        self.markers = MarkerDetector("4x4_50", size_m=0.3)
+
+    def process(self, frame):  # BGR, shape (h, w, 3), uint8
+        seen = self.markers.detect(frame)
+        outlines = [skyloop.Polyline(tuple(map(tuple, one.corners.tolist())), closed=True) for one in seen]
+        return Output([Sighting(right=one.position[0], ahead=one.position[2]) for one in seen], outlines)
+
+
+class Face(skyloop.Controller):
+    """Turns on the spot until a marker is in the middle of the picture."""
+
+    processors = ("detector",)
+    result_max_age_s = 0.5  # older results are left out, and counted
+
+    def on_result(self, result):
+        sightings = result.to(list[Sighting])
+        yaw_rate = -1.5 * sightings[0].right / sightings[0].ahead if sightings else 0.7
+        self.drone.velocity(yaw_rate=yaw_rate)  # rad/s, counter-clockwise
+
+
+def main(name, seconds=20.0):
+    with skyloop.connect(name) as drone:
+        drone.takeoff()
+        print(Face(drone).run(seconds=seconds))
+        drone.land()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

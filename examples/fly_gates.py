@@ -1,0 +1,23 @@
+"""Fly a course of five gates, each found by its colour.
+
+python examples/fly_gates.py             # in a simulated hall of its own
+python examples/fly_gates.py alpha 120   # a running proxy, for two minutes at most
+"""
+
+import sys
+
+import skyloop
+from skyloop.control import FIVE_GATES, FlyThroughGates
+
+
+def main(target="sim://?world=gates&cameras=front&fps=15", seconds=120.0):
+    with skyloop.connect(target) as drone:
+        drone.takeoff()
+        course = FlyThroughGates(drone, FIVE_GATES)
+        with drone.on_event(lambda event: print(event.text)):
+            print(course.run(seconds=seconds))
+        print("passed", course.passed, "of", len(FIVE_GATES), "gates")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:2], *map(float, sys.argv[2:3]))

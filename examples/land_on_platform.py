@@ -1,0 +1,27 @@
+"""Land on a platform that moves: search its marker with the camera below, follow it, go down with it.
+
+python examples/land_on_platform.py            # a simulated platform that goes about at 0.3 m/s
+python examples/land_on_platform.py alpha 90   # a running proxy, for a minute and a half at most
+"""
+
+import sys
+
+import skyloop
+from skyloop.control import LandOnMarker
+
+
+def main(target="sim://?world=platform&cameras=bottom&fps=15", seconds=90.0):
+    with skyloop.connect(target) as drone:
+        drone.takeoff()
+        landing = LandOnMarker(drone, marker_id=30, size_m=0.2)
+        with drone.on_event(lambda event: print(event.text)):
+            print(landing.run(seconds=seconds))
+        print("it stands" if landing.landed else f"not landed: {landing.phase}")
+        truth = drone.feedback().native or {}
+        if "truth.target.x" in truth:  # the simulator tells where both really are
+            east, north = (truth[f"truth.{axis}"] - truth[f"truth.target.{axis}"] for axis in "xy")
+            print(f"{(east**2 + north**2) ** 0.5:.2f} m from the marker's centre")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:2], *map(float, sys.argv[2:3]))

@@ -1,0 +1,44 @@
+"""Fly a circle looking outwards, and map the markers on the walls from there.
+
+python examples/orbit_and_map.py                     # in a simulated room
+python examples/orbit_and_map.py alpha 0.25          # a running proxy that knows its position; markers of 0.25 m
+"""
+
+import sys
+
+import numpy as np
+
+import skyloop
+from skyloop.control import OrbitPlace
+from skyloop.poses import target_in_world
+from skyloop.vision import MarkerDetector
+
+
+class Map(OrbitPlace):
+    def __init__(self, drone, size_m, **options):
+        super().__init__(drone, (0.0, 0.0, 1.5), 1.0, look="out", **options)
+        self.detector = MarkerDetector(size_m=size_m)
+        self.mounting = drone.capabilities.cameras[0]
+        self.places = {}
+
+    def on_frame(self, frame):  # on_feedback flies, this one maps
+        state = frame.feedback
+        if state is None or state.position is None:
+            return
+        for marker in self.detector.detect(frame):
+            pose = target_in_world(marker.pose, self.mounting, state)
+            self.places.setdefault(marker.id, []).append(pose.translation)
+
+
+def main(target="sim://?position=1&cameras=front&fps=15", size_m=0.25):
+    with skyloop.connect(target) as drone:
+        drone.takeoff()
+        survey = Map(drone, size_m, laps=1.2)
+        print(survey.run(seconds=60.0))
+        for number, places in sorted(survey.places.items()):
+            x, y, z = np.median(places, axis=0)
+            print(f"marker {number}: {x:.2f} {y:.2f} {z:.2f}, seen {len(places)} times")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:2], *map(float, sys.argv[2:3]))

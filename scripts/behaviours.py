@@ -1,0 +1,302 @@
+"""How well behaviours fly: ``python scripts/behaviours.py [follow] [gates] [landing] … [--seeds 20] [--gust 0 1]``.
+
+Each flight is the whole of Skyloop in simulated time: a simulated AR.Drone 2 with its sensors' noise and biases and its
+cameras' noise, blur and latency at 15 pictures a second; commands 40 ms, feedback and pictures 20 ms on the way, 5 % of
+each lost; in calm air and in gusts. Every error is that of the truth.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import statistics
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Final, NamedTuple
+
+from skyloop.client import Drone
+from skyloop.control import (
+    ApproachMarker,
+    FlowHover,
+    FlyThroughGates,
+    FollowMarker,
+    ImageServo,
+    LandOnMarker,
+    OrbitMarker,
+    SeeAndAvoid,
+)
+from skyloop.control.rehearsal import Radio, rehearse
+from skyloop.messages import Event, EventKind, Feedback, FlightState
+from skyloop.sim.render import use_one_core
+from skyloop.sim.world import Gate
+from skyloop.sim.world_file import load_world
+
+FOLLOW_S: Final = 40.0
+FOLLOW_RMS_M: Final = 0.25
+SETTLED_NS: Final = 5_000_000_000  # after the first sighting, from when on the distance counts
+LANDING_M: Final = 0.2
+
+
+class Flight(NamedTuple):
+    """One flight."""
+
+    good: bool  #: it did what it should
+    error_m: float  #: what the table shows: see there
+    seconds: float  #: simulated, from the behaviour's begin to its end
+    note: str = ""  #: why it was no good
+
+
+@contextmanager
+def flying(world: str, camera: str, seed: int, gust_m_s: float) -> Iterator[Drone]:
+    """A drone of a world, taken off, in nothing but gusts."""
+    uri = f"sim://?world={world}&cameras={camera}&fps=15&seed={seed}"
+    with rehearse(uri, radio=Radio(seed=seed)) as drone:
+        drone.config["sim.wind"] = (0.0, 0.0, 0.0)
+        drone.config["sim.gust"] = gust_m_s
+        drone.takeoff()
+        yield drone
+
+
+def truth(feedback: Feedback, of: str = "truth") -> tuple[float, float, float]:
+    """A true position [m]; ``of`` a target: ``truth.target``."""
+    assert feedback.native is not None
+    x, y, z = (feedback.native[f"{of}.{axis}"] for axis in "xyz")
+    assert isinstance(x, float)
+    assert isinstance(y, float)
+    assert isinstance(z, float)
+    return x, y, z
+
+
+def follow(seed: int, gust_m_s: float, seconds: float = FOLLOW_S) -> Flight:
+    """Follow the carried board at 1.5 m; the error is the RMS of the true distance, 5 s after the first sighting on."""
+    errors: list[float] = []
+    with flying("room", "front", seed, gust_m_s) as drone:
+        follower = FollowMarker(drone, 7)
+
+        def look(feedback: Feedback) -> None:
+            first_ns = follower.score.first_seen_ns
+            if first_ns is not None and feedback.captured_ns - first_ns > SETTLED_NS:
+                distance = math.dist(truth(feedback), truth(feedback, "truth.target"))
+                errors.append(distance - follower.distance_m)
+
+        with drone.on_feedback(look):
+            run = follower.run(seconds=seconds)
+    if not errors:
+        return Flight(False, math.nan, run.seconds, "the marker was not found")
+    rms = math.sqrt(statistics.fmean(error**2 for error in errors))
+    return Flight(rms <= FOLLOW_RMS_M, rms, run.seconds, f"{follower.score.share_in_view:.0%} in view")
+
+
+class Crossings:
+    """Which gates were flown through, in order, and how far from the middle."""
+
+    def __init__(self, gates: tuple[Gate, ...]) -> None:
+        self._gates = gates
+        self._last: tuple[float, float, float] | None = None
+        self.passed: list[tuple[int, float]] = []  #: number of the gate, distance from its middle [m]
+
+    def look(self, feedback: Feedback) -> None:
+        place, last = truth(feedback), self._last
+        self._last = place
+        if last is None:
+            return
+        for number, gate in enumerate(self._gates):
+            before, after = _along(gate, last), _along(gate, place)
+            width, height = gate.inner_size_m
+            if before[0] < 0.0 <= after[0] and abs(after[1]) < width / 2 and abs(after[2]) < height / 2:
+                self.passed.append((number, math.hypot(after[1], after[2])))
+
+
+def _along(gate: Gate, place: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Along the way through the gate, to its left, and above its middle [m]."""
+    east, north, up = (a - b for a, b in zip(place, gate.position_m, strict=True))
+    c, s = math.cos(gate.yaw_rad), math.sin(gate.yaw_rad)
+    return c * east + s * north, c * north - s * east, up
+
+
+def gates(seed: int, gust_m_s: float) -> Flight:
+    """The course of five gates in order, without touching anything; the error is the largest from a gate's middle."""
+    course = load_world("gates").gates
+    crossings = Crossings(course)
+    with flying("gates", "front", seed, gust_m_s) as drone:
+        hits = Hits(drone)
+        flight = FlyThroughGates(drone)
+        with drone.on_feedback(crossings.look):
+            run = flight.run(seconds=150.0)
+        touched = hits.count
+    order = [number for number, _ in crossings.passed]
+    good = order == list(range(len(course))) and flight.passed == len(course) and not touched
+    note = "" if good else f"passed {order}, touched {touched}, believed {flight.passed}"
+    return Flight(good, max((off for _, off in crossings.passed), default=math.nan), run.seconds, note)
+
+
+def landing(seed: int, gust_m_s: float) -> Flight:
+    """Land on the platform that moves at 0.3 m/s; the error is the distance of the vehicle's centre from the marker's
+    two seconds after it stood."""
+    places: list[tuple[Feedback, float, float]] = []
+    with flying("platform", "bottom", seed, gust_m_s) as drone:
+
+        def look(feedback: Feedback) -> None:
+            x, y, z = (a - b for a, b in zip(truth(feedback), truth(feedback, "truth.target"), strict=True))
+            places.append((feedback, math.hypot(x, y), z))
+
+        drone.on_feedback(look)
+        lander = LandOnMarker(drone)
+        run = lander.run(seconds=90.0)
+        stood_ns = places[-1][0].captured_ns
+        while places[-1][0].captured_ns - stood_ns < 2_000_000_000:
+            drone.next_feedback(timeout_s=2.0)
+        newest, off, above = places[-1]
+    on_top = newest.state is FlightState.LANDED and 0.0 < above < 0.1
+    note = "" if on_top else f"{newest.state}, {above:.2f} m above the platform: {lander.phase}"
+    return Flight(lander.landed and on_top and off <= LANDING_M, off, run.seconds, note)
+
+
+class Hits:
+    """Counts what the vehicle touches."""
+
+    def __init__(self, drone: Drone) -> None:
+        self.count = 0
+        drone.on_event(self._look)
+
+    def _look(self, event: Event) -> None:
+        self.count += event.kind is EventKind.COLLISION
+
+
+#: The marker on the south wall of the world ``room``: where it is, and that it looks north.
+WALL_MARKER: Final = (12, (0.2, -3.0, 1.5), 0.25)
+
+
+def approach(seed: int, gust_m_s: float) -> Flight:
+    """To 1 m before a marker on a wall; the error is the true distance from that place on arrival."""
+    number, (x, y, z), size = WALL_MARKER
+    with flying("room", "front", seed, gust_m_s) as drone:
+        pilot = ApproachMarker(drone, number, distance_m=1.0, size_m=size)
+        run = pilot.run(seconds=60.0)
+        off = math.dist(truth(drone.feedback()), (x, y + 1.0, z))
+    return Flight(pilot.done and off <= 0.25, off, run.seconds, pilot.mode.value)
+
+
+def servo(seed: int, gust_m_s: float) -> Flight:
+    """Before the same marker by its picture alone; the error is the RMS of the true distance of the camera from 1.5 m
+    before it, from 15 s after the first sighting on."""
+    number, (x, y, z), size = WALL_MARKER
+    errors: list[float] = []
+    first: list[int] = []
+    with flying("room", "front", seed, gust_m_s) as drone:
+        pilot = ImageServo(drone, number, distance_m=1.5, size_m=size)
+
+        def look(feedback: Feedback) -> None:
+            if not math.isinf(pilot.error_px):
+                first[:] = first or [feedback.captured_ns]
+                if feedback.captured_ns - first[0] > 3 * SETTLED_NS:
+                    errors.append(math.dist(truth(feedback), (x, y + 1.5 + 0.12, z)))
+
+        with drone.on_feedback(look):
+            run = pilot.run(seconds=45.0)
+    rms = math.sqrt(statistics.fmean(error**2 for error in errors)) if errors else math.nan
+    return Flight(rms <= 0.25, rms, run.seconds)
+
+
+def orbit(seed: int, gust_m_s: float) -> Flight:
+    """Swing round the same marker at 1.5 m; the error is the RMS of the true distance, less 1.5 m."""
+    number, place, size = WALL_MARKER
+    errors: list[float] = []
+    angles: list[float] = []
+    with flying("room", "front", seed, gust_m_s) as drone:
+        pilot = OrbitMarker(drone, number, radius_m=1.5, size_m=size)
+
+        def look(feedback: Feedback) -> None:
+            first_ns = pilot.score.first_seen_ns
+            if first_ns is not None and feedback.captured_ns - first_ns > SETTLED_NS:
+                x, y, _ = (a - b for a, b in zip(truth(feedback), place, strict=True))
+                errors.append(math.dist(truth(feedback), place) - 1.5)
+                angles.append(math.atan2(x, y))
+
+        with drone.on_feedback(look):
+            run = pilot.run(seconds=45.0)
+    if not errors:
+        return Flight(False, math.nan, run.seconds, "the marker was not found")
+    rms = math.sqrt(statistics.fmean(error**2 for error in errors))
+    swung = max(angles) - min(angles)
+    return Flight(rms <= 0.25 and pilot.turns >= 2 and swung > 1.0, rms, run.seconds, f"swung over {swung:.2f} rad")
+
+
+def flow(seed: int, gust_m_s: float) -> Flight:
+    """Hold the place for a minute by the ground's picture and attitude alone; the error is the RMS of the way off."""
+    with flying("room", "bottom", seed, gust_m_s) as drone:
+        begin = truth(drone.feedback())[:2]
+        off: list[float] = []
+        with drone.on_feedback(lambda feedback: off.append(math.dist(begin, truth(feedback)[:2]))):
+            run = FlowHover(drone).run(seconds=60.0)
+    rms = math.sqrt(statistics.fmean(error**2 for error in off))
+    return Flight(max(off) <= 0.75, rms, run.seconds, f"at most {max(off):.2f} m")
+
+
+def avoid(seed: int, gust_m_s: float) -> Flight:
+    """12.5 m ahead among four pillars without touching one; the error is the way off to the side at the end."""
+    with flying("pillars", "front", seed, gust_m_s) as drone:
+        hits = Hits(drone)
+        pilot = SeeAndAvoid(drone, 12.5)
+        run = pilot.run(seconds=60.0)
+        touched, aside = hits.count, abs(truth(drone.feedback())[1])
+    return Flight(pilot.done and not touched, aside, run.seconds, f"touched {touched}, {pilot.phase}")
+
+
+class Goal(NamedTuple):
+    """What is to come out."""
+
+    fly: Callable[[int, float], Flight]
+    what: str
+    error: str
+    of_20: int  #: good flights of twenty
+
+
+GOALS: Final = {
+    "follow": Goal(follow, "a carried marker followed at 1.5 m, RMS of the distance within 0.25 m", "RMS", 20),
+    "gates": Goal(gates, "a course of five gates passed, nothing touched", "off the middle", 19),
+    "landing": Goal(landing, "landed on a platform at 0.3 m/s, within 0.2 m of its middle", "off the middle", 18),
+    "approach": Goal(approach, "flown up to a marker on a wall, within 0.25 m of 1 m before it", "off", 18),
+    "servo": Goal(servo, "held before a marker by its picture, within 0.25 m of 1.5 m before it", "RMS", 18),
+    "orbit": Goal(orbit, "swung round a marker at 1.5 m, RMS of the distance within 0.25 m", "RMS", 18),
+    "flow": Goal(flow, "held the place for a minute by the ground's picture, at most 0.75 m off", "RMS", 18),
+    "avoid": Goal(avoid, "12.5 m ahead among four pillars, none touched", "to the side at the end", 18),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("which", nargs="*", metavar="behaviour", help=f"{', '.join(GOALS)}; default: all")
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--gust", type=float, nargs="*", default=[0.0, 1.0], help="standard deviations of gusts [m/s]")
+    parser.add_argument("--verbose", action="store_true", help="a line for each flight")
+    options = parser.parse_args()
+    if unknown := set(options.which) - set(GOALS):
+        parser.error(f"no such behaviour: {', '.join(sorted(unknown))}; there are {', '.join(GOALS)}")
+    use_one_core()
+    for name in options.which or GOALS:
+        goal = GOALS[name]
+        for gust in options.gust:
+            flights = []
+            for seed in range(options.seeds):
+                flights.append(goal.fly(seed, gust))
+                if options.verbose or not flights[-1].good:
+                    good, error, seconds, note = flights[-1]
+                    print(f"  {name} {seed}: {'good' if good else 'BAD'}, {error:.3f} m, {seconds:.0f} s {note}")
+            print(summary(goal, gust, flights), flush=True)
+
+
+def summary(goal: Goal, gust_m_s: float, flights: list[Flight]) -> str:
+    """One line of what came out."""
+    good = [flight for flight in flights if flight.good]
+    met = len(good) * 20 >= goal.of_20 * len(flights)
+    errors = [flight.error_m for flight in flights if not math.isnan(flight.error_m)]
+    return (
+        f"{goal.what}, gusts {gust_m_s:g} m/s: {len(good)} of {len(flights)} "
+        f"({goal.error} {statistics.median(errors):.3f} m, worst {max(errors):.3f} m; "
+        f"{statistics.fmean(flight.seconds for flight in flights):.0f} s): {'met' if met else 'missed'}"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,224 @@
+"""Makes the pictures of the examples by running them: ``python scripts/example_pictures.py``, all or those named.
+
+Each example flies simulated drones that are recorded, and the recording becomes a film: ``flight_film``. They go to
+``docs/pictures/examples``, and ``docs/examples.md`` shows them. Needs the extras sim, vision, record, gym and ``pip
+install pillow matplotlib nbclient ipykernel``.
+"""
+
+from __future__ import annotations
+
+import base64
+import os
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import nbformat
+import numpy as np
+from flight_film import Array, Picture, View, film, save, span_ns
+from matplotlib.figure import Figure
+from nbclient import NotebookClient
+
+import skyloop
+from skyloop.logfile.reader import Recording
+from skyloop.recording.review.compare import compare
+from skyloop.recording.review.tables import begin_ns
+
+ROOT = Path(__file__).parents[1]
+EXAMPLES, PICTURES = ROOT / "examples", ROOT / "docs" / "pictures" / "examples"
+MOST_BYTES = 280_000
+ROOM = View("room", eye=(-3.6, -2.7, 2.4), at=(0.2, 0.0, 0.75), focal_px=330.0)
+HALL = View("empty", eye=(-3.4, -2.6, 2.5), at=(0.0, 0.0, 0.75), focal_px=330.0)
+
+
+def main() -> None:
+    wanted = sys.argv[1:] or list(MAKERS)
+    for name in wanted:
+        if name not in MAKERS:
+            sys.exit(f"there is no picture of an example {name!r}: choose from {', '.join(MAKERS)}")
+        with tempfile.TemporaryDirectory(prefix="skyloop-") as folder:
+            os.environ["SKYLOOP_RUNTIME_DIR"] = f"{folder}/run"
+            MAKERS[name](Path(folder))
+
+
+# Those that fly what is already there ---------------------------------------------------------------------------------
+
+
+def first_flight(folder: Path) -> None:
+    with flight(folder, "alpha"):
+        run("first_flight", "alpha")
+    keep("first_flight", film(folder / "flight.mcap", ROOM))
+
+
+def follow_marker(folder: Path) -> None:
+    with flight(folder, "alpha", "--seed", "4"):
+        run("follow_marker", "alpha", "24")
+    keep("follow_marker", film(folder / "flight.mcap", ROOM))
+
+
+def fly_a_path(folder: Path) -> None:
+    with flight(folder, "alpha", "--world", "empty", "--option", "position=1", "--option", "cameras=none"):
+        run("fly_a_path", "alpha")
+    keep("fly_a_path", film(folder / "flight.mcap", HALL))
+
+
+def detector_on_another_host(folder: Path) -> None:
+    with flight(folder, "alpha", "--seed", "4"):
+        detector = f"{EXAMPLES / 'detector_on_another_host.py'}:Detector"
+        with started("-m", "skyloop", "process", detector, "--drone", "alpha", until="part 1 of 1"):
+            run("detector_on_another_host", "alpha")
+    keep("detector_on_another_host", film(folder / "flight.mcap", ROOM))
+
+
+def shared_drone(folder: Path) -> None:
+    with flight(folder, "alpha", "--world", "empty", "--option", "cameras=none"):
+        program = str(EXAMPLES / "shared_drone.py")
+        with started(program, "alpha", "pilot", "60"):
+            time.sleep(8.0)
+            run("shared_drone", "alpha", "turn")
+            time.sleep(5.0)
+    keep("shared_drone", film(folder / "flight.mcap", replace(HALL, focal_px=520.0), owners=True))
+
+
+def swarm_formation(folder: Path) -> None:
+    names = [f"drone{number}" for number in (1, 2, 3)]
+    with flight(folder, *names, "--world", "empty", "--option", "position=1", "--option", "cameras=none"):
+        run("swarm_formation", "drone*")
+    keep("swarm_formation", film(folder / "flight.mcap", replace(HALL, focal_px=240.0)))
+
+
+# Those that bring their own -------------------------------------------------------------------------------------------
+
+
+def replay_and_compare(folder: Path) -> None:
+    """The flight, and below it what both controllers asked for when they looked at it again."""
+    run("replay_and_compare", str(folder))
+    flown = Recording.open(folder / "flight.mcap")
+    old, new = (Recording.open(folder / f"{name}.mcap") for name in ("old", "new"))
+    both = compare(old, new)
+    first_ns, last_ns = span_ns(flown)
+    later_s = (begin_ns(old, old.drone().name) - first_ns) / 1e9  # between the beginnings of both time axes
+    pictures = film(folder / "flight.mcap", ROOM)
+    times = np.linspace(0.0, (last_ns - first_ns) / 1e9, len(pictures))
+    for picture, now in zip(pictures, times, strict=True):
+        chart(
+            picture, [(one.times_s + later_s, one.numbers["yaw_rate"]) for one in (both.old, both.new)], now, times[-1]
+        )
+    keep("replay_and_compare", pictures)
+
+
+def chart(canvas: Picture, series: Sequence[tuple[Array, Array]], now_s: float, last_s: float) -> None:
+    """Turning rates along time, up to now, on a card at the lower edge."""
+    height, width = canvas.shape[:2]
+    left, top, right, bottom = 8, height - 72, width - 8, height - 8
+    card = canvas[top:bottom, left:right]
+    card[:] = (card * 0.2 + 200).astype(np.uint8)
+    for (times, rates), colour, name, y in zip(
+        series, ((235, 99, 37), (12, 65, 194)), ("gain 1.5", "gain 2.5"), (58, 44), strict=True
+    ):
+        known = (times >= 0) & (times <= now_s) & np.isfinite(rates)
+        across = left + (right - left) * times[known] / last_s
+        up = bottom - 16 - rates[known] * 28  # a turn of 1 rad/s is 28 pixels high
+        line = np.column_stack([across, up])
+        cv2.polylines(canvas, [np.round(line * 16).astype(np.int32)], False, colour, 2, cv2.LINE_AA, 4)
+        cv2.putText(canvas, name, (left + 6, top + y), cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)
+
+
+def learn_to_reach(folder: Path) -> None:  # noqa: ARG001
+    """How the mean return grew."""
+    said = run("learn_to_reach", "--rounds", "25")
+    means, bests = (
+        [float(found) for found in re.findall(rf"{what} +(-?[\d.]+)", said)][:25] for what in ("mean return", "best")
+    )
+    figure = Figure(figsize=(4.8, 2.7), dpi=100, layout="constrained")
+    axes = figure.subplots()
+    rounds = range(1, len(means) + 1)
+    axes.plot(rounds, bests, color="#9ca3af", label="best of 64")
+    axes.plot(rounds, means, color="#2563eb", label="mean of 64")
+    axes.set(xlabel="round", ylabel="return", title="What 64 simulated drones have learnt")
+    axes.grid(color="#e5e7eb")
+    axes.legend()
+    PICTURES.mkdir(parents=True, exist_ok=True)
+    figure.savefig(PICTURES / "learn_to_reach.png")
+    print(f"learn_to_reach.png: {(PICTURES / 'learn_to_reach.png').stat().st_size:,} bytes")
+
+
+def first_flight_notebook(folder: Path) -> None:
+    """The notebook's own plot."""
+    notebook = nbformat.read(EXAMPLES / "first_flight.ipynb", as_version=4)
+    NotebookClient(notebook, kernel_name="python3", resources={"metadata": {"path": str(folder)}}).execute()
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", ())]
+    plots = [output.data["image/png"] for output in outputs if "image/png" in output.get("data", {})]
+    PICTURES.mkdir(parents=True, exist_ok=True)
+    (PICTURES / "first_flight_notebook.png").write_bytes(base64.b64decode(plots[-1]))
+
+
+MAKERS: dict[str, Callable[[Path], None]] = {
+    maker.__name__: maker
+    for maker in (
+        first_flight,
+        follow_marker,
+        fly_a_path,
+        replay_and_compare,
+        detector_on_another_host,
+        shared_drone,
+        swarm_formation,
+        learn_to_reach,
+        first_flight_notebook,
+    )
+}
+
+
+# How they are run -----------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def flight(folder: Path, *words: str) -> Iterator[None]:
+    """Simulated drones of these names (the words before the first option), recorded to ``flight.mcap``."""
+    count = next((number for number, word in enumerate(words) if word.startswith("--")), len(words))
+    names, options = words[:count], words[count:]
+    channels = ["feedback", "annotations", *([] if "cameras=none" in options else ["video.front"])]
+    base = names[0] if count == 1 else names[0].rstrip("0123456789")
+    with ExitStack() as stack:
+        stack.enter_context(
+            started("-m", "skyloop", "sim", "--name", base, "--drones", str(count), *options, until="ready")
+        )
+        stack.enter_context(skyloop.record(names, folder / "flight.mcap", channels=channels))
+        yield
+
+
+@contextmanager
+def started(*words: str, until: str = "") -> Iterator[None]:
+    """A Python process for as long as the block; begins it when that has said a word."""
+    with subprocess.Popen([sys.executable, "-u", *words], stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            while until and until not in process.stdout.readline():
+                assert process.poll() is None, f"{words} ended without saying {until!r}"
+            yield
+        finally:
+            process.terminate()
+
+
+def run(example: str, *words: str) -> str:
+    """An example, to its end; what it said."""
+    done = subprocess.run(
+        [sys.executable, str(EXAMPLES / f"{example}.py"), *words], check=True, stdout=subprocess.PIPE, text=True
+    )
+    print(*(f"{example}: {line}" for line in done.stdout.splitlines()[-3:]), sep="\n")
+    return done.stdout
+
+
+def keep(name: str, pictures: list[Picture]) -> None:
+    save(PICTURES / f"{name}.webp", pictures, MOST_BYTES)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,276 @@
+"""``skyloop camera``: prints boards, and calibrates cameras by them."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final, Self
+
+import typer
+
+from skyloop.errors import NoAnswerError, UnknownNameError, UsageError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from skyloop.calibration import Calibration
+    from skyloop.vision.board import Board, BoardFinder, BoardView
+    from skyloop.vision.calibrating import Collector
+
+    Picture = tuple[str, NDArray[np.uint8]]  # its name, and its pixels
+
+camera = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
+
+_EXAMPLE: Final = "Example: skyloop camera "
+_PICTURES: Final = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
+_GOOD_COVERAGE: Final = 0.5
+_GOOD_RMS_PX: Final = 1.0
+_PATIENCE_S: Final = 10.0  # without a picture
+
+
+class Kind(StrEnum):
+    CHARUCO = "charuco"
+    CHESSBOARD = "chessboard"
+
+
+class Lens(StrEnum):
+    PINHOLE = "pinhole"
+    FISHEYE = "fisheye"
+
+
+Columns = Annotated[int, typer.Option(metavar="N", help="Squares across")]
+Rows = Annotated[int, typer.Option(metavar="N", help="Squares down")]
+SquareMm = Annotated[float, typer.Option(metavar="MM", help="Side of a square; measure it once it is printed")]
+KindOption = Annotated[Kind, typer.Option(help="A ChArUco board may be seen in part, a chessboard as a whole")]
+Dictionary = Annotated[str, typer.Option(metavar="NAME", help="Of a ChArUco board's markers")]
+
+
+@camera.callback()
+def _camera() -> None:
+    """Print a board, and calibrate a camera by pictures of it.
+
+    skyloop camera COMMAND --help tells more about each.
+    """
+
+
+@camera.command(short_help="Write a board to be printed", epilog=f"{_EXAMPLE}board -o board.pdf")
+def board(
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="A .pdf or .png")] = Path("board.pdf"),
+    columns: Columns = 7,
+    rows: Rows = 5,
+    square_mm: SquareMm = 33.0,
+    kind: KindOption = Kind.CHARUCO,
+    dictionary: Dictionary = "4x4_50",
+    dpi: Annotated[int, typer.Option(min=30, max=1200, help="Of the picture")] = 300,
+) -> None:
+    """Write a board for calibration; the standard one fits A4. Print it at 100 %, and glue it onto something flat."""
+    made = _board(columns, rows, square_mm, kind, dictionary)
+    made.save(output, dpi)
+    size = f"{(columns + 1) * square_mm:g} × {(rows + 1) * square_mm:g} mm"
+    typer.echo(f"wrote {output}: {columns} × {rows} squares of {square_mm:g} mm, {size} with its margin")
+
+
+@camera.command(short_help="Calibrate by pictures of a board", epilog=f"{_EXAMPLE}calibrate alpha -o front.json")
+def calibrate(
+    source: Annotated[
+        list[str],
+        typer.Argument(metavar="SOURCE...", help="A running proxy or a vehicle's address; or files: pictures, a video"),
+    ],
+    output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="To write")] = Path("camera.json"),
+    camera: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Of the vehicle's cameras [default: the first]")
+    ] = None,
+    model: Annotated[Lens, typer.Option(help="Of the lens; a fisheye sees more than about 100° across")] = Lens.PINHOLE,
+    views: Annotated[int, typer.Option(min=6, max=200, help="How many to take from a vehicle or a video")] = 25,
+    seconds: Annotated[float, typer.Option(metavar="S", min=1.0, help="How long to look for them at most")] = 180.0,
+    columns: Columns = 7,
+    rows: Rows = 5,
+    square_mm: SquareMm = 33.0,
+    kind: KindOption = Kind.CHARUCO,
+    dictionary: Dictionary = "4x4_50",
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Write over an existing file")] = False,
+) -> None:
+    """Find a camera's focal length, principal point and distortion, and write them as JSON.
+
+    Show the board near and far, in all corners of the picture, and tilted. Views that differ are taken by
+    themselves; Ctrl-C ends that early.
+    """
+    from skyloop.vision.board import BoardFinder
+    from skyloop.vision.calibrating import calibrate as fit
+
+    if output.exists() and not overwrite:
+        raise UsageError(f"{output} exists: give another name, or --overwrite")
+    search = _Search(BoardFinder(_board(columns, rows, square_mm, kind, dictionary)), views)
+    if _are_files(source):
+        search.every = all(_is_picture(name) for name in source)
+        search.run(_from_files(source))
+    else:
+        with _Vehicle(source[0], camera, seconds) as vehicle:
+            search.run(vehicle.pictures(), vehicle.draw)
+    collector = search.collector
+    if collector is None:
+        raise UsageError("no picture came")
+    _say(f"{search.looked} pictures looked at, {len(collector.views)} views of the board taken")
+    found, rejected = fit(collector.views, *collector.size, model=model.value, camera=camera or "")
+    found.save(output)
+    _report(found, rejected, output)
+
+
+class _Search:
+    """Looks for the board in one picture after the other."""
+
+    def __init__(self, finder: BoardFinder, most: int) -> None:
+        self.every = False  #: whether each view is taken: of single pictures; of a stream those that differ are
+        self.collector: Collector | None = None
+        self.looked = 0
+        self._finder = finder
+        self._most = most
+
+    def run(self, pictures: Iterable[Picture], found: Callable[[Any, BoardView], None] | None = None) -> None:
+        """Until there are no more pictures, enough views, or Ctrl-C. Raises :class:`UsageError` for other sizes."""
+        from skyloop.vision.calibrating import Collector
+
+        try:
+            for name, picture in pictures:
+                self.looked += 1
+                size = (picture.shape[1], picture.shape[0])
+                if self.collector is None:
+                    self.collector = Collector(*size)
+                elif self.collector.size != size:
+                    raise UsageError(f"{name} is {_by(size)} pixels, and those before are {_by(self.collector.size)}")
+                view = self._finder.find(picture, name)
+                if view is not None and found is not None:
+                    found(picture, view)
+                self._take(self.collector, view, name)
+                if not self.every and len(self.collector.views) >= self._most:
+                    break
+        except KeyboardInterrupt:
+            _say("ended by Ctrl-C")
+
+    def _take(self, collector: Collector, view: BoardView | None, name: str) -> None:
+        if view is None:
+            if self.every:
+                _say(f"{name}: the board is not seen, or too little of it")
+        elif self.every:
+            collector.views.append(view)
+        elif collector.offer(view):
+            seen = f"{len(view.pixels)} corners, {collector.coverage:.0%} of the picture covered"
+            _say(f"view {len(collector.views)}: {seen}")
+
+
+def _board(columns: int, rows: int, square_mm: float, kind: Kind, dictionary: str) -> Board:
+    from skyloop.vision.board import Board
+
+    return Board(columns, rows, square_mm / 1000, kind.value, dictionary)
+
+
+def _report(found: Calibration, rejected: list[BoardView], output: Path) -> None:
+    for view in rejected:
+        _say(f"taken out, as it does not go with the others: {view.name}")
+    sure = "" if found.fx_deviation is None else f" ± {found.fx_deviation:.1f}"
+    assert found.rms_px is not None
+    assert found.coverage is not None
+    typer.echo(f"{found.model}, {found.width}x{found.height}: fx {found.fx:.1f}{sure}, fy {found.fy:.1f} px, ")
+    typer.echo(
+        f"centre {found.cx:.1f}, {found.cy:.1f} px, distortion {', '.join(f'{k:.4f}' for k in found.distortion)}"
+    )
+    typer.echo(f"reprojection error {found.rms_px:.3f} px RMS over {found.views} views, coverage {found.coverage:.0%}")
+    if found.rms_px > _GOOD_RMS_PX:
+        _say("that error is large: is the board flat, and its size in squares as given?")
+    if found.coverage < _GOOD_COVERAGE:
+        _say("little of the picture was covered: the distortion is known there only; show the board in the corners too")
+    typer.echo(f"wrote {output}")
+
+
+def _are_files(source: list[str]) -> bool:
+    """Whether the sources are files; raises :class:`UsageError` for a mixture."""
+    files = [Path(name).is_file() for name in source]
+    if any(files) and not all(files):
+        raise UsageError(f"no file {source[files.index(False)]!r}: give files only, or one vehicle")
+    if not any(files) and len(source) > 1:
+        raise UsageError(f"no file {source[0]!r}: give files, or one vehicle")
+    return all(files)
+
+
+def _by(size: tuple[int, int]) -> str:
+    return f"{size[0]}x{size[1]}"
+
+
+def _is_picture(name: str) -> bool:
+    return Path(name).suffix.lower() in _PICTURES
+
+
+def _from_files(names: list[str]) -> Iterator[Picture]:
+    from skyloop.vision.opencv import opencv
+
+    cv = opencv("reading pictures")
+    for name in names:
+        if _is_picture(name):
+            picture = cv.imread(name, cv.IMREAD_COLOR)
+            if picture is None:
+                raise UsageError(f"{name} can't be read as a picture")
+            yield name, picture
+        else:
+            yield from _from_video(cv, name)
+
+
+def _from_video(cv: Any, name: str) -> Iterator[Picture]:
+    video, number = cv.VideoCapture(name), 0
+    try:
+        while True:
+            read, picture = video.read()
+            if not read:
+                break
+            number += 1
+            yield f"{name}, picture {number}", picture
+    finally:
+        video.release()
+    if not number:
+        raise UsageError(f"{name} can't be read as a video")
+
+
+class _Vehicle:
+    """A camera of a vehicle, looked at for so long; a context manager."""
+
+    def __init__(self, source: str, camera: str | None, seconds: float) -> None:
+        from skyloop.client import connect
+
+        try:
+            self._drone = connect(source, access="observe", name="skyloop camera")
+        except UnknownNameError as error:
+            raise UsageError(f"{source} is neither a file nor a running proxy: {error}") from error
+        self._camera = camera
+        self._seconds = seconds
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._drone.close()
+
+    def pictures(self) -> Iterator[Picture]:
+        """The newest, until the time is over or no more come."""
+        end = time.monotonic() + self._seconds
+        try:
+            for frame in self._drone.frames(self._camera, timeout_s=_PATIENCE_S):
+                yield f"picture {frame.seq}", frame
+                if time.monotonic() > end:
+                    _say(f"{self._seconds:g} s are over")
+                    return
+        except NoAnswerError as error:
+            _say(str(error))
+
+    def draw(self, frame: Any, view: BoardView) -> None:
+        """Show in the cockpit what was found."""
+        from skyloop.messages import Points
+
+        corners = tuple((float(x), float(y)) for x, y in view.pixels)
+        self._drone.annotate(frame, [Points(corners, (64, 220, 100))], source="calibration")
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)

@@ -1,0 +1,62 @@
+"""What both demos need besides their flights: the page beside them, and a Ctrl-C that ends them in good order."""
+
+from __future__ import annotations
+
+import signal
+import webbrowser
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+
+from skyloop.errors import LinkError
+
+if TYPE_CHECKING:
+    from skyloop.client import Drone
+    from skyloop.cockpit.child import CockpitProcess
+
+
+def show_page(page: CockpitProcess, console: Console, browser: bool) -> None:
+    """A demo without its page is still a demo."""
+    try:
+        address = page.address()
+    except LinkError as error:
+        console.print(f"[yellow]no page:[/] {error}")
+        return
+    console.print(f"watch it at [bold cyan]{address}[/]")
+    if browser:
+        webbrowser.open(address)
+
+
+def land(drone: Drone, console: Console) -> None:
+    """Unless somebody else flies it."""
+    status = drone.authority
+    if status.state != "held":
+        console.print(f"[yellow]{status.holder or 'somebody else'} took over: the drone is left to them[/]")
+        return
+    console.print("landing")
+    drone.land()
+
+
+@contextmanager
+def interrupted_by_signals(stop: Callable[[], None]) -> Iterator[None]:
+    """SIGINT and SIGTERM call ``stop``; a second one of either acts as it did before."""
+    before: dict[int, Any] = {}
+
+    def put_back() -> None:
+        while before:
+            number, handler = before.popitem()
+            signal.signal(number, handler)
+
+    def handle(_number: int, _frame: FrameType | None) -> None:
+        put_back()
+        stop()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        before[number] = signal.signal(number, handle)
+    try:
+        yield
+    finally:
+        put_back()

@@ -1,0 +1,99 @@
+"""A flight with a controller from a file: what is run, in which order, and what happens when it fails or is saved."""
+
+from __future__ import annotations
+
+import math
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from skyloop.errors import SkyloopError
+
+if TYPE_CHECKING:
+    from skyloop.client import Drone
+    from skyloop.control import Controller
+    from skyloop.control.reloading import Reloader
+
+Make = Callable[[type["Controller"]], "Controller"]
+_LOOK_S: Final = 0.1  #: how often a flight that waits for a mended file looks whether the drone is still there
+
+
+class Flight:
+    """Runs a controller to its end, and what takes its place when its file is saved. Use once."""
+
+    def __init__(self, drone: Drone, controller: Controller, say: Callable[[str], None]) -> None:
+        self._drone = drone
+        self._controller = controller
+        self._say = say
+
+    def run(self, seconds: float | None) -> bool:
+        """Fly it; whether it ended as it should. What it raises is shown, and leaves the vehicle hovering."""
+        try:
+            summary = self._controller.run(seconds=seconds)
+        except Exception as error:  # noqa: BLE001  the user's code may raise anything
+            self._say(what_failed(error))
+            self._say("the controller failed")
+            return False
+        self._say(str(summary))
+        return True
+
+    def run_reloading(self, seconds: float | None, reloader: Reloader, make: Make) -> bool:
+        """As :meth:`run`; a saved file takes over in flight, and one that failed hovers until it is saved again."""
+        deadline = math.inf if seconds is None else time.monotonic() + seconds
+        while True:
+            try:
+                left = None if seconds is None else max(0.0, deadline - time.monotonic())
+                summary = self._controller.run(seconds=left, until=lambda: reloader.waiting)
+            except Exception as error:  # noqa: BLE001  the user's code may raise anything
+                self._say(what_failed(error))
+                self._say("the controller failed: hovering; save the file to go on, Ctrl-C lands")
+                if not self._await_mended(reloader, make, deadline):
+                    return False
+                continue
+            if summary.reason != "until":
+                self._say(str(summary))
+                return True
+            if not self._take(reloader, make):
+                self._say("the saved file is not flown: the one before it goes on")
+
+    def _await_mended(self, reloader: Reloader, make: Make, deadline: float) -> bool:
+        """Hover until a file was saved that can be flown; False if the time is over or the drone gone before."""
+        while not (reloader.waiting and self._take(reloader, make)):
+            if self._drone.closed or time.monotonic() >= deadline:
+                return False
+            time.sleep(_LOOK_S)
+        return True
+
+    def _take(self, reloader: Reloader, make: Make) -> bool:
+        """Put what was loaded in the place of the present controller, if it can be."""
+        found = reloader.take()
+        try:
+            if found is None or isinstance(found, SkyloopError):
+                raise found or SkyloopError("nothing was loaded")
+            after = make(found)
+            after.on_reload(self._controller)
+        except Exception as error:  # noqa: BLE001  the user's code may raise anything
+            self._say(what_failed(error))
+            return False
+        self._controller = after
+        self._say(f"reloaded {type(after).__name__}, {reloader.age_s:.2f} s after it was seen to be saved")
+        return True
+
+
+def what_failed(error: Exception) -> str:
+    """What a person needs to mend it: the traceback without Skyloop's own lines.
+
+    An error that Skyloop raised on purpose with no line of the user in it is one line; any other is told in full.
+    """
+    home = str(Path(__file__).parents[1])
+    told = traceback.TracebackException.from_exception(error)
+    if all(line.filename.startswith(home) for line in told.stack):
+        return f"skyloop: {error}" if isinstance(error, SkyloopError) else "".join(told.format()).rstrip()
+    part: traceback.TracebackException | None = told
+    while part is not None:
+        theirs = [line for line in part.stack if not line.filename.startswith(home)]
+        part.stack = traceback.StackSummary.from_list(theirs)
+        part = part.__cause__ or part.__context__
+    return "".join(told.format()).rstrip()

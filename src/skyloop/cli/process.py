@@ -1,0 +1,161 @@
+"""``skyloop process``: runs a class of the user's on a drone's frames, and publishes what it finds."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, Final, NoReturn
+
+import msgspec
+import typer
+
+from skyloop.errors import UsageError
+
+if TYPE_CHECKING:
+    from skyloop.processing import Code, Settings, Status
+
+LINE_EVERY_S: Final = 1.0
+_LOOK_S: Final = 0.1
+_MOST_WORKERS: Final = 64
+
+
+def process(
+    target: Annotated[
+        str, typer.Argument(metavar="CLASS", help="module:Class, FILE.py or FILE.py:Class, with process(self, frame)")
+    ],
+    drone: Annotated[str, typer.Option(metavar="NAME", help="A running proxy, or a vehicle's address")],
+    camera: Annotated[str | None, typer.Option(metavar="CAMERA", help="Whose frames; the first if not given")] = None,
+    name: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Of the processor; the class's in small letters if not given")
+    ] = None,
+    share: Annotated[
+        bool, typer.Option("--share/--all", help="Each frame to one of the workers of this name, or all to all")
+    ] = True,
+    workers: Annotated[int, typer.Option(metavar="N", min=1, max=_MOST_WORKERS, help="Processes on this machine")] = 1,
+    max_age: Annotated[
+        float, typer.Option(metavar="S", min=0.0, help="Leave out frames that are older when their turn comes")
+    ] = 1.0,
+    max_fps: Annotated[
+        float | None, typer.Option(metavar="F", min=0.001, help="Frames a second that a worker takes at most")
+    ] = None,
+    stuck: Annotated[
+        float, typer.Option(metavar="S", min=0.05, help="One frame for longer than this, and others get the share")
+    ] = 2.0,
+    seconds: Annotated[
+        float | None, typer.Option(metavar="S", min=0.0, help="How long; until Ctrl-C if not given")
+    ] = None,
+    json: Annotated[bool, typer.Option("--json", help="For programs: a JSON object each second")] = False,
+    child: Annotated[bool, typer.Option("--child", hidden=True)] = False,
+) -> None:
+    """Take the newest frames of a drone, and publish what a class of yours finds in them. Read-only.
+
+    The class has a method process(self, frame) that returns numbers, texts, lists, dicts, dataclasses or small NumPy
+    arrays; drone.results("NAME") and Controller.on_result get them. A line each second says how it goes.
+    """
+    from skyloop.processing import Settings, load_processor
+
+    code = load_processor(target)
+    settings = Settings(name if name is not None else code.name, code.mark, camera, share, max_age, max_fps, stuck)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _interrupt)
+    show = _json if json else _text
+    try:
+        if workers == 1:
+            _work(code, settings, drone, seconds, show, child=child)
+        else:
+            _lead(workers, settings, target, drone, seconds, show)
+    except KeyboardInterrupt:
+        pass  # how it is meant to end
+
+
+def _work(
+    code: Code, settings: Settings, target: str, seconds: float | None, show: Callable[[Status], str], *, child: bool
+) -> None:
+    """One worker, in this process."""
+    from skyloop.client import connect
+    from skyloop.processing import Worker
+    from skyloop.processing.group import end_with_parent
+
+    processor = code.make()
+    app = f"{settings.name[:32]}@{socket.gethostname()[:20]}:{os.getpid()}"
+    with connect(target, access="observe", name=app) as drone:
+        worker = Worker(drone, processor, settings, _say)
+        if child:
+            end_with_parent(worker.stop)
+        ended = threading.Event()
+        lines = threading.Thread(target=_lines, args=(lambda: show(worker.status), ended), daemon=True)
+        lines.start()
+        try:
+            worker.run(seconds)
+        finally:
+            ended.set()
+            lines.join()
+
+
+def _lines(line: Callable[[], str], ended: threading.Event) -> None:
+    """One each second, by absolute deadlines."""
+    due = time.monotonic() + LINE_EVERY_S
+    while not ended.wait(max(0.0, due - time.monotonic())):
+        due = max(due + LINE_EVERY_S, time.monotonic())
+        typer.echo(line())
+
+
+def _lead(
+    workers: int,
+    settings: Settings,
+    target: str,
+    drone: str,
+    seconds: float | None,
+    show: Callable[[Status], str],
+) -> None:
+    """Several, each in a process of its own, so that none waits for another's interpreter."""
+    from skyloop.processing.group import Group, child_command
+
+    if "://" in drone:
+        raise UsageError(f"several workers need one proxy: skyloop proxy {drone} --name alpha, then --drone alpha")
+    due = time.monotonic() + LINE_EVERY_S
+    with Group(child_command(_arguments(settings, target, drone, seconds)), workers, _say) as group:
+        while (ended := group.look()) is None:
+            time.sleep(_LOOK_S)
+            status = group.status
+            if time.monotonic() >= due and status is not None:
+                due = max(due + LINE_EVERY_S, time.monotonic())
+                typer.echo(show(status))
+    if ended:
+        raise typer.Exit(ended)
+
+
+def _arguments(settings: Settings, target: str, drone: str, seconds: float | None) -> list[str]:
+    """The command of one worker of several."""
+    options: dict[str, object] = {
+        "--drone": drone,
+        "--name": settings.name,
+        "--camera": settings.camera,
+        "--max-age": settings.max_age_s,
+        "--max-fps": settings.max_fps,
+        "--stuck": settings.stuck_s,
+        "--seconds": seconds,
+    }
+    given = [word for option, value in options.items() if value is not None for word in (option, str(value))]
+    return ["process", target, *given, "--share" if settings.shared else "--all", "--json", "--child"]
+
+
+def _text(status: Status) -> str:
+    return f"{time.strftime('%H:%M:%S')}  {status}"
+
+
+def _json(status: Status) -> str:
+    return msgspec.json.encode(status).decode()
+
+
+def _interrupt(number: int, frame: FrameType | None) -> NoReturn:  # noqa: ARG001  as signal handlers are called
+    raise KeyboardInterrupt
+
+
+def _say(text: str) -> None:
+    typer.echo(text, err=True)

@@ -1,0 +1,62 @@
+"""``skyloop router``: joins proxies and applications that can't reach one another."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from types import FrameType
+from typing import Annotated
+
+import typer
+
+from skyloop.cli.network import ConnectOption, KeysOption, ListenOption, MulticastOption
+
+PORT = 7447
+_POLL_S = 0.2
+
+
+def router(
+    listen: ListenOption = None,
+    connect: ConnectOption = None,
+    multicast: MulticastOption = True,
+    keys: KeysOption = None,
+    print_config: Annotated[
+        bool,
+        typer.Option("--print-config", help="Only print the configuration, for Zenoh's own router: zenohd -c FILE"),
+    ] = False,
+) -> None:
+    """Pass on what proxies and applications of several networks say, until Ctrl-C.
+
+    Each of them connects to a router that it can reach; routers connect to each other.
+    """
+    from skyloop.transport.fabric import config
+    from skyloop.transport.fabric.config import Part
+    from skyloop.transport.fabric.environment import settings
+    from skyloop.transport.fabric.session import acquire, release
+
+    everywhere = f"{config.all_interfaces()}:{PORT}"
+    chosen = settings(
+        listen=tuple(listen or (everywhere,)), connect=tuple(connect or ()), multicast=multicast, keys=keys
+    )
+    if chosen.identity is not None:
+        chosen.identity.require_router()
+    if print_config:
+        typer.echo(config.to_json(config.make(chosen, Part.ROUTER)))
+        return
+    if chosen.tls is None:
+        typer.echo(
+            "WARNING: a router without keys: anyone who reaches it can watch and fly what is behind it", err=True
+        )
+    ended = threading.Event()
+
+    def end(number: int, frame: FrameType | None) -> None:  # noqa: ARG001
+        ended.set()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, end)
+    session = acquire(chosen, Part.ROUTER)
+    typer.echo(f"ready: a router at {', '.join(session.listens)}")
+    while not ended.wait(_POLL_S):  # looks up now and then: the kernel may hand a signal to any thread
+        for news in chosen.ring.look() if chosen.ring is not None else ():
+            typer.echo(f"skyloop: {news}", err=True)
+    release(session, linger=False)

@@ -1,0 +1,148 @@
+"""``skyloop teleop``: flies a drone by the keys of the terminal."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+from rich.console import Console, Group
+from rich.live import Live
+from rich.text import Text
+
+from skyloop.cli.keyboard import KEY_MAP, Deflection, Keyboard, Order, Sticks
+from skyloop.errors import AuthorityError, SkyloopError
+
+if TYPE_CHECKING:
+    from skyloop.client import Drone
+    from skyloop.cockpit.child import CockpitProcess
+
+ADVICE = "wait in line with --wait SECONDS, take over with a higher --priority, or look on: skyloop watch"
+PERIOD_S: Final = 0.05  #: how often a moved stick is sent anew; sooner at each press
+REFRESH_S: Final = 0.125
+EVENTS_SHOWN: Final = 3
+GAINS: Final = (0.25, 0.5, 1.0, 2.0, 4.0)  #: that + and - step through
+
+
+def teleop(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="A running proxy, or an address such as sim://")],
+    speed: Annotated[float, typer.Option(metavar="M/S", min=0.05, max=10.0, help="Of a key that is held")] = 0.5,
+    turn: Annotated[float, typer.Option(metavar="RAD/S", min=0.05, max=6.0, help="Turning, of a key held")] = 0.8,
+    priority: Annotated[int, typer.Option(metavar="P", min=0, max=31, help="0 is the highest, 31 the lowest")] = 16,
+    wait: Annotated[float, typer.Option(metavar="S", min=0.0, help="How long to wait in line for the authority")] = 0.0,
+    cockpit: Annotated[bool, typer.Option("--cockpit", help="Serve a page beside it that shows the video")] = False,
+) -> None:
+    """Fly by keys, with the drone's state live. It hovers when no key is held, and lands at the end.
+
+    The keys are those of the cockpit: W A S D, arrows, T take off, L land, Esc Esc motors off, Q end.
+    """
+    from skyloop.cli.piloting import connect_pilot
+
+    keyboard = Keyboard()
+    with connect_pilot(name, ADVICE, name="skyloop teleop", priority=priority, wait_s=wait) as drone:
+        page = _page(drone) if cockpit else None
+        try:
+            Teleop(drone, speed, turn, "" if page is None else page.address()).run(keyboard)
+        except (KeyboardInterrupt, EOFError):
+            pass  # as good as Q: the end of the block lands it
+        finally:
+            if page is not None:
+                page.close()
+
+
+class Teleop:
+    """One session of a pilot at the keys."""
+
+    def __init__(self, drone: Drone, speed: float, turn: float, page: str = "") -> None:
+        self._drone = drone
+        self._speed, self._turn = speed, turn
+        self._page = page
+        self._sticks = Sticks()
+        self._gain = 1.0
+        self._moving = False  # whether a stick was moved when it was sent last
+        self._said = ""
+
+    def run(self, keyboard: Keyboard) -> None:
+        """Until Q. Raises ``EOFError`` when the terminal is gone."""
+        shown_s = 0.0
+        with keyboard, Live(console=Console(), auto_refresh=False) as live:
+            while True:
+                for key in keyboard.keys(PERIOD_S):
+                    order = self._sticks.press(key, time.monotonic())
+                    if order == "quit":
+                        return
+                    if order is not None:
+                        self.obey(order)
+                now_s = time.monotonic()
+                self.steer(self._sticks.deflection(now_s))
+                if now_s - shown_s > REFRESH_S:
+                    shown_s = now_s
+                    live.update(self.picture(), refresh=True)
+
+    def obey(self, order: Order) -> None:
+        """Do what a key orders; what can't be done is said and changes nothing."""
+        try:
+            self._said = self._obey(order)
+        except SkyloopError as error:
+            self._said = str(error)
+
+    def _obey(self, order: Order) -> str:
+        drone = self._drone
+        if order in ("faster", "slower"):
+            step = GAINS.index(self._gain) + (1 if order == "faster" else -1)
+            self._gain = GAINS[max(0, min(step, len(GAINS) - 1))]
+            return f"{self._speed * self._gain:g} m/s, {self._turn * self._gain:g} rad/s"
+        if order == "stop":
+            drone.emergency_stop()
+            return "motors off"
+        if order == "takeoff":
+            drone.takeoff(wait=False)
+        elif order == "land":
+            drone.land(wait=False)
+        elif order == "hover":
+            self._moving = False
+            if drone.feedback().state.airborne:
+                drone.hover()
+        elif order == "take":
+            drone.request_authority()
+        elif order == "release":
+            drone.release_authority()
+        return order
+
+    def steer(self, sticks: Deflection) -> None:
+        """Send where the sticks are while one is moved, and one hover when all are let go."""
+        moved = any(sticks)
+        if not moved and not self._moving:
+            return
+        try:
+            if not self._drone.feedback().state.airborne:
+                self._said = "on the ground: T takes off" if moved else self._said
+            elif moved:
+                speed, turn = self._speed * self._gain, self._turn * self._gain
+                self._drone.velocity(
+                    forward=sticks.forward * speed,
+                    left=sticks.left * speed,
+                    up=sticks.up * speed,
+                    yaw_rate=sticks.yaw_rate * turn,
+                )
+            else:
+                self._drone.hover()
+        except AuthorityError as error:
+            self._said = f"{error} (C takes control)"
+        self._moving = moved
+
+    def picture(self) -> Group:
+        """All that is shown at one time, what matters most on top: what does not fit is cut at the bottom."""
+        from skyloop.cli.watch import channels, events, state_panel
+
+        drone = self._drone
+        keys = Text("  ").join(Text.assemble((key, "bold"), f" {does}") for key, does in KEY_MAP)
+        video = Text(self._page or f"skyloop cockpit {drone.name} shows the video", "dim")
+        said = Text(self._said, "bold")
+        return Group(said, state_panel(drone), keys, video, channels(drone), *events(drone, EVENTS_SHOWN))
+
+
+def _page(drone: Drone) -> CockpitProcess:
+    from skyloop.cockpit.child import CockpitProcess
+
+    return CockpitProcess(drone.reach)

@@ -1,0 +1,154 @@
+"""Fly up to a marker and stop before it; swing round a marker; circle round a place."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, Literal
+
+from skyloop.clock import seconds
+from skyloop.control.follow import FollowMarker
+from skyloop.control.follow_law import FollowSettings, Mode
+from skyloop.control.heading import AlongPath, LookAt
+from skyloop.control.path import Circle
+from skyloop.control.path_following import FollowPath
+from skyloop.errors import UsageError
+
+if TYPE_CHECKING:
+    from skyloop.client import Drone, Frame
+    from skyloop.control.path_law import PathSettings
+    from skyloop.control.position import PositionSource
+    from skyloop.messages import Vector
+
+_LONGEST_STEP_S = 0.2
+
+
+class ApproachMarker(FollowMarker):
+    """Finds a marker, flies to the place straight before its face, and hovers there; then :meth:`run` returns.
+
+    The place counts as reached when distance, height and the angle to the marker's face were within ``near_m`` and
+    ``near_rad`` for ``hold_s``.
+    """
+
+    name = "approach"
+
+    def __init__(
+        self,
+        drone: Drone,
+        marker_id: int = 0,
+        *,
+        distance_m: float = 1.0,
+        near_m: float = 0.1,
+        near_rad: float = 0.2,
+        hold_s: float = 1.0,
+        size_m: float = 0.3,
+        dictionary: str = "4x4_50",
+        camera: str | None = None,
+        settings: FollowSettings | None = None,
+    ) -> None:
+        """``distance_m`` goes before that of ``settings``; the others as those of :class:`FollowMarker`. Raises
+        :class:`UsageError` for numbers that make no sense."""
+        _require_above_0(distance_m=distance_m, near_m=near_m, near_rad=near_rad, hold_s=hold_s)
+        wanted = replace(settings or FollowSettings(aside_rad=0.0), distance_m=distance_m)
+        super().__init__(drone, marker_id, size_m=size_m, dictionary=dictionary, camera=camera, settings=wanted)
+        self._near_m, self._near_rad, self._hold_s = near_m, near_rad, hold_s
+        self._there_ns: int | None = None
+
+    def on_frame(self, frame: Frame) -> None:
+        """As :class:`FollowMarker`, and see whether it is there."""
+        super().on_frame(frame)
+        law = self._follow_law
+        there = (
+            self.mode is Mode.FOLLOWING
+            and law.off_m is not None
+            and law.off_m < self._near_m
+            and law.aside_rad is not None
+            and abs(law.aside_rad) < self._near_rad
+        )
+        if not there:
+            self._there_ns = None
+        elif self._there_ns is None:
+            self._there_ns = frame.captured_ns
+        elif not self.done and seconds(frame.captured_ns - self._there_ns) >= self._hold_s:
+            self.finish(f"{self.distance_m:.2f} m before marker {self.marker_id}")
+
+
+class OrbitMarker(FollowMarker):
+    """Swings to and fro round a marker, looking at it: a flat marker can't be seen from behind.
+
+    Begins where it sees the marker from; ``turns`` counts how often it came to the end of the arc.
+    """
+
+    name = "orbit"
+
+    def __init__(
+        self,
+        drone: Drone,
+        marker_id: int = 0,
+        *,
+        radius_m: float = 1.5,
+        reach_rad: float = 0.8,
+        rate_rad_s: float = 0.25,
+        size_m: float = 0.3,
+        dictionary: str = "4x4_50",
+        camera: str | None = None,
+        settings: FollowSettings | None = None,
+    ) -> None:
+        """``radius_m`` goes before the distance of ``settings``; ``reach_rad``: how far to each side of straight before
+        the marker's face, at most 1.1; ``rate_rad_s``: how fast. Raises :class:`UsageError`."""
+        _require_above_0(radius_m=radius_m, reach_rad=reach_rad, rate_rad_s=rate_rad_s)
+        if reach_rad > 1.1:
+            raise UsageError(f"reach_rad is {reach_rad!r}: from farther aside than 1.1 the marker is not seen any more")
+        wanted = replace(settings or FollowSettings(aside_rad=0.05), distance_m=radius_m)
+        super().__init__(drone, marker_id, size_m=size_m, dictionary=dictionary, camera=camera, settings=wanted)
+        self.turns = 0
+        self._reach, self._rate = reach_rad, rate_rad_s
+        self._last_ns: int | None = None
+
+    def on_frame(self, frame: Frame) -> None:
+        """Move the station on while the marker is seen, then as :class:`FollowMarker`."""
+        law = self._follow_law
+        dt_s = 0.0 if self._last_ns is None else min(_LONGEST_STEP_S, seconds(frame.captured_ns - self._last_ns))
+        self._last_ns = frame.captured_ns
+        going = self.mode is Mode.FOLLOWING and law.aside_rad is not None
+        law.station_rate_rad_s = self._rate if going else 0.0
+        if law.aside_rad is not None and not going:
+            law.station_rad = law.aside_rad  # from where it is found again
+        if abs(law.station_rad) >= self._reach and law.station_rad * self._rate > 0.0:
+            self._rate = -self._rate
+            self.turns += 1
+        law.station_rad = max(-self._reach, min(self._reach, law.station_rad + law.station_rate_rad_s * dt_s))
+        super().on_frame(frame)
+
+
+class OrbitPlace(FollowPath):
+    """Flies round a place on a circle, looking at it or away from it; then hovers, and :meth:`run` returns.
+
+    Needs to know where it is: see :class:`FollowPath`.
+    """
+
+    def __init__(
+        self,
+        drone: Drone,
+        centre: Vector,
+        radius_m: float,
+        *,
+        look: Literal["in", "out"] = "in",
+        speed_m_s: float = 0.4,
+        laps: float = 1.0,
+        settings: PathSettings | None = None,
+        source: PositionSource | None = None,
+    ) -> None:
+        """``centre``: x, y and the height to fly at [m], world axes; ``look``: where the front goes. Raises
+        :class:`UsageError`."""
+        if look not in ("in", "out"):
+            raise UsageError(f"look is {look!r} and must be 'in' or 'out'")
+        circle = Circle(centre, radius_m, laps=laps, speed_m_s=speed_m_s)
+        yaw = LookAt(centre[0], centre[1]) if look == "in" else AlongPath(offset=-math.pi / 2)
+        super().__init__(drone, circle, yaw=yaw, settings=settings, source=source)
+
+
+def _require_above_0(**values: float) -> None:
+    for name, value in values.items():
+        if not 0.0 < value < math.inf:
+            raise UsageError(f"{name} is {value!r} and must be a finite number above 0")

@@ -1,0 +1,164 @@
+"""Hold the place by the ground's picture alone, by attitude: for a vehicle that knows neither place nor velocity."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.clock import nanoseconds, seconds
+from skyloop.control.behaviour import Behaviour
+from skyloop.control.kalman import ConstantVelocityFilter
+from skyloop.control.limiting import clamped, shortened
+from skyloop.errors import UsageError
+from skyloop.messages import Attitude, Feedback, Points, Text
+from skyloop.messages.annotation import Colour, Shape
+from skyloop.messages.geometry import wrap_angle
+from skyloop.vision.flow import GroundTracker
+
+if TYPE_CHECKING:
+    from skyloop.client import Drone, Frame
+
+Array = NDArray[np.float64]
+GRAVITY_M_S2 = 9.80665
+_SEEN: Colour = (64, 220, 100)
+_LOST: Colour = (255, 180, 60)
+
+
+class FlowPhase(StrEnum):
+    WAITING = "waiting for the first pictures of the ground"
+    HOLDING = "holding the place by the ground's picture"
+    LOST = "lost the ground: level"
+
+
+@dataclass(frozen=True, slots=True)
+class FlowSettings:
+    """How hard it holds. Raises :class:`UsageError` for numbers that make no sense."""
+
+    gain: float = 2.5  #: acceleration by distance [1/s²]
+    damping: float = 2.6  #: acceleration by velocity [1/s]
+    integral: float = 0.6  #: acceleration by distance and time, for the wind [1/s³]
+    tilt_rad: float = 0.2
+    height_gain: float = 1.0  #: [1/s]
+    yaw_gain: float = 1.5  #: [1/s]
+    lead_s: float = 0.12  #: from a picture's capture until what was asked for by it takes hold, less its age
+    fresh_s: float = 0.3  #: older than this, what is known of the place is not flown by
+
+    def __post_init__(self) -> None:
+        for name in self.__dataclass_fields__:
+            value = getattr(self, name)
+            if not 0.0 <= value < math.inf:
+                raise UsageError(f"{name} is {value!r} and must be a finite number, 0 or more")
+
+
+@dataclass(slots=True)
+class _Kept:
+    """What it came with."""
+
+    yaw: float
+    altitude: float
+    place: Array = field(default_factory=lambda: np.zeros(2))
+
+
+class FlowLaw:
+    """Places in, attitudes out. Pure: times are on the proxy's clock [ns].
+
+    Acceleration by place, velocity and the integral of the place, as a PID of each axis; the velocity comes from a
+    constant-velocity filter of the places, not from the vehicle.
+    """
+
+    def __init__(self, settings: FlowSettings | None = None) -> None:
+        self.settings = settings or FlowSettings()
+        self.phase = FlowPhase.WAITING
+        self.off_m: float | None = None  #: from where it is to hold, as it believes; None while it does not know
+        self._filter = ConstantVelocityFilter(2, intensity_m2_s3=0.5, speed_m_s=0.5, gate=math.inf)
+        self._integral = np.zeros(2)
+        self._kept: _Kept | None = None
+        self._newest: Feedback | None = None
+        self._seen_ns: int | None = None
+        self._last_ns: int | None = None
+
+    def feedback(self, feedback: Feedback) -> None:
+        """Take attitude and height; velocity and position are not looked at."""
+        self._newest = feedback
+
+    def see(self, place: Array, captured_ns: int) -> None:
+        """Take where the vehicle was, (2,) [m] along yaw 0 and to its left."""
+        newest = self._newest
+        if newest is None or newest.yaw is None or newest.altitude is None:
+            return
+        if self._seen_ns is None or seconds(captured_ns - self._seen_ns) > 1.0:
+            self._filter.start(place, 0.02, captured_ns)
+            self._kept = _Kept(newest.yaw, newest.altitude, np.asarray(place, np.float64))
+        else:
+            self._filter.update(place, 0.02, captured_ns)
+        self._seen_ns = captured_ns
+
+    def step(self, now_ns: int) -> Attitude:
+        """What to ask the vehicle for now: level while it does not know where it is."""
+        s, newest = self.settings, self._newest
+        dt_s = 0.0 if self._last_ns is None else min(0.2, seconds(now_ns - self._last_ns))
+        self._last_ns = now_ns
+        if self._seen_ns is None or self._kept is None or newest is None:
+            return Attitude()
+        if seconds(now_ns - self._seen_ns) > s.fresh_s or newest.yaw is None or newest.altitude is None:
+            self.phase, self.off_m = FlowPhase.LOST, None
+            return Attitude()
+        self.phase = FlowPhase.HOLDING
+        ahead = self._filter.at(now_ns + nanoseconds(s.lead_s))
+        off = self._kept.place - ahead.position
+        self.off_m = float(np.linalg.norm(self._kept.place - self._filter.at(now_ns).position))
+        self._integral = shortened(self._integral + s.integral * off * dt_s, 0.5 * s.tilt_rad * GRAVITY_M_S2)
+        wanted = shortened(s.gain * off - s.damping * ahead.velocity + self._integral, s.tilt_rad * GRAVITY_M_S2)
+        c, si = math.cos(newest.yaw), math.sin(newest.yaw)
+        forward, left = c * wanted[0] + si * wanted[1], c * wanted[1] - si * wanted[0]
+        return Attitude(
+            roll=-math.atan2(left, GRAVITY_M_S2),
+            pitch=math.atan2(forward, GRAVITY_M_S2),
+            climb=clamped(s.height_gain * (self._kept.altitude - newest.altitude), 0.5),
+            yaw_rate=clamped(s.yaw_gain * wrap_angle(self._kept.yaw - newest.yaw), 1.0),
+        )
+
+
+class FlowHover(Behaviour):
+    """Holds the place, height and yaw at which it first saw the ground, by the camera that looks down.
+
+    Needs attitude and height from the vehicle, takes nothing else from it, and steers by attitude. Without the ground
+    it goes level, which lets the vehicle drift, says so, and holds wherever it finds the ground again.
+    """
+
+    name = "flow hover"
+    losses = frozenset({FlowPhase.LOST})
+
+    def __init__(self, drone: Drone, *, camera: str = "bottom", settings: FlowSettings | None = None) -> None:
+        """Raises :class:`UnknownNameError` for a camera that is not there, :class:`UsageError` for a vehicle that takes
+        no attitude, :class:`MissingExtraError` without OpenCV."""
+        if "attitude" not in drone.capabilities.actions:
+            raise UsageError("this vehicle does not fly by attitude")
+        self._flow_law = FlowLaw(settings)
+        super().__init__(drone, self._flow_law, camera)
+        self._tracker = GroundTracker(self._mounting)
+
+    @property
+    def phase(self) -> FlowPhase:
+        """What it is doing."""
+        return self._flow_law.phase
+
+    @property
+    def off_m(self) -> float | None:
+        """From where it is to hold, as it believes [m]; None while it does not know."""
+        return self._flow_law.off_m
+
+    def look(self, frame: Frame) -> list[Shape]:
+        """Track the ground."""
+        found = None if frame.feedback is None else self._tracker.see(frame, frame.feedback)
+        if found is None:
+            return [Text(self.phase.value, (8.0, 16.0), _LOST)]
+        place, count = found
+        self._flow_law.see(place, frame.captured_ns)
+        off = "" if self.off_m is None else f", {self.off_m:.2f} m off"
+        return [Points(self._tracker.points, _SEEN), Text(f"{count} corners{off}", (8.0, 16.0), _SEEN)]

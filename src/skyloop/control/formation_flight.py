@@ -1,0 +1,262 @@
+"""Flying a swarm in formation, by the positions that the drones tell in world axes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from skyloop.control.formation import Places, assign, closest_approach, kept_apart, places
+from skyloop.control.waypoint import Waypoint, WaypointSettings, lacking, reached, velocity_to
+from skyloop.errors import NoAnswerError, UnknownNameError, UsageError
+from skyloop.messages import AnyAction, Feedback, Vector, Velocity
+from skyloop.messages.geometry import rotation_from_euler
+
+if TYPE_CHECKING:
+    from skyloop.client import Swarm
+    from skyloop.client.swarm import Tick
+
+MAX_AGE_S: Final = 1.0  #: of the feedback that is flown by
+SLACK_S: Final = 10.0  #: how much longer than planned a flight may take
+_PEAK: Final = 1.875  # of a minimum-jerk way's speed over its mean
+
+
+@dataclass(frozen=True, slots=True)
+class FormationReport:
+    """How a flight went."""
+
+    seconds: float
+    slots: dict[str, Vector]  #: where each was to be at the end, in world axes [m]
+    errors_m: dict[str, float]  #: and how far from there each was
+    closest_m: float  #: the least distance that any two were seen at; infinite for one drone
+    spread_s: float | None  #: how far apart the set-points of one tick left, at most
+
+
+class Formation:
+    """Flies the active drones of a swarm, on the thread that calls. Each must be in the air and tell position and yaw.
+
+    ``apart_m``: ways that would bring two closer are refused, and drones that come closer are steered apart.
+    ``settings``: how hard they fly. Raises :class:`UsageError` for drones that can't, and as ``on_error`` of the swarm
+    says for drones that fail on the way.
+    """
+
+    def __init__(
+        self, drones: Swarm, *, rate_hz: float = 20.0, apart_m: float = 0.7, settings: WaypointSettings | None = None
+    ) -> None:
+        if not (math.isfinite(apart_m) and apart_m >= 0.0):
+            raise UsageError(f"apart_m is {apart_m!r} and must be 0 m or more")
+        self.drones = drones
+        self.apart_m = apart_m
+        self._rate_hz = rate_hz
+        self._settings = settings or WaypointSettings()
+        self._closest_m = math.inf
+
+    def fly_to(
+        self, slots: ArrayLike, *, speed_m_s: float = 0.6, yaw: float | None = None, timeout_s: float | None = None
+    ) -> FormationReport:
+        """Assign the places, shape (n, 3) in world axes [m], and fly there straight, all leaving and arriving together.
+
+        ``speed_m_s``: of who has the longest way, at most. ``yaw`` [rad]: of all; None: as each is. There may be more
+        places than drones. Those that are not there ``timeout_s`` after the start have failed (default: ten seconds
+        more than planned). They hover at the end.
+        """
+        if not (math.isfinite(speed_m_s) and speed_m_s > 0.0):
+            raise UsageError(f"speed_m_s is {speed_m_s!r} and must be more than 0 m/s")
+        before = self._ready()
+        starts = _positions(before)
+        goals = places(slots)
+        goals = goals[assign(starts, goals)]
+        self._check_ways(list(before), starts, goals)
+        longest_m = float(np.linalg.norm(goals - starts, axis=1).max())
+        planned_s = max(_PEAK * longest_m / speed_m_s, 1e-3)
+        ways = {name: (starts[k], goals[k]) for k, name in enumerate(before)}
+        limit_s = planned_s + SLACK_S if timeout_s is None else timeout_s
+        elapsed_s = 0.0
+        for tick in self.drones.ticks(self._rate_hz, limit_s):
+            elapsed_s = tick.elapsed_s
+            now = {name: sample for name, sample in self._look().items() if name in ways}
+            along, speed = _minimum_jerk(elapsed_s / planned_s)
+            goal = {name: _waypoint(a + along * (b - a), yaw) for name, (a, b) in ways.items() if name in now}
+            drift = {name: speed / planned_s * (ways[name][1] - ways[name][0]) for name in now}
+            self._steer(now, goal, drift)
+            if along >= 1.0 and all(reached(goal[name], now[name], self._settings) for name in now):
+                break
+        self.drones.hover()
+        return self._arrived({name: way[1] for name, way in ways.items()}, yaw, elapsed_s)
+
+    def hold(self, seconds: float) -> FormationReport:
+        """Keep the places where they are."""
+        here = {name: np.array(sample.position) for name, sample in self._ready().items()}
+        still = np.zeros(3)
+        for _ in self.drones.ticks(self._rate_hz, seconds):
+            now = {name: sample for name, sample in self._look().items() if name in here}
+            self._steer(now, {name: _waypoint(here[name], None) for name in now}, dict.fromkeys(now, still))
+        return self._report(here, seconds)
+
+    def follow(
+        self,
+        leader: str,
+        offsets: Mapping[str, ArrayLike],
+        seconds: float,
+        *,
+        lead: Callable[[Tick], AnyAction] | None = None,
+        turn: bool = True,
+    ) -> FormationReport:
+        """Keep each follower at its offset from the leader for so long, its velocity fed forward.
+
+        ``offsets``: by name, three coordinates [m]: ahead, left and up of the leader, or with ``turn=False`` east,
+        north and up of it. ``lead``: what the leader is told at each tick, sent together with the followers'
+        set-points; None: somebody else flies it. A leader that fails lets the followers hover: :class:`SwarmError` or,
+        with ``on_error="continue"``, the end of this call.
+        """
+        wanted = {name: _offset(offset) for name, offset in offsets.items()}
+        for name in (leader, *wanted):
+            if name not in self.drones:
+                raise UnknownNameError("drone in this swarm", name, self.drones.names)
+        if leader in wanted:
+            raise UsageError(f"{leader} leads, and can't follow itself")
+        self._ready()
+        slots: dict[str, NDArray[np.float64]] = {}
+        for tick in self.drones.ticks(self._rate_hz, seconds):
+            now = self._look()
+            if leader not in now:
+                break
+            first = now[leader]
+            slots = {name: station(first, wanted[name], turn=turn) for name in wanted if name in now}
+            goals = {name: _waypoint(slot, first.yaw if turn else None) for name, slot in slots.items()}
+            drift = dict.fromkeys(goals, _world_velocity(first))
+            followers = {name: now[name] for name in goals}
+            self._steer(
+                followers, goals, drift, fixed={leader: first}, also={} if lead is None else {leader: lead(tick)}
+            )
+        self.drones.hover()
+        return self._report(slots, seconds)
+
+    # Inside ----------------------------------------------------------------------------------------------------
+
+    def _look(self) -> dict[str, Feedback]:
+        return self.drones.feedback(max_age_s=MAX_AGE_S)
+
+    def _ready(self) -> dict[str, Feedback]:
+        """The newest of each. Raises :class:`UsageError` naming those that can't be flown by their position."""
+        self._closest_m = math.inf
+        found = self._look()
+        problems = [f"{name}: {lacking(sample)}" for name, sample in found.items() if lacking(sample)]
+        problems += [
+            f"{name}: it is {sample.state.value}, take off first"
+            for name, sample in found.items()
+            if not lacking(sample) and not sample.state.airborne
+        ]
+        if problems:
+            raise UsageError(f"these can't be flown in formation: {'; '.join(problems)}")
+        return found
+
+    def _check_ways(self, names: list[str], starts: Places, goals: Places) -> None:
+        nearest = closest_approach(starts, goals)
+        if nearest.distance_m < self.apart_m:
+            raise UsageError(
+                f"{names[nearest.first]} and {names[nearest.second]} would come within {nearest.distance_m:.2f} m of "
+                f"each other, and must keep {self.apart_m:g} m apart: choose other places, or fly there in two steps"
+            )
+
+    def _steer(
+        self,
+        now: Mapping[str, Feedback],
+        goals: Mapping[str, Waypoint],
+        drift: Mapping[str, NDArray[np.float64]],
+        *,
+        fixed: Mapping[str, Feedback] | None = None,
+        also: Mapping[str, AnyAction] | None = None,
+    ) -> None:
+        """Send each towards its goal, which moves by ``drift`` [m/s]; ``fixed``: others that they keep away from."""
+        towards = {name: velocity_to(goals[name], now[name], self._settings) for name in now}
+        others = fixed or {}
+        positions = _positions({**now, **others})
+        wanted = [_turned(towards[name], now[name], 1.0) + drift[name] for name in now]
+        wanted += [_world_velocity(sample) for sample in others.values()]
+        if len(positions) > 1:
+            self._closest_m = min(self._closest_m, closest_approach(positions, positions).distance_m)
+        steered = kept_apart(np.array(wanted).reshape(-1, 3), positions, self.apart_m)
+        actions: dict[str, AnyAction] = {
+            name: _command(steered[k], now[name], towards[name].yaw_rate) for k, name in enumerate(now)
+        }
+        self.drones.send({**actions, **(also or {})})
+
+    def _arrived(self, goals: Mapping[str, NDArray[np.float64]], yaw: float | None, seconds: float) -> FormationReport:
+        report = self._report(goals, seconds)
+        now = self._look()
+        late = {
+            name: NoAnswerError(f"it is {report.errors_m[name]:.2f} m from its place after {seconds:.1f} s")
+            for name in report.errors_m
+            if name in now and not reached(_waypoint(goals[name], yaw), now[name], self._loose)
+        }
+        self.drones.fail("flying in formation", late)
+        return report
+
+    @property
+    def _loose(self) -> WaypointSettings:
+        """What counts as there a moment later, when they hover."""
+        return replace(self._settings, near_m=3 * self._settings.near_m, near_rad=math.pi, slow_m_s=math.inf)
+
+    def _report(self, goals: Mapping[str, NDArray[np.float64]], seconds: float) -> FormationReport:
+        now = self._look()
+        slots = {name: _vector(goal) for name, goal in goals.items()}
+        errors = {name: math.dist(slots[name], now[name].position or slots[name]) for name in slots if name in now}
+        spread = self.drones.spread
+        return FormationReport(seconds, slots, errors, self._closest_m, None if spread is None else spread.maximum)
+
+
+def station(leader: Feedback, offset: ArrayLike, *, turn: bool = True) -> NDArray[np.float64]:
+    """The place at an offset from a leader in world axes [m], shape (3,): ahead, left and up of it, or with
+    ``turn=False`` east, north and up. Raises :class:`UsageError` while the leader's position or yaw are not known."""
+    problem = lacking(leader)
+    if problem or leader.position is None or leader.yaw is None:
+        raise UsageError(f"nobody can keep a place beside it: {problem}")
+    relative = _offset(offset)
+    turned = rotation_from_euler(0.0, 0.0, leader.yaw) @ relative if turn else relative
+    return np.asarray(leader.position + turned, dtype=np.float64)
+
+
+def _minimum_jerk(share: float) -> tuple[float, float]:
+    """Way and speed along a way of length 1 in time 1: at rest at both ends (Flash and Hogan 1985)."""
+    t = min(1.0, max(0.0, share))
+    return t**3 * (10.0 - 15.0 * t + 6.0 * t * t), 30.0 * t * t * (1.0 - t) ** 2
+
+
+def _offset(offset: ArrayLike) -> NDArray[np.float64]:
+    place: NDArray[np.float64] = places(np.asarray(offset)[None])[0]
+    return place
+
+
+def _positions(samples: Mapping[str, Feedback]) -> Places:
+    told = [sample.position or (math.nan, math.nan, math.nan) for sample in samples.values()]
+    return places(np.array(told).reshape(-1, 3))
+
+
+def _waypoint(place: NDArray[np.float64], yaw: float | None) -> Waypoint:
+    return Waypoint(*_vector(place), yaw)
+
+
+def _vector(place: NDArray[np.float64]) -> Vector:
+    x, y, z = (float(value) for value in place)
+    return x, y, z
+
+
+def _turned(velocity: Velocity, sample: Feedback, way: float) -> NDArray[np.float64]:
+    """From the body's levelled axes to the world's, or back with ``way`` -1."""
+    rotation = rotation_from_euler(0.0, 0.0, way * (sample.yaw or 0.0))
+    return np.asarray(rotation @ (velocity.forward, velocity.left, velocity.up), dtype=np.float64)
+
+
+def _world_velocity(sample: Feedback) -> NDArray[np.float64]:
+    """As told; nothing for one that does not tell."""
+    return _turned(Velocity(*(sample.velocity or (0.0, 0.0, 0.0))), sample, 1.0)
+
+
+def _command(world: NDArray[np.float64], sample: Feedback, yaw_rate: float) -> Velocity:
+    forward, left, up = _vector(_turned(Velocity(*_vector(world)), sample, -1.0))
+    return Velocity(forward, left, up, yaw_rate)

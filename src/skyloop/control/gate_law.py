@@ -1,0 +1,194 @@
+"""The law that flies through a gate: sightings and feedback in, velocities out. Pure: no clock, no thread.
+
+Position-based visual servoing (Chaumette and Hutchinson, "Visual servo control, part I", IEEE RAM 13(4), 2006). The
+gate's place and the way through it are kept in odometry axes, where they stand still but for the odometry's drift. The
+vehicle is brought onto the axis of the gate while it looks at the opening, comes nearer the better it is aligned, and
+flies through, the last metre and a half by odometry, because there the frame is larger than the picture.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.clock import nanoseconds, seconds
+from skyloop.control.kalman import ConstantVelocityFilter
+from skyloop.control.limiting import SetpointLimiter, SetpointLimits, clamped, shortened
+from skyloop.control.search import TurningSearch
+from skyloop.control.target import Motion, Odometry
+from skyloop.messages import Feedback, Velocity
+from skyloop.messages.geometry import wrap_angle
+
+Array = NDArray[np.float64]
+
+
+class GatePhase(StrEnum):
+    SEARCHING = "searching the gate"  #: turning on the spot, at one height after the other
+    ALIGNING = "going to the gate's axis"  #: seen a moment ago
+    RECOVERING = "lost the gate: holding the place, turning to where it must be"
+    PASSING = "flying through"  #: aligned and near: what is left is flown by odometry
+    PASSED = "through"
+
+
+@dataclass(frozen=True, slots=True)
+class GateSettings:
+    """How it flies. The defaults suit a small indoor vehicle and openings of about a metre."""
+
+    lead_s: float = 0.12  #: from a command's decision to its taking hold
+    #: Share of the velocity's error that is asked for on top: gusts push a vehicle with a soft velocity loop less far.
+    velocity_gain: float = 1.0
+    speed_m_s: float = 1.1  #: greatest, horizontally
+    cruise_m_s: float = 0.8  #: through the gate, and to it at most
+    climb_m_s: float = 0.5
+    turn_rad_s: float = 1.4
+    acceleration_m_s2: float = 2.0
+    aside_gain: float = 1.3  #: [1/s]
+    height_gain: float = 1.3  #: [1/s]
+    yaw_gain: float = 1.8  #: [1/s]
+    stand_m: float = 1.7  #: before the gate, where it must be aligned
+    aligned_m: float = 0.15  #: off the axis, across and in height
+    aligned_rad: float = 0.25  #: off its heading
+    cone: float = 0.3  #: how much farther off the axis it may be for each metre before that
+    beyond_m: float = 0.7  #: so far behind the gate it is through
+    fresh_s: float = 0.4  #: since last seen: it flies on
+    recovering_s: float = 3.0
+    search_rad_s: float = 0.7
+    search_heights_m: tuple[float, ...] = (0.0, 0.5, -0.4)
+    lowest_m: float = 0.6
+    highest_m: float = 2.4
+
+
+class Axis(NamedTuple):
+    """Where the vehicle is, seen from the gate."""
+
+    along_m: float  #: the way through; negative before it
+    aside_m: float  #: to the left of the axis
+    above_m: float
+
+
+class GateLaw:
+    """Tell it every feedback and every sighting; ask it for the velocity. Times are on the proxy's clock [ns]."""
+
+    def __init__(self, settings: GateSettings | None = None) -> None:
+        self.settings = s = settings or GateSettings()
+        self.phase = GatePhase.SEARCHING
+        self.axis: Axis | None = None  #: as of the last step
+        self._odometry = Odometry()
+        self._altitude: float | None = None
+        self._search = TurningSearch(s.search_rad_s, s.search_heights_m, s.lowest_m, s.highest_m)
+        self._limiter = SetpointLimiter(SetpointLimits(s.speed_m_s, s.climb_m_s, acceleration_m_s2=s.acceleration_m_s2))
+        self._last_ns: int | None = None
+        self._gate = _new_filter()
+        self._way: Array | None = None  # through the gate, horizontal unit vector
+        self._seen_ns: int | None = None
+
+    def next_gate(self, *, turning: float = 0.0) -> None:
+        """Another gate from here on; ``turning``: which way to search for it first, counter-clockwise positive."""
+        self.phase, self.axis = GatePhase.SEARCHING, None
+        self._gate, self._way, self._seen_ns = _new_filter(), None, None
+        self._search.restart(turning=turning)
+
+    def feedback(self, feedback: Feedback) -> None:
+        """Take the vehicle's newest state."""
+        self._odometry.add(feedback)
+        self._altitude = feedback.altitude
+
+    def see(self, position: Array, normal: Array, at_capture: Feedback, captured_ns: int, trust: float = 1.0) -> None:
+        """Take a sighting: the opening's centre [m] and the normal of the side seen, both (3,) in body axes.
+
+        ``at_capture`` gives the attitude then; ``trust`` (0 to 1) is how sure the normal is. Ignored while the
+        vehicle's attitude or motion is not known, and where it is far from where the gate was seen before.
+        """
+        motion = self._odometry.at(captured_ns)
+        if motion is None or at_capture.roll is None or at_capture.pitch is None or at_capture.yaw is None:
+            return
+        to_level = at_capture.rotation
+        distance = float(np.linalg.norm(position))
+        if not self._gate.update(motion.position + to_level @ position, 0.02 + 0.006 * distance**2, captured_ns):
+            return
+        way = -(to_level @ normal)[:2]
+        weight = 0.2 * trust / max(1.0, 0.4 * distance)
+        self._way = way if self._way is None else (1.0 - weight) * self._way + weight * way
+        self._seen_ns = captured_ns
+
+    def step(self, now_ns: int) -> Velocity:
+        """What to ask the vehicle for now. All zero until the vehicle's motion is known."""
+        motion = self._odometry.at(now_ns)
+        if motion is None:
+            return Velocity()
+        ahead = motion.moved_to(now_ns + nanoseconds(self.settings.lead_s))
+        wanted = self._wanted(ahead, now_ns)
+        dt_s = 0.0 if self._last_ns is None else seconds(now_ns - self._last_ns)
+        self._last_ns = now_ns
+        return self._limiter.step(wanted, dt_s)
+
+    def _wanted(self, own: Motion, now_ns: int) -> Array:
+        """Forward, left, up [m/s] and yaw rate [rad/s]; decides the phase."""
+        s = self.settings
+        if self._seen_ns is None or self._way is None:
+            return self._search.step(own.yaw, self._altitude)
+        unseen_s = seconds(now_ns - self._seen_ns)
+        gate = self._gate.at(now_ns, longest_s=0.0).position
+        way = self._way / max(1e-6, float(np.linalg.norm(self._way)))
+        offset = own.position - gate
+        self.axis = axis = Axis(
+            float(offset[:2] @ way), float(offset[:2] @ np.array([-way[1], way[0]])), float(offset[2])
+        )
+        heading = math.atan2(way[1], way[0])
+        self.phase = self._next_phase(axis, wrap_angle(heading - own.yaw), unseen_s)
+        if self.phase is GatePhase.PASSED:
+            return np.zeros(4)
+        if self.phase is GatePhase.SEARCHING:
+            self._forget()
+            return self._search.step(own.yaw, self._altitude)
+        bearing = math.atan2(-offset[1], -offset[0])
+        look = heading if self.phase is GatePhase.PASSING else bearing
+        turn = clamped(s.yaw_gain * wrap_angle(look - own.yaw), s.turn_rad_s)
+        self._search.restart(turning=turn)
+        if self.phase is GatePhase.RECOVERING:
+            return np.array([0.0, 0.0, 0.0, turn])
+        along = s.cruise_m_s if self.phase is GatePhase.PASSING else self._approach(axis)
+        aside = -s.aside_gain * axis.aside_m
+        horizontal = shortened(along * way + aside * np.array([-way[1], way[0]]), s.speed_m_s)
+        up = clamped(-s.height_gain * axis.above_m, s.climb_m_s)
+        velocity = own.stiffened(np.array([*horizontal, up]), s.velocity_gain)
+        return np.array([*own.to_body(velocity[:2]), velocity[2], turn])
+
+    def _next_phase(self, axis: Axis, off_heading: float, unseen_s: float) -> GatePhase:
+        s = self.settings
+        if self.phase is GatePhase.PASSED or axis.along_m > s.beyond_m:
+            return GatePhase.PASSED
+        if self.phase is GatePhase.PASSING:
+            # Odometry is good for the few seconds that this takes, and no longer.
+            late = unseen_s > 2.0 * (s.stand_m + s.beyond_m) / s.cruise_m_s
+            return GatePhase.RECOVERING if late else GatePhase.PASSING
+        if unseen_s > s.recovering_s:
+            return GatePhase.SEARCHING
+        if unseen_s > s.fresh_s:
+            return GatePhase.RECOVERING
+        aligned = max(abs(axis.aside_m), abs(axis.above_m)) < s.aligned_m and abs(off_heading) < s.aligned_rad
+        near = -s.stand_m - 0.15 < axis.along_m < 0.0
+        return GatePhase.PASSING if near and aligned else GatePhase.ALIGNING
+
+    def _approach(self, axis: Axis) -> float:
+        """Speed along the axis while aligning [m/s]: to the place before the gate, and only within the cone."""
+        s = self.settings
+        left_m = -s.stand_m - axis.along_m
+        if left_m < 0.0:
+            return clamped(1.0 * left_m, 0.4)
+        off = math.hypot(axis.aside_m, axis.above_m)
+        share = clamped(1.5 - off / (s.aligned_m + s.cone * left_m), 1.0)
+        return max(0.0, share) * min(s.cruise_m_s, 0.1 + 0.9 * left_m)
+
+    def _forget(self) -> None:
+        self._gate, self._way, self._seen_ns, self.axis = _new_filter(), None, None, None
+
+
+def _new_filter() -> ConstantVelocityFilter:
+    """Of a thing that stands still, in axes that drift by some centimetres a second."""
+    return ConstantVelocityFilter(3, intensity_m2_s3=0.002, speed_m_s=0.03, gate=6.0)

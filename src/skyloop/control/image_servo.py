@@ -1,0 +1,194 @@
+"""Hold a place before a marker by its picture alone: image-based visual servoing."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.clock import seconds
+from skyloop.control.behaviour import Behaviour, camera_info
+from skyloop.control.interaction import levelled, servo
+from skyloop.control.limiting import SetpointLimiter, SetpointLimits
+from skyloop.control.search import TurningSearch
+from skyloop.errors import UsageError
+from skyloop.messages import CameraInfo, Feedback, Polyline, Text, Velocity
+from skyloop.messages.annotation import Colour, Shape
+from skyloop.poses import mounting_rotation
+from skyloop.vision import MarkerDetector
+from skyloop.vision.lens import normalised, project
+from skyloop.vision.planar import rectangle
+
+if TYPE_CHECKING:
+    from skyloop.client import Drone, Frame
+
+Array = NDArray[np.float64]
+_SEEN: Colour = (64, 220, 100)
+_WANTED: Colour = (255, 210, 60)
+_LOOKING: Colour = (120, 190, 255)
+
+
+class ServoPhase(StrEnum):
+    SEARCHING = "searching the marker"
+    SERVOING = "servoing"
+    HOLDING = "lost the marker: holding the place"
+
+
+@dataclass(frozen=True, slots=True)
+class ServoSettings:
+    """How it flies. Raises :class:`UsageError` for numbers that make no sense."""
+
+    gain: float = 0.8  #: [1/s]
+    #: Share of the velocity's error, where the velocity is known, that is asked for on top, against gusts.
+    velocity_gain: float = 1.0
+    speed_m_s: float = 0.8
+    climb_m_s: float = 0.5
+    turn_rad_s: float = 1.0
+    acceleration_m_s2: float = 2.0
+    fresh_s: float = 0.3  #: since last seen: it flies on
+    holding_s: float = 2.0
+    search_rad_s: float = 0.7
+
+    def __post_init__(self) -> None:
+        for name in self.__dataclass_fields__:
+            value = getattr(self, name)
+            if not 0.0 < value < math.inf:
+                raise UsageError(f"{name} is {value!r} and must be a finite number above 0")
+
+
+class ImageServoLaw:
+    """Points in, velocities out. Pure: times are on the proxy's clock [ns]."""
+
+    def __init__(
+        self, camera: CameraInfo, wanted: Array, depth_m: float, settings: ServoSettings | None = None
+    ) -> None:
+        """``wanted`` (n, 2): where the level camera is to see the points, in the plane at z = 1; ``depth_m``: how far
+        they are from it then."""
+        s = self.settings = settings or ServoSettings()
+        self.phase = ServoPhase.SEARCHING
+        self.error = math.inf  #: root mean square of the points' distances from where they are wanted, plane at z = 1
+        self._camera = camera
+        self._wanted = np.asarray(wanted, np.float64)
+        self._depth_m = depth_m
+        self._velocity = np.zeros(4)
+        self._seen_ns: int | None = None
+        self._last_ns: int | None = None
+        self._yaw: float | None = None
+        self._flown: Array | None = None  # forward, left, up [m/s]
+        self._altitude: float | None = None
+        self._search = TurningSearch(s.search_rad_s)
+        self._limiter = SetpointLimiter(
+            SetpointLimits(s.speed_m_s, s.climb_m_s, s.turn_rad_s, s.acceleration_m_s2, climb_acceleration_m_s2=2.0)
+        )
+
+    def feedback(self, feedback: Feedback) -> None:
+        """Take the vehicle's newest state."""
+        self._yaw, self._altitude = feedback.yaw, feedback.altitude
+        self._flown = None if feedback.velocity is None else np.asarray(feedback.velocity)
+
+    def see(self, points: Array, at_capture: Feedback, captured_ns: int) -> None:
+        """Take the points (n, 2) as the camera saw them, in the plane at z = 1, with the attitude then.
+
+        Ignored while the attitude is not known. The depth of all is guessed from how large they look.
+        """
+        if at_capture.roll is None or at_capture.pitch is None:
+            return
+        level = levelled(points, self._camera, at_capture.roll, at_capture.pitch)
+        self.error = math.sqrt(float(((level - self._wanted) ** 2).sum(axis=1).mean()))
+        # The mean of the depths now and at the goal keeps large motions straight (their equation 14).
+        now_m = self._depth_m * _size(self._wanted) / max(1e-6, _size(level))
+        depths = np.full(len(level), (now_m + self._depth_m) / 2)
+        self._velocity = servo(level, self._wanted, depths, self._camera, self.settings.gain)
+        self._seen_ns = captured_ns
+
+    def step(self, now_ns: int) -> Velocity:
+        """What to ask the vehicle for now."""
+        s = self.settings
+        unseen_s = math.inf if self._seen_ns is None else seconds(now_ns - self._seen_ns)
+        wanted = np.zeros(4)
+        if unseen_s <= s.fresh_s:
+            self.phase, wanted = ServoPhase.SERVOING, self._velocity.copy()
+            self._search.restart(turning=float(wanted[3]))
+            if self._flown is not None:
+                wanted[:3] += s.velocity_gain * (wanted[:3] - self._flown)
+        elif unseen_s <= s.holding_s:
+            self.phase = ServoPhase.HOLDING
+        else:
+            self.phase = ServoPhase.SEARCHING
+            if self._yaw is not None:
+                wanted = self._search.step(self._yaw, self._altitude)
+        dt_s = 0.0 if self._last_ns is None else seconds(now_ns - self._last_ns)
+        self._last_ns = now_ns
+        return self._limiter.step(wanted, dt_s)
+
+
+class ImageServo(Behaviour):
+    """Flies to where a marker looks as it would from ``distance_m`` straight before it, and holds that place.
+
+    Nothing is measured in metres on the way but the marker's size, which gives the wanted picture. ``error_px`` tells
+    how far its corners are from there.
+    """
+
+    name = "servo"
+    losses = frozenset({ServoPhase.HOLDING, ServoPhase.SEARCHING})
+
+    def __init__(
+        self,
+        drone: Drone,
+        marker_id: int = 0,
+        *,
+        distance_m: float = 1.5,
+        size_m: float = 0.3,
+        dictionary: str = "4x4_50",
+        camera: str | None = None,
+        settings: ServoSettings | None = None,
+    ) -> None:
+        """``camera``: one that looks forward, the vehicle's first if not given. Raises :class:`UsageError` for a
+        distance that is not above 0, :class:`UnknownNameError`, :class:`MissingExtraError` without OpenCV."""
+        if not 0.0 < distance_m < math.inf:
+            raise UsageError(f"distance_m is {distance_m!r} and must be a finite number above 0")
+        info = camera_info(drone, camera)
+        if mounting_rotation(info)[0, 2] < 0.5:
+            raise UsageError(f"camera {info.name!r} does not look forward")
+        self.marker_id = marker_id
+        self._wanted = rectangle(size_m, size_m)[:, :2] * (1.0, -1.0) / distance_m
+        self._servo_law = ImageServoLaw(info, self._wanted, distance_m, settings)
+        self._detector = MarkerDetector(dictionary, size_m)
+        self._focal_px = 0.0
+        super().__init__(drone, self._servo_law, camera)
+
+    @property
+    def phase(self) -> ServoPhase:
+        """What it is doing."""
+        return self._servo_law.phase
+
+    @property
+    def error_px(self) -> float:
+        """Root mean square of the corners' distances from where they are wanted; infinite before the first sighting."""
+        return self._servo_law.error * self._focal_px if self._focal_px else math.inf
+
+    def look(self, frame: Frame) -> list[Shape]:
+        """Take the marker's corners if they are there."""
+        intrinsics = frame.intrinsics
+        mine = next((one for one in self._detector.detect(frame) if one.id == self.marker_id), None)
+        if mine is None or intrinsics is None:
+            return [Text(f"marker {self.marker_id}: {self.phase.value}", (8.0, 16.0), _LOOKING)]
+        if frame.feedback is not None:
+            self._focal_px = intrinsics.fx
+            self._servo_law.see(normalised(mine.corners, intrinsics), frame.feedback, frame.captured_ns)
+        rays = np.column_stack([self._wanted, np.ones(len(self._wanted))])
+        goal = tuple((float(x), float(y)) for x, y in project(rays, intrinsics))
+        return [
+            Polyline(goal, True, _WANTED),
+            Polyline(mine.outline, True, _SEEN),
+            Text(f"marker {self.marker_id}: {self.error_px:.0f} px off", (8.0, 16.0), _SEEN),
+        ]
+
+
+def _size(points: Array) -> float:
+    """How large points look, by the root mean square of their distances from their middle."""
+    return math.sqrt(float(((points - points.mean(axis=0)) ** 2).sum(axis=1).mean()))

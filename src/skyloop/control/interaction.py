@@ -1,0 +1,81 @@
+"""Image-based visual servoing of points: the interaction matrix, the level camera, and four degrees of freedom. Pure.
+
+Chaumette and Hutchinson, "Visual servo control, part I: basic approaches", IEEE Robotics & Automation Magazine 13(4),
+2006: equation numbers below are theirs. Camera axes are optical: x right, y down, z forward; points are where their
+rays meet the plane at z = 1, shape (n, 2). A multirotor must tilt to fly, which moves the picture of what stands still;
+so points are turned into the picture of a *virtual level camera* first, which has the vehicle's yaw but neither its
+roll nor its pitch (Jabbari, Oriolo and Bolandi, "An adaptive scheme for image-based visual servoing of an underactuated
+UAV", Int. J. Robotics and Automation 29(1), 2014), and the twist is sought among those that the levelled vehicle can
+take: forward, left, up and yaw.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.errors import UsageError
+from skyloop.messages import CameraInfo
+from skyloop.messages.geometry import rotation_from_euler
+from skyloop.poses import mounting_rotation
+
+Array = NDArray[np.float64]
+
+
+def interaction_matrix(points: Array, depths_m: Array) -> Array:
+    """How points (n, 2) at these depths (n,) move in the picture with the camera's twist: (2n, 6), equation 11.
+
+    The twist is velocity [m/s] and angular velocity [rad/s] of the camera along and about its own axes, (6,); the rows
+    are x and y of each point in turn. Raises :class:`UsageError` for other shapes, and depths that are not above 0.
+    """
+    points, depths = np.asarray(points, np.float64), np.asarray(depths_m, np.float64)
+    if points.ndim != 2 or points.shape[1] != 2 or depths.shape != (len(points),):
+        raise UsageError(f"points have shape (n, 2) and depths (n,), not {points.shape} and {depths.shape}")
+    if not (np.isfinite(points).all() and np.isfinite(depths).all() and (depths > 0.0).all()):
+        raise UsageError("points must be finite, and depths above 0")
+    x, y, z, none = points[:, 0], points[:, 1], 1.0 / depths, np.zeros(len(points))
+    along_x = np.column_stack([-z, none, x * z, x * y, -(1.0 + x * x), y])
+    along_y = np.column_stack([none, -z, y * z, 1.0 + y * y, -x * y, -x])
+    return np.stack([along_x, along_y], axis=1).reshape(-1, 6)
+
+
+def camera_twist(camera: CameraInfo) -> Array:
+    """The twist of a level camera, (6, 4), by what the levelled vehicle does: forward, left, up [m/s], yaw [rad/s].
+
+    The camera's place in the body matters: what is mounted before the centre swings when the vehicle turns. Raises
+    :class:`UsageError` if the camera does not say how it is mounted.
+    """
+    to_camera = mounting_rotation(camera).T
+    place = np.zeros(3) if camera.position is None else np.asarray(camera.position)
+    up = np.array([0.0, 0.0, 1.0])
+    twist = np.zeros((6, 4))
+    twist[:3, :3] = to_camera
+    twist[:3, 3] = to_camera @ np.cross(up, place)
+    twist[3:, 3] = to_camera @ up
+    return twist
+
+
+def levelled(points: Array, camera: CameraInfo, roll: float, pitch: float) -> Array:
+    """Where the points (n, 2) would be for the level camera, (n, 2), while the vehicle has this attitude [rad].
+
+    Raises :class:`UsageError` for points that a level camera does not have before it.
+    """
+    mounting = mounting_rotation(camera)
+    turn = mounting.T @ rotation_from_euler(roll, pitch, 0.0) @ mounting
+    rays = np.column_stack([points, np.ones(len(points))]) @ turn.T
+    if (rays[:, 2] <= 1e-3).any():
+        raise UsageError("a level camera would not see these points: the vehicle is tilted too far")
+    return np.asarray(rays[:, :2] / rays[:, 2:])
+
+
+def servo(points: Array, wanted: Array, depths_m: Array, camera: CameraInfo, gain: float) -> Array:
+    """Forward, left, up [m/s] and yaw rate [rad/s], (4,), that bring the level camera's points (n, 2) to where they are
+    wanted, exponentially: ``-gain · (L·T)⁺ · e`` (equation 5, with T of :func:`camera_twist`), ``gain`` in 1/s.
+
+    At least two points. Raises :class:`UsageError` for shapes that do not fit.
+    """
+    if np.shape(points) != np.shape(wanted) or len(points) < 2:
+        raise UsageError(f"two points or more, and as many wanted ones, not {np.shape(points)} and {np.shape(wanted)}")
+    jacobian = interaction_matrix(points, depths_m) @ camera_twist(camera)
+    error = (np.asarray(points) - np.asarray(wanted)).reshape(-1)
+    return np.asarray(-gain * (np.linalg.pinv(jacobian, rcond=1e-3) @ error))

@@ -1,0 +1,150 @@
+"""A constant-velocity Kalman filter for points that are seen now and then, in any number of dimensions. Pure.
+
+Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation", Wiley 2001: the model with
+continuous white-noise acceleration (section 6.2.2), whose predictions over two steps are those over one; the gate by
+the normalised innovation squared (section 5.4); the update in Joseph's form (section 5.2.6), which keeps the covariance
+positive whatever the rounding.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.clock import seconds
+from skyloop.errors import UsageError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """Where a point is believed to be at one time, and how sure that is."""
+
+    at_ns: int
+    position: Array  #: (n,) [m]
+    velocity: Array  #: (n,) [m/s]
+    covariance: Array  #: (2n, 2n) of position and velocity, in this order [m², m²/s, m²/s²]
+
+    @property
+    def deviation_m(self) -> float:
+        """Standard deviation of the position: the root of the sum of its variances."""
+        n = len(self.position)
+        return math.sqrt(float(np.trace(self.covariance[:n, :n])))
+
+
+class ConstantVelocityFilter:
+    """A point that goes on as it went, up to accelerations by chance. Times are integer nanoseconds on one clock."""
+
+    def __init__(
+        self,
+        dimensions: int = 3,
+        *,
+        intensity_m2_s3: float = 0.05,
+        speed_m_s: float = 0.7,
+        gate: float = 5.0,
+    ) -> None:
+        """``intensity_m2_s3``: of the acceleration's white noise: the velocity wanders by the root of it within a
+        second; ``speed_m_s``: standard deviation of each component of the velocity at first; ``gate``: a measurement
+        farther off than so many standard deviations (Mahalanobis distance) is refused, ``math.inf``: none is.
+
+        Raises :class:`UsageError` for what is out of range.
+        """
+        if isinstance(dimensions, bool) or not isinstance(dimensions, int) or dimensions < 1:
+            raise UsageError(f"dimensions is {dimensions!r} and must be a whole number of at least 1")
+        for name, value in (("intensity_m2_s3", intensity_m2_s3), ("speed_m_s", speed_m_s)):
+            if not 0.0 <= value < math.inf:
+                raise UsageError(f"{name} is {value!r} and must be a finite number, 0 or more")
+        if not gate > 0.0:
+            raise UsageError(f"gate is {gate!r} and must be above 0")
+        self._n = dimensions
+        self._intensity = intensity_m2_s3
+        self._speed = speed_m_s
+        self._gate = gate
+        self._estimate: Estimate | None = None
+        self.refused = 0  #: measurements outside of the gate since the last one within it
+
+    @property
+    def newest(self) -> Estimate | None:
+        """As of the last measurement; None before the first."""
+        return self._estimate
+
+    def start(self, position: Array, deviation_m: float | Array, at_ns: int) -> Estimate:
+        """Begin anew at a measured position, at rest as far as is known; see :meth:`update`."""
+        measured, noise = self._checked(position, deviation_m)
+        n = self._n
+        covariance = np.zeros((2 * n, 2 * n))
+        covariance[:n, :n] = noise
+        covariance[n:, n:] = np.eye(n) * self._speed**2
+        self.refused = 0
+        self._estimate = Estimate(at_ns, measured, np.zeros(n), covariance)
+        return self._estimate
+
+    def update(self, position: Array, deviation_m: float | Array, at_ns: int) -> bool:
+        """Take a measured position (n,) [m] with its standard deviation, one for all axes, or its covariance (n, n)
+        [m²]. False if it was not used: outside of the gate (counted in :attr:`refused`), or older than the last.
+
+        Raises :class:`UsageError` for other shapes and for what is not finite.
+        """
+        if self._estimate is None:
+            self.start(position, deviation_m, at_ns)
+            return True
+        if at_ns < self._estimate.at_ns:
+            return False
+        measured, noise = self._checked(position, deviation_m)
+        n, before = self._n, self.at(at_ns)
+        innovation = measured - before.position
+        spread = before.covariance[:n, :n] + noise
+        try:
+            distance = math.sqrt(float(innovation @ np.linalg.solve(spread, innovation)))
+        except np.linalg.LinAlgError:
+            raise UsageError(
+                "a measurement without any deviation, of a point that is known exactly, says nothing"
+            ) from None
+        if distance > self._gate:
+            self.refused += 1
+            return False
+        self.refused = 0
+        share = np.linalg.solve(spread, before.covariance[:n]).T  # the gain, (2n, n)
+        state = np.concatenate([before.position, before.velocity]) + share @ innovation
+        keep = np.eye(2 * n)
+        keep[:, :n] -= share
+        covariance = keep @ before.covariance @ keep.T + share @ noise @ share.T
+        self._estimate = Estimate(at_ns, state[:n], state[n:], covariance)
+        return True
+
+    def at(self, at_ns: int, *, longest_s: float = math.inf) -> Estimate:
+        """The prediction for a time, later than the last measurement by ``longest_s`` at most; for an earlier time
+        the estimate as of the last measurement. Raises :class:`UsageError` before the first one."""
+        last = self._estimate
+        if last is None:
+            raise UsageError("the target was never seen")
+        dt = max(0.0, min(longest_s, seconds(at_ns - last.at_ns)))
+        if dt == 0.0:
+            return last
+        n = self._n
+        move = np.eye(2 * n)
+        move[:n, n:] = np.eye(n) * dt
+        wander = np.kron(np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]) * self._intensity, np.eye(n))
+        covariance = move @ last.covariance @ move.T + wander
+        return Estimate(last.at_ns + round(dt * 1e9), last.position + last.velocity * dt, last.velocity, covariance)
+
+    def _checked(self, position: Array, deviation: float | Array) -> tuple[Array, Array]:
+        """Position (n,) and covariance (n, n) of a measurement."""
+        n = self._n
+        measured = np.asarray(position, dtype=np.float64)
+        noise = np.asarray(deviation, dtype=np.float64)
+        if noise.ndim == 0:
+            if noise < 0.0:
+                raise UsageError(f"deviation_m is {deviation!r} and must be 0 or more")
+            noise = np.eye(n) * noise**2
+        if measured.shape != (n,) or noise.shape != (n, n):
+            raise UsageError(
+                f"a position has shape ({n},) and a covariance ({n}, {n}), not {measured.shape} and {noise.shape}"
+            )
+        if not (np.isfinite(measured).all() and np.isfinite(noise).all()):
+            raise UsageError("a measured position and its deviation must be finite")
+        return measured, noise

@@ -1,0 +1,92 @@
+"""Land on a marker that the camera below sees, also when it moves."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from skyloop.control.behaviour import Behaviour
+from skyloop.control.landing_law import LandingLaw, LandingPhase, LandingSettings
+from skyloop.errors import UsageError
+from skyloop.messages import FlightState, Polyline, Text
+from skyloop.messages.annotation import Colour, Shape
+from skyloop.vision import MarkerDetector
+
+if TYPE_CHECKING:
+    from skyloop.client import Drone, Frame
+    from skyloop.messages import Attitude, Feedback, Velocity
+
+_LOOKING: Colour = (120, 190, 255)
+_SEEN: Colour = (64, 220, 100)
+
+
+class LandOnMarker(Behaviour):
+    """Searches the marker on a spiral, goes over it, goes down with it, and stops the motors when it stands.
+
+    ``landed`` tells whether it did. A marker that is lost on the way makes it climb where it must be, then search.
+    Low over the marker, where that no longer fits into the picture, it comes down by the marker's last known motion.
+    """
+
+    name = "landing"
+    losses = frozenset({LandingPhase.RECOVERING, LandingPhase.SEARCHING})
+
+    def __init__(
+        self,
+        drone: Drone,
+        marker_id: int = 30,
+        *,
+        size_m: float = 0.2,
+        dictionary: str = "4x4_50",
+        camera: str = "bottom",
+        settings: LandingSettings | None = None,
+    ) -> None:
+        """``size_m`` is the edge of the marker's black square. Raises :class:`UnknownNameError` for a camera or
+        dictionary that is not there, :class:`UsageError` for a vehicle that can't land by itself,
+        :class:`MissingExtraError` without OpenCV."""
+        if "land" not in drone.capabilities.actions:
+            raise UsageError("this vehicle can't land by itself")
+        self._landing_law = LandingLaw(settings)
+        self._detector = MarkerDetector(dictionary, size_m)
+        self.marker_id = marker_id
+        super().__init__(drone, self._landing_law, camera)
+
+    @property
+    def phase(self) -> LandingPhase:
+        """What it is doing."""
+        return self._landing_law.phase
+
+    @property
+    def landed(self) -> bool:
+        """Whether it stands."""
+        return self.done
+
+    def on_feedback(self, feedback: Feedback) -> None:
+        """As every behaviour, until it is down: then wait until the vehicle stands."""
+        if self.phase is not LandingPhase.DOWN:
+            super().on_feedback(feedback)
+        elif feedback.state is FlightState.LANDED and not self.done:
+            self.done = True
+            self.tell("standing on the marker")
+            self.stop()
+
+    def look(self, frame: Frame) -> list[Shape]:
+        """Take the marker if it is there."""
+        law = self._landing_law
+        mine = next((one for one in self._detector.detect(frame) if one.id == self.marker_id), None)
+        if mine is None:
+            return [Text(f"marker {self.marker_id}: {self.phase.value}", (8.0, 16.0), _LOOKING)]
+        if frame.feedback is not None:
+            law.see(mine.position_in_body(self._mounting), frame.feedback, frame.captured_ns)
+        shapes: list[Shape] = [
+            Text(f"marker {self.marker_id}: {self.phase.value}", (8.0, 16.0), _SEEN),
+            Polyline(mine.outline, True, _SEEN),
+        ]
+        if law.height_m is not None and law.target_speed_m_s is not None:
+            shapes.append(Text(f"{law.height_m:.2f} m over it, at {law.target_speed_m_s:.2f} m/s", (8.0, 32.0), _SEEN))
+        return shapes
+
+    def steer(self, wanted: Velocity | Attitude) -> None:
+        """By velocity until it is down; then the vehicle's own landing stops the motors."""
+        if self.phase is LandingPhase.DOWN:
+            self.drone.land(wait=False)
+        else:
+            super().steer(wanted)

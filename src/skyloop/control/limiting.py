@@ -1,0 +1,80 @@
+"""Limits of numbers, vectors and set-points: how large they may be, and how fast they may change. Pure."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.errors import UsageError
+from skyloop.messages import Velocity
+
+Array = NDArray[np.float64]
+_LONGEST_STEP_S = 0.2  # a longer pause gives no right to a larger step
+
+
+def clamped(value: float, longest: float) -> float:
+    """The nearest value within ±``longest``."""
+    return max(-longest, min(longest, value))
+
+
+def shortened(vector: Array, longest: float) -> Array:
+    """A vector (n,) of the same direction that is at most so long."""
+    length = math.sqrt(float(vector @ vector))
+    return vector if length <= longest else vector * (longest / length)
+
+
+@dataclass(frozen=True, slots=True)
+class SetpointLimits:
+    """How large set-points of a vehicle may be and how fast they may change; infinite: as they come.
+
+    Raises :class:`UsageError` for what is not above 0.
+    """
+
+    speed_m_s: float = math.inf  #: horizontally
+    climb_m_s: float = math.inf
+    turn_rad_s: float = math.inf
+    acceleration_m_s2: float = math.inf  #: horizontally; a harder one tilts a camera off what it looks at
+    climb_acceleration_m_s2: float = math.inf
+    turn_acceleration_rad_s2: float = math.inf
+
+    def __post_init__(self) -> None:
+        for name in self.__dataclass_fields__:
+            value = getattr(self, name)
+            if not value > 0.0:
+                raise UsageError(f"{name} is {value!r} and must be above 0")
+
+
+class SetpointLimiter:
+    """Velocity set-points within their limits, each near enough to the one before. The first one may be anything."""
+
+    def __init__(self, limits: SetpointLimits) -> None:
+        self.limits = limits
+        self._last: Array | None = None
+
+    def step(self, wanted: Array, dt_s: float) -> Velocity:
+        """``wanted``: forward, left, up [m/s] and yaw rate [rad/s], shape (4,); ``dt_s`` since the last call."""
+        limits, dt = self.limits, max(0.0, min(_LONGEST_STEP_S, dt_s))
+        result = np.asarray(wanted, dtype=np.float64).copy()
+        result[:2] = shortened(result[:2], limits.speed_m_s)
+        result[2] = clamped(float(result[2]), limits.climb_m_s)
+        result[3] = clamped(float(result[3]), limits.turn_rad_s)
+        if self._last is not None:
+            change = result - self._last
+            change[:2] = shortened(change[:2], _change(limits.acceleration_m_s2, dt))
+            change[2] = clamped(float(change[2]), _change(limits.climb_acceleration_m_s2, dt))
+            change[3] = clamped(float(change[3]), _change(limits.turn_acceleration_rad_s2, dt))
+            result = self._last + change
+        self._last = result
+        forward, left, up, yaw_rate = result.tolist()
+        return Velocity(forward=forward, left=left, up=up, yaw_rate=yaw_rate)
+
+    def reset(self, last: Velocity | None = None) -> None:
+        """Begin anew, from a set-point or from whatever comes."""
+        self._last = None if last is None else np.array([last.forward, last.left, last.up, last.yaw_rate])
+
+
+def _change(rate: float, dt_s: float) -> float:
+    return math.inf if math.isinf(rate) else rate * dt_s

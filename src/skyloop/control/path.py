@@ -1,0 +1,301 @@
+"""Paths: where to be at which time, and how fast to be then. World axes x east, y north, z up [m]. Pure.
+
+Anything with :class:`Path`'s attributes is one. Those made here begin and end at rest.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from skyloop.control.motion_profile import MotionProfile
+from skyloop.errors import MissingExtraError, UsageError
+
+Array = NDArray[np.float64]
+_DIFFERENCE_S = 0.01
+
+
+class Path(Protocol):
+    """A place and a velocity at each time from 0 to ``duration_s``; before and after, it stands still at its ends."""
+
+    @property
+    def duration_s(self) -> float: ...
+
+    def position(self, t_s: float) -> Array:
+        """Shape (3,) [m]."""
+
+    def velocity(self, t_s: float) -> Array:
+        """Shape (3,) [m/s]."""
+
+
+class FunctionPath:
+    """A path by a function of the time."""
+
+    def __init__(
+        self,
+        position: Callable[[float], ArrayLike],
+        duration_s: float,
+        velocity: Callable[[float], ArrayLike] | None = None,
+    ) -> None:
+        """``position(t)`` and ``velocity(t)`` return three numbers; without ``velocity`` it is the difference quotient.
+
+        Raises :class:`UsageError` for a duration that is not above 0.
+        """
+        self.duration_s = _positive("duration_s", duration_s)
+        self._position = position
+        self._velocity = velocity
+
+    def position(self, t_s: float) -> Array:
+        return _point(self._position(self._within(t_s)))
+
+    def velocity(self, t_s: float) -> Array:
+        if not 0.0 <= t_s < self.duration_s:
+            return np.zeros(3)
+        if self._velocity is not None:
+            return _point(self._velocity(t_s))
+        before, after = self._within(t_s - _DIFFERENCE_S), self._within(t_s + _DIFFERENCE_S)
+        return (self.position(after) - self.position(before)) / (after - before)
+
+    def _within(self, t_s: float) -> float:
+        return max(0.0, min(self.duration_s, t_s))
+
+
+class Polyline:
+    """Straight legs between points at one speed, with a stop at each corner, or with the corners cut by arcs."""
+
+    def __init__(
+        self,
+        points: Sequence[ArrayLike],
+        *,
+        speed_m_s: float = 0.5,
+        acceleration_m_s2: float = 0.8,
+        corner_m: float = 0.0,
+    ) -> None:
+        """``corner_m``: how long before a corner the arc begins, at most half of a leg; on it the vehicle is no
+        faster than its acceleration allows. 0: it stops at the corners.
+
+        Raises :class:`UsageError` for fewer than two points that differ, or numbers that make no sense.
+        """
+        speed, acceleration = _speeds(speed_m_s, acceleration_m_s2)
+        if not 0.0 <= corner_m < math.inf:
+            raise UsageError(f"corner_m is {corner_m!r} and must be a number of metres, 0 or more")
+        corners = _distinct([_point(point) for point in points])
+        if len(corners) < 2:
+            raise UsageError("a polyline needs at least two points that differ")
+        self._pieces: list[_Leg | _Arc] = []
+        stretches: list[tuple[float, float]] = []
+        begin = corners[0]
+        for k, end in enumerate(corners[1:], 1):
+            arc = None if k + 1 == len(corners) else _arc(corners[k - 1], end, corners[k + 1], corner_m)
+            leg = _Leg(begin, end if arc is None else arc.begin)
+            self._pieces.append(leg)
+            stretches.append((leg.length, speed))
+            if arc is None:
+                stretches.append((0.0, 0.0))
+                begin = end
+            else:
+                self._pieces.append(arc)
+                stretches.append((arc.length, min(speed, math.sqrt(acceleration * arc.radius))))
+                begin = arc.end
+        self._profile = MotionProfile(stretches, acceleration)
+        self._begins = np.cumsum([0.0, *(piece.length for piece in self._pieces)])
+
+    @property
+    def duration_s(self) -> float:
+        return self._profile.duration_s
+
+    def position(self, t_s: float) -> Array:
+        piece, way, _ = self._at(t_s)
+        return piece.point(way)
+
+    def velocity(self, t_s: float) -> Array:
+        piece, way, speed = self._at(t_s)
+        return piece.direction(way) * speed
+
+    def _at(self, t_s: float) -> tuple[_Leg | _Arc, float, float]:
+        way, speed = self._profile.at(t_s)
+        k = int(np.searchsorted(self._begins, way, side="right")) - 1
+        k = min(k, len(self._pieces) - 1)
+        return self._pieces[k], way - float(self._begins[k]), speed
+
+
+class Circle:
+    """Round a centre at one height and speed, from rest to rest."""
+
+    def __init__(
+        self,
+        centre: ArrayLike,
+        radius_m: float,
+        *,
+        speed_m_s: float = 0.5,
+        laps: float = 1.0,
+        begin_rad: float = 0.0,
+        clockwise: bool = False,
+        acceleration_m_s2: float = 0.8,
+    ) -> None:
+        """``begin_rad``: where on the circle it begins, counter-clockwise from east. Raises :class:`UsageError`."""
+        self._centre = _point(centre)
+        self._radius = _positive("radius_m", radius_m)
+        self._begin = begin_rad
+        self._sense = -1.0 if clockwise else 1.0
+        length = 2 * math.pi * self._radius * _positive("laps", laps)
+        speed, acceleration = _speeds(speed_m_s, acceleration_m_s2)
+        self._profile = MotionProfile([(length, speed)], acceleration)
+
+    @property
+    def duration_s(self) -> float:
+        return self._profile.duration_s
+
+    def position(self, t_s: float) -> Array:
+        angle, _ = self._angle(t_s)
+        return self._centre + self._radius * np.array([math.cos(angle), math.sin(angle), 0.0])
+
+    def velocity(self, t_s: float) -> Array:
+        angle, speed = self._angle(t_s)
+        return self._sense * speed * np.array([-math.sin(angle), math.cos(angle), 0.0])
+
+    def _angle(self, t_s: float) -> tuple[float, float]:
+        way, speed = self._profile.at(t_s)
+        return self._begin + self._sense * way / self._radius, speed
+
+
+class Lemniscate:
+    """A lying eight at one height, Gerono's: ``x = a·sin u``, ``y = a·sin u·cos u``, turned by ``yaw_rad``."""
+
+    def __init__(
+        self,
+        centre: ArrayLike,
+        half_width_m: float,
+        *,
+        speed_m_s: float = 0.5,
+        laps: float = 1.0,
+        yaw_rad: float = 0.0,
+        acceleration_m_s2: float = 0.8,
+    ) -> None:
+        """It begins in the centre; ``speed_m_s`` is the greatest, which it has there. Raises :class:`UsageError`."""
+        self._centre = _point(centre)
+        self._a = _positive("half_width_m", half_width_m)
+        c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+        self._turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        speed, acceleration = _speeds(speed_m_s, acceleration_m_s2)
+        steepest = self._a * math.sqrt(2.0)  # way per u, where it is greatest
+        turns = 2 * math.pi * _positive("laps", laps)
+        self._profile = MotionProfile([(turns, speed / steepest)], acceleration / steepest)
+
+    @property
+    def duration_s(self) -> float:
+        return self._profile.duration_s
+
+    def position(self, t_s: float) -> Array:
+        u, _ = self._profile.at(t_s)
+        return self._centre + self._turn @ (self._a * np.array([math.sin(u), math.sin(u) * math.cos(u), 0.0]))
+
+    def velocity(self, t_s: float) -> Array:
+        u, rate = self._profile.at(t_s)
+        along: Array = self._turn @ (self._a * rate * np.array([math.cos(u), math.cos(2 * u), 0.0]))
+        return along
+
+
+class Spline:
+    """A smooth curve through points at given times, at rest at both ends: SciPy's clamped cubic spline."""
+
+    def __init__(self, points: Sequence[ArrayLike], times_s: Sequence[float]) -> None:
+        """``times_s``: one a point, from 0 and growing.
+
+        Raises :class:`UsageError` for other times, :class:`MissingExtraError` without SciPy.
+        """
+        places, times = np.array([_point(point) for point in points]), np.asarray(times_s, dtype=np.float64)
+        if len(places) < 2 or times.shape != (len(places),):
+            raise UsageError(
+                f"a spline needs two points or more and a time for each, not {len(places)} and {times.size}"
+            )
+        if times[0] != 0.0 or not np.isfinite(times).all() or not (np.diff(times) > 0.0).all():
+            raise UsageError("the times of a spline begin at 0 and grow")
+        try:
+            from scipy.interpolate import CubicSpline
+        except ImportError as error:
+            raise MissingExtraError("a spline", "control", cause=str(error)) from error
+        self._curve = CubicSpline(times, places, bc_type="clamped")
+        self._slope = self._curve.derivative()
+        self.duration_s = float(times[-1])
+
+    def position(self, t_s: float) -> Array:
+        return np.asarray(self._curve(max(0.0, min(self.duration_s, t_s))), dtype=np.float64)
+
+    def velocity(self, t_s: float) -> Array:
+        return np.asarray(self._slope(t_s), dtype=np.float64) if 0.0 <= t_s <= self.duration_s else np.zeros(3)
+
+
+class _Leg:
+    """A straight piece."""
+
+    def __init__(self, begin: Array, end: Array) -> None:
+        self.length = float(np.linalg.norm(end - begin))
+        self._begin = begin
+        self._direction = (end - begin) / self.length if self.length > 0.0 else np.zeros(3)
+
+    def point(self, way: float) -> Array:
+        return self._begin + self._direction * way
+
+    def direction(self, way: float) -> Array:  # noqa: ARG002  (as an arc's)
+        return self._direction
+
+
+class _Arc:
+    """A piece of a circle that leaves one leg and joins the next."""
+
+    def __init__(self, corner: Array, before: Array, after: Array, reach: float, turn: float) -> None:
+        """``before``, ``after``: directions of the legs; ``reach`` from the corner to either end; ``turn`` [rad]."""
+        self.begin, self.end = corner - before * reach, corner + after * reach
+        self.radius = reach / math.tan(turn / 2)
+        self.length = self.radius * turn
+        self._before = before
+        aside = after - before * float(after @ before)
+        self._aside = aside / np.linalg.norm(aside)
+
+    def point(self, way: float) -> Array:
+        angle = way / self.radius
+        forward, sideward = math.sin(angle), 1.0 - math.cos(angle)
+        return self.begin + self.radius * (self._before * forward + self._aside * sideward)
+
+    def direction(self, way: float) -> Array:
+        angle = way / self.radius
+        return self._before * math.cos(angle) + self._aside * math.sin(angle)
+
+
+def _arc(before: Array, corner: Array, after: Array, reach: float) -> _Arc | None:
+    """None where there is no corner to cut, or where it turns back on itself."""
+    come, go = corner - before, after - corner
+    reach = min(reach, float(np.linalg.norm(come)) / 2, float(np.linalg.norm(go)) / 2)
+    come, go = come / np.linalg.norm(come), go / np.linalg.norm(go)
+    turn = math.atan2(float(np.linalg.norm(np.cross(come, go))), float(come @ go))
+    return _Arc(corner, come, go, reach, turn) if reach > 0.0 and 1e-6 < turn < math.pi - 1e-3 else None
+
+
+def _distinct(points: list[Array]) -> list[Array]:
+    kept: list[Array] = []
+    for point in points:
+        if not kept or float(np.linalg.norm(point - kept[-1])) > 1e-9:
+            kept.append(point)
+    return kept
+
+
+def _point(value: ArrayLike) -> Array:
+    point = np.asarray(value, dtype=np.float64)
+    if point.shape != (3,) or not np.isfinite(point).all():
+        raise UsageError(f"a place is three finite numbers, x, y, z in metres, not {value!r:.80}")
+    return point
+
+
+def _positive(name: str, value: float) -> float:
+    if not 0.0 < value < math.inf:
+        raise UsageError(f"{name} is {value!r} and must be a finite number above 0")
+    return float(value)
+
+
+def _speeds(speed_m_s: float, acceleration_m_s2: float) -> tuple[float, float]:
+    return _positive("speed_m_s", speed_m_s), _positive("acceleration_m_s2", acceleration_m_s2)

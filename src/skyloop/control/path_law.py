@@ -1,0 +1,148 @@
+"""The law that keeps a vehicle on a path: where it is in, velocities out. Pure: no clock, no thread.
+
+The path's own velocity is fed forward, ahead by what the vehicle needs to take it up, and PI loops on the position take
+out what is left: the integral is for wind and for a velocity that the vehicle measures wrong (Åström and Hägglund,
+"Advanced PID Control", ISA 2006, chapter 5). A measured place is compared with the path at the time of the
+measurement, so that its delay is no error.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.clock import seconds
+from skyloop.control.heading import YawMode
+from skyloop.control.limiting import SetpointLimiter, SetpointLimits
+from skyloop.control.path import Path
+from skyloop.control.pid import Gains, Pid
+from skyloop.control.position import Fix
+from skyloop.errors import UsageError
+from skyloop.messages import Velocity
+from skyloop.messages.geometry import wrap_angle
+
+Array = NDArray[np.float64]
+_LONGEST_STEP_S = 0.5  # a longer gap between two fixes does not move the path on by more
+_MAY_BE_ZERO = ("velocity_gain", "yaw_gain", "lead_s")
+_AHEAD_S = 0.1  # over which the turn of the wanted yaw is looked up
+
+
+@dataclass(frozen=True, slots=True)
+class PathSettings:
+    """How closely it keeps to the path, and what counts as there. The defaults suit a small indoor vehicle.
+
+    Raises :class:`UsageError` for numbers that make no sense.
+    """
+
+    gains: Gains = field(default_factory=lambda: Gains(p=1.6, i=0.15))  #: by position error [1/s, 1/s²]
+    #: Share of the velocity's error, where the velocity is known, that is asked for on top: a vehicle whose own loop is
+    #: soft takes it up sooner, and gusts push it less far.
+    velocity_gain: float = 1.0
+    yaw_gain: float = 1.5  #: [1/s]
+    lead_s: float = 0.25  #: from a set-point until the vehicle flies it: how far ahead the velocity is fed forward
+    limits: SetpointLimits = field(
+        default_factory=lambda: SetpointLimits(
+            speed_m_s=1.5, climb_m_s=0.6, turn_rad_s=1.2, acceleration_m_s2=3.0, climb_acceleration_m_s2=2.0
+        )
+    )
+    leash_m: float = 0.5  #: farther from the path than this, the path waits
+    near_m: float = 0.15  #: so close to a place is there (acceptance radius)
+    near_rad: float = 0.15  #: the same for the yaw
+
+    def __post_init__(self) -> None:
+        for name in ("velocity_gain", "yaw_gain", "lead_s", "leash_m", "near_m", "near_rad"):
+            value = getattr(self, name)
+            if not 0.0 <= value < math.inf or (value == 0.0 and name not in _MAY_BE_ZERO):
+                raise UsageError(f"{name} is {value!r} and must be a finite number above 0")
+
+
+class PathLaw:
+    """Tell it where the vehicle is, and it says how to fly. The path's time begins with the first fix."""
+
+    def __init__(self, path: Path, settings: PathSettings | None = None, yaw: YawMode | None = None) -> None:
+        """``yaw`` None: the yaw that it has at first is kept."""
+        self.settings = settings or PathSettings()
+        self.time_s = 0.0  #: on the path
+        self.off_m = 0.0  #: distance from where it should have been, as of the last fix
+        self._path = path
+        self._yaw = yaw
+        self._loops = [Pid(self.settings.gains) for _ in range(3)]
+        self._limiter = SetpointLimiter(self.settings.limits)
+        self._last: Fix | None = None
+        self._wanted_yaw: float | None = None
+        self._turning = 0.0  # of the wanted yaw [rad/s]
+
+    @property
+    def over(self) -> bool:
+        """Whether the path has been flown to its end, as far as its time goes."""
+        return self.time_s >= self._path.duration_s
+
+    @property
+    def target(self) -> tuple[Array, Array]:
+        """Where it should be now, and how fast: position (3,) [m] and velocity (3,) [m/s]."""
+        return self._path.position(self.time_s), self._path.velocity(self.time_s)
+
+    def follow(self, path: Path, yaw: YawMode | None = None) -> None:
+        """Go on with another path, from its begin, keeping what the integrals have learnt; ``yaw`` None: as before."""
+        self._path, self.time_s = path, 0.0
+        if yaw is not None:
+            self._yaw = yaw
+
+    def pause(self) -> None:
+        """The vehicle was made to hover meanwhile: set-points begin at rest again."""
+        self._limiter.reset(Velocity())
+
+    def there(self, fix: Fix) -> bool:
+        """Whether the path is over and the vehicle within the acceptance radius of its end, looking the right way."""
+        s = self.settings
+        turned = 0.0 if self._wanted_yaw is None else wrap_angle(self._wanted_yaw - fix.yaw)
+        return self.over and self._off(fix) <= s.near_m and abs(turned) <= s.near_rad
+
+    def step(self, fix: Fix) -> Velocity:
+        """What to ask for now. A fix that is not newer than the last moves nothing on."""
+        dt_s = 0.0 if self._last is None else max(0.0, seconds(fix.at_ns - self._last.at_ns))
+        self._last = fix
+        self._go_on(min(dt_s, _LONGEST_STEP_S), self._off(fix))
+        self.off_m = self._off(fix)
+        target, _ = self.target
+        ahead = self._path.velocity(self.time_s + self.settings.lead_s)
+        wanted = np.array(
+            [
+                loop.step(float(to), at, dt_s, float(feed))
+                for loop, to, at, feed in zip(self._loops, target, fix.position, ahead, strict=True)
+            ]
+        )
+        if fix.velocity is not None:
+            wanted += self.settings.velocity_gain * (wanted - fix.velocity)
+        c, s = math.cos(fix.yaw), math.sin(fix.yaw)
+        turn = self._turn(fix)
+        velocity = self._limiter.step(
+            np.array([c * wanted[0] + s * wanted[1], c * wanted[1] - s * wanted[0], wanted[2], turn]), dt_s
+        )
+        asked = (c * velocity.forward - s * velocity.left, s * velocity.forward + c * velocity.left, velocity.up)
+        for loop, applied in zip(self._loops, asked, strict=True):
+            loop.applied(applied)
+        return velocity
+
+    def _off(self, fix: Fix) -> float:
+        return float(np.linalg.norm(self._path.position(self.time_s) - fix.position))
+
+    def _go_on(self, dt_s: float, off_m: float) -> None:
+        """The path's time goes on, slower beyond the leash, and stands still at twice its length."""
+        share = max(0.0, min(1.0, 2.0 - off_m / self.settings.leash_m))
+        self.time_s = min(self._path.duration_s, self.time_s + share * dt_s)
+
+    def _turn(self, fix: Fix) -> float:
+        """The yaw rate to ask for [rad/s]."""
+        position, velocity = self.target
+        if self._yaw is not None:
+            later = self.time_s + _AHEAD_S
+            now, soon = self._yaw(position, velocity), self._yaw(self._path.position(later), self._path.velocity(later))
+            self._turning = 0.0 if now is None or soon is None else wrap_angle(soon - now) / _AHEAD_S
+            self._wanted_yaw = self._wanted_yaw if now is None else now
+        if self._wanted_yaw is None:
+            self._wanted_yaw = fix.yaw
+        return self._turning + self.settings.yaw_gain * wrap_angle(self._wanted_yaw - fix.yaw)

@@ -1,0 +1,134 @@
+"""A PID controller of one number. Pure: the time step is an argument.
+
+Åström and Hägglund, "Advanced PID Control", ISA 2006: the derivative acts on the measurement and through a filter
+(section 3.3), what a limit takes off is fed back into the integral (back-calculation, section 3.5), and new gains do
+not make the output jump, because the integral term, not the integral, is kept (section 3.6).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from skyloop.control.filters import LowPass, gain
+from skyloop.control.limiting import clamped
+from skyloop.errors import UsageError
+from skyloop.messages.geometry import wrap_angle
+
+
+@dataclass(frozen=True, slots=True)
+class Gains:
+    """Of error, its integral and its derivative, and how they are limited. Raises :class:`UsageError`."""
+
+    p: float = 1.0  #: output per error
+    i: float = 0.0  #: output per error and second
+    d: float = 0.0  #: output per change of the measurement a second
+    derivative_filter_s: float = 0.05  #: time constant of the low pass before the derivative
+    #: Time constant with which the integral term follows what a limit takes off; None: p/i, or at once without p.
+    tracking_s: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("p", "i", "d", "derivative_filter_s", "tracking_s"):
+            value = getattr(self, name)
+            if value is not None and not 0.0 <= value < math.inf:
+                raise UsageError(f"{name} is {value!r} and must be a finite number, 0 or more")
+
+    @property
+    def tracking_time_s(self) -> float:
+        """The time constant in force."""
+        if self.tracking_s is not None:
+            return self.tracking_s
+        return self.p / self.i if self.i > 0.0 else 0.0
+
+
+class Pid:
+    """One loop. :attr:`gains` may be replaced in flight; the output does not jump then while there is an integral gain
+    to take the difference out again, and else no faster than the rate limit lets it."""
+
+    def __init__(
+        self,
+        gains: Gains,
+        *,
+        low: float = -math.inf,
+        high: float = math.inf,
+        rate: float = math.inf,
+        angle: bool = False,
+    ) -> None:
+        """``low``, ``high``: of the output; ``rate``: how much it may change a second; ``angle``: set-point and
+        measurement are angles [rad], and the way between them is the short one.
+
+        Raises :class:`UsageError` unless ``low`` < ``high`` and ``rate`` > 0.
+        """
+        if not low < high:
+            raise UsageError(f"low is {low!r} and must be below high, which is {high!r}")
+        if not rate > 0.0:
+            raise UsageError(f"rate is {rate!r} and must be above 0")
+        self._gains = gains
+        self._low, self._high, self._rate = low, high, rate
+        self._angle = angle
+        self._integral = 0.0  # the term, in units of the output
+        self._slope: LowPass[float] = LowPass(gains.derivative_filter_s, 0.0)
+        self._measured: float | None = None
+        self._error = 0.0
+        self._unlimited = 0.0
+        self._output: float | None = None
+        self._dt_s = 0.0
+
+    @property
+    def gains(self) -> Gains:
+        """The gains in force."""
+        return self._gains
+
+    @gains.setter
+    def gains(self, new: Gains) -> None:
+        old = self._gains
+        if new.i > 0.0:
+            slope = self._slope.value or 0.0
+            self._integral += (old.p - new.p) * self._error - (old.d - new.d) * slope
+        elif old.i > 0.0:
+            self._integral = 0.0  # nothing would ever take it out again
+        self._slope.time_constant_s = new.derivative_filter_s
+        self._gains = new
+
+    @property
+    def integral(self) -> float:
+        """The integral term, in units of the output."""
+        return self._integral
+
+    def step(self, set_point: float, measured: float, dt_s: float, feed_forward: float = 0.0) -> float:
+        """The output for a measurement that was taken ``dt_s`` after the last; ``feed_forward`` is added to it."""
+        g = self._gains
+        error = self._difference(set_point, measured)
+        if self._measured is not None and dt_s > 0.0:
+            self._slope.step(self._difference(measured, self._measured) / dt_s, dt_s)
+            self._integral += g.i * error * dt_s
+        self._measured, self._error, self._dt_s = measured, error, dt_s
+        self._unlimited = feed_forward + g.p * error + self._integral - g.d * (self._slope.value or 0.0)
+        limited = max(self._low, min(self._high, self._unlimited))
+        if self._output is not None and self._rate < math.inf:
+            nearer = self._output + clamped(limited - self._output, self._rate * max(0.0, dt_s))
+            # The sum is rounded, and may be a last bit beyond the limit that it goes to.
+            limited = min(nearer, limited) if limited >= self._output else max(nearer, limited)
+        self.applied(limited)
+        return limited
+
+    def applied(self, output: float) -> None:
+        """What was really done with the last output, where a limit outside of this loop took something off: the
+        integral term follows it. :meth:`step` calls this with its own output."""
+        if self._gains.i > 0.0:
+            self._integral += gain(self._gains.tracking_time_s, self._dt_s) * (output - self._unlimited)
+            self._unlimited = output
+        self._output = output
+
+    def reset(self, output: float = 0.0, *, set_point: float = 0.0, measured: float | None = None) -> None:
+        """Begin anew with the integral term that makes ``output`` the next one, so that taking over is no jump.
+
+        Without an integral gain the next output is what error and derivative say.
+        """
+        self._error = 0.0 if measured is None else self._difference(set_point, measured)
+        self._integral = output - self._gains.p * self._error if self._gains.i > 0.0 else 0.0
+        self._slope.reset(0.0)
+        self._measured, self._output = measured, output
+
+    def _difference(self, to: float, back: float) -> float:
+        return wrap_angle(to - back) if self._angle else to - back

@@ -1,0 +1,74 @@
+"""Where the vehicle is, from whatever knows it: its own feedback, motion capture, its velocity summed up."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+from skyloop.control.target import Odometry
+from skyloop.messages import Feedback, Vector
+
+if TYPE_CHECKING:
+    from skyloop.client import Drone
+
+
+class Fix(NamedTuple):
+    """A place in world axes (x east, y north, z up) at one time."""
+
+    at_ns: int  #: on the proxy's clock
+    position: Vector  #: [m]
+    yaw: float  #: counter-clockwise from x [rad]
+    velocity: Vector | None = None  #: in world axes [m/s], if it is known
+
+
+#: Gives the newest known place, None while it is not known; must return at once.
+PositionSource = Callable[[], Fix | None]
+
+
+def fix_of(feedback: Feedback) -> Fix | None:
+    """The place that the vehicle itself tells; None while it does not know its position or yaw."""
+    if feedback.position is None or feedback.yaw is None:
+        return None
+    return Fix(feedback.captured_ns, feedback.position, feedback.yaw, _world_velocity(feedback.velocity, feedback.yaw))
+
+
+class DeadReckoning:
+    """A source of positions for a vehicle that tells its velocity only: summed up from where it was when this was made.
+
+    It drifts by what the velocity is wrong. The height is the vehicle's altitude, where it tells one.
+    """
+
+    def __init__(self, drone: Drone, begin: tuple[float, float] = (0.0, 0.0)) -> None:
+        """``begin``: where it is now, x and y [m]."""
+        self._begin = begin
+        self._odometry = Odometry()
+        self._newest: Fix | None = None
+        self._listener = drone.on_feedback(self._take, inline=True)
+
+    def __call__(self) -> Fix | None:
+        """The newest place; None before velocity and yaw were told."""
+        return self._newest
+
+    def close(self) -> None:
+        """Listen no longer."""
+        self._listener.cancel()
+
+    def _take(self, feedback: Feedback) -> None:
+        self._odometry.add(feedback)
+        motion = self._odometry.newest
+        if motion is None or motion.at_ns != feedback.captured_ns:
+            return  # nothing new, or nothing of use
+        east, north, up = motion.position.tolist()
+        height = up if feedback.altitude is None else feedback.altitude
+        vx, vy, vz = motion.velocity.tolist()
+        place = (self._begin[0] + east, self._begin[1] + north, height)
+        self._newest = Fix(motion.at_ns, place, motion.yaw, (vx, vy, vz))
+
+
+def _world_velocity(velocity: Vector | None, yaw: float) -> Vector | None:
+    if velocity is None:
+        return None
+    forward, left, up = velocity
+    c, s = math.cos(yaw), math.sin(yaw)
+    return c * forward - s * left, s * forward + c * left, up

@@ -1,0 +1,274 @@
+"""Receives a vehicle's live video, decodes it, and shows the newest picture.
+
+Two threads: one takes frames off the socket at once, so that no picture grows old in a buffer of the kernel, and makes
+the connection anew for ever when it is lost; the other decodes what is wanted. Between them stands the
+:class:`~skyloop.drivers.backlog.Backlog`, which decides what is left out when decoding is late.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.clock import Clock, monotonic_ns
+from skyloop.drivers.backlog import Backlog, Coded
+from skyloop.errors import UnsupportedError, UsageError
+
+RETRY_S: Final = (0.25, 0.5, 1.0, 2.0)  #: waits between attempts to connect; the last one is repeated
+REFUSALS: Final = 3  #: frames in a row of a codec that is not decoded, before it is told; one may be a flipped bit
+_CLOSE_S: Final = 2.0
+
+Decoded = tuple[int, NDArray[np.uint8]]  # the vehicle's number of the picture; BGR, (height, width, 3), C-contiguous
+
+
+class Stream(Protocol):
+    """One connection to a vehicle's video."""
+
+    @property
+    def broken(self) -> int:
+        """Frames that were begun and broken off, or stale."""
+
+    @property
+    def lost_bytes(self) -> int:
+        """Bytes that belong to no whole frame."""
+
+    def read(self) -> list[Coded]:
+        """The frames that came, after a tenth of a second at most. Raises OSError once the connection is lost."""
+
+    def close(self) -> None: ...
+
+
+class Decoder(Protocol):
+    """Decodes the frames of one connection after the other."""
+
+    @property
+    def waited(self) -> int:
+        """Frames left out because what they build on was never seen, or because a newer one was shown before."""
+
+    @property
+    def damaged(self) -> int:
+        """Frames that could not be decoded."""
+
+    def restart(self) -> None:
+        """What comes next does not continue what came before."""
+
+    def decode(self, coded: Coded, *, show: bool) -> Decoded | None:
+        """The picture of this frame; None if there is none, or it is not to be shown.
+
+        Raises :class:`UnsupportedError` for a codec that is not decoded here, and nothing else for what a frame holds.
+        """
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Picture:
+    """A picture of whichever camera the vehicle is switched to."""
+
+    pixels: NDArray[np.uint8]  #: BGR, (height, width, 3), C-contiguous
+    width: int  #: [px]
+    height: int
+    captured_ns: int  #: on this host's monotonic clock; of a vehicle that gives no stamp, when it came
+    number: int  #: counts the vehicle's pictures, 32 bits
+
+
+class Notice(Enum):
+    """What a receiver tells beside pictures."""
+
+    STREAMING = "streaming"  #: frames come
+    LOST = "lost"  #: no connection, or no more; told once for each reason, tried again for ever
+    UNSUPPORTED = "unsupported"  #: frames come in a codec that is not decoded here; told once a connection
+    FAULT = "fault"  #: an error of this program, told once; it goes on
+
+
+@dataclass(frozen=True, slots=True)
+class VideoCounters:
+    """What became of the frames, all connections together."""
+
+    received: int = 0
+    frames: int = 0  #: shown
+    waited: int = 0  #: left out up to the next key frame, or because a newer one was shown before
+    damaged: int = 0  #: broken off, stale at the start of a connection, or not to be decoded
+    refused: int = 0  #: of a codec that is not decoded here
+    skipped: int = 0  #: wanted, but newer ones were there
+    lost_bytes: int = 0  #: of the stream that belong to no whole frame
+    reconnects: int = 0  #: connections on which frames came, after the first such
+
+
+class LiveVideo:
+    """The video of one vehicle. ``show`` and ``told`` are called from its threads, and must return quickly.
+
+    ``wants`` says whether anybody looks. While nobody does nothing is decoded, but the stream is read on and the frames
+    since its newest key frame are kept, so that a picture is there with the first frame after somebody looks.
+    """
+
+    def __init__(
+        self,
+        place: str,
+        *,
+        connect: Callable[[int], Stream],
+        make_decoder: Callable[[], Decoder],
+        show: Callable[[Picture], None],
+        told: Callable[[Notice, str], None],
+        wants: Callable[[], bool] = lambda: True,
+        came: Callable[[Coded], None] | None = None,
+        clock: Clock = monotonic_ns,
+        name: str = "video",
+    ) -> None:
+        """No I/O. ``place`` is for people.
+
+        ``connect`` makes the connection of this number, and raises OSError if it can't. ``came`` gets every whole frame
+        as it came, on the reading thread.
+        """
+        self._place = place
+        self._connect = connect
+        self._make_decoder = make_decoder
+        self._show = show
+        self._told = told
+        self._wants = wants
+        self._frame_came = came
+        self._clock = clock
+        self._name = name
+        self._stop = threading.Event()
+        self._came = threading.Condition()  # guards the backlog and the counts of the reading thread
+        self._backlog = Backlog()
+        self._wanted = False  # when the last frame came
+        self._received = self._connections = self._broken = self._lost_bytes = 0
+        self._stream: Stream | None = None
+        self._shown = self._refused = 0
+        self._decoder: Decoder | None = None
+        self._threads: list[threading.Thread] = []
+
+    def start(self) -> None:
+        """Returns at once. Raises :class:`skyloop.errors.MissingExtraError` if no decoder is installed."""
+        if self._threads:
+            raise UsageError("this receiver was started before")
+        self._decoder = self._make_decoder()
+        self._threads = [
+            threading.Thread(target=self._read, name=self._name, daemon=True),
+            threading.Thread(target=self._decode, args=(self._decoder,), name=f"{self._name}-pictures", daemon=True),
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def stop(self) -> None:
+        """Ends both threads. Idempotent; after it neither callback is called, unless it is called from one."""
+        self._stop.set()
+        with self._came:
+            self._came.notify_all()
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join(_CLOSE_S)
+
+    @property
+    def counters(self) -> VideoCounters:
+        """So far; from any thread."""
+        with self._came:
+            stream, decoder = self._stream, self._decoder
+            return VideoCounters(
+                received=self._received,
+                frames=self._shown,
+                waited=decoder.waited if decoder else 0,
+                damaged=(decoder.damaged if decoder else 0) + self._broken + (stream.broken if stream else 0),
+                refused=self._refused,
+                skipped=self._backlog.skipped,
+                lost_bytes=self._lost_bytes + (stream.lost_bytes if stream else 0),
+                reconnects=max(0, self._connections - 1),
+            )
+
+    # The thread that reads ---------------------------------------------------------------------------------------
+
+    def _read(self) -> None:
+        failures = 0
+        said = ""
+        while not self._stop.is_set():
+            before = self._connections
+            try:
+                self._follow()
+            except OSError as error:
+                reason = error.strerror or str(error)
+            else:
+                return
+            if self._connections > before:
+                failures, said = 0, ""
+            if reason != said:
+                said = reason
+                self._tell(Notice.LOST, f"{self._place}: {reason}")
+            self._stop.wait(RETRY_S[min(failures, len(RETRY_S) - 1)])
+            failures += 1
+
+    def _follow(self) -> None:
+        """One connection, from beginning to end. Raises OSError when it ends otherwise than by :meth:`stop`."""
+        stream = self._connect(self._connections)
+        with self._came:
+            self._stream = stream
+        streaming = False
+        try:
+            while not self._stop.is_set():
+                frames = stream.read()
+                if frames and not streaming:
+                    streaming = True
+                    self._tell(Notice.STREAMING, self._place)
+                    with self._came:
+                        self._connections += 1
+                wanted = bool(frames) and self._wants()
+                with self._came:
+                    for frame in frames:
+                        self._backlog.put(frame, wanted=wanted)
+                    if frames:
+                        self._received += len(frames)
+                        self._wanted = wanted
+                        self._came.notify()
+                if self._frame_came is not None:
+                    for frame in frames:
+                        self._frame_came(frame)
+        finally:
+            stream.close()
+            with self._came:
+                self._stream = None
+                self._broken += stream.broken
+                self._lost_bytes += stream.lost_bytes
+
+    # The thread that decodes -------------------------------------------------------------------------------------
+
+    def _decode(self, decoder: Decoder) -> None:
+        connection = -1
+        refusals = 0
+        said = ""
+        while (taken := self._next()) is not None:
+            coded, show = taken
+            if coded.connection != connection:
+                connection, refusals = coded.connection, 0
+                decoder.restart()
+            try:
+                decoded = decoder.decode(coded, show=show)
+                refusals = 0
+                if decoded is not None:
+                    number, pixels = decoded
+                    height, width = pixels.shape[:2]
+                    self._shown += 1
+                    self._show(Picture(pixels, width, height, coded.captured_ns, number))
+            except UnsupportedError as error:
+                refusals += 1
+                self._refused += 1
+                if refusals == REFUSALS:
+                    self._tell(Notice.UNSUPPORTED, str(error))
+            except Exception as error:  # noqa: BLE001  a surprise of a codec or a callback must not end the video
+                decoder.restart()
+                if repr(error) != said:
+                    said = repr(error)
+                    self._tell(Notice.FAULT, said)
+
+    def _next(self) -> tuple[Coded, bool] | None:
+        """Waits for a frame while pictures are wanted; the frame, and whether to show it. None after :meth:`stop`."""
+        with self._came:
+            self._came.wait_for(lambda: self._stop.is_set() or (self._wanted and len(self._backlog)))
+            return None if self._stop.is_set() else self._backlog.take(self._clock())
+
+    def _tell(self, notice: Notice, text: str) -> None:
+        if not self._stop.is_set():
+            self._told(notice, text)

@@ -1,0 +1,5 @@
+"""``mavlink://…``: ArduCopter and PX4 multirotors."""
+
+from skyloop.drivers.mavlink.driver import MavlinkDriver
+
+__all__ = ["MavlinkDriver"]

@@ -1,0 +1,199 @@
+"""What a ``mavlink://`` address asks for. Pure. ``docs/mavlink.md`` has the options as a table."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Final
+
+from skyloop.drivers.base import reject_unknown_options
+from skyloop.drivers.intrinsics import INTRINSICS_OPTIONS, check_intrinsics
+from skyloop.drivers.uri import VehicleUri
+from skyloop.errors import UnknownNameError, UsageError
+
+KEY_BYTES: Final = 32
+DEFAULT_BAUD: Final = 57_600
+#: Rotations from a camera's optical axes (right, down, forward) to the body's, row by row; the picture's top is up, or
+#: forward for one that looks down.
+FACINGS: Final = {
+    "forward": (0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0),
+    "down": (0.0, -1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0),
+}
+_EXAMPLES: Final = (
+    "it looks like mavlink://udpin:127.0.0.1:14540, mavlink://udpout:127.0.0.1:14580, mavlink://tcp:127.0.0.1:5760 or "
+    "mavlink://serial:/dev/ttyACM0:921600"
+)
+_HOST: Final = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?\Z")
+_KNOWN: Final = {
+    *("sysid", "peer", "own_sysid", "rate", "takeoff_altitude", "parameters", "signing_key", "origin", "pose"),
+    *("camera", "camera_name", "camera_width", "camera_height", "camera_fps", "camera_facing"),
+    *INTRINSICS_OPTIONS,
+}
+
+
+class Way(StrEnum):
+    """How the bytes travel."""
+
+    UDP_IN = "udpin"  #: listens, and answers whoever is heard
+    UDP_OUT = "udpout"  #: speaks first
+    TCP = "tcp"  #: connects
+    SERIAL = "serial"
+
+
+class PoseMessage(StrEnum):
+    """What poses from outside are sent as."""
+
+    ODOMETRY = "odometry"
+    VISION = "vision_position_estimate"
+
+
+@dataclass(frozen=True, slots=True)
+class Address:
+    """Where the vehicle is. ``place``: host or device; ``number``: port, or bits a second."""
+
+    way: Way
+    place: str
+    number: int
+
+    def __str__(self) -> str:
+        return f"{self.way.value}:{self.place}:{self.number}"
+
+
+@dataclass(frozen=True, slots=True)
+class CameraOptions:
+    """A camera beside the autopilot. Size and rate are what is announced before the first picture comes."""
+
+    source: str
+    name: str
+    width: int
+    height: int
+    fps: float
+    facing: str  #: one of :data:`FACINGS`
+
+
+@dataclass(frozen=True, slots=True)
+class MavlinkOptions:
+    """An address, understood."""
+
+    address: Address
+    system: int | None = None  #: of the vehicle; None: the first that is heard
+    peer: tuple[str, int] | None = None  #: whom to hear; None: whoever the vehicle is heard from first
+    own_system: int = 255
+    rate_hz: float = 50.0  #: of attitude, place and speed
+    takeoff_altitude_m: float = 1.5
+    parameters: bool = True  #: whether they are read
+    key: bytes | None = None
+    origin: tuple[float, float, float] | None = None  #: latitude and longitude [degrees], altitude [m]
+    pose: PoseMessage = PoseMessage.ODOMETRY
+    camera: CameraOptions | None = None
+
+
+def options_of(uri: VehicleUri) -> MavlinkOptions:
+    """From an address. Raises :class:`UsageError` for what makes no sense."""
+    reject_unknown_options(uri, _KNOWN)
+    check_intrinsics(uri)
+    own = uri.whole("own_sysid", 255, minimum=1, maximum=255)
+    system = uri.whole("sysid", 1, minimum=1, maximum=255) if "sysid" in uri.options else None
+    if system == own:
+        raise UsageError(f"{uri}: sysid is the vehicle's and own_sysid is ours: they must differ")
+    return MavlinkOptions(
+        address=address_of(uri),
+        system=system,
+        peer=_peer(uri),
+        own_system=own,
+        rate_hz=uri.number("rate", 50.0, minimum=1.0, maximum=200.0),
+        takeoff_altitude_m=uri.number("takeoff_altitude", 1.5, minimum=0.5, maximum=50.0),
+        parameters=uri.flag("parameters", default=True),
+        key=_key(uri),
+        origin=_origin(uri),
+        pose=_pose(uri),
+        camera=_camera(uri),
+    )
+
+
+def address_of(uri: VehicleUri) -> Address:
+    """The place of an address. Raises :class:`UsageError`."""
+    word, _, rest = uri.place.partition(":")
+    place, colon, number = rest.rpartition(":")
+    if word not in [way.value for way in Way]:
+        raise UsageError(f"{uri}: {word!r} is none of {', '.join(way.value for way in Way)}: {_EXAMPLES}")
+    way = Way(word)
+    if way is Way.SERIAL and (not colon or not number.isdecimal()):
+        place, number = rest, str(DEFAULT_BAUD)
+    good = bool(place) if way is Way.SERIAL else bool(_HOST.match(place))
+    highest = 10_000_000 if way is Way.SERIAL else 65_535
+    if not good or not number.isdecimal() or not 1 <= int(number) <= highest:
+        raise UsageError(f"{uri} names no place: {_EXAMPLES}")
+    return Address(way, place, int(number))
+
+
+def _peer(uri: VehicleUri) -> tuple[str, int] | None:
+    given = uri.options.get("peer")
+    if given is None:
+        return None
+    host, _, port = given.rpartition(":")
+    if not _HOST.match(host) or not port.isdecimal() or not 1 <= int(port) <= 65_535:
+        raise UsageError(f"{uri}: peer is {given!r}; it looks like peer=127.0.0.1:14580")
+    return host, int(port)
+
+
+def _key(uri: VehicleUri) -> bytes | None:
+    given = uri.options.get("signing_key")
+    if given is None:
+        return None
+    try:
+        held = Path(given).expanduser().read_bytes()
+    except OSError as error:
+        raise UsageError(f"{uri}: the file of the signing key can't be read: {error.strerror}") from error
+    if len(held) == KEY_BYTES:
+        return held
+    text = held.decode("ascii", "replace").strip()
+    if not re.fullmatch(r"[0-9a-fA-F]{64}", text):
+        raise UsageError(f"{uri}: {given} holds no signing key: 32 bytes, or 64 hexadecimal digits")
+    return bytes.fromhex(text)
+
+
+def _origin(uri: VehicleUri) -> tuple[float, float, float] | None:
+    given = uri.options.get("origin")
+    if given is None:
+        return None
+    try:
+        latitude, longitude, altitude = (float(each) for each in given.split(","))
+    except ValueError:
+        latitude = longitude = altitude = float("nan")
+    if not (abs(latitude) <= 90 and abs(longitude) <= 180 and abs(altitude) <= 10_000):
+        raise UsageError(f"{uri}: origin is {given!r}; it looks like origin=47.3977,8.5456,488 (degrees and m)")
+    return latitude, longitude, altitude
+
+
+def _pose(uri: VehicleUri) -> PoseMessage:
+    given = uri.options.get("pose", PoseMessage.ODOMETRY.value)
+    if given not in [each.value for each in PoseMessage]:
+        raise UnknownNameError("pose of mavlink://", given, [each.value for each in PoseMessage])
+    return PoseMessage(given)
+
+
+def _camera(uri: VehicleUri) -> CameraOptions | None:
+    source = uri.options.get("camera")
+    if source is None:
+        given = sorted(name for name in uri.options if name.startswith("camera_"))
+        if given:
+            raise UsageError(f"{uri}: {given[0]} is for a camera: say camera=rtsp://… as well")
+        return None
+    if not source:
+        raise UsageError(f"{uri}: camera is empty; it looks like camera=rtsp://192.168.1.10/live or camera=/dev/video0")
+    name, facing = uri.options.get("camera_name", "front"), uri.options.get("camera_facing", "forward")
+    if facing not in FACINGS:
+        raise UnknownNameError("camera_facing of mavlink://", facing, FACINGS)
+    if not 1 <= len(name) <= 64:
+        raise UsageError(f"{uri}: a camera's name has 1 to 64 characters")
+    return CameraOptions(
+        source=source,
+        name=name,
+        width=uri.whole("camera_width", 640, minimum=1, maximum=16384),
+        height=uri.whole("camera_height", 480, minimum=1, maximum=16384),
+        fps=uri.number("camera_fps", 30.0, minimum=0.1, maximum=1000.0),
+        facing=facing,
+    )

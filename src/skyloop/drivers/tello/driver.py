@@ -1,0 +1,136 @@
+"""The driver of ``tello://``: what the proxy calls, put together from the link, the video and the parameters."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from skyloop.clock import monotonic_ns
+from skyloop.drivers.base import Driver, Sink
+from skyloop.drivers.live_video import LiveVideo, Notice, Picture
+from skyloop.drivers.tello.cameras import cameras_of, intrinsics_for
+from skyloop.drivers.tello.decoding import TelloVideo
+from skyloop.drivers.tello.link import Link
+from skyloop.drivers.tello.options import options_of
+from skyloop.drivers.tello.session import Session, Telling
+from skyloop.drivers.tello.settings import DroneSettings
+from skyloop.drivers.tello.stream import VideoStream
+from skyloop.drivers.uri import VehicleUri
+from skyloop.errors import DriverError, ParameterError
+from skyloop.messages import AnyAction, Capabilities, EventKind, Parameter, Refusal, Severity, Value
+
+ACTIONS: Final = frozenset(
+    {"idle", "takeoff", "hover", "land", "velocity", "attitude", "emergency_stop", "reset_emergency"}
+)
+_NOTICES: Final = {
+    Notice.STREAMING: (EventKind.VEHICLE_MESSAGE, Severity.INFO),
+    Notice.LOST: (EventKind.VEHICLE_MESSAGE, Severity.WARNING),
+    Notice.UNSUPPORTED: (EventKind.DRIVER_ERROR, Severity.ERROR),
+    Notice.FAULT: (EventKind.DRIVER_ERROR, Severity.ERROR),
+}
+
+
+class TelloDriver(Driver):
+    """A Ryze Tello. ``docs/tello.md`` has its options, parameters, events and telemetry."""
+
+    def __init__(self, uri: VehicleUri) -> None:
+        super().__init__(uri)
+        self.options = options_of(uri)
+        self._cameras = cameras_of(uri)
+        self._link: Link | None = None
+        self._settings: DroneSettings | None = None
+        self._video: LiveVideo | None = None
+        self._video_ns = 0  # when a picture came last
+
+    def capabilities(self) -> Capabilities:
+        """The camera that looks down is announced though only SDK 3.0 can switch to it."""
+        return Capabilities(
+            vehicle="tello",
+            actions=ACTIONS,
+            cameras=self._cameras if self.options.video else (),
+            description=f"a Ryze Tello at {self.options.host}",
+        )
+
+    # Life cycle ------------------------------------------------------------------------------------------------
+
+    def _open(self, sink: Sink) -> None:
+        if self.options.video:
+            TelloVideo()  # says now what is not installed
+        session = Session(self.options, monotonic_ns(), extra=self._video_telemetry, video_ns=lambda: self._video_ns)
+        self._link = Link(session, lambda tellings: self._deliver(sink, tellings))
+        self._settings = DroneSettings(self._link)
+        self._link.start()
+
+    def _close(self) -> None:
+        if self._link is not None:
+            self._link.stop()
+        if self._video is not None:
+            self._video.stop()
+        self._link = self._settings = self._video = None
+
+    def _deliver(self, sink: Sink, tellings: list[Telling]) -> None:
+        """On the link's thread."""
+        for telling in tellings:
+            telling(sink)
+        link, settings = self._link, self._settings
+        if self._video is not None or not self.options.video or link is None or settings is None:
+            return
+        if link.session.ready:
+            self._start_video(sink, link, settings)
+
+    # Flying ----------------------------------------------------------------------------------------------------
+
+    def _apply(self, action: AnyAction) -> AnyAction:
+        if self._link is None:
+            raise DriverError(f"{self.uri} is not open")
+        return self._link.command(action)
+
+    # Parameters ------------------------------------------------------------------------------------------------
+
+    def parameters(self) -> list[Parameter]:
+        """Those that depend on the version of its SDK come once the drone told it."""
+        return [] if self._settings is None else self._settings.parameters()
+
+    def set_parameter(self, name: str, value: Value) -> Value:
+        """Takes up to 0.95 s: the drone answers."""
+        if self._settings is None:
+            raise ParameterError(f"{self.uri} is not open", code=Refusal.VEHICLE_LINK_LOST)
+        return self._settings.write(name, value)
+
+    # Video -----------------------------------------------------------------------------------------------------
+
+    def _start_video(self, sink: Sink, link: Link, settings: DroneSettings) -> None:
+        def show(picture: Picture) -> None:
+            camera = settings.camera
+            sink.frame(
+                camera,
+                picture.pixels,
+                picture.captured_ns,
+                width=picture.width,
+                height=picture.height,
+                intrinsics=intrinsics_for(self._cameras[0], camera, picture.width),
+            )
+
+        def tell(notice: Notice, text: str) -> None:
+            kind, severity = _NOTICES[notice]
+            sink.event(kind, f"video {notice.value}: {text}", severity, where="video")
+
+        def came(_coded: object) -> None:
+            self._video_ns = monotonic_ns()
+
+        self._video = LiveVideo(
+            f"port {self.options.video_port}",
+            connect=lambda number: VideoStream(self.options, lambda: link.addresses, number, monotonic_ns),
+            make_decoder=TelloVideo,
+            show=show,
+            told=tell,
+            wants=lambda: sink.wants(settings.camera),
+            came=came,
+            name="tello-video",
+        )
+        self._video.start()
+
+    def _video_telemetry(self) -> dict[str, Value]:
+        if self._video is None:
+            return {}
+        counters = self._video.counters
+        return {f"video.{name}": getattr(counters, name) for name in counters.__dataclass_fields__}

@@ -1,0 +1,193 @@
+"""The sockets of one drone and the thread that serves them: commands at their pace, answers, state.
+
+All decisions are the session's, made under one lock; what it tells is delivered by this thread with the lock free.
+"""
+
+from __future__ import annotations
+
+import selectors
+import socket
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from typing import Final
+
+from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
+from skyloop.drivers.base import Sink
+from skyloop.drivers.tello.session import TICK_NS, Session, Telling
+from skyloop.drivers.tello.sockets import MAX_DATAGRAM, address_of, at, towards
+from skyloop.messages import AnyAction, EventKind, Severity
+
+BURST: Final = 32  #: datagrams that are read before commands get their turn
+ASK_S: Final = 0.95  #: a command is answered within this, or it failed
+RENEW_NS: Final = nanoseconds(2.0)  #: pace of new sockets while nothing is heard: this host's address may have changed
+_CLOSE_S: Final = 2.0
+
+
+class Link:
+    """Serves a session from :meth:`start` to :meth:`stop`. ``deliver`` gets its tellings, on the link's thread."""
+
+    def __init__(self, session: Session, deliver: Callable[[list[Telling]], None], clock: Clock = monotonic_ns) -> None:
+        self.session = session
+        self.lock = threading.Lock()  #: to be held by whoever touches the session
+        self.addresses: tuple[str, str] | None = None  #: the drone's, and this host's towards it
+        self._deliver = deliver
+        self._clock = clock
+        self._stopping = threading.Event()
+        self._selector = selectors.DefaultSelector()
+        self._awake, self._waker = socket.socketpair()
+        self._commands: socket.socket | None = None
+        self._states: socket.socket | None = None
+        self._renewed_ns = -RENEW_NS
+        self._thread = threading.Thread(target=self._run, name="skyloop-tello", daemon=True)
+
+    def start(self) -> None:
+        """Begin."""
+        self._awake.setblocking(False)
+        self._waker.setblocking(False)
+        self._selector.register(self._awake, selectors.EVENT_READ)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End, and give everything back. Questions that wait are answered by nothing."""
+        self._stopping.set()
+        self._wake()
+        if self._thread is not threading.current_thread():
+            self._thread.join(_CLOSE_S)
+        with self.lock:
+            self.session.close()
+
+    # From the proxy's threads ----------------------------------------------------------------------------------
+
+    def command(self, action: AnyAction) -> AnyAction:
+        """Decide, and say it at once unless the last ``rc`` was just sent."""
+        with self.lock:
+            now_ns = self._clock()
+            applied = self.session.command(action, now_ns)
+            due_ns = self.session.due_ns
+            if due_ns <= now_ns:
+                self._say(now_ns)
+        if now_ns < due_ns:
+            self._wake()
+        return applied
+
+    def ask(self, text: str) -> str | None:
+        """Say a command and wait for its answer; None if none came. Takes up to 0.95 s."""
+        done = threading.Event()
+        replies: list[str | None] = []
+
+        def end(reply: str | None) -> None:
+            replies.append(reply)
+            done.set()
+
+        with self.lock:
+            self.session.ask(text, end)
+        self._wake()
+        done.wait(ASK_S)
+        return replies[0] if replies else None
+
+    def _wake(self) -> None:
+        with suppress(OSError):  # it is awake, or it ended
+            self._waker.send(b"\0")
+
+    # On the link's thread --------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        try:
+            while not self._stopping.is_set():
+                try:
+                    self._step()
+                except Exception as error:  # noqa: BLE001  whatever happens, the drone must be told what to do
+                    self._deliver([partial(_tell_failure, error)])
+                    self._stopping.wait(seconds(TICK_NS))
+        finally:
+            with self.lock:
+                self._close_sockets()
+            self._selector.close()
+            self._awake.close()
+            self._waker.close()
+
+    def _step(self) -> None:
+        now_ns = self._clock()
+        with self.lock:
+            wait_ns = self.session.due_ns - now_ns
+        ready = self._selector.select(max(0.0, seconds(wait_ns)))
+        self._renew_sockets()
+        for key, _ in ready:
+            if key.fileobj is self._awake:
+                with suppress(BlockingIOError):
+                    self._awake.recv(4096)
+            elif key.fileobj is self._commands:
+                self._receive(self._commands, self.session.reply_heard)
+            elif key.fileobj is self._states:
+                self._receive(self._states, self.session.state_heard)
+        with self.lock:
+            now_ns = self._clock()
+            if now_ns >= self.session.due_ns:
+                self._say(now_ns)
+            tellings = self.session.tellings()
+        if not self._stopping.is_set():
+            self._deliver(tellings)
+
+    def _receive(self, port: socket.socket, heard: Callable[[bytes, int], None]) -> None:
+        for _ in range(BURST):
+            try:
+                datagram, sender = port.recvfrom(MAX_DATAGRAM)
+            except BlockingIOError:
+                return
+            except OSError as error:
+                with self.lock:
+                    self.session.unreachable(error.strerror or str(error))
+                return
+            if self.addresses is not None and sender[0] == self.addresses[0]:
+                with self.lock:
+                    heard(datagram, self._clock())
+
+    def _say(self, now_ns: int) -> None:
+        for datagram in self.session.tick(now_ns):
+            if self._commands is None:
+                return
+            try:
+                self._commands.send(datagram)
+            except BlockingIOError:
+                pass  # lost, like any datagram may be
+            except OSError as error:
+                self.session.unreachable(error.strerror or str(error))
+
+    # Sockets ---------------------------------------------------------------------------------------------------
+
+    def _renew_sockets(self) -> None:
+        """Make them, and make them anew now and then while the drone is not heard."""
+        now_ns = self._clock()
+        with self.lock:
+            if self.session.is_heard or now_ns - self._renewed_ns < RENEW_NS:
+                return
+            self._renewed_ns = now_ns
+            self._close_sockets()
+            try:
+                self._open_sockets()
+            except OSError as error:
+                self._close_sockets()
+                self.session.unreachable(error.strerror or str(error))
+
+    def _open_sockets(self) -> None:
+        options = self.session.options
+        address = address_of(options)
+        self._commands = towards(options, address)
+        self._selector.register(self._commands, selectors.EVENT_READ)
+        local = str(self._commands.getsockname()[0])
+        self._states = at(options, local, options.state_port)
+        self._selector.register(self._states, selectors.EVENT_READ)
+        self.addresses = address, local
+
+    def _close_sockets(self) -> None:
+        for port in (self._commands, self._states):
+            if port is not None:
+                self._selector.unregister(port)
+                port.close()
+        self._commands = self._states = None
+
+
+def _tell_failure(error: Exception, sink: Sink) -> None:
+    sink.event(EventKind.DRIVER_ERROR, f"the link to the drone failed: {error!r}", Severity.ERROR, where="link")

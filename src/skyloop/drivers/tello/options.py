@@ -1,0 +1,98 @@
+"""What a ``tello://`` address asks for. Pure. ``docs/tello.md`` has the options as a table."""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+from skyloop.drivers.base import reject_unknown_options
+from skyloop.drivers.intrinsics import INTRINSICS_OPTIONS, check_intrinsics
+from skyloop.drivers.uri import VehicleUri
+from skyloop.errors import UnknownNameError, UsageError
+from skyloop.wire.tello.commands import PORT, STATE_PORT, VIDEO_PORT
+
+_HOST: Final = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?\Z")
+_INTERFACE: Final = re.compile(r"[A-Za-z0-9_.:@-]{1,15}\Z")
+_LEAST_PORT: Final = 1025  # that the Tello's command takes
+_KNOWN: Final = {
+    *("local", "interface", "port", "state_port", "video_port", "video", "pads", "velocity_axes"),
+    *INTRINSICS_OPTIONS,
+}
+
+
+class VelocityAxes(StrEnum):
+    """Which axes the drone's ``vgx`` and ``vgy`` are along. The guides do not say."""
+
+    START = "start"  #: x along the heading that it was switched on with
+    BODY = "body"  #: x along its nose
+    NONE = "none"  #: not to be trusted: feedback has no velocity
+
+
+@dataclass(frozen=True, slots=True)
+class TelloOptions:
+    """An address, understood."""
+
+    host: str
+    local: str | None = None  #: this host's address to talk from, and to be sent to
+    interface: str | None = None  #: this host's interface to talk through
+    port: int = PORT
+    state_port: int = STATE_PORT
+    video_port: int = VIDEO_PORT
+    video: bool = True
+    pads: bool = False  #: look for mission pads from the beginning
+    velocity_axes: VelocityAxes = VelocityAxes.START
+
+    @property
+    def own_ports(self) -> bool:
+        """Whether the drone must be told where to send state and video."""
+        return (self.state_port, self.video_port) != (STATE_PORT, VIDEO_PORT)
+
+
+def options_of(uri: VehicleUri) -> TelloOptions:
+    """From an address. Raises :class:`UsageError` for what makes no sense."""
+    reject_unknown_options(uri, _KNOWN)
+    if not uri.place:
+        raise UsageError(f"{uri} names no host: it looks like tello://192.168.10.1")
+    if not _HOST.match(uri.place):
+        hint = "; the port is given as an option: ?port=8889" if ":" in uri.place else ""
+        raise UsageError(f"{uri}: {uri.place!r} is not the name or IPv4 address of a host{hint}")
+    check_intrinsics(uri)
+    axes = uri.options.get("velocity_axes", VelocityAxes.START)
+    if axes not in list(VelocityAxes):
+        raise UnknownNameError("velocity_axes of tello://", axes, [known.value for known in VelocityAxes])
+    made = TelloOptions(
+        host=uri.place,
+        local=_local(uri),
+        interface=_interface(uri),
+        port=uri.whole("port", PORT, minimum=1, maximum=65535),
+        state_port=uri.whole("state_port", STATE_PORT, minimum=_LEAST_PORT, maximum=65535),
+        video_port=uri.whole("video_port", VIDEO_PORT, minimum=_LEAST_PORT, maximum=65535),
+        video=uri.flag("video", default=True),
+        pads=uri.flag("pads", default=False),
+        velocity_axes=VelocityAxes(axes),
+    )
+    if made.state_port == made.video_port:
+        raise UsageError(f"{uri}: state and video can't both come to port {made.state_port}")
+    return made
+
+
+def _local(uri: VehicleUri) -> str | None:
+    given = uri.options.get("local")
+    if given is None:
+        return None
+    try:
+        return str(ipaddress.IPv4Address(given))
+    except ValueError:
+        raise UsageError(
+            f"{uri}: local is {given!r} and must be an IPv4 address of this host; an interface is named by interface="
+        ) from None
+
+
+def _interface(uri: VehicleUri) -> str | None:
+    given = uri.options.get("interface")
+    if given is not None and not _INTERFACE.match(given):
+        raise UsageError(f"{uri}: interface is {given!r} and must be the name of a network interface, such as wlan1")
+    return given

@@ -1,0 +1,227 @@
+"""What the drone is told of flying: the last thing decided, until its state shows that it is so. Pure.
+
+Answers decide nothing: they come seconds late, or not at all. A take-off or landing is said again until it shows.
+"""
+
+from __future__ import annotations
+
+from enum import Enum, auto
+from typing import Final
+
+from skyloop.clock import nanoseconds
+from skyloop.drivers.tello.notice import Notice, message
+from skyloop.drivers.tello.sticks import Scale, sticks_of
+from skyloop.drivers.tello.watch import FlightWatch
+from skyloop.errors import DriverError
+from skyloop.messages import (
+    AnyAction,
+    Attitude,
+    EmergencyStop,
+    EventKind,
+    FlightState,
+    Hover,
+    Idle,
+    Land,
+    ResetEmergency,
+    Severity,
+    Takeoff,
+    Velocity,
+)
+from skyloop.wire.tello.commands import LEVEL, Stick
+from skyloop.wire.tello.replies import is_error
+
+AGAIN_NS: Final = nanoseconds(1.5)  #: a take-off or landing that does not show is said again
+TAKEOFF_NS: Final = nanoseconds(8.0)  #: a drone that has not started by then refuses to
+STOP_AGAIN_NS: Final = nanoseconds(0.1)
+STOPS: Final = 5  #: so often at least an emergency stop is said, for it may not be answered
+STOP_NS: Final = nanoseconds(5.0)  #: and so long at most
+
+TAKEOFF, LAND, EMERGENCY = "takeoff", "land", "emergency"
+
+
+class Decision(Enum):
+    """What is wanted of take-off and landing."""
+
+    STAY = auto()  #: as it is: in the air if it flies
+    TAKE_OFF = auto()
+    LAND = auto()
+
+
+class Pilot:
+    """Remembers the last decision and puts it into commands. ``full``: what a full stick comes to."""
+
+    def __init__(self) -> None:
+        self.watch = FlightWatch()
+        self.full = Scale()
+        self.limits = Scale()
+        self.heard = False  #: whether the drone's state comes
+        self._decision = Decision.STAY
+        self._stick = LEVEL
+        self._decided_ns = 0
+        self._said_ns: int | None = None  # the take-off or landing
+        self._stopped = False  # motors cut by us, until the reset
+        self._stops = 0
+        self._stop_ns = 0
+        self._stop_done = True
+        self._was_in_air = False  # when it was heard last
+        self._notices: list[Notice] = []
+
+    @property
+    def intent(self) -> tuple[object, ...]:
+        """Changes when something else is to be said."""
+        return self._decision, self._stick, self._stop_done
+
+    def state(self) -> FlightState:
+        """For feedback."""
+        if self._stopped:
+            return FlightState.EMERGENCY
+        if self.watch.in_air and self._stick != LEVEL:
+            return FlightState.FLYING
+        return self.watch.phase
+
+    # What is decided -------------------------------------------------------------------------------------------
+
+    def take(self, action: AnyAction, now_ns: int) -> AnyAction:
+        """Decide; returns what is really applied. Raises :class:`DriverError` for what can't be done now."""
+        if isinstance(action, Idle):
+            return action
+        if isinstance(action, EmergencyStop):
+            self._stop(now_ns)
+        elif isinstance(action, ResetEmergency):
+            self._reset(now_ns)
+        elif self._stopped:
+            if isinstance(action, Takeoff):
+                raise DriverError("the motors were stopped: reset the emergency first")
+            if isinstance(action, Velocity | Attitude):
+                return Hover()
+        elif isinstance(action, Takeoff):
+            self._take_off(now_ns)
+        elif isinstance(action, Land):
+            self._decide(Decision.LAND, now_ns)
+        elif isinstance(action, Velocity | Attitude):
+            stick, applied = sticks_of(action, self.full, self.limits)
+            self._remain(stick, now_ns)
+            return applied
+        elif isinstance(action, Hover):
+            self._remain(LEVEL, now_ns)
+        return action
+
+    def _decide(self, decision: Decision, now_ns: int) -> None:
+        self._stick = LEVEL
+        if decision is self._decision:
+            return
+        self._decision, self._decided_ns, self._said_ns = decision, now_ns, None
+        self.watch.rising = decision is Decision.TAKE_OFF
+        self.watch.sinking = decision is Decision.LAND
+        self.watch.landing_answered = False
+
+    def _remain(self, stick: Stick, now_ns: int) -> None:
+        if self._decision is Decision.LAND:
+            self._decide(Decision.STAY, now_ns)
+        self._stick = stick
+
+    def _take_off(self, now_ns: int) -> None:
+        if not self.heard:
+            raise DriverError("the drone is not heard: it does not take off blindly")
+        if self.watch.in_air:
+            self._remain(LEVEL, now_ns)
+        else:
+            self._decide(Decision.TAKE_OFF, now_ns)
+
+    def _stop(self, now_ns: int) -> None:
+        self._decide(Decision.STAY, now_ns)
+        self._stick = LEVEL
+        if not self._stopped:
+            text = "the drone was told to cut its motors; reset the emergency when it lies safely"
+            self._notices.append(Notice(EventKind.EMERGENCY, text, Severity.ERROR, {"reason": "user"}))
+        self._stopped, self._stop_done = True, False
+        self._stops, self._stop_ns = 0, now_ns
+
+    def _reset(self, now_ns: int) -> None:
+        if not self._stopped:
+            return
+        if not self.heard:
+            raise DriverError("the drone is not heard: whether it lies on the ground can't be known")
+        if not self._stop_done and self.watch.motors(now_ns):
+            raise DriverError("the motors still run: the stop has not shown yet")
+        self._stopped, self._stop_done = False, True
+
+    # What is heard ---------------------------------------------------------------------------------------------
+
+    def look(self, now_ns: int) -> None:
+        """The watch has seen a new state."""
+        phase = self.watch.phase
+        self.heard = True
+        self._was_in_air = phase.airborne
+        shown = {Decision.TAKE_OFF: FlightState.HOVERING, Decision.LAND: FlightState.LANDED}.get(self._decision)
+        if phase is shown:
+            self._decide(Decision.STAY, now_ns)
+        elif phase is FlightState.LANDED:
+            self._stick = LEVEL
+        if self._stops >= STOPS and self.watch.motors(now_ns) is False:
+            self._stop_done = True
+
+    def answered(self, motion: str, reply: str, now_ns: int) -> None:
+        """The answer to one of these commands."""
+        refused = is_error(reply)
+        if motion == LAND:
+            self.watch.landing_answered = self._decision is Decision.LAND and not refused
+        elif motion == EMERGENCY:
+            self._stop_done = self._stop_done or not refused
+        elif motion == TAKEOFF and refused and self._decision is Decision.TAKE_OFF and not self.watch.phase.airborne:
+            self._decide(Decision.STAY, now_ns)
+            text = f"the drone refused to take off: {reply!r}"
+            self._notices.append(message(text, "takeoff_refused", Severity.WARNING, reply=reply))
+
+    def lost(self, now_ns: int) -> None:
+        """The drone is not heard any more: nothing that moves it is wanted any longer."""
+        self.heard = False
+        if self._decision is Decision.TAKE_OFF:
+            self._decide(Decision.STAY, now_ns)
+        self._stick = LEVEL
+        self.watch = FlightWatch()
+        self.watch.sinking = self._decision is Decision.LAND
+
+    # What is said ----------------------------------------------------------------------------------------------
+
+    def notices(self) -> list[Notice]:
+        """What there is to tell since the last call."""
+        notices, self._notices = self._notices, []
+        return notices
+
+    def motions(self, now_ns: int) -> list[str]:
+        """Commands that are answered seconds later, due now."""
+        if self._stopped:
+            return self._emergency(now_ns)
+        if self._decision is Decision.TAKE_OFF and not self.watch.phase.airborne:
+            if now_ns - self._decided_ns >= TAKEOFF_NS:
+                self._decide(Decision.STAY, now_ns)
+                text = "the drone did not take off: it may refuse because of its battery, its heat or its tilt"
+                self._notices.append(message(text, "no_takeoff", Severity.WARNING))
+                return []
+            return self._again(TAKEOFF, now_ns)
+        landed = self.heard and self.watch.phase is FlightState.LANDED
+        if self._decision is Decision.LAND and not landed:
+            return self._again(LAND, now_ns)
+        return []
+
+    def stick(self) -> Stick | None:
+        """For ``rc``; None if nothing is to be said: a drone that stands, rises or sinks is left alone."""
+        if self._stopped or self._decision is not Decision.STAY:
+            return None
+        if self.heard:
+            return self._stick if self.watch.in_air else None
+        return LEVEL if self._was_in_air else None
+
+    def _again(self, text: str, now_ns: int) -> list[str]:
+        if self._said_ns is not None and now_ns - self._said_ns < AGAIN_NS:
+            return []
+        self._said_ns = now_ns
+        return [text]
+
+    def _emergency(self, now_ns: int) -> list[str]:
+        late = now_ns - self._stop_ns
+        if (self._stop_done and self._stops >= STOPS) or late >= STOP_NS or late < self._stops * STOP_AGAIN_NS:
+            return []
+        self._stops += 1
+        return [EMERGENCY]

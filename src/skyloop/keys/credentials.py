@@ -1,0 +1,162 @@
+"""One identity's folder, as a program uses it: read, checked, watched for a newer roster.
+
+=================  ====================================================================
+``ca.pem``         the certificate of the lab's authority
+``identity.pem``   the identity's certificate
+``identity.key``   its private key: readable by its owner only
+``roster.json``    all identities of the lab, signed; replace it when there is a newer one
+=================  ====================================================================
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Final
+
+from skyloop.errors import UsageError
+from skyloop.keys import files
+from skyloop.keys import roster as rosters
+from skyloop.keys.certificates import (
+    Authority,
+    check_issued,
+    check_time,
+    identity_of,
+    matches,
+    read_authority,
+    read_certificate,
+    read_key,
+)
+from skyloop.keys.identity import Identity, KeyRole
+from skyloop.keys.roster import Roster
+
+AUTHORITY_FILE: Final = "ca.pem"
+CERTIFICATE_FILE: Final = "identity.pem"
+KEY_FILE: Final = "identity.key"
+ROSTER_FILE: Final = "roster.json"
+NOTICE: Final = timedelta(days=7)  #: how long before its end an expiry is told
+
+
+@dataclass(frozen=True, slots=True)
+class Credentials:
+    """A checked identity. The paths are absolute, for Zenoh to read the files itself."""
+
+    identity: Identity
+    expires: datetime
+    authority: Authority
+    roster: Roster
+    directory: Path
+
+    @property
+    def name(self) -> str:
+        return self.identity.name
+
+    @property
+    def role(self) -> KeyRole:
+        return self.identity.role
+
+    @property
+    def authority_file(self) -> Path:
+        return self.directory / AUTHORITY_FILE
+
+    @property
+    def certificate_file(self) -> Path:
+        return self.directory / CERTIFICATE_FILE
+
+    @property
+    def key_file(self) -> Path:
+        return self.directory / KEY_FILE
+
+    @property
+    def roster_file(self) -> Path:
+        return self.directory / ROSTER_FILE
+
+    def ends(self, now: datetime | None = None) -> dict[str, str]:
+        """What ends within a week, this key and the lab's authority, with a sentence for people each."""
+        now = now or datetime.now(UTC)
+        dates = {f"the key of {self.name}": self.expires, "the lab's authority": self.authority.expires}
+        return {what: text for what, end in dates.items() if (text := expiry_notice(what, end, now))}
+
+    def renewed(self) -> Credentials | None:
+        """These with a newer roster, if one lies in the folder by now; None if not.
+
+        Raises :class:`UsageError` for one that can't be read or is not signed by this lab's authority.
+        """
+        roster = _read_roster(self.directory, self.authority)
+        return replace(self, roster=roster) if roster.number > self.roster.number else None
+
+
+def load(directory: Path | str, now: datetime | None = None) -> Credentials:
+    """Read an identity's folder and check all that can be checked. Raises :class:`UsageError`, also its branch
+    :class:`skyloop.errors.FileFormatError`, with what is wrong and what would be right."""
+    now = now or datetime.now(UTC)
+    path = Path(directory).expanduser().resolve()
+    _check_folder(path)
+    certificate_path, key_path = path / CERTIFICATE_FILE, path / KEY_FILE
+    key = read_key(files.read_private(key_path, "the private key"), key_path)
+    certificate = read_certificate(files.read(certificate_path, "the certificate"), certificate_path)
+    authority = _read_authority(path)
+    if not matches(key, certificate):
+        raise UsageError(f"{key_path} does not belong to the certificate {certificate_path}: copy both from one folder")
+    check_issued(certificate, authority, certificate_path)
+    check_time(authority.certificate, f"the lab's authority, {path / AUTHORITY_FILE},", now)
+    check_time(certificate, f"the key {path}", now)
+    identity = identity_of(certificate, certificate_path)
+    roster = _read_roster(path, authority)
+    _check_listed(identity, roster, path)
+    return Credentials(identity, certificate.not_valid_after_utc, authority, roster, path)
+
+
+def read_public(directory: Path) -> tuple[Authority, Roster]:
+    """What everybody may know, from the folder of a lab or of an identity. Raises :class:`UsageError`."""
+    if not directory.is_dir():
+        raise UsageError(f"there is no folder {directory}: make a lab's with skyloop keys init")
+    authority = _read_authority(directory)
+    return authority, _read_roster(directory, authority)
+
+
+def expiry_notice(what: str, end: datetime, now: datetime) -> str:
+    """A sentence for people if the end is less than a week away, or past; empty if not."""
+    left = end - now
+    if left > NOTICE:
+        return ""
+    day = f"{end:%Y-%m-%d %H:%M} UTC"
+    if left <= timedelta(0):
+        return f"{what} expired on {day}: issue a new one (skyloop keys issue)"
+    hours = left / timedelta(hours=1)
+    rest = f"{hours / 24:.0f} days" if hours >= 36 else f"{hours:.0f} h"
+    return f"{what} expires in {rest}, on {day}: issue a new one (skyloop keys issue)"
+
+
+def _read_authority(directory: Path) -> Authority:
+    path = directory / AUTHORITY_FILE
+    return read_authority(read_certificate(files.read(path, "the authority's certificate"), path), None, path)
+
+
+def _read_roster(directory: Path, authority: Authority) -> Roster:
+    path = directory / ROSTER_FILE
+    return rosters.decode(files.read(path, "the roster"), authority, path)
+
+
+def _check_folder(path: Path) -> None:
+    if not path.is_dir():
+        raise UsageError(f"there is no folder {path}: give the one of an identity that skyloop keys issue made")
+    if (path / "ca.key").exists():
+        raise UsageError(
+            f"{path} is the folder of the lab's authority, which no program on the network needs: give that of an "
+            f"identity, such as {path / 'issued' / 'NAME'}"
+        )
+
+
+def _check_listed(identity: Identity, roster: Roster, path: Path) -> None:
+    entry = roster.find(identity.name)
+    if entry is None:
+        raise UsageError(f"{identity.name} is not on the roster in {path}: copy the newest roster.json there")
+    if entry.revoked:
+        raise UsageError(f"{identity.name} was revoked: issue a key under another name")
+    if entry.identity != identity:
+        raise UsageError(
+            f"the key {path} is of {identity}, but the roster says {entry.identity}: the key was replaced, "
+            "take the new one"
+        )

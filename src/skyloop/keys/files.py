@@ -1,0 +1,72 @@
+"""Files that hold keys: who may read them, and how they are replaced."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+from skyloop.errors import UsageError
+
+_OTHERS: Final = stat.S_IRWXG | stat.S_IRWXO
+
+
+def make_directory(path: Path) -> None:
+    """Make a directory that only its owner can enter, or see that it is one. Raises :class:`UsageError`."""
+    try:
+        path.mkdir(mode=0o700, parents=True, exist_ok=True)
+        mode = path.stat().st_mode
+    except OSError as error:
+        raise UsageError(f"{path} can't be made: {error.strerror}") from None
+    if mode & _OTHERS:
+        raise UsageError(f"{path} is open to others (mode {stat.S_IMODE(mode):04o}): chmod 700 it")
+
+
+def write(path: Path, content: bytes, *, private: bool = False) -> None:
+    """Replace a file in one step; a private one can be read by its owner only, from its first byte on."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600 if private else 0o644)
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise UsageError(f"{path} can't be written: {error.strerror}") from None
+
+
+def read(path: Path, what: str) -> bytes:
+    """The content of a file. ``what`` says for people what is in it. Raises :class:`UsageError`."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise UsageError(f"{what} {path} can't be read: {error.strerror}") from None
+
+
+def read_private(path: Path, what: str) -> bytes:
+    """The same of a file that must not be open to others: somebody else may have the key already."""
+    content = read(path, what)
+    mode = path.stat().st_mode
+    if mode & _OTHERS:
+        raise UsageError(
+            f"{what} {path} is open to others (mode {stat.S_IMODE(mode):04o}): chmod 600 it, and issue a new one if "
+            "others may have read it"
+        )
+    return content
+
+
+@contextmanager
+def locked(directory: Path) -> Iterator[None]:
+    """Hold a directory against other processes that change it; the kernel lets go of it with this process."""
+    descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)

@@ -1,0 +1,96 @@
+"""Who somebody is on the network, and which drones that is about. Pure."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from enum import StrEnum
+from fnmatch import fnmatchcase
+from typing import Final
+
+from skyloop.errors import UsageError
+
+ANYONE: Final = "anyone"  #: what everybody is called who has no key, so that no key has this name
+ALL_DRONES: Final = ("*",)
+MAX_PATTERNS: Final = 32
+_NAME: Final = re.compile(r"[a-z0-9][a-z0-9_.-]{0,47}")
+_PATTERN: Final = re.compile(r"[a-z0-9_.*-]{1,48}")
+
+
+class KeyRole(StrEnum):
+    """What a key lets its holder be. ``drones`` are the names that it is about."""
+
+    PILOT = "pilot"  #: sees every drone, and may fly those that are named
+    OBSERVER = "observer"  #: sees those that are named, and flies nothing
+    PROXY = "proxy"  #: serves drones of these names
+    ROUTER = "router"  #: carries everybody's traffic between networks, and is trusted with all of it
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """A name with what it may do. ``drones`` are patterns in which ``*`` stands for any characters."""
+
+    name: str
+    role: KeyRole
+    drones: tuple[str, ...] = ALL_DRONES
+
+    def covers(self, drone: str) -> bool:
+        """Whether a drone of this name is among those that this identity is for."""
+        return any(fnmatchcase(drone, pattern) for pattern in self.drones)
+
+    def may_fly(self, drone: str) -> bool:
+        """Whether this is a pilot of a drone of this name."""
+        return self.role is KeyRole.PILOT and self.covers(drone)
+
+    def require_proxy(self, drone: str) -> None:
+        """Raise :class:`UsageError` unless this is a proxy that may serve this name."""
+        if self.role is not KeyRole.PROXY:
+            raise UsageError(f"these are the keys of {self}: a proxy needs some of --role proxy")
+        if not self.covers(drone):
+            raise UsageError(f"these are the keys of {self}: they are not for the name {drone!r}")
+
+    def require_router(self) -> None:
+        """Raise :class:`UsageError` unless this is a router."""
+        if self.role is not KeyRole.ROUTER:
+            raise UsageError(f"these are the keys of {self}: a router needs some of --role router")
+
+    def require_application(self) -> None:
+        """Raise :class:`UsageError` unless this is a pilot or an observer."""
+        if self.role not in (KeyRole.PILOT, KeyRole.OBSERVER):
+            raise UsageError(f"these are the keys of {self}: an application needs a pilot's or an observer's")
+
+    def __str__(self) -> str:
+        return f"{self.name}, {self.role}" + ("" if self.role is KeyRole.ROUTER else f" of {','.join(self.drones)}")
+
+
+def make_identity(name: str, role: str, drones: str = "*") -> Identity:
+    """Check what a person typed. Raises :class:`UsageError`."""
+    if not _NAME.fullmatch(name):
+        raise UsageError(
+            f"{name!r} cannot be the name of a key: 1 to 48 lower-case letters, digits, '_', '-' and '.', "
+            "the first one a letter or a digit"
+        )
+    if name == ANYONE:
+        raise UsageError(f"no key can be named {ANYONE!r}: that is what everybody is called who has none")
+    if role not in list(KeyRole):
+        raise UsageError(f"there is no role {role!r}; there are {', '.join(KeyRole)}")
+    patterns = parse_drones(drones)
+    if role == KeyRole.ROUTER and patterns != ALL_DRONES:
+        raise UsageError("a router carries the traffic of all drones: leave out which")
+    return Identity(name, KeyRole(role), patterns)
+
+
+def parse_drones(text: str) -> tuple[str, ...]:
+    """Names of drones or patterns of them, separated by commas: ``alpha,bravo*``. Raises :class:`UsageError`."""
+    patterns = tuple(dict.fromkeys(re.sub(r"\*+", "*", part.strip()) for part in text.split(",")))
+    for pattern in patterns:
+        if not _PATTERN.fullmatch(pattern) or not (_NAME.fullmatch(pattern) or "*" in pattern):
+            raise UsageError(
+                f"{pattern!r} names no drones: lower-case letters, digits, '_', '-' and '.', and '*' for any of these; "
+                "several are separated by commas: alpha,bravo*"
+            )
+    if len(patterns) > MAX_PATTERNS:
+        raise UsageError(
+            f"{len(patterns)} patterns of drones are too many: at most {MAX_PATTERNS}, and '*' is any name"
+        )
+    return ALL_DRONES if "*" in patterns else patterns

@@ -1,0 +1,142 @@
+"""A lab's authority: the folder from which identities are issued and revoked.
+
+=====================  =====================================================================
+``ca.key``             the authority's private key: who has it can make any identity
+``ca.pem``             its certificate
+``roster.json``        all identities, signed
+``issued/NAME/``       one identity's folder, to be copied to its machine
+=====================  =====================================================================
+"""
+
+from __future__ import annotations
+
+import math
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from skyloop.errors import UnknownNameError, UsageError
+from skyloop.keys import certificates, files
+from skyloop.keys import roster as rosters
+from skyloop.keys.certificates import Authority
+from skyloop.keys.credentials import AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE, ROSTER_FILE
+from skyloop.keys.identity import Identity
+from skyloop.keys.roster import Entry, Roster
+
+AUTHORITY_DAYS: Final = 1825  #: how long a lab's authority is valid by default
+IDENTITY_DAYS: Final = 30.0  #: how long an identity is
+MAX_IDENTITY_DAYS: Final = 366.0
+_AUTHORITY_KEY: Final = "ca.key"
+_ISSUED: Final = "issued"
+
+
+class Lab:
+    """An authority that can issue. Each change is made under a lock on the folder, so two processes don't lose one."""
+
+    def __init__(self, directory: Path, authority: Authority) -> None:
+        self.directory = directory
+        self.authority = authority
+
+    @classmethod
+    def make(cls, directory: Path, days: int = AUTHORITY_DAYS, now: datetime | None = None) -> Lab:
+        """A new authority in a folder of its own. Raises :class:`UsageError`, also where there is one already."""
+        if not 1 <= days <= 36500:
+            raise UsageError(f"an authority is valid for 1 to 36500 days, not {days}")
+        files.make_directory(directory)
+        with files.locked(directory):
+            if (directory / _AUTHORITY_KEY).exists():
+                raise UsageError(f"{directory} has an authority already: a new one would make all its keys worthless")
+            authority = certificates.make_authority(days, _now(now))
+            assert authority.key is not None
+            lab = cls(directory, authority)
+            files.write(directory / AUTHORITY_FILE, certificates.certificate_pem(authority.certificate))
+            lab._write_roster(Roster(1, authority.name))
+            files.write(directory / _AUTHORITY_KEY, certificates.key_pem(authority.key), private=True)
+        return lab
+
+    @classmethod
+    def open(cls, directory: Path) -> Lab:
+        """The authority in a folder. Raises :class:`UsageError`."""
+        key_path, certificate_path = directory / _AUTHORITY_KEY, directory / AUTHORITY_FILE
+        if not key_path.exists():
+            raise UsageError(f"there is no authority in {directory}: make one with skyloop keys init")
+        key = certificates.read_key(files.read_private(key_path, "the authority's key"), key_path)
+        content = files.read(certificate_path, "the authority's certificate")
+        certificate = certificates.read_certificate(content, certificate_path)
+        return cls(directory, certificates.read_authority(certificate, key, certificate_path))
+
+    @property
+    def roster(self) -> Roster:
+        """The roster as it lies in the folder now."""
+        path = self.directory / ROSTER_FILE
+        return rosters.decode(files.read(path, "the roster"), self.authority, path)
+
+    def folder(self, name: str) -> Path:
+        """Where an identity's folder is."""
+        return self.directory / _ISSUED / name
+
+    def issue(self, identity: Identity, days: float = IDENTITY_DAYS, now: datetime | None = None) -> Entry:
+        """A new key and certificate for an identity, which may be a renewal; returns its entry in the roster.
+
+        ``days`` is shortened to what is left of the authority's. Raises :class:`UsageError`.
+        """
+        now = _now(now)
+        if not (math.isfinite(days) and 0 < days <= MAX_IDENTITY_DAYS):
+            raise UsageError(f"a key is valid for more than 0 and at most {MAX_IDENTITY_DAYS:g} days, not {days:g}")
+        certificates.check_time(self.authority.certificate, "the lab's authority", now)
+        with files.locked(self.directory):
+            before = self.roster.find(identity.name)
+            if before is not None and before.revoked and now < before.last_at:
+                raise UsageError(
+                    f"{identity.name} was revoked, and the lost key is valid until {before.last_at:%Y-%m-%d}: "
+                    "choose another name"
+                )
+            key = certificates.new_key()
+            certificate = certificates.issue(self.authority, identity, key, now + timedelta(days=days), now)
+            entry = _entry(identity, certificate.serial_number, certificate.not_valid_after_utc, before)
+            folder = self.folder(identity.name)
+            files.make_directory(folder)
+            files.write(folder / KEY_FILE, certificates.key_pem(key), private=True)
+            files.write(folder / CERTIFICATE_FILE, certificates.certificate_pem(certificate))
+            files.write(folder / AUTHORITY_FILE, certificates.certificate_pem(self.authority.certificate))
+            self._write_roster(self.roster.put(entry))
+        return entry
+
+    def revoke(self, name: str) -> Entry:
+        """Take an identity off the list of those who may join, and delete its folder here; returns its entry.
+
+        It counts wherever the new roster has arrived. Raises :class:`UsageError`.
+        """
+        with files.locked(self.directory):
+            roster = self.roster
+            entry = roster.find(name)
+            if entry is None:
+                raise UnknownNameError("key", name, [each.name for each in roster.entries])
+            if entry.revoked:
+                raise UsageError(f"{name} was revoked already")
+            revoked = msgspec.structs.replace(entry, revoked=True)
+            self._write_roster(roster.put(revoked))
+            for file in (KEY_FILE, CERTIFICATE_FILE, AUTHORITY_FILE, ROSTER_FILE):
+                (self.folder(name) / file).unlink(missing_ok=True)
+        return revoked
+
+    def _write_roster(self, roster: Roster) -> None:
+        """To the folder and to those of all identities, so that each one that is copied from now on has the newest."""
+        content = rosters.encode(roster, self.authority)
+        files.write(self.directory / ROSTER_FILE, content)
+        for entry in roster.entries:
+            folder = self.folder(entry.name)
+            if not entry.revoked and folder.is_dir():
+                files.write(folder / ROSTER_FILE, content)
+
+
+def _entry(identity: Identity, serial: int, end: datetime, before: Entry | None) -> Entry:
+    expires = int(end.timestamp())
+    last = max(expires, before.last) if before else expires
+    return Entry(identity.name, identity.role, identity.drones, f"{serial:x}", expires, last)
+
+
+def _now(now: datetime | None) -> datetime:
+    return now or datetime.now(UTC)

@@ -1,0 +1,95 @@
+"""The value of a processor's result to bytes and back: one MessagePack value, with NumPy's arrays. Pure.
+
+An array is extension type 1, whose bytes are a MessagePack array of its type's name, its shape and its elements
+(little-endian, row by row). A dataclass or ``msgspec.Struct`` goes as a map and comes back as a dict.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.errors import DecodeError, UsageError
+from skyloop.messages.result import MAX_PAYLOAD
+
+ARRAY: Final = 1  #: extension type
+MAX_DIMENSIONS: Final = 8
+#: Types of arrays that travel: the same on every machine.
+DTYPES: Final = (
+    "bool",
+    *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)),
+    *(f"float{bits}" for bits in (16, 32, 64)),
+)
+_WHAT: Final = (
+    "None, bool, int (of 64 bits), float, str, bytes, list, tuple, dict, dataclass, msgspec.Struct and NumPy arrays of "
+    "numbers can be sent"
+)
+
+
+class _Array(msgspec.Struct, frozen=True, array_like=True):
+    dtype: str
+    shape: Annotated[tuple[Annotated[int, msgspec.Meta(ge=0, le=MAX_PAYLOAD)], ...], msgspec.Meta(max_length=8)]
+    data: bytes
+
+
+def pack(value: Any) -> bytes:
+    """The bytes of a value. Raises :class:`UsageError` for what can't be sent, and for more than 32 768 bytes."""
+    try:
+        data = _encoder.encode(value)
+    except (TypeError, ValueError, OverflowError, RecursionError, msgspec.MsgspecError) as error:
+        raise UsageError(f"a result can't be sent: {error}; {_WHAT}") from None
+    if len(data) > MAX_PAYLOAD:
+        raise UsageError(
+            f"a result of {len(data)} bytes can't be sent, at most {MAX_PAYLOAD} can: send what was found in a "
+            "picture, not the picture"
+        )
+    return data
+
+
+def unpack(payload: bytes) -> Any:
+    """The value in a payload; arrays are read-only. Raises :class:`DecodeError` for what is none."""
+    try:
+        return _decoder.decode(payload)
+    except (msgspec.MsgspecError, ValueError, TypeError, RecursionError) as error:
+        raise DecodeError(f"a result that can't be understood: {error}") from None
+
+
+def _encode_other(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, np.ndarray):
+        return msgspec.msgpack.Ext(ARRAY, _pack_array(value))
+    raise TypeError(f"there is a {type(value).__module__}.{type(value).__qualname__} in it")
+
+
+def _pack_array(array: NDArray[Any]) -> bytes:
+    if array.dtype.name not in DTYPES or array.ndim > MAX_DIMENSIONS:
+        raise TypeError(
+            f"there is an array of {array.ndim} dimensions of {array.dtype} in it, and arrays have at most "
+            f"{MAX_DIMENSIONS} dimensions of {', '.join(DTYPES)}"
+        )
+    if array.nbytes > MAX_PAYLOAD:
+        raise ValueError(f"there is an array of {array.nbytes} bytes in it, and results have at most {MAX_PAYLOAD}")
+    plain = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
+    return msgspec.msgpack.encode(_Array(array.dtype.name, array.shape, plain.tobytes()))
+
+
+def _decode_extension(code: int, data: memoryview) -> Any:
+    if code != ARRAY:
+        raise ValueError(f"extension type {code} is not known")
+    packed = _array_decoder.decode(data)
+    if packed.dtype not in DTYPES:
+        raise ValueError(f"an array of {packed.dtype[:40]!r}")
+    dtype = np.dtype(packed.dtype).newbyteorder("<")
+    if math.prod(packed.shape) * dtype.itemsize != len(packed.data):
+        raise ValueError(f"an array of shape {packed.shape} and type {packed.dtype} with {len(packed.data)} bytes")
+    return np.frombuffer(packed.data, dtype).reshape(packed.shape).astype(packed.dtype, copy=False)
+
+
+_encoder = msgspec.msgpack.Encoder(enc_hook=_encode_other)
+_decoder = msgspec.msgpack.Decoder(ext_hook=_decode_extension)
+_array_decoder = msgspec.msgpack.Decoder(_Array)

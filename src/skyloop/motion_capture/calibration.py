@@ -1,0 +1,105 @@
+"""How a body's axes, as a motion capture system defines them, lie to the drone's. Pure.
+
+As MAVwork did it: the drone stands still for two seconds, the poses are averaged, and the calibration is refused when
+they are spread too much. At rest the drone's own roll and pitch tell how it stands; its heading is taken from the way
+that it is put down: nose along the world's x axis, or as ``heading`` says.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.errors import UsageError
+from skyloop.motion_capture.pose import BodyPose, Quaternion, multiply
+
+REST_S: Final = 2.0
+MAX_SPREAD_M: Final = 0.005
+MAX_SPREAD_RAD: Final = math.radians(1.0)
+MIN_POSES: Final = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """Turns the poses of a tracked body into those of the drone."""
+
+    turn: Quaternion = (0.0, 0.0, 0.0, 1.0)  #: drone's axes to the tracked body's axes
+    spread_m: float = 0.0  #: root mean square distance of the poses from their mean
+    spread_rad: float = 0.0  #: root mean square angle between the poses and their mean
+    poses: int = 0  #: how many were averaged
+    yaw_offset: float | None = None  #: the drone's own yaw less its heading in the world [rad], if it tells its yaw
+
+    def apply(self, pose: BodyPose) -> BodyPose:
+        """The drone's pose."""
+        return replace(pose, quaternion=multiply(pose.quaternion, self.turn))
+
+
+def calibrate(
+    poses: Sequence[BodyPose],
+    *,
+    roll: float = 0.0,
+    pitch: float = 0.0,
+    yaw: float | None = None,
+    heading: float = 0.0,
+    max_spread_m: float = MAX_SPREAD_M,
+    max_spread_rad: float = MAX_SPREAD_RAD,
+) -> Calibration:
+    """From poses at rest. ``roll``, ``pitch``, ``yaw`` [rad]: as the drone tells them, averaged over the same time
+    (roll: right side down, pitch: nose down); ``heading``: of its nose in the world [rad], counter-clockwise from x.
+
+    Raises :class:`UsageError` for too few poses, or poses that are spread more than the limits: it moved, or the
+    tracking is poor.
+    """
+    if len(poses) < MIN_POSES:
+        raise UsageError(
+            f"{len(poses)} poses are too few for a calibration, at least {MIN_POSES}: is the body tracked?"
+        )
+    mean = mean_quaternion([pose.quaternion for pose in poses])
+    spread_m = _spread(np.array([pose.position for pose in poses]))
+    angles = [_angle(mean, pose.quaternion) for pose in poses]
+    spread_rad = math.sqrt(sum(angle * angle for angle in angles) / len(angles))
+    if spread_m > max_spread_m or spread_rad > max_spread_rad:
+        raise UsageError(
+            f"the poses are spread by {spread_m * 1e3:.1f} mm and {math.degrees(spread_rad):.2f}°, at most "
+            f"{max_spread_m * 1e3:.1f} mm and {math.degrees(max_spread_rad):.2f}° are allowed: let it stand still"
+        )
+    stands = quaternion_of(roll, pitch, heading)
+    offset = None if yaw is None else math.remainder(yaw - heading, math.tau)
+    return Calibration(multiply(conjugate(mean), stands), spread_m, spread_rad, len(poses), offset)
+
+
+def quaternion_of(roll: float, pitch: float, yaw: float) -> Quaternion:
+    """Turns about the body's x, then y, then z axis (ROS REP 103; pitch positive with the nose down)."""
+    x: Quaternion = (math.sin(roll / 2), 0.0, 0.0, math.cos(roll / 2))
+    y: Quaternion = (0.0, math.sin(pitch / 2), 0.0, math.cos(pitch / 2))
+    z: Quaternion = (0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
+    return multiply(z, multiply(y, x))
+
+
+def conjugate(quaternion: Quaternion) -> Quaternion:
+    """The opposite turn."""
+    x, y, z, w = quaternion
+    return -x, -y, -z, w
+
+
+def mean_quaternion(quaternions: Sequence[Quaternion]) -> Quaternion:
+    """The turn nearest to all of them: largest eigenvector of their outer products (Markley et al., "Averaging
+    Quaternions", 2007), which does not care for their signs."""
+    parts = np.array(quaternions)
+    _, vectors = np.linalg.eigh(parts.T @ parts)
+    x, y, z, w = vectors[:, -1].tolist()
+    return x, y, z, w
+
+
+def _angle(a: Quaternion, b: Quaternion) -> float:
+    along = abs(sum(one * other for one, other in zip(a, b, strict=True)))
+    return 2.0 * math.acos(min(1.0, along))
+
+
+def _spread(places: NDArray[np.float64]) -> float:
+    return float(np.sqrt(((places - places.mean(axis=0)) ** 2).sum(axis=1).mean()))

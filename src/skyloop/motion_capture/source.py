@@ -1,0 +1,134 @@
+"""Where frames of a motion capture system come from: a child process that listens to it, started anew when it dies."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from typing import IO, BinaryIO, Final, cast
+
+import msgspec
+
+from skyloop.errors import LinkError, MissingExtraError
+from skyloop.motion_capture.address import System
+from skyloop.motion_capture.worker import MISSING, RawFrame, read
+
+AGAIN_S: Final = 0.5  #: pause before a child that ended is started anew
+SILENT_S: Final = 3.0  #: a child that says nothing for so long is ended: its system may have been restarted
+FIRST_S: Final = 10.0  #: and one that has not said anything yet
+_TAIL: Final = 2000  #: bytes of what a child said that an error shows
+
+
+class ChildSource:
+    """Runs :mod:`skyloop.motion_capture.worker` for a system and hands on each frame, on a thread of its own.
+
+    A child that ends, or falls silent, is replaced for as long as :meth:`close` was not called.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        take: Callable[[RawFrame], None],
+        trouble: Callable[[str], None],
+        *,
+        command: tuple[str, ...] = (sys.executable, "-m", "skyloop.motion_capture.worker"),
+    ) -> None:
+        self._system = system
+        self._take = take
+        self._trouble = trouble
+        self._command = command
+        self._child: subprocess.Popen[bytes] | None = None
+        self._heard_s = 0.0
+        self._ended = threading.Event()
+        self._first = threading.Event()
+        self._failed: Exception | None = None
+        self._said = ""  # what the last child complained of
+        self._reader = threading.Thread(target=self._run, name="skyloop-mocap", daemon=True)
+        self._guard = threading.Thread(target=self._watch, name="skyloop-mocap-guard", daemon=True)
+
+    @property
+    def pid(self) -> int | None:
+        """Of the child."""
+        return None if self._child is None else self._child.pid
+
+    def start(self, timeout_s: float) -> None:
+        """Listen, and wait for the first frame. Raises :class:`LinkError` if none comes, or
+        :class:`MissingExtraError`."""
+        self._reader.start()
+        self._guard.start()
+        if not self._first.wait(timeout_s) or self._failed is not None:
+            failed, said = self._failed, self._said
+            self.close()
+            raise failed or LinkError(f"{self._system.address} sent no frame within {timeout_s:g} s{said}")
+
+    def close(self) -> None:
+        """End the child. Idempotent."""
+        self._ended.set()
+        self._kill()
+        for thread in (self._reader, self._guard):
+            if thread.ident is not None and thread is not threading.current_thread():
+                thread.join()
+
+    # --- threads ---
+
+    def _run(self) -> None:
+        while not self._ended.is_set():
+            with tempfile.TemporaryFile() as messages:
+                code = self._listen(messages)
+                self._said = _tail(messages)
+            if code == MISSING:
+                cause = self._said.removeprefix(": ")
+                self._failed = MissingExtraError(f"{self._system.kind} motion capture", "mocap", cause=cause)
+                self._first.set()
+                return
+            if not self._ended.is_set():
+                self._trouble(f"{self._system.address} is not heard{self._said}; trying again")
+            self._ended.wait(AGAIN_S)
+
+    def _listen(self, messages: IO[bytes]) -> int:
+        """One child from its start to its end; its exit code."""
+        settings = msgspec.json.encode(self._system.configuration).decode()
+        self._heard_s = time.monotonic() + FIRST_S - SILENT_S
+        child = subprocess.Popen(
+            [*self._command, self._system.kind, settings],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=messages,
+            start_new_session=True,
+        )
+        self._child = child
+        assert child.stdout is not None
+        if self._ended.is_set():  # closed between two children
+            child.kill()
+        try:
+            while (frame := read(cast(BinaryIO, child.stdout))) is not None:
+                self._heard_s = time.monotonic()
+                self._first.set()
+                self._take(frame)
+        except msgspec.DecodeError as error:
+            self._trouble(f"{self._system.address}: {error}")
+        finally:
+            child.kill()
+            child.stdout.close()
+        return child.wait()
+
+    def _watch(self) -> None:
+        """End a child that has fallen silent: the native code waits for ever."""
+        while not self._ended.wait(AGAIN_S):
+            if time.monotonic() - self._heard_s > SILENT_S:
+                self._kill()
+
+    def _kill(self) -> None:
+        child = self._child
+        if child is not None and child.poll() is None:
+            child.kill()
+
+
+def _tail(messages: IO[bytes]) -> str:
+    size = messages.seek(0, 2)
+    messages.seek(max(0, size - _TAIL))
+    text = messages.read().decode(errors="replace").strip()
+    return f": {text}" if text else ""

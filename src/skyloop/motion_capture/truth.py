@@ -1,0 +1,68 @@
+"""The simulator as a motion capture system: the true poses that its drones tell with ``sim://?truth=1``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import TYPE_CHECKING
+
+from skyloop.errors import UnsupportedError
+from skyloop.motion_capture.calibration import quaternion_of
+from skyloop.motion_capture.worker import RawFrame
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from skyloop.client import Drone
+    from skyloop.messages import Feedback
+
+
+class TruthSource:
+    """Observes the proxies of simulated drones, and takes the truth out of their native telemetry."""
+
+    def __init__(self, proxies: Iterable[str], take: Callable[[RawFrame], None]) -> None:
+        self._proxies = tuple(proxies)
+        self._take = take
+        self._open = ExitStack()
+
+    def start(self, timeout_s: float) -> None:
+        """Connect to all. Raises what :func:`skyloop.connect` raises, and :class:`UnsupportedError` for a vehicle that
+        does not tell the truth."""
+        from skyloop.client import connect
+
+        with ExitStack() as opening:
+            for name in self._proxies:
+                drone = opening.enter_context(
+                    connect(name, access="observe", name="skyloop mocap", timeout_s=timeout_s)
+                )
+                if true_pose(drone.feedback()) is None:
+                    raise UnsupportedError(f"{name} tells no true pose: start it with truth=1, as sim://?truth=1")
+                opening.enter_context(drone.on_feedback(self._taking(name, drone), inline=True))
+            self._open = opening.pop_all()
+
+    def close(self) -> None:
+        """Idempotent."""
+        self._open.close()
+
+    def _taking(self, name: str, drone: Drone) -> Callable[[Feedback], None]:
+        def take(feedback: Feedback) -> None:
+            pose = true_pose(feedback)
+            if pose is not None:
+                self._take(RawFrame(feedback.captured_ns - drone.clock_offset_ns, {name: pose}))
+
+        return take
+
+
+def true_pose(
+    feedback: Feedback,
+) -> tuple[tuple[float, float, float], tuple[float, float, float, float]] | None:
+    """Position [m] and quaternion (x, y, z, w) in native telemetry of the simulator; None if it is not there."""
+    native = feedback.native or {}
+    try:
+        x, y, z, roll, pitch, yaw = (
+            float(native[f"truth.{name}"])  # type: ignore[arg-type]
+            for name in ("x", "y", "z", "roll", "pitch", "yaw")
+        )
+    except (KeyError, TypeError, ValueError):
+        return None
+    return (x, y, z), quaternion_of(roll, pitch, yaw)

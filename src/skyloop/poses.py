@@ -1,0 +1,107 @@
+"""Poses as SciPy's ``RigidTransform``: of the body, its cameras and what they see. Needs the extra ``control``.
+
+``a_in_b`` is the pose of ``a`` in ``b``'s axes: applied to a point in ``a``'s axes, it gives the point in ``b``'s. So
+they are chained by ``*``, and turned round by ``inv()``. World axes: x east, y north, z up; body axes: x forward, y
+left, z up (ROS REP 103); a camera's optical axes: x right, y down, z forward. Metres.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from skyloop.errors import MissingExtraError, UsageError
+from skyloop.messages import CameraInfo, Feedback
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import RigidTransform, Rotation
+
+
+def transform(position: ArrayLike, rotation: ArrayLike) -> RigidTransform:
+    """The pose with this position (3,) and this rotation matrix (3, 3) or (9,), row by row.
+
+    Raises :class:`UsageError` for what is not finite, or is no rotation.
+    """
+    place = np.asarray(position, dtype=np.float64)
+    turn = np.asarray(rotation, dtype=np.float64)
+    if place.shape != (3,) or turn.size != 9:
+        raise UsageError(f"a position has 3 numbers and a rotation 3×3, not {place.shape} and {turn.shape}")
+    turn = turn.reshape(3, 3)
+    if not (np.isfinite(place).all() and np.isfinite(turn).all()):
+        raise UsageError("a pose must be finite")
+    if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-6) or np.linalg.det(turn) < 0.0:
+        raise UsageError(
+            "this matrix is no rotation: its rows must be of length 1, square to one another, right-handed"
+        )
+    transforms = _scipy()
+    pose: RigidTransform = transforms.RigidTransform.from_components(place, transforms.Rotation.from_matrix(turn))
+    return pose
+
+
+def attitude(feedback: Feedback) -> Rotation:
+    """From body to world axes. Raises :class:`UsageError` while the attitude is not known."""
+    rotation: Rotation = _scipy().Rotation.from_matrix(_rotation(feedback))
+    return rotation
+
+
+def body_in_world(feedback: Feedback, position: ArrayLike | None = None) -> RigidTransform:
+    """The vehicle's pose; ``position`` (3,) [m] from elsewhere goes before the vehicle's own.
+
+    Raises :class:`UsageError` while attitude or position is not known.
+    """
+    place = feedback.position if position is None else position
+    if place is None:
+        raise UsageError("the vehicle does not tell its position: give the one that you know")
+    return transform(place, _rotation(feedback))
+
+
+def camera_in_body(camera: CameraInfo) -> RigidTransform:
+    """How a camera is mounted; one that does not say where is taken to be in the body's centre.
+
+    Raises :class:`UsageError` if it does not say how it is turned.
+    """
+    return transform((0.0, 0.0, 0.0) if camera.position is None else camera.position, mounting_rotation(camera))
+
+
+def camera_in_world(camera: CameraInfo, feedback: Feedback, position: ArrayLike | None = None) -> RigidTransform:
+    """A camera's pose in the state of ``feedback``: for a picture, ``frame.feedback``, the state at its capture.
+
+    ``position`` and errors as of :func:`body_in_world` and :func:`camera_in_body`.
+    """
+    return body_in_world(feedback, position) * camera_in_body(camera)
+
+
+def target_in_world(
+    target_in_camera: RigidTransform, camera: CameraInfo, feedback: Feedback, position: ArrayLike | None = None
+) -> RigidTransform:
+    """Where something is that a camera saw, as :attr:`MarkerSighting.pose` tells it, in the state of ``feedback``."""
+    return camera_in_world(camera, feedback, position) * target_in_camera
+
+
+def mounting_rotation(camera: CameraInfo) -> NDArray[np.float64]:
+    """From a camera's optical axes to body axes, shape (3, 3); needs no extra.
+
+    Raises :class:`UsageError` if the camera does not say how it is mounted.
+    """
+    if camera.rotation is None:
+        raise UsageError(f"camera {camera.name!r} does not tell how it is mounted: give its CameraInfo a rotation")
+    return np.asarray(camera.rotation, dtype=np.float64).reshape(3, 3)
+
+
+def _rotation(feedback: Feedback) -> NDArray[np.float64]:
+    try:
+        return feedback.rotation
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+
+
+def _scipy() -> Any:
+    try:
+        from scipy.spatial import transform as transforms
+    except ImportError as error:
+        raise MissingExtraError("poses", "control", cause=str(error)) from error
+    if not hasattr(transforms, "RigidTransform"):
+        raise MissingExtraError("poses", "control", cause="SciPy is older than 1.16")
+    return transforms

@@ -1,0 +1,8 @@
+"""Processors: classes that look at frames on any host and publish what they find. docs/processors.md is the page."""
+
+from skyloop.processing.loading import Code, load_processor
+from skyloop.processing.output import Output
+from skyloop.processing.status import Status
+from skyloop.processing.worker import Settings, Worker
+
+__all__ = ["Code", "Output", "Settings", "Status", "Worker", "load_processor"]

@@ -1,0 +1,83 @@
+"""The frames of a worker: its share of a camera's, the newest first."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any, Self
+
+from skyloop.client import Drone, Frame
+from skyloop.client.frame import Arrival
+from skyloop.client.membership import Membership
+from skyloop.client.reception import VideoChannel
+from skyloop.client.slots import Buffer
+from skyloop.messages import ProcessorShare
+
+
+class Frames:
+    """The newest frame of a worker's part that it did not take yet. A context manager: subscribed while open.
+
+    Only the frames of its part are asked for, anew whenever that changes, so that over a network no others travel.
+    """
+
+    def __init__(
+        self, drone: Drone, membership: Membership, came: Callable[[], None], *, max_fps: float | None = None
+    ) -> None:
+        self._drone = drone
+        self._membership = membership
+        self._came = came
+        self._how: dict[str, Any] = {} if max_fps is None else {"max_fps": max_fps}
+        self._usual = drone.channel(membership.camera)
+        self._channel: VideoChannel | None = None  # whose frames come now
+        self._buffer: Buffer[Arrival] = Buffer()
+        self._sink = self._arrived
+        self._lock = threading.Lock()  # guards the change from one channel to another
+
+    def __enter__(self) -> Self:
+        self._membership.changed = self._follow
+        if self._membership.share is not None:
+            self._follow(self._membership.share)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._membership.changed = None
+        self._turn_to(None)
+
+    @property
+    def dropped(self) -> int:
+        """Frames of its part that newer ones replaced."""
+        return self._buffer.dropped
+
+    def wait(self, timeout_s: float) -> Arrival | None:
+        """The newest, waited for."""
+        return self._buffer.wait(timeout_s)
+
+    def picture(self, arrival: Arrival) -> Frame | None:
+        """The frame; None, and counted by its channel, if it can't be understood."""
+        return (self._channel or self._usual).picture(arrival)
+
+    # On the receiving thread, but for the first time -----------------------------------------------------------
+
+    def _follow(self, share: ProcessorShare) -> None:
+        part = (share.part, share.parts)
+        self._turn_to(self._drone.channel(share.camera, part=part, **self._how) if share.parts else None)
+
+    def _turn_to(self, channel: VideoChannel | None) -> None:
+        with self._lock:
+            before, self._channel = self._channel, channel
+            if channel is before:
+                return
+            if channel is not None:
+                already = self._buffer.dropped
+                channel.topic.add(self._sink, lambda: self._buffer.dropped - already)
+            if before is not None:
+                before.topic.remove(self._sink)
+
+    def _arrived(self, arrival: Arrival) -> None:
+        share = self._membership.share  # a frame may have been on its way when that changed
+        if share is not None and share.parts and arrival.header.seq % share.parts == share.part:
+            self._came()
+            self._buffer.put(arrival)

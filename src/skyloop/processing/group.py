@@ -1,0 +1,144 @@
+"""Several workers on this host, each a process of its own; one that dies is started anew."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from types import TracebackType
+from typing import Final, Self
+
+import msgspec
+
+from skyloop.processing.status import Status, together
+
+_PAUSE_S: Final = 1.0  #: before a worker that died is started anew
+_GRACE_S: Final = 4.0  #: to end by itself, before it is told to
+USAGE_ERROR: Final = 2  #: exit code of a child that can't work at all, as it then says itself
+
+
+class Child:
+    """One worker's process. It ends when its standard input does, and so never outlives this process."""
+
+    def __init__(self, command: Sequence[str]) -> None:
+        self.status: Status | None = None
+        # A session of its own: Ctrl-C in the terminal is for the parent, which then ends the children.
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True)
+        self._thread = threading.Thread(target=self._listen, name="skyloop-worker", daemon=True)
+        self._thread.start()
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    @property
+    def code(self) -> int | None:
+        """How it ended; None while it runs."""
+        return self._process.poll()
+
+    def part(self) -> None:
+        """Let it end, without waiting."""
+        assert self._process.stdin is not None
+        with contextlib.suppress(OSError):
+            self._process.stdin.close()
+
+    def end(self) -> None:
+        """Wait for its end, and force it if need be."""
+        self.part()
+        for harder in (self._process.terminate, self._process.kill):
+            try:
+                self._process.wait(_GRACE_S)
+            except subprocess.TimeoutExpired:
+                harder()
+        self._process.wait()
+        self._thread.join()
+
+    def _listen(self) -> None:
+        assert self._process.stdout is not None
+        with self._process.stdout as lines:
+            for text in lines:
+                with contextlib.suppress(msgspec.DecodeError):  # what the user's code prints goes there too
+                    self.status = msgspec.json.decode(text, type=Status)
+
+
+class Group:
+    """``count`` children that run the same command. A context manager that ends them. ``tell`` is told of deaths."""
+
+    def __init__(
+        self, command: Sequence[str], count: int, tell: Callable[[str], None], *, pause_s: float = _PAUSE_S
+    ) -> None:
+        self._command = tuple(command)
+        self._tell = tell
+        self._pause_s = pause_s
+        self._children: list[Child | None] = [Child(self._command) for _ in range(count)]
+        self._due_s = [0.0] * count
+
+    @property
+    def status(self) -> Status | None:
+        """All of them together; None until one has told something."""
+        return together(child.status for child in self._children if child is not None and child.status is not None)
+
+    @property
+    def pids(self) -> list[int]:
+        """Of those that run."""
+        return [child.pid for child in self._children if child is not None]
+
+    def look(self) -> int | None:
+        """Start anew who died; the exit code once all have ended by themselves, or one said that it can't work."""
+        for number, child in enumerate(self._children):
+            if child is None:
+                self._restart(number)
+            elif child.code not in (None, 0, USAGE_ERROR):
+                self._bury(number, child)
+        codes = [None if child is None else child.code for child in self._children]
+        if USAGE_ERROR in codes:
+            return USAGE_ERROR
+        return 0 if all(code == 0 for code in codes) else None
+
+    def _bury(self, number: int, child: Child) -> None:
+        code = child.code
+        assert code is not None
+        how = f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
+        self._tell(f"worker {number + 1} {how}: the others have its share until it is started anew")
+        child.end()
+        self._children[number] = None
+        self._due_s[number] = time.monotonic() + self._pause_s
+
+    def _restart(self, number: int) -> None:
+        if time.monotonic() >= self._due_s[number]:
+            self._children[number] = Child(self._command)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        children = [child for child in self._children if child is not None]
+        for child in children:
+            child.part()
+        for child in children:
+            child.end()
+
+
+def end_with_parent(stop: Callable[[], None]) -> None:
+    """In a child: call ``stop`` when standard input ends, and leave all the same if it does not end then."""
+
+    def watch() -> None:
+        with contextlib.suppress(OSError):
+            while os.read(0, 64):
+                pass
+        stop()
+        time.sleep(_GRACE_S / 2)
+        os._exit(1)  # the user's code hangs, and nobody is there any more to end this process
+
+    threading.Thread(target=watch, name="skyloop-parent", daemon=True).start()
+
+
+def child_command(arguments: Sequence[str]) -> list[str]:
+    """The command line of this program with these arguments."""
+    return [sys.executable, "-m", "skyloop", *arguments]

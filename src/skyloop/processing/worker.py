@@ -1,0 +1,165 @@
+"""One worker of a processor: takes its share of the frames, calls the user's class, publishes what that returns."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+from skyloop.client import Drone, Frame
+from skyloop.client.frame import Arrival
+from skyloop.client.results import checked_age, checked_name
+from skyloop.errors import UsageError
+from skyloop.messages import Severity
+from skyloop.messages.log import MAX_TEXT
+from skyloop.processing.frames import Frames
+from skyloop.processing.output import Output
+from skyloop.processing.status import Status, Tally
+
+_LOOK_S: Final = 0.1  #: how often it is looked whether to end while no frame comes
+_TELL_EVERY_S: Final = 1.0  #: how often an exception of the user's code is told
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """How a processor is run. Raises :class:`UsageError` for what makes no sense."""
+
+    name: str  #: of the processor; its results go by it
+    code: str  #: what tells it from other code of that name; of all its workers the same
+    camera: str | None = None  #: None: the vehicle's first
+    shared: bool = True  #: each frame to one worker; else all get all
+    max_age_s: float | None = 1.0  #: frames that are older when their turn comes are left out
+    max_fps: float | None = None  #: frames a second that this worker takes at most
+    stuck_s: float = 2.0  #: a call of ``process`` that takes longer gives this worker's share to the others
+
+    def __post_init__(self) -> None:
+        checked_name(self.name)
+        checked_age(self.max_age_s)
+        for what, value in (("max_fps", self.max_fps), ("stuck_s", self.stuck_s)):
+            if value is not None and not (isinstance(value, int | float) and 0.0 < value < math.inf):
+                raise UsageError(f"{what} is {value!r} and must be a number above 0")
+
+
+class Worker:
+    """Runs a processor on a drone's frames: ``Worker(drone, Detector(), settings).run()``.
+
+    What ``process`` raises, and results that can't be sent, are told on ``drone.log`` and by ``tell``, counted, and
+    work goes on with the next frame.
+    """
+
+    def __init__(
+        self, drone: Drone, processor: Any, settings: Settings, tell: Callable[[str], None] = lambda _: None
+    ) -> None:
+        self.settings = settings
+        self._drone = drone
+        self._process = processor.process
+        self._tell = tell
+        self._clock = time.monotonic_ns
+        self._tally = Tally(self._clock)
+        self._stopped = threading.Event()
+        self._busy_since_s: float | None = None
+        self._told_s = -math.inf
+        self._told_refused = False
+        self.membership = drone.join_processor(
+            settings.name, code=settings.code, camera=settings.camera, shared=settings.shared
+        )
+        self.membership.ready = self._ready
+        self._frames = Frames(drone, self.membership, self._tally.came, max_fps=settings.max_fps)
+
+    def run(self, seconds: float | None = None) -> None:
+        """Work for ``seconds``, or until :meth:`stop` or the drone's end.
+
+        Raises :class:`NameTakenError` if meanwhile other code took over the name, as it can while the proxy is away.
+        """
+        end_s = math.inf if seconds is None else time.monotonic() + seconds
+        try:
+            with self._frames as frames:
+                while not self._over(end_s):
+                    arrival = frames.wait(_LOOK_S)
+                    if arrival is not None:
+                        self._work(arrival)
+                    del arrival  # else its memory stayed on loan while this waits for the next one
+        finally:
+            self.membership.close()
+
+    def stop(self) -> None:
+        """End :meth:`run` after the call that is under way. Any thread."""
+        self._stopped.set()
+
+    @property
+    def status(self) -> Status:
+        """How it does. Any thread."""
+        membership = self.membership
+        return self._tally.status(membership.processor, membership.camera, membership.share, self._frames.dropped)
+
+    def _over(self, end_s: float) -> bool:
+        refused = self.membership.refused
+        if refused is not None:
+            raise refused
+        return self._stopped.is_set() or self._drone.closed or time.monotonic() >= end_s
+
+    def _work(self, arrival: Arrival) -> None:
+        limit_s = self.settings.max_age_s
+        if limit_s is not None and arrival.age_s > limit_s:
+            self._tally.stale += 1
+            return
+        frame = self._frames.picture(arrival)
+        if frame is None:
+            return
+        began_s = self._busy_since_s = time.monotonic()
+        try:
+            found = self._process(frame)
+        except Exception as error:  # noqa: BLE001  (the user's code may raise anything)
+            self._failed(error)
+            return
+        finally:
+            stuck = not self._ready()
+            self._busy_since_s = None
+            if stuck:
+                self.membership.renew()  # its share comes back
+        self._publish(frame, found, time.monotonic() - began_s)
+
+    def _ready(self) -> bool:
+        """Whether it can take frames: not while a call of ``process`` takes too long."""
+        since_s = self._busy_since_s
+        return since_s is None or time.monotonic() - since_s < self.settings.stuck_s
+
+    def _publish(self, frame: Frame, found: Any, took_s: float) -> None:
+        output = found if isinstance(found, Output) else Output(found)
+        try:
+            if output.shapes:
+                self._drone.annotate(frame, output.shapes, source=self.settings.name)
+            if output.value is None:
+                return
+            sent = self.membership.publish(frame, output.value, took_s)
+        except UsageError as error:
+            self._refused(error)
+            return
+        if sent:
+            self._tally.made(frame.age_s, took_s)
+        else:
+            self._tally.unsent += 1
+
+    def _refused(self, error: UsageError) -> None:
+        self._tally.refused += 1
+        if not self._told_refused:  # what it returns is the same kind of thing each time
+            self._told_refused = True
+            self._say(f"{self.settings.name}: {error}. Further ones are counted and not told.")
+
+    def _failed(self, error: Exception) -> None:
+        self._tally.errors += 1
+        now_s = time.monotonic()
+        if now_s - self._told_s < _TELL_EVERY_S:
+            return
+        self._told_s = now_s
+        inner = error.__traceback__.tb_next if error.__traceback__ is not None else None  # without our own line
+        lines = "".join(traceback.format_exception(type(error), error, inner))
+        self._say(f"{self.settings.name} failed ({self._tally.errors} times so far):\n{lines.rstrip()}")
+
+    def _say(self, text: str) -> None:
+        self._tell(text)
+        self._drone.log.text(text[-MAX_TEXT:], name=self.settings.name, severity=Severity.ERROR)

@@ -1,0 +1,185 @@
+"""The audit trail: who flew when, one JSON object a line, only ever appended to. ``docs/sharing.md`` describes it.
+
+:func:`entry_of` and :func:`tenures` are pure: events to lines, and lines to a table.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+from collections.abc import Callable, Iterable
+from datetime import UTC, datetime
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Final
+
+import msgspec
+
+from skyloop.errors import UsageError
+from skyloop.messages import Event, EventKind, FlightState
+
+FOLDER: Final = "audit"
+SUFFIX: Final = ".jsonl"
+CLOSE_S: Final = 2.0  #: how long the end of a proxy waits for the last lines to be written
+_MODE: Final = 0o600
+_log = logging.getLogger(__name__)
+
+
+class Entry(msgspec.Struct, frozen=True, omit_defaults=True):
+    """One line. Which of the fields there are, depends on ``what``."""
+
+    at: datetime  #: wall-clock time, UTC
+    proxy: str
+    run: str  #: of the proxy, at random
+    what: str  #: ``begin``, ``granted``, ``ended``, ``takeoff``, ``landed``, ``emergency`` or ``end``
+    who: str = ""  #: name of the application
+    identity: str = ""  #: what the transport knows of it: process and user, or a certificate's name
+    lease: int = 0
+    priority: int = 0
+    how: str = ""  #: why a lease, or the run, ended; the vehicle's address at the begin of a run
+
+
+class Tenure(msgspec.Struct, frozen=True):
+    """From a grant to its end."""
+
+    proxy: str
+    who: str
+    identity: str
+    priority: int
+    begin: datetime
+    end: datetime | None  #: None: it goes on, or the proxy was killed
+    how: str  #: how it ended; empty: it goes on, as far as the file tells
+    takeoffs: int = 0
+
+
+def entry_of(event: Event, at: datetime, proxy: str, run: str) -> Entry | None:
+    """The line of an event; None for one that is no part of who flew when."""
+    data, who = event.data, event.app or ""
+    lease = data.get("lease")
+    numbered = Entry(at, proxy, run, "", who, lease=lease if isinstance(lease, int) else 0)
+    filled = msgspec.structs.replace
+    if event.kind is EventKind.AUTHORITY_GRANTED:
+        priority = data.get("priority")
+        number = priority if isinstance(priority, int) else 0
+        return filled(numbered, what="granted", identity=str(data.get("identity", "")), priority=number)
+    if event.kind is EventKind.AUTHORITY_LOST:
+        return filled(numbered, what="ended", how=str(data.get("reason", "")))
+    if event.kind is EventKind.AUTHORITY_PREEMPTED:
+        verb = "handed over to" if data.get("granted") else "taken over by"
+        return filled(numbered, what="ended", how=f"{verb} {data.get('by', '')}")
+    if event.kind is EventKind.STATE_CHANGED:
+        return _of_state(filled(numbered, who="", lease=0), data.get("before"), data.get("after"))
+    if event.kind is EventKind.EMERGENCY:
+        return filled(numbered, what="emergency", how=event.text)
+    return filled(numbered, what="end", how=event.text) if event.kind is EventKind.PROXY_CLOSING else None
+
+
+def _of_state(entry: Entry, before: object, after: object) -> Entry | None:
+    states = frozenset(FlightState)
+    if before not in states or after not in states:
+        return None
+    was, now = FlightState(str(before)).airborne, FlightState(str(after)).airborne
+    if was is now or (now and before != FlightState.LANDED):
+        return None
+    return msgspec.structs.replace(entry, what="takeoff" if now else "landed")
+
+
+def tenures(entries: Iterable[Entry]) -> list[Tenure]:
+    """Who held the authority from when to when, in the order of the grants; entries of several proxies may be mixed."""
+    done: list[Tenure] = []
+    held: dict[str, int] = {}
+    for entry in entries:
+        place = held.get(entry.proxy)
+        if entry.what == "granted":
+            held[entry.proxy] = len(done)
+            begun = (entry.proxy, entry.who, entry.identity, entry.priority, entry.at)
+            done.append(Tenure(*begun, end=None, how=""))
+        elif place is None:
+            continue
+        elif entry.what == "takeoff":
+            done[place] = msgspec.structs.replace(done[place], takeoffs=done[place].takeoffs + 1)
+        elif entry.what in ("ended", "end", "begin"):
+            del held[entry.proxy]
+            how = {"ended": entry.how, "end": "the proxy ended", "begin": "the proxy was killed"}[entry.what]
+            ended = entry.at if entry.what != "begin" else None
+            done[place] = msgspec.structs.replace(done[place], end=ended, how=how)
+    return done
+
+
+def read(path: Path) -> tuple[list[Entry], int]:
+    """The entries of a file, and how many of its lines can't be understood (as one that a crash has torn).
+
+    Raises :class:`UsageError` for a file that can't be read.
+    """
+    try:
+        lines = path.read_bytes().splitlines()
+    except OSError as error:
+        raise UsageError(f"the audit trail {path} can't be read: {error.strerror}") from None
+    entries, bad = [], 0
+    for line in lines:
+        try:
+            entries.append(msgspec.json.decode(line, type=Entry))
+        except msgspec.DecodeError:
+            bad += 1
+    return entries, bad
+
+
+def audit_folder() -> Path:
+    """Where the files are unless somebody says otherwise: in the user's directory of state."""
+    import platformdirs
+
+    return Path(platformdirs.user_state_dir("skyloop", appauthor=False)) / FOLDER
+
+
+def audit_path(name: str) -> Path:
+    """The file of a proxy."""
+    return audit_folder() / (name + SUFFIX)
+
+
+class AuditTrail:
+    """Writes the lines of one proxy's run, on a thread of its own: :meth:`note` never waits for the disk."""
+
+    def __init__(self, path: Path, proxy: str, run: str, wall: Callable[[], datetime] | None = None) -> None:
+        """Opens the file. Raises ``OSError``."""
+        self.path = path
+        self._proxy = proxy
+        self._run = run
+        self._wall = wall or (lambda: datetime.now(UTC))
+        self._queue: SimpleQueue[Entry | None] = SimpleQueue()
+        self._failed = False
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, _MODE)
+        self._thread = threading.Thread(target=self._write_all, name="skyloop-audit", daemon=True)
+        self._thread.start()
+
+    def begin(self, uri: str) -> None:
+        """The proxy's run begins."""
+        self._queue.put(Entry(self._wall(), self._proxy, self._run, "begin", how=uri))
+
+    def note(self, event: Event) -> None:
+        """An event was told. Any thread."""
+        entry = entry_of(event, self._wall(), self._proxy, self._run)
+        if entry is not None:
+            self._queue.put(entry)
+
+    def close(self) -> None:
+        """Write what is left, at most for two seconds."""
+        self._queue.put(None)
+        self._thread.join(CLOSE_S)
+
+    def _write_all(self) -> None:
+        try:
+            while (entry := self._queue.get()) is not None:
+                self._write(msgspec.json.encode(entry) + b"\n")
+        finally:
+            os.close(self._file)
+
+    def _write(self, line: bytes) -> None:
+        try:
+            os.write(self._file, line)  # one call, so that lines of several writers do not mix
+            self._failed = False
+        except OSError as error:
+            if not self._failed:  # a full disk is told once, and the flight goes on
+                _log.error("the audit trail %s can't be written: %s", self.path, error)
+            self._failed = True

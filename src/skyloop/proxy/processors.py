@@ -1,0 +1,215 @@
+"""Processors: which applications are the workers of which, who takes which frames, and what they find.
+
+:class:`Roster` decides, and is pure; :class:`Processors` tells what it decided and relays results.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import defaultdict
+from dataclasses import dataclass
+from typing import Final
+
+import msgspec
+
+from skyloop.clock import nanoseconds
+from skyloop.messages import (
+    AnyReply,
+    Done,
+    EventKind,
+    JoinProcessor,
+    ProcessorResult,
+    ProcessorShare,
+    Refusal,
+    Refused,
+    Severity,
+    Value,
+    encode,
+)
+from skyloop.proxy.events import EventLog, Notice
+from skyloop.proxy.sessions import Session
+from skyloop.proxy.statistics import Counters
+from skyloop.transport.base import RESULTS, ServerEnd, results
+
+#: A worker of which nothing was heard for so long gives up its share: it hangs, or its host does.
+SILENT_S: Final = 1.0
+MAX_JOINED: Final = 8  #: processors that one application may work for
+
+_Key = tuple[int, str]  # application, processor
+
+
+@dataclass(slots=True)
+class Worker:
+    """One application as a worker of one processor."""
+
+    asked: JoinProcessor
+    heard_ns: int
+    silent: bool = False
+
+    @property
+    def works(self) -> bool:
+        return self.asked.ready and not self.silent
+
+
+class Roster:
+    """The workers of all processors, by application and name of the processor."""
+
+    def __init__(self) -> None:
+        self._workers: dict[_Key, Worker] = {}
+
+    def find(self, app_id: int, processor: str) -> Worker | None:
+        """This application as a worker of that processor, if it is one."""
+        return self._workers.get((app_id, processor))
+
+    def put(self, app_id: int, asked: JoinProcessor, now_ns: int) -> None:
+        """It works, or goes on working."""
+        self._workers[app_id, asked.processor] = Worker(asked, now_ns)
+
+    def remove(self, app_id: int) -> list[JoinProcessor]:
+        """It is gone; what it worked for."""
+        keys = [key for key in self._workers if key[0] == app_id]
+        return [self._workers.pop(key).asked for key in keys]
+
+    def joined(self, app_id: int) -> int:
+        """For how many processors it works."""
+        return sum(app == app_id for app, _ in self._workers)
+
+    def conflict(self, app_id: int, asked: JoinProcessor) -> tuple[int, JoinProcessor] | None:
+        """Another worker of that name that does not go together with this one."""
+        for (app, name), worker in self._workers.items():
+            other = worker.asked
+            alike = (other.code, other.shared) == (asked.code, asked.shared)
+            if name == asked.processor and app != app_id and not alike:
+                return app, other
+        return None
+
+    def fall_silent(self, now_ns: int) -> list[tuple[int, JoinProcessor]]:
+        """Those that were not heard for too long since the last look."""
+        found = []
+        for (app_id, _), worker in self._workers.items():
+            if not worker.silent and now_ns - worker.heard_ns > nanoseconds(SILENT_S):
+                worker.silent = True
+                found.append((app_id, worker.asked))
+        return found
+
+    def shares(self) -> dict[_Key, ProcessorShare]:
+        """Which frames each worker is to take."""
+        groups: defaultdict[tuple[str, str], list[int]] = defaultdict(list)
+        for (app_id, name), worker in self._workers.items():
+            groups[name, worker.asked.camera].append(app_id)
+        found = {}
+        for (name, camera), members in groups.items():
+            working = sorted(app_id for app_id in members if self._workers[app_id, name].works)
+            for app_id in members:
+                part, parts = _part(app_id, working, shared=self._workers[app_id, name].asked.shared)
+                found[app_id, name] = ProcessorShare(name, camera, part, parts, len(members))
+        return found
+
+
+def _part(app_id: int, working: list[int], *, shared: bool) -> tuple[int, int]:
+    if app_id not in working:
+        return 0, 0
+    return (working.index(app_id), len(working)) if shared else (0, 1)
+
+
+class Processors:
+    """Tells workers their shares, and relays results. Any thread."""
+
+    def __init__(self, server: ServerEnd, events: EventLog, counters: Counters) -> None:
+        self._server = server
+        self._events = events
+        self._counts = counters.counts
+        self._lock = threading.Lock()
+        self._roster = Roster()
+        self._sessions: dict[int, Session] = {}
+        self._told: dict[_Key, ProcessorShare] = {}
+
+    def join(self, session: Session, asked: JoinProcessor, now_ns: int) -> AnyReply:
+        """Make the application a worker, or keep it as one, and tell its share."""
+        app_id = session.app_id
+        with self._lock:
+            before = self._roster.find(app_id, asked.processor)
+            refused = self._refusal(session, asked, new=before is None)
+            if refused is not None:
+                return refused
+            self._sessions[app_id] = session
+            self._roster.put(app_id, asked, now_ns)
+            self._told.pop((app_id, asked.processor), None)  # told again each time: once it may have been missed
+            self._tell_shares()
+        if before is None:
+            self._tell(session, asked, "joined", f"works for processor {asked.processor}")
+        elif asked.ready and not before.works:
+            self._tell(session, asked, "back", f"works for processor {asked.processor} again")
+        elif before.works and not asked.ready:
+            self._tell(session, asked, "busy", f"gave up its share of processor {asked.processor}: it is busy too long")
+        return Done()
+
+    def gone(self, session: Session) -> None:
+        """The application's connection ended: its share goes to the others."""
+        with self._lock:
+            self._sessions.pop(session.app_id, None)
+            left = self._roster.remove(session.app_id)
+            self._tell_shares()
+        for asked in left:
+            self._tell(session, asked, "left", f"left processor {asked.processor}")
+
+    def tick(self, now_ns: int) -> None:
+        """Take their share from those who are silent. Some times a second."""
+        with self._lock:
+            silent = [(self._sessions[app_id], asked) for app_id, asked in self._roster.fall_silent(now_ns)]
+            if silent:
+                self._tell_shares()
+        for session, asked in silent:
+            text = f"lost its share of processor {asked.processor}: silent for more than {SILENT_S:g} s"
+            self._tell(session, asked, "silent", text)
+
+    def relay(self, session: Session, result: ProcessorResult) -> None:
+        """Hand a result to whoever subscribed, under the number of the application that sent it."""
+        with self._lock:
+            known = self._roster.find(session.app_id, result.processor) is not None
+        if not known:
+            self._counts["results.refused"] += 1
+            text = f"a result of {session.name} was refused: it is no worker of processor {result.processor}"
+            data: dict[str, Value] = {"processor": result.processor, "state": "refused", "app_id": session.app_id}
+            self._events.repeated(
+                (session.app_id, "results"), lambda: Notice(EventKind.PROCESSOR, text, app=session.name, data=data)
+            )
+            return
+        packet = encode(msgspec.structs.replace(result, worker=session.app_id))
+        self._counts["results.relayed"] += 1
+        for topic in (RESULTS, results(result.processor)):
+            self._server.publish(topic, packet)
+
+    # Under the lock --------------------------------------------------------------------------------------------
+
+    def _refusal(self, session: Session, asked: JoinProcessor, *, new: bool) -> Refused | None:
+        conflict = self._roster.conflict(session.app_id, asked)
+        if conflict is not None:
+            return Refused(Refusal.NAME_TAKEN, self._explain(asked, *conflict))
+        if new and self._roster.joined(session.app_id) >= MAX_JOINED:
+            return Refused(Refusal.BUSY, f"one application works for at most {MAX_JOINED} processors")
+        return None
+
+    def _explain(self, asked: JoinProcessor, app_id: int, other: JoinProcessor) -> str:
+        who = f"{self._sessions[app_id].name} (application {app_id})"
+        if other.code != asked.code:
+            why = f"runs other code under the name {asked.processor}: {other.code}, and this is {asked.code}"
+            return f"{who} {why}; take another name, or stop that one"
+        ways = {True: "shares the frames", False: "takes all frames"}
+        why = f"works for {asked.processor} and {ways[other.shared]}, while this one {ways[asked.shared]}"
+        return f"{who} {why}: all its workers do the one or the other"
+
+    def _tell_shares(self) -> None:
+        """Tell each worker whose share is not what it was told last."""
+        shares = self._roster.shares()
+        self._told = {key: share for key, share in self._told.items() if key in shares}
+        for key, share in shares.items():
+            if self._told.get(key) != share and self._server.send(self._sessions[key[0]].peer, encode(share)):
+                self._told[key] = share
+
+    # Not under the lock ----------------------------------------------------------------------------------------
+
+    def _tell(self, session: Session, asked: JoinProcessor, state: str, text: str) -> None:
+        severity = Severity.INFO if state in ("joined", "back") else Severity.WARNING
+        data: dict[str, Value] = {"processor": asked.processor, "state": state, "app_id": session.app_id}
+        self._events.tell(EventKind.PROCESSOR, f"{session.name} {text}", severity, app=session.name, data=data)

@@ -1,0 +1,179 @@
+"""What a Zenoh session is told, from the settings of this process. Pure but for the search of a free port."""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Iterable
+from enum import StrEnum
+from typing import Any, Final
+
+from skyloop.errors import LinkError, UsageError
+from skyloop.transport.fabric.settings import FabricSettings
+
+DEFAULT_PORT: Final = 7447  #: Zenoh's
+#: Without a sign of life for this long a peer is gone.
+LEASE_MS: Final = 700
+#: An address that does not answer for so long is given up, and the next one of the same peer is tried.
+OPEN_MS: Final = 800
+MAX_MESSAGE: Final = 1 << 27  #: bytes of one frame that are taken from others
+_ENCRYPTED: Final = ("quic/", "tls/")
+_RETRY: Final = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
+
+
+class Part(StrEnum):
+    """What a session is in the network."""
+
+    PROXY = "proxy"  #: listens, and is called by applications
+    APP = "app"  #: calls proxies
+    ROUTER = "router"  #: joins those that can't reach one another
+
+
+#: Signs of life in the time of a lease: so many that on a path that loses three packets in ten some arrive.
+KEEP_ALIVES: Final = 8
+#: Messages that wait to be sent, by priority (Zenoh's most). Its default is 2, and what comes then is dropped within a
+#: millisecond: ten drones of one process tell of the same event in the same moment.
+_QUEUES: Final = dict.fromkeys(("real_time", "data_high", "data", "data_low"), 16)
+#: What keeps proxies apart from applications for Zenoh: a router passes on from one region to another, and takes those
+#: of one region to reach one another without it (https://zenoh.io/docs/migration_1.9/regions/).
+_REGIONS: Final = {Part.PROXY: "proxies", Part.APP: "apps"}
+
+
+def make(settings: FabricSettings, part: Part, listen: Iterable[str] = ()) -> dict[str, Any]:
+    """Zenoh's configuration, as its sections by name. ``listen``: endpoints, instead of those of the settings."""
+    endpoints = list(listen) or endpoints_of(settings.listen, settings)
+    connect = endpoints_of(settings.connect, settings)
+    found_by_search = {"peer": _called(part, bool(connect)), "router": _called(part, bool(connect))}
+    found: dict[str, Any] = {
+        "mode": "router" if part is Part.ROUTER else "peer",
+        "listen": {"endpoints": endpoints},
+        "connect": {"endpoints": connect, "timeout_ms": -1, "exit_on_failure": False, "retry": _RETRY},
+        "scouting": {
+            "multicast": {"enabled": settings.multicast, "autoconnect": found_by_search},
+            "gossip": {"enabled": True, "autoconnect": found_by_search},
+        },
+        "transport": {
+            "unicast": {"max_links": 2, "open_timeout": OPEN_MS},
+            "link": {
+                "protocols": _protocols([*endpoints, *connect], settings),
+                "tx": {"lease": LEASE_MS, "keep_alive": KEEP_ALIVES, "queue": {"size": _QUEUES}},
+                "rx": {"max_message_size": MAX_MESSAGE},
+            },
+            "shared_memory": {"enabled": False},
+        },
+    }
+    if part is Part.ROUTER:
+        found["gateway"] = {"south": [{"filters": [{"region_names": [name]}]} for name in _REGIONS.values()]}
+    else:
+        found["region_name"] = _REGIONS[part]
+    if settings.tls is not None:
+        found["transport"]["link"]["tls"] = _tls(settings)
+    if settings.access_control is not None:
+        found["access_control"] = settings.access_control
+    return found
+
+
+def endpoints_of(addresses: Iterable[str], settings: FabricSettings) -> list[str]:
+    """The endpoints of some addresses. Raises :class:`UsageError` for what is none."""
+    found: list[str] = []
+    for address in addresses:
+        if "/" in address:
+            if settings.tls is not None and not address.startswith(_ENCRYPTED):
+                raise UsageError(f"with keys nothing travels unencrypted: {address!r} must begin with quic/ or tls/")
+            found.append(address)
+            continue
+        place = _with_port(address)
+        if settings.tls is not None:
+            found.append(f"quic/{place}?mixed_rel=1")
+        else:
+            found += [f"tcp/{place}?rel=1", f"udp/{place}?rel=0"]
+    return found
+
+
+def to_json(sections: dict[str, Any]) -> str:
+    """A configuration as a file for Zenoh's own programs."""
+    return json.dumps(sections, indent=2)
+
+
+def listening(settings: FabricSettings) -> list[str]:
+    """Addresses to listen at, with a free port instead of port 0; all interfaces if the settings name none."""
+    addresses = settings.listen or (f"{all_interfaces()}:0",)
+    return [
+        f"{address.removesuffix(':0')}:{free_port(_host(address))}"
+        if address.endswith(":0") and "/" not in address
+        else address
+        for address in addresses
+    ]
+
+
+def free_port(host: str) -> int:
+    """A port that is free for TCP and for UDP now. Raises :class:`LinkError` if there is none at this host."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        for _ in range(50):
+            with socket.socket(family, socket.SOCK_STREAM) as tcp, socket.socket(family, socket.SOCK_DGRAM) as udp:
+                tcp.bind((host, 0))
+                port = int(tcp.getsockname()[1])
+                try:
+                    udp.bind((host, port))
+                except OSError:
+                    continue
+                return port
+    except OSError as error:
+        raise LinkError(f"cannot listen at {host}: {error.strerror or error}") from None
+    raise LinkError(f"no port is free for TCP and UDP at {host}")
+
+
+def _called(part: Part, has_addresses: bool) -> list[str]:
+    """Whom a node calls when it hears of them.
+
+    Nobody but an application calls proxies, so that a hundred proxies have no links to one another. Whoever was given
+    addresses calls no router besides: a router that was found is not called again as often as an address is.
+    """
+    if part is Part.APP:
+        return ["router", "peer"]
+    return [] if has_addresses or part is Part.ROUTER else ["router"]
+
+
+def _protocols(endpoints: list[str], settings: FabricSettings) -> list[str]:
+    """The only protocols that are taken: with keys, nothing that is not encrypted."""
+    usual = ["quic"] if settings.tls is not None else ["tcp", "udp"]
+    return sorted({*usual, *(endpoint.partition("/")[0] for endpoint in endpoints)})
+
+
+def _tls(settings: FabricSettings) -> dict[str, Any]:
+    assert settings.tls is not None
+    certificate, key = str(settings.tls.certificate), str(settings.tls.key)
+    return {
+        "root_ca_certificate": str(settings.tls.ca),
+        "listen_certificate": certificate,
+        "listen_private_key": key,
+        "connect_certificate": certificate,
+        "connect_private_key": key,
+        "enable_mtls": True,
+        # A certificate names an identity, which may be at any address.
+        "verify_name_on_connect": False,
+        "close_link_on_expiration": True,
+    }
+
+
+def _with_port(address: str) -> str:
+    """HOST:PORT of an address. Raises :class:`UsageError`."""
+    host, colon, port = address.rpartition(":")
+    if address.startswith("[") and address.endswith("]"):
+        return f"{address}:{DEFAULT_PORT}"
+    if not colon:
+        host, port = address, str(DEFAULT_PORT)
+    bare = host.startswith("[") == host.endswith("]") and (":" not in host or host.startswith("["))
+    if not host or not bare or not port.isdecimal() or int(port) > 65535:
+        raise UsageError(f"{address!r} is no network address: it looks like 10.0.0.5:7447, [fe80::1]:7447 or lab.local")
+    return f"{host}:{port}"
+
+
+def _host(address: str) -> str:
+    return address.rpartition(":")[0].strip("[]")
+
+
+def all_interfaces() -> str:
+    """The address that stands for all of this host."""
+    return "[::]" if socket.has_dualstack_ipv6() else "0.0.0.0"

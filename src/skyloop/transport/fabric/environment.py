@@ -1,0 +1,79 @@
+"""Whether and how this process takes part in the network: by what it is told, or else by its environment."""
+
+from __future__ import annotations
+
+import logging
+import os
+from importlib import import_module
+from pathlib import Path
+from typing import Final
+
+from skyloop.errors import UsageError
+from skyloop.transport.fabric import config
+from skyloop.transport.fabric.settings import FabricSettings
+
+_log = logging.getLogger(__name__)
+
+NETWORK_VARIABLE: Final = "SKYLOOP_NETWORK"
+KEYS_VARIABLE: Final = "SKYLOOP_KEYS"
+MULTICAST: Final = "multicast"
+_ON: Final = frozenset({MULTICAST, "on", "1", "true", "yes"})
+_OFF: Final = frozenset({"", "off", "0", "false", "no"})
+
+#: ``True``: search by multicast; addresses to call, with ``multicast`` among them to search as well, separated by
+#: commas; ``False``: this host only; ``None``: as the environment says.
+Network = bool | str | FabricSettings | None
+
+
+def choose(network: Network = None, keys: Path | str | None = None) -> FabricSettings | None:
+    """The settings, None to stay on this host.
+
+    ``network`` defaults to the variable ``SKYLOOP_NETWORK``, without which nothing leaves this host; ``keys``, the
+    folder of an identity, to ``SKYLOOP_KEYS``. That a key ends within a week is logged as a warning. Raises
+    :class:`UsageError` for addresses or a folder that make no sense.
+    """
+    found = _choose(network, keys)
+    if found is not None and found.ring is not None:
+        for notice in found.ring.look():
+            _log.warning("%s", notice)
+    return found
+
+
+def _choose(network: Network, keys: Path | str | None) -> FabricSettings | None:
+    if isinstance(network, FabricSettings):
+        return network if keys is None else secure(network, keys)
+    wish = os.environ.get(NETWORK_VARIABLE, "") if network is None else network
+    if isinstance(wish, bool):
+        wish = MULTICAST if wish else ""
+    if wish.strip().lower() in _OFF:
+        if keys is not None and network is None:
+            raise UsageError(f"keys are for the network: say network=True as well, or set {NETWORK_VARIABLE}")
+        return None
+    words = [word.strip() for word in wish.split(",") if word.strip()]
+    connect = tuple(word for word in words if word.lower() not in _ON)
+    return settings(connect=connect, multicast=len(connect) < len(words), keys=keys)
+
+
+def settings(
+    *,
+    listen: tuple[str, ...] = (),
+    connect: tuple[str, ...] = (),
+    multicast: bool = True,
+    keys: Path | str | None = None,
+) -> FabricSettings:
+    """Settings for the network, with the keys of ``SKYLOOP_KEYS`` if no other folder is given.
+
+    Raises :class:`UsageError`.
+    """
+    found = FabricSettings(listen=listen, connect=connect, multicast=multicast)
+    config.endpoints_of((*listen, *connect), found)  # says what is wrong with an address before anything is opened
+    folder = keys or os.environ.get(KEYS_VARIABLE) or None
+    return found if folder is None else secure(found, folder)
+
+
+def secure(plain: FabricSettings, folder: Path | str) -> FabricSettings:
+    """These settings with the identity in a folder. Raises :class:`UsageError`."""
+    credentials = import_module("skyloop.keys").load(folder)
+    found: FabricSettings = import_module("skyloop.transport.fabric.access").secured(plain, credentials)
+    config.endpoints_of((*found.listen, *found.connect), found)  # not all that are good without keys are with them
+    return found

@@ -1,0 +1,189 @@
+"""The fabric transport's own packets and attachments: bytes to typed tuples and back. Pure; tables in
+``docs/wire-format.md``.
+
+They share the header of all packets and have kinds from 0x50, which no sample has.
+"""
+
+from __future__ import annotations
+
+import struct
+from enum import IntEnum
+from typing import Final, NamedTuple
+
+import msgspec
+
+from skyloop.errors import DecodeError
+from skyloop.messages import FrameHeader, decode
+from skyloop.messages.codec import HEADER, HEADER_SIZE, SIGNATURE, VERSION
+from skyloop.transport.base import MAX_TOPIC
+
+REVISION: Final = 1  #: of the fabric transport
+MAX_REASON: Final = 400  #: bytes of UTF-8
+
+
+class FabricKind(IntEnum):
+    """The kinds of packet that the two ends exchange between themselves."""
+
+    SUBSCRIBE = 0x50  #: application to proxy
+    TAKEN = 0x51  #: either way: packets up to this number were taken
+    SEEN = 0x52  #: application to proxy: frames up to this number were taken
+    BYE = 0x53  #: either way: why the connection ends; answered with the same
+
+
+class Subscribe(NamedTuple):
+    topic: str
+    on: bool
+
+
+class Taken(NamedTuple):
+    topic: str  #: empty: of the packets sent to this end alone
+    number: int
+
+
+class Seen(NamedTuple):
+    topic: str
+    number: int
+
+
+class Bye(NamedTuple):
+    reason: str
+
+
+Message = Subscribe | Taken | Seen | Bye
+
+_NUMBER = struct.Struct("<Q")
+_OWN: Final = bytes([FabricKind.SUBSCRIBE])
+_PUBLISHED = struct.Struct("<8sQ")
+
+
+class Join(msgspec.Struct, frozen=True, array_like=True):
+    """What an application says when it asks to be let in, as MessagePack."""
+
+    revision: int
+    run: str  #: of the proxy that is meant
+    host: str = ""  #: for people
+    pid: int = 0  #: for people
+    program: str = ""  #: for people
+
+
+class Welcome(msgspec.Struct, frozen=True, array_like=True):
+    """The answer to :class:`Join`: the connection stands."""
+
+    revision: int
+    run: str
+
+
+class ProxyInfo(msgspec.Struct, frozen=True, array_like=True):
+    """Who a proxy is: the answer at its ``info`` key, as MessagePack."""
+
+    name: str
+    run: str
+    since_ns: int  #: wall-clock time of its start [ns since 1970]: the older one keeps a name
+    host: str
+    pid: int
+    vehicle: str  #: its address, e.g. ``sim://``
+    address: str  #: where it listens, for people
+
+
+encode_own = msgspec.msgpack.Encoder().encode
+decode_join = msgspec.msgpack.Decoder(Join).decode
+decode_welcome = msgspec.msgpack.Decoder(Welcome).decode
+decode_info = msgspec.msgpack.Decoder(ProxyInfo).decode
+
+
+def is_own(packet: bytes) -> bool:
+    """Whether a packet may be for the transport itself and not for the handler."""
+    return packet[5:6] >= _OWN and packet.startswith(SIGNATURE)
+
+
+def subscribe(topic: str, on: bool) -> bytes:
+    return _packet(FabricKind.SUBSCRIBE, bytes((on,)) + topic.encode())
+
+
+def taken(topic: str, number: int) -> bytes:
+    return _packet(FabricKind.TAKEN, _NUMBER.pack(number) + topic.encode())
+
+
+def seen(topic: str, number: int) -> bytes:
+    return _packet(FabricKind.SEEN, _NUMBER.pack(number) + topic.encode())
+
+
+def bye(reason: str) -> bytes:
+    return _packet(FabricKind.BYE, reason.encode(errors="replace")[:MAX_REASON])
+
+
+def _packet(kind: FabricKind, body: bytes) -> bytes:
+    return HEADER.pack(SIGNATURE, VERSION, kind, 0, len(body)) + body
+
+
+def parse(packet: bytes) -> Message:
+    """What one of the transport's own packets says. Raises :class:`DecodeError` for anything that is none."""
+    if len(packet) < HEADER_SIZE:
+        raise DecodeError(f"{len(packet)} bytes are less than the header of {HEADER_SIZE}")
+    signature, version, kind, reserved, length = HEADER.unpack_from(packet)
+    if signature != SIGNATURE or version != VERSION or reserved or length != len(packet) - HEADER_SIZE:
+        raise DecodeError(f"not a packet of the fabric transport: header {packet[:HEADER_SIZE].hex(' ')}")
+    body = packet[HEADER_SIZE:]
+    try:
+        if kind == FabricKind.SUBSCRIBE:
+            if body[0] > 1:
+                raise DecodeError(f"a subscription with flag {body[0]}")
+            return Subscribe(_topic(body[1:], least=1), bool(body[0]))
+        if kind == FabricKind.TAKEN:
+            return Taken(_topic(body[_NUMBER.size :]), *_NUMBER.unpack_from(body))
+        if kind == FabricKind.SEEN:
+            return Seen(_topic(body[_NUMBER.size :], least=1), *_NUMBER.unpack_from(body))
+        if kind == FabricKind.BYE:
+            return Bye(body[:MAX_REASON].decode(errors="replace"))
+    except (IndexError, struct.error, UnicodeDecodeError) as error:
+        raise DecodeError(f"bad packet of kind {kind:#x} with {length} bytes of body: {error!r}") from None
+    raise DecodeError(f"unknown kind {kind:#x}")
+
+
+def _topic(text: bytes, least: int = 0) -> str:
+    topic = text.decode()
+    if not least <= len(topic) <= MAX_TOPIC:
+        raise DecodeError(f"a topic of {len(topic)} characters")
+    return topic
+
+
+# Attachments ---------------------------------------------------------------------------------------------------
+
+#: Of a packet to one end: its number, from 1; 0 for the transport's own, which are not counted.
+number = _NUMBER.pack
+
+
+def parse_number(attachment: bytes) -> int:
+    """Raises :class:`DecodeError`."""
+    try:
+        return int(_NUMBER.unpack(attachment)[0])
+    except struct.error as error:
+        raise DecodeError(f"an attachment of {len(attachment)} bytes: {error}") from None
+
+
+def published(run: bytes, count: int) -> bytes:
+    """The attachment of a published packet: RUN of its proxy (8 bytes) and its number on this topic, from 1."""
+    return _PUBLISHED.pack(run, count)
+
+
+def parse_published(attachment: bytes) -> tuple[bytes, int]:
+    """RUN and number. Raises :class:`DecodeError`."""
+    try:
+        run, count = _PUBLISHED.unpack(attachment)
+    except struct.error as error:
+        raise DecodeError(f"an attachment of {len(attachment)} bytes: {error}") from None
+    return run, count
+
+
+def frame(run: bytes, count: int, header: bytes) -> bytes:
+    """The attachment of a frame: as of a packet, then the whole packet of its :class:`FrameHeader`."""
+    return _PUBLISHED.pack(run, count) + header
+
+
+def parse_frame(attachment: bytes) -> tuple[bytes, int, FrameHeader]:
+    """RUN, number and header. Raises :class:`DecodeError`."""
+    run, count = parse_published(attachment[: _PUBLISHED.size])
+    header = decode(attachment[_PUBLISHED.size :])
+    if type(header) is not FrameHeader:
+        raise DecodeError(f"a frame came with a {type(header).__name__} and must with a FrameHeader")
+    return run, count, header

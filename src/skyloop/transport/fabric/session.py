@@ -1,0 +1,181 @@
+"""Zenoh sessions of this process: one for all that take part in the same way, however many drones they fly."""
+
+from __future__ import annotations
+
+import atexit
+import json
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any, Final
+
+from skyloop.errors import LinkError, MissingExtraError
+from skyloop.transport.fabric import config
+from skyloop.transport.fabric.config import Part
+from skyloop.transport.fabric.settings import FabricSettings
+
+if TYPE_CHECKING:
+    import zenoh
+
+_log = logging.getLogger(__name__)
+LINGER_S: Final = 2.0  #: a session that nobody uses stays open so long: whoever connects anew finds it as it was
+_BORROWED: Final = 1000  # times to try again what another thread is just using …
+_BORROWED_S: Final = 0.001  # … after so long
+_ATTEMPTS: Final = 5  # to get a free port before somebody else has it
+
+
+class Session:
+    """One Zenoh session, shared; :meth:`release` gives it back."""
+
+    def __init__(self, settings: FabricSettings, part: Part) -> None:
+        self.settings = settings
+        self.part = part
+        self.users = 0
+        self.retired = False  #: not for new users: there is a better one
+        self.idle_since = 0.0
+        self.opened = time.monotonic()
+        self.listens: list[str] = []  #: addresses
+        self.zenoh: zenoh.Session = self._open()
+
+    def callback(self, function: Callable[[Any], None]) -> Any:
+        """What Zenoh calls on its receiving thread with each sample, reply or query; it must be quick."""
+        from zenoh.handlers import Callback
+
+        return Callback(function, indirect=False)
+
+    def over(self, now: float) -> bool:
+        """Whether it has lingered long enough without a user. For the pool."""
+        return self.retired or now - self.idle_since >= LINGER_S
+
+    def close(self) -> None:
+        """End it. For the pool."""
+        try:
+            self.zenoh.close()  # type: ignore[no-untyped-call]
+        except Exception as error:  # noqa: BLE001  (whatever it is, there is nothing more that can be done)
+            _log.warning("a network session did not end well: %s", error)
+
+    def _open(self) -> Any:
+        zenoh_module = load()
+        listens = self.part is not Part.APP
+        for attempt in range(_ATTEMPTS):
+            self.listens = config.listening(self.settings) if listens else list(self.settings.listen)
+            sections = config.make(self.settings, self.part, config.endpoints_of(self.listens, self.settings))
+            try:
+                return zenoh_module.open(configure(sections))
+            except zenoh_module.ZError as error:
+                # The port was found free, and somebody else was faster: only then is another attempt of any use.
+                if attempt == _ATTEMPTS - 1 or not any(each.endswith(":0") for each in self.settings.listen or (":0",)):
+                    raise LinkError(f"cannot join the network: {error}") from None
+        raise AssertionError("unreachable")
+
+
+class _Pool:
+    """All sessions of this process. A thread ends those that nobody uses, and itself when there are none."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._sessions: list[Session] = []
+        self._reaper: threading.Thread | None = None
+
+    def acquire(self, settings: FabricSettings, part: Part) -> Session:
+        """A session with these settings. Raises :class:`LinkError`, :class:`UsageError`, :class:`MissingExtraError`."""
+        with self._changed:
+            for session in self._sessions:
+                same = (session.settings, session.part) == (settings, part)
+                if same and not session.retired and not session.zenoh.is_closed():
+                    session.users += 1
+                    return session
+            session = Session(settings, part)
+            session.users = 1
+            self._sessions.append(session)
+            return session
+
+    def release(self, session: Session, *, linger: bool = True) -> None:
+        """Give a session back."""
+        with self._changed:
+            session.users -= 1
+            session.idle_since = time.monotonic() if linger else -LINGER_S
+            at_once = not linger and session.users == 0
+            if at_once:
+                self._sessions.remove(session)
+            elif self._reaper is None:
+                self._reaper = threading.Thread(target=self._reap, name="skyloop-fabric-sessions", daemon=True)
+                self._reaper.start()
+            self._changed.notify()
+        if at_once:
+            session.close()  # outside the lock, as it may wait for the network
+
+    def retire(self, session: Session) -> None:
+        """Let those who come from now on have a new one; this one ends with its last user."""
+        with self._changed:
+            session.retired = True
+
+    def close_all(self) -> None:
+        """At the end of the process: Zenoh's threads may not call into an interpreter that is gone."""
+        with self._changed:
+            for session in self._sessions:
+                session.close()
+            self._sessions.clear()
+            self._changed.notify()
+
+    def _reap(self) -> None:
+        while True:
+            with self._changed:
+                if not any(session.users == 0 for session in self._sessions):
+                    self._reaper = None
+                    return
+                now = time.monotonic()
+                over = [session for session in self._sessions if session.users == 0 and session.over(now)]
+                for session in over:
+                    self._sessions.remove(session)
+            for session in over:
+                session.close()  # outside the lock, as it may wait for the network
+            with self._changed:
+                self._changed.wait(LINGER_S / 4)
+
+
+_POOL: Final = _Pool()
+acquire = _POOL.acquire
+release = _POOL.release
+retire = _POOL.retire
+atexit.register(_POOL.close_all)
+
+
+def load() -> Any:
+    """The package zenoh. Raises :class:`MissingExtraError`."""
+    try:
+        import zenoh
+    except ImportError as error:
+        raise MissingExtraError("the network", "network", cause=str(error)) from None
+    return zenoh
+
+
+def undeclare(held: Iterable[Any]) -> None:
+    """Take back what was declared, the last first. Not on Zenoh's threads."""
+    ended: type[Exception] = load().ZError
+    for each in reversed([*held]):
+        for _ in range(_BORROWED):
+            try:
+                each.undeclare()
+            except ended:  # the session has ended, and everything with it
+                break
+            except RuntimeError:  # "Already borrowed": another thread is just sending by it
+                time.sleep(_BORROWED_S)
+            else:
+                break
+
+
+def configure(sections: dict[str, Any]) -> zenoh.Config:
+    """Zenoh's own form of a configuration."""
+    found = load().Config()
+    for path, value in _leaves("", sections):
+        found.insert_json5(path, json.dumps(value))
+    return found  # type: ignore[no-any-return]
+
+
+def _leaves(path: str, value: Any) -> list[tuple[str, Any]]:
+    """The sections taken apart, so that what they leave out keeps its default; some can only be set as a whole."""
+    if isinstance(value, dict) and not path.endswith(("access_control", "autoconnect", "gateway", "retry")):
+        return [leaf for key, inner in value.items() for leaf in _leaves(f"{path}/{key}" if path else key, inner)]
+    return [(path, value)]

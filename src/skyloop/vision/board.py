@@ -1,0 +1,157 @@
+"""Boards for calibration: ChArUco and chessboards, to be printed, and found in pictures.
+
+ChArUco: a chessboard with a marker in each white square, so that every corner has a number and a part of the board is
+enough (Garrido-Jurado et al., "Automatic generation and detection of highly reliable fiducial markers under occlusion",
+Pattern Recognition 47(6), 2014; detection is OpenCV's). A chessboard must be seen as a whole (Duda and Frese, "Accurate
+Detection and Localization of Checkerboard Corners for Calibration", BMVC 2018).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.errors import MissingExtraError, UsageError
+from skyloop.vision.opencv import marker_dictionary, opencv
+
+Array = NDArray[np.float64]
+Kind = Literal["charuco", "chessboard"]
+MM_PER_INCH = 25.4
+_MARKER_SHARE = 0.74  # of a square's side
+_LEAST_CORNERS = 8  # of a ChArUco board in a picture
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoardView:
+    """The corners of a board in one picture."""
+
+    points: Array  #: (n, 3) on the board [m]
+    pixels: Array  #: (n, 2) in the picture
+    name: str = ""  #: of the picture, for people
+
+    @property
+    def centre(self) -> Array:
+        """Mean of the corners (2,) [px]."""
+        return np.asarray(self.pixels.mean(axis=0))
+
+
+@dataclass(frozen=True, slots=True)
+class Board:
+    """A board of ``columns`` × ``rows`` squares. Raises :class:`UsageError` for one that can't be."""
+
+    columns: int = 7
+    rows: int = 5
+    square_m: float = 0.033  #: side of a square as it was printed: measure it
+    kind: Kind = "charuco"
+    dictionary: str = "4x4_50"  #: of a ChArUco board's markers
+
+    def __post_init__(self) -> None:
+        for name, least in (("columns", 3), ("rows", 3)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= 40:
+                raise UsageError(f"{name} is {value!r} and must be a whole number from {least} to 40")
+        if not 0.0 < self.square_m < math.inf:
+            raise UsageError(f"square_m is {self.square_m!r} and must be the side of a square in metres, above 0")
+        if self.kind not in ("charuco", "chessboard"):
+            raise UsageError(f"kind is {self.kind!r} and must be 'charuco' or 'chessboard'")
+
+    @property
+    def corners(self) -> int:
+        """How many inner corners there are."""
+        return (self.columns - 1) * (self.rows - 1)
+
+    def picture(self, square_px: int = 100) -> NDArray[np.uint8]:
+        """The board with half a square of white around it, grey, shape (h, w). Raises :class:`UsageError`."""
+        cv = opencv("drawing a board")
+        if self.kind == "charuco":
+            size = (self.columns * square_px, self.rows * square_px)
+            inner = np.asarray(self._charuco(cv).generateImage(size, marginSize=0), dtype=np.uint8)
+        else:
+            row, column = np.indices((self.rows, self.columns))
+            squares = np.where((row + column) % 2, 255, 0).astype(np.uint8)
+            inner = np.kron(squares, np.ones((square_px, square_px), np.uint8))
+        return np.pad(inner, square_px // 2, constant_values=255)
+
+    def save(self, path: str | Path, dpi: int = 300) -> None:
+        """Write it to be printed at its size: PNG or PDF, by the ending. Raises :class:`UsageError`,
+        :class:`MissingExtraError` without Pillow."""
+        file = Path(path)
+        if file.suffix.lower() not in (".png", ".pdf"):
+            raise UsageError(f"{file} must end with .png or .pdf")
+        try:
+            from PIL import Image
+        except ImportError as error:
+            raise MissingExtraError("writing a board", "vision", cause=str(error)) from error
+        square_px = round(self.square_m * 1000 / MM_PER_INCH * dpi)
+        if not 20 <= square_px <= 2000:
+            raise UsageError(
+                f"squares of {self.square_m * 1000:g} mm at {dpi} dpi are {square_px} pixels, not 20 to 2000"
+            )
+        true_dpi = square_px / (self.square_m * 1000 / MM_PER_INCH)  # so that a square is as large as it says
+        try:
+            if file.suffix.lower() == ".pdf":
+                Image.fromarray(self.picture(square_px)).save(file, resolution=true_dpi)
+            else:
+                Image.fromarray(self.picture(square_px)).save(file, dpi=(true_dpi, true_dpi))
+        except OSError as error:
+            raise UsageError(f"{file} can't be written: {error.strerror or error}") from error
+
+    def _charuco(self, cv: Any) -> Any:
+        markers = marker_dictionary(cv, self.dictionary)
+        needed, there = self.columns * self.rows // 2, markers.bytesList.shape[0]
+        if needed > there:
+            raise UsageError(
+                f"a board of {self.columns}x{self.rows} squares needs {needed} markers, and there are {there}"
+            )
+        side = self.square_m * _MARKER_SHARE
+        return cv.aruco.CharucoBoard((self.columns, self.rows), self.square_m, side, markers)
+
+
+class BoardFinder:
+    """Finds one board in pictures. Holds OpenCV's scratch memory: one finder a thread."""
+
+    def __init__(self, board: Board) -> None:
+        self.board = board
+        self._cv = opencv("finding a board")
+        self._charuco = self._detector = None
+        if board.kind == "charuco":
+            self._charuco = board._charuco(self._cv)
+            self._detector = self._cv.aruco.CharucoDetector(self._charuco)
+
+    def find(self, image: NDArray[np.uint8], name: str = "") -> BoardView | None:
+        """The board's corners in a picture, (h, w, 3) BGR or (h, w) grey, uint8; None if it is not seen well enough.
+
+        Raises :class:`UsageError` for another array.
+        """
+        pixels = np.asarray(image)
+        if pixels.dtype != np.uint8 or pixels.ndim not in (2, 3) or pixels.size == 0:
+            raise UsageError(f"a picture is uint8 and (h, w, 3) or (h, w), not {pixels.dtype} and {pixels.shape}")
+        grey = self._cv.cvtColor(pixels, self._cv.COLOR_BGR2GRAY) if pixels.ndim == 3 else np.ascontiguousarray(pixels)
+        return self._find_charuco(grey, name) if self._detector is not None else self._find_chessboard(grey, name)
+
+    def _find_charuco(self, grey: NDArray[np.uint8], name: str) -> BoardView | None:
+        assert self._detector is not None
+        assert self._charuco is not None
+        corners, ids, _, _ = self._detector.detectBoard(grey)
+        if ids is None or len(ids) < _LEAST_CORNERS:
+            return None
+        points = np.asarray(self._charuco.getChessboardCorners(), dtype=np.float64)[np.ravel(ids)]
+        if np.linalg.matrix_rank(points[:, :2] - points[0, :2], tol=1e-6) < 2:
+            return None  # all on one line: it says nothing of a plane
+        return BoardView(points, np.asarray(corners, dtype=np.float64).reshape(-1, 2), name)
+
+    def _find_chessboard(self, grey: NDArray[np.uint8], name: str) -> BoardView | None:
+        board = self.board
+        inner = (board.columns - 1, board.rows - 1)
+        found, corners = self._cv.findChessboardCornersSB(grey, inner, flags=self._cv.CALIB_CB_ACCURACY)
+        if not found:
+            return None
+        row, column = np.indices((inner[1], inner[0]))
+        places = np.column_stack([column.ravel(), row.ravel(), np.zeros(row.size)]).astype(np.float64)
+        points: Array = places * board.square_m
+        return BoardView(points, np.asarray(corners, dtype=np.float64).reshape(-1, 2), name)

@@ -1,0 +1,123 @@
+"""Where a camera that looks down has gone, by the motion of the ground's picture.
+
+Corners (Shi and Tomasi, "Good features to track", CVPR 1994) are tracked from picture to picture by pyramidal
+Lucas-Kanade (Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", Intel 2000), forth and back.
+Each ray is levelled by the attitude and meets the ground at the height that the vehicle measures; a corner that was
+first seen from a known place tells where the vehicle is now, and the median of them all is taken. It drifts only as
+corners leave the picture and new ones take their places.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.messages import CameraInfo, Feedback, Intrinsics
+from skyloop.poses import mounting_rotation
+from skyloop.vision.lens import normalised
+from skyloop.vision.opencv import opencv
+from skyloop.vision.planar import checked
+
+Array = NDArray[np.float64]
+
+_MOST: Final = 80  # corners
+_ENOUGH: Final = 8
+_REFILL: Final = 50  # with fewer, new ones are looked for
+_APART_PX: Final = 12
+_RETURN_PX: Final = 0.7  # a corner tracked forth and back must come back so near
+_LOWEST_M: Final = 0.15  # nearer to the ground there is nothing to track
+
+
+class GroundTracker:
+    """Tell it each picture of a camera that looks down; it tells where the vehicle is, from where it began."""
+
+    def __init__(self, camera: CameraInfo) -> None:
+        """Raises :class:`UsageError` if the camera does not say how it is mounted, :class:`MissingExtraError` without
+        OpenCV."""
+        self._cv: Any = opencv("optical flow")
+        self._mounting = mounting_rotation(camera)
+        self._offset = np.zeros(3) if camera.position is None else np.asarray(camera.position, np.float64)
+        self._grey: NDArray[np.uint8] | None = None
+        self._corners = np.empty((0, 2), np.float32)  # pixels in the last picture
+        self._ground = np.empty((0, 2))  # where they are on the ground, in the axes of `place`
+        self.place = np.zeros(2)  #: of the vehicle, along yaw 0 and to its left [m], as of the last picture
+
+    @property
+    def points(self) -> tuple[tuple[float, float], ...]:
+        """The corners that it goes by, pixels in the last picture."""
+        return tuple((float(x), float(y)) for x, y in self._corners)
+
+    def forget(self) -> None:
+        """Begin anew at the present place with the next picture."""
+        self._grey, self._corners, self._ground = None, np.empty((0, 2), np.float32), np.empty((0, 2))
+
+    def see(
+        self, image: NDArray[np.uint8], at_capture: Feedback, intrinsics: Intrinsics | None = None
+    ) -> tuple[Array, int] | None:
+        """Where the vehicle is, (2,) [m] along yaw 0 and to its left, and by how many corners; None where too few were
+        found again, or attitude or height are not known: then it begins anew at the place that it knew last.
+
+        ``image`` and ``intrinsics`` as those of :meth:`.MarkerDetector.detect`; raises as that.
+        """
+        pixels, intrinsics = checked(image, intrinsics)
+        grey = self._cv.cvtColor(pixels, self._cv.COLOR_BGR2GRAY) if pixels.ndim == 3 else pixels.copy()
+        height = at_capture.altitude
+        if height is None or height < _LOWEST_M or None in (at_capture.roll, at_capture.pitch, at_capture.yaw):
+            self.forget()
+            return None
+        began = self._grey is None
+        self._track(grey)
+        below, good = self._below(self._corners, at_capture, intrinsics)
+        self._corners, self._ground, below = self._corners[good], self._ground[good], below[good]
+        count = len(below)
+        found = count >= _ENOUGH
+        if found:
+            self.place = np.median(self._ground - below, axis=0)
+            kept = np.linalg.norm(self._ground - below - self.place, axis=1) < 0.05 + 0.05 * height
+            self._corners, self._ground = self._corners[kept], self._ground[kept]
+        elif not began:
+            self.forget()
+        self._grey = grey
+        if len(self._corners) < _REFILL:
+            self._refill(grey, at_capture, intrinsics)
+        return (self.place.copy(), count) if found else None
+
+    def _track(self, grey: NDArray[np.uint8]) -> None:
+        if self._grey is None or not len(self._corners):
+            return
+        cv = self._cv
+        before = self._corners.reshape(-1, 1, 2)
+        after, forth, _ = cv.calcOpticalFlowPyrLK(self._grey, grey, before, None, winSize=(15, 15), maxLevel=3)
+        again, back, _ = cv.calcOpticalFlowPyrLK(grey, self._grey, after, None, winSize=(15, 15), maxLevel=3)
+        off = np.linalg.norm((again - before).reshape(-1, 2), axis=1)
+        kept = (forth.ravel() == 1) & (back.ravel() == 1) & (off < _RETURN_PX)
+        self._corners, self._ground = after.reshape(-1, 2)[kept], self._ground[kept]
+
+    def _refill(self, grey: NDArray[np.uint8], at_capture: Feedback, intrinsics: Intrinsics) -> None:
+        free = np.full(grey.shape, 255, np.uint8)
+        for x, y in self._corners:
+            self._cv.circle(free, (round(float(x)), round(float(y))), _APART_PX, 0, -1)
+        wanted = _MOST - len(self._corners)
+        found = self._cv.goodFeaturesToTrack(grey, wanted, 0.01, _APART_PX, mask=free, blockSize=5)
+        if found is None:
+            return
+        corners = found.reshape(-1, 2).astype(np.float32)
+        below, good = self._below(corners, at_capture, intrinsics)
+        self._corners = np.concatenate([self._corners, corners[good]])
+        self._ground = np.concatenate([self._ground, below[good] + self.place])
+
+    def _below(
+        self, corners: NDArray[Any], at_capture: Feedback, intrinsics: Intrinsics
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """Where the corners' rays meet the ground, from the vehicle, (n, 2) [m], and which of them do."""
+        if not len(corners):
+            return np.empty((0, 2)), np.empty(0, np.bool_)
+        rays = normalised(np.asarray(corners, np.float64), intrinsics)
+        turn = at_capture.rotation
+        level = np.column_stack([rays, np.ones(len(rays))]) @ (turn @ self._mounting).T
+        lever = turn @ self._offset
+        good = level[:, 2] < -0.2
+        depth = np.where(good, -((at_capture.altitude or 0.0) + lever[2]) / np.where(good, level[:, 2], 1.0), 0.0)
+        return level[:, :2] * depth[:, None] + lever[:2], good

@@ -1,0 +1,180 @@
+"""How a lens maps directions to pixels, both ways, and pictures without its distortion.
+
+OpenCV's models: ``pinhole`` with Brown and Conrady's distortion (``calib3d``: k1, k2, p1, p2, k3, …) and ``fisheye``
+(Kannala and Brandt, "A Generic Camera Model and Calibration Method", IEEE PAMI 28(8), 2006: an odd polynomial of the
+angle to the axis, k1 … k4). Optical axes: x right, y down, z forward; the centre of the first pixel is (0, 0).
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from skyloop.errors import UsageError
+from skyloop.messages import Intrinsics
+from skyloop.vision.opencv import opencv
+
+Array = NDArray[np.float64]
+_WIDEST = 1e-9  # z over distance below this: beside or behind the camera
+_STEEPEST = 3.0  # x/z, 72°: an ideal camera that saw more would show little else than its edges
+_ITERATIONS = (40, 1e-10)  # of the inverse of a distortion
+
+
+def project(points: ArrayLike, intrinsics: Intrinsics) -> Array:
+    """Pixels (n, 2) of points in optical axes (n, 3), or of directions of any length; NaN for those that the model
+    can't show: beside or behind a pinhole, or beyond the angle at which a fisheye's polynomial turns back.
+
+    Raises :class:`UsageError` for another shape or an unknown model.
+    """
+    given = _rows(points, 3)
+    if _is_fisheye(intrinsics):
+        return _bent(given, intrinsics)
+    before = given[:, 2] > _WIDEST * np.linalg.norm(given, axis=1)
+    pixels = np.full((len(given), 2), np.nan)
+    if before.any():
+        cv, none = opencv("projecting"), np.zeros(3)
+        seen = given[before].reshape(-1, 1, 3)
+        found, _ = cv.projectPoints(seen, none, none, intrinsics.matrix, _distortion(intrinsics))
+        pixels[before] = np.asarray(found, dtype=np.float64).reshape(-1, 2)
+    return pixels
+
+
+def unproject(pixels: ArrayLike, intrinsics: Intrinsics) -> Array:
+    """Unit vectors (n, 3) in optical axes to what pixels (n, 2) see; NaN where the model has no such direction.
+
+    Raises as :func:`project`.
+    """
+    given = _rows(pixels, 2)
+    if _is_fisheye(intrinsics):
+        return _straight(given, intrinsics)
+    rays = np.column_stack([_ideal(given, intrinsics), np.ones(len(given))])
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True), dtype=np.float64)
+
+
+def normalised(pixels: ArrayLike, intrinsics: Intrinsics) -> Array:
+    """x/z and y/z (n, 2) of what pixels (n, 2) see; NaN also for what is beside or behind the camera."""
+    if not _is_fisheye(intrinsics):
+        return _ideal(_rows(pixels, 2), intrinsics)
+    rays = unproject(pixels, intrinsics)
+    rays[~(rays[:, 2] > _WIDEST)] = np.nan
+    return np.asarray(rays[:, :2] / rays[:, 2:], dtype=np.float64)
+
+
+def undistort(
+    image: NDArray[np.uint8], intrinsics: Intrinsics | None = None, *, balance: float = 0.0
+) -> tuple[NDArray[np.uint8], Intrinsics]:
+    """The picture as an ideal pinhole camera would have taken it, and that camera's intrinsics.
+
+    ``image`` is a :class:`skyloop.Frame`, or any array (h, w, 3) or (h, w) of uint8 with ``intrinsics``; ``balance`` 0
+    shows only what every pixel knows, 1 all that was seen, with black around it. Raises :class:`UsageError`.
+    """
+    if intrinsics is None:
+        intrinsics = getattr(image, "intrinsics", None)
+    if intrinsics is None:
+        raise UsageError("the picture carries no intrinsics: give the camera's as intrinsics=Intrinsics(fx, …)")
+    pixels = np.asarray(image)
+    if pixels.dtype != np.uint8 or pixels.ndim not in (2, 3) or pixels.size == 0:
+        raise UsageError(
+            f"the picture has shape {pixels.shape} and type {pixels.dtype} and must be uint8, (h, w, 3) or (h, w)"
+        )
+    if not 0.0 <= balance <= 1.0:
+        raise UsageError(f"balance is {balance!r} and must be from 0 to 1")
+    ideal, across, down = _maps(intrinsics, pixels.shape[1], pixels.shape[0], balance)
+    cv = opencv("taking out distortion")
+    return np.asarray(cv.remap(pixels, across, down, cv.INTER_LINEAR), dtype=np.uint8), ideal
+
+
+@lru_cache(maxsize=8)
+def _maps(intrinsics: Intrinsics, width: int, height: int, balance: float) -> tuple[Intrinsics, Any, Any]:
+    """The ideal camera, and where each of its pixels is to be taken from; once for each camera."""
+    cv, size, turn = opencv("taking out distortion"), (width, height), np.eye(3)
+    focal = _focal_length(intrinsics, width, height, balance)
+    ideal = Intrinsics(focal, focal, intrinsics.cx, intrinsics.cy)
+    lens = cv.fisheye if _is_fisheye(intrinsics) else cv
+    across, down = lens.initUndistortRectifyMap(
+        intrinsics.matrix, _distortion(intrinsics), turn, ideal.matrix, size, cv.CV_16SC2
+    )
+    return ideal, across, down
+
+
+def _focal_length(intrinsics: Intrinsics, width: int, height: int, balance: float) -> float:
+    """Of a pinhole with the same axis: from one that shows nothing that is not known to one that shows all."""
+    across, down = np.linspace(0, width - 1, 33), np.linspace(0, height - 1, 25)
+    reach = []  # how far from the axis each side is in the picture, and by the least and the greatest direction on it
+    for axis, at, along in ((0, 0.0, down), (0, width - 1.0, down), (1, 0.0, across), (1, height - 1.0, across)):
+        side = np.full((len(along), 2), at)
+        side[:, 1 - axis] = along
+        seen = np.nan_to_num(np.abs(normalised(side, intrinsics)[:, axis]), nan=_STEEPEST)
+        pixels = abs(at - (intrinsics.cx, intrinsics.cy)[axis])
+        reach.append((pixels / min(_STEEPEST, seen.min()), pixels / min(_STEEPEST, seen.max())))
+    closest, widest = max(near for near, _ in reach), min(far for _, far in reach)
+    return float(closest ** (1.0 - balance) * widest**balance)
+
+
+def _ideal(pixels: Array, intrinsics: Intrinsics) -> Array:
+    """x/z and y/z of a pinhole's pixels."""
+    if not len(pixels):
+        return np.empty((0, 2))
+    cv, given = opencv("taking out distortion"), pixels.reshape(-1, 1, 2)
+    matrix, distortion = intrinsics.matrix, _distortion(intrinsics)
+    criteria = (cv.TERM_CRITERIA_COUNT | cv.TERM_CRITERIA_EPS, *_ITERATIONS)
+    if hasattr(cv, "undistortPointsIter"):  # OpenCV 4
+        flat = cv.undistortPointsIter(given, matrix, distortion, None, None, criteria)
+    else:
+        flat = cv.undistortPoints(given, matrix, distortion, criteria=criteria)
+    return np.asarray(flat, dtype=np.float64).reshape(-1, 2)
+
+
+def _bent(points: Array, intrinsics: Intrinsics) -> Array:
+    """A fisheye's pixels of directions."""
+    aside = np.hypot(points[:, 0], points[:, 1])
+    angle = np.arctan2(aside, points[:, 2])
+    radius, slope = _polynomial(angle, intrinsics)
+    scale = np.divide(radius, aside, out=np.ones_like(aside), where=aside > 0.0)
+    scale[slope <= 0.0] = np.nan
+    return points[:, :2] * scale[:, None] * (intrinsics.fx, intrinsics.fy) + (intrinsics.cx, intrinsics.cy)
+
+
+def _straight(pixels: Array, intrinsics: Intrinsics) -> Array:
+    """Unit vectors to what a fisheye's pixels see, by Newton's method on the angle to the axis."""
+    flat = (pixels - (intrinsics.cx, intrinsics.cy)) / (intrinsics.fx, intrinsics.fy)
+    radius = np.hypot(flat[:, 0], flat[:, 1])
+    angle = np.minimum(radius, np.pi)
+    for _ in range(_ITERATIONS[0]):
+        value, slope = _polynomial(angle, intrinsics)
+        angle = np.clip(angle - (value - radius) / np.where(np.abs(slope) > 1e-6, slope, 1.0), 0.0, np.pi)
+    value, slope = _polynomial(angle, intrinsics)
+    lost = (np.abs(value - radius) > 1e-9) | (slope <= 0.0)
+    aside = np.divide(np.sin(angle), radius, out=np.zeros_like(radius), where=radius > 0.0)
+    rays = np.column_stack([flat * aside[:, None], np.cos(angle)])
+    rays[lost] = np.nan
+    return rays
+
+
+def _polynomial(angle: Array, intrinsics: Intrinsics) -> tuple[Array, Array]:
+    """Distance from the axis in the picture, for f = 1, by the angle to the axis, and its derivative."""
+    k1, k2, k3, k4 = _distortion(intrinsics)
+    square = angle * angle
+    value = angle * (1.0 + square * (k1 + square * (k2 + square * (k3 + square * k4))))
+    slope = 1.0 + square * (3 * k1 + square * (5 * k2 + square * (7 * k3 + square * 9 * k4)))
+    return value, slope
+
+
+def _is_fisheye(intrinsics: Intrinsics) -> bool:
+    if intrinsics.model not in ("pinhole", "fisheye"):
+        raise UsageError(f"the intrinsics' model is {intrinsics.model!r} and must be 'pinhole' or 'fisheye'")
+    return intrinsics.model == "fisheye"
+
+
+def _distortion(intrinsics: Intrinsics) -> Array:
+    return np.asarray(intrinsics.distortion or (0.0, 0.0, 0.0, 0.0), dtype=np.float64)
+
+
+def _rows(values: ArrayLike, columns: int) -> Array:
+    rows = np.asarray(values, dtype=np.float64)
+    if rows.ndim != 2 or rows.shape[1] != columns:
+        raise UsageError(f"an array of shape (n, {columns}) is wanted, not {rows.shape}")
+    return np.ascontiguousarray(rows)

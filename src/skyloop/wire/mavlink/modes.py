@@ -1,0 +1,110 @@
+"""The autopilots' modes by name: numbers of ArduCopter, and main and sub modes of PX4.
+
+Sources: ``mode.h`` of ArduCopter, ``px4_custom_mode.h`` of PX4.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum, IntFlag
+from typing import Final
+
+
+class Autopilot(IntEnum):
+    """``MAV_AUTOPILOT`` of those that are known here."""
+
+    ARDUPILOT = 3
+    PX4 = 12
+
+
+class ModeFlag(IntFlag):
+    """``base_mode`` of a heartbeat."""
+
+    CUSTOM = 1
+    ARMED = 128
+
+
+class SystemState(IntEnum):
+    """``system_status`` of a heartbeat, as far as it says something here."""
+
+    STANDBY = 3
+    ACTIVE = 4
+    CRITICAL = 5  #: a failsafe is at work
+    EMERGENCY = 6
+    TERMINATION = 8
+
+
+class Landed(IntEnum):
+    """``landed_state`` of ``EXTENDED_SYS_STATE``."""
+
+    UNKNOWN = 0
+    ON_GROUND = 1
+    IN_AIR = 2
+    TAKING_OFF = 3
+    LANDING = 4
+
+
+COPTER_MODES: Final = {
+    0: "STABILIZE",
+    1: "ACRO",
+    2: "ALT_HOLD",
+    3: "AUTO",
+    4: "GUIDED",
+    5: "LOITER",
+    6: "RTL",
+    7: "CIRCLE",
+    9: "LAND",
+    11: "DRIFT",
+    13: "SPORT",
+    14: "FLIP",
+    15: "AUTOTUNE",
+    16: "POSHOLD",
+    17: "BRAKE",
+    18: "THROW",
+    19: "AVOID_ADSB",
+    20: "GUIDED_NOGPS",
+    21: "SMART_RTL",
+    22: "FLOWHOLD",
+    23: "FOLLOW",
+    24: "ZIGZAG",
+    25: "SYSTEMID",
+    26: "AUTOROTATE",
+    27: "AUTO_RTL",
+    28: "TURTLE",
+}
+COPTER_NUMBERS: Final = {name: number for number, name in COPTER_MODES.items()}
+
+#: (main, sub).
+PX4_MODES: Final = {
+    (1, 0): "MANUAL",
+    (2, 0): "ALTCTL",
+    (3, 0): "POSCTL",
+    (4, 1): "AUTO.READY",
+    (4, 2): "AUTO.TAKEOFF",
+    (4, 3): "AUTO.LOITER",
+    (4, 4): "AUTO.MISSION",
+    (4, 5): "AUTO.RTL",
+    (4, 6): "AUTO.LAND",
+    (4, 8): "AUTO.FOLLOW",
+    (4, 9): "AUTO.PRECLAND",
+    (5, 0): "ACRO",
+    (6, 0): "OFFBOARD",
+    (7, 0): "STABILIZED",
+}
+PX4_NUMBERS: Final = {name: numbers for numbers, name in PX4_MODES.items()}
+
+
+def copter_mode(custom_mode: int) -> str:
+    """The name of a heartbeat's ``custom_mode``."""
+    return COPTER_MODES.get(custom_mode, f"MODE_{custom_mode}")
+
+
+def px4_mode(custom_mode: int) -> str:
+    """The name of a heartbeat's ``custom_mode``."""
+    main, sub = custom_mode >> 16 & 0xFF, custom_mode >> 24 & 0xFF
+    return PX4_MODES.get((main, sub)) or PX4_MODES.get((main, 0)) or f"MODE_{main}.{sub}"
+
+
+def px4_custom(name: str) -> int:
+    """The ``custom_mode`` of a name."""
+    main, sub = PX4_NUMBERS[name]
+    return main << 16 | sub << 24

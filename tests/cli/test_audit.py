@@ -1,0 +1,75 @@
+"""``skyloop audit``, and the proxies that write what it shows."""
+
+from __future__ import annotations
+
+import json
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import skyloop
+from tests.cli.conftest import FAST_SIM, Run
+from tests.processes.conftest import Process
+
+Start = Callable[..., Process]
+
+
+@pytest.fixture(autouse=True)
+def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+
+
+def flown(start: Start, *arguments: str) -> None:
+    """A proxy is started, flown, and ended."""
+    proxy = start("proxy", FAST_SIM, "--name", "alpha", *arguments)
+    proxy.until("ready")
+    with skyloop.connect("alpha", name="alice", priority=7) as drone:
+        drone.takeoff()
+    proxy.signal(signal.SIGINT)
+    proxy.wait()
+
+
+def test_nobody_has_flown_yet(run: Run) -> None:
+    assert run("audit").out.startswith("Nobody has flown yet")
+    ended = run("audit", "alpha")
+    assert ended.code == 2
+    assert "no named proxy of this user has run yet" in ended.err
+
+
+@pytest.mark.process
+def test_who_flew_when(start: Start, run: Run) -> None:
+    flown(start)
+    for arguments in ((), ("alpha",), ("alpha", "--last", "1")):
+        head, line = run("audit", *arguments).out.splitlines()
+        assert head.split() == ["DRONE", "WHO", "IDENTITY", "PRIORITY", "FROM", "TO", "TAKE-OFFS", "HOW", "IT", "ENDED"]
+        assert line.startswith("alpha  alice  ")
+        assert line.endswith("released")
+    [row] = json.loads(run("audit", "--json").out)
+    assert (row["who"], row["priority"], row["takeoffs"], row["how"]) == ("alice", 7, 1, "released")
+    assert "process" in row["identity"] or "pid" in row["identity"]
+    assert row["begin"] < row["end"]
+    ended = run("audit", "alpah")
+    assert ended.code == 2
+    assert "did you mean 'alpha'" in ended.err
+
+
+@pytest.mark.process
+def test_a_file_of_ones_own(start: Start, run: Run, tmp_path: Path) -> None:
+    path = tmp_path / "mine.jsonl"
+    flown(start, "--audit", str(path))
+    with path.open("a") as file:
+        file.write('{"torn')
+    ended = run("audit", "--file", str(path))
+    assert "alice" in ended.out
+    assert "1 line can't be understood" in ended.err
+    assert run("audit", "bravo", "--file", str(path)).out.startswith("Nobody has flown yet")
+    assert run("audit").out.startswith("Nobody has flown yet")
+
+
+def test_a_file_that_can_not_be_used(run: Run, tmp_path: Path) -> None:
+    assert "can't be read" in run("audit", "--file", str(tmp_path / "none")).err
+    ended = run("proxy", FAST_SIM, "--audit", str(tmp_path))
+    assert ended.code == 2
+    assert "can't be written: Is a directory" in ended.err

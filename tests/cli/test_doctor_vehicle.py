@@ -1,0 +1,38 @@
+"""``skyloop doctor ADDRESS`` on emulated autopilots."""
+
+from __future__ import annotations
+
+import pytest
+
+from skyloop.cli import checkup
+from skyloop.sim.firmware.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
+from skyloop.sim.host import SimHost
+from skyloop.sim.options import SimOptions
+from tests.cli.conftest import Run
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "advice"),
+    [(Kind.ARDUCOPTER, "ArduCopter 4.7.0", "fs_gcs_enable=7"), (Kind.PX4, "PX4 1.17.0", "com_obl_rc_act=5")],
+)
+def test_safety_nets_that_are_off_are_reported(run: Run, kind: Kind, name: str, advice: str) -> None:
+    host = SimHost(with_multirotors(SimOptions(world="empty", speed=3.0)))
+    with MavlinkFirmware(host, kind=kind, ports=Ports.free(kind)) as firmware:
+        ended = run("doctor", firmware.address)
+    assert ended.code == 0, ended.out
+    assert f"✓ autopilot: {name}, system 1" in ended.out
+    assert "– loss of this computer:" in ended.out
+    assert f"→ set the parameter mavlink.{advice}" in ended.out
+
+
+def test_a_vehicle_that_is_not_there(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(checkup, "PATIENCE_S", 0.2)
+    ended = run("doctor", f"mavlink://udpin:127.0.0.1:{Ports.free(Kind.PX4).remote}")
+    assert ended.code == 1
+    assert "✗ vehicle: its link is connecting" in ended.out
+
+
+def test_an_address_that_makes_no_sense(run: Run) -> None:
+    ended = run("doctor", "mavlink://nowhere")
+    assert ended.code == 2
+    assert "udpin" in ended.err

@@ -1,0 +1,119 @@
+"""Behaviours flown by the whole of Skyloop in simulated time, one or two seeds each; the script flies all."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from skyloop.control import FlowHover, FlyThroughGates, GateKind, ImageServo, LandOnMarker, SeeAndAvoid
+from skyloop.control.gate_law import GatePhase
+from skyloop.control.rehearsal import Radio, rehearse
+from skyloop.errors import UnknownNameError, UsageError
+from skyloop.messages import Annotation, Severity
+
+
+@pytest.fixture(scope="module")
+def script() -> ModuleType:
+    """The script that measures."""
+    path = Path(__file__).parents[2] / "scripts" / "behaviours.py"
+    spec = importlib.util.spec_from_file_location("behaviours", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize(
+    ("name", "seed", "gust"),
+    [("gates", 0, 0.0), ("gates", 3, 1.0), ("landing", 0, 0.0), ("landing", 5, 1.0), ("approach", 1, 1.0)],
+)
+def test_does_what_it_should(script: ModuleType, name: str, seed: int, gust: float) -> None:
+    flight = script.GOALS[name].fly(seed, gust)
+    assert flight.good, flight.note
+    assert flight.seconds > 5.0
+
+
+def test_follows_in_gusts(script: ModuleType) -> None:
+    flight = script.follow(2, 1.0, seconds=20.0)
+    assert flight.error_m <= script.FOLLOW_RMS_M
+
+
+@pytest.mark.parametrize("name", ["servo", "orbit", "avoid", "flow"])
+def test_does_what_it_should_in_calm_air(script: ModuleType, name: str) -> None:
+    flight = script.GOALS[name].fly(1, 0.0)
+    assert flight.good, flight.note
+
+
+def test_two_flights_with_the_same_seed_are_the_same(script: ModuleType) -> None:
+    first, second = (script.avoid(4, 0.5) for _ in range(2))
+    assert first == second
+
+
+def test_summary_says_what_was_missed(script: ModuleType) -> None:
+    good, bad = script.Flight(True, 0.1, 10.0), script.Flight(False, math.nan, 90.0, "lost")
+    text = script.summary(script.GOALS["landing"], 0.0, [good] * 17 + [bad] * 3)
+    assert "17 of 20" in text
+    assert text.endswith("missed")
+    assert script.summary(script.GOALS["landing"], 0.0, [good] * 18 + [bad] * 2).endswith("met")
+
+
+def test_a_gate_that_is_not_there_is_searched_and_not_flown_to(script: ModuleType) -> None:
+    nowhere = GateKind("none", (0, 255, 255))
+    with rehearse("sim://?world=gates&cameras=front&fps=15&wind=0") as drone:
+        drone.takeoff()
+        told: list[str] = []
+        drawn: list[Annotation] = []
+        drone.on_event(lambda event: told.append(event.text))
+        drone.on_annotation(drawn.append)
+        pilot = FlyThroughGates(drone, [nowhere])
+        before = script.truth(drone.feedback())
+        pilot.run(seconds=8.0)
+        after = script.truth(drone.feedback())
+        assert pilot.phase is GatePhase.SEARCHING
+        assert pilot.passed == 0
+        assert not pilot.done
+        assert math.dist(after[:2], before[:2]) < 0.3, "it turns on the spot"
+        assert "gates: searching the gate" in told
+        assert drawn
+        assert drawn[-1].source == "gates"
+
+
+def test_pictures_that_stop_make_it_hover_and_say_so() -> None:
+    with rehearse("sim://?world=gates&cameras=front&fps=15&wind=0", radio=Radio(drop=0.0)) as drone:
+        drone.takeoff()
+        told: list[tuple[str, Severity]] = []
+        drone.on_event(lambda event: told.append((event.text, event.severity)))
+        pilot = FlyThroughGates(drone)
+        pilot.run(seconds=2.0)
+        drone.config["camera.front.fps"] = 0.1
+        pilot.run(seconds=4.0)
+        assert pilot.blind
+        assert ("gates: no pictures come: hovering", Severity.WARNING) in told
+        assert drone.feedback().state == "hovering"
+        drone.config["camera.front.fps"] = 15.0
+        pilot.run(seconds=12.0)
+        assert not pilot.blind
+        assert ("gates: pictures come again", Severity.INFO) in told
+
+
+def test_what_makes_no_sense_is_refused() -> None:
+    with rehearse("sim://?world=empty&cameras=front&native=velocity,hover,takeoff,land") as drone:
+        with pytest.raises(UsageError, match="no gate"):
+            FlyThroughGates(drone, [])
+        with pytest.raises(UsageError, match="too grey"):
+            FlyThroughGates(drone, [GateKind("grey", (100, 100, 100))])
+        with pytest.raises(UnknownNameError, match="bottom"):
+            LandOnMarker(drone)
+        with pytest.raises(UsageError, match="distance_m"):
+            SeeAndAvoid(drone, math.nan)
+        with pytest.raises(UsageError, match="distance_m"):
+            ImageServo(drone, 7, distance_m=0.0)
+    with rehearse("sim://?world=empty&cameras=bottom") as drone:
+        with pytest.raises(UsageError, match="does not look forward"):
+            ImageServo(drone, 7, camera="bottom")
+        assert FlowHover(drone).off_m is None

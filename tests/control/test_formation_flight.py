@@ -1,0 +1,200 @@
+"""Formations flown by vehicles that move as they are told, over real proxies in this process."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from skyloop.client import Drone, Swarm
+from skyloop.control.formation import line, placed
+from skyloop.control.formation_flight import Formation, station
+from skyloop.control.waypoint import WaypointSettings
+from skyloop.drivers.base import Sink
+from skyloop.errors import NoAnswerError, SwarmError, UnknownNameError, UsageError
+from skyloop.messages import AnyAction, Feedback, FlightState, LinkState, Vector, Velocity
+from skyloop.proxy.proxy import Proxy
+from skyloop.transport.memory import MemoryServer
+from tests.integration.fake_vehicle import FakeVehicle
+
+NAMES = ("a", "b", "c")
+PERIOD_S = 0.01
+BRISK = WaypointSettings(gain=3.0, speed_m_s=2.0, climb_m_s=2.0, slow_down_m_s2=4.0)
+
+
+class Mover(FakeVehicle):
+    """Takes on each velocity at once, and tells where it is."""
+
+    def __init__(self, position: Vector, yaw: float = 0.0) -> None:
+        super().__init__()
+        self.at = np.array(position)
+        self.yaw = yaw
+        self.tells = True
+        self.stuck = False
+        self.velocity = Velocity()
+        self._over = threading.Event()
+
+    def _apply(self, action: AnyAction) -> AnyAction:
+        self.velocity = action if isinstance(action, Velocity) else Velocity()
+        return super()._apply(action)
+
+    def _open(self, sink: Sink) -> None:
+        self._over.clear()
+        sink.link(LinkState.UP)
+        self._mover = threading.Thread(target=self._move, args=(sink,), daemon=True)
+        self._mover.start()
+
+    def _close(self) -> None:
+        self._over.set()
+        self._mover.join()
+
+    def _move(self, sink: Sink) -> None:
+        before = time.monotonic()
+        while not self._over.wait(PERIOD_S):
+            now = time.monotonic()
+            v, passed, before = Velocity() if self.stuck else self.velocity, now - before, now
+            c, s = math.cos(self.yaw), math.sin(self.yaw)
+            self.at = self.at + passed * np.array((c * v.forward - s * v.left, s * v.forward + c * v.left, v.up))
+            self.yaw += passed * v.yaw_rate
+            x, y, z = (float(value) for value in self.at)
+            sample = Feedback(
+                captured_ns=time.monotonic_ns(),
+                state=self.state,
+                yaw=self.yaw,
+                altitude=z,
+                velocity=(v.forward, v.left, v.up),
+                position=(x, y, z) if self.tells else None,
+            )
+            sink.feedback(sample)
+
+
+@contextmanager
+def flying(movers: dict[str, Mover], *, on_error: str = "raise") -> Iterator[Swarm]:
+    servers = {name: MemoryServer(name) for name in movers}
+    proxies = [Proxy(mover, servers[name], name=name) for name, mover in movers.items()]
+    for proxy in proxies:
+        proxy.start()
+    drones = Swarm(
+        {name: Drone(servers[name].dial, app="test").open() for name in movers},
+        on_error=on_error,  # type: ignore[arg-type]
+    )
+    try:
+        drones.takeoff()
+        yield drones
+    finally:
+        drones.close()
+        for proxy in proxies:
+            proxy.stop()
+
+
+def row(spacing: float = 1.0) -> dict[str, Mover]:
+    """Three in a row along x, each with another heading."""
+    return {name: Mover((spacing * k, 0.0, 1.0), yaw=0.7 * k) for k, name in enumerate(NAMES)}
+
+
+def test_all_fly_to_their_places_and_arrive_together() -> None:
+    movers = row()
+    slots = placed(line(3, 1.0), at=(1.0, 1.5, 1.2))  # side by side along y
+    with flying(movers) as drones:
+        report = Formation(drones, settings=BRISK).fly_to(slots, speed_m_s=2.0, yaw=1.0)
+        assert set(report.slots) == set(NAMES)
+        assert {tuple(round(value, 6) for value in slot) for slot in report.slots.values()} == {
+            tuple(round(float(value), 6) for value in slot) for slot in slots
+        }
+        assert all(error < 0.5 for error in report.errors_m.values())
+        assert report.closest_m > 0.69
+        assert report.spread_s is not None
+        assert all(abs(mover.yaw - 1.0) < 0.2 for mover in movers.values())
+        drones.wait_all("hovering", 5.0)
+
+
+def test_ways_that_cross_too_near_are_refused_before_anybody_moves() -> None:
+    with flying(row(0.8)) as drones:
+        crowded = [(0.0, 1.0, 1.0), (0.3, 1.0, 1.0), (0.6, 1.0, 1.0)]
+        with pytest.raises(UsageError, match=r"a and b would come within 0\.30 m of each other"):
+            Formation(drones).fly_to(crowded)
+        with pytest.raises(UsageError, match="only 2 places"):
+            Formation(drones).fly_to(crowded[:2])
+        with pytest.raises(UsageError, match="speed_m_s is 0"):
+            Formation(drones).fly_to(crowded, speed_m_s=0)
+        with pytest.raises(UsageError, match="apart_m is -1"):
+            Formation(drones, apart_m=-1)
+        assert drones.spread is None or drones.feedback()["a"].state is FlightState.HOVERING
+
+
+def test_drones_that_do_not_know_where_they_are_or_stand_on_the_ground() -> None:
+    movers = row()
+    movers["b"].tells = False
+    with flying(movers) as drones:
+        drones["c"].land()
+        with pytest.raises(
+            UsageError, match="b: the vehicle does not tell its position; c: it is landed, take off first"
+        ):
+            Formation(drones).hold(1.0)
+
+
+def test_one_that_does_not_arrive_has_failed_and_the_others_are_there() -> None:
+    movers = row()
+    movers["b"].stuck = True
+    with flying(movers, on_error="continue") as drones:
+        report = Formation(drones, settings=BRISK).fly_to(
+            [(x, 2.0, 1.0) for x in (0.0, 1.0, 2.0)], speed_m_s=4.0, timeout_s=4.0
+        )
+        assert report.errors_m["b"] == pytest.approx(2.0, abs=0.1)
+        assert report.errors_m["a"] < 0.5
+        assert list(drones.active) == ["a", "c"]
+        assert isinstance(drones.errors["b"], NoAnswerError)
+        assert "2.00 m from its place" in str(drones.errors["b"])
+
+
+def test_holding_the_place() -> None:
+    movers = row()
+    with flying(movers) as drones:
+        report = Formation(drones).hold(0.3)
+        assert set(report.errors_m) == set(NAMES)
+        assert max(report.errors_m.values()) < 0.1
+        assert report.closest_m == pytest.approx(1.0, abs=0.1)
+
+
+def test_followers_keep_their_places_beside_a_leader_that_moves_and_turns() -> None:
+    movers = row()
+    offsets = {"b": (-1.0, 1.0, 0.0), "c": (-1.0, -1.0, 0.3)}
+    with flying(movers) as drones:
+        formation = Formation(drones, settings=BRISK)
+        report = formation.follow("a", offsets, 3.0, lead=lambda tick: Velocity(forward=0.5, yaw_rate=0.2))
+        assert set(report.errors_m) == {"b", "c"}
+        assert max(report.errors_m.values()) < 0.5
+        assert movers["a"].at[0] > 0.5
+        drones.wait_all("hovering", 5.0)
+        with pytest.raises(UnknownNameError, match="drone in this swarm"):
+            formation.follow("a", {"z": (0, 0, 0)}, 1.0)
+        with pytest.raises(UsageError, match="can't follow itself"):
+            formation.follow("a", {"a": (0, 0, 0)}, 1.0)
+
+
+def test_a_leader_that_fails_lets_the_followers_hover() -> None:
+    movers = row()
+    with flying(movers, on_error="continue") as drones:
+        drones["a"].close()
+        report = Formation(drones).follow("a", {"b": (-1.0, 0.0, 0.0)}, 30.0)
+        assert report.errors_m == {}
+        assert set(drones.wait_all("hovering", 5.0)) == {"b", "c"}
+    with flying(row()) as drones:
+        drones["a"].close()
+        with pytest.raises(SwarmError, match="a: ClosedError"):
+            Formation(drones).follow("a", {"b": (-1.0, 0.0, 0.0)}, 30.0)
+
+
+def test_the_place_beside_a_leader() -> None:
+    leader = Feedback(captured_ns=0, position=(1.0, 2.0, 3.0), yaw=math.pi / 2)
+    assert np.allclose(station(leader, (1.0, 0.5, 0.2)), (0.5, 3.0, 3.2))
+    assert np.allclose(station(leader, (1.0, 0.5, 0.2), turn=False), (2.0, 2.5, 3.2))
+    with pytest.raises(UsageError, match="does not tell its position"):
+        station(Feedback(captured_ns=0), (1.0, 0.0, 0.0))
+    with pytest.raises(UsageError, match=r"shape \(n, 3\)"):
+        station(leader, (1.0, 0.0))

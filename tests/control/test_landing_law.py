@@ -1,0 +1,142 @@
+"""The landing's law in a kinematic world with a platform, and what it does when it sees nothing."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skyloop.clock import NS_PER_S, nanoseconds
+from skyloop.control.landing_law import LandingLaw, LandingPhase
+from skyloop.control.spiral import SpiralSearch
+from skyloop.errors import UsageError
+from skyloop.messages import Feedback, Velocity
+
+DT = 1 / 15
+TOP_M = 0.2
+
+
+class World:
+    """A vehicle that flies exactly what it is asked for, over a platform that goes straight on."""
+
+    def __init__(self, position: tuple[float, float, float], speed: float = 0.3) -> None:
+        self.position, self.velocity = np.array(position), Velocity()
+        self.platform, self.speed = np.array([0.0, 0.0, TOP_M]), np.array([speed, 0.0, 0.0])
+        self.now_ns = NS_PER_S
+        self.law = LandingLaw()
+
+    def step(self, *, visible: bool = True) -> None:
+        v = self.velocity
+        self.position = self.position + DT * np.array([v.forward, v.left, v.up])
+        self.platform = self.platform + DT * self.speed
+        self.now_ns += nanoseconds(DT)
+        state = self.state()
+        self.law.feedback(state)
+        seen = self.platform - self.position
+        depth = -seen[2] - 0.03
+        if visible and depth > 0.0 and abs(seen[0]) + 0.15 < 0.375 * depth and abs(seen[1]) + 0.15 < 0.5 * depth:
+            self.law.see(seen, state, self.now_ns)
+        self.velocity = self.law.step(self.now_ns)
+
+    def phase(self) -> LandingPhase:
+        return self.law.phase
+
+    def state(self) -> Feedback:
+        v = self.velocity
+        return Feedback(
+            captured_ns=self.now_ns,
+            roll=0.0,
+            pitch=0.0,
+            yaw=0.0,
+            altitude=float(self.position[2]) - 0.06,
+            velocity=(v.forward, v.left, v.up),
+            angular_velocity=(0.0, 0.0, v.yaw_rate),
+        )
+
+    @property
+    def off(self) -> float:
+        return math.hypot(*(self.platform - self.position)[:2])
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.3, -0.5])
+def test_comes_down_on_what_moves(speed: float) -> None:
+    world = World((0.3, -0.2, 2.0), speed)
+    phases = []
+    for _ in range(600):
+        world.step()
+        phases.append(world.phase())
+        if world.phase() is LandingPhase.DOWN:
+            break
+    assert phases[-1] is LandingPhase.DOWN
+    assert LandingPhase.COMMITTED in phases
+    assert world.off < 0.08
+    assert world.position[2] - 0.06 - TOP_M < 0.1
+    assert world.law.step(world.now_ns) == Velocity(), "what is down stays down"
+    assert world.law.target_speed_m_s == pytest.approx(abs(speed), abs=0.08)
+
+
+def test_loses_it_high_up_and_climbs_then_searches() -> None:
+    world = World((0.0, 0.0, 2.0))
+    for _ in range(30):
+        world.step()
+    assert world.phase() is LandingPhase.DESCENDING
+    for _ in range(12):
+        world.step(visible=False)
+    assert world.phase() is LandingPhase.RECOVERING
+    assert world.velocity.up > 0.0
+    for _ in range(60):
+        world.step(visible=False)
+    assert world.phase() is LandingPhase.SEARCHING
+    assert world.law.height_m is None
+
+
+def test_what_turns_just_above_is_waited_for() -> None:
+    world = World((0.0, 0.0, 1.4))
+    for tick in range(200):
+        world.speed = 0.4 * np.array([math.cos(tick * DT * 1.5), math.sin(tick * DT * 1.5), 0.0])
+        world.step()
+    assert world.phase() is not LandingPhase.DOWN
+    world.speed = np.zeros(3)
+    for _ in range(600):
+        world.step()
+    assert world.phase() is LandingPhase.DOWN
+
+
+def test_nothing_is_asked_for_before_the_vehicle_was_heard() -> None:
+    assert LandingLaw().step(NS_PER_S) == Velocity()
+    assert LandingLaw().target_speed_m_s is None
+
+
+@given(st.lists(st.tuples(*[st.floats(-20, 20)] * 3), min_size=1, max_size=20))
+def test_whatever_is_seen_the_answer_is_finite_and_within_limits(sights: list[tuple[float, float, float]]) -> None:
+    world = World((0.0, 0.0, 1.0))
+    for sight in sights:
+        state = world.state()
+        world.law.feedback(state)
+        world.law.see(np.array(sight), state, world.now_ns)
+        asked = world.law.step(world.now_ns)
+        assert asked.finite
+        assert math.hypot(asked.forward, asked.left) <= world.law.settings.speed_m_s + 1e-9
+        world.now_ns += nanoseconds(DT)
+
+
+def test_spiral_comes_near_every_place_and_begins_anew() -> None:
+    search, place = SpiralSearch(lane_m=1.0, speed_m_s=0.7, largest_m=4.0), np.zeros(2)
+    way = [place]
+    for _ in range(3000):
+        place = place + 0.05 * search.step(place)
+        way.append(place)
+    places = np.array(way)
+    for x in np.arange(-1.4, 1.5, 0.4):
+        for y in np.arange(-1.4, 1.5, 0.4):
+            assert np.linalg.norm(places - (x, y), axis=1).min() < 0.75
+    assert np.abs(places).max() < 3.1
+    assert np.linalg.norm(places[1500:], axis=1).min() < 0.25, "it came back"
+
+
+def test_a_spiral_needs_numbers_above_0() -> None:
+    with pytest.raises(UsageError, match="lane_m"):
+        SpiralSearch(lane_m=0.0)

@@ -1,0 +1,40 @@
+"""The tables of docs/mavlink.md are those of the code."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from skyloop.drivers.mavlink import options
+from skyloop.drivers.mavlink.metadata import COMMON
+from skyloop.drivers.mavlink.session import DEGRADED_NS, FIRST_WORD_NS, LOST_NS, PARAMETERS_NS
+from tests.docs.pages import rows, section
+
+PAGE = "docs/mavlink.md"
+
+
+def names(cell: str) -> list[str]:
+    return re.findall(r"`([^`]+)`", cell)
+
+
+def test_the_options_of_addresses() -> None:
+    told = [name for row in rows(section(PAGE, "### `mavlink://`")) for name in names(row[0])]
+    assert sorted(name for name in told if ":" not in name) == sorted(options._KNOWN)
+    ways = {name.removeprefix("mavlink://").partition(":")[0] for name in told if ":" in name}
+    assert ways == {way.value for way in options.Way}
+
+
+def test_the_names_that_all_drivers_share() -> None:
+    told = {
+        (names(row[0])[0], native)
+        for row in rows(section(PAGE, "### Parameters"))
+        for native in names(row[1] + row[2])
+        if native != "FENCE_ENABLE"
+    }
+    assert told == {(common.name, common.native) for common in COMMON}
+
+
+@pytest.mark.parametrize("ns", [DEGRADED_NS, LOST_NS, FIRST_WORD_NS, PARAMETERS_NS])
+def test_the_times_of_the_link(ns: int) -> None:
+    assert f"{ns / 1e9:g} s" in section(PAGE, "### Link and events")

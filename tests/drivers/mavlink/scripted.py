@@ -1,0 +1,158 @@
+"""A session on a clock that the tests move, and a vehicle that says what they want."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from skyloop.clock import ManualClock, nanoseconds
+from skyloop.drivers.mavlink.connections import Peer
+from skyloop.drivers.mavlink.options import MavlinkOptions, options_of
+from skyloop.drivers.mavlink.session import TICK_NS, Session
+from skyloop.drivers.recording_sink import RecordingSink
+from skyloop.drivers.uri import parse_uri
+from skyloop.messages import AnyAction, Feedback, FlightState, LinkState
+from skyloop.wire.mavlink.codec import Codec, Message
+from skyloop.wire.mavlink.codec import dialect as m
+from skyloop.wire.mavlink.modes import COPTER_NUMBERS, Landed, px4_custom
+
+PEER: Peer = ("127.0.0.1", 14580)
+PX4 = 12
+ARDUPILOT = 3
+
+
+def options(text: str = "mavlink://udpin:127.0.0.1:14540?parameters=no") -> MavlinkOptions:
+    return options_of(parse_uri(text))
+
+
+class Vehicle:
+    """What an autopilot would say. ``autopilot``: :data:`PX4` or :data:`ARDUPILOT`."""
+
+    def __init__(self, autopilot: int, system: int = 1, *, version: int = 2) -> None:
+        self.autopilot = autopilot
+        self.codec = Codec(system, 1)
+        self.version = version
+        self.mode = "STABILIZE" if autopilot == ARDUPILOT else "AUTO.LOITER"
+        self.armed = False
+        self.status = 3
+        self.kind = 2
+        self.landed = Landed.ON_GROUND
+        self.ready = True
+        self.boot_ms = 10_000
+        self.place = (0.0, 0.0, 0.0)
+        self.velocity = (0.0, 0.0, 0.0)
+        self.yaw = 0.0
+        self.amsl_m = 488.0
+
+    def heartbeat(self) -> Message:
+        custom = COPTER_NUMBERS[self.mode] if self.autopilot == ARDUPILOT else px4_custom(self.mode)
+        return m.MAVLink_heartbeat_message(self.kind, self.autopilot, 1 | self.armed << 7, custom, self.status, 3)
+
+    def telemetry(self) -> list[Message]:
+        """Everything that flows."""
+        sensors = 0x10000000
+        altitude = -self.place[2]
+        return [
+            m.MAVLink_local_position_ned_message(self.boot_ms, *self.place, *self.velocity),
+            m.MAVLink_global_position_int_message(
+                self.boot_ms, 0, 0, round((self.amsl_m + altitude) * 1000), round(altitude * 1000), 0, 0, 0, 0
+            ),
+            m.MAVLink_extended_sys_state_message(0, int(self.landed)),
+            m.MAVLink_sys_status_message(sensors, sensors, sensors * self.ready, 0, 12_000, 0, 80, 0, 0, 0, 0, 0, 0),
+            m.MAVLink_ekf_status_report_message(0x1F, 0, 0, 0, 0, 0),
+            m.MAVLink_attitude_message(self.boot_ms, 0.1, 0.2, self.yaw, 0.0, 0.0, 0.0),
+        ]
+
+
+class Bench:
+    """A session, its vehicle, and what went between them."""
+
+    def __init__(self, vehicle: Vehicle, given: MavlinkOptions | None = None) -> None:
+        self.vehicle = vehicle
+        self.clock = ManualClock()
+        self.session = Session(given or options(), self.clock())
+        self.sink = RecordingSink()
+        self.said: list[Message] = []
+        self.frames: list[bytes] = []
+        self._ears = Codec(1, 1)
+        self.deliver()
+
+    def hear(self, *messages: Message, peer: Peer = PEER, codec: Codec | None = None) -> None:
+        for message in messages:
+            frame = (codec or self.vehicle.codec).encode(message, version=self.vehicle.version)
+            self.session.heard(frame, peer, self.clock(), whole=True)
+        self.deliver()
+
+    def deliver(self) -> None:
+        for telling in self.session.tellings():
+            telling(self.sink)
+
+    def tick(self) -> None:
+        for frame, _ in self.session.tick(self.clock()):
+            self.frames.append(frame)
+            self.said += self._ears.decode(frame, whole=True)
+        self.deliver()
+
+    def go_on(self, seconds: float, *, silent: bool = False) -> None:
+        """Time passes; the vehicle tells everything at 50 Hz, its heartbeat at 5 Hz."""
+        for step in range(round(nanoseconds(seconds) / TICK_NS)):
+            self.clock.advance(TICK_NS / 1e9)
+            self.vehicle.boot_ms += 20
+            if not silent:
+                if step % 10 == 0:
+                    self.hear(self.vehicle.heartbeat())
+                self.hear(*self.vehicle.telemetry())
+            self.tick()
+
+    def found(self) -> Bench:
+        """Up and running, with all of its messages flowing."""
+        self.hear(self.vehicle.heartbeat())
+        self.go_on(0.5)
+        self.said.clear()
+        return self
+
+    def flying(self, mode: str, height_m: float = 3.0) -> Bench:
+        """Somebody took off with it before."""
+        vehicle = self.vehicle
+        vehicle.mode, vehicle.armed, vehicle.status, vehicle.landed = mode, True, 4, Landed.IN_AIR
+        vehicle.place = (0.0, 0.0, -height_m)
+        return self.found()
+
+    def apply(self, action: AnyAction, *, alone: bool = False) -> AnyAction:
+        applied = self.session.command(action, self.clock(), alone=alone)
+        self.tick()
+        return applied
+
+    def heard_of(self, kind: str) -> list[Message]:
+        """What the vehicle was told, of this kind, since the last look."""
+        found = [message for message in self.said if message.get_type() == kind]
+        self.said = [message for message in self.said if message.get_type() != kind]
+        return found
+
+    def commands(self) -> list[tuple[Any, ...]]:
+        """Number and arguments, without the requests for messages."""
+        asked = (m.MAV_CMD_SET_MESSAGE_INTERVAL, m.MAV_CMD_REQUEST_MESSAGE)
+        return [
+            (each.command, *(each.param1, each.param2, each.param3, each.param7))
+            for each in self.heard_of("COMMAND_LONG")
+            if each.command not in asked
+        ]
+
+    def answer(self, command: int, result: int = 0) -> None:
+        self.hear(m.MAVLink_command_ack_message(command, result, 0, 0, 255, 190))
+
+    @property
+    def newest(self) -> Feedback:
+        assert self.sink.newest is not None
+        return self.sink.newest
+
+    def state(self) -> FlightState:
+        """As told last."""
+        return self.newest.state
+
+    def link(self) -> LinkState | None:
+        """As told last."""
+        return self.sink.link_state
+
+    @property
+    def texts(self) -> list[str]:
+        return [event.text for event in self.sink.events]

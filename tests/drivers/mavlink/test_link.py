@@ -1,0 +1,278 @@
+"""The driver over every way to a vehicle, against emulated autopilots."""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from skyloop.drivers.base import Driver
+from skyloop.drivers.mavlink import MavlinkDriver
+from skyloop.drivers.recording_sink import RecordingSink
+from skyloop.drivers.seams import ExternalPose
+from skyloop.drivers.uri import parse_uri
+from skyloop.errors import DriverError, UnsupportedError, UsageError
+from skyloop.messages import FlightState, Land, LinkState, Takeoff, Velocity
+from skyloop.sim.firmware.mavlink import Faults, Kind, MavlinkFirmware, Ports, with_multirotors
+from skyloop.sim.host import SimHost
+from skyloop.sim.options import SimOptions
+from skyloop.transport.testing import wait_until
+from skyloop.wire.mavlink.codec import Codec
+from skyloop.wire.mavlink.codec import dialect as m
+
+PATIENCE_S = 15.0
+
+
+def world(drones: int = 1, speed: float = 3.0) -> SimHost:
+    return SimHost(with_multirotors(SimOptions(world="empty", seed=4, wind=0.0, speed=speed)), drones)
+
+
+def firmware(host: SimHost | None = None, kind: Kind = Kind.PX4, **options: object) -> MavlinkFirmware:
+    settings = {"kind": kind, "ports": Ports.free(kind), "boot_s": 0.5, **options}
+    return MavlinkFirmware(host or world(), **settings)  # type: ignore[arg-type]
+
+
+@contextmanager
+def opened(address: str) -> Iterator[tuple[Driver, RecordingSink]]:
+    driver, sink = MavlinkDriver(parse_uri(address)), RecordingSink(watch=set())
+    driver.open(sink)
+    try:
+        yield driver, sink
+    finally:
+        driver.close()
+    assert not sink.problems
+
+
+def up(sink: RecordingSink) -> None:
+    assert sink.wait(lambda: sink.link_state is LinkState.UP, PATIENCE_S), sink.links
+
+
+def test_udp_that_speaks_first() -> None:
+    with firmware() as it, opened(f"mavlink://udpout:127.0.0.1:{it.settings.ports.udp}") as (_, sink):
+        up(sink)
+
+
+def test_tcp_is_up_when_a_heartbeat_comes_and_not_when_it_is_connected() -> None:
+    with firmware(kind=Kind.ARDUCOPTER) as it:
+        assert it.settings.ports.tcp is not None
+        with socket.create_connection(("127.0.0.1", it.settings.ports.tcp)) as first:
+            first.recv(16)  # it has the autopilot for itself
+            with opened(it.tcp_address) as (_, sink):
+                assert sink.wait(lambda: sink.link_state is LinkState.LOST, PATIENCE_S), sink.links
+                first.close()
+                up(sink)
+                assert sink.wait(lambda: sink.newest is not None and sink.newest.roll is not None, PATIENCE_S)
+
+
+def test_tcp_is_connected_again_after_the_vehicle_was_away() -> None:
+    it = firmware(kind=Kind.ARDUCOPTER)
+    with it, opened(it.tcp_address) as (_, sink):
+        up(sink)
+        it.stop()
+        assert sink.wait(lambda: sink.link_state is LinkState.LOST, PATIENCE_S)
+        it.start()
+        up(sink)
+
+
+def test_a_serial_port() -> None:
+    """A pseudo-terminal, whose other end is carried to an autopilot's TCP port."""
+    pytest.importorskip("serial")
+    master, slave = os.openpty()
+    with firmware(kind=Kind.ARDUCOPTER) as it:
+        assert it.settings.ports.tcp is not None
+        with socket.create_connection(("127.0.0.1", it.settings.ports.tcp)) as far:
+            ends = [_carry(lambda: os.read(master, 4096), far.sendall), _carry(lambda: far.recv(4096), _into(master))]
+            with opened(f"mavlink://serial:{os.ttyname(slave)}:921600") as (_, sink):
+                up(sink)
+            far.shutdown(socket.SHUT_RDWR)
+            os.write(slave, b"\0")
+            os.close(slave)
+            for end in ends:
+                end.join(5.0)
+    os.close(master)
+
+
+def _into(descriptor: int) -> Callable[[bytes], object]:
+    return lambda data: os.write(descriptor, data)
+
+
+def _carry(read: Callable[[], bytes], write: Callable[[bytes], object]) -> threading.Thread:
+    def run() -> None:
+        try:
+            while data := read():
+                write(data)
+        except OSError:
+            return
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    return thread
+
+
+@pytest.mark.parametrize("way", ["udpin:127.0.0.1:1", "tcp:127.0.0.1:1", "serial:/dev/nothing-of-the-kind:57600"])
+def test_what_can_not_be_reached_is_told_with_the_reason(way: str) -> None:
+    with opened(f"mavlink://{way}") as (driver, sink):
+        assert sink.wait(lambda: sink.link_state is LinkState.LOST, PATIENCE_S)
+        if not way.startswith("udpin") or os.geteuid() != 0:  # root may listen anywhere
+            assert "(" in sink.links[-1][1]
+        with pytest.raises(DriverError, match="not heard"):
+            driver.apply(Takeoff())
+
+
+def test_two_vehicles_on_one_port_are_told_apart() -> None:
+    host = world(2)
+    remote = Ports.free(Kind.PX4).remote
+    ports = [Ports(Ports.free(Kind.PX4).udp, remote) for _ in range(2)]
+    with (
+        firmware(host, drone=0, ports=ports[0]),
+        firmware(host, drone=1, ports=ports[1]),
+        opened(f"mavlink://udpin:127.0.0.1:{remote}?sysid=2") as (driver, sink),
+    ):
+        up(sink)
+        fly(driver, sink)
+        assert host.simulation.truth(0).state is FlightState.LANDED
+        assert any("another vehicle" in event.text for event in sink.events)
+
+
+def test_two_vehicles_with_one_id_are_told_apart_by_their_addresses() -> None:
+    host = world(2)
+    remote = Ports.free(Kind.PX4).remote
+    ports = [Ports(Ports.free(Kind.PX4).udp, remote) for _ in range(2)]
+    with (
+        firmware(host, drone=0, ports=ports[0], system=1),
+        firmware(host, drone=1, ports=ports[1], system=1),
+        opened(f"mavlink://udpin:127.0.0.1:{remote}?peer=127.0.0.1:{ports[1].udp}") as (driver, sink),
+    ):
+        up(sink)
+        fly(driver, sink)
+        assert host.simulation.truth(0).state is FlightState.LANDED
+
+
+def fly(driver: Driver, sink: RecordingSink) -> None:
+    """Up and down again."""
+
+    def state() -> FlightState | None:
+        return sink.newest.state if sink.newest is not None else None
+
+    assert sink.wait(lambda: ready(sink), PATIENCE_S)
+    driver.apply(Takeoff())
+    assert sink.wait(lambda: state() is FlightState.HOVERING, PATIENCE_S), (sink.newest, list(sink.events))
+    driver.apply(Land())
+    assert sink.wait(lambda: state() is FlightState.LANDED, PATIENCE_S), sink.newest
+
+
+def test_a_second_program_that_takes_the_vehicle_keeps_it() -> None:
+    """On a link of its own: it lands what the driver flies, and the driver lets it."""
+    with firmware(world(speed=1.0), kind=Kind.ARDUCOPTER) as it, opened(it.tcp_address) as (driver, sink):
+        up(sink)
+        wait_until(lambda: ready(sink), "it may be armed")
+        driver.apply(Takeoff())
+        assert sink.wait(lambda: sink.newest is not None and sink.newest.state is FlightState.HOVERING, PATIENCE_S)
+        driver.apply(Velocity(forward=0.3))
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+            lands = m.MAVLink_command_long_message(1, 1, m.MAV_CMD_DO_SET_MODE, 0, 1, 9, 0, 0, 0, 0, 0)
+            other.sendto(Codec(250, 190).encode(lands), ("127.0.0.1", it.settings.ports.udp))
+        assert sink.wait(lambda: any("went to LAND" in event.text for event in sink.events), PATIENCE_S)
+        with pytest.raises(DriverError, match="not chosen here"):
+            driver.apply(Velocity(forward=0.3))
+        assert sink.wait(lambda: sink.newest is not None and sink.newest.state is FlightState.LANDED, PATIENCE_S)
+
+
+def ready(sink: RecordingSink) -> bool:
+    return bool(((sink.newest and sink.newest.native) or {}).get("mavlink.ready"))
+
+
+@pytest.mark.parametrize("kind", list(Kind))
+def test_the_old_version_flies(kind: Kind) -> None:
+    with firmware(kind=kind, version=1) as it, opened(it.address) as (driver, sink):
+        up(sink)
+        fly(driver, sink)
+
+
+def test_signed_messages_fly_with_the_key(tmp_path: Path) -> None:
+    key = tmp_path / "key"
+    key.write_bytes(bytes(range(32)))
+    with firmware(key=bytes(range(32))) as it, opened(f"{it.address}?signing_key={key}") as (driver, sink):
+        up(sink)
+        fly(driver, sink)
+
+
+@pytest.mark.parametrize("kind", list(Kind))
+def test_it_flies_with_a_tenth_of_all_datagrams_lost(kind: Kind) -> None:
+    faults = Faults(seed=5, drop=0.1, duplicate=0.02, reorder=0.02, corrupt=0.02)
+    with firmware(kind=kind, faults=faults) as it, opened(it.address) as (driver, sink):
+        up(sink)
+        assert len(driver.parameters()) > 20
+        fly(driver, sink)
+
+
+@pytest.mark.parametrize("kind", list(Kind))
+@pytest.mark.parametrize("pose", ["odometry", "vision_position_estimate"])
+def test_poses_from_outside_make_it_fly_without_gps(kind: Kind, pose: str) -> None:
+    with (
+        firmware(kind=kind, gps=False) as it,
+        opened(f"{it.address}?pose={pose}&origin=47.4,8.5,488") as (driver, sink),
+    ):
+        up(sink)
+        stop = threading.Event()
+
+        def capture() -> None:
+            while not stop.wait(0.02):
+                captured_ns = sink.newest.captured_ns if sink.newest is not None else 0
+                driver.external_pose(ExternalPose((0.0, 0.0, 0.1), (1.0, 0.0, 0.0, 0.0), captured_ns, 0.001, 0.01))
+
+        thread = threading.Thread(target=capture)
+        thread.start()
+        try:
+            fly(driver, sink)
+        finally:
+            stop.set()
+            thread.join()
+        assert it.autopilot.poses > 20
+
+
+def test_poses_are_checked() -> None:
+    with pytest.raises(UsageError, match="length 1"):
+        ExternalPose((0.0, 0.0, 0.0), (2.0, 0.0, 0.0, 0.0), 0)
+    with pytest.raises(UsageError, match="finite"):
+        ExternalPose((float("nan"), 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0)
+    nobody = f"mavlink://udpin:127.0.0.1:{Ports.free(Kind.PX4).remote}"
+    with opened(nobody) as (driver, _), pytest.raises(DriverError, match="not heard"):
+        driver.external_pose(ExternalPose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0))
+
+
+def test_a_vehicle_that_takes_no_poses_says_so() -> None:
+    from skyloop.drivers.registry import make_driver
+
+    with pytest.raises(UnsupportedError, match="sim://"):
+        make_driver("sim://?cameras=none").external_pose(ExternalPose((0.0,) * 3, (1.0, 0.0, 0.0, 0.0), 0))
+
+
+def test_a_camera_beside_the_autopilot_shows_its_newest_picture() -> None:
+    pytest.importorskip("av")
+    port = Ports.free(Kind.PX4).remote
+    host = SimHost(with_multirotors(SimOptions(world="room", seed=4, wind=0.0)))
+    with firmware(host, video=("127.0.0.1", port)) as it:
+        driver, sink = MavlinkDriver(parse_uri(f"{it.address}?camera=udp://127.0.0.1:{port}")), RecordingSink()
+        driver.open(sink)
+        try:
+            assert sink.wait(lambda: sink.frame_counts["front"] >= 5, 20.0), list(sink.events)
+            frame = sink.frames[-1]
+            assert (frame.width, frame.height) == (320, 240)
+            assert float(np.std(frame.pixels)) > 10.0
+            assert frame.arrived_ns - frame.captured_ns < 1e9
+        finally:
+            driver.close()
+
+
+def test_a_camera_that_is_not_there_is_told_and_does_not_disturb() -> None:
+    pytest.importorskip("av")
+    with firmware() as it, opened(f"{it.address}?camera=/dev/video-of-nobody") as (_, sink):
+        up(sink)
+        wait_until(lambda: any("there is no device" in event.text for event in sink.events), "the camera is missed")

@@ -1,0 +1,78 @@
+"""Addresses of MAVLink vehicles."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from skyloop.drivers.mavlink import MavlinkDriver
+from skyloop.drivers.mavlink.options import MavlinkOptions, Way, options_of
+from skyloop.drivers.uri import parse_uri
+from skyloop.errors import UsageError
+
+
+def understood(text: str) -> MavlinkOptions:
+    return options_of(parse_uri(text))
+
+
+@pytest.mark.parametrize(
+    ("text", "way", "place", "number"),
+    [
+        ("mavlink://udpin:127.0.0.1:14540", Way.UDP_IN, "127.0.0.1", 14540),
+        ("mavlink://udpout:drone.local:14580", Way.UDP_OUT, "drone.local", 14580),
+        ("mavlink://tcp:192.168.4.1:5760", Way.TCP, "192.168.4.1", 5760),
+        ("mavlink://serial:/dev/ttyACM0:921600", Way.SERIAL, "/dev/ttyACM0", 921600),
+        ("mavlink://serial:/dev/ttyACM0", Way.SERIAL, "/dev/ttyACM0", 57600),
+    ],
+)
+def test_ways(text: str, way: Way, place: str, number: int) -> None:
+    address = understood(text).address
+    assert (address.way, address.place, address.number) == (way, place, number)
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("mavlink://", "none of udpin, udpout, tcp, serial"),
+        ("mavlink://127.0.0.1:14540", "none of udpin"),
+        ("mavlink://udpin:127.0.0.1", "names no place"),
+        ("mavlink://tcp:127.0.0.1:99999", "names no place"),
+        ("mavlink://serial:", "names no place"),
+        ("mavlink://udpin:0.0.0.0:14550?sysid=0", "sysid"),
+        ("mavlink://udpin:0.0.0.0:14550?sysid=255", "must differ"),
+        ("mavlink://udpin:0.0.0.0:14550?peer=here", "peer=127.0.0.1:14580"),
+        ("mavlink://udpin:0.0.0.0:14550?speed=1", "speed"),
+        ("mavlink://udpin:0.0.0.0:14550?origin=91,0,0", "origin"),
+        ("mavlink://udpin:0.0.0.0:14550?pose=mocap", "odometry"),
+        ("mavlink://udpin:0.0.0.0:14550?signing_key=/nowhere", "can't be read"),
+        ("mavlink://udpin:0.0.0.0:14550?camera_fps=30", "say camera="),
+        ("mavlink://udpin:0.0.0.0:14550?camera=", "camera is empty"),
+        ("mavlink://udpin:0.0.0.0:14550?camera=picture.jpg", "must be one of rtsp"),
+        ("mavlink://udpin:0.0.0.0:14550?camera=/dev/video0&camera_facing=up", "camera_facing"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_with_what_would(text: str, what: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        MavlinkDriver(parse_uri(text))
+    assert what in str(caught.value)
+
+
+@pytest.mark.parametrize("held", [bytes(range(32)), bytes(range(32)).hex().encode() + b"\n"])
+def test_a_signing_key_comes_from_a_file(tmp_path: Path, held: bytes) -> None:
+    file = tmp_path / "key"
+    file.write_bytes(held)
+    assert understood(f"mavlink://udpin:0.0.0.0:14550?signing_key={file}").key == bytes(range(32))
+    file.write_bytes(b"short")
+    with pytest.raises(UsageError, match="64 hexadecimal digits"):
+        understood(f"mavlink://udpin:0.0.0.0:14550?signing_key={file}")
+
+
+def test_a_camera() -> None:
+    text = "mavlink://udpin:0.0.0.0:14550?camera=rtsp://10.0.0.2:8554/live&camera_facing=down&camera_name=belly"
+    camera = understood(text).camera
+    assert camera is not None
+    assert (camera.source, camera.name) == ("rtsp://10.0.0.2:8554/live", "belly")
+    (info,) = MavlinkDriver(parse_uri(text)).capabilities().cameras
+    assert info.rotation is not None
+    assert info.rotation[6:] == (0.0, 0.0, -1.0)

@@ -1,0 +1,42 @@
+"""Poses from outside as the autopilots take them."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from skyloop.drivers.mavlink.options import PoseMessage
+from skyloop.drivers.mavlink.poses import pose_message
+from skyloop.drivers.seams import ExternalPose
+from skyloop.messages.geometry import quaternion_from_euler
+from skyloop.wire.mavlink.axes import angles_of
+
+#: 1 m east, 2 m north, 3 m up; left turned 30° from east, nose down 10°, right side down 5°.
+POSE = ExternalPose(
+    (1.0, 2.0, 3.0),
+    quaternion_from_euler(math.radians(5), math.radians(10), math.radians(30)),
+    1_234_567_890,
+    0.01,
+    0.02,
+)
+ANGLES = (math.radians(5), math.radians(-10), math.radians(60))  # nose up, and clockwise from north, is positive there
+
+
+def test_as_odometry() -> None:
+    message = pose_message(POSE, PoseMessage.ODOMETRY)
+    assert message.time_usec == 1_234_567
+    assert (message.frame_id, message.child_frame_id) == (1, 12)
+    assert (message.x, message.y, message.z) == (2.0, 1.0, -3.0)
+    assert angles_of(tuple(message.q)) == pytest.approx(ANGLES)
+    assert message.pose_covariance[:8] == pytest.approx([1e-4, 0, 0, 0, 0, 0, 1e-4, 0])
+    assert message.pose_covariance[20] == pytest.approx(4e-4)
+    assert math.isnan(message.vx)
+    assert math.isnan(message.velocity_covariance[0])
+
+
+def test_as_a_vision_estimate_of_unknown_accuracy() -> None:
+    message = pose_message(ExternalPose(POSE.position, POSE.quaternion, POSE.captured_ns), PoseMessage.VISION)
+    assert (message.usec, message.x, message.y, message.z) == (1_234_567, 2.0, 1.0, -3.0)
+    assert (message.roll, message.pitch, message.yaw) == pytest.approx(ANGLES)
+    assert math.isnan(message.covariance[0])

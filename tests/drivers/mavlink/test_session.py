@@ -1,0 +1,320 @@
+"""Who is heard, what is made of it, and how the link stands: on a clock that the tests move."""
+
+from __future__ import annotations
+
+import math
+import struct
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from skyloop.drivers.mavlink.session import LOST_NS, Session
+from skyloop.drivers.recording_sink import RecordingSink, implausible
+from skyloop.errors import DriverError
+from skyloop.messages import FlightState, Hover, LinkState, Severity, Takeoff, Velocity
+from skyloop.wire.mavlink.codec import Codec
+from skyloop.wire.mavlink.codec import dialect as m
+from skyloop.wire.mavlink.texts import chunks_of
+from tests.drivers.mavlink.scripted import ARDUPILOT, PEER, PX4, Bench, Vehicle, options
+
+TLOG = Path(__file__).parents[2] / "data" / "mavlink" / "arduplane-flight.tlog"
+AUTOPILOTS = pytest.mark.parametrize("autopilot", [ARDUPILOT, PX4])
+
+
+@AUTOPILOTS
+def test_an_autopilot_is_known_by_its_heartbeat(autopilot: int) -> None:
+    bench = Bench(Vehicle(autopilot, system=7))
+    assert bench.link() is LinkState.CONNECTING
+    bench.hear(m.MAVLink_attitude_message(0, 0, 0, 0, 0, 0, 0))
+    assert bench.sink.newest is None, "nothing counts before the first heartbeat"
+    bench.found()
+    assert bench.link() is LinkState.UP
+    assert bench.state() is FlightState.LANDED
+    assert bench.session.commander.target == (7, 1)
+    assert bench.session.description.startswith("ArduCopter" if autopilot == ARDUPILOT else "PX4")
+
+
+def test_messages_are_asked_for_until_they_flow() -> None:
+    bench = Bench(Vehicle(ARDUPILOT))
+    bench.hear(bench.vehicle.heartbeat())
+    for _ in range(400):  # 8 s, in which nothing but heartbeats comes
+        bench.clock.advance(0.02)
+        bench.hear(bench.vehicle.heartbeat())
+        bench.tick()
+    asked = [each.param1 for each in bench.heard_of("COMMAND_LONG") if each.command == m.MAV_CMD_SET_MESSAGE_INTERVAL]
+    assert asked.count(m.MAVLINK_MSG_ID_ATTITUDE) == 3, "at once, and every three seconds"
+    assert asked.count(m.MAVLINK_MSG_ID_HEARTBEAT) == 1, "that one flows"
+
+
+def test_what_does_not_flow_is_absent_and_what_stops_becomes_so() -> None:
+    bench = Bench(Vehicle(ARDUPILOT))
+    bench.hear(bench.vehicle.heartbeat())
+    first = bench.newest
+    assert (first.roll, first.altitude, first.velocity, first.battery, first.position) == (None,) * 5
+    bench.found()
+    assert None not in (bench.newest.altitude, bench.newest.velocity, bench.newest.battery)
+    for _ in range(80):  # 1.6 s with nothing but the attitude
+        bench.clock.advance(0.02)
+        bench.vehicle.boot_ms += 20
+        bench.hear(bench.vehicle.telemetry()[-1])
+        bench.tick()
+    assert bench.newest.roll is not None
+    assert (bench.newest.velocity, bench.newest.position) == (None, None)
+    assert (bench.newest.native or {})["mavlink.age.local_position_ned"] == pytest.approx(1.6, abs=0.05)
+
+
+def test_units_axes_and_signs() -> None:
+    bench = Bench(Vehicle(PX4))
+    vehicle = bench.vehicle
+    vehicle.yaw = math.pi / 2  # to the east
+    vehicle.velocity = (1.0, 2.0, -0.5)  # north, east, down
+    vehicle.place = (10.0, 20.0, -3.0)
+    bench.found()
+    newest = bench.newest
+    assert newest.yaw == pytest.approx(0.0, abs=1e-6)
+    assert newest.roll == pytest.approx(0.1)
+    assert newest.pitch == pytest.approx(-0.2), "nose up"
+    assert newest.velocity == pytest.approx((2.0, 1.0, 0.5), abs=1e-5), "forward is east, left is north"
+    assert newest.position == pytest.approx((20.0, 10.0, 3.0))
+    assert newest.altitude == pytest.approx(3.0, abs=1e-3)
+    assert newest.battery == pytest.approx(0.8)
+    assert newest.battery_v == pytest.approx(12.0)
+
+
+def test_another_vehicle_with_the_same_id_is_told_and_left_alone() -> None:
+    bench = Bench(Vehicle(PX4)).found()
+    other = Codec(1, 1)
+    bench.hear(m.MAVLink_attitude_message(20_000, 1.0, 0, 0, 0, 0, 0), peer=("127.0.0.1", 14581), codec=other)
+    for _ in range(3):
+        bench.hear(bench.vehicle.heartbeat(), peer=("127.0.0.1", 14581), codec=other)
+    assert bench.newest.roll == pytest.approx(0.1)
+    told = [text for text in bench.texts if "another vehicle" in text]
+    assert len(told) == 1
+    assert "peer=HOST:PORT" in told[0]
+
+
+def test_a_vehicle_is_chosen_by_its_system_id_and_by_its_peer() -> None:
+    for text, right in (("sysid=2", Codec(2, 1)), ("peer=127.0.0.1:14581", Codec(1, 1))):
+        bench = Bench(Vehicle(PX4), options(f"mavlink://udpin:127.0.0.1:14540?parameters=no&{text}"))
+        bench.hear(bench.vehicle.heartbeat())
+        assert not bench.session.is_heard
+        bench.hear(bench.vehicle.heartbeat(), peer=("127.0.0.1", 14581), codec=right)
+        assert bench.session.is_heard
+
+
+def test_after_a_loss_no_other_system_is_flown_instead() -> None:
+    bench = Bench(Vehicle(PX4)).found()
+    bench.go_on(3.0, silent=True)
+    assert bench.link() is LinkState.LOST
+    bench.hear(bench.vehicle.heartbeat(), codec=Codec(9, 1))
+    assert not bench.session.is_heard
+    bench.hear(bench.vehicle.heartbeat(), peer=("127.0.0.1", 20_000))
+    assert bench.session.is_heard, "the same system, from elsewhere"
+
+
+@pytest.mark.parametrize(("system", "component", "kind", "autopilot"), [(255, 190, 6, 8), (1, 100, 30, 8)])
+def test_ground_stations_and_cameras_are_no_vehicles(system: int, component: int, kind: int, autopilot: int) -> None:
+    bench = Bench(Vehicle(PX4))
+    bench.hear(m.MAVLink_heartbeat_message(kind, autopilot, 0, 0, 4, 3), codec=Codec(system, component))
+    assert not bench.session.is_heard
+    assert bench.texts == []
+
+
+def test_answers_to_other_programs_are_not_ours() -> None:
+    bench = Bench(Vehicle(ARDUPILOT)).found()
+    bench.hear(m.MAVLink_command_ack_message(400, 0, 0, 0, 245, 190))
+    assert bench.session.commander.answer(400, 0) is None
+    bench.answer(400, 4)
+    assert bench.session.commander.answer(400, 0) == 4
+
+
+@pytest.mark.parametrize(("autopilot", "kind", "why"), [(0, 2, "autopilot is number 0"), (3, 1, "no multirotor")])
+def test_what_can_not_be_flown_is_seen_and_refused_clearly(autopilot: int, kind: int, why: str) -> None:
+    bench = Bench(Vehicle(ARDUPILOT))
+    bench.vehicle.autopilot, bench.vehicle.kind = autopilot, kind
+    heartbeat = m.MAVLink_heartbeat_message(kind, autopilot, 1, 0, 3, 3)
+    for _ in range(50):
+        bench.clock.advance(0.02)
+        bench.hear(heartbeat, bench.vehicle.telemetry()[-1])
+        bench.tick()
+    assert bench.newest.roll is not None
+    assert any(why in text for text in bench.texts)
+    with pytest.raises(DriverError, match="can't be flown"):
+        bench.apply(Takeoff())
+
+
+def test_an_old_vehicle_is_answered_in_its_version_and_invited_to_the_new_one() -> None:
+    bench = Bench(Vehicle(ARDUPILOT, version=1)).found()
+    bench.frames.clear()
+    bench.go_on(1.1)
+    magics = [frame[0] for frame in bench.frames]
+    assert magics.count(0xFD) == 1, "one heartbeat a second"
+    assert magics.count(0xFE) > 1
+    bench.vehicle.version = 2
+    bench.go_on(0.1)
+    bench.frames.clear()
+    bench.go_on(1.1)
+    assert {frame[0] for frame in bench.frames} == {0xFD}
+
+
+def test_signed_messages_without_a_key_are_refused_clearly() -> None:
+    bench = Bench(Vehicle(PX4))
+    signing = Codec(1, 1, key=bytes(32))
+    for _ in range(300):
+        bench.clock.advance(0.02)
+        bench.hear(bench.vehicle.heartbeat(), codec=signing)
+        bench.tick()
+    assert bench.link() is LinkState.LOST
+    assert "signing_key" in bench.sink.links[-1][1]
+    assert sum("signing_key" in text for text in bench.texts) == 1
+
+
+def test_silence_is_told_in_steps() -> None:
+    bench = Bench(Vehicle(PX4)).found()
+    bench.go_on(1.3, silent=True)
+    assert bench.link() is LinkState.DEGRADED
+    bench.go_on(LOST_NS / 1e9, silent=True)
+    assert bench.link() is LinkState.LOST
+    assert bench.state() is FlightState.UNKNOWN
+    with pytest.raises(DriverError, match="not heard"):
+        bench.apply(Velocity(forward=1.0))
+    bench.found()
+    assert bench.link() is LinkState.UP
+
+
+def test_a_vehicle_that_was_started_anew_is_set_up_anew() -> None:
+    bench = Bench(Vehicle(ARDUPILOT)).found()
+    bench.vehicle.boot_ms = 0
+    bench.go_on(0.1)
+    assert (LinkState.LOST, "the vehicle was started anew") in bench.sink.links
+    bench.go_on(1.0)
+    asked = [each for each in bench.heard_of("COMMAND_LONG") if each.command == m.MAV_CMD_SET_MESSAGE_INTERVAL]
+    assert len(asked) >= 10
+    assert bench.link() is LinkState.UP
+
+
+def test_its_clock_is_mapped_on_ours_by_timesync() -> None:
+    bench = Bench(Vehicle(PX4)).found()
+    bench.go_on(1.1)
+    question = bench.heard_of("TIMESYNC")[-1]
+    assert question.tc1 == 0
+    bench.clock.advance(0.004)
+    bench.vehicle.boot_ms += 4
+    theirs_ns = bench.vehicle.boot_ms * 1_000_000 - 2_000_000
+    bench.hear(m.MAVLink_timesync_message(theirs_ns, question.ts1))
+    assert bench.session.clock.round_trip_s is not None
+    boot_ms = bench.vehicle.boot_ms
+    bench.clock.advance(0.1)  # the message is 100 ms late, and tells when it was so
+    bench.hear(m.MAVLink_attitude_message(boot_ms, 0, 0, 0, 0, 0, 0))
+    assert bench.clock() - bench.newest.captured_ns == pytest.approx(100e6, abs=5e6)
+
+
+def test_its_questions_about_time_are_answered() -> None:
+    bench = Bench(Vehicle(PX4)).found()
+    bench.said.clear()
+    bench.hear(m.MAVLink_timesync_message(0, 987_654_321))
+    bench.tick()
+    answers = [each for each in bench.heard_of("TIMESYNC") if each.ts1 == 987_654_321]
+    assert answers[0].tc1 == bench.clock()
+
+
+def test_texts_and_health_become_events() -> None:
+    bench = Bench(Vehicle(PX4))
+    bench.vehicle.ready = False
+    bench.found()
+    for chunk in chunks_of("Preflight Fail: ekf2 missing data, and more words so that it is long\t", 2, 3):
+        bench.hear(chunk)
+    bench.vehicle.ready = True
+    bench.go_on(0.1)
+    told = {event.text: event for event in bench.sink.events}
+    text = told["Preflight Fail: ekf2 missing data, and more words so that it is long"]
+    assert (text.severity, text.data["reason"]) == (Severity.ERROR, "prearm")
+    assert told["the vehicle can't be armed now"].severity is Severity.WARNING
+    assert "the vehicle is ready to be armed" in told
+    assert "the vehicle knows where it is" in told
+
+
+def test_a_plane_is_seen_and_the_whole_recording_is_taken() -> None:
+    data, at, frames = TLOG.read_bytes(), 0, 0
+    session, sink = Session(options(), 0), RecordingSink()
+    while at + 9 < len(data) and at + data[at + 9] + 16 <= len(data):
+        now_ns = struct.unpack_from(">Q", data, at)[0] * 1000
+        length = data[at + 9] + 8
+        session.heard(data[at + 8 : at + 8 + length], PEER, now_ns, whole=True)
+        frames += 1
+        at += 8 + length
+        for telling in session.tellings():
+            telling(_Timeless(sink))
+    assert (frames, session.codec.frames, session.codec.damaged) == (417, 417, 0)
+    newest = sink.newest
+    assert newest is not None
+    assert implausible(newest) == []
+    assert None not in (newest.roll, newest.pitch, newest.yaw, newest.altitude, newest.velocity)
+
+
+class _Timeless(RecordingSink):
+    """Of a recording, whose clock is not ours."""
+
+    def __init__(self, sink: RecordingSink) -> None:
+        self.__dict__ = sink.__dict__
+
+    def _check_time(self, what: str, captured_ns: int, now_ns: int) -> None:
+        pass
+
+
+KINDS = (
+    *("HEARTBEAT", "ATTITUDE", "LOCAL_POSITION_NED", "GLOBAL_POSITION_INT", "SYS_STATUS", "EXTENDED_SYS_STATE"),
+    *("GPS_RAW_INT", "STATUSTEXT", "PARAM_VALUE", "COMMAND_ACK", "TIMESYNC", "AUTOPILOT_VERSION", "DISTANCE_SENSOR"),
+    *("HIGHRES_IMU", "RAW_IMU", "EKF_STATUS_REPORT", "ESTIMATOR_STATUS", "CURRENT_MODE", "BATTERY_STATUS"),
+)
+
+
+@settings(max_examples=120, deadline=None)
+@given(
+    st.lists(st.tuples(st.sampled_from(KINDS), st.binary(min_size=300, max_size=300)), max_size=12),
+    st.sampled_from([ARDUPILOT, PX4]),
+)
+def test_hostile_messages_never_raise_and_feedback_stays_plausible(
+    hostile: list[tuple[str, bytes]], autopilot: int
+) -> None:
+    """Well-formed frames with any bits in their fields, of the vehicle that is flown."""
+    given_ = options("mavlink://udpin:127.0.0.1:14540")
+    bench = Bench(Vehicle(autopilot), given_).found()
+    for kind, noise in hostile:
+        number = getattr(m, f"MAVLINK_MSG_ID_{kind}")
+        made = m.mavlink_map[number]
+        bench.session.heard(_frame(made, noise), PEER, bench.clock(), whole=True)
+        bench.clock.advance(0.02)
+        with suppress(DriverError):
+            bench.session.command(Hover(), bench.clock())
+        bench.tick()
+    for feedback in bench.sink.feedbacks:
+        for name in ("roll", "pitch", "yaw", "altitude", "battery", "battery_v"):
+            value = getattr(feedback, name)
+            assert value is None or math.isfinite(value), name
+        for name in ("velocity", "position", "angular_velocity", "acceleration"):
+            vector = getattr(feedback, name)
+            assert vector is None or all(map(math.isfinite, vector)), name
+
+
+def _frame(made: type, noise: bytes) -> bytes:
+    size = made.unpacker.size  # type: ignore[attr-defined]
+    head = struct.pack("<BBBBBBBHB", 0xFD, size, 0, 0, 0, 1, 1, made.id & 0xFFFF, made.id >> 16)  # type: ignore[attr-defined]
+    check = m.x25crc(head[1:] + noise[:size])
+    check.accumulate(bytes([made.crc_extra]))  # type: ignore[attr-defined]
+    return head + noise[:size] + struct.pack("<H", check.crc)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.binary(max_size=80), max_size=10))
+def test_noise_never_raises(datagrams: list[bytes]) -> None:
+    bench = Bench(Vehicle(PX4)).found()
+    for datagram in datagrams:
+        bench.session.heard(datagram, PEER, bench.clock(), whole=True)
+        bench.session.heard(datagram, ("10.0.0.1", 1), bench.clock(), whole=False)
+        bench.tick()
+    bench.go_on(0.1)
+    assert bench.link() is LinkState.UP

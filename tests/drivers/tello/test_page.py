@@ -1,0 +1,43 @@
+"""The driver's page says what the code does."""
+
+from __future__ import annotations
+
+import re
+
+from skyloop.drivers.tello import options
+from skyloop.drivers.tello.parameters import SETTINGS, flip_parameter, scale_parameters
+from skyloop.drivers.tello.session import ALIVE_NS, DEGRADED_NS, ENTER_NS, LOST_NS
+from skyloop.drivers.tello.sticks import Scale
+from tests.docs.pages import rows, section
+
+
+def names(cell: str) -> list[str]:
+    return re.findall(r"`([^`]+)`", cell)
+
+
+def test_options() -> None:
+    table = rows(section("docs/tello.md", "### `tello://`"))
+    assert sorted(name for row in table for name in names(row[0])) == sorted(options._KNOWN)
+
+
+def test_parameters() -> None:
+    told = {name for row in rows(section("docs/tello.md", "### Parameters")) for name in names(row[0])}
+    known = {parameter.name for parameter in (*scale_parameters(Scale(), Scale()), flip_parameter("none"))}
+    assert told == known | set(SETTINGS) | {"tello.sdk", "tello.serial"}
+
+
+def test_times() -> None:
+    text = section("docs/tello.md", "### Link and events")
+    for words in (
+        f"no state for {DEGRADED_NS / 1e9:g} s",
+        f"no state for {LOST_NS / 1e9:g} s",
+        f"{ENTER_NS / 1e9:g} s",
+    ):
+        assert words in text
+    assert f"`wifi?` every {ALIVE_NS / 1e9:g} s" in section("docs/tello.md", "### What is said to the drone")
+
+
+def test_what_a_full_stick_is() -> None:
+    full = Scale()
+    assert (full.speed, full.climb, full.yaw_rate) == (1.0, 1.0, 1.75)
+    assert "taken for 1 m/s, 1 m/s of climb and 1.75 rad/s" in section("docs/tello.md", "## The driver")

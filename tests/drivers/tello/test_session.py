@@ -1,0 +1,374 @@
+"""Whole flights of a session with an emulated Tello, in simulated time, over good and bad links."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from skyloop.drivers.tello.options import TelloOptions, VelocityAxes
+from skyloop.errors import DriverError
+from skyloop.messages import (
+    Attitude,
+    EmergencyStop,
+    EventKind,
+    FlightState,
+    Hover,
+    Idle,
+    Land,
+    LinkState,
+    ResetEmergency,
+    Takeoff,
+    Velocity,
+)
+from skyloop.wire.tello.commands import Sdk
+from tests.drivers.tello.rig import Rig
+from tests.wire.tello.test_state import recorded
+
+
+@pytest.mark.parametrize("lost", [0.0, 0.1, 0.3])
+def test_a_flight(lost: float) -> None:
+    rig = Rig(lost=lost)
+    rig.ready()
+    assert rig.state is FlightState.LANDED
+    rig.do(Takeoff())
+    rig.until(lambda: rig.state is FlightState.TAKING_OFF, 8.0)
+    rig.until(lambda: rig.state is FlightState.HOVERING, 10.0)
+    assert rig.feedback.altitude is not None
+    assert rig.feedback.altitude > 0.4
+    rig.do(Velocity(forward=0.5))
+    rig.until(lambda: rig.state is FlightState.FLYING, 1.0)
+    rig.until(lambda: (rig.feedback.velocity or (0.0,))[0] > 0.35, 4.0)
+    rig.do(Hover())
+    rig.until(lambda: rig.state is FlightState.HOVERING, 1.0)
+    rig.run(30.0)
+    assert rig.bench.truth.state is FlightState.HOVERING  # it did not land by itself
+    rig.do(Land())
+    rig.until(lambda: rig.state is FlightState.LANDING, 2.0)
+    rig.until(lambda: rig.state is FlightState.LANDED, 15.0)
+    assert rig.bench.flight is FlightState.LANDED
+
+
+def test_sticks_come_twenty_times_a_second_and_a_new_one_at_once() -> None:
+    rig = Rig()
+    rig.ready()
+    rig.do(Takeoff())
+    rig.until(lambda: rig.state is FlightState.HOVERING, 10.0)
+    rig.take_said()
+    rig.run(2.0)
+    sticks = [text for text in rig.take_said() if text.startswith("rc")]
+    assert set(sticks) == {"rc 0 0 0 0"}
+    assert 30 <= len(sticks) <= 45
+    rig.do(Velocity(left=0.3))
+    rig.step()
+    rig.step()
+    assert "rc -30 0 0 0" in rig.take_said()
+
+
+def test_nothing_moves_a_drone_that_stands() -> None:
+    rig = Rig()
+    rig.ready()
+    rig.do(Velocity(forward=1.0))
+    rig.do(Hover())
+    rig.run(3.0)
+    assert not [text for text in rig.said if text.startswith("rc")]
+
+
+def test_a_drone_that_does_not_take_off_is_told() -> None:
+    rig = Rig()
+    rig.ready()
+    rig.deaf = True
+    rig.do(Takeoff())
+    rig.run(9.0)
+    assert rig.said.count("takeoff") in (5, 6)
+    assert "no_takeoff" in rig.reasons
+    assert rig.state is FlightState.LANDED
+    rig.take_said()
+    rig.run(3.0)
+    assert "takeoff" not in rig.said
+
+
+def test_a_drone_that_refuses_to_take_off_is_told() -> None:
+    rig = Rig()
+    rig.ready()
+    rig.bench.simulation.set_charge(0, 0.01)
+    rig.do(Takeoff())
+    rig.until(lambda: "takeoff_refused" in rig.reasons, 5.0)
+    assert rig.state is FlightState.LANDED
+
+
+def test_a_landing_can_be_broken_off() -> None:
+    rig = Rig()
+    rig.ready()
+    rig.do(Takeoff())
+    rig.until(lambda: rig.state is FlightState.HOVERING, 10.0)
+    rig.run(8.0)
+    rig.do(Land())
+    rig.do(Hover())
+    assert rig.session.pilot.watch.sinking is False
+
+
+@pytest.mark.parametrize("lost", [0.0, 0.2])
+def test_an_emergency_stop_is_kept_until_the_reset(lost: float) -> None:
+    rig = Rig(lost=lost)
+    rig.ready()
+    rig.do(Takeoff())
+    rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
+    rig.do(EmergencyStop())
+    rig.until(lambda: rig.state is FlightState.EMERGENCY, 1.0)
+    rig.until(lambda: rig.bench.flight is FlightState.LANDED, 4.0)
+    assert EventKind.EMERGENCY in [event.kind for event in rig.sink.events]
+    with pytest.raises(DriverError, match="reset the emergency first"):
+        rig.do(Takeoff())
+    assert rig.do(Velocity(forward=1.0)) == Hover()
+    rig.do(Hover())
+    rig.run(3.0)
+    assert rig.state is FlightState.EMERGENCY
+    rig.take_said()
+    rig.run(5.0)
+    assert "emergency" not in rig.said
+    rig.do(ResetEmergency())
+    rig.until(lambda: rig.state is FlightState.LANDED, 1.0)
+    rig.do(Takeoff())
+    rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
+
+
+def test_a_stop_that_does_not_show_can_not_be_reset() -> None:
+    rig = Rig()
+    rig.ready()
+    rig.do(Takeoff())
+    rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
+    rig.deaf = True
+    rig.do(EmergencyStop())
+    rig.run(0.5)
+    with pytest.raises(DriverError, match="motors still run"):
+        rig.do(ResetEmergency())
+    assert rig.do(Idle()) == Idle()
+
+
+def test_attitude_is_a_share_of_the_stick() -> None:
+    rig = Rig()
+    rig.ready()
+    rig.do(Takeoff())
+    rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
+    rig.take_said()
+    applied = rig.do(Attitude(roll=0.1, pitch=-0.9, climb=5.0, yaw_rate=0.875))
+    assert applied == Attitude(roll=0.1, pitch=-0.2, climb=1.0, yaw_rate=0.875)
+    rig.run(0.1)
+    assert rig.said[-1] == "rc 50 -100 100 -50"
+
+
+# Losing and finding ------------------------------------------------------------------------------------------------
+
+
+def test_a_drone_that_is_not_there_is_told_and_looked_for() -> None:
+    rig = Rig()
+    rig.on = False
+    rig.run(2.5)
+    assert [state for state, _ in rig.sink.links] == [LinkState.CONNECTING, LinkState.LOST]
+    assert "no state from drone, UDP port 8889" in rig.sink.links[-1][1]
+    assert 4 <= rig.said.count("command") <= 6
+    with pytest.raises(DriverError, match="not heard"):
+        rig.do(Takeoff())
+    rig.on = True
+    rig.ready()
+    rig.run(0.2)
+    assert rig.sink.link_state is LinkState.UP
+
+
+def test_a_firewall_is_thought_of_when_answers_come_and_no_state() -> None:
+    rig = Rig()
+    rig.bench.board.state_string = lambda: None  # type: ignore[method-assign]
+    rig.run(2.5)
+    assert rig.sink.link_state is LinkState.LOST
+    assert "though it answers: does a firewall of this host let UDP port 8890 in?" in rig.sink.links[-1][1]
+
+
+def test_a_link_that_breaks_in_flight_is_found_again_and_resumes_nothing() -> None:
+    rig = Rig()
+    rig.ready()
+    rig.do(Takeoff())
+    rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
+    rig.do(Velocity(forward=0.3))
+    rig.run(1.0)
+    rig.on = False
+    rig.until(lambda: rig.sink.link_state is LinkState.DEGRADED, 1.0)
+    rig.until(lambda: rig.sink.link_state is LinkState.LOST, 1.2)
+    rig.take_said()
+    rig.run(1.0)
+    assert set(rig.take_said()) == {"command", "rc 0 0 0 0"}  # it may hear us
+    rig.on = True
+    rig.until(lambda: rig.sink.link_state is LinkState.UP, 3.0)
+    rig.until(lambda: rig.state is FlightState.HOVERING, 3.0)  # in the air, by its motors
+    assert "rc 0 30 0 0" not in rig.said
+
+
+def test_a_landing_goes_on_while_the_drone_is_not_heard() -> None:
+    rig = Rig()
+    rig.ready()
+    rig.do(Takeoff())
+    rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
+    rig.on = False
+    rig.until(lambda: rig.sink.link_state is LinkState.LOST, 3.0)
+    rig.do(Land())
+    rig.take_said()
+    rig.run(3.2)
+    assert rig.said.count("land") in (2, 3)
+    rig.on = True
+    rig.until(lambda: rig.bench.flight is FlightState.LANDED, 12.0)
+    rig.until(lambda: rig.state is FlightState.LANDED, 4.0)
+
+
+def test_a_drone_that_was_started_again_is_set_up_again() -> None:
+    rig = Rig(TelloOptions("drone", video=False, pads=True))
+    rig.ready()
+    rig.run(1.0)
+    assert rig.bench.board.looks_for_pads
+    rig.session.remembered["camera.fps"] = "setfps low"
+    rig.on = False
+    rig.until(lambda: rig.sink.link_state is LinkState.LOST, 3.0)
+    rig.restart_drone()
+    rig.ready()
+    rig.run(1.0)
+    assert rig.bench.board.looks_for_pads
+    assert rig.bench.board.fps == 5.0
+
+
+def test_a_drone_that_does_not_hear_us_is_told() -> None:
+    rig = Rig()
+    rig.ready()
+    rig.run(0.1)
+    rig.deaf = True
+    rig.until(lambda: rig.sink.link_state is LinkState.DEGRADED, 15.0)
+    assert rig.sink.links[-1][1] == "the drone tells its state, and answers no command"
+    rig.deaf = False
+    rig.until(lambda: rig.sink.link_state is LinkState.UP, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("sdk", "serial"), [(Sdk.V1_3, ""), (Sdk.V2_0, "0TQEMULATED001"), (Sdk.V3_0, "0TQEMULATED001")]
+)
+def test_the_version_is_found_out(sdk: Sdk, serial: str) -> None:
+    rig = Rig(sdk=sdk)
+    rig.ready()
+    rig.run(1.0)
+    assert rig.session.sdk is sdk
+    assert rig.session.serial == serial
+
+
+def test_ports_of_its_own_need_a_drone_that_knows_them() -> None:
+    options = TelloOptions("drone", video=False, state_port=9990)
+    rig = Rig(options)
+    rig.ready()
+    assert rig.bench.board.state_port == 9990
+    old = Rig(options, sdk=Sdk.V2_0)
+    board = old.bench.board
+    board.state_string = lambda: None  # type: ignore[method-assign]  # its states go to another port
+    old.run(3.0)
+    assert old.reasons.count("ports_refused") == 1
+
+
+def test_video_is_asked_for_until_it_comes() -> None:
+    came_ns = [0]
+    rig = Rig(TelloOptions("drone"))
+    rig.session._video_ns = lambda: came_ns[0]
+    rig.ready()
+    rig.run(5.0)
+    assert rig.said.count("streamon") in (2, 3)
+    assert rig.bench.board.streaming
+    rig.take_said()
+    for _ in range(100):
+        came_ns[0] = rig.now_ns
+        rig.step()
+    assert "streamon" not in rig.said
+
+
+# What it tells -----------------------------------------------------------------------------------------------------
+
+
+def test_pads_are_told_when_they_come_and_go() -> None:
+    x, y, _ = Rig().bench.truth.position_m
+    rig = Rig(TelloOptions("drone", video=False, pads=True), pads={5: (x, y)})
+    rig.ready()
+    rig.run(1.0)
+    rig.do(Takeoff())
+    rig.until(lambda: "mission_pad" in rig.reasons, 10.0)
+    event = next(event for event in rig.sink.events if event.data.get("reason") == "mission_pad")
+    assert event.data["pad"] == 5
+    assert event.data["in_view"] is True
+    place = event.data["place"]
+    assert isinstance(place, tuple)
+    assert place[2] == pytest.approx(0.3, abs=0.15)
+    rig.until(lambda: rig.state is FlightState.HOVERING, 10.0)
+    rig.do(Velocity(forward=0.8))
+    rig.until(lambda: rig.sink.events[-1].data.get("in_view") is False, 6.0)
+    assert rig.feedback.native is not None
+    assert rig.feedback.native["mid"] == -1
+
+
+def test_feedback_agrees_with_the_truth() -> None:
+    rig = Rig()
+    rig.ready()
+    start_yaw = rig.bench.truth.yaw_rad
+    rig.do(Takeoff())
+    rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
+    rig.do(Velocity(forward=0.4, left=0.3, yaw_rate=0.5))
+    rig.run(2.5)
+    feedback, truth = rig.feedback, rig.bench.truth
+    assert feedback.yaw == pytest.approx(math.remainder(truth.yaw_rad - start_yaw, math.tau), abs=0.1)
+    assert feedback.altitude == pytest.approx(truth.position_m[2], abs=0.1)
+    assert feedback.velocity is not None
+    assert feedback.velocity[0] == pytest.approx(0.4, abs=0.15)
+    assert feedback.velocity[1] == pytest.approx(0.3, abs=0.15)
+    assert feedback.pitch == pytest.approx(truth.pitch_rad, abs=0.03)
+    assert feedback.roll == pytest.approx(truth.roll_rad, abs=0.03)
+    assert feedback.acceleration is not None
+    assert feedback.acceleration[2] == pytest.approx(9.8, abs=1.0)
+    assert feedback.battery == pytest.approx(1.0, abs=0.05)
+    assert feedback.position is None
+    assert feedback.native is not None
+    assert feedback.native["state.received"] > 10  # type: ignore[operator]
+
+
+def test_velocity_may_be_left_out() -> None:
+    rig = Rig(TelloOptions("drone", video=False, velocity_axes=VelocityAxes.NONE))
+    rig.ready()
+    rig.run(0.5)
+    assert rig.feedback.velocity is None
+
+
+# Damage ------------------------------------------------------------------------------------------------------------
+
+_NOISE = st.binary(max_size=300) | st.text(alphabet="okerounmidpthbatvgxyz:;-.0123456789 ", max_size=120).map(
+    str.encode
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.tuples(st.booleans(), _NOISE), max_size=60), st.booleans())
+def test_nothing_that_comes_raises(datagrams: list[tuple[bool, bytes]], flying: bool) -> None:
+    rig = Rig()
+    rig.run(0.5)
+    if flying:
+        rig.do(Takeoff())
+    for is_state, datagram in datagrams:
+        (rig.session.state_heard if is_state else rig.session.reply_heard)(datagram, rig.now_ns)
+        rig.step()
+    assert not rig.sink.problems
+    assert isinstance(rig.state, FlightState)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.data())
+def test_recorded_states_that_were_damaged_do_not_raise(data: st.DataObject) -> None:
+    rig = Rig()
+    rig.run(0.2)
+    for _ in range(10):
+        line = bytearray(data.draw(st.sampled_from(recorded())).encode())
+        for _ in range(data.draw(st.integers(0, 6))):
+            line[data.draw(st.integers(0, len(line) - 1))] = data.draw(st.integers(0, 255))
+        rig.session.state_heard(bytes(line), rig.now_ns)
+        rig.step()
+    assert not rig.sink.problems

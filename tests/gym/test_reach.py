@@ -1,0 +1,133 @@
+"""The Gymnasium environment over the simulator."""
+
+from __future__ import annotations
+
+import math
+import runpy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("gymnasium", reason="needs Gymnasium: pip install 'skyloop[gym]'")
+
+import gymnasium
+from gymnasium.utils.env_checker import check_env
+
+from skyloop.errors import UsageError
+from skyloop.gym import ReachEnv, ReachVectorEnv, register
+from skyloop.gym.picture import look_at
+from skyloop.gym.reach import NEAR_M
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "learn_to_reach.py"
+
+
+def steer(seen: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """A plain controller: towards the goal, and turning to its heading; shape (…, 4)."""
+    turn = np.arctan2(seen[..., 8], seen[..., 9])
+    wanted = np.concatenate([1.2 * seen[..., :3] - 0.3 * seen[..., 3:6], turn[..., None]], axis=-1)
+    action: np.ndarray[Any, Any] = np.clip(wanted, -1, 1).astype(np.float32)
+    return action
+
+
+def test_gymnasiums_own_checker_is_content() -> None:
+    register()
+    register()
+    env = gymnasium.make("skyloop/Reach-v0", render_mode="rgb_array", seconds=2.0)
+    check_env(env.unwrapped)
+    env.close()
+
+
+def test_the_same_seed_and_actions_give_the_same_episode() -> None:
+    def episode(seed: int) -> list[np.ndarray[Any, Any]]:
+        env = ReachEnv(seconds=1.0)
+        seen = [env.reset(seed=seed)[0]]
+        env.action_space.seed(1)
+        seen += [env.step(env.action_space.sample())[0] for _ in range(20)]
+        return seen
+
+    first, again, other = episode(3), episode(3), episode(4)
+    assert all(np.array_equal(a, b) for a, b in zip(first, again, strict=True))
+    assert not np.array_equal(first[0], other[0])
+
+
+def test_a_plain_controller_reaches_the_goal_and_time_ends_the_episode() -> None:
+    env = ReachEnv(seconds=8.0)
+    seen, _ = env.reset(seed=5)
+    total, steps, over = 0.0, 0, False
+    while not over:
+        seen, reward, failed, over, told = env.step(steer(seen))
+        assert not failed
+        total, steps = total + reward, steps + 1
+    assert steps == 200
+    assert told["distance_m"] < NEAR_M
+    assert told["is_success"]
+    assert total > 5.0
+    seen, _ = env.reset()
+    assert np.linalg.norm(seen[:3]) > NEAR_M, "another start and goal, in the same world"
+
+
+def test_a_drone_that_leaves_its_cell_has_failed() -> None:
+    env = ReachEnv(seconds=60.0)
+    env.reset(seed=1)
+    for _ in range(500):
+        _, reward, failed, over, _ = env.step(np.array([1.0, 0.0, 0.0, 0.0], np.float32))
+        if failed:
+            break
+    assert failed
+    assert not over
+    assert reward < -4.0
+
+
+def test_many_drones_begin_anew_on_their_own() -> None:
+    envs = gymnasium.make_vec("skyloop/Reach-v0", num_envs=5, seconds=2.0)
+    assert isinstance(envs.unwrapped, ReachVectorEnv)
+    seen, _ = envs.reset(seed=2)
+    assert seen.shape == (5, 10)
+    assert envs.observation_space.contains(seen)
+    for _ in range(50):
+        seen, _, failed, over, told = envs.step(steer(seen))
+    assert over.all()
+    assert not failed.any()
+    near = told["distance_m"].copy()
+    _, rewards, failed, over, told = envs.step(steer(seen))
+    none = np.concatenate([rewards != 0.0, failed, over])
+    assert not none.any(), "the first step of an episode is its reset"
+    assert (told["distance_m"] > near).any()
+    with pytest.raises(UsageError, match="num_envs is 0"):
+        ReachVectorEnv(0)
+
+
+def test_a_picture_shows_the_goal() -> None:
+    env = ReachEnv(render_mode="rgb_array")
+    env.reset(seed=1)
+    picture = env.render()
+    assert picture is not None
+    assert picture.shape == (240, 320, 3)
+    red = (picture[..., 0] > 180) & (picture[..., 1] < 90) & (picture[..., 2] < 90)
+    assert red.sum() > 10
+    assert ReachEnv().render() is None
+    turn = look_at(np.array([1.0, 2.0, 3.0]), np.array([4.0, 4.0, 1.0]))
+    assert np.allclose(turn @ turn.T, np.eye(3))
+    assert math.isclose(float(np.linalg.det(turn)), 1.0)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [({"render_mode": "human"}, "render_mode"), ({"seconds": 0.0}, "seconds"), ({"gusts_m_s": math.nan}, "gusts_m_s")],
+)
+def test_wrong_arguments_are_told(wrong: dict[str, Any], said: str) -> None:
+    with pytest.raises(UsageError, match=said):
+        ReachEnv(**wrong)
+
+
+def test_it_must_be_reset_first() -> None:
+    with pytest.raises(UsageError, match="call reset"):
+        ReachEnv().step(np.zeros(4, np.float32))
+
+
+def test_a_short_run_learns() -> None:
+    learn = runpy.run_path(str(EXAMPLE))["learn"]
+    curve = learn(10)
+    assert curve[-1] > curve[0] + 1.0

@@ -1,0 +1,122 @@
+"""A proxy in a process of its own and an application that flies it, with the patience that real autopilots need."""
+
+from __future__ import annotations
+
+import math
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO
+
+import skyloop
+from skyloop.messages import Feedback, FlightState, LinkState
+
+NAME = "hardware"
+READY_S = 120.0  #: from the start of an autopilot until it may be armed: 40 s were seen, EKF and GPS included
+TAKEOFF_S = 60.0
+LANDING_S = 60.0
+LINK_S = 60.0
+
+
+class Rig:
+    """One vehicle's proxy, started and killed as often as need be."""
+
+    def __init__(self, address: str) -> None:
+        self.address = address
+        self._process: subprocess.Popen[bytes] | None = None
+        self._log: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115  closed by end()
+
+    def start(self) -> None:
+        """A proxy that serves."""
+        command = [sys.executable, "-m", "skyloop", "proxy", self.address, "--name", NAME]
+        self._process = subprocess.Popen(command, stdout=self._log, stderr=subprocess.STDOUT)
+
+    def connect(self) -> skyloop.Drone:
+        """A pilot, as soon as the proxy serves and the vehicle is heard."""
+        deadline = time.monotonic() + LINK_S
+        while True:
+            try:
+                drone = skyloop.connect(NAME, timeout_s=10.0)
+                break
+            except skyloop.SkyloopError:
+                assert time.monotonic() < deadline, self.said()
+                time.sleep(0.2)
+        until(drone, lambda f: f.vehicle_link in (LinkState.UP, LinkState.DEGRADED), LINK_S, "the vehicle is heard")
+        until(drone, lambda f: f.state is not FlightState.UNKNOWN, LINK_S, "its state is known")
+        return drone
+
+    def kill(self) -> None:
+        """The proxy dies without a word to anybody."""
+        assert self._process is not None
+        self._process.send_signal(signal.SIGKILL)
+        self._process.wait(10)
+        self._process = None
+
+    def end(self) -> None:
+        """In the end the proxy lands what flies and goes."""
+        if self._process is not None:
+            self._process.send_signal(signal.SIGINT)
+            try:
+                self._process.wait(LANDING_S)
+            except subprocess.TimeoutExpired:
+                self.kill()
+        self._log.close()
+
+    def said(self) -> str:
+        """What the proxies wrote so far."""
+        self._log.seek(0)
+        return self._log.read().decode(errors="replace")[-4000:]
+
+
+def until(
+    drone: skyloop.Drone,
+    wanted: Callable[[Feedback], bool],
+    timeout_s: float,
+    what: str,
+    say: Callable[[], object] = lambda: None,
+) -> Feedback:
+    """Wait for it, and ``say`` a command meanwhile; the vehicle's last words stand in the failure."""
+    deadline = time.monotonic() + timeout_s
+    while True:
+        say()
+        newest = drone.feedback()
+        if wanted(newest):
+            return newest
+        words = [event.text for event in drone.recent_events()][-12:]
+        assert time.monotonic() < deadline, f"not within {timeout_s:g} s: {what}; {newest}; {words}"
+        time.sleep(0.02)
+
+
+def place(feedback: Feedback) -> tuple[float, float, float]:
+    """East, north, up [m]."""
+    assert feedback.position is not None, "the vehicle does not tell where it is"
+    return feedback.position
+
+
+def speed(feedback: Feedback) -> float:
+    """Horizontally [m/s]."""
+    assert feedback.velocity is not None, "the vehicle does not tell its speed"
+    return math.hypot(*feedback.velocity[:2])
+
+
+def holds(
+    drone: skyloop.Drone, seconds: float, radius_m: float, what: str, say: Callable[[], object] = lambda: None
+) -> None:
+    """It stays where it is, horizontally, for so long."""
+    begun = place(drone.feedback())
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        say()
+        east, north, _ = place(drone.feedback())
+        gone = math.hypot(east - begun[0], north - begun[1])
+        assert gone <= radius_m, f"{what}: it went {gone:.2f} m"
+        time.sleep(0.05)
+
+
+def runtime_folder() -> tempfile.TemporaryDirectory[str]:
+    """For sockets of these proxies alone."""
+    return tempfile.TemporaryDirectory(prefix="skyloop-", dir=Path(tempfile.gettempdir()))

@@ -1,0 +1,219 @@
+"""Client, fabric transport and proxy: flying over a network, video as each asks for it, clocks that differ."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+
+from skyloop.client import Drone, Frame
+from skyloop.client.pace import Pace
+from skyloop.errors import UsageError
+from skyloop.messages import Applied, FlightState, Velocity
+from skyloop.proxy.proxy import Proxy
+from skyloop.transport.base import Dialer, ServerEnd
+from skyloop.transport.fabric import FabricServer, FabricSettings, dial
+from skyloop.transport.fabric.config import free_port
+from skyloop.transport.memory import MemoryServer
+from tests.integration.fake_vehicle import FakeVehicle
+
+pytest.importorskip("cv2", reason="encoded video needs the extra 'network'")
+WAIT_S = 10.0
+
+
+class Node:
+    """A proxy with a fake vehicle, and how it is reached."""
+
+    def __init__(self, server: ServerEnd, dialer: Dialer) -> None:
+        self.vehicle = FakeVehicle()
+        self.dialer = dialer
+        self.proxy = Proxy(self.vehicle, server, name="alpha")
+
+    @contextmanager
+    def connected(self, **options: Any) -> Iterator[Drone]:
+        with Drone(self.dialer, app="me", **options).open() as drone:
+            yield drone
+
+
+def far_node() -> Node:
+    place = f"127.0.0.1:{free_port('127.0.0.1')}"
+    server = FabricServer("alpha", FabricSettings(listen=(place,), multicast=False))
+    return Node(server, dial("alpha", FabricSettings(connect=(place,), multicast=False)))
+
+
+def near_node() -> Node:
+    server = MemoryServer("alpha")
+    return Node(server, server.dial)
+
+
+@pytest.fixture(params=[far_node, near_node], ids=["network", "one process"])
+def node(request: pytest.FixtureRequest) -> Iterator[Node]:
+    """Code behaves alike wherever the proxy is."""
+    made: Node = request.param()
+    with made.proxy:
+        yield made
+
+
+@pytest.fixture
+def far() -> Iterator[Node]:
+    made = far_node()
+    with made.proxy:
+        yield made
+
+
+def take(frames: Iterator[Frame], count: int) -> list[Frame]:
+    return list(itertools.islice(frames, count))
+
+
+def test_a_flight_over_the_network(far: Node) -> None:
+    with far.connected() as drone:
+        drone.takeoff()
+        drone.velocity(forward=0.5)
+        drone.wait(FlightState.FLYING, WAIT_S)
+        drone.config["limits.speed"] = 0.3
+        drone.velocity(forward=0.5)
+        drone.wait(lambda _: Velocity(0.3) in list(far.vehicle.applied), WAIT_S)
+        echoes: list[Applied] = []
+        drone.on_command(echoes.append, inline=True)
+        drone.wait(lambda _: bool(echoes), WAIT_S)
+        drone.land()
+        drone.wait(FlightState.LANDED, WAIT_S)
+        assert drone.link.application == "up"
+
+
+def test_frames_come_as_jpeg_from_afar_and_raw_from_near(node: Node) -> None:
+    with node.connected() as drone:
+        frame = drone.next_frame(timeout_s=WAIT_S)
+        assert frame.shape == (24, 32, 3)
+        far = not isinstance(node.proxy.server, MemoryServer)
+        assert frame.header.encoding == ("jpeg" if far else "bgr8")
+        assert np.allclose(frame.image, frame.image[0, 0], atol=4)
+        assert "video/front" in drone.stats
+
+
+def test_raw_frames_are_the_same_to_the_bit(node: Node) -> None:
+    with node.connected() as drone:
+        for frame in take(drone.frames(encoding="raw"), 5):
+            assert frame.header.encoding == "bgr8"
+            assert (frame.image == frame.image[0, 0, 0]).all()
+
+
+def test_smaller_frames(node: Node) -> None:
+    with node.connected() as drone:
+        for encoding in ("raw", "jpeg"):
+            (frame,) = take(drone.frames(encoding=encoding, scale=0.5), 1)
+            assert frame.shape == (12, 16, 3)
+            assert (frame.header.width, frame.header.height) == (16, 12)
+            assert np.allclose(frame.image, frame.image[0, 0], atol=4)
+
+
+def test_fewer_frames(node: Node) -> None:
+    with node.connected() as drone:
+        seen = [frame.captured_ns for frame in take(drone.frames(max_fps=10.0), 6)]
+        assert seen[-1] - seen[0] >= 490_000_000
+
+
+def test_workers_share_the_frames(node: Node) -> None:
+    with node.connected() as drone:
+        numbers: list[list[int]] = [[], [], []]
+        workers = [
+            drone.add_processor(lambda frame, k=k: numbers[k].append(frame.seq), part=(k, 3), depth=8)  # type: ignore[misc]
+            for k in range(3)
+        ]
+        drone.wait(lambda _: all(len(mine) >= 5 for mine in numbers), WAIT_S)
+        for worker in workers:
+            worker.cancel()
+        for k, mine in enumerate(numbers):
+            assert {number % 3 for number in mine} == {k}
+
+
+def test_two_forms_of_one_camera_at_the_same_time(node: Node) -> None:
+    with node.connected() as drone:
+        small = drone.frames(scale=0.25)
+        large = drone.frames(encoding="raw")
+        for _ in range(3):
+            assert next(small).shape == (6, 8, 3)
+            assert next(large).shape == (24, 32, 3)
+        small.close()  # type: ignore[attr-defined]
+        assert next(large).shape == (24, 32, 3)
+
+
+def test_wishes_that_make_no_sense_are_refused(node: Node) -> None:
+    with node.connected() as drone:
+        for wrong in (
+            {"scale": 0.0},
+            {"scale": 2.0},
+            {"max_fps": -1.0},
+            {"quality": 101},
+            {"encoding": "png"},
+            {"encoding": "raw", "quality": 5},
+            {"part": (3, 3)},
+        ):
+            with pytest.raises(UsageError, match=r"must be|is of encoding"):
+                next(drone.frames(**wrong))
+
+
+def test_nobody_encodes_what_nobody_wants(far: Node) -> None:
+    server = far.proxy.server
+    with far.connected() as drone:
+        frames = drone.frames(max_fps=20)
+        next(frames)
+        assert server.subscribers("video/front") == 1
+        frames.close()  # type: ignore[attr-defined]
+        drone.wait(lambda _: server.subscribers("video/front") == 0, WAIT_S)
+
+
+class Wrong:
+    """A clock that is set wrong and runs fast."""
+
+    def __init__(self, ahead_s: float, drift: float) -> None:
+        self._ahead_ns = round(ahead_s * 1e9)
+        self._drift = drift
+        self._start_ns = time.monotonic_ns()
+
+    def __call__(self) -> int:
+        now_ns = time.monotonic_ns()
+        return now_ns + self._ahead_ns + round(self._drift * (now_ns - self._start_ns))
+
+    @property
+    def truth_ns(self) -> int:
+        """The proxy's clock less this one."""
+        return time.monotonic_ns() - self()
+
+
+@pytest.mark.parametrize("ahead_s", [-300.0, 86_400.0])
+def test_ages_are_true_to_their_uncertainty_whatever_the_clocks_say(far: Node, ahead_s: float) -> None:
+    clock = Wrong(ahead_s, drift=150e-6)
+    with far.connected(pace=Pace(clock)) as drone:
+        drone.takeoff()
+        for _ in range(20):
+            before_ns = clock.truth_ns
+            uncertainty_ns = drone.clock_uncertainty_ns
+            assert 0 < uncertainty_ns < 50_000_000
+            assert abs(drone.clock_offset_ns - before_ns) <= uncertainty_ns + 100_000
+            sample = drone.next_feedback(WAIT_S)
+            earliest_s = (time.monotonic_ns() - sample.captured_ns) / 1e9
+            age_s = drone.age_s(sample)
+            latest_s = (time.monotonic_ns() - sample.captured_ns) / 1e9
+            wrong_s = drone.clock_uncertainty_ns / 1e9 + 1e-4
+            assert earliest_s - wrong_s <= age_s <= latest_s + wrong_s
+        frame = drone.next_frame(timeout_s=WAIT_S)
+        assert frame.age_s == pytest.approx((time.monotonic_ns() - frame.captured_ns) / 1e9, abs=0.06)
+        stats = drone.stats
+        assert stats["feedback"].uncertainty_s > 0.0
+        delay = stats["feedback"].delay_s
+        assert delay is not None
+        assert delay.median > -stats["feedback"].uncertainty_s - 0.01
+        assert far.proxy.watch.airborne, "commands were not taken for stale"
+
+
+def test_one_host_needs_no_estimate() -> None:
+    near = near_node()
+    with near.proxy, near.connected() as drone:
+        assert drone.clock_uncertainty_ns == 0
+        assert drone.stats["feedback"].uncertainty_s == 0.0

@@ -1,0 +1,71 @@
+"""The page about the bytes on a network says what the fabric transport does."""
+
+from __future__ import annotations
+
+import re
+
+import msgspec
+import pytest
+
+from skyloop.transport.base import MAX_TOPIC
+from skyloop.transport.fabric import config, frames, layout, packets, server, window
+from tests.messages.test_codec import PACKETS
+from tests.messages.test_wire_format import FABRIC
+
+GOLDEN: dict[str, packets.Message] = {
+    "subscribe": packets.Subscribe("video/front?encoding=jpeg&quality=80", True),
+    "taken": packets.Taken("feedback", 9),
+    "seen": packets.Seen("video/front", 1000),
+    "bye": packets.Bye("closed by the application"),
+}
+
+
+def test_the_keys() -> None:
+    names = ("NAME", "WHO", "ID")
+    told = set(re.findall(r"^\| `(skyloop/1/[^`]+)` \|", FABRIC, re.MULTILINE))
+    assert told == {
+        layout.alive("NAME", "RUN"),
+        layout.info("NAME"),
+        layout.app(*names),
+        layout.join(*names),
+        *(layout.upward(way, *names) for way in (layout.ASK, layout.ORDER, layout.COMMAND)),
+        layout.to("NAME", "ID"),
+        layout.topic("NAME", "TOPIC"),
+        layout.video("NAME", "CAMERA", "VARIANT"),
+        layout.video_for("NAME", "CAMERA", "VARIANT", "ID"),
+    }
+
+
+def test_the_transports_own_kinds_are_complete() -> None:
+    rows = {int(number, 16): name for number, name in re.findall(r"^\| (0x\w+) \| (\w+) \|", FABRIC, re.MULTILINE)}
+    assert rows == {int(kind): kind.name.lower() for kind in packets.FabricKind}
+
+
+@pytest.mark.parametrize("name", GOLDEN)
+def test_golden_packets(name: str) -> None:
+    packet = (PACKETS / "fabric" / f"{name}.bin").read_bytes()
+    assert packets.parse(packet) == GOLDEN[name]
+    assert {path.stem for path in (PACKETS / "fabric").glob("*.bin")} == set(GOLDEN)
+
+
+def test_the_packet_that_is_shown_byte_by_byte() -> None:
+    rows = re.findall(r"^\| \d+ \| \d+ \| `([0-9A-F ]+)` \|$", FABRIC, re.MULTILINE)
+    assert bytes.fromhex("".join(rows)) == packets.taken("feedback", 9)
+
+
+def test_the_fields_of_what_begins_a_connection() -> None:
+    for struct in (packets.Join, packets.Welcome, packets.ProxyInfo):
+        (row,) = re.findall(rf"^\| {struct.__name__} \| (.*) \|$", FABRIC, re.MULTILINE)
+        assert re.findall(r"`(\w+)`", row) == [field.name for field in msgspec.structs.fields(struct)]
+
+
+def test_numbers_in_the_text() -> None:
+    assert f"`revision` uint, now {packets.REVISION}" in FABRIC
+    assert f"1 to {MAX_TOPIC} characters" in FABRIC
+    assert f"at most {packets.MAX_REASON} bytes" in FABRIC
+    assert f"Lease {config.LEASE_MS} ms" in FABRIC
+    assert f"seen within {server.CONFIRM_S:g} s" in FABRIC
+    assert f"At most {window.DEPTH} packets or {window.MAX_BYTES >> 20} MiB" in FABRIC
+    assert f"every {window.ACKNOWLEDGE_AFTER} packets, or {window.MAX_BYTES >> 13} KiB" in FABRIC
+    assert f"At most {frames.WINDOW} frames of a request" in FABRIC
+    assert f"nothing is heard for {frames.LOST_NS / 1e9:g} s" in FABRIC

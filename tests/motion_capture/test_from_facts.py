@@ -1,0 +1,85 @@
+"""Vicon, Qualisys and VRPN: the clients that the ``motioncapture`` package carries, against small servers that are
+written from public facts."""
+
+from __future__ import annotations
+
+import math
+import socket
+from collections.abc import Iterator
+
+import pytest
+
+from skyloop.errors import LinkError
+from skyloop.motion_capture import BodyPose, TrackState, mocap
+from skyloop.transport.testing import wait_until
+from tests.motion_capture.moving import BODIES, frame_of, pose
+from tests.processes.conftest import Process
+
+pytest.importorskip("motioncapture", reason="needs the motioncapture package: pip install 'skyloop[mocap]'")
+pytestmark = pytest.mark.process
+ENOUGH = 50
+QUALISYS_FRAMES_PORT = 6734  #: the UDP port of this host on which the package takes frames, whatever the address says
+
+
+def busy(port: int) -> bool:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+        try:
+            one.bind(("", port))
+        except OSError:
+            return True
+    return False
+
+
+@pytest.fixture(params=["vicon", "qualisys", "vrpn"])
+def address(request: pytest.FixtureRequest) -> Iterator[str]:
+    """Of a server that runs. It ends with its client."""
+    system = str(request.param)
+    if system == "qualisys" and busy(QUALISYS_FRAMES_PORT):
+        pytest.skip(f"UDP port {QUALISYS_FRAMES_PORT} of this host, which the package uses, is taken")
+    process = Process("-m", f"tests.motion_capture.{system}", "0")
+    try:
+        process.until("ready")
+        yield f"{system}://127.0.0.1:{process.text.split('ready ')[1].split()[0]}"
+    finally:
+        process.end()
+
+
+def test_the_poses_that_the_server_sends_come_out(address: str) -> None:
+    body, hidden = BODIES
+    seen: list[BodyPose] = []
+    with mocap(address, {"alpha": body, "beta": hidden}) as capture:
+        capture.wait("alpha", 20.0)
+        with capture.on_pose(seen.append):
+            wait_until(lambda: len(seen) >= ENOUGH, "poses came")
+        assert capture.state("beta") is TrackState.WAITING, "it is hidden"
+        assert capture.unknown == set()
+    assert {one.body for one in seen} == {"alpha"}
+    for one in seen:
+        place, yaw = pose(frame_of(one.position[2]))
+        assert one.position == pytest.approx(place, abs=1e-6), "metres, z up"
+        assert math.remainder(one.yaw - yaw, math.tau) == pytest.approx(0.0, abs=1e-5)
+    assert len({one.position for one in seen}) > ENOUGH / 2, "they are not one and the same"
+
+
+@pytest.fixture
+def vicon() -> Iterator[Process]:
+    process = Process("-m", "tests.motion_capture.vicon", "0")
+    try:
+        process.until("ready")
+        yield process
+    finally:
+        process.end()
+
+
+def test_a_vicon_that_ends_is_told_and_its_last_pose_not_kept(vicon: Process) -> None:
+    with mocap(f"vicon://127.0.0.1:{vicon.text.split('ready ')[1].split()[0]}", {"alpha": BODIES[0]}) as capture:
+        capture.wait("alpha", 20.0)
+        vicon.end()
+        wait_until(lambda: capture.state("alpha") is TrackState.LOST, "it was lost")
+        assert capture.pose("alpha") is None
+
+
+@pytest.mark.parametrize("system", ["vicon", "qualisys", "vrpn"])
+def test_nobody_there_is_a_link_error(system: str) -> None:
+    with pytest.raises(LinkError, match=r"sent no frame within 0\.3 s"):
+        mocap(f"{system}://127.0.0.1:9", {"alpha": "x"}, timeout_s=0.3)

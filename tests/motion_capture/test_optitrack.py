@@ -1,0 +1,100 @@
+"""The recorded OptiTrack session, through the ``motioncapture`` package and our process that listens to it."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+
+import pytest
+
+import skyloop
+from skyloop.errors import LinkError, NoAnswerError
+from skyloop.motion_capture import BodyPose, MotionCapture, TrackState, mocap
+from skyloop.motion_capture.pose import z_up
+from skyloop.motion_capture.source import ChildSource
+from skyloop.transport.testing import wait_until
+from tests.motion_capture import natnet
+from tests.processes.conftest import Process
+
+pytest.importorskip("motioncapture", reason="needs the motioncapture package: pip install 'skyloop[mocap]'")
+pytestmark = pytest.mark.process
+ENOUGH = 200
+
+
+@pytest.fixture
+def server() -> Iterator[Process]:
+    process = Process("-m", "tests.motion_capture.natnet", "0")
+    try:
+        process.until("ready")
+        yield process
+    finally:
+        process.end()
+
+
+def address(server: Process) -> str:
+    port = server.text.split("ready ")[1].split()[0]
+    return f"optitrack://127.0.0.1?interface=127.0.0.1&port={port}"
+
+
+def connect(server: Process) -> MotionCapture:
+    return mocap(address(server), {"alpha": natnet.BODY})
+
+
+def test_the_recorded_poses_come_out_in_our_axes(server: Process) -> None:
+    recorded = [natnet.rigid_body(frame) for frame in natnet.frames()]
+    assert len(recorded) == 518
+    expected = {z_up(body.position, body.quaternion) for body in recorded if body.tracked}
+    seen: list[BodyPose] = []
+    with connect(server) as capture:
+        pose = capture.wait("alpha")
+        with capture.on_pose(seen.append):
+            wait_until(lambda: len(seen) >= ENOUGH, "poses came")
+        assert capture.state("alpha") is TrackState.TRACKED
+        assert capture.unknown == set()
+    assert all((pose.position, pose.quaternion) in expected for pose in seen)
+    assert len({pose.position for pose in seen}) > ENOUGH / 2, "they are not one and the same"
+    assert [pose.captured_ns for pose in seen] == sorted({pose.captured_ns for pose in seen})
+    assert 1.3 < pose.position[2] < 1.6, "it flew at head height: z is up"
+    assert pose.transform.rotation.as_matrix().shape == (3, 3)
+
+
+def test_a_server_that_stops_is_told_and_a_frozen_pose_never_given(server: Process) -> None:
+    with connect(server) as capture:
+        capture.wait("alpha")
+        told: list[str] = []
+        with capture.on_event(lambda event: told.append(event.text)):
+            server.signal(signal.SIGSTOP)
+            wait_until(lambda: "alpha is not tracked any more" in told, "it was told")
+            assert capture.pose("alpha") is None
+            assert capture.state("alpha") is TrackState.LOST
+            server.signal(signal.SIGCONT)
+            wait_until(lambda: "alpha is tracked again" in told, "it was told")
+            assert capture.pose("alpha") is not None
+
+
+def test_the_process_that_listens_is_replaced_when_it_dies(server: Process) -> None:
+    with connect(server) as capture:
+        capture.wait("alpha")
+        source = capture._source
+        assert isinstance(source, ChildSource)
+        assert source.pid is not None
+        told: list[str] = []
+        with capture.on_event(lambda event: told.append(event.text)):
+            os.kill(source.pid, signal.SIGKILL)
+            wait_until(lambda: any("trying again" in text for text in told), "it was told")
+    assert capture.state("alpha") is TrackState.ENDED
+    with pytest.raises(skyloop.ClosedError):
+        capture.wait("alpha", 0.1)
+
+
+def test_a_body_that_it_does_not_know_names_those_that_it_sees(server: Process) -> None:
+    with mocap(address(server), {"alpha": "RaceQuadd"}) as capture:
+        wait_until(lambda: capture.unknown, "it saw another one")
+        with pytest.raises(NoAnswerError, match=r"does not track 'RaceQuadd'.*it sees RaceQuad"):
+            capture.wait("alpha", 0.2)
+
+
+def test_nobody_there_is_a_link_error() -> None:
+    with pytest.raises(LinkError, match=r"sent no frame within 0\.3 s"):
+        mocap("optitrack://127.0.0.1?interface=127.0.0.1&port=9", {"alpha": "x"}, timeout_s=0.3)

@@ -1,0 +1,119 @@
+"""The process that listens to a system, and what replaces it when it dies, without a system."""
+
+from __future__ import annotations
+
+import io
+import sys
+import types
+from typing import Any
+
+import msgspec
+import pytest
+
+from skyloop.errors import LinkError, MissingExtraError
+from skyloop.motion_capture import parse_system, worker
+from skyloop.motion_capture.source import ChildSource
+from skyloop.motion_capture.worker import RawFrame, read
+from skyloop.transport.testing import wait_until
+
+SYSTEM = parse_system("vicon://192.0.2.1")
+
+
+class Turn:
+    x, y, z, w = 0.0, 0.0, 0.6, 0.8
+
+
+class Body:
+    position = (1.0, 2.0, 3.0)
+    rotation = Turn()
+
+
+def package(frames: int, error: Exception) -> types.ModuleType:
+    """Stands for the ``motioncapture`` package: gives so many frames, and then fails."""
+
+    class System:
+        def __init__(self) -> None:
+            self.left = frames
+
+        def waitForNextFrame(self) -> None:  # noqa: N802  as the package names it
+            self.left -= 1
+            if self.left < 0:
+                raise error
+
+        rigidBodies = {"alpha_body": Body()}  # noqa: N815, RUF012
+
+    made: list[tuple[str, dict[str, str]]] = []
+
+    def connect(kind: str, settings: dict[str, str]) -> System:
+        made.append((kind, settings))
+        return System()
+
+    module = types.ModuleType("motioncapture")
+    module.connect = connect  # type: ignore[attr-defined]
+    module.made = made  # type: ignore[attr-defined]
+    return module
+
+
+@pytest.mark.parametrize(("error", "code"), [(RuntimeError("gone"), 1), (BrokenPipeError(), 0)])
+def test_frames_are_written_until_it_fails(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], error: Exception, code: int
+) -> None:
+    module: Any = package(2, error)
+    monkeypatch.setitem(sys.modules, "motioncapture", module)
+    written: list[bytes] = []
+    monkeypatch.setattr(worker, "open_output", lambda: Collect(written))
+    assert worker.main("vicon", msgspec.json.encode(SYSTEM.configuration).decode()) == code
+    assert module.made == [("vicon", {"hostname": "192.0.2.1"})]
+    stream = io.BytesIO(b"".join(written))
+    first = read(stream)
+    assert first is not None
+    assert first.bodies == {"alpha_body": ((1.0, 2.0, 3.0), (0.0, 0.0, 0.6, 0.8))}
+    assert read(stream) is not None
+    assert read(stream) is None
+    assert ("gone" in capfd.readouterr().err) is (code == 1)
+
+
+class Collect(io.BytesIO):
+    def __init__(self, written: list[bytes]) -> None:
+        super().__init__()
+        self._written = written
+
+    def write(self, data: Any) -> int:
+        self._written.append(bytes(data))
+        return len(data)
+
+
+def test_without_the_package_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "motioncapture", None)
+    assert worker.main("vicon", "{}") == worker.MISSING
+
+
+def source(code: str, taken: list[RawFrame], told: list[str]) -> ChildSource:
+    """A source whose child runs this code."""
+    return ChildSource(SYSTEM, taken.append, told.append, command=(sys.executable, "-c", code))
+
+
+def test_a_missing_package_names_what_to_install() -> None:
+    with pytest.raises(MissingExtraError, match=r"skyloop\[mocap\]"):
+        source("raise SystemExit(3)", [], []).start(20.0)
+
+
+def test_what_a_child_complains_of_is_told() -> None:
+    told: list[str] = []
+    failing = source("import sys; sys.exit('no such host')", [], told)
+    with pytest.raises(LinkError, match="no frame within"):
+        failing.start(1.0)
+    assert failing.pid is not None
+    assert any("no such host" in text for text in told)
+
+
+def test_a_child_that_sends_nonsense_is_replaced() -> None:
+    told: list[str] = []
+    taken: list[RawFrame] = []
+    good = "from skyloop.motion_capture.worker import *; write(sys.stdout.buffer, RawFrame(1, {}));"
+    failing = source(good + "sys.stdout.buffer.write(b'\\xff' * 9); sys.stdout.flush()", taken, told)
+    failing.start(20.0)
+    wait_until(lambda: len(taken) >= 2, "a second child was started")
+    failing.close()
+    failing.close()
+    assert any("bytes" in text for text in told)

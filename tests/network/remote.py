@@ -1,0 +1,85 @@
+"""An application on another host that does what a test tells it, call by call, and says what came of it."""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any, Concatenate, ParamSpec, TypeVar
+
+from skyloop.bench.hosts.namespaces import Host
+from skyloop.bench.workers import STARTS_WITHIN_S, Pipe, Workers
+from skyloop.client import Drone
+
+ANSWERS_WITHIN_S = 40.0
+_Result = TypeVar("_Result")
+_Arguments = ParamSpec("_Arguments")
+
+
+class RemoteError(Exception):
+    """What a call raised over there, with its traceback."""
+
+
+class Here:
+    """What an application has: its drones, and what it was told, with the time on its own clock [ns]."""
+
+    def __init__(self) -> None:
+        self.drones: dict[str, Drone] = {}
+        self.told: dict[str, list[tuple[int, Any]]] = {}
+        self.objects: dict[str, Any] = {}
+
+    def tell(self, what: str) -> Callable[[Any], None]:
+        """A listener that writes down what it gets."""
+        found = self.told.setdefault(what, [])
+        return lambda value: found.append((time.monotonic_ns(), value))
+
+
+class Remote:
+    """``do(function, …)`` calls a function of a module there, as ``function(here, …)``; its result comes back."""
+
+    def __init__(self, workers: Workers, host: Host) -> None:
+        self.host = host
+        self._worker = workers.start(serve, prefix=host.prefix)
+        self._worker.answer(STARTS_WITHIN_S)
+
+    def begin(
+        self, work: Callable[Concatenate[Here, _Arguments], _Result], *args: _Arguments.args, **kw: _Arguments.kwargs
+    ) -> None:
+        """Start a call whose :meth:`end` is waited for later."""
+        self._worker.pipe.send((work.__module__, work.__qualname__, args, kw))
+
+    def end(self, timeout_s: float = ANSWERS_WITHIN_S) -> Any:
+        """The result of the call that was begun. Raises :class:`RemoteError` for what it raised."""
+        good, answer = self._worker.answer(timeout_s)
+        if good:
+            return answer
+        raise RemoteError(f"on host {self.host.name!r}:\n{answer}")
+
+    def do(
+        self, work: Callable[Concatenate[Here, _Arguments], _Result], *args: _Arguments.args, **kw: _Arguments.kwargs
+    ) -> _Result:
+        self.begin(work, *args, **kw)
+        result: _Result = self.end()
+        return result
+
+    @property
+    def pid(self) -> int:
+        return self._worker.pid
+
+
+def serve(pipe: Pipe) -> None:
+    """What a remote application's process does."""
+    here = Here()
+    pipe.send("ready")
+    try:
+        while (call := pipe.recv()) is not None:
+            module, name, arguments, keywords = call
+            try:
+                answer = (True, getattr(import_module(module), name)(here, *arguments, **keywords))
+            except Exception:  # noqa: BLE001  (whatever it is, the test wants to know)
+                answer = (False, traceback.format_exc())
+            pipe.send(answer)
+    finally:
+        for drone in here.drones.values():
+            drone.close()

@@ -1,0 +1,47 @@
+"""Ages of samples on a host whose clock says something else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from skyloop.bench.hosts.impairments import Impairments
+from skyloop.bench.hosts.namespaces import Lab
+from skyloop.bench.hosts.path import Path
+from skyloop.transport.testing import wait_until
+from tests.network import flying
+from tests.network.remote import Remote
+
+AHEAD_S = 1000
+AHEAD_NS = AHEAD_S * 1_000_000_000
+PORT = 7447
+
+
+def test_the_offset_of_a_clock_set_apart_is_true_to_its_stated_uncertainty(
+    lab: Lab, proxy: Callable[..., object], remote: Callable[..., Remote]
+) -> None:
+    """Both ways take differently long, which no round trip shows: half the difference is the error, and is stated."""
+    hangar, desk = lab.host("hangar"), lab.host("desk", clock_ahead_s=AHEAD_S)
+    path = Path(lab, hangar, desk, seed=3)
+    path.set(Impairments(delay_s=0.025, jitter_s=0.005), back=Impairments(delay_s=0.001))
+    address = f"{path.first}:{PORT}"
+    proxy(hangar, "alpha", "--listen", address, "--no-multicast", uri="sim://?world=empty&cameras=front")
+    app = remote(desk)
+    app.do(flying.connect, "alpha", network=address)
+    app.do(flying.watch_frames, "alpha")
+
+    def error_and_uncertainty_ns() -> tuple[int, int]:
+        offset_ns, uncertainty_ns = app.do(flying.clock, "alpha")
+        return abs(offset_ns + AHEAD_NS), uncertainty_ns  # the proxy's clock less ours, which is ahead
+
+    error_ns, uncertainty_ns = error_and_uncertainty_ns()
+    assert 0.010e9 < error_ns <= uncertainty_ns, "(25 ms - 1 ms) / 2 cannot be seen from there"
+    app.do(flying.wait_frames, "alpha", 5)
+    ages_s = [age_s for _, (_, age_s, _) in app.do(flying.frames, "alpha")]
+    assert min(ages_s) >= 0.025 - 0.05, "a frame was on the way for 25 ms, and the clock may be wrong by 13"
+    assert min(ages_s) < 0.5
+    path.set(Impairments(delay_s=0.001))
+    wait_until(lambda: error_and_uncertainty_ns()[1] < uncertainty_ns // 2, "a ping has made the estimate a better one")
+    better_ns, uncertainty_ns = error_and_uncertainty_ns()
+    assert better_ns <= uncertainty_ns
+    app.do(flying.call, "alpha", "takeoff")  # commands are young enough by the proxy's clock
+    app.do(flying.wait, "alpha", "hovering")

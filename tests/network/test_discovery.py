@@ -1,0 +1,52 @@
+"""Who is found on a network of several hosts, and what is told of a name that is not there or taken."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+
+import pytest
+
+from tests.network import flying
+from tests.network.conftest import Lan
+from tests.network.remote import Remote, RemoteError
+from tests.processes.conftest import Process
+
+Start = Callable[..., Process]
+OnHost = Callable[..., Remote]
+
+
+def test_proxies_of_other_hosts_are_listed_and_connected_to_by_name(
+    lan: Lan, start: Start, proxy: Start, remote: OnHost
+) -> None:
+    hangar, roof, desk = (lan.host(name) for name in ("hangar", "roof", "desk"))
+    proxy(hangar, "alpha")
+    proxy(roof, "bravo")
+    hidden = start(roof, "-m", "skyloop", "proxy", "sim://?world=empty&cameras=none", "--name", "hidden")
+    hidden.until("ready")
+
+    listed = desk.run("env", "COLUMNS=200", sys.executable, "-m", "skyloop", "list")
+    rows = {line.split()[0]: line for line in listed.splitlines() if line.split()}
+    assert "hangar" in rows["alpha"]
+    assert "roof" in rows["bravo"]
+    assert "landed" in rows["alpha"]
+    assert "hidden" not in rows, "without --network nothing leaves a host"
+    app = remote(desk)
+    for name in ("alpha", "bravo"):
+        assert app.do(flying.connect, name) == "up"
+        app.do(flying.call, name, "takeoff")
+        app.do(flying.wait, name, "hovering")
+    with pytest.raises(RemoteError, match=r"'alphaa'.*did you mean 'alpha'"):
+        app.do(flying.connect, "alphaa")
+    with pytest.raises(RemoteError, match="no proxy"):
+        app.do(flying.connect, "hidden")
+
+
+def test_a_name_that_another_host_has_is_refused_with_who_has_it(lan: Lan, start: Start, proxy: Start) -> None:
+    hangar, roof = lan.host("hangar"), lan.host("roof")
+    first = proxy(hangar, "alpha")
+    second = start(roof, "-m", "skyloop", "proxy", "sim://?cameras=none", "--name", "alpha", "--network")
+    second.until("in use")
+    second.until("hangar")
+    second.until(str(first.pid))
+    assert second.wait() != 0

@@ -1,0 +1,29 @@
+"""A swarm over the network whose users stop and die: each of its drones that flies fails safe."""
+
+from __future__ import annotations
+
+import pytest
+
+from skyloop.bench import swarm
+
+pytest.importorskip("zenoh")
+pytest.importorskip("cv2")
+
+
+@pytest.mark.usefixtures("_possible")
+def test_ten_drones_of_three_users_with_observers_fail_safe_with_their_users() -> None:
+    found = swarm.measure(6.0, drones=10, users=3, observers=3)
+    assert (found.drones, found.users, found.observers, found.hosts) == (10, 3, 3, True)
+    verdict = found.failsafe
+    assert verdict.missed == 0
+    assert verdict.expected >= 10, (
+        "each user's drones once, and the first one's twice, but for some that are late to fly"
+    )
+    assert verdict.delay is not None
+    assert verdict.delay.median_us < 1e6
+    assert found.command.samples > 100
+    assert found.commands_per_s > 5.0
+    assert found.feedback_at_observers is not None
+    assert found.feedback_at_observers.samples > found.feedback.samples
+    assert found.frames_per_s > 0.5
+    assert set(found.cpu) == {"simulation", "users", "observers"}

@@ -1,0 +1,83 @@
+"""Poses from outside: who may tell them, what the driver gets, and what is told of those that it can't take."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from skyloop.drivers.seams import ExternalPose
+from skyloop.errors import DriverError
+from skyloop.messages import EventKind, GetStatistics, Role, Statistics, VehiclePose, encode
+from tests.proxy.fake import App, Bench
+
+POSE = VehiclePose(3_000, (1.0, 2.0, 3.0), (0.0, 0.0, 0.6, 0.8), 0.001, 0.01)
+
+
+@pytest.fixture
+def taken(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> list[ExternalPose]:
+    """What the driver was told."""
+    poses: list[ExternalPose] = []
+    monkeypatch.setattr(bench.driver, "external_pose", poses.append)
+    return poses
+
+
+def refusals(app: App) -> list[tuple[object, str]]:
+    app.sync()
+    return [(event.data["reason"], event.text) for event in app.events if event.kind is EventKind.COMMAND_REFUSED]
+
+
+def test_a_pilots_pose_reaches_the_driver_without_the_authority(bench: Bench, taken: list[ExternalPose]) -> None:
+    app = bench.join("mocap")
+    assert app.end.send(encode(POSE))
+    app.sync()
+    assert taken == [ExternalPose((1.0, 2.0, 3.0), (0.8, 0.0, 0.0, 0.6), 3_000, 0.001, 0.01)]
+    assert refusals(app) == []
+    counts = app.ask(GetStatistics())
+    assert isinstance(counts, Statistics)
+    assert counts.counters["poses.told"] == 1
+
+
+def test_an_observers_pose_is_refused(bench: Bench, taken: list[ExternalPose]) -> None:
+    app = bench.join("onlooker", Role.OBSERVER)
+    assert app.end.send(encode(POSE))
+    [(reason, text)] = refusals(app)
+    assert reason == "observer"
+    assert "connect as a pilot" in text
+    assert taken == []
+
+
+@pytest.mark.parametrize(
+    ("pose", "said"),
+    [
+        (VehiclePose(1, (math.nan, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)), "finite"),
+        (VehiclePose(1, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 2.0)), "length 1"),
+    ],
+)
+def test_what_is_no_pose_is_refused(bench: Bench, taken: list[ExternalPose], pose: VehiclePose, said: str) -> None:
+    app = bench.join("mocap")
+    assert app.end.send(encode(pose))
+    [(reason, text)] = refusals(app)
+    assert reason == "non_finite"
+    assert said in text
+    assert taken == []
+
+
+def test_a_vehicle_that_takes_none_is_told_of(bench: Bench) -> None:
+    app = bench.join("mocap")
+    for _ in range(3):
+        assert app.end.send(encode(POSE))
+    [(reason, text)] = refusals(app)
+    assert (reason, text) == ("unsupported", "mocap: a pose refused: fake:// takes no poses from outside")
+
+
+def test_a_driver_that_fails_is_told_of(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(pose: ExternalPose) -> None:
+        raise DriverError("the vehicle is not heard")
+
+    monkeypatch.setattr(bench.driver, "external_pose", fail)
+    app = bench.join("mocap")
+    assert app.end.send(encode(POSE))
+    [(reason, text)] = refusals(app)
+    assert reason == "driver_failed"
+    assert "not heard" in text

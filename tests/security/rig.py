@@ -1,0 +1,193 @@
+"""A drone on the network with its rightful users, and somebody with the plain API of Zenoh who tries things."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from contextlib import ExitStack
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import zenoh
+
+from skyloop.keys import Lab, load
+from skyloop.keys.identity import make_identity
+from skyloop.messages import AnyRequest, FlightState, Hello, Request, Role, Sample, encode
+from skyloop.transport.base import Dialer
+from skyloop.transport.fabric import FabricServer, FabricSettings, layout, packets
+from skyloop.transport.fabric import dial as fabric_dial
+from skyloop.transport.fabric.access import secured
+from skyloop.transport.fabric.client import FabricClient
+from skyloop.transport.fabric.config import free_port
+from tests.proxy.fake import App, Bench
+
+DRONE = "alpha"
+ANSWER_S = 0.3
+NOW = datetime.now(UTC)
+
+
+def make_lab(directory: Path) -> Lab:
+    """Jane flies alpha while Wendy looks on; the others have keys, too, but not for what they will try."""
+    lab = Lab.make(directory, now=NOW - timedelta(days=40))
+    for name, role, drones in (
+        ("alpha", "proxy", "alpha"),
+        ("bravo", "proxy", "bravo"),
+        ("jane", "pilot", "alpha*"),
+        ("wendy", "observer", "*"),
+        ("kim", "pilot", "alpha"),
+        ("bob", "pilot", "bravo,charlie*"),
+        ("olga", "observer", "*"),
+        ("oscar", "observer", "bravo"),
+        ("eve", "pilot", "*"),
+        ("hub", "router", "*"),
+    ):
+        lab.issue(make_identity(name, role, drones), now=NOW)
+    lab.issue(make_identity("old", "pilot"), now=NOW - timedelta(days=35))
+    return lab
+
+
+def keys_of(lab: Lab, name: str, directory: Path) -> Path:
+    """A copy of an identity's folder, as its holder has it."""
+    copy = directory / name
+    copy.mkdir(mode=0o700, parents=True, exist_ok=True)
+    for file in lab.folder(name).iterdir():
+        (copy / file.name).write_bytes(file.read_bytes())
+    (copy / "identity.key").chmod(0o600)
+    return copy
+
+
+class Rig:
+    """A proxy named ``alpha`` with a fake vehicle, jane who flies it, and wendy who looks on. ``keys`` is None for a
+    network without keys, where everybody is called ``anyone``."""
+
+    def __init__(self, keys: Callable[[str], Path] | None) -> None:
+        self._keys = keys
+        self.place = f"127.0.0.1:{free_port('127.0.0.1')}"
+        self.frames = 0  #: that were published
+        self._ends = ExitStack()
+
+    def __enter__(self) -> Rig:
+        server = FabricServer(DRONE, self._settings("alpha", listen=(self.place,)))
+        self.bench = self._ends.enter_context(Bench(transport=(server, self.dialer("jane"))))
+        self.server = server
+        self.jane = self.bench.pilot("jane")
+        self.bench.driver.report(state=FlightState.HOVERING)
+        self.bench.dial = self.dialer("wendy")
+        self.wendy = self.bench.join("wendy", Role.OBSERVER)
+        self.wendy.end.subscribe("video/front")
+        self.wendy.sync()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ends.__exit__(kind, error, trace)
+
+    def _settings(self, who: str, **where: Any) -> FabricSettings:
+        settings = FabricSettings(multicast=False, **where)
+        return settings if self._keys is None else secured(settings, load(self._keys(who)))
+
+    def settings(self, who: str) -> FabricSettings:
+        """An application's."""
+        return self._settings(who, connect=(self.place,))
+
+    def dialer(self, who: str) -> Dialer:
+        return fabric_dial(DRONE, self.settings(who))
+
+    @property
+    def endpoint(self) -> str:
+        return f"tcp/{self.place}" if self._keys is None else f"quic/{self.place}?mixed_rel=1"
+
+    def who(self, name: str) -> str:
+        """What somebody is called on this network."""
+        return "anyone" if self._keys is None else name
+
+    def connection_of(self, app: App) -> str:
+        """What an eavesdropper would have to know."""
+        assert isinstance(app.end, FabricClient)
+        return app.end._id
+
+    def run_bytes(self) -> bytes:
+        return bytes.fromhex(self.server._run)
+
+    def intruder(self, name: str) -> Intruder:
+        session = third_party(self.endpoint, None if self._keys is None else self._keys(name))
+        return Intruder(session, self.who(name), self)
+
+
+def third_party(endpoint: str, keys: Path | None, *, authority: Path | None = None, timeout_ms: int = 3000) -> Any:
+    """A session of the plain API, configured by whoever wants something; raises ``zenoh.ZError`` if nothing answers."""
+    config = zenoh.Config()
+    tls: dict[str, Any] = {"enable_mtls": True, "verify_name_on_connect": False}
+    if keys is not None:
+        certificate, key = str(keys / "identity.pem"), str(keys / "identity.key")
+        tls |= {"connect_certificate": certificate, "connect_private_key": key}
+        authority = authority or keys / "ca.pem"
+    else:
+        tls["enable_mtls"] = False
+    if authority is not None:
+        tls["root_ca_certificate"] = str(authority)
+    wishes = {
+        "mode": "client",
+        "connect/endpoints": [endpoint],
+        "connect/timeout_ms": timeout_ms,
+        "connect/exit_on_failure": True,
+        "scouting/multicast/enabled": False,
+        "transport/link/tls": tls,
+    }
+    for path, value in wishes.items():
+        config.insert_json5(path, json.dumps(value))
+    return zenoh.open(config)
+
+
+class Intruder:
+    """Somebody with a session of the plain API, who knows the layout of keys and the packets as they are documented."""
+
+    def __init__(self, session: Any, who: str, rig: Rig) -> None:
+        self.session = session
+        self.who = who
+        self.rig = rig
+        self.id = layout.new_id()
+        self.got: list[tuple[str, bytes]] = []
+        self.held: list[Any] = []
+
+    def close(self) -> None:
+        self.session.close()
+
+    def put(self, key: str, packet: bytes, attachment: bytes = bytes(8)) -> None:
+        """By both links. A put without a publisher is sent whether or not this end was told that somebody listens, so
+        what is kept from arriving is kept by the other end."""
+        self.session.put(key, packet, attachment=attachment, congestion_control=zenoh.CongestionControl.BLOCK)
+        publisher = self.session.declare_publisher(key, reliability=zenoh.Reliability.BEST_EFFORT)
+        publisher.put(packet, attachment=attachment)
+        self.held.append(publisher)
+
+    def send(self, way: str, sample: Sample, *, who: str | None = None, connection: str | None = None) -> None:
+        """As an application, by one of its keys or by somebody else's."""
+        self.put(layout.upward(way, DRONE, who or self.who, connection or self.id), encode(sample))
+
+    def request(self, way: str, body: AnyRequest, **to: str) -> None:
+        self.send(way, Request(7, body), **to)
+
+    def listen(self, key: str) -> None:
+        def heard(sample: Any) -> None:
+            self.got.append((str(sample.key_expr), bytes(sample.payload)))
+
+        self.held.append(self.session.declare_subscriber(key, heard))
+
+    def ask(self, key: str, payload: bytes = b"") -> list[bytes]:
+        """The answers to a query."""
+        replies = self.session.get(key, payload=payload, target=zenoh.QueryTarget.ALL, timeout=ANSWER_S)
+        return [bytes(reply.ok.payload) for reply in replies if reply.ok is not None]
+
+    def join(self, who: str | None = None) -> bool:
+        """Begin a connection, with its token, as the layout of keys says; whether the proxy agreed."""
+        who = who or self.who
+        self.listen(layout.to(DRONE, self.id))
+        self.held.append(self.session.liveliness().declare_token(layout.app(DRONE, who, self.id)))
+        wish = packets.encode_own(packets.Join(packets.REVISION, self.rig.server._run))
+        joined = bool(self.ask(layout.join(DRONE, who, self.id), wish))
+        self.request(layout.ASK, Hello("intruder", Role.PILOT), who=who)
+        return joined

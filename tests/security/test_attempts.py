@@ -1,0 +1,102 @@
+"""Attempts with the plain API of Zenoh: which key lets one do what. ``docs/security.md`` shows the outcomes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from skyloop.transport.testing import wait_until
+from tests.security.deeds import DEEDS, Deed
+from tests.security.rig import Intruder, Rig, keys_of, make_lab
+
+#: The columns: whose key is used, and in words.
+COLUMNS = {
+    "nobody": "without keys",
+    "kim": "another pilot of it",
+    "bob": "a pilot of others",
+    "olga": "an observer",
+    "oscar": "an observer of others",
+    "bravo": "another drone's proxy",
+    "eve": "revoked",
+}
+#: What works, by the deed's words; everything else has no effect.
+SEEN = {"nobody", "kim", "bob", "olga"}
+WORKS = {
+    "find the drone": {*SEEN, "oscar", "bravo"},
+    "see its feedback": SEEN,
+    "see its video": SEEN,
+    "read its parameters": SEEN,
+    "hear the answers to another pilot": SEEN,  # parameters, statistics, leases: what is no secret
+    "request the authority": {"nobody", "kim"},
+    "stop its motors": {"nobody", "kim"},
+    "take over the token of another pilot's life, and end it": set(),  # Zenoh: it lives while one of the two does
+}
+
+
+def works(deed: Deed, who: str) -> bool:
+    return who in WORKS.get(deed.what, {"nobody"})
+
+
+@pytest.fixture(scope="module")
+def keys(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """A lab with keys, from which eve was shut out later on."""
+    directory = tmp_path_factory.mktemp("keys")
+    lab = make_lab(directory / "lab")
+    eve = keys_of(lab, "eve", directory)
+    lab.revoke("eve")
+    return lambda name: eve if name == "eve" else lab.folder(name)
+
+
+@pytest.fixture(scope="module")
+def secured(keys: Callable[[str], Path]) -> Iterator[Rig]:
+    with Rig(keys) as rig:
+        yield rig
+
+
+@pytest.fixture
+def rig(request: pytest.FixtureRequest, keys: Callable[[str], Path]) -> Iterator[Rig]:
+    """The one that all attempts without effect share, or a new one for an attempt that works."""
+    deed, who = request.node.callspec.params["deed"], request.node.callspec.params["who"]
+    if who != "nobody" and not works(deed, who):
+        yield request.getfixturevalue("secured")
+        return
+    with Rig(None if who == "nobody" else keys) as own:
+        yield own
+
+
+@pytest.fixture
+def intruder(rig: Rig, who: str) -> Iterator[Intruder]:
+    somebody = rig.intruder(who)
+    yield somebody
+    somebody.close()
+
+
+def comes_true(condition: Callable[[], bool], within_s: float) -> bool:
+    deadline = time.monotonic() + within_s
+    while not condition():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.002)
+    return True
+
+
+@pytest.mark.parametrize("who", COLUMNS)
+@pytest.mark.parametrize("deed", DEEDS, ids=lambda deed: deed.what.replace(" ", "-"))
+def test_an_attempt(deed: Deed, who: str, rig: Rig, intruder: Intruder) -> None:
+    if works(deed, who):
+
+        def tried() -> bool:  # again, as datagrams may be lost and subscriptions need a moment to be known
+            deed.do(rig, intruder)
+            return comes_true(lambda: deed.done(rig, intruder), 0.5)
+
+        wait_until(tried, f"{deed.what} works")
+        return
+    deed.do(rig, intruder)
+    deed.do(rig, intruder)
+    assert not comes_true(lambda: deed.done(rig, intruder), 0.05)
+    rig.jane.sync()
+    rig.wendy.sync()
+    assert not deed.done(rig, intruder)

@@ -1,0 +1,53 @@
+"""The fabric transport keeps the contract of all transports, over TCP and UDP on the loopback interface."""
+
+from __future__ import annotations
+
+import itertools
+
+from skyloop.transport.base import Dialer, ServerEnd
+from skyloop.transport.conformance import TransportSuite
+from skyloop.transport.fabric import FabricServer, FabricSettings, dial
+from skyloop.transport.fabric.client import FabricClient
+from skyloop.transport.fabric.config import free_port
+from skyloop.transport.fabric.session import Session
+from skyloop.transport.testing import ClientLog, ServerLog, wait_until
+
+_numbers = itertools.count(1)
+
+
+class TestFabric(TransportSuite):
+    def make_server(self) -> ServerEnd:
+        self.place = f"127.0.0.1:{free_port('127.0.0.1')}"
+        self.name = f"proxy{next(_numbers)}"
+        return FabricServer(self.name, FabricSettings(listen=(self.place,), multicast=False))
+
+    def dialer(self, server: ServerEnd) -> Dialer:
+        return dial(self.name, FabricSettings(connect=(self.place,), multicast=False))
+
+
+def test_after_an_end_that_nobody_announced_another_session_is_used() -> None:
+    """The old one may be half forgotten at the other end, and then finds nobody or gets no answers."""
+    settings = FabricSettings(listen=(f"127.0.0.1:{free_port('127.0.0.1')}",), multicast=False)
+    dialer = dial("alpha", FabricSettings(connect=settings.listen, multicast=False))
+
+    def serve_once(session: Session | None) -> Session:
+        server, log = FabricServer("alpha", settings), ClientLog()
+        server.start(ServerLog())
+        try:
+            client = dialer(log)
+            assert isinstance(client, FabricClient)
+            assert session is None or client.session is not session
+            first = client.session
+            client.close()
+            client = dialer(log)
+            assert isinstance(client, FabricClient)
+            assert client.session is first, "an end that both know of is none"
+            found = server._session
+            assert found is not None
+            found.close()  # as the network would
+            wait_until(lambda: len(log.closings) == 2, "the connection has ended")
+            return first
+        finally:
+            server.stop()
+
+    serve_once(serve_once(None))

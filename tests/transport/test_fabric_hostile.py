@@ -1,0 +1,206 @@
+"""Whatever anybody sends on whichever key, the fabric transport goes on serving those who keep to the protocol."""
+
+from __future__ import annotations
+
+import json
+import logging
+import random
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import pytest
+import zenoh
+
+from skyloop.messages import Command, Hello, ReleaseAuthority, Request, Takeoff, encode
+from skyloop.transport.base import FEEDBACK, MAX_PACKET, video
+from skyloop.transport.fabric import FabricServer, FabricSettings, dial, layout, packets
+from skyloop.transport.fabric.client import FabricClient
+from skyloop.transport.fabric.config import free_port
+from skyloop.transport.testing import FRONT, ClientLog, ServerLog, header, picture, wait_until
+
+LOCAL = "127.0.0.1"
+
+
+def stranger(**sections: list[str]) -> zenoh.Session:
+    """Somebody with Zenoh and nothing else."""
+    config = zenoh.Config()
+    wishes: dict[str, Any] = {"mode": "peer", "scouting/multicast/enabled": False, "listen/endpoints": []}
+    for key, value in {**wishes, **{f"{name}/endpoints": value for name, value in sections.items()}}.items():
+        config.insert_json5(key, json.dumps(value))
+    return zenoh.open(config)
+
+
+class Scene:
+    """A server and an application that keep to the protocol, and a stranger who is connected to both."""
+
+    def __init__(self, ends: ExitStack) -> None:
+        place, lair = (f"{LOCAL}:{free_port(LOCAL)}" for _ in range(2))
+        self.intruder = stranger(listen=[f"tcp/{lair}"], connect=[f"tcp/{place}"])
+        ends.callback(self.intruder.close)
+        self.server = FabricServer("alpha", FabricSettings(listen=(place,), multicast=False))
+        self.log = ServerLog()
+        self.server.start(self.log)
+        ends.callback(self.server.stop)
+        self.app_log = ClientLog()
+        self.app = dial("alpha", FabricSettings(connect=(place, f"tcp/{lair}"), multicast=False))(self.app_log)
+        ends.callback(self.app.close)
+        wait_until(lambda: self.log.joined, "the application joined")
+        for topic in (FEEDBACK, video(FRONT)):
+            self.app.subscribe(topic)
+        wait_until(lambda: self.server.subscribers(video(FRONT)) == 1, "it is subscribed")
+        assert isinstance(self.app, FabricClient)
+        self.id = self.app._id
+        self.run = bytes.fromhex(self.server._run)
+        wait_until(lambda: len(list(self.intruder.info.peers_zid())) == 2, "the intruder is connected to both")
+
+    def still_serves(self) -> None:
+        before = len(self.app_log.packets)
+        assert self.app.send(b"still here")
+        wait_until(lambda: self.log.packets[-1:] == [(self.log.joined[0], b"still here")], "it still comes up")
+        wait_until(lambda: self.server.publish(FEEDBACK, b"f") == 0, "there is room")
+        wait_until(lambda: b"f" in self.app_log.packets[before:], "it still comes down")
+        seq = self.app_log.seen[-1] + 1 if self.app_log.seen else 0
+        self.server.publish_frame(header(seq), picture(header(seq)))
+        wait_until(lambda: self.app_log.saw(seq), "frames still come")
+        assert self.app_log.closings == []
+        assert self.log.left == []
+
+
+@pytest.fixture
+def scene(caplog: pytest.LogCaptureFixture) -> Iterator[Scene]:
+    with ExitStack() as ends:
+        yield Scene(ends)
+    raised = [record.getMessage() for record in caplog.records if record.levelno >= logging.ERROR]
+    assert raised == [], "nothing may raise out of the transport"
+
+
+def garbage(seed: int) -> Iterator[tuple[bytes, bytes | None]]:
+    """Payloads and attachments: none at all, random, and nearly right."""
+    rng = random.Random(seed)
+    number = packets.number(1)
+    for size in (0, 1, 7, 8, 9, 16, 24, 100, 5000):
+        yield rng.randbytes(size), None
+        yield rng.randbytes(size), rng.randbytes(size)
+        yield rng.randbytes(size), number
+    yield bytes(MAX_PACKET + 1), number
+    for packet in (packets.subscribe("x", True), packets.seen("x", 2**63), packets.taken("", 2**63), packets.bye("x")):
+        yield packet[:-1], number
+        yield packet + b"\0", number
+    yield packets.seen("video/front", 2**64 - 1), packets.number(0)
+
+
+def test_garbage_on_every_key(scene: Scene) -> None:
+    other = layout.new_id()
+    keys = [
+        *(layout.upward(way, "alpha", "anyone", other) for way in (layout.ASK, layout.ORDER, layout.COMMAND)),
+        *(f"{layout.ROOT}/alpha/{way}/*/*" for way in (layout.ASK, layout.ORDER, layout.COMMAND)),
+        *(f"{layout.ROOT}/alpha/ask/{who}" for who in ("anyone/x", f"*/{scene.id}", f"mallory/{scene.id}")),
+        layout.to("alpha", scene.id),
+        layout.topic("alpha", FEEDBACK),
+        layout.video("alpha", FRONT),
+        layout.video_for("alpha", FRONT, "", scene.id),
+        f"{layout.ROOT}/**",
+    ]
+    for number, key in enumerate(keys):
+        for payload, attachment in garbage(number):
+            scene.intruder.put(key, payload, attachment=attachment)
+            scene.intruder.delete(key)
+    scene.still_serves()
+    assert scene.server.strays > 0
+
+
+def test_garbage_by_the_key_of_an_application_is_handed_on_as_garbage(scene: Scene) -> None:
+    """Whoever has no keys of his own can send as anybody; the handler judges what comes."""
+    key = layout.upward(layout.ASK, "alpha", "anyone", scene.id)
+    scene.intruder.put(key, b"nonsense", attachment=packets.number(7))
+    wait_until(lambda: scene.log.packets, "it came")
+    assert scene.log.packets == [(scene.log.joined[0], b"nonsense")]
+    scene.still_serves()
+
+
+def test_tokens_and_queries_of_strangers(scene: Scene) -> None:
+    held = [
+        scene.intruder.liveliness().declare_token(f"{layout.ROOT}/alpha/{rest}")
+        for rest in ("app/x", "app/anyone/zz", "app/a/b/c", f"app/anyone/{layout.new_id()}", "alive/zz", "alive/a/b")
+    ]
+    for payload in (b"", b"\xc1", b"\x93\x01\x02\x03", packets.encode_own(packets.Join(1, "zz"))):
+        for key in (
+            layout.join("alpha", "anyone", layout.new_id()),
+            f"{layout.ROOT}/alpha/join/*/*",
+            f"{layout.ROOT}/alpha/join/x/y",
+            f"{layout.ROOT}/alpha/info",
+            f"{layout.ROOT}/**",
+        ):
+            replies = scene.intruder.get(key, payload=payload, timeout=0.2)
+            assert all("welcome" not in str(reply) for reply in replies)
+    for token in held:
+        token.undeclare()  # type: ignore[no-untyped-call]
+    scene.still_serves()
+    assert len(scene.log.joined) == 1
+
+
+def test_whoever_speaks_another_revision_is_told(scene: Scene) -> None:
+    wish = packets.Join(99, scene.server._run)
+    (reply,) = scene.intruder.get(
+        layout.join("alpha", "anyone", layout.new_id()), payload=packets.encode_own(wish), timeout=2
+    )
+    assert reply.err is not None
+    assert "revision 99" in reply.err.payload.to_string()
+
+
+def test_whoever_joins_and_shows_no_token_is_let_go(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("skyloop.transport.fabric.server.CONFIRM_S", 0.1)
+    wish = packets.encode_own(packets.Join(packets.REVISION, scene.server._run))
+    (reply,) = scene.intruder.get(layout.join("alpha", "anyone", layout.new_id()), payload=wish, timeout=2)
+    assert reply.ok is not None
+    wait_until(lambda: len(scene.log.left) == 1, "the mute one was let go")
+    assert scene.log.left[0][0] == scene.log.joined[1]
+    assert "token" in scene.log.left[0][1]
+
+
+TAKEOFF = encode(Command(1, 1, 1, 1, Takeoff()))
+RELEASE = encode(Request(1, ReleaseAuthority()))
+
+
+@pytest.mark.parametrize(("way", "packet"), [(layout.ASK, TAKEOFF), (layout.ORDER, TAKEOFF), (layout.ASK, RELEASE)])
+def test_a_key_of_lesser_right_does_not_carry_what_needs_more(scene: Scene, way: str, packet: bytes) -> None:
+    scene.intruder.put(layout.upward(way, "alpha", "anyone", scene.id), packet, attachment=packets.number(0))
+    wait_until(lambda: scene.log.refusals, "it was refused")
+    assert scene.server.refused == 1
+    assert scene.log.packets == []
+    scene.still_serves()
+
+
+@pytest.mark.parametrize(
+    ("way", "packet"),
+    [(layout.COMMAND, TAKEOFF), (layout.ORDER, RELEASE), (layout.ASK, encode(Request(1, Hello("me"))))],
+)
+def test_the_application_itself_sends_each_packet_by_its_key(scene: Scene, way: str, packet: bytes) -> None:
+    came: list[str] = []
+    scene.intruder.declare_subscriber(
+        f"{layout.ROOT}/alpha/*/anyone/*", lambda sample: came.append(str(sample.key_expr))
+    )
+    wait_until(lambda: scene.app.send(packet) and scene.log.packets[-1:] == [(scene.log.joined[0], packet)], "it came")
+    wait_until(lambda: layout.upward(way, "alpha", "anyone", scene.id) in came, f"it came by the key {way}")
+
+
+def test_what_another_proxy_of_the_same_name_publishes_is_not_taken(scene: Scene) -> None:
+    forged = packets.published(b"\1" * 8, 10**6)
+    frame = packets.frame(b"\1" * 8, 10**6, encode(header(1)))
+    for _ in range(20):
+        scene.intruder.put(layout.topic("alpha", FEEDBACK), b"forged", attachment=forged)
+        scene.intruder.put(layout.video("alpha", FRONT), picture(header(1)).tobytes(), attachment=frame)
+    scene.still_serves()
+    assert b"forged" not in scene.app_log.packets
+
+
+def test_frames_that_are_not_what_they_say(scene: Scene) -> None:
+    sends: list[Callable[[], None]] = []
+    key = layout.video("alpha", FRONT)
+    for said, sent in ((header(5), b""), (header(5), bytes(10)), (header(5, 16384, 16384), bytes(10))):
+        attachment = packets.frame(scene.run, 10**6, encode(said))
+        sends.append(lambda attachment=attachment, sent=sent: scene.intruder.put(key, sent, attachment=attachment))  # type: ignore[misc]
+    for send in sends:
+        send()
+    scene.still_serves()

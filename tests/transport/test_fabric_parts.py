@@ -1,0 +1,402 @@
+"""The pure parts of the fabric transport: keys, packets, rights, windows, configuration, requests for video."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skyloop.errors import DecodeError, LinkError, MissingExtraError, UsageError
+from skyloop.messages import (
+    Annotation,
+    Command,
+    GetStatistics,
+    Hello,
+    LogEntry,
+    ReleaseAuthority,
+    Request,
+    RequestAuthority,
+    SetParameter,
+    Takeoff,
+    VehiclePose,
+    encode,
+)
+from skyloop.messages.config import AnyRequest
+from skyloop.messages.video import FrameFilter, VideoRequest
+from skyloop.transport.base import MAX_TOPIC
+from skyloop.transport.fabric import (
+    FabricServer,
+    FabricSettings,
+    TlsFiles,
+    config,
+    dial,
+    environment,
+    layout,
+    packets,
+    rights,
+)
+from skyloop.transport.fabric.config import Part
+from skyloop.transport.fabric.seeking import FORGET_S, Strangers
+from skyloop.transport.fabric.window import ACKNOWLEDGE_AFTER, DEPTH, MAX_BYTES, Recent, Taker, Window
+from skyloop.transport.testing import header
+
+TOPICS = st.text(min_size=1, max_size=MAX_TOPIC).filter(lambda text: text.isprintable())
+TLS = TlsFiles(Path("/k/ca.pem"), Path("/k/identity.pem"), Path("/k/identity.key"))
+
+# --- keys ---
+
+
+@given(TOPICS)
+def test_any_topic_is_one_chunk_of_a_key_and_back(topic: str) -> None:
+    key = layout.topic("alpha", topic)
+    assert key.startswith("skyloop/1/alpha/topic/")
+    assert not set(key.removeprefix("skyloop/1/alpha/topic/")) & set("/*$?#")
+    assert layout.parse_topic(key) == topic
+
+
+def test_the_keys() -> None:
+    connection = "0123456789abcdef"
+    assert layout.alive("alpha", connection) == "skyloop/1/alpha/alive/0123456789abcdef"
+    assert layout.app("alpha", "anna", connection) == "skyloop/1/alpha/app/anna/0123456789abcdef"
+    assert layout.video("alpha", "front") == "skyloop/1/alpha/video/front/-"
+    form = "encoding=jpeg&quality=80"
+    assert layout.video_for("alpha", "front", form, connection) == (
+        f"skyloop/1/alpha/video/front/encoding=jpeg&quality=80/{connection}"
+    )
+    assert layout.parse_alive(layout.alive("alpha", connection)) == ("alpha", connection)
+    assert layout.parse_sender(layout.join("alpha", "anna", connection)) == ("join", "anna", connection)
+    assert len({layout.new_id() for _ in range(100)}) == 100
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "",
+        "**",
+        "skyloop/1/alpha/ask/anyone",
+        "skyloop/1/alpha/ask/*/*",
+        "skyloop/1/alpha/ask/a$*/0123456789abcdef",
+        "skyloop/1/alpha/ask/anna/0123456789ABCDEF",
+        "skyloop/1/alpha/ask/anna/0123456789abcdef/x",
+    ],
+)
+def test_keys_of_nobody(key: str) -> None:
+    with pytest.raises(DecodeError):
+        layout.parse_sender(key)
+    with pytest.raises(DecodeError):
+        layout.parse_alive(key)
+
+
+@pytest.mark.parametrize("who", ["", "a/b", "*", "-x", "ä", "x" * 65])
+def test_what_cannot_be_an_identity(who: str) -> None:
+    with pytest.raises(UsageError, match="cannot be an identity"):
+        FabricSettings(tls=TLS, who=who)
+
+
+# --- packets ---
+
+
+@given(st.binary(max_size=80))
+def test_parsing_anything_gives_a_message_or_a_decode_error(data: bytes) -> None:
+    for parse in (packets.parse, packets.parse_number, packets.parse_published, packets.parse_frame):
+        for attempt in (data, b"SKYL\x01\x51\0\0" + len(data).to_bytes(4, "little") + data):
+            try:
+                parse(attempt)
+            except DecodeError:
+                continue
+
+
+@given(TOPICS, st.booleans(), st.integers(0, 2**64 - 1))
+def test_packets_come_back_as_they_were(topic: str, on: bool, number: int) -> None:
+    assert packets.parse(packets.subscribe(topic, on)) == packets.Subscribe(topic, on)
+    assert packets.parse(packets.taken(topic, number)) == packets.Taken(topic, number)
+    assert packets.parse(packets.taken("", number)) == packets.Taken("", number)
+    assert packets.parse(packets.seen(topic, number)) == packets.Seen(topic, number)
+    assert packets.parse_number(packets.number(number)) == number
+    assert packets.parse_published(packets.published(b"12345678", number)) == (b"12345678", number)
+    assert packets.parse_frame(packets.frame(b"12345678", number, encode(header(3)))) == (
+        b"12345678",
+        number,
+        header(3),
+    )
+
+
+def test_a_long_reason_is_cut() -> None:
+    message = packets.parse(packets.bye("é" * 1000))
+    assert isinstance(message, packets.Bye)
+    assert 100 < len(message.reason) <= packets.MAX_REASON
+
+
+# --- rights ---
+
+BODIES: list[tuple[AnyRequest, str]] = [
+    (Hello("me"), layout.ASK),
+    (GetStatistics(), layout.ASK),
+    (RequestAuthority(), layout.ORDER),
+    (ReleaseAuthority(), layout.ORDER),
+    (SetParameter("limits.tilt", 1.0, 1), layout.ORDER),
+]
+
+
+@pytest.mark.parametrize(("body", "way"), BODIES)
+def test_requests_need_what_they_do(body: AnyRequest, way: str) -> None:
+    packet = encode(Request(1, body))
+    assert rights.way_of(packet) == way
+    assert rights.allows(way, packet)
+    assert rights.allows(layout.ORDER, packet)
+    assert rights.allows(layout.ASK, packet) is (way == layout.ASK)
+
+
+TAKEOFF = encode(Command(1, 1, 1, 1, Takeoff()))
+
+
+def test_other_packets_need_what_they_are() -> None:
+    assert rights.way_of(TAKEOFF) == layout.COMMAND
+    assert rights.way_of(encode(Annotation("me", "front", 1, 32, 24))) == layout.ASK
+    assert rights.way_of(encode(LogEntry("me", "", 1, text="x"))) == layout.ASK
+    assert not rights.allows(layout.ORDER, TAKEOFF)
+    assert rights.way_of(encode(VehiclePose(1, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))) == layout.ORDER
+
+
+@given(st.binary(max_size=60))
+def test_garbage_needs_no_right_unless_it_looks_like_a_command_or_a_pose(data: bytes) -> None:
+    assert rights.way_of(data) == {b"\1": layout.COMMAND, b"\15": layout.ORDER}.get(data[5:6], layout.ASK)
+
+
+# --- windows ---
+
+
+def test_a_window_is_full_and_opens_as_packets_are_taken() -> None:
+    window = Window()
+    assert [window.send(10) for _ in range(DEPTH + 2)] == [*range(1, DEPTH + 1), 0, 0]
+    window.taken(1)
+    assert window.send(10) == DEPTH + 1
+    assert window.send(10) == 0
+    window.taken(0)
+    window.taken(10**6)  # never sent: it says nothing
+    assert window.send(10) == 0
+    window.taken(DEPTH + 1)
+    assert window.send(10) == DEPTH + 2
+
+
+def test_a_window_counts_bytes_too_but_lets_one_packet_pass() -> None:
+    window = Window()
+    assert window.send(2 * MAX_BYTES) == 1
+    assert window.send(1) == 0
+    window.taken(1)
+    assert window.send(MAX_BYTES) == 2
+
+
+@given(st.lists(st.integers(1, 60_000), max_size=400))
+def test_what_is_taken_in_order_never_closes_the_window(sizes: list[int]) -> None:
+    window, taker = Window(), Taker()
+    for size in sizes:
+        number = window.send(size)
+        assert number
+        if taker.took(number, size):
+            window.taken(number)
+
+
+def test_taking_is_told_now_and_then() -> None:
+    taker = Taker()
+    told = [number for number in range(1, 101) if taker.took(number, 1)]
+    assert told == [ACKNOWLEDGE_AFTER * n for n in range(1, 100 // ACKNOWLEDGE_AFTER + 1)]
+
+
+# --- configuration ---
+
+
+def test_an_address_stands_for_two_links_without_keys_and_one_with() -> None:
+    plain, secured = FabricSettings(), FabricSettings(tls=TLS, who="anna")
+    assert config.endpoints_of(["10.0.0.5:1"], plain) == ["tcp/10.0.0.5:1?rel=1", "udp/10.0.0.5:1?rel=0"]
+    assert config.endpoints_of(["10.0.0.5"], secured) == ["quic/10.0.0.5:7447?mixed_rel=1"]
+    assert config.endpoints_of(["[::1]"], secured) == ["quic/[::1]:7447?mixed_rel=1"]
+    assert config.endpoints_of(["lab.local:80"], secured) == ["quic/lab.local:80?mixed_rel=1"]
+    assert config.endpoints_of(["ws/10.0.0.5:1"], plain) == ["ws/10.0.0.5:1"]
+
+
+@pytest.mark.parametrize("address", ["", ":1", "host:", "host:x", "host:70000", "::1", "[::1", "a:b:1"])
+def test_what_is_no_address(address: str) -> None:
+    with pytest.raises(UsageError, match="is no network address"):
+        config.endpoints_of([address], FabricSettings())
+
+
+def test_with_keys_nothing_that_is_not_encrypted_is_taken() -> None:
+    settings = FabricSettings(tls=TLS, who="anna", access_control={"enabled": True})
+    made = config.make(settings, Part.PROXY, ["quic/0.0.0.0:1?mixed_rel=1"])
+    assert made["transport"]["link"]["protocols"] == ["quic"]
+    tls = made["transport"]["link"]["tls"]
+    assert tls["enable_mtls"] is True
+    assert (tls["root_ca_certificate"], tls["connect_private_key"]) == ("/k/ca.pem", "/k/identity.key")
+    assert made["access_control"] == {"enabled": True}
+
+
+def test_only_applications_call_proxies() -> None:
+    def called(part: Part) -> Any:
+        return config.make(FabricSettings(), part)["scouting"]["multicast"]["autoconnect"]["peer"]
+
+    assert called(Part.APP) == ["router", "peer"]
+    assert called(Part.PROXY) == ["router"]
+    assert config.make(FabricSettings(), Part.ROUTER)["mode"] == "router"
+
+
+def test_a_free_port_is_chosen_instead_of_port_0() -> None:
+    (address,) = config.listening(FabricSettings(listen=("127.0.0.1:0",)))
+    host, _, port = address.rpartition(":")
+    assert host == "127.0.0.1"
+    assert int(port) > 0
+    assert config.listening(FabricSettings(listen=("10.0.0.5:7447", "tcp/1.2.3.4:0"))) == [
+        "10.0.0.5:7447",
+        "tcp/1.2.3.4:0",
+    ]
+    with pytest.raises(LinkError, match="cannot listen at"):
+        config.listening(FabricSettings(listen=("203.0.113.7:0",)))
+
+
+def test_an_identity_needs_its_files() -> None:
+    with pytest.raises(UsageError, match="needs its certificate"):
+        FabricSettings(who="anna")
+
+
+# --- whether to take part at all ---
+
+
+def test_without_being_asked_a_process_stays_on_its_host(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("SKYLOOP_NETWORK", raising=False)
+    monkeypatch.delenv("SKYLOOP_KEYS", raising=False)
+    assert environment.choose() is None
+    for word in ("", "off", "0", "False"):
+        monkeypatch.setenv("SKYLOOP_NETWORK", word)
+        assert environment.choose() is None
+    assert environment.choose(network=True) == FabricSettings()
+    assert environment.choose(network=False) is None
+    with pytest.raises(UsageError, match="keys are for the network"):
+        environment.choose(keys="/somewhere")
+
+
+def test_the_environment_may_ask(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SKYLOOP_NETWORK", "multicast")
+    assert environment.choose() == FabricSettings()
+    monkeypatch.setenv("SKYLOOP_NETWORK", "10.0.0.5:7447, lab.local")
+    assert environment.choose() == FabricSettings(connect=("10.0.0.5:7447", "lab.local"), multicast=False)
+    assert environment.choose("10.0.0.5,multicast") == FabricSettings(connect=("10.0.0.5",))
+    given_ = FabricSettings(connect=("1.2.3.4",))
+    assert environment.choose(given_) is given_
+    with pytest.raises(UsageError, match="is no network address"):
+        environment.choose("10.0.0.5:port")
+
+
+def test_where_is_looked_is_told_in_words() -> None:
+    assert FabricSettings().reach == "multicast"
+    assert FabricSettings(connect=("10.0.0.5",), multicast=False).reach == "10.0.0.5"
+    assert FabricSettings(multicast=False).reach == "nowhere"
+
+
+def test_without_zenoh_it_is_said_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "zenoh", None)
+    for use in (lambda: dial("alpha"), lambda: FabricServer("alpha")):
+        with pytest.raises(MissingExtraError, match=r"pip install 'skyloop\[network\]'"):
+            use()
+
+
+# --- whom to try again ---
+
+
+def test_somebody_new_is_tried_once_until_somebody_was_reached() -> None:
+    strangers = Strangers()
+    assert strangers.news({"a"}, set(), 0.0)
+    assert not strangers.news({"a"}, set(), 1.0)
+    assert not strangers.news({"a", "b"}, {"b"}, 1.0)
+    assert strangers.news({"a", "b"}, set(), 1.0)
+    strangers.reached()
+    assert strangers.news({"a"}, set(), 2.0)
+    assert strangers.news({"a"}, set(), 2.0 + FORGET_S)
+
+
+# --- requests for video ---
+
+REQUESTS = st.builds(
+    VideoRequest,
+    st.text(min_size=1, max_size=20).filter(lambda text: "?" not in text and text.isprintable()),
+    encoding=st.sampled_from(["raw", "jpeg"]),
+    quality=st.integers(1, 100),
+    max_fps=st.none() | st.sampled_from([0.5, 10.0, 29.97]),
+    scale=st.sampled_from([1.0, 0.5, 0.125]),
+    part=st.none() | st.sampled_from([(0, 3), (2, 3), (1, 2)]),
+)
+
+
+@given(REQUESTS)
+def test_a_request_and_its_topic_are_the_same_thing(request: VideoRequest) -> None:
+    assert VideoRequest.parse(request.topic) == request
+    assert VideoRequest.parse(request.plain.topic) == VideoRequest(request.camera)
+
+
+def test_the_canonical_text() -> None:
+    assert VideoRequest("front").topic == "video/front"
+    assert VideoRequest("front", quality=30).topic == "video/front"
+    assert VideoRequest("front", part=(0, 1)).topic == "video/front"
+    full = VideoRequest("front", encoding="jpeg", max_fps=10, part=(0, 3), scale=0.5)
+    assert full.topic == "video/front?encoding=jpeg&max_fps=10&part=0%2F3&quality=80&scale=0.5"
+
+
+@pytest.mark.parametrize(
+    "topic",
+    [
+        "",
+        "video/",
+        "feedback",
+        "video/front?x=1",
+        "video/front?scale=2",
+        "video/front?scale=nan",
+        "video/front?part=1",
+        "video/front?part=a/b",
+        "video/front?encoding=png",
+        "video/front?quality=1.5",
+        "video/front?&",
+    ],
+)
+def test_what_is_no_request(topic: str) -> None:
+    with pytest.raises(UsageError):
+        VideoRequest.parse(topic)
+
+
+@given(st.floats(1.0, 60.0), st.floats(1.0, 200.0), st.integers(10, 300))
+def test_a_filter_keeps_to_the_rate_and_uses_it(max_fps: float, fps: float, count: int) -> None:
+    chosen = FrameFilter(VideoRequest("front", max_fps=max_fps))
+    times = [round(n * 1e9 / fps) for n in range(count)]
+    kept = [at for at in times if chosen.wants(0, at)]
+    span_s = (kept[-1] - kept[0]) / 1e9
+    assert len(kept) - 1 <= span_s * max_fps + 0.2
+    if fps <= max_fps:
+        assert kept == times
+    else:
+        assert len(kept) >= (times[-1] / 1e9) * max_fps / 2 - 1
+
+
+def test_a_filter_starts_anew_with_a_camera_that_does() -> None:
+    chosen = FrameFilter(VideoRequest("front", max_fps=1.0))
+    assert chosen.wants(0, 10**12)
+    assert not chosen.wants(1, 10**12 + 10**8)
+    assert chosen.wants(0, 5)
+
+
+def test_what_comes_twice_is_told_from_what_is_sent_twice() -> None:
+    recent = Recent(depth=2)
+    assert [recent.is_new(*packet) for packet in ((1, b"a"), (1, b"a"), (2, b"a"), (0, b"b"), (1, b"a"))] == [
+        *(True, False, True, True),
+        True,  # forgotten meanwhile
+    ]
+
+
+def test_a_router_passes_on_between_proxies_and_applications() -> None:
+    """Zenoh takes those of one region to reach one another without it."""
+    settings = FabricSettings(listen=("10.0.0.5",))
+    regions = [config.make(settings, part)["region_name"] for part in (Part.PROXY, Part.APP)]
+    filters = [south["filters"] for south in config.make(settings, Part.ROUTER)["gateway"]["south"]]
+    assert filters == [[{"region_names": [name]}] for name in regions]
+    assert len(set(regions)) == 2
