@@ -301,8 +301,15 @@ def test_who_takes_over_and_does_not_want_to_wait_is_not_left_in_line() -> None:
     authority.request(1, 16, True, 0)
     authority.request(2, 2, True, 0, ask=True)
     effects = authority.request(3, 4, False, 1 * S)
-    assert effects == [Preempted(1, 1, 2, 2), Granted(2, 2, 2), Queued(1, 16, 2)]
+    assert effects == [Preempted(1, 1, 2, 2), Granted(2, 2, 2), Queued(1, 16, 1)]
     assert authority.position(3) == 0
+
+
+def test_who_asks_again_when_its_time_is_over_waits_like_everybody() -> None:
+    authority = Authority(timeout_s=1000.0)
+    authority.request(1, 16, True, 0, term_ns=S)
+    authority.request(2, 16, True, 0)
+    assert authority.request(1, 16, True, 2 * S) == [Lost(1, 1, "expired"), Granted(2, 16, 2), Queued(1, 16, 1)]
 
 
 # Any history -----------------------------------------------------------------------------------------------------

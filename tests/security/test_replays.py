@@ -17,6 +17,7 @@ from skyloop.transport.base import Dialer, ServerEnd
 from skyloop.transport.fabric import FabricServer, FabricSettings
 from skyloop.transport.fabric import dial as fabric_dial
 from skyloop.transport.fabric.config import free_port
+from skyloop.transport.fabric.window import RECENT_PACKETS
 from skyloop.transport.local import LocalServer
 from skyloop.transport.local import dial as local_dial
 from skyloop.transport.memory import MemoryServer
@@ -48,12 +49,12 @@ def bench(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> It
             yield bench
 
 
-def fly(bench: Bench, pilot: App) -> Command:
+def fly(bench: Bench, pilot: App, forward: float = 0.25) -> Command:
     """Have a command of the pilot executed, which is what somebody records. Datagrams may be lost or overtaken."""
     sent: list[Command] = []
 
     def executed() -> bool:
-        sent.append(pilot.command(Velocity(0.25 + len(sent) / 1000)))
+        sent.append(pilot.command(Velocity(forward + len(sent) / 1000)))
         return wait_briefly(lambda: sent[-1].action in bench.driver.told)
 
     wait_until(executed, "the command is executed")
@@ -93,8 +94,19 @@ def jane(bench: Bench) -> App:
     return pilot
 
 
+def test_at_once_by_the_same_connection(bench: Bench, jane: App) -> None:
+    """Where packets come by two ways, the transport takes the second one for what it is and no event tells of it."""
+    recorded = fly(bench, jane)
+    for _ in range(5):
+        assert jane.end.send(encode(recorded))
+    fly(bench, jane, 0.5)
+    assert bench.driver.told.count(recorded.action) == 1
+
+
 def test_again_by_the_same_connection(bench: Bench, jane: App) -> None:
     recorded = fly(bench, jane)
+    for _ in range(RECENT_PACKETS):
+        fly(bench, jane)
     done = list(bench.driver.told)
     assert send_until_refused(bench, jane, encode(recorded)) == Refusal.OUT_OF_SEQUENCE
     assert bench.driver.told == done

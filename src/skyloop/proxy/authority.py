@@ -172,18 +172,21 @@ class Authority:
         ``ask``: let the holder be asked first. Afterwards the application holds the authority, or has a
         :meth:`position`, or was refused because somebody of at least the same priority holds it.
         """
+        effects: list[Effect] = []
         if self.holder is not None and self.holder.app_id == app_id:
             self.holder = replace(self.holder, priority=priority)
             self._change_term(term_ns, now_ns)
-            return self._settle(now_ns)
+            if not (self._waiting and self._is_over(now_ns)):
+                return self._settle(now_ns)
+            effects.append(self._relieve())  # and asks anew, as everybody else does
         claim, asked_before = self._take_claim(app_id, priority, term_ns, ask, now_ns)
         if queue or self._may_be_taken(claim, now_ns):
             insort(self._waiting, claim)
             self._told_places.pop(app_id, None)
-        effects = self._settle(now_ns)
+        effects += self._hand_over(now_ns)
         if not queue and claim in self._waiting:  # somebody of higher priority was in line
             self._waiting.remove(claim)
-            effects = [effect for effect in effects if not (isinstance(effect, Queued) and effect.app_id == app_id)]
+        effects += self._moves(now_ns)
         if claim.asks_until_ns is not None and not asked_before and claim in self._waiting and self.holder is not None:
             effects.append(Asked(self.holder.app_id, self.lease, app_id, priority, claim.asks_until_ns, term_ns))
         return effects
@@ -276,6 +279,13 @@ class Authority:
         insort(self._waiting, replace(holder, priority=priority, term_ns=left_ns))
         return [Preempted(holder.app_id, lease, grant.app_id, grant.priority, granted), grant]
 
+    def _relieve(self) -> Lost:
+        """The holder's time is over and others wait."""
+        assert self.holder is not None
+        lost = Lost(self.holder.app_id, self.lease, "expired")
+        self._vacate()
+        return lost
+
     def _vacate(self) -> None:
         self.holder, self.lease, self.until_ns, self._told_expired = None, 0, None, False
 
@@ -290,19 +300,22 @@ class Authority:
         return effects + self._settle(now_ns)
 
     def _settle(self, now_ns: int) -> list[Effect]:
+        """Hand the authority over if it is time to, then tell who has moved in the line."""
+        return self._hand_over(now_ns) + self._moves(now_ns)
+
+    def _hand_over(self, now_ns: int) -> list[Effect]:
         """Give the authority to the first in line if nobody holds it, the holder's time is over, or somebody of
-        strictly higher priority need not ask any longer; then tell who has moved in the line."""
+        strictly higher priority need not ask any longer."""
         effects: list[Effect] = []
         holder = self.holder
         if holder is not None and self._waiting:
             if self._is_over(now_ns):
-                effects.append(Lost(holder.app_id, self.lease, "expired"))
-                self._vacate()
+                effects.append(self._relieve())
             elif any(claim.priority < holder.priority and not claim.asks(now_ns) for claim in self._waiting):
                 effects += self._pre_empt(now_ns)
         if self.holder is None and self._waiting:
             effects.append(self._grant(now_ns))
-        return effects + self._moves(now_ns)
+        return effects
 
     def _grant(self, now_ns: int) -> Granted:
         first = self._waiting.pop(0)

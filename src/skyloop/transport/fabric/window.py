@@ -7,6 +7,7 @@ from typing import Final
 
 DEPTH: Final = 256  #: packets that were sent to an end and not yet taken there, before further ones are refused
 MAX_BYTES: Final = 1 << 20  #: the same in bytes
+RECENT_PACKETS: Final = 64  #: of an end, among which one that comes a second time is known
 ACKNOWLEDGE_AFTER: Final = DEPTH // 8  #: packets taken before that is told
 
 
@@ -55,7 +56,7 @@ class Taker:
 class Recent:
     """The packets that came last. Where there is a direct way and one through a router, each comes twice."""
 
-    def __init__(self, depth: int = 64) -> None:
+    def __init__(self, depth: int = RECENT_PACKETS) -> None:
         self._packets: deque[tuple[int, bytes]] = deque(maxlen=depth)
 
     def is_new(self, number: int, packet: bytes) -> bool:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from skyloop.errors import LinkError, UsageError
@@ -94,6 +95,9 @@ NUMBERS = st.floats(width=32)
     st.sampled_from([16, 20, 21, 22, 176, 400, 510, 511, 512, 520, 192, 31000]),
     st.lists(NUMBERS, min_size=7, max_size=7),
 )
+@example(Kind.PX4, 510, [65536.0] + 6 * [0.0])  # a message whose number its answer has no room for
+@example(Kind.PX4, 511, [1.0, 1e30] + 5 * [0.0])  # an interval that another answer has no room for
+@example(Kind.PX4, 511, [1.0, math.nan] + 5 * [0.0])
 def test_commands_of_any_numbers_are_answered(kind: Kind, number: int, arguments: list[float]) -> None:
     it = Rig(kind)
     it.go_on(0.1)
@@ -103,6 +107,7 @@ def test_commands_of_any_numbers_are_answered(kind: Kind, number: int, arguments
 
 @settings(max_examples=40, deadline=None)
 @given(st.sampled_from(list(Kind)), st.lists(NUMBERS, min_size=11, max_size=11), st.integers(0, 0xFFFF))
+@example(Kind.ARDUCOPTER, 10 * [0.0] + [math.inf], 1024)  # a yaw rate without end
 def test_set_points_of_any_numbers_harm_nothing(kind: Kind, numbers: list[float], mask: int) -> None:
     it = Rig(kind)
     it.up(1.0)

@@ -15,6 +15,7 @@ from skyloop.sim.firmware.ardrone.vehicle import Vehicle
 from skyloop.sim.firmware.mavlink.flyer import Flyer
 from skyloop.sim.firmware.mavlink.links import Port
 from skyloop.sim.firmware.mavlink.parameters import ParameterTable
+from skyloop.sim.firmware.mavlink.streams import MAX_INTERVAL_US
 from skyloop.sim.firmware.mavlink.targets import AttitudeTarget, Target
 from skyloop.sim.firmware.mavlink.telemetry import HOME_ALTITUDE_M, MAKERS
 from skyloop.sim.host import Report
@@ -263,8 +264,8 @@ class Autopilot(ABC):
         if number == m.MAV_CMD_SET_MESSAGE_INTERVAL:
             result = self._set_interval(port, whole(arguments[0]), arguments[1])
         elif number == m.MAV_CMD_GET_MESSAGE_INTERVAL:
-            interval = port.streams.interval_us(whole(arguments[0]))
-            answer, result = m.MAVLink_message_interval_message(whole(arguments[0]), interval), ACCEPTED
+            answer = self._interval(port, whole(arguments[0]))
+            result = ACCEPTED if answer is not None else FAILED
         elif number in (m.MAV_CMD_REQUEST_MESSAGE, m.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES):
             asked = m.MAVLINK_MSG_ID_AUTOPILOT_VERSION if number != m.MAV_CMD_REQUEST_MESSAGE else whole(arguments[0])
             answer = self._requested(asked)
@@ -287,8 +288,13 @@ class Autopilot(ABC):
         maker = MAKERS.get(number)
         return maker(self) if maker is not None else None
 
+    def _interval(self, port: Port, number: int) -> Message | None:
+        if not 0 <= number <= 0xFFFF:  # the answer has no room for it
+            return None
+        return m.MAVLink_message_interval_message(number, port.streams.interval_us(number))
+
     def _set_interval(self, port: Port, number: int, interval_us: float) -> int:
-        if number not in MAKERS:
+        if number not in MAKERS or not interval_us <= MAX_INTERVAL_US:  # nor for NaN
             return FAILED
         port.streams.set_interval(number, interval_us)
         return ACCEPTED

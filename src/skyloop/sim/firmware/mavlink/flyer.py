@@ -125,6 +125,8 @@ class Flyer:
         return max(-YAW_RATE_RAD_S, min(YAW_RATE_RAD_S, YAW_GAIN_PER_S * wrap_angle(yaw - self.yaw)))
 
     def _fly(self, action: AnyAction) -> None:
+        if not action.finite:
+            action = Hover()  # what is no number moves nothing
         if self.vehicle.state is FlightState.LANDING:
             self.lift_off()  # the vehicle's way out of its landing
         if self.airborne:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Final
+
+MAX_INTERVAL_US: Final = 2**31 - 1  #: that ``MESSAGE_INTERVAL`` can tell
 
 
 class Streams:
