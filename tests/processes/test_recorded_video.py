@@ -59,13 +59,8 @@ def test_its_h264_reaches_a_recorder_in_a_process_of_its_own_as_it_was(tmp_path:
         skyloop.record(drone, path, min_free_mb=0) as recorder,
     ):
         drone.wait(lambda feedback: feedback.vehicle_link == "closed", timeout_s=20.0)
-        history: list[int] = []
-
-        def written() -> bool:
-            history.append(recorder.status.messages)
-            return len(history) > 500 and history[-500] == history[-1] > 0 and not recorder.status.waiting
-
-        eventually(written, "nothing comes any more, and it was written", 60.0)
+        closed_s = recorder.status.seconds
+        eventually(lambda: recorder.status.seconds > closed_s + 2.0, "what was on the way is written", 30.0)
     recording = Recording.open(path)
     pictures = list(recording.pictures(recording.drone().name, "front"))
     sent = [frame.payload for frame in PaveParser().feed(RECORDING.read_bytes())]
