@@ -14,13 +14,14 @@ import pytest
 
 import skyloop
 from skyloop.client import Drone
+from skyloop.clock import NS_PER_S
 from skyloop.drivers.registry import make_driver
 from skyloop.drivers.replay import ReplayDriver
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import LinkError, NoAnswerError, UnsupportedError, UsageError
 from skyloop.logfile.layout import Channel
 from skyloop.logfile.reader import Recording
-from skyloop.messages import Applied, Event, Feedback, Hover, Velocity
+from skyloop.messages import Applied, Event, EventKind, Feedback, Hover, Velocity
 from skyloop.proxy.proxy import Proxy
 from skyloop.recording.lockstep import Lockstep, connector
 from skyloop.recording.review.compare import compare
@@ -294,6 +295,9 @@ def test_a_replay_is_recorded_beside_the_old_commands_and_compared(tmp_path: Pat
             controller(drone).run()
         recorded.append(Recording.open(path))
     first, second, bolder = recorded
+    events = [item.value for item in first.items("flight", (Channel.EVENTS,))]
+    assert EventKind.RECORDING in {event.kind for event in events}
+    assert all(abs(event.at_ns - BEGIN_NS) < 60 * NS_PER_S for event in events)  # the flight's time, the recorder's too
     commands = [item.value for item in first.items("flight", (Channel.COMMANDS,))]
     assert any(isinstance(one.asked, Velocity) for one in commands)
     old = {item.value.native.get("replay.asked") for item in first.items("flight", (Channel.FEEDBACK,))}

@@ -171,6 +171,11 @@ class Drone(Flying, ResultReading):
         return self._link.offset_ns
 
     @property
+    def now_ns(self) -> int:
+        """The time on the proxy's clock [ns], as estimated; in a replay in step, the flight's."""
+        return self._link.now_ns
+
+    @property
     def clock_uncertainty_ns(self) -> int:
         """How wrong :attr:`clock_offset_ns` may be [ns], and with it each age and delay; 0 on the proxy's own host."""
         return self._link.uncertainty_ns

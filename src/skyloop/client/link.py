@@ -168,6 +168,11 @@ class Link:
         return 0 if connection is None else connection.offset_ns
 
     @property
+    def now_ns(self) -> int:
+        """The time on the proxy's clock."""
+        return self._clock() + self.offset_ns
+
+    @property
     def uncertainty_ns(self) -> int:
         """How wrong :attr:`offset_ns` may be; 0 where both ends read one clock."""
         connection = self._connection

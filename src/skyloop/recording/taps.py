@@ -135,10 +135,8 @@ class Tap:
 
     def put_event(self, text: str, severity: Severity, data: dict[str, str]) -> None:
         """An event of the recorder's own, into the file."""
-        now_ns = time.monotonic_ns()
-        at_ns = now_ns + self.drone.clock_offset_ns
-        event = Event(EventKind.RECORDING, text, at_ns, severity, app="recorder", data=dict(data))
-        self._put(Channel.EVENTS.value, Rank.KEPT, event, _SIZE, now_ns)
+        event = Event(EventKind.RECORDING, text, self.drone.now_ns, severity, app="recorder", data=dict(data))
+        self._put(Channel.EVENTS.value, Rank.KEPT, event, _SIZE)
 
     def put_parameter(self, parameter: Parameter) -> None:
         self._put(Channel.PARAMETERS.value, Rank.KEPT, parameter, _SIZE)
