@@ -4,10 +4,13 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 from hypothesis import settings
+
+TESTS = Path(__file__).parent
 
 # A busy machine is no failure; what hangs is ended by the tests' time-out.
 settings.register_profile("skyloop", deadline=None)
@@ -20,6 +23,16 @@ pytest.register_assert_rewrite("skyloop.transport.conformance", "skyloop.transpo
 # interrupt would never hear of it.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+# Folders whose processes mostly fly. Measuring their coverage would slow flights down and find what others have found.
+FLIGHTS = {"bench", "docs", "examples", "processes", "test_demo.py", "third_party"}
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if item.get_closest_marker("process") and FLIGHTS.intersection(item.path.relative_to(TESTS).parts):
+            item.add_marker("flight")
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -105,7 +105,7 @@ def test_commands_of_any_numbers_are_answered(kind: Kind, number: int, arguments
     it.go_on(0.2)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(st.sampled_from(list(Kind)), st.lists(NUMBERS, min_size=11, max_size=11), st.integers(0, 0xFFFF))
 @example(Kind.ARDUCOPTER, 10 * [0.0] + [math.inf], 1024)  # a yaw rate without end
 def test_set_points_of_any_numbers_harm_nothing(kind: Kind, numbers: list[float], mask: int) -> None:
