@@ -25,9 +25,14 @@ class Map(OrbitPlace):
         state = frame.feedback
         if state is None or state.position is None:
             return
+        shapes = []
         for marker in self.detector.detect(frame):
-            pose = target_in_world(marker.pose, self.mounting, state)
-            self.places.setdefault(marker.id, []).append(pose.translation)
+            place = target_in_world(marker.pose, self.mounting, state).translation
+            self.places.setdefault(marker.id, []).append(place)
+            x, y, z = place
+            shapes.append(skyloop.Polyline(marker.outline, closed=True))
+            shapes.append(skyloop.Text(f"{marker.id}: {x:.2f} {y:.2f} {z:.2f}", marker.outline[0]))
+        self.drone.annotate(frame, shapes)
 
 
 def main(target="sim://?position=1&cameras=front&fps=15", size_m=0.25):

@@ -27,6 +27,7 @@ from matplotlib.figure import Figure
 from nbclient import NotebookClient
 
 import skyloop
+from skyloop.logfile.layout import Channel
 from skyloop.logfile.reader import Recording
 from skyloop.recording.review.compare import compare
 from skyloop.recording.review.tables import begin_ns
@@ -36,6 +37,15 @@ EXAMPLES, PICTURES = ROOT / "examples", ROOT / "docs" / "pictures" / "examples"
 MOST_BYTES = 280_000
 ROOM = View("room", eye=(-3.6, -2.7, 2.4), at=(0.2, 0.0, 0.75), focal_px=330.0)
 HALL = View("empty", eye=(-3.4, -2.6, 2.5), at=(0.0, 0.0, 0.75), focal_px=330.0)
+# From outside, where the walls and the ceiling in between are not seen.
+SOUTH_WALL = View("room", eye=(3.6, 4.6, 4.2), at=(0.1, -1.3, 1.0), focal_px=430.0)
+FOUR_WALLS = View("room", eye=(-5.2, -6.4, 6.4), at=(1.1, -0.4, 0.9), focal_px=345.0)
+COURSE = View("gates", eye=(-8.8, -10.6, 8.4), at=(1.55, -1.4, 1.15), focal_px=330.0)
+PLATFORM = View("platform", eye=(-4.9, -6.4, 4.9), at=(0.1, 0.4, 1.0), focal_px=400.0)
+PILLARS = View("pillars", eye=(4.0, -9.5, 7.0), at=(-0.9, 0.0, 0.9), focal_px=300.0)
+FRONT = ("--option", "cameras=front", "--option", "fps=15")
+BELOW = ("--option", "cameras=bottom", "--option", "fps=15")
+DOTS = ((22, 115, 249), (94, 197, 34), (60, 50, 220), (180, 63, 194), (31, 194, 224))  # BGR, a marker each
 
 
 def main() -> None:
@@ -92,6 +102,65 @@ def swarm_formation(folder: Path) -> None:
     with flight(folder, *names, "--world", "empty", "--option", "position=1", "--option", "cameras=none"):
         run("swarm_formation", "drone*")
     keep("swarm_formation", film(folder / "flight.mcap", replace(HALL, focal_px=240.0)))
+
+
+# Behaviours, each in the world that it is for -------------------------------------------------------------------------
+
+
+def approach(folder: Path) -> None:
+    with flight(folder, "alpha", *FRONT):
+        run("approach", "alpha")
+    keep("approach", film(folder / "flight.mcap", SOUTH_WALL, captions=True))
+
+
+def fly_gates(folder: Path) -> None:
+    with flight(folder, "alpha", "--world", "gates", *FRONT):
+        run("fly_gates", "alpha")
+    keep("fly_gates", film(folder / "flight.mcap", COURSE, captions=True))
+
+
+def land_on_platform(folder: Path) -> None:
+    """With a few seconds more, of the platform that goes on with the drone on it."""
+    with flight(folder, "alpha", "--world", "platform", *BELOW):
+        run("land_on_platform", "alpha")
+        time.sleep(4.0)
+    keep("land_on_platform", film(folder / "flight.mcap", PLATFORM, captions=True, after_s=4.0))
+
+
+def orbit_and_map(folder: Path) -> None:
+    """The flight, and each place where it took a marker to be."""
+    with flight(folder, "alpha", "--option", "position=1", *FRONT):
+        run("orbit_and_map", "alpha")
+    flown = Recording.open(folder / "flight.mcap")
+    written = [
+        (item.value.captured_ns, [shape.text for shape in item.value.shapes if isinstance(shape, skyloop.Text)])
+        for item in flown.items("alpha", (Channel.ANNOTATIONS,))
+    ]
+    pictures = film(folder / "flight.mcap", FOUR_WALLS, captions=True)
+    for picture, now_ns in zip(pictures, np.linspace(*span_ns(flown), len(pictures)), strict=True):
+        places: dict[str, list[list[float]]] = {}
+        for name, place in (text.split(":") for at_ns, texts in written if at_ns <= now_ns for text in texts):
+            places.setdefault(name, []).append([float(number) for number in place.split()])
+        dots(picture, places)
+    keep("orbit_and_map", pictures)
+
+
+def dots(canvas: Picture, places: dict[str, list[list[float]]]) -> None:
+    """The places of each marker, and its name at their median, as the map has it."""
+    for number, (name, own) in enumerate(places.items()):
+        colour = DOTS[number % len(DOTS)]
+        for point in np.round(FOUR_WALLS.pixels(np.array(own)) * 16).astype(np.int32).tolist():
+            cv2.circle(canvas, point, 2 << 4, colour, -1, cv2.LINE_AA, 4)
+        x, y = np.round(FOUR_WALLS.pixels(np.median(own, axis=0)[None])[0]).astype(int).tolist()
+        for ink, thickness in (((40, 40, 40), 4), ((255, 255, 255), 1)):
+            at = (x + 7, y - 6)
+            cv2.putText(canvas, name, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, ink, thickness, cv2.LINE_AA)
+
+
+def see_and_avoid(folder: Path) -> None:
+    with flight(folder, "alpha", "--world", "pillars", *FRONT):
+        run("see_and_avoid", "alpha")
+    keep("see_and_avoid", film(folder / "flight.mcap", PILLARS, captions=True))
 
 
 # Those that bring their own -------------------------------------------------------------------------------------------
@@ -170,6 +239,11 @@ MAKERS: dict[str, Callable[[Path], None]] = {
         detector_on_another_host,
         shared_drone,
         swarm_formation,
+        approach,
+        fly_gates,
+        land_on_platform,
+        orbit_and_map,
+        see_and_avoid,
         learn_to_reach,
         first_flight_notebook,
     )
@@ -184,7 +258,8 @@ def flight(folder: Path, *words: str) -> Iterator[None]:
     """Simulated drones of these names (the words before the first option), recorded to ``flight.mcap``."""
     count = next((number for number, word in enumerate(words) if word.startswith("--")), len(words))
     names, options = words[:count], words[count:]
-    channels = ["feedback", "annotations", *([] if "cameras=none" in options else ["video.front"])]
+    cameras = next((word.partition("=")[2] for word in options if word.startswith("cameras=")), "front")
+    channels = ["feedback", "annotations", *([] if cameras == "none" else [f"video.{cameras}"])]
     base = names[0] if count == 1 else names[0].rstrip("0123456789")
     with ExitStack() as stack:
         stack.enter_context(
@@ -212,7 +287,7 @@ def run(example: str, *words: str) -> str:
     done = subprocess.run(
         [sys.executable, str(EXAMPLES / f"{example}.py"), *words], check=True, stdout=subprocess.PIPE, text=True
     )
-    print(*(f"{example}: {line}" for line in done.stdout.splitlines()[-3:]), sep="\n")
+    print(*(f"{example}: {line}" for line in done.stdout.splitlines()[-6:]), sep="\n")
     return done.stdout
 
 

@@ -4,6 +4,7 @@ flown so far, and in a corner what a drone's own camera saw, with what was drawn
 from __future__ import annotations
 
 import bisect
+import itertools
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 from pictures import draw
 from PIL import Image
@@ -18,7 +20,7 @@ from PIL import Image
 from skyloop.gym.picture import look_at
 from skyloop.logfile.layout import Channel
 from skyloop.logfile.reader import Recording
-from skyloop.messages import Annotation, Feedback
+from skyloop.messages import Annotation, Feedback, Text
 from skyloop.sim import load_world
 from skyloop.sim.camera import CameraModel, CameraPose
 from skyloop.sim.render import PlanarRenderer, Quality, Scene, SceneState
@@ -27,6 +29,8 @@ from skyloop.sim.world import TargetState, Vec3
 WIDTH, HEIGHT = 480, 270
 INSET = (160, 120)
 FRAMES, FPS = 40, 8
+DRAWN_NS = 400_000_000  # so old may a picture be that is shown for what was drawn on it
+BACKDROP = (72, 64, 58)  # BGR, around a room that is looked into from outside
 WAYS = ((246, 130, 59), (22, 115, 249), (94, 197, 34))  # BGR, one a drone
 Picture = NDArray[np.uint8]
 Array = NDArray[np.float64]
@@ -57,6 +61,25 @@ class View:
         ahead = np.where(ahead > 0.05, ahead, np.nan)
         return np.column_stack([WIDTH / 2 + self.focal_px * right / ahead, HEIGHT / 2 + self.focal_px * down / ahead])
 
+    def outside(self) -> NDArray[np.bool_]:
+        """The pixels past the room, for an onlooker who stands outside of it and looks in; none for one within."""
+        size = np.array(load_world(self.world).room.size_m)
+        low, high = size * (-0.5, -0.5, 0.0), size * (0.5, 0.5, 1.0)
+        if (low < self.eye).all() and (self.eye < high).all():
+            return np.zeros((HEIGHT, WIDTH), np.bool_)
+        corners = self.pixels(np.array(list(itertools.product(*zip(low, high, strict=True)))))
+        inside = np.zeros((HEIGHT, WIDTH), np.uint8)
+        cv2.fillConvexPoly(inside, cv2.convexHull(np.round(corners).astype(np.int32)), 1)
+        return inside == 0
+
+
+@dataclass(frozen=True, slots=True)
+class Sight:
+    """What a drone's camera saw."""
+
+    picture: Picture
+    drawing: Annotation | None  # what was drawn on it
+
 
 @dataclass(slots=True)
 class Track:
@@ -82,43 +105,47 @@ class Track:
         return np.array([place(self.states[self.index(time)]) for time in times]).reshape(-1, 3)
 
 
-def film(path: Path, view: View, *, owners: bool = False) -> list[Picture]:
-    """The pictures of a film, from the first take-off to the last landing. ``owners``: write at each drone who flies
-    it."""
+def film(
+    path: Path, view: View, *, owners: bool = False, captions: bool = False, after_s: float = 0.0
+) -> list[Picture]:
+    """The pictures of a film, from the first take-off until ``after_s`` after the last landing. ``owners``: write at
+    each drone who flies it; ``captions``: what was written on the camera's picture stands at the lower edge instead,
+    where there is room for it."""
     recording = Recording.open(path)
     names = [drone.name for drone in recording.drones]
-    begin_ns, end_ns = span_ns(recording)
+    begin_ns, end_ns = span_ns(recording, after_s)
     tracks = [Track.of(recording, name, begin_ns) for name in names]
     times = np.linspace(0.0, (end_ns - begin_ns) / 1e9, FRAMES)
     renderer = PlanarRenderer(Scene(load_world(view.world), len(tracks)), Quality.SMOOTH)
-    insets = _insets(recording, names[0], tracks[0], begin_ns, times)
+    outside = view.outside()
+    sights = _sights(recording, names[0], tracks[0], begin_ns, times)
     shown = []
-    for time, inset in zip(times, insets, strict=True):
+    for time, sight in zip(times, sights, strict=True):
         now = [track.states[track.index(time)] for track in tracks]
         state = SceneState(
             np.array([place(one) for one in now]), np.array([_rotation(one) for one in now]), _targets(view, now[0])
         )
         canvas = renderer.render(state, view.pose, view.lens)
+        canvas[outside] = BACKDROP
         for number, track in enumerate(tracks):
             _way(canvas, view.pixels(track.way(time)), WAYS[number % len(WAYS)])
             if owners:
                 _label(canvas, view.pixels(place(now[number])[None])[0], now[number].owner or "nobody")
-        if inset is not None:
-            canvas[8 : 8 + INSET[1], WIDTH - 8 - INSET[0] : WIDTH - 8] = inset
-            cv2.rectangle(canvas, (WIDTH - 9 - INSET[0], 7), (WIDTH - 8, 8 + INSET[1]), (255, 255, 255), 1)
+        if sight is not None:
+            _inset(canvas, sight, captions)
         shown.append(canvas)
     return shown
 
 
-def span_ns(recording: Recording) -> tuple[int, int]:
-    """From the first take-off to the last landing, on the proxies' clock [ns]."""
+def span_ns(recording: Recording, after_s: float = 0.0) -> tuple[int, int]:
+    """From the first take-off until ``after_s`` after the last landing, on the proxies' clock [ns]."""
     airborne = [
         item.value.captured_ns
         for drone in recording.drones
         for item in recording.items(drone.name, (Channel.FEEDBACK,))
         if item.value.state.airborne
     ]
-    return min(airborne), max(airborne)
+    return min(airborne), max(airborne) + round(after_s * 1e9)
 
 
 def save(path: Path, pictures: list[Picture], most_bytes: int) -> None:
@@ -172,28 +199,49 @@ def _targets(view: View, state: Feedback) -> tuple[TargetState, ...]:
     return tuple(found)
 
 
-def _insets(recording: Recording, drone: str, track: Track, begin_ns: int, times: Array) -> list[Picture | None]:
-    """What the first camera saw at each time, small; None each without a camera."""
+def _sights(recording: Recording, drone: str, track: Track, begin_ns: int, times: Array) -> list[Sight | None]:
+    """What the first camera saw at each time; None each without a camera."""
     cameras = recording.cameras(drone)
     if not cameras:
         return [None] * len(times)
-    shown: list[Picture | None] = []
-    newest: Picture | None = None
-    drawing: Annotation | None = None
+    shown: list[Sight | None] = []
+    newest: Sight | None = None
     for picture in recording.pictures(drone, cameras[0]):
         while len(shown) < len(times) and (picture.header.captured_ns - begin_ns) / 1e9 > times[len(shown)]:
             shown.append(newest)
         if len(shown) == len(times):
             break
-        drawing = track.annotations.get(picture.header.captured_ns)
-        newest = cv2.resize(draw(picture.pixels(), drawing), INSET, interpolation=cv2.INTER_AREA).astype(np.uint8)
+        captured_ns = picture.header.captured_ns
+        drawing = track.annotations.get(captured_ns)
+        # Controllers skip pictures when they are busy: the last one that they drew on stands a little longer.
+        if drawing or not (newest and newest.drawing) or captured_ns - newest.drawing.captured_ns > DRAWN_NS:
+            newest = Sight(picture.pixels(), drawing)
     return shown + [newest] * (len(times) - len(shown))
+
+
+def _inset(canvas: Picture, sight: Sight, captions: bool) -> None:
+    """The camera's picture in the upper right corner. ``captions``: the words of its drawing at the lower edge."""
+    drawing = sight.drawing
+    if drawing is not None and captions:
+        words = [shape.text for shape in drawing.shapes if isinstance(shape, Text)]
+        drawing = replace(drawing, shapes=tuple(shape for shape in drawing.shapes if not isinstance(shape, Text)))
+        if words:
+            _caption(canvas, ", ".join(words))
+    small = cv2.resize(draw(sight.picture, drawing), INSET, interpolation=cv2.INTER_AREA)
+    canvas[8 : 8 + INSET[1], WIDTH - 8 - INSET[0] : WIDTH - 8] = small
+    cv2.rectangle(canvas, (WIDTH - 9 - INSET[0], 7), (WIDTH - 8, 8 + INSET[1]), (255, 255, 255), 1)
 
 
 def _way(canvas: Picture, pixels: Array, colour: tuple[int, int, int]) -> None:
     seen = pixels[np.isfinite(pixels).all(axis=1)]
     line = np.round(seen * 16).astype(np.int32)
     cv2.polylines(canvas, [line], False, colour, 2, cv2.LINE_AA, 4)
+
+
+def _caption(canvas: Picture, text: str) -> None:
+    (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.42, 1)
+    cv2.rectangle(canvas, (8, HEIGHT - 18 - height), (18 + width, HEIGHT - 8), (40, 40, 40), -1)
+    cv2.putText(canvas, text, (13, HEIGHT - 14), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (255, 255, 255), 1, cv2.LINE_AA)
 
 
 def _label(canvas: Picture, at: Array, text: str) -> None:
