@@ -6,7 +6,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.clock import NS_PER_S
-from skyloop.proxy.authority import Asked, Authority, Declined, Effect, Expired, Granted, Lost, Preempted, Queued
+from skyloop.proxy.authority import (
+    Asked,
+    Authority,
+    Declined,
+    Effect,
+    Expired,
+    Granted,
+    Lost,
+    Preempted,
+    Queued,
+    Withdrawn,
+)
 
 S = NS_PER_S
 
@@ -285,6 +296,19 @@ def test_answers_that_mean_nothing_any_more() -> None:
     assert authority.answer(1, 1, 3, True, "", 0) == []  # does not ask
     assert authority.answer(1, 1, 7, True, "", 0) == []  # is not there
     assert authority.lease == 1
+
+
+def test_the_holder_is_told_when_who_asked_does_so_no_more() -> None:
+    authority = Authority(timeout_s=1000.0, ask_s=10.0)
+    authority.request(1, 16, True, 0)
+    for leave in (authority.release, authority.gone):
+        authority.request(2, 4, True, 0, ask=True)
+        assert leave(2, 1 * S) == [Withdrawn(1, 1, 2)]
+    authority.request(2, 16, True, 0, ask=True)
+    assert authority.request(2, 16, True, 1 * S) == [Queued(2, 16, 1), Withdrawn(1, 1, 2)]  # waits without asking
+    assert authority.release(2, 2 * S) == []
+    authority.request(2, 16, True, 2 * S, ask=True)
+    assert authority.release(2, 12 * S) == []  # it was asked for long enough
 
 
 def test_somebody_who_does_not_ask_lets_the_first_in_line_have_it() -> None:

@@ -257,6 +257,15 @@ def test_a_holder_that_does_not_answer_is_pre_empted_after_the_time_to_ask(bench
     assert preempted.data["granted"] is False
 
 
+def test_a_holder_is_told_when_who_asked_leaves_the_line(bench: Bench) -> None:
+    alice, bob = bench.pilot("alice"), bench.join("bob")
+    bob.ask(RequestAuthority(4, takeover=Takeover.ASK))
+    bob.ask(ReleaseAuthority())
+    (withdrawn,) = alice.told(EventKind.AUTHORITY_WITHDRAWN)
+    assert withdrawn.data == {"app_id": alice.app_id, "lease": alice.lease, "by": "bob", "by_id": bob.app_id}
+    assert withdrawn.text == "bob no longer asks alice for the authority"
+
+
 def test_who_does_not_wait_can_not_ask_first(bench: Bench) -> None:
     bench.pilot("alice")
     bob = bench.join("bob")

@@ -36,6 +36,7 @@ class TakeoverRequest:
     within_s: float  #: after so long it wins, if its priority is strictly higher
     for_s: float | None  #: for how long it wants it; None: it does not say
     lease: int  #: the lease that is to be given up
+    by_id: int = 0  #: its number in this run of the proxy
 
 
 def authority_wish(priority: int, for_s: float | None = None, takeover: TakeoverWay = "now") -> RequestAuthority:
@@ -55,26 +56,33 @@ def answering(function: Callable[[TakeoverRequest], TakeoverAnswer], pilot: Pilo
         raise UsageError(f"{function!r:.80} can't be called: a function with one argument is needed")
 
     def hear(event: Event) -> None:
-        data = event.data
-        if event.kind is not EventKind.AUTHORITY_ASKED or data.get("app_id") != pilot.app_id:
+        request = takeover_request(event, pilot.app_id)
+        if request is None:
             return
-        lease, by_id = data.get("lease"), data.get("by_id")
-        if not isinstance(lease, int) or not isinstance(by_id, int):
-            return
-        for_s = _number(data.get("for_s"))
-        priority = data.get("by_priority")
-        request = TakeoverRequest(
-            str(data.get("by", "")),
-            priority if isinstance(priority, int) else LOWEST_PRIORITY,
-            _number(data.get("within_s")) or 0.0,
-            for_s,
-            lease,
-        )
         answer = function(request)
         if answer is not None:
-            pilot.answer(lease, by_id, answer is True, answer if isinstance(answer, str) else "")
+            pilot.answer(request.lease, request.by_id, answer is True, answer if isinstance(answer, str) else "")
 
     return hear
+
+
+def takeover_request(event: Event, app_id: int) -> TakeoverRequest | None:
+    """What an event asks the application with this number; None if it asks nothing, or somebody else."""
+    data = event.data
+    if event.kind is not EventKind.AUTHORITY_ASKED or data.get("app_id") != app_id:
+        return None
+    lease, by_id = data.get("lease"), data.get("by_id")
+    if not isinstance(lease, int) or not isinstance(by_id, int):
+        return None
+    priority = data.get("by_priority")
+    return TakeoverRequest(
+        str(data.get("by", "")),
+        priority if isinstance(priority, int) else LOWEST_PRIORITY,
+        _number(data.get("within_s")) or 0.0,
+        _number(data.get("for_s")),
+        lease,
+        by_id,
+    )
 
 
 def _number(value: Value | None) -> float | None:

@@ -83,6 +83,7 @@ class EventKind(StrEnum):
     AUTHORITY_PREEMPTED = "authority_preempted"  #: data: app_id, lease, by, by_id, by_priority, granted
     AUTHORITY_ASKED = "authority_asked"  #: the holder is asked for it; data: app_id, lease, by, by_id, by_priority …
     AUTHORITY_DECLINED = "authority_declined"  #: and said no; data: app_id (who asked), by (the holder), reason
+    AUTHORITY_WITHDRAWN = "authority_withdrawn"  #: and asks no more; data: app_id (the holder), lease, by, by_id
     AUTHORITY_EXPIRED = "authority_expired"  #: the holder's time is over, and nobody waits; data: app_id, lease
     FAILSAFE = "failsafe"  #: a step of the ladder was taken or left; data: step, reason
     COMMAND_REFUSED = "command_refused"  #: data: reason (a Refusal), seq, count

@@ -94,6 +94,15 @@ class Declined:
 
 
 @dataclass(frozen=True, slots=True)
+class Withdrawn:
+    """Who asked the holder does so no more: it has left the line, or waits without asking."""
+
+    app_id: int  #: the holder
+    lease: int
+    by_id: int
+
+
+@dataclass(frozen=True, slots=True)
 class Expired:
     """The holder's time is over; it keeps the authority until somebody wants it. Told once."""
 
@@ -101,7 +110,7 @@ class Expired:
     lease: int
 
 
-Effect = Granted | Lost | Preempted | Queued | Asked | Declined | Expired
+Effect = Granted | Lost | Preempted | Queued | Asked | Declined | Withdrawn | Expired
 
 
 class Authority:
@@ -187,8 +196,14 @@ class Authority:
         if not queue and claim in self._waiting:  # somebody of higher priority was in line
             self._waiting.remove(claim)
         effects += self._moves(now_ns)
-        if claim.asks_until_ns is not None and not asked_before and claim in self._waiting and self.holder is not None:
-            effects.append(Asked(self.holder.app_id, self.lease, app_id, priority, claim.asks_until_ns, term_ns))
+        holder = self.holder
+        if holder is None or holder.app_id == app_id:
+            return effects
+        asks_until_ns = claim.asks_until_ns if claim in self._waiting else None
+        if asks_until_ns is not None and not asked_before:
+            effects.append(Asked(holder.app_id, self.lease, app_id, priority, asks_until_ns, term_ns))
+        elif asks_until_ns is None and asked_before:
+            effects.append(Withdrawn(holder.app_id, self.lease, app_id))
         return effects
 
     def answer(self, app_id: int, lease: int, by_id: int, grant: bool, reason: str, now_ns: int) -> list[Effect]:
@@ -290,10 +305,12 @@ class Authority:
         self.holder, self.lease, self.until_ns, self._told_expired = None, 0, None, False
 
     def _drop(self, app_id: int, reason: str, now_ns: int) -> list[Effect]:
+        effects: list[Effect] = []
+        if self.holder is not None and self.asking(app_id, now_ns):
+            effects.append(Withdrawn(self.holder.app_id, self.lease, app_id))
         self._waiting = [claim for claim in self._waiting if claim.app_id != app_id]
         if self.silent is not None and self.silent.app_id == app_id:
             self.silent = None
-        effects: list[Effect] = []
         if self.holder is not None and self.holder.app_id == app_id:
             effects.append(Lost(app_id, self.lease, reason))
             self._vacate()

@@ -84,6 +84,13 @@ def _declined(effect: rights.Declined, scene: Scene) -> Notice:
     return Notice(EventKind.AUTHORITY_DECLINED, text, Severity.INFO, data=data)
 
 
+def _withdrawn(effect: rights.Withdrawn, scene: Scene) -> Notice:
+    by = scene.name(effect.by_id)
+    data: dict[str, Value] = {"lease": effect.lease, "by": by, "by_id": effect.by_id}
+    text = f"{by} no longer asks {scene.name(effect.app_id)} for the authority"
+    return Notice(EventKind.AUTHORITY_WITHDRAWN, text, Severity.INFO, data=data)
+
+
 def _expired(effect: rights.Expired, scene: Scene) -> Notice:
     text = f"the time of {scene.name(effect.app_id)} is over: the authority goes to whoever asks next"
     return Notice(EventKind.AUTHORITY_EXPIRED, text, data={"lease": effect.lease})
@@ -101,5 +108,6 @@ _WORDS: Final[dict[type[rights.Effect], Callable[[Any, Scene], Notice]]] = {
     rights.Preempted: _preempted,
     rights.Asked: _asked,
     rights.Declined: _declined,
+    rights.Withdrawn: _withdrawn,
     rights.Expired: _expired,
 }
