@@ -1,10 +1,11 @@
-"""Photographs the cockpit: ``python scripts/cockpit_pictures.py``, or with ``one`` or ``swarm`` for a part of them.
+"""Photographs the cockpit: ``python scripts/cockpit_pictures.py``, or with ``one``, ``swarm`` or ``asked`` for a part.
 
 =======================================  ===========================================================================
 ``cockpit-one-dark.png``, ``…-light``    one simulated drone that follows a marker, with what its controller draws; once
                                          with the map and the events, once with the 3-D view and the parameters
 ``cockpit-swarm-dark.png``, ``…-light``  three in one world, each on a round of waypoints that its controller logs
 ``cockpit-phone-dark.png``, ``…-light``  the first one again, on a telephone
+``cockpit-asked-dark.png``, ``…-phone``  a program asks for the drone that the page flies
 =======================================  ===========================================================================
 
 Needs Chromium and ``pip install playwright pillow``.
@@ -52,7 +53,7 @@ Fly = Callable[[threading.Event], None]
 
 
 def main() -> None:
-    makers = {"one": one, "swarm": swarm}
+    makers = {"one": one, "swarm": swarm, "asked": asked}
     wanted = sys.argv[1:] or list(makers)
     for name in wanted:
         if name not in makers:
@@ -100,6 +101,24 @@ def swarm() -> None:
             page = open_page(chromium, f"{address}#{','.join(names)}", WALL, scheme)
             settle(page, names, 12.0)
             save(page, f"cockpit-swarm-{scheme}.png")
+
+
+def asked() -> None:
+    """A person flies, and a program asks for the drone."""
+    command = ["sim", "--name", "alpha", "--seed", "4"]
+    command += [word for option in ("width=640", "fps=15", "position=1") for word in ("--option", option)]
+    with flight(command, []) as (chromium, address):
+        for name, size, scheme in (("dark", DESK, "dark"), ("phone", PHONE, "light")):
+            page = open_page(chromium, f"{address}#alpha", size, scheme)
+            page.get_by_role("button", name="Take control").click()
+            page.locator('.pane[data-mine="true"]').wait_for()
+            page.keyboard.press("t")
+            page.locator(".pill", has_text="hovering").wait_for()
+            with skyloop.connect("alpha", name="survey.py", priority=4, takeover="ask", for_s=600, stay=True):
+                page.locator(".asks button.primary:enabled").wait_for()
+                page.locator(".camera[data-seq]").first.wait_for()
+                page.wait_for_timeout(1500)
+                save(page, f"cockpit-asked-{name}.png")
 
 
 def rounds(name: str, number: int) -> Fly:

@@ -39,6 +39,12 @@ export function clock(seconds: Known): string {
   return h ? `${h}:${tail}` : tail;
 }
 
+/** About so long, in words. */
+export function lasting(seconds: number): string {
+  if (seconds < 90) return `${Math.ceil(seconds)} s`;
+  return seconds < 5400 ? `${Math.round(seconds / 60)} min` : `${plain(Math.round(seconds / 360) / 10)} h`;
+}
+
 export function bytes(count: Known): string {
   if (count === null || count === undefined) return "–";
   const units = ["B", "kB", "MB", "GB", "TB"];

@@ -3,7 +3,7 @@
 import type { Sticks } from "./model.js";
 import { CENTRED } from "./sticks.js";
 
-export type Deed = "takeoff" | "hover" | "land" | "stop" | "take" | "release" | "help";
+export type Deed = "takeoff" | "hover" | "land" | "stop" | "take" | "release" | "question" | "help";
 
 type Axis = keyof Sticks;
 
@@ -24,6 +24,7 @@ const DEEDS: Readonly<Record<string, Deed>> = {
   KeyL: "land",
   KeyC: "take",
   KeyR: "release",
+  KeyQ: "question",
   Slash: "help",
 };
 
@@ -33,7 +34,8 @@ export const TWICE_MS = 1000;
 export const KEY_MAP: readonly { keys: string[]; does: string }[] = [
   { keys: ["Esc", "Esc"], does: "Motors off, at once. The first Esc hovers." },
   { keys: ["C"], does: "Take control" },
-  { keys: ["R"], does: "Release" },
+  { keys: ["R"], does: "Release, or stop waiting for control" },
+  { keys: ["Q"], does: "To the question of who asks for control" },
   { keys: ["T"], does: "Take off" },
   { keys: ["H"], does: "Hover" },
   { keys: ["L"], does: "Land" },

@@ -134,6 +134,7 @@ class Page {
 
   private act(deed: Deed): void {
     if (deed === "help") this.help.toggle();
+    else if (deed === "question") [this.selected, ...this.panes.values()].find((pane) => pane?.isAsked)?.act(deed);
     else this.selected?.act(deed);
   }
 

@@ -118,10 +118,37 @@ export interface Authority {
   holder: string | null;
   priority: number | null;
   mine: boolean;
+  /** Where this page waits; null while it does not. */
+  line: Line | null;
+}
+
+export interface Line {
+  /** 1 is next. */
+  position: number | null;
+  /** Expected, as it was told. */
+  wait_s: number | null;
+  /** The one who has control was asked first, */
+  asked: boolean;
+  /** and keeps it for this reason, which may be empty. */
+  declined: string | null;
+}
+
+/** Somebody asks for the control that this page has. */
+export interface Question {
+  id: number;
+  by: string;
+  priority: number;
+  /** For how long it is wanted. */
+  for_s: number | null;
+  /** Of the time to ask, as it was told; then a higher priority has it. */
+  left_s: number;
+  /** By this page. */
+  declined: boolean;
 }
 
 export type Told =
   | Authority
+  | { type: "asked"; questions: Question[] }
   | { type: "done"; do: string; name?: string; value?: Value }
   | { type: "refused"; do: string; why: string }
   | { type: "pong"; n: number };
@@ -134,7 +161,8 @@ export interface Sticks {
 }
 
 export type Order =
-  | { do: "take"; priority: number }
+  | { do: "take"; priority: number; ask: boolean }
+  | { do: "answer"; id: number; grant: boolean; reason: string }
   | { do: "release" | "takeoff" | "hover" | "land" | "stop" | "reset" }
   | ({ do: "fly" } & Sticks)
   | { do: "goto"; x: number; y: number; z: number; yaw?: number }

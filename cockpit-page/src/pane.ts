@@ -74,7 +74,7 @@ export class Pane {
   ) {
     const base = `/ws/drones/${encodeURIComponent(name)}`;
     this.stage = new Stage(name);
-    this.strip = new Strip((deed) => this.act(deed));
+    this.strip = new Strip((deed) => this.act(deed), (id, grant, reason) => this.pilot?.answer(id, grant, reason));
     this.thumbs = new Thumbs((sticks) => host.push(name, sticks));
     this.map = new MapView(() => this.world(), (x, y, z) => this.pilot?.goTo(x, y, z));
     this.plots = new Plots(this.history, now_s);
@@ -101,6 +101,11 @@ export class Pane {
     this.element.remove();
   }
 
+  /** Somebody asks for the control that this page has of it. */
+  get isAsked(): boolean {
+    return this.strip.question.isOpen;
+  }
+
   selected(selected: boolean): void {
     setAttribute(this.element, "data-selected", String(selected));
   }
@@ -109,7 +114,8 @@ export class Pane {
     this.host.select(this.name);
     if (deed === "help") this.host.help();
     else if (this.pilot === null) this.say("you may watch, not fly", "warn");
-    else if (deed === "take") this.pilot.take(this.strip.wanted);
+    else if (deed === "question") this.strip.question.focus();
+    else if (deed === "take") this.pilot.take(this.strip.wanted, this.strip.asks);
     else if (deed === "release") this.pilot.release();
     // Escape hovers what this page flies; pressed by who does not fly it does nothing yet.
     else if (deed !== "hover" || this.pilot.mine) this.pilot.act(deed);
@@ -117,6 +123,7 @@ export class Pane {
 
   tick(now_ms: number): void {
     if (this.news) this.update();
+    this.strip.count(this.pilot);
     this.stage.update(now_ms);
     if (this.decks.space.shown === "Map") this.map.draw(now_ms);
     else this.scene?.draw(now_ms);

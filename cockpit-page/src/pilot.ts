@@ -4,7 +4,7 @@
 // the centre are sent twenty times a second. Sticks that come back to the centre, a page that loses the focus and a
 // gamepad that goes away make the vehicle hover; a connection that breaks makes the cockpit do that.
 
-import type { Authority, Order, Sticks, Told, Value } from "./model.js";
+import type { Authority, Order, Question, Sticks, Told, Value } from "./model.js";
 import type { Handlers } from "./socket.js";
 import { isCentred } from "./sticks.js";
 
@@ -19,16 +19,18 @@ export interface Line {
 }
 
 export interface PilotListener {
-  /** Who has control, or the connection, has changed. */
+  /** Who has control or asks for it, or the connection, has changed. */
   changed(): void;
   refused(order: string, why: string): void;
   done(order: string, name?: string, value?: Value): void;
 }
 
-const NOBODY: Authority = { type: "authority", state: "none", holder: null, priority: null, mine: false };
+const NOBODY: Authority = { type: "authority", state: "none", holder: null, priority: null, mine: false, line: null };
 
 export class Pilot {
   authority: Authority = NOBODY;
+  /** Who asks for the control that this page has; who would get it first is the first. */
+  questions: readonly Question[] = [];
   /** There and back to the cockpit [s]; null while not known. */
   round_trip_s: number | null = null;
   connected = false;
@@ -37,6 +39,8 @@ export class Pilot {
   private steering = false;
   private wanted = false;
   private readonly line: Line;
+  private told_ms = 0; // when the authority was told
+  private questioned_ms = 0; // and the questions
   private number = 0;
   private asked_ms = Number.NEGATIVE_INFINITY;
   private readonly pings = new Map<number, number>();
@@ -58,9 +62,26 @@ export class Pilot {
     return this.connected && (this.authority.state === "queued" || this.authority.state === "preempted");
   }
 
-  take(priority: number): void {
+  /** How long it is expected to wait, now; null if that is not known, or it does not wait. */
+  get wait_s(): number | null {
+    const wait_s = this.waits ? (this.authority.line?.wait_s ?? null) : null;
+    return wait_s === null ? null : Math.max(0, wait_s - (this.now_ms() - this.told_ms) / 1000);
+  }
+
+  /** What is left of the time to answer, now. */
+  left_s(question: Question): number {
+    return Math.max(0, question.left_s - (this.now_ms() - this.questioned_ms) / 1000);
+  }
+
+  /** `ask`: who has control is asked first. */
+  take(priority: number, ask: boolean): void {
     this.wanted = true;
-    this.order({ do: "take", priority });
+    this.order({ do: "take", priority, ask });
+  }
+
+  /** To who asks: hand it over now, or keep it, for a reason that may be empty. */
+  answer(id: number, grant: boolean, reason: string): void {
+    this.order({ do: "answer", id, grant, reason });
   }
 
   release(): void {
@@ -129,6 +150,7 @@ export class Pilot {
     this.connected = open;
     this.end();
     this.authority = NOBODY;
+    this.questions = [];
     this.round_trip_s = null;
     this.pings.clear();
     if (lost) this.listener.refused("", "the connection to the cockpit broke: it makes the vehicle hover; take control again");
@@ -141,8 +163,14 @@ export class Pilot {
     if (told.type === "authority") {
       const lost = this.authority.mine && !told.mine && this.wanted;
       this.authority = told;
+      this.told_ms = this.now_ms();
       if (!told.mine) this.end();
+      if (!told.mine) this.questions = [];
       if (lost) this.listener.refused("", `${told.holder ?? "somebody else"} has control now`);
+      this.listener.changed();
+    } else if (told.type === "asked") {
+      this.questions = told.questions;
+      this.questioned_ms = this.now_ms();
       this.listener.changed();
     } else if (told.type === "refused") {
       if (told.do === "goto" || told.do === "fly") this.end();

@@ -1,10 +1,12 @@
 // The row of a drone's flight controls.
 
 import { h, memory, setAttribute, setDisabled, setHidden, setText, setTone } from "./dom.js";
+import { lasting } from "./format.js";
 import { holderText } from "./instruments.js";
 import type { Deed } from "./keys.js";
-import type { State, Vehicle } from "./model.js";
+import type { Authority, State, Vehicle } from "./model.js";
 import type { Pilot } from "./pilot.js";
+import { QuestionPanel } from "./question.js";
 
 const USUAL_PRIORITY = 8; // before the controllers' usual 16
 
@@ -13,12 +15,26 @@ function keyed(name: string, key: string, kind: string, act: () => void): HTMLBu
   return h("button", { type: "button", class: kind, onclick: act, "aria-keyshortcuts": key }, h("span", {}, name), h("kbd", { "aria-hidden": "true" }, key));
 }
 
+/** Where this page waits, in words; empty while it does not. */
+export function lineText({ state, holder, line }: Authority): string {
+  if (state === "none" || state === "held" || line === null) return "";
+  const who = holder ?? "the one in control";
+  const answer = line.declined !== null ? `${who} keeps it for now${line.declined && `: “${line.declined}”`}` : line.asked ? `${who} was asked` : "";
+  const place = line.position === null ? "wait in line" : `are number ${line.position} in line`;
+  return answer ? `${answer} · you ${place}` : `You ${place}`;
+}
+
 export class Strip {
   readonly element: HTMLElement;
+  readonly question: QuestionPanel;
   private readonly who = h("b", { class: "who" });
   private readonly more = h("span", { class: "more" });
   private readonly holder: HTMLElement;
   private readonly priority = h("input", { type: "number", class: "priority", min: 0, max: 31, step: 1, title: "Priority: 0 is the highest, 31 the lowest", "aria-label": "Priority to take control with: 0 is the highest, 31 the lowest" });
+  private readonly ask = h("button", { type: "button", class: "small", title: "Who has control is asked first, and may say no; a higher priority has it after a time all the same", onclick: () => this.choose(!this.asks) }, "Ask first");
+  private readonly line = h("span", { role: "status", "aria-label": "Your place in the line" });
+  private readonly wait = h("span", { class: "wait", role: "timer", "aria-live": "off" });
+  private readonly waiting = h("p", { class: "waiting" }, this.line, this.wait);
   private readonly take: HTMLButtonElement;
   private readonly release: HTMLButtonElement;
   private readonly takeOff: HTMLButtonElement;
@@ -28,24 +44,31 @@ export class Strip {
   private readonly stop: HTMLButtonElement;
   private readonly why = h("p", { class: "note" });
 
-  constructor(act: (deed: Deed | "reset") => void) {
+  constructor(act: (deed: Deed | "reset") => void, answer: (id: number, grant: boolean, reason: string) => void) {
+    this.question = new QuestionPanel(answer);
     this.holder = h("div", { class: "holder", role: "status", "aria-live": "polite", "aria-label": "Who has control" }, this.who, this.more);
     this.priority.value = memory.get("priority") ?? String(USUAL_PRIORITY);
     this.priority.addEventListener("change", () => memory.set("priority", this.priority.value));
     this.take = keyed("Take control", "C", "primary", () => act("take"));
+    this.choose(memory.get("ask-first") === "true");
     this.release = keyed("Release", "R", "", () => act("release"));
     this.takeOff = keyed("Take off", "T", "", () => act("takeoff"));
     this.hover = keyed("Hover", "H", "", () => act("hover"));
     this.land = keyed("Land", "L", "", () => act("land"));
     this.reset = h("button", { type: "button", onclick: () => act("reset") }, "Reset emergency");
     this.stop = h("button", { type: "button", class: "stop", onclick: () => act("stop"), "aria-keyshortcuts": "Escape Escape" }, h("span", {}, "Motors off"), h("kbd", { "aria-hidden": "true" }, "Esc Esc"));
-    this.element = h("div", { class: "strip", role: "group", "aria-label": "Flying" }, this.holder, h("span", { class: "taking" }, this.priority, this.take, this.release), h("span", { class: "deeds" }, this.takeOff, this.hover, this.land, this.reset), this.why, this.stop);
+    this.element = h("div", { class: "strip", role: "group", "aria-label": "Flying" }, this.question.voice, this.question.element, this.waiting, this.holder, h("span", { class: "taking" }, this.priority, this.ask, this.take, this.release), h("span", { class: "deeds" }, this.takeOff, this.hover, this.land, this.reset), this.why, this.stop);
   }
 
   /** What was chosen, within its range. */
   get wanted(): number {
     const value = Math.round(Number(this.priority.value));
     return Number.isFinite(value) && this.priority.value !== "" ? Math.max(0, Math.min(31, value)) : USUAL_PRIORITY;
+  }
+
+  /** Whether who has control is to be asked first. */
+  get asks(): boolean {
+    return this.ask.getAttribute("aria-pressed") === "true";
   }
 
   /** `pilot` is null for who may only look. */
@@ -58,8 +81,13 @@ export class Strip {
     const [can, mine] = [flies && (pilot?.connected ?? false), pilot?.mine ?? false];
     const emergency = state?.flight === "emergency";
     setHidden(this.take, mine || pilot === null || !flies);
-    setHidden(this.priority, mine || pilot === null || !flies);
+    for (const choice of [this.priority, this.ask]) setHidden(choice, mine || pilot === null || !flies);
     setHidden(this.release, !mine && !(pilot?.waits ?? false));
+    setText(this.release.firstElementChild as Element, pilot?.waits ? "Stop waiting" : "Release");
+    setText(this.line, pilot?.waits ? lineText(pilot.authority) : "");
+    setHidden(this.waiting, !this.line.textContent);
+    this.question.update(pilot, performance.now());
+    this.count(pilot);
     setDisabled(this.take, !can);
     for (const button of [this.takeOff, this.hover, this.land]) {
       setHidden(button, pilot === null || !flies || emergency);
@@ -72,5 +100,19 @@ export class Strip {
     setText(this.why, vehicle && !flies ? `It can't fly: ${vehicle.why_not}` : pilot === null ? "You may watch, not fly." : "");
     setHidden(this.why, !this.why.textContent);
     setAttribute(this.element, "data-mine", String(mine));
+  }
+
+  /** What runs out, as of now. */
+  count(pilot: Pilot | null): void {
+    this.question.count(pilot, performance.now());
+    if (this.waiting.hidden || pilot === null) return;
+    const wait_s = pilot.wait_s;
+    setText(this.wait, wait_s === null ? "nobody knows for how long" : `about ${lasting(wait_s)} to wait`);
+  }
+
+  private choose(asks: boolean): void {
+    memory.set("ask-first", String(asks));
+    setAttribute(this.ask, "aria-pressed", String(asks));
+    setText(this.take.firstElementChild as Element, asks ? "Ask for control" : "Take control");
   }
 }

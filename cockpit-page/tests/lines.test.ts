@@ -2,7 +2,7 @@
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import type { Authority, FrameHead } from "../src/model.js";
+import type { Authority, FrameHead, Question } from "../src/model.js";
 import { NewestFrame, unpack } from "../src/newest.js";
 import { Pilot } from "../src/pilot.js";
 import { FIRST_PAUSE_MS, type Handlers, LastingSocket, LONGEST_PAUSE_MS, type Wire } from "../src/socket.js";
@@ -161,7 +161,7 @@ function flown(): { pilot: Pilot; sent: Record<string, unknown>[]; told: string[
   };
 }
 
-const held = (mine: boolean, holder: string | null = mine ? "cockpit 1" : null): Authority => ({ type: "authority", state: mine ? "held" : "none", holder, priority: 8, mine });
+const held = (mine: boolean, holder: string | null = mine ? "cockpit 1" : null): Authority => ({ type: "authority", state: mine ? "held" : "none", holder, priority: 8, mine, line: null });
 const doings = (sent: Record<string, unknown>[]): unknown[] => sent.map((message) => message["do"]).filter((one) => one !== "ping");
 const FORWARD = { ...CENTRED, forward: 0.5 };
 
@@ -222,7 +222,7 @@ test("an emergency stop needs no control; without a connection it is told that i
 test("who loses control is told to whom; after a broken connection nothing is flown on", () => {
   const { pilot, sent, told, hear, link } = flown();
   link(true);
-  pilot.take(8);
+  pilot.take(8, false);
   hear(held(true));
   pilot.steer(FORWARD);
   hear(held(false, "follow.py"));
@@ -236,4 +236,49 @@ test("who loses control is told to whom; after a broken connection nothing is fl
   link(true);
   pilot.steer(FORWARD);
   assert.deepEqual(doings(sent), ["take", "fly", "fly"]);
+});
+
+const asks = (id: number, more: Partial<Question> = {}): Question => ({ id, by: `app ${id}`, priority: 4, for_s: null, left_s: 10, declined: false, ...more });
+
+test("who has control is asked for it, and answers; the time runs out here too", () => {
+  const { pilot, sent, hear, link, at } = flown();
+  link(true);
+  hear(held(true));
+  at(1000);
+  hear({ type: "asked", questions: [asks(3)] });
+  assert.equal(pilot.questions.length, 1);
+  at(5000);
+  assert.equal(pilot.left_s(pilot.questions[0] as Question), 6);
+  at(12_000);
+  assert.equal(pilot.left_s(pilot.questions[0] as Question), 0);
+  pilot.answer(3, false, "landing");
+  pilot.answer(3, true, "");
+  assert.deepEqual(sent.filter((message) => message["do"] === "answer"), [
+    { do: "answer", id: 3, grant: false, reason: "landing" },
+    { do: "answer", id: 3, grant: true, reason: "" },
+  ]);
+  hear(held(false, "app 3"));
+  assert.deepEqual(pilot.questions, [], "who has no control is asked nothing");
+  hear(held(true));
+  hear({ type: "asked", questions: [asks(4)] });
+  link(false);
+  assert.deepEqual(pilot.questions, []);
+});
+
+test("who asks first waits, and sees for how long", () => {
+  const { pilot, sent, told, hear, link, at } = flown();
+  link(true);
+  pilot.take(8, true);
+  assert.deepEqual(sent.filter((message) => message["do"] === "take"), [{ do: "take", priority: 8, ask: true }]);
+  assert.equal(pilot.wait_s, null);
+  hear({ ...held(false, "follow.py"), state: "queued", line: { position: 1, wait_s: 9, asked: true, declined: null } });
+  at(4000);
+  assert.ok(pilot.waits);
+  assert.equal(pilot.wait_s, 5);
+  hear({ ...held(false, "follow.py"), state: "queued", line: { position: 1, wait_s: null, asked: true, declined: "" } });
+  assert.equal(pilot.wait_s, null, "not known");
+  pilot.release();
+  hear(held(false, "follow.py"));
+  assert.equal(pilot.wait_s, null);
+  assert.deepEqual(told, [], "control that was never had is not lost");
 });

@@ -3,14 +3,16 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 import { passes } from "../src/events.js";
-import { bytes, clock, duration, figure, heading, headingText, plain, short } from "../src/format.js";
+import { bytes, clock, duration, figure, heading, headingText, lasting, plain, short } from "../src/format.js";
 import { GamepadReader, type Pad } from "../src/gamepad.js";
 import { History, Trail } from "../src/history.js";
 import { type Press, Keys, TWICE_MS } from "../src/keys.js";
-import type { Sticks } from "../src/model.js";
+import type { Authority, Line, Question, Sticks } from "../src/model.js";
 import { grouped } from "../src/plots.js";
+import { explained, pending, wins } from "../src/question.js";
 import { lacking } from "../src/recordings.js";
 import { CENTRED, DEAD_BAND, deadBand, isCentred, Latch, merge, PACES, type Pace, ramp, RAMP_S, scale } from "../src/sticks.js";
+import { lineText } from "../src/strip.js";
 import { parse, rangeText } from "../src/values.js";
 import { around, gridStep, toMetres, toPixels, zoomed } from "../src/view.js";
 
@@ -113,6 +115,7 @@ test("figures for people", () => {
   assert.equal(duration(0.25), "250 ms");
   assert.equal(duration(125), "2:05");
   assert.equal(clock(3725), "1:02:05");
+  assert.deepEqual([0.2, 89, 90, 600, 5400, 9000].map(lasting), ["1 s", "89 s", "2 min", "10 min", "1.5 h", "2.5 h"]);
   assert.equal(bytes(1234), "1.2 kB");
   assert.equal(bytes(999_600), "1.0 MB");
   assert.equal(bytes(12), "12 B");
@@ -190,4 +193,27 @@ test("events by words and severity", () => {
 test("numbers to plot are grouped; what a recording lacks is added up", () => {
   assert.deepEqual([...grouped(["log.b", "yaw", "log.a"])], [["log", ["log.a", "log.b"]], ["vehicle", ["yaw"]]]);
   assert.equal(lacking({ dropped: { a: { video: 2 } }, missed: { a: { feedback: 1 }, b: { video: 4 } } }), 7);
+});
+
+const asks = (more: Partial<Question> = {}): Question => ({ id: 3, by: "survey.py", priority: 4, for_s: 120, left_s: 10, declined: false, ...more });
+
+test("a question for control says what becomes of it", () => {
+  assert.ok(wins(asks(), 8));
+  assert.ok(!wins(asks({ priority: 8 }), 8));
+  assert.equal(explained(asks(), 8, 0), "Priority 4, yours 8. That is higher than yours: it has control when the time is over. Wanted for 2 min.");
+  assert.match(explained(asks({ priority: 16, for_s: null }), 8, 2), /you keep control unless.*not said\. 2 more ask for it\.$/);
+  assert.match(explained(asks({ declined: true }), 8, 0), /^You keep it for now; the higher priority/);
+  const [kept, keptFromLower] = [asks({ declined: true }), asks({ id: 4, declined: true, priority: 16 })];
+  assert.deepEqual(pending([kept, keptFromLower], 8), [kept], "nothing more comes of one that is no higher");
+});
+
+test("the place in the line, with what was answered", () => {
+  const waits = (line: Partial<Line>, state: Authority["state"] = "queued"): string =>
+    lineText({ type: "authority", state, holder: "follow.py", priority: 16, mine: false, line: { position: 2, wait_s: null, asked: false, declined: null, ...line } });
+  assert.equal(waits({}), "You are number 2 in line");
+  assert.equal(waits({ position: null }, "preempted"), "You wait in line");
+  assert.equal(waits({ asked: true }), "follow.py was asked · you are number 2 in line");
+  assert.equal(waits({ asked: true, declined: "" }), "follow.py keeps it for now · you are number 2 in line");
+  assert.equal(waits({ asked: true, declined: "landing" }), "follow.py keeps it for now: “landing” · you are number 2 in line");
+  assert.equal(waits({}, "none"), "");
 });

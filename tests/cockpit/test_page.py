@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 import skyloop
-from skyloop.messages import FlightState
+from skyloop.messages import EventKind, FlightState
 from tests.cockpit.browser import CHROMIUM, Deck, DronePage, browser_and_cockpit
 
 if TYPE_CHECKING:
@@ -156,6 +156,90 @@ def test_a_lower_priority_is_refused_with_its_reason(deck: Deck) -> None:
         page.wait_for_text(".holder", "first.py")
         page.press("c")
         page.wait_for_text(".notice", "first.py has control with priority 2")
+
+
+def allow_time(name: str) -> None:
+    """More than the usual 10 s to answer: a busy machine's browser is slow."""
+    with skyloop.connect(name, name="patience") as drone:
+        drone.config["authority.ask_s"] = 120.0
+
+
+def test_a_person_who_is_asked_for_control_keeps_it_and_then_hands_it_over(deck: Deck) -> None:
+    deck.proxy("asks")
+    allow_time("asks")
+    page = deck.page("asks")
+    page.take_off()
+    panel = page.pane.get_by_role("alertdialog")
+    assert not panel.is_visible()
+    with skyloop.connect("asks", name="survey.py", priority=4, takeover="ask", stay=True, for_s=120) as drone:
+        page.wait_for_text(".asks", "survey.py asks for control")
+        for words in ("Priority 4, yours 8", "Wanted for 2 min", "it has control when the time is over"):
+            assert words in page.says(".asks")
+        assert 60 < int(page.says(".asks-left b").split()[0]) <= 120
+        assert "survey.py asks for control" in (page.pane.locator("[aria-live=assertive]").text_content() or "")
+        assert page.page.evaluate("document.activeElement === document.body"), "the focus is not taken from who flies"
+        page.until(lambda: not panel.get_by_role("button", name="Keep it").is_disabled(), "there was time to read it")
+        # By keyboard alone; what is written in the reason flies nothing.
+        page.press("q", "Tab")
+        page.page.keyboard.type("what is this")
+        page.press("Enter")
+        page.wait_for_text(".asks", "survey.py still asks for control")
+        told = [event for event in drone.recent_events() if event.kind is EventKind.AUTHORITY_DECLINED]
+        assert told[-1].data["reason"] == "what is this"
+        assert drone.feedback().state is FlightState.HOVERING
+        assert drone.authority.state == "queued"
+        page.page.set_viewport_size({"width": 390, "height": 844})
+        assert page.page.evaluate("document.documentElement.scrollWidth") <= 390, "nothing beside the screen"
+        panel.get_by_role("button", name="Hand over").click()
+        page.until(lambda: drone.authority.state == "held", "the program has it")
+        page.wait_for_text(".holder", "survey.py")
+        page.until(lambda: not panel.is_visible(), "nobody asks any more")
+        page.wait_for_text(".waiting", "You are number 1 in line")
+        assert page.pane.get_attribute("data-mine") == "false"
+        assert drone.feedback().state is FlightState.HOVERING
+        drone.release_authority()
+        page.until(lambda: page.pane.get_attribute("data-mine") == "true", "the person has it back")
+        page.press("l")
+        page.wait_for_text(".pill", "landed")
+    assert page.problems == []
+
+
+def test_a_question_that_is_withdrawn_vanishes(deck: Deck) -> None:
+    deck.proxy("withdrawn")
+    allow_time("withdrawn")
+    page = deck.page("withdrawn")
+    page.take_control()
+    with skyloop.connect("withdrawn", name="survey.py", takeover="ask", stay=True):
+        page.wait_for_text(".asks", "That is no higher than yours")
+        page.press("q")
+        assert page.page.evaluate("document.activeElement.className") == "asks"
+    page.until(lambda: not page.pane.locator(".asks").is_visible(), "nobody asks any more")
+    assert page.pane.get_attribute("data-mine") == "true"
+
+
+def test_a_person_asks_first_waits_and_changes_her_mind(deck: Deck) -> None:
+    deck.proxy("first")
+    allow_time("first")
+    page = deck.page("first")
+    with skyloop.connect("first", name="follow.py", priority=16) as drone:
+        page.wait_for_text(".holder", "follow.py")
+        drone.on_takeover(lambda request: "measuring until noon" if request.priority == 8 else True)
+        page.pane.get_by_role("button", name="Ask first").click()
+        assert page.pane.get_by_role("button", name="Ask for control").is_visible()
+        page.press("c")
+        page.wait_for_text(".waiting", "follow.py keeps it for now: “measuring until noon” · you are number 1 in line")
+        page.wait_for_text(".waiting", "min to wait")  # then the higher priority has it
+        assert drone.authority.state == "held"
+        page.pane.get_by_role("button", name="Stop waiting").click()
+        page.until(lambda: not page.pane.locator(".waiting").is_visible(), "it waits no more")
+        kinds = [event.kind for event in drone.recent_events()]
+        assert EventKind.AUTHORITY_WITHDRAWN in kinds
+        page.pane.locator(".priority").fill("4")
+        page.pane.locator(".pane-head").click()
+        page.press("c")
+        page.until(lambda: page.pane.get_attribute("data-mine") == "true", "follow.py hands it over")
+        assert drone.authority.state == "preempted"
+    assert page.problems == []
 
 
 def test_emergency_stops_the_motors(deck: Deck) -> None:

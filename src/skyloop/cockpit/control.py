@@ -16,9 +16,11 @@ from typing import TYPE_CHECKING, Any, Final
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from skyloop.clock import monotonic_ns
+from skyloop.cockpit.asking import Asking, Place
 from skyloop.cockpit.feeds import call_soon
 from skyloop.cockpit.orders import (
     Alive,
+    Answer,
     AnyOrder,
     Fly,
     GoTo,
@@ -70,15 +72,17 @@ class ControlSession:
         self._goto: asyncio.Task[None] | None = None
         self._steering = False  # by sticks: the newest set-point is a velocity of this page
         self._silence: asyncio.TimerHandle | None = None
-        self._authority: Json | None = None  # as told last
+        self._authority: tuple[str, str | None, int | None, Place | None] | None = None  # as told last
+        self._takeover = Asking(self._say)
         self._last = ""  # what was ordered last
         self._orders = 0  # how many there were
         self._told_of = 0  # the order of which a refusal was told
         self._awaited: tuple[str, frozenset[FlightState], int] | None = None  # what is done in which states, from when
         self._complained = ("", 0.0)  # about sticks: why, and when
         self._do: dict[type[AnyOrder], Callable[[Any], None]] = {
-            Take: lambda order: self._begin(order.do, self._take(order.priority)),
+            Take: lambda order: self._begin(order.do, self._take(order.priority, order.ask)),
             Release: lambda order: self._begin(order.do, self._release()),
+            Answer: lambda order: self._begin(order.do, self._answer(order)),
             TakeOff: lambda order: self._command(order.do, lambda hands: hands.takeoff(wait=False), _UP),
             HoverHere: lambda order: self._command(order.do, lambda hands: hands.hover()),
             LandHere: lambda order: self._command(order.do, lambda hands: hands.land(wait=False), _DOWN),
@@ -119,7 +123,7 @@ class ControlSession:
             self._refuse("", str(error))
             return
         self._rearm()
-        if not isinstance(order, Alive):
+        if not isinstance(order, Alive | Answer):
             self._last = order.do
             self._orders += 1
         try:
@@ -135,7 +139,7 @@ class ControlSession:
         if not act(hands):
             raise LinkError(f"{do} was not sent: the link to the proxy is {hands.link.application}")
         if until:
-            self._awaited = do, until, monotonic_ns() + hands.clock_offset_ns + _SETTLED_NS
+            self._awaited = do, until, hands.proxy_ns + _SETTLED_NS
         else:
             self._say({"type": "done", "do": do})
 
@@ -180,14 +184,15 @@ class ControlSession:
             )
         self._say({"type": "done", "do": "stop"})
 
-    async def _take(self, priority: int) -> None:
+    async def _take(self, priority: int, ask: bool) -> None:
         hands = self._hands
         if hands is None:
             hands = self._hands = await self._station.open_hands(self.app)
             loop = asyncio.get_running_loop()
             hands.on_event(lambda event: call_soon(loop, self._hear, event), inline=True)
+        self._takeover.join(ask=ask)
         try:
-            await asyncio.to_thread(hands.take, priority)
+            await asyncio.to_thread(hands.take, priority, ask=ask)
         except SkyloopError as error:
             if hands.authority.state == "none":
                 await self._drop_hands()
@@ -196,6 +201,10 @@ class ControlSession:
             raise
         self._say({"type": "done", "do": "take"})
         self._look()
+
+    async def _answer(self, order: Answer) -> None:
+        await self._takeover.answer(order, self._held())
+        self._say({"type": "done", "do": order.do})
 
     async def _release(self) -> None:
         self._hover()
@@ -285,7 +294,7 @@ class ControlSession:
         flies = self._steering or self._goto is not None
         self._end_flight()
         hands = self._hands
-        if hands is not None and (flies or _is_flying(hands)):
+        if hands is not None and (flies or hands.flies):
             self._hover_if_held(hands)
 
     def _hover_if_held(self, hands: Hands) -> None:
@@ -314,7 +323,7 @@ class ControlSession:
     # What the page is told -------------------------------------------------------------------------------------
 
     def _look(self) -> None:
-        """Tell who has the authority, and what is done, if that is news."""
+        """Tell who has the authority, what this page is asked, and what is done, if that is news."""
         self._tell_authority()
         hands = self._hands
         if self._awaited is not None and hands is not None:
@@ -339,18 +348,22 @@ class ControlSession:
             holder, priority = None, None
         if mine and hands is not None:  # known here first
             holder, priority = self.app, hands.authority.priority
-        told = {"type": "authority", "state": state, "holder": holder, "priority": priority, "mine": mine}
-        if told != self._authority:
-            self._authority = told
+        place = self._takeover.look(hands)
+        if (state, holder, priority, place) != self._authority:
+            self._authority = state, holder, priority, place
             if not mine:
                 self._end_flight()
-            self._say(told)
+            told = {"type": "authority", "state": state, "holder": holder, "priority": priority, "mine": mine}
+            self._say(told | {"line": None if place is None else place.told(monotonic_ns())})
 
     def _hear(self, event: Event) -> None:
-        """The proxy refused what this page commanded."""
+        """The proxy refused what this page commanded, or somebody asks for control or answers."""
         hands = self._hands
+        if hands is None:
+            return
+        self._takeover.hear(event, hands)
         ours = event.kind is EventKind.COMMAND_REFUSED and event.app == self.app
-        if not ours or hands is None or self._told_of == self._orders:
+        if not ours or self._told_of == self._orders:
             return  # its repeats are refused too, which is no news
         self._told_of = self._orders
         self._awaited = None
@@ -390,10 +403,3 @@ class ControlSession:
         with suppress(WebSocketDisconnect):  # the receiving side sees it too
             while True:
                 await self._socket.send_text(encode_json(await self._outbox.get()).decode())
-
-
-def _is_flying(hands: Hands) -> bool:
-    try:
-        return hands.feedback().state is FlightState.FLYING
-    except LinkError:
-        return False

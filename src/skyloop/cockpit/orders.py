@@ -8,6 +8,7 @@ import msgspec
 
 from skyloop.errors import DecodeError
 from skyloop.messages import HIGHEST_PRIORITY, LOWEST_PRIORITY
+from skyloop.messages.config import Reason
 
 Priority = Annotated[int, msgspec.Meta(ge=HIGHEST_PRIORITY, le=LOWEST_PRIORITY)]
 
@@ -24,10 +25,19 @@ class Take(Order, frozen=True, tag="take"):
     """Ask for the authority: 0 is the highest priority, 31 the lowest."""
 
     priority: Priority
+    ask: bool = False  #: the holder is asked first, and the page waits in line
 
 
 class Release(Order, frozen=True, tag="release"):
-    """Give it back."""
+    """Give it back, or leave the line."""
+
+
+class Answer(Order, frozen=True, tag="answer"):
+    """The holder's answer to who asks for the authority."""
+
+    id: int  #: of the question
+    grant: bool
+    reason: Reason = ""  #: why not, for a person
 
 
 class TakeOff(Order, frozen=True, tag="takeoff"): ...
@@ -78,7 +88,7 @@ class Alive(Order, frozen=True, tag="ping"):
     n: int = 0
 
 
-AnyOrder = Take | Release | TakeOff | HoverHere | LandHere | Stop | Reset | Fly | GoTo | Write | Alive
+AnyOrder = Take | Release | Answer | TakeOff | HoverHere | LandHere | Stop | Reset | Fly | GoTo | Write | Alive
 
 _decoder = msgspec.json.Decoder(AnyOrder)
 

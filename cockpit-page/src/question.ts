@@ -1,0 +1,106 @@
+// Somebody asks for the control that this page has: who, for how long, until when, and what the person answers.
+//
+// It does not take the focus, which may be on a button that flies: a key goes there. Nor can it be answered in its
+// first moment: whoever was about to press something else there has not read it.
+
+import { h, setAttribute, setDisabled, setHidden, setText, unique } from "./dom.js";
+import { lasting } from "./format.js";
+import type { Question } from "./model.js";
+import type { Pilot } from "./pilot.js";
+
+export const UNREAD_MS = 600;
+const MOST_REASON = 200;
+
+/** Who gets it in the end whatever is answered. */
+export const wins = (question: Question, own: number | null): boolean => own !== null && question.priority < own;
+
+/** Those that still matter: declined ones only as long as the higher priority is to come. */
+export const pending = (questions: readonly Question[], own: number | null): Question[] =>
+  questions.filter((one) => !one.declined || wins(one, own));
+
+/** What it means, in sentences. `own`: the priority that this page has control with; `more`: how many others ask. */
+export function explained(question: Question, own: number | null, more: number): string {
+  const others = more > 0 ? [`${more} more ${more === 1 ? "asks" : "ask"} for it.`] : [];
+  if (question.declined) return ["You keep it for now; the higher priority has it when the time is over.", ...others].join(" ");
+  const length = question.for_s === null ? "Wanted for a time that is not said." : `Wanted for ${lasting(question.for_s)}.`;
+  const end = wins(question, own) ? "That is higher than yours: it has control when the time is over." : "That is no higher than yours: you keep control unless you hand it over.";
+  return [`Priority ${question.priority}, yours ${own ?? "–"}. ${end}`, length, ...others].join(" ");
+}
+
+export class QuestionPanel {
+  readonly element: HTMLElement;
+  /** Says it to who does not see it. */
+  readonly voice = h("p", { class: "unseen", "aria-live": "assertive", "aria-atomic": "true" });
+  private readonly title = h("h3", { id: unique("asks") });
+  private readonly text = h("p", { id: unique("asks-text"), class: "asks-text" });
+  private readonly left = h("b", {});
+  private readonly reason = h("input", { type: "text", maxlength: MOST_REASON, placeholder: "Reason, if you like", "aria-label": "Reason to keep it, if you like", autocomplete: "off", enterkeyhint: "send" });
+  private readonly keep = h("button", { type: "submit" }, "Keep it");
+  private readonly handOver = h("button", { type: "button", class: "primary", onclick: () => this.say(true) }, "Hand over");
+  private shown: Question | null = null;
+  private since_ms = 0;
+
+  constructor(private readonly answer: (id: number, grant: boolean, reason: string) => void) {
+    const time = h("p", { class: "asks-left", role: "timer", "aria-live": "off" }, this.left, " left");
+    const form = h("form", { class: "asks-form", onsubmit: (event: Event) => this.submit(event) }, this.reason, this.keep, this.handOver);
+    const marks = { role: "alertdialog", "aria-modal": "false", "aria-labelledby": this.title.id, "aria-describedby": this.text.id, "aria-keyshortcuts": "Q" };
+    this.element = h("section", { class: "asks", tabindex: -1, hidden: true, "data-tone": "warn", ...marks }, this.title, time, this.text, form);
+  }
+
+  get isOpen(): boolean {
+    return !this.element.hidden;
+  }
+
+  focus(): void {
+    if (this.isOpen) this.element.focus({ preventScroll: true }); // it is on the screen wherever that is scrolled to
+  }
+
+  /** `now_ms`: on the clock that the moment for reading is measured by. */
+  update(pilot: Pilot | null, now_ms: number): void {
+    const own = pilot?.authority.priority ?? null;
+    const asked = pilot?.mine ? pending(pilot.questions, own) : [];
+    // The one that is read stays until it is over, whoever else asks meanwhile.
+    const question = asked.find((one) => one.id === this.shown?.id) ?? asked[0] ?? null;
+    if (question?.id !== this.shown?.id) {
+      this.since_ms = now_ms;
+      this.reason.value = "";
+    }
+    this.shown = question;
+    if (question === null) {
+      this.close();
+      return;
+    }
+    const text = explained(question, own, asked.length - 1);
+    setText(this.title, question.declined ? `${question.by} still asks for control` : `${question.by} asks for control`);
+    setText(this.text, text);
+    setText(this.voice, `${this.title.textContent}. ${text} Press Q to answer.`);
+    setHidden(this.reason, question.declined);
+    setHidden(this.keep, question.declined);
+    setHidden(this.element, false);
+    this.count(pilot, now_ms);
+  }
+
+  count(pilot: Pilot | null, now_ms: number): void {
+    if (this.shown === null || pilot === null) return;
+    const left_s = pilot.left_s(this.shown);
+    setText(this.left, `${Math.ceil(left_s)} s`);
+    setAttribute(this.element, "data-tone", left_s <= 3 ? "bad" : "warn");
+    for (const button of [this.keep, this.handOver]) setDisabled(button, now_ms - this.since_ms < UNREAD_MS);
+  }
+
+  private close(): void {
+    // What had the focus here would leave it nowhere, and a text field would go on keeping the keys.
+    if (this.element.contains(document.activeElement)) this.element.closest<HTMLElement>(".pane")?.focus({ preventScroll: true });
+    setHidden(this.element, true);
+    setText(this.voice, "");
+  }
+
+  private submit(event: Event): void {
+    event.preventDefault();
+    if (!this.keep.disabled) this.say(false);
+  }
+
+  private say(grant: boolean): void {
+    if (this.shown) this.answer(this.shown.id, grant, grant ? "" : this.reason.value.trim());
+  }
+}
