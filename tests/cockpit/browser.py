@@ -105,6 +105,11 @@ class DronePage:
         first = self.attribute(".camera", "data-seq")
         self.until(lambda: self.attribute(".camera", "data-seq") not in ("", first), "another picture")
 
+    def ask_for_control(self) -> None:
+        """Press the key, once the page has its line to the cockpit."""
+        self.until(lambda: not self.pane.locator(".taking .primary").is_disabled(), "the line is open")
+        self.press("c")
+
     def take_control(self) -> None:
         """As a person does it: press again if nothing came of it, as when the page had just been opened."""
         pressed_s = 0.0

@@ -226,7 +226,7 @@ def test_a_person_asks_first_waits_and_changes_her_mind(deck: Deck) -> None:
         drone.on_takeover(lambda request: "measuring until noon" if request.priority == 8 else True)
         page.pane.get_by_role("button", name="Ask first").click()
         assert page.pane.get_by_role("button", name="Ask for control").is_visible()
-        page.press("c")
+        page.ask_for_control()
         page.wait_for_text(".waiting", "follow.py keeps it for now: “measuring until noon” · you are number 1 in line")
         page.wait_for_text(".waiting", "min to wait")  # then the higher priority has it
         assert drone.authority.state == "held"
@@ -238,7 +238,7 @@ def test_a_person_asks_first_waits_and_changes_her_mind(deck: Deck) -> None:
         page.pane.locator(".pane-head").click()
         page.press("c")
         page.until(lambda: page.pane.get_attribute("data-mine") == "true", "follow.py hands it over")
-        assert drone.authority.state == "preempted"
+        page.until(lambda: drone.authority.state == "preempted", "follow.py waits to have it back")
     assert page.problems == []
 
 
