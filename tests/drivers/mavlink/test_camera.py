@@ -20,7 +20,8 @@ from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import UsageError
 from skyloop.messages import EventKind
-from skyloop.sim.firmware.mavlink import Kind, Ports
+from skyloop.sim.firmware.mavlink import Kind, Ports, video
+from skyloop.sim.firmware.mavlink.video import TransportStream
 from skyloop.transport.testing import wait_until
 from tests.drivers.ardrone.video_ports import TcpPort
 from tests.drivers.mavlink.film import FPS, HEIGHT, WIDTH, Film, Projector, number_of, picture_of
@@ -280,6 +281,16 @@ def test_a_stream_that_becomes_noise_is_told_and_seen_again_when_it_is_none() ->
 def test_an_address_without_a_host_is_refused(source: str) -> None:
     with pytest.raises(UsageError, match="names no host"):
         MavlinkDriver(parse_uri(f"mavlink://udpin:127.0.0.1:14540?camera={source}"))
+
+
+def test_pictures_that_come_close_together_go_out_with_stamps_of_their_own() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
+        listener.bind((HOST, 0))
+        stream = TransportStream(HOST, listener.getsockname()[1])
+        for number in range(12):  # FFmpeg refuses a second picture of one stamp
+            stream.pack(picture_of(number), video._SETTINGS, number * 20_000_000)
+        stream.close()
+        assert listener.recv(2048)[0] == 0x47
 
 
 # Devices ---------------------------------------------------------------------------------------------------------
