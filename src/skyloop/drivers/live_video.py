@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
-from typing import Final, Protocol
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,13 @@ RETRY_S: Final = (0.25, 0.5, 1.0, 2.0)  #: waits between attempts to connect; th
 REFUSALS: Final = 3  #: frames in a row of a codec that is not decoded, before it is told; one may be a flipped bit
 _CLOSE_S: Final = 2.0
 
-Decoded = tuple[int, NDArray[np.uint8]]  # the vehicle's number of the picture; BGR, (height, width, 3), C-contiguous
+
+class Decoded(NamedTuple):
+    """A picture that a decoder gave."""
+
+    number: int  #: counts the vehicle's pictures
+    pixels: NDArray[np.uint8]  #: BGR, (height, width, 3), C-contiguous
+    captured_ns: int | None = None  #: None: when the frame was that was decoded last
 
 
 class Stream(Protocol):
@@ -39,7 +45,10 @@ class Stream(Protocol):
         """Bytes that belong to no whole frame."""
 
     def read(self) -> list[Coded]:
-        """The frames that came, after a tenth of a second at most. Raises OSError once the connection is lost."""
+        """The frames that came, after a tenth of a second at most if it can: :meth:`LiveVideo.stop` waits for it.
+
+        Raises OSError once the connection is lost.
+        """
 
     def close(self) -> None: ...
 
@@ -61,7 +70,7 @@ class Decoder(Protocol):
     def decode(self, coded: Coded, *, show: bool) -> Decoded | None:
         """The picture of this frame; None if there is none, or it is not to be shown.
 
-        Raises :class:`UnsupportedError` for a codec that is not decoded here, and nothing else for what a frame holds.
+        Raises :class:`UnsupportedError` for what is not decoded here, and nothing else for what a frame holds.
         """
 
 
@@ -81,7 +90,9 @@ class Notice(Enum):
 
     STREAMING = "streaming"  #: frames come
     LOST = "lost"  #: no connection, or no more; told once for each reason, tried again for ever
-    UNSUPPORTED = "unsupported"  #: frames come in a codec that is not decoded here; told once a connection
+    UNSUPPORTED = (
+        "unsupported"  #: frames come that are not decoded here: another codec, or noise; told once a row of them
+    )
     FAULT = "fault"  #: an error of this program, told once; it goes on
 
 
@@ -93,7 +104,7 @@ class VideoCounters:
     frames: int = 0  #: shown
     waited: int = 0  #: left out up to the next key frame, or because a newer one was shown before
     damaged: int = 0  #: broken off, stale at the start of a connection, or not to be decoded
-    refused: int = 0  #: of a codec that is not decoded here
+    refused: int = 0  #: of a kind that is not decoded here
     skipped: int = 0  #: wanted, but newer ones were there
     lost_bytes: int = 0  #: of the stream that belong to no whole frame
     reconnects: int = 0  #: connections on which frames came, after the first such
@@ -156,7 +167,10 @@ class LiveVideo:
             thread.start()
 
     def stop(self) -> None:
-        """Ends both threads. Idempotent; after it neither callback is called, unless it is called from one."""
+        """Ends both threads. Idempotent; after it neither callback is called, unless it is called from one.
+
+        Takes up to 4 s; a connection that is being made or read for longer is left to end by itself, unseen.
+        """
         self._stop.set()
         with self._came:
             self._came.notify_all()
@@ -191,6 +205,8 @@ class LiveVideo:
                 self._follow()
             except OSError as error:
                 reason = error.strerror or str(error)
+            except Exception as error:  # noqa: BLE001  nor may a surprise of a demuxer end it in silence
+                reason = repr(error)
             else:
                 return
             if self._connections > before:
@@ -248,10 +264,12 @@ class LiveVideo:
                 decoded = decoder.decode(coded, show=show)
                 refusals = 0
                 if decoded is not None:
-                    number, pixels = decoded
+                    number, pixels, captured_ns = decoded
                     height, width = pixels.shape[:2]
                     self._shown += 1
-                    self._show(Picture(pixels, width, height, coded.captured_ns, number))
+                    if not self._stop.is_set():
+                        taken_ns = coded.captured_ns if captured_ns is None else captured_ns
+                        self._show(Picture(pixels, width, height, taken_ns, number))
             except UnsupportedError as error:
                 refusals += 1
                 self._refused += 1

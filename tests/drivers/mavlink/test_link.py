@@ -275,4 +275,6 @@ def test_a_camera_that_is_not_there_is_told_and_does_not_disturb() -> None:
     pytest.importorskip("av")
     with firmware() as it, opened(f"{it.address}?camera=/dev/video-of-nobody") as (_, sink):
         up(sink)
-        wait_until(lambda: any("there is no device" in event.text for event in sink.events), "the camera is missed")
+        wait_until(
+            lambda: any("there is no such device" in event.text for event in sink.events), "the camera is missed"
+        )

@@ -50,7 +50,7 @@ class PaveVideo:
         image = self._decoder.decode(frame)
         if image is None or not show:
             return None
-        return frame.number, np.ascontiguousarray(image.to_ndarray(format="bgr24"), dtype=np.uint8)
+        return Decoded(frame.number, np.ascontiguousarray(image.to_ndarray(format="bgr24"), dtype=np.uint8))
 
 
 class UvlcVideo:
@@ -85,7 +85,7 @@ class UvlcVideo:
             self.waited += 1
             return None
         self._number = picture.number
-        return (picture.number, picture.pixels) if show else None
+        return Decoded(picture.number, picture.pixels) if show else None
 
     def _is_old(self, picture: UvlcPicture) -> bool:
         """Whether it came after a newer one, or a second time."""

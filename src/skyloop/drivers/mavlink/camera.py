@@ -2,33 +2,40 @@
 
 from __future__ import annotations
 
-import threading
+import socket
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
+from urllib.parse import urlsplit
 
-import numpy as np
-from numpy.typing import NDArray
-
+from skyloop.clock import monotonic_ns
 from skyloop.drivers.base import Sink
 from skyloop.drivers.intrinsics import intrinsics_of
+from skyloop.drivers.live_video import Decoder, LiveVideo, Notice, Picture
 from skyloop.drivers.mavlink.options import FACINGS, CameraOptions
 from skyloop.drivers.uri import VehicleUri
-from skyloop.errors import DriverError, UsageError
-from skyloop.messages import CameraInfo, Encoding, EventKind, Feedback, Intrinsics, LinkState, Severity, Value
+from skyloop.errors import MissingExtraError, UsageError
+from skyloop.messages import CameraInfo, EventKind, Severity, Value
 
 if TYPE_CHECKING:
-    from skyloop.drivers.video.sources import Source
+    from skyloop.drivers.video.live import ContainerStream
 
-STALLED_US: Final = 1_500_000  #: a stream that is silent for so long is opened anew
-_CLOSE_S: Final = 4.0
-#: No picture waits in a buffer for the next ones.
-_LIVE: Final = {"fflags": "nobuffer", "flags": "low_delay", "timeout": str(STALLED_US)}
+STALLED_S: Final = 1.5  #: a stream that is silent for so long, or for three of its periods, is opened anew
+OPEN_S: Final = 5.0  #: for the connection, the handshake and the first picture
+DEVICE_FORMAT: Final = "v4l2"
+#: Of what FFmpeg gathers before it gives the first picture, as little as it can: no rate of pictures is needed.
+_LIVE: Final = {"fpsprobesize": "0"}
 _WAYS: Final = {
-    "rtsp": {**_LIVE, "rtsp_flags": "prefer_tcp"},
+    "rtsp": {**_LIVE, "rtsp_flags": "prefer_tcp", "allowed_media_types": "video"},
     "udp": {**_LIVE, "fifo_size": "100000", "overrun_nonfatal": "1"},
     "http": _LIVE,
     "tcp": _LIVE,
+}
+_NOTICES: Final = {
+    Notice.STREAMING: (EventKind.VEHICLE_MESSAGE, Severity.INFO),
+    Notice.LOST: (EventKind.VEHICLE_MESSAGE, Severity.WARNING),
+    Notice.UNSUPPORTED: (EventKind.DRIVER_ERROR, Severity.ERROR),
+    Notice.FAULT: (EventKind.DRIVER_ERROR, Severity.ERROR),
 }
 
 
@@ -49,6 +56,8 @@ def check_source(uri: VehicleUri, options: CameraOptions) -> None:
     """Raises :class:`UsageError` for what is neither a stream's address nor a device."""
     scheme, separator, _ = options.source.partition("://")
     if separator and scheme in _WAYS:
+        if not _names_host(options.source, needed=scheme != "udp"):
+            raise UsageError(f"{uri}: camera names no host: it looks like {scheme}://192.168.1.10:8554/live")
         return
     if not separator and Path(options.source).is_relative_to("/dev"):
         return
@@ -57,82 +66,96 @@ def check_source(uri: VehicleUri, options: CameraOptions) -> None:
 
 
 class Camera:
-    """Plays the camera into a sink from :meth:`start` to :meth:`stop`; opens it anew for ever. The newest picture wins.
-
-    Raises :class:`skyloop.errors.MissingExtraError` without PyAV.
-    """
+    """Shows the camera's newest picture from :meth:`start` to :meth:`stop`, and connects anew for ever."""
 
     def __init__(self, uri: VehicleUri, options: CameraOptions, sink: Sink) -> None:
-        from skyloop.drivers.video.player import LivePlayer, Screen
-
         self._options = options
-        self._stop = threading.Event()
-        intrinsics = partial(intrinsics_of, uri)
-        self._screen = Screen(_CameraSink(sink), options.name, intrinsics, self._stop)
-        self._player = LivePlayer(self._screen, self._open)
         self._sink = sink
-        self._thread = threading.Thread(target=self._run, name="skyloop-camera", daemon=True)
+        self._intrinsics = partial(intrinsics_of, uri)
+        self._video = LiveVideo(
+            place_of(options.source),
+            connect=self._connect,
+            make_decoder=_make_decoder,
+            show=self._show,
+            told=self._tell,
+            wants=lambda: sink.wants(options.name),
+            name="skyloop-camera",
+        )
 
     def start(self) -> None:
-        self._thread.start()
+        """Returns at once. Raises :class:`skyloop.errors.MissingExtraError` without PyAV."""
+        self._video.start()
 
     def stop(self) -> None:
-        self._stop.set()
-        if self._thread.is_alive() and self._thread is not threading.current_thread():
-            self._thread.join(_CLOSE_S)
+        """Takes up to 4 s. Idempotent; the sink hears nothing of it afterwards."""
+        self._video.stop()
 
     @property
     def telemetry(self) -> dict[str, Value]:
-        return {"camera.frames": self._screen.shown}
+        """``camera.`` and the names of :class:`skyloop.drivers.live_video.VideoCounters`."""
+        counters = self._video.counters
+        return {f"camera.{name}": getattr(counters, name) for name in counters.__dataclass_fields__}
 
-    def _run(self) -> None:
-        try:
-            self._player.run()
-        except Exception as error:  # noqa: BLE001  a codec's surprise must not end in silence
-            self._sink.event(EventKind.DRIVER_ERROR, f"the camera failed: {error!r}", Severity.ERROR, where="camera")
-
-    def _open(self) -> Source:
-        from skyloop.drivers.video.sources import ContainerSource, open_device
+    def _connect(self, number: int) -> ContainerStream:
+        from skyloop.drivers.video.live import ContainerStream
 
         source = self._options.source
         scheme, separator, _ = source.partition("://")
+        read_s = max(STALLED_S, 3.0 / self._options.fps)
         if separator:
-            return ContainerSource(source, None, dict(_WAYS[scheme]), live=True)
+            if scheme != "udp":
+                _look_up(source)
+            return ContainerStream(
+                source, number, monotonic_ns, options=dict(_WAYS[scheme]), open_s=OPEN_S, read_s=read_s
+            )
         if not Path(source).exists():
-            raise DriverError(f"there is no device {source}")
-        size = f"{self._options.width}x{self._options.height}"
-        return open_device(Path(source), {"video_size": size, "framerate": f"{self._options.fps:g}"})
-
-
-class _CameraSink:
-    """Hands on pictures; a camera's link is no vehicle's."""
-
-    def __init__(self, sink: Sink) -> None:
-        self._sink = sink
-        self.event = sink.event
-        self.wants = sink.wants
-        self.stream = sink.stream
-        self.wants_stream = sink.wants_stream
-
-    def feedback(self, feedback: Feedback) -> None:
-        """A camera's is nobody's."""
-
-    def frame(
-        self,
-        camera: str,
-        pixels: NDArray[np.uint8],
-        captured_ns: int,
-        *,
-        width: int,
-        height: int,
-        encoding: Encoding = Encoding.BGR8,
-        intrinsics: Intrinsics | None = None,
-    ) -> None:
-        self._sink.frame(
-            camera, pixels, captured_ns, width=width, height=height, encoding=encoding, intrinsics=intrinsics
+            raise FileNotFoundError("there is no such device")
+        options = {"video_size": f"{self._options.width}x{self._options.height}", "framerate": f"{self._options.fps:g}"}
+        return ContainerStream(
+            source, number, monotonic_ns, format_name=DEVICE_FORMAT, options=options, open_s=OPEN_S, read_s=read_s
         )
 
-    def link(self, state: LinkState, reason: str = "") -> None:
-        severity = Severity.INFO if state is LinkState.UP else Severity.WARNING
-        text = f"camera: {state.value}" + (f" ({reason})" if reason else "")
-        self._sink.event(EventKind.VEHICLE_MESSAGE, text, severity, where="camera")
+    def _show(self, picture: Picture) -> None:
+        self._sink.frame(
+            self._options.name,
+            picture.pixels,
+            picture.captured_ns,
+            width=picture.width,
+            height=picture.height,
+            intrinsics=self._intrinsics(picture.width, picture.height),
+        )
+
+    def _tell(self, notice: Notice, text: str) -> None:
+        kind, severity = _NOTICES[notice]
+        self._sink.event(kind, f"camera {notice.value}: {text}", severity, where="camera")
+
+
+def place_of(source: str) -> str:
+    """The address without what may be a secret: user, password and query."""
+    if "://" not in source:
+        return source
+    parts = urlsplit(source)
+    return parts._replace(netloc=parts.netloc.rpartition("@")[2], query="", fragment="").geturl()
+
+
+def _names_host(source: str, *, needed: bool) -> bool:
+    try:
+        parts = urlsplit(source)
+        return parts.port != 0 and (bool(parts.hostname) or not needed)
+    except ValueError:
+        return False
+
+
+def _look_up(source: str) -> None:
+    """Raises OSError for a host of no known address: FFmpeg would call it an error of input or output."""
+    host = urlsplit(source).hostname
+    if host:
+        socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)
+
+
+def _make_decoder() -> Decoder:
+    try:
+        from skyloop.drivers.video.live import LiveDecoder
+    except MissingExtraError as error:
+        raise MissingExtraError("a camera beside the autopilot", error.extra, cause=str(error.__cause__)) from error
+    return LiveDecoder()

@@ -63,7 +63,7 @@ class TelloVideo:
         if image is None or not show:
             return None
         self._number += 1
-        return self._number, np.ascontiguousarray(image.to_ndarray(format="bgr24"), dtype=np.uint8)
+        return Decoded(self._number, np.ascontiguousarray(image.to_ndarray(format="bgr24"), dtype=np.uint8))
 
     def _decode_key(self, data: bytes) -> av.VideoFrame | None:
         fresh = self._fresh(strict=True)

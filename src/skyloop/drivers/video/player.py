@@ -180,10 +180,11 @@ class LivePlayer:
             except SkyloopError as error:
                 reason = str(error)
             else:
-                screen.sink.link(LinkState.UP)
                 told = ""
                 try:
-                    self._play(source)
+                    if not screen.stop.is_set():  # opening may take longer than the driver was open
+                        screen.sink.link(LinkState.UP)
+                        self._play(source)
                     reason = "the device ended its stream"
                 except SkyloopError as error:
                     reason = str(error)

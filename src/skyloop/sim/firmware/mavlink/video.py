@@ -43,7 +43,7 @@ class TransportStream:
         self._stream.pix_fmt = "yuv420p"
         self._stream.bit_rate = _SETTINGS.bitrate_kbps * 1000
         self._stream.gop_size = GROUP
-        self._stream.time_base = _CLOCK
+        self._stream.time_base = self._stream.codec_context.time_base = _CLOCK  # or two pictures may get one stamp
         self._begun_ns: int | None = None
         self._stamp = -1
 
