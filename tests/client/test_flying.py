@@ -15,6 +15,7 @@ from skyloop.client import AuthorityStatus, Drone
 from skyloop.errors import AuthorityError, ClosedError, NoAnswerError, RefusedError, UnsupportedError, UsageError
 from skyloop.messages import (
     Attitude,
+    Command,
     EmergencyStop,
     Event,
     EventKind,
@@ -111,6 +112,69 @@ def test_take_off_and_land(proxy: ScriptedProxy, drone: Drone) -> None:
     thread.join(WAIT_S)
     after = len(proxy.commands)
     proxy.until(lambda: Idle() in proxy.actions()[after:], "a landed vehicle is told to land for ever")
+
+
+def failsafe(proxy: ScriptedProxy, _: Command) -> None:
+    proxy.more["failsafe"] = Failsafe.HOVER
+
+
+def not_fresh(proxy: ScriptedProxy, command: Command) -> None:
+    proxy.event(EventKind.COMMAND_REFUSED, "me: ask anew", "me", reason=Refusal.NOT_FRESH.value, seq=command.seq)
+
+
+def lost_link(proxy: ScriptedProxy, _: Command) -> None:
+    proxy.stop()
+    proxy.start()
+
+
+def lost_lease(proxy: ScriptedProxy, _: Command) -> None:
+    assert proxy.owner is not None
+    app_id, name, lease = proxy.owner
+    proxy.owner = None
+    proxy.event(EventKind.AUTHORITY_LOST, "", name, app_id=app_id, lease=lease, reason="silent")
+
+
+@pytest.mark.parametrize("ending", [failsafe, not_fresh, lost_link, lost_lease])
+def test_a_landing_that_something_ended_is_asked_for_anew(
+    proxy: ScriptedProxy, drone: Drone, ending: Callable[[ScriptedProxy, Command], None]
+) -> None:
+    def vehicle() -> None:
+        first = proxy.until_commanded(Land())
+        ending(proxy, first)
+        proxy.until(lambda: any(command.intent > first.intent for command in proxy.commands), "a new intent to land")
+        proxy.more.clear()
+        proxy.state = FlightState.LANDED
+
+    proxy.state = FlightState.HOVERING
+    drone.wait(lambda feedback: feedback.state is FlightState.HOVERING, WAIT_S)
+    landing = background(vehicle)
+    assert drone.land(timeout_s=2 * WAIT_S)
+    landing.join(WAIT_S)
+    assert {command.action for command in proxy.commands if command.intent > 0} <= {Land(), Idle()}
+
+
+def test_a_landing_that_something_newer_ended_is_over(proxy: ScriptedProxy, drone: Drone) -> None:
+    def change_of_mind() -> None:
+        proxy.until_commanded(Land())
+        drone.hover()
+        proxy.until_commanded(Hover())
+        proxy.more["failsafe"] = Failsafe.HOVER
+
+    proxy.state = FlightState.HOVERING
+    drone.wait(lambda feedback: feedback.state is FlightState.HOVERING, WAIT_S)
+    changing = background(change_of_mind)
+    with pytest.raises(NoAnswerError, match="land was not completed"):
+        drone.land(timeout_s=0.5)
+    changing.join(WAIT_S)
+    assert len({command.intent for command in proxy.commands if command.action == Land()}) == 1
+
+
+def test_a_take_off_that_a_failsafe_ended_is_not_asked_for_anew(proxy: ScriptedProxy, drone: Drone) -> None:
+    taking_off = background(lambda: failsafe(proxy, proxy.until_commanded(Takeoff())))
+    with pytest.raises(NoAnswerError, match="takeoff was not completed"):
+        drone.takeoff(timeout_s=0.5)
+    taking_off.join(WAIT_S)
+    assert len({command.intent for command in proxy.commands if command.action == Takeoff()}) == 1
 
 
 def test_take_off_that_does_not_happen(proxy: ScriptedProxy, drone: Drone) -> None:

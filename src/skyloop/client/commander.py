@@ -72,6 +72,7 @@ class Commander:
         self._min_interval_ns = nanoseconds(min_interval_s)
         self._keep_ns = nanoseconds(keep_s)
         self.action: AnyAction = _IDLE
+        self.asked: AnyAction = _IDLE  #: what the application asked for last, whether or not it is over
         self.intent = 0
         self._asked_ns = 0
         # Repeats must not get in the way of an application that has about the same beat: the first one lets it go
@@ -85,7 +86,7 @@ class Commander:
     def ask(self, action: AnyAction, now_ns: int) -> None:
         """The application wants this from now on."""
         stops = type(action) is Hover and type(self.action) is not Hover
-        self.action = action
+        self.action = self.asked = action
         self.intent += 1
         self._asked_ns = now_ns
         if stops or type(action) in _DONE_IN:  # rare and important: at once

@@ -102,7 +102,10 @@ class Flying(Handle):
         return self._reach(Takeoff(), _UP, wait, timeout_s)
 
     def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> bool:
-        """Land where it is; waits until it has landed. Raises :class:`NoAnswerError` with its state and why not."""
+        """Land where it is; waits until it has landed. Raises :class:`NoAnswerError` with its state and why not.
+
+        While it waits, a landing that a failsafe, a lost link or a lost lease has ended is asked for anew.
+        """
         return self._reach(Land(), _DOWN, wait, timeout_s)
 
     def hover(self) -> bool:
@@ -157,6 +160,7 @@ class Flying(Handle):
         done: list[Exception | None] = []
 
         def look() -> bool:
+            nonlocal seq
             newest = reception.newest
             if newest is not None and newest.state in states and reception.received_ns - asked_ns > _STALE_NS:
                 done.append(None)
@@ -164,6 +168,10 @@ class Flying(Handle):
                 problem = self._problem(action, seq)
                 if problem is not None:
                     done.append(problem)
+                elif type(action) is Land and (pilot.lapsed(action) or self._too_old(action, seq)):
+                    # Nothing old is taken up again by itself, but who waits here still wants to be on the ground.
+                    self._command(action)
+                    seq = pilot.seq
             return bool(done)
 
         self._check_may_wait()
@@ -190,6 +198,13 @@ class Flying(Handle):
         if reason == Refusal.WRONG_STATE:
             return RefusedError(refusal.text, code=str(reason))
         return None
+
+    def _too_old(self, action: AnyAction, seq: int) -> bool:
+        """Whether the proxy takes the newest command for one from before a failsafe or a new lease."""
+        refusal = self._reception.refusal
+        if refusal is None or refusal.data.get("reason") != Refusal.NOT_FRESH or not _concerns(refusal, seq):
+            return False
+        return self._pilot.is_newest(action)
 
     def _not_reached(self, action: AnyAction, timeout_s: float, asked_ns: int) -> str:
         newest, refusal = self._reception.newest, self._reception.refusal

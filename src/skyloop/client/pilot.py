@@ -125,6 +125,16 @@ class Pilot:
             if self._commander.action is action:
                 self._commander.clear()
 
+    def is_newest(self, action: AnyAction) -> bool:
+        """Whether the application asked for this and for nothing since, and has the authority."""
+        return self._authority.held and self._commander.asked is action
+
+    def lapsed(self, action: AnyAction) -> bool:
+        """Whether it is the newest and yet over, ended by a failsafe, a lost link or a lost lease, and could be asked
+        for anew now."""
+        with self._lock:
+            return self.is_newest(action) and self._commander.action is not action and self.link.connected
+
     def request(self, wish: RequestAuthority, wait_s: float, *, stay: bool = False) -> AuthorityStatus:
         """Ask for the authority and wait for it. See :meth:`skyloop.client.drone.Drone.request_authority`."""
         if self._role is Role.OBSERVER:

@@ -119,12 +119,18 @@ class Autopilot:
             if speed > self._parameters[drone].crash_speed_m_s:
                 self._advance(drone, Happening.CRASHED, Idle(), time_s, text)
         for drone in contacts.standing:
-            self._stood_s[drone] = time_s
-            state = self.states[drone]
-            if state is FlightState.LANDING:
-                self._advance(drone, Happening.TOUCHED_GROUND, Idle(), time_s)
-            elif state is FlightState.EMERGENCY:
-                self._loops.rest(drone)
+            self._stand(drone, time_s)
+        for drone, below in contacts.upon:
+            if not self.states[below].airborne and time_s - self._stood_s[below] <= _STANDING_S:
+                self._stand(drone, time_s)
+
+    def _stand(self, drone: int, time_s: float) -> None:
+        self._stood_s[drone] = time_s
+        state = self.states[drone]
+        if state is FlightState.LANDING:
+            self._advance(drone, Happening.TOUCHED_GROUND, Idle(), time_s)
+        elif state is FlightState.EMERGENCY:
+            self._loops.rest(drone)
 
     def _advance(
         self, drone: int, happening: Happening, action: AnyAction, time_s: float, reason: str = ""
@@ -150,7 +156,7 @@ class Autopilot:
         elif state is FlightState.HOVERING:
             loops.follow_velocity(drone, 0.0, 0.0, 0.0, 0.0)
         elif state is FlightState.LANDING:
-            loops.follow_velocity(drone, 0.0, 0.0, -parameters.landing_descent_m_s, 0.0)
+            loops.land(drone, parameters.landing_descent_m_s)
         elif isinstance(action, Attitude):
             loops.follow_attitude(drone, action.roll, action.pitch, action.climb, action.yaw_rate)
         elif isinstance(action, Velocity):

@@ -21,15 +21,17 @@ from skyloop.sim.world import Vec3
 _MOST_ACCELERATION_M_S2 = 60.0  # above what thrust, gravity and drag at 10 m/s of headwind give together
 _STILL_M_S = 0.3  # along the normal: slower contacts don't bounce, or things would never come to rest
 _PASSES = 6
+_TOUCH_M = 1e-9  # overlaps up to this are touching: rounding alone leaves some that no push ends
 _FAR_STEPS = 250
 
 
 @dataclass(slots=True)
 class Contacts:
-    """What was touched in a step. ``standing``: drones with something under their feet. ``impacts``: drone, speed along
-    the normal [m/s], and what it met."""
+    """What was touched in a step. ``standing``: drones with something under their feet that is no drone. ``upon``:
+    drones on drones, the upper one first. ``impacts``: drone, speed along the normal [m/s], and what it met."""
 
     standing: set[int] = field(default_factory=set)
+    upon: list[tuple[int, int]] = field(default_factory=list)
     impacts: list[tuple[int, float, str]] = field(default_factory=list)
 
 
@@ -90,9 +92,10 @@ class Collisions:
 
     def _meet_solids(self, drone: int, contacts: Contacts) -> None:
         position, hull = self._bodies.position[:, drone].copy(), self._hull[:, drone]
+        height, climb = float(position[2]), float(self._bodies.velocity[2, drone])
         for _ in range(_PASSES):
             overlap = self._solids.overlap(position, hull)
-            if overlap is None:
+            if overlap is None or overlap.depth_m <= _TOUCH_M:
                 break
             position += np.array(overlap.normal) * overlap.depth_m
             position[2] = max(position[2], hull[2])
@@ -102,12 +105,28 @@ class Collisions:
             if impact > _STILL_M_S:
                 contacts.impacts.append((drone, impact, "something solid"))
         else:
-            # Wedged where pushing out of one thing leads into another: back to where it was clear. (A moving platform
-            # may then overlap it: it can't be clear of both.)
-            if self._solids.overlap(position, hull, moving=False) is not None:
-                position = self._free[:, drone]
-                self._bodies.velocity[:, drone] = 0.0
+            # (A moving platform may overlap it afterwards: it can't be clear of both.)
+            if self._within_fixed(position, hull):
+                position = self._wedge(drone, height, climb, contacts)
         self._bodies.position[:, drone] = position
+
+    def _wedge(self, drone: int, height: float, climb: float, contacts: Contacts) -> Floats:
+        """Where a drone is that is pressed so that pushing it out of one thing leads into another: across where it was
+        clear, and upright on its way, for nothing that it is wedged between holds it there. It rubs on nothing: what
+        presses it would grow without end in a narrow enough corner, and hold it in the air for ever."""
+        velocity, free = self._bodies.velocity[:, drone], self._free[:, drone]
+        position = np.array([free[0], free[1], height])
+        velocity[:] = 0.0, 0.0, climb
+        if self._within_fixed(position, self._hull[:, drone]):  # all faces are level or upright: one above or below
+            position[2] = free[2]
+            velocity[2] = 0.0
+            if height < free[2]:
+                contacts.standing.add(drone)
+        return position
+
+    def _within_fixed(self, position: Floats, hull: Floats) -> bool:
+        overlap = self._solids.overlap(position, hull, moving=False)
+        return overlap is not None and overlap.depth_m > _TOUCH_M
 
     def _rebound(self, drone: int, normal: Vec3, surface_m_s: Vec3) -> float:
         """Take the velocity into the surface back, and rub; returns that velocity [m/s]."""
@@ -157,6 +176,7 @@ class Collisions:
             depth = -across
         else:
             normal, depth = np.array([0.0, 0.0, 1.0 if away[2] >= 0 else -1.0]), -upright
+            contacts.upon.append((one, other) if away[2] >= 0 else (other, one))
         share = float(self._mass[other] / (self._mass[one] + self._mass[other]))
         position[:, one] += normal * depth * share
         position[:, other] -= normal * depth * (1.0 - share)

@@ -1,8 +1,10 @@
 """The firmware's outer loops: from set-points and what the vehicle believes to attitude and thrust, for all drones.
 
-Altitude is held by a reference that moves with the commanded climb rate. Horizontal velocity is a PI loop; its integral
-is kept in world axes, so that what it has learnt about the wind stays right while the drone turns, and since the
-integral of the velocity is a way, it also holds the place.
+Altitude is held by a reference that moves with the commanded climb rate. A landing drone that something holds, such as
+a wall that what it has learnt about the wind presses it to, or the air between the rotors and the floor, grows heavier
+until it gives way. Horizontal velocity is a PI loop; its integral is kept in world axes, so that what it has learnt
+about the wind stays right while the drone turns, and since the integral of the velocity is a way, it also holds the
+place.
 """
 
 from __future__ import annotations
@@ -17,6 +19,10 @@ from skyloop.sim.sensors import Sensors
 from skyloop.sim.streams import Floats
 
 _REFERENCE_LEAD_M = 0.5  # the altitude reference waits for a vehicle that can't follow
+_HELD_M = 0.25  # so far behind its descent, a landing drone counts as held
+_HELD_CLIMB_M_S = 0.15  # what climbs faster isn't held, but on its way
+_HELD_EASE_PER_S2 = 8.0  # of thrust, for each metre further behind
+_HELD_REGAIN = 4.0  # how much faster it counts as free again, or it would drop when nothing holds it any more
 _INTEGRATED_ERROR_M_S = 0.25  # larger errors count as this: braking from speed must not wind the integral up
 _MOST_INTEGRAL_M_S2 = 3.0  # a drone that is held by a wall stops learning here
 
@@ -36,6 +42,8 @@ class ControlLoops:
         self._reference = np.zeros(n)
         self._ceiling = np.zeros(n)
         self._integral = np.zeros((2, n))
+        self._landing = np.zeros(n, dtype=np.bool_)
+        self._behind = np.zeros(n)  # how far a landing drone is above where its descent should have brought it
         self._velocity_gain = column(parameters, lambda p: p.velocity_gain_per_s)
         self._integral_gain = column(parameters, lambda p: p.velocity_integral_per_s2) * period_s
         self._level_brake = column(parameters, lambda p: p.level_brake_per_m) / GRAVITY_M_S2
@@ -67,11 +75,19 @@ class ControlLoops:
         """Levelled body axes [m/s], yaw rate [rad/s]."""
         self._set_point[:, drone] = (forward, left, climb, yaw_rate)
         self._by_velocity[drone] = True
+        self._landing[drone] = False
 
     def follow_attitude(self, drone: int, roll: float, pitch: float, climb: float, yaw_rate: float) -> None:
         """Roll right side down, pitch nose down [rad], climb [m/s], yaw rate [rad/s]."""
         self._set_point[:, drone] = (roll, pitch, climb, yaw_rate)
         self._by_velocity[drone] = False
+        self._landing[drone] = False
+
+    def land(self, drone: int, descent_m_s: float) -> None:
+        """Descend on the spot, whatever holds it."""
+        self.follow_velocity(drone, 0.0, 0.0, -descent_m_s, 0.0)
+        self._landing[drone] = True
+        self._behind[drone] = 0.0
 
     def start(self, drone: int, altitude_m: float) -> None:
         """The motors run from here on, the altitude reference starts at what the vehicle believes."""
@@ -83,6 +99,7 @@ class ControlLoops:
     def stop(self, drone: int) -> None:
         """The motors stop."""
         self._running[drone] = 0.0
+        self._landing[drone] = False
         self._bodies.cut(drone)
 
     def rest(self, drone: int) -> None:
@@ -140,6 +157,18 @@ class ControlLoops:
         wanted = climb * (reference < self._ceiling) + self._altitude_gain * (reference - altitude)
         wanted = np.minimum(np.maximum(wanted, -self._climb_limit), self._climb_limit)
         upward = GRAVITY_M_S2 + self._climb_gain * (wanted - climbing)
+        if self._landing.any():
+            upward -= self._ease(climbing)
         thrust = upward / (self._bodies.cos[0] * self._bodies.cos[1])
         thrust = np.minimum(np.maximum(thrust, self._least_thrust), self.most_thrust)
         np.multiply(thrust, self._running, out=self._bodies.thrust_command)
+
+    def _ease(self, climbing: Floats) -> Floats:
+        """How much less thrust a landing drone takes that does not get down [m/s²]."""
+        error = climbing - np.maximum(self._set_point[2], -self._climb_limit)
+        change = np.where(error > 0, error * (climbing < _HELD_CLIMB_M_S), _HELD_REGAIN * error)
+        most = _HELD_M + GRAVITY_M_S2 / _HELD_EASE_PER_S2
+        behind = np.minimum(np.maximum(self._behind + change * self._period_s, 0.0), most)
+        np.multiply(behind, self._landing, out=self._behind)
+        eased: Floats = _HELD_EASE_PER_S2 * np.maximum(self._behind - _HELD_M, 0.0)
+        return eased
