@@ -52,6 +52,10 @@ class RedialPolicy:
         return float(min(self.cap_s, self.first_s * self.factor ** min(failures, 30)))
 
 
+class _EndedError(LinkError):
+    """The proxy ended the connection before it said welcome."""
+
+
 class LinkUser(Protocol):
     """What a link calls. ``feedback``, ``frame`` … on the receiving thread, the rest on the link's own thread."""
 
@@ -122,6 +126,7 @@ class Link:
         Raises what the dialer raises, :class:`RefusedError`, and :class:`NoAnswerError` if nobody says welcome.
         """
         deadline = time.monotonic() + timeout_s
+        ended = False
         while True:
             try:
                 self._connect()
@@ -129,6 +134,10 @@ class Link:
             except NoAnswerError:  # the one packet may have been lost, or the proxy is slow to start
                 if time.monotonic() > deadline:
                     raise
+            except _EndedError:  # it has just failed to start: the dialer knows why
+                if ended:
+                    raise
+                ended = True
         self._begin(self)
 
     def close(self) -> None:
@@ -332,7 +341,7 @@ class Link:
         if isinstance(answer, Refused):
             raise RefusedError(f"the proxy refused the connection: {answer.message}", code=answer.code.value)
         if connection.closed_reason is not None:
-            raise LinkError(f"the proxy ended the connection: {connection.closed_reason}")
+            raise _EndedError(f"the proxy ended the connection: {connection.closed_reason}")
         raise NoAnswerError(f"the proxy at {connection.address} was reached but did not answer: is it stopped?")
 
     def _drop(self, error: LinkError, reason: str) -> None:

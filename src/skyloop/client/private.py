@@ -74,9 +74,9 @@ class PrivateProxy:
                     end = inner(handler)
                 except (LinkError, UsageError) as error:
                     self._check_alive()
-                    if served:
-                        raise
                     if time.monotonic() > deadline_s:
+                        if served:
+                            raise
                         raise NoAnswerError(f"the proxy for {self.uri} did not start in time{self._said()}") from error
                     self._wait_for_output()
                 else:
