@@ -9,15 +9,14 @@ import selectors
 import socket
 import threading
 from collections.abc import Callable
-from contextlib import suppress
 from functools import partial
 from typing import Final
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
-from skyloop.drivers.base import Sink
-from skyloop.drivers.tello.session import TICK_NS, Session, Telling
+from skyloop.drivers.link_thread import LinkThread, tell_failure
+from skyloop.drivers.tello.session import Session, Telling
 from skyloop.drivers.tello.sockets import MAX_DATAGRAM, address_of, at, towards
-from skyloop.messages import AnyAction, EventKind, Severity
+from skyloop.messages import AnyAction
 
 BURST: Final = 32  #: datagrams that are read before commands get their turn
 ASK_S: Final = 0.95  #: a command is answered within this, or it failed
@@ -25,36 +24,22 @@ RENEW_NS: Final = nanoseconds(2.0)  #: pace of new sockets while nothing is hear
 _CLOSE_S: Final = 2.0
 
 
-class Link:
+class Link(LinkThread):
     """Serves a session from :meth:`start` to :meth:`stop`. ``deliver`` gets its tellings, on the link's thread."""
 
     def __init__(self, session: Session, deliver: Callable[[list[Telling]], None], clock: Clock = monotonic_ns) -> None:
+        super().__init__("skyloop-tello", close_s=_CLOSE_S)
         self.session = session
-        self.lock = threading.Lock()  #: to be held by whoever touches the session
         self.addresses: tuple[str, str] | None = None  #: the drone's, and this host's towards it
         self._deliver = deliver
         self._clock = clock
-        self._stopping = threading.Event()
-        self._selector = selectors.DefaultSelector()
-        self._awake, self._waker = socket.socketpair()
         self._commands: socket.socket | None = None
         self._states: socket.socket | None = None
         self._renewed_ns = -RENEW_NS
-        self._thread = threading.Thread(target=self._run, name="skyloop-tello", daemon=True)
-
-    def start(self) -> None:
-        """Begin."""
-        self._awake.setblocking(False)
-        self._waker.setblocking(False)
-        self._selector.register(self._awake, selectors.EVENT_READ)
-        self._thread.start()
 
     def stop(self) -> None:
         """End, and give everything back. Questions that wait are answered by nothing."""
-        self._stopping.set()
-        self._wake()
-        if self._thread is not threading.current_thread():
-            self._thread.join(_CLOSE_S)
+        self.join()
         with self.lock:
             self.session.close()
 
@@ -69,7 +54,7 @@ class Link:
             if due_ns <= now_ns:
                 self._say(now_ns)
         if now_ns < due_ns:
-            self._wake()
+            self.wake()
         return applied
 
     def ask(self, text: str) -> str | None:
@@ -83,30 +68,18 @@ class Link:
 
         with self.lock:
             self.session.ask(text, end)
-        self._wake()
+        self.wake()
         done.wait(ASK_S)
         return replies[0] if replies else None
 
-    def _wake(self) -> None:
-        with suppress(OSError):  # it is awake, or it ended
-            self._waker.send(b"\0")
-
     # On the link's thread --------------------------------------------------------------------------------------
 
-    def _run(self) -> None:
-        try:
-            while not self._stopping.is_set():
-                try:
-                    self._step()
-                except Exception as error:  # noqa: BLE001  whatever happens, the drone must be told what to do
-                    self._deliver([partial(_tell_failure, error)])
-                    self._stopping.wait(seconds(TICK_NS))
-        finally:
-            with self.lock:
-                self._close_sockets()
-            self._selector.close()
-            self._awake.close()
-            self._waker.close()
+    def _fail(self, error: Exception) -> None:
+        self._deliver([partial(tell_failure, error)])
+
+    def _release(self) -> None:
+        with self.lock:
+            self._close_sockets()
 
     def _step(self) -> None:
         now_ns = self._clock()
@@ -116,8 +89,7 @@ class Link:
         self._renew_sockets()
         for key, _ in ready:
             if key.fileobj is self._awake:
-                with suppress(BlockingIOError):
-                    self._awake.recv(4096)
+                self._slept()
             elif key.fileobj is self._commands:
                 self._receive(self._commands, self.session.reply_heard)
             elif key.fileobj is self._states:
@@ -187,7 +159,3 @@ class Link:
                 self._selector.unregister(port)
                 port.close()
         self._commands = self._states = None
-
-
-def _tell_failure(error: Exception, sink: Sink) -> None:
-    sink.event(EventKind.DRIVER_ERROR, f"the link to the drone failed: {error!r}", Severity.ERROR, where="link")
