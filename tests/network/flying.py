@@ -96,9 +96,9 @@ def links(here: Here, name: str) -> list[tuple[int, str]]:
 
 
 def watch_frames(here: Here, name: str, /, **options: Any) -> None:
-    """Write down the shape and the age [s] of each frame."""
+    """Write down the shape, the age [s] and the time of capture [ns] of each frame."""
     write = here.tell(f"{name} frame")
-    here.drones[name].add_processor(lambda frame: write((frame.shape, frame.age_s, frame.seq)), **options)
+    here.drones[name].add_processor(lambda frame: write((frame.shape, frame.age_s, frame.captured_ns)), **options)
 
 
 def frames(here: Here, name: str) -> list[tuple[int, tuple[tuple[int, ...], float, int]]]:

@@ -4,7 +4,6 @@ to several."""
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -81,5 +80,5 @@ def test_video_goes_to_several_hosts_as_each_wants_it(lan: Lan, proxy: Start, re
         name: {shape for _, (shape, _, _) in viewer.do(flying.frames, "alpha")} for name, viewer in viewers.items()
     }
     assert shapes == {"one": {(240, 320, 3)}, "two": {(240, 320, 3)}, "three": {(120, 160, 3)}}
-    seen = [seq for _, (_, _, seq) in viewers["three"].do(flying.frames, "alpha")]
-    assert min(b - a for a, b in pairwise(seen)) >= 2, "every third frame is wanted"
+    captured_ns = [at for _, (_, _, at) in viewers["three"].do(flying.frames, "alpha")]
+    assert len(captured_ns) <= (captured_ns[-1] - captured_ns[0]) / 1e9 * 5.0 + 2.0, "five in a second are wanted"
