@@ -25,8 +25,9 @@ from skyloop.drivers.ardrone.decoding import PaveVideo
 from skyloop.drivers.backlog import Coded
 from skyloop.errors import MissingExtraError
 from skyloop.sim.camera import FRONT_CAMERA
-from skyloop.sim.firmware.ardrone.encoders import GROUP, H264_360P, Encoder
-from skyloop.sim.firmware.uvlc import encode as encode_uvlc
+from skyloop.sim.firmware.ardrone.formats import H264_360P
+from skyloop.sim.firmware.ardrone.uvlc import encode as encode_uvlc
+from skyloop.sim.firmware.encoders import GROUP, Encoder
 from skyloop.wire.ardrone import navdata
 from skyloop.wire.ardrone.options import LAYOUTS
 from skyloop.wire.ardrone.pave import FrameType, PaveFrame

@@ -16,7 +16,8 @@ from skyloop.drivers.ardrone.assembly import PaveAssembly
 from skyloop.drivers.ardrone.decoding import PaveVideo
 from skyloop.drivers.backlog import Coded
 from skyloop.errors import UnsupportedError
-from skyloop.sim.firmware.ardrone.encoders import MP4_360P, Encoder
+from skyloop.sim.firmware.ardrone.formats import MP4_360P
+from skyloop.sim.firmware.encoders import Encoder
 from skyloop.wire.ardrone.pave import Codec, FrameType, PaveFrame
 from tests.drivers.ardrone.video_ports import LONG, SHORT, Digest, digest, frames, pieces, recording, true_pictures
 

@@ -15,17 +15,16 @@ from skyloop.drivers.backlog import Coded
 from skyloop.drivers.tello.cameras import cameras_of, intrinsics_for
 from skyloop.drivers.tello.decoding import MOST_DAMAGED, TelloVideo
 from skyloop.drivers.uri import parse_uri
-from skyloop.sim.firmware.ardrone.board import VideoSettings
 from skyloop.sim.firmware.tello.running import GROUP, TelloPacker
 from skyloop.sim.firmware.tello.settings import FRONT
-from skyloop.wire.ardrone.keys import VideoChannel, VideoCodec
+from skyloop.sim.firmware.video import OneCamera
 from skyloop.wire.tello.video import AccessUnit, Assembly, pieces
 
 pytest.importorskip("av")
 
 Pixels = NDArray[np.uint8]
 COUNT = 70
-SETTINGS = VideoSettings(VideoChannel.FRONT, VideoCodec.H264_720P, 30.0, 600)
+SETTINGS = OneCamera("front", 30.0, 600)
 
 
 def scene(number: int) -> Pixels:

@@ -9,10 +9,10 @@ from typing import Final
 from skyloop.clock import NS_PER_S, ManualClock
 from skyloop.messages import FlightState
 from skyloop.sim.dynamics import STEP_S
-from skyloop.sim.firmware.ardrone.datagrams import Address
-from skyloop.sim.firmware.ardrone.vehicle import SimulatedVehicle
+from skyloop.sim.firmware.datagrams import Address
 from skyloop.sim.firmware.tello.board import Board
 from skyloop.sim.firmware.tello.settings import LIMITS, TELLO
+from skyloop.sim.firmware.vehicle import SimulatedVehicle
 from skyloop.sim.host import Report
 from skyloop.sim.parameters import with_ideal_sensors
 from skyloop.sim.reports import VehicleTruth

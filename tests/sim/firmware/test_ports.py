@@ -13,9 +13,9 @@ import pytest
 
 from skyloop.clock import monotonic_ns
 from skyloop.errors import LinkError
-from skyloop.sim.firmware.ardrone.datagrams import Address, DatagramPort
-from skyloop.sim.firmware.ardrone.loop import Loop
 from skyloop.sim.firmware.ardrone.streams import MOST_BACKLOG, MOST_CLIENTS, StreamPort
+from skyloop.sim.firmware.datagrams import Address, DatagramPort
+from skyloop.sim.firmware.loop import Loop
 from skyloop.transport.faults import Faults
 from skyloop.transport.testing import wait_until
 

@@ -11,7 +11,8 @@ from skyloop.messages import FlightState
 from skyloop.sim.firmware.ardrone.clock import DroneClock
 from skyloop.sim.firmware.ardrone.listeners import MOST, Listeners
 from skyloop.sim.firmware.ardrone.set_points import Progress
-from skyloop.sim.firmware.ardrone.telemetry import Snapshot, VideoStatus, options_of, tags_of
+from skyloop.sim.firmware.ardrone.telemetry import Snapshot, options_of, tags_of
+from skyloop.sim.firmware.video import VideoStatus
 from skyloop.wire.ardrone import options as o
 from skyloop.wire.ardrone.navdata import ControlState, Navdata, decode, encode
 from tests.sim.firmware.rig import RESTING
@@ -123,7 +124,7 @@ def test_values_that_no_field_can_hold_are_cut() -> None:
         MOVING, altitude_m=-3.0, battery_v=1e9, angular_velocity_rad_s=(1e6,) * 3, acceleration_m_s2=(-1e6,) * 3
     )
     progress = Progress(1, 1e30, -1e30, 1e30, 0.0)
-    video = VideoStatus(1 << 40, 1 << 40, 1, 0)
+    video = VideoStatus(1 << 40, 1 << 40, 1)
     assert (
         len(told(Snapshot(wild, FlightState.FLYING, time=0, thrust=9.0, progress=progress, video=video)).options) == 28
     )

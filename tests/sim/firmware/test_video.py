@@ -17,8 +17,10 @@ from skyloop.errors import MissingExtraError, UsageError
 from skyloop.sim.firmware.ardrone.board import VideoSettings
 from skyloop.sim.firmware.ardrone.cameras import BOTTOM_1, BOTTOM_2, BOTTOM_2_SENT, FRONT_1, FRONT_2
 from skyloop.sim.firmware.ardrone.clock import DroneClock
-from skyloop.sim.firmware.ardrone.encoders import FORMATS, GROUP, Encoder, as_the_drone_does, require_encoder
-from skyloop.sim.firmware.ardrone.video import PavePacker, Piece, UvlcPacker, VideoEncoding, with_inset
+from skyloop.sim.firmware.ardrone.formats import FORMATS
+from skyloop.sim.firmware.ardrone.packers import PavePacker, UvlcPacker
+from skyloop.sim.firmware.encoders import GROUP, Encoder, as_the_drone_does, require_encoder
+from skyloop.sim.firmware.video import Piece, VideoEncoding, with_inset
 from skyloop.transport.testing import wait_until
 from skyloop.wire.ardrone import uvlc
 from skyloop.wire.ardrone.keys import VideoChannel, VideoCodec

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 
 from skyloop.sim.dynamics import STEP_S
-from skyloop.sim.firmware.ardrone.vehicle import SimulatedVehicle
 from skyloop.sim.firmware.mavlink import Kind
 from skyloop.sim.firmware.mavlink.arducopter import ArduCopter
 from skyloop.sim.firmware.mavlink.px4 import Px4
 from skyloop.sim.firmware.mavlink.streams import Streams
+from skyloop.sim.firmware.vehicle import SimulatedVehicle
 from skyloop.sim.host import Report
 from skyloop.sim.parameters import VehicleParameters, with_ideal_sensors
 from skyloop.sim.simulation import Simulation

@@ -13,7 +13,7 @@ from skyloop.sim.firmware.ardrone.configuration import Configuration, Ids
 from skyloop.sim.firmware.ardrone.flight import LOST_AFTER_S, FlightControl
 from skyloop.sim.firmware.ardrone.sequence import CommandSequence
 from skyloop.sim.firmware.ardrone.set_points import Progress, limits_of
-from skyloop.sim.firmware.ardrone.vehicle import Vehicle
+from skyloop.sim.firmware.vehicle import Vehicle
 from skyloop.sim.reports import VehicleFeedback
 from skyloop.wire.ardrone.at import AtCommand, Ctrl, parse_commands, to_float
 from skyloop.wire.ardrone.keys import VideoChannel, VideoCodec
@@ -31,6 +31,13 @@ _ALWAYS: Final = (
     | State.ACQUISITION_THREAD
 )
 _NOTHING_DETECTED: Final = 3  # detect:detect_type
+_CAMERAS: Final = {
+    VideoChannel.FRONT: ("front",),
+    VideoChannel.BOTTOM: ("bottom",),
+    VideoChannel.FRONT_WITH_BOTTOM: ("front", "bottom"),
+    VideoChannel.BOTTOM_WITH_FRONT: ("bottom", "front"),
+}
+_INSETS: Final = {VideoChannel.FRONT_WITH_BOTTOM: (88, 72), VideoChannel.BOTTOM_WITH_FRONT: (58, 42)}
 #: What a real drone takes and nothing here comes of: legacy, and the factory's.
 _WITHOUT_EFFECT: Final = (*("PMODE", "MISC", "GAIN", "VISP", "VISO", "CAP", "MTRIM", "POL", "PWM", "AFLIGHT", "VICON"),)
 
@@ -43,6 +50,14 @@ class VideoSettings:
     codec: VideoCodec
     fps: float
     bitrate_kbps: int
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        return _CAMERAS[self.channel]
+
+    @property
+    def inset(self) -> tuple[int, int]:
+        return _INSETS.get(self.channel, (0, 0))
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,9 +7,10 @@ from typing import Final
 
 from skyloop.errors import UsageError
 from skyloop.sim.firmware.ardrone.board import MainBoard
-from skyloop.sim.firmware.ardrone.encoders import require_encoder
 from skyloop.sim.firmware.ardrone.running import RunningFirmware
-from skyloop.sim.firmware.ardrone.settings import NO_FAULTS, Settings
+from skyloop.sim.firmware.ardrone.settings import Settings
+from skyloop.sim.firmware.encoders import require_encoder
+from skyloop.sim.firmware.firmware import NO_FAULTS, Firmware, checked_delay
 from skyloop.sim.host import SimHost
 from skyloop.transport.faults import Faults
 from skyloop.wire.ardrone.ports import STANDARD, Ports
@@ -17,7 +18,7 @@ from skyloop.wire.ardrone.ports import STANDARD, Ports
 VERSIONS: Final = (1, 2)
 
 
-class ArdroneFirmware:
+class ArdroneFirmware(Firmware[RunningFirmware]):
     """The firmware of one drone of a host's world. Several may share a host, each with a drone and ports of its own.
 
     ``version``: 1 or 2. ``bind``: the address of this machine to listen on. ``faults`` befall the datagrams of AT
@@ -50,51 +51,23 @@ class ArdroneFirmware:
             raise UsageError(f"there is an AR.Drone 1 and an AR.Drone 2, and none of version {version!r}")
         if header_size not in (64, 68):
             raise UsageError(f"a PaVE header has 64 or 68 bytes, not {header_size!r}")
-        if not 0 <= delay_s <= 10:
-            raise UsageError(f"a delay is from 0 to 10 s, not {delay_s!r}")
         if version > 1:
             require_encoder()
-        self.host = host
-        self.drone = drone
-        self.settings = Settings(version, bind, ports, faults, delay_s, header_size, torn_start)
-        self._running: RunningFirmware | None = None
+        super().__init__(host, drone)
+        self.settings = Settings(version, bind, ports, faults, checked_delay(delay_s), header_size, torn_start)
 
-    def start(self) -> None:
-        """Switch the drone on: its clock, its configuration and its link begin anew.
-
-        Raises :class:`skyloop.errors.LinkError` if a port is taken, and :class:`UsageError` if it is started already
-        or somebody else has this drone.
-        """
-        if self._running is not None:
-            raise UsageError("this firmware is started already")
-        self._running = RunningFirmware(self.host, self.drone, self.settings)
-        self.settings = replace(self.settings, ports=self._running.ports)  # found again after a restart
-
-    def stop(self) -> None:
-        """Switch it off, in the middle of whatever it does; the vehicle goes on with what it was told last. When this
-        returns the ports are free again. Does nothing if it is not started."""
-        running, self._running = self._running, None
-        if running is not None:
-            running.stop()
+    def _switched_on(self) -> RunningFirmware:
+        running = RunningFirmware(self.host, self.drone, self.settings)
+        self.settings = replace(self.settings, ports=running.ports)  # found again after a restart
+        return running
 
     @property
     def ports(self) -> Ports:
         """The real ones. Raises :class:`UsageError` if it is not started."""
-        if self._running is None:
-            raise UsageError("firmware that is not started has no ports: call start() first")
-        return self._running.ports
+        return self._started.ports
 
     @property
     def board(self) -> MainBoard:
         """For tests: the state of the running firmware, which belongs to its thread. Raises :class:`UsageError` if it
         is not started."""
-        if self._running is None:
-            raise UsageError("firmware that is not started has no state: call start() first")
-        return self._running.board
-
-    def __enter__(self) -> ArdroneFirmware:
-        self.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
+        return self._started.board

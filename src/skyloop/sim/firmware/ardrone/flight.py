@@ -25,7 +25,7 @@ from skyloop.messages import (
 from skyloop.sim.autopilot import LOW_BATTERY
 from skyloop.sim.firmware.ardrone.configuration import Configuration
 from skyloop.sim.firmware.ardrone.set_points import NO_PROGRESS, Progress, set_point
-from skyloop.sim.firmware.ardrone.vehicle import Vehicle
+from skyloop.sim.firmware.vehicle import Vehicle
 from skyloop.sim.reports import VehicleFeedback
 from skyloop.wire.ardrone.at import Ref
 from skyloop.wire.ardrone.navdata import State

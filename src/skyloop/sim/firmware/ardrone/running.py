@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-import numpy as np
-from numpy.typing import NDArray
-
 from skyloop.clock import monotonic_ns, nanoseconds
-from skyloop.sim.camera import CameraModel
-from skyloop.sim.firmware.ardrone.board import MainBoard
+from skyloop.sim.firmware.ardrone.board import MainBoard, VideoSettings
 from skyloop.sim.firmware.ardrone.cameras import CAMERAS
 from skyloop.sim.firmware.ardrone.clock import DroneClock
-from skyloop.sim.firmware.ardrone.datagrams import Address, DatagramPort
 from skyloop.sim.firmware.ardrone.listeners import Listeners
-from skyloop.sim.firmware.ardrone.loop import Loop
+from skyloop.sim.firmware.ardrone.packers import PavePacker, UvlcPacker
 from skyloop.sim.firmware.ardrone.settings import Settings
 from skyloop.sim.firmware.ardrone.streams import Outlet, StreamPort
 from skyloop.sim.firmware.ardrone.telemetry import Snapshot, options_of, tags_of
-from skyloop.sim.firmware.ardrone.vehicle import SimulatedVehicle
-from skyloop.sim.firmware.ardrone.video import Packer, PavePacker, Piece, UvlcPacker, VideoEncoding
+from skyloop.sim.firmware.datagrams import Address, DatagramPort
+from skyloop.sim.firmware.running import Running
+from skyloop.sim.firmware.vehicle import SimulatedVehicle
+from skyloop.sim.firmware.video import Packer, Piece, VideoEncoding
 from skyloop.sim.host import Report, SimHost
-from skyloop.sim.reports import Occurrence
 from skyloop.wire.ardrone import navdata
 from skyloop.wire.ardrone.ports import Ports
 
@@ -33,48 +28,31 @@ if TYPE_CHECKING:
 
 DEMO_HZ: Final = 15.0
 
-_log = logging.getLogger(__name__)
 
-
-class RunningFirmware:
-    """A passenger of the host, from its making until :meth:`stop`.
-
-    The board, the ports and who listens belong to the loop's thread; the host's threads only leave their reports and
-    pictures, and look at what is replaced as a whole.
-    """
+class RunningFirmware(Running):
+    """The board, the ports and who listens belong to the loop's thread."""
 
     def __init__(self, host: SimHost, drone: int, settings: Settings) -> None:
-        self._host, self._drone, self._settings = host, drone, settings
+        super().__init__(host, drone, "skyloop-ardrone")
+        self._settings = settings
         self._clock = DroneClock(monotonic_ns())
-        self._report: Report | None = None
-        self._posted = False
         self._demo_due_ns = 0
         self._stale = b""  # the picture sent last that needs others before it
         self._navdata_clients, self._video_clients = Listeners(), Listeners()
         self._most_thrust = host.simulation.parameters[drone].most_thrust
-        self._loop = Loop("skyloop-ardrone")
         vehicle = SimulatedVehicle(host.simulation, drone)
         self.board = MainBoard(vehicle, self._send_text, monotonic_ns, version=settings.version)
         self._shown = self.board.video
-        self._video = VideoEncoding(self._packer(), lambda: self._shown, self._encoded)
+        self._video = self._encoding = VideoEncoding(self._packer(), lambda: self._shown, self._encoded)
         self._cameras: tuple[Camera, ...] = ()
-        self._open: list[DatagramPort | StreamPort] = []
         try:
             self._open_ports(settings.ports)
-            self._video.start()
+            self._encoding.start()
             self._loop.start()
             self._cameras = host.board(drone, self, self, list(CAMERAS[settings.version]))
         except BaseException:
             self.stop()
             raise
-
-    def stop(self) -> None:
-        """When this returns the ports are free."""
-        self._host.leave(self._drone, self)
-        self._video.stop()
-        self._loop.stop()
-        for port in self._open:
-            port.close()
 
     # Ports -----------------------------------------------------------------------------------------------------
 
@@ -119,12 +97,7 @@ class RunningFirmware:
         if self._navdata_clients.heard(sender):
             self._demo_due_ns = 0
 
-    def _tick(self) -> None:
-        """There is a new report."""
-        self._posted = False
-        report = self._report
-        if report is None:
-            return
+    def _tick(self, report: Report) -> None:
         self.board.supervise(report.believed)
         if self.board.lost:
             self._video_clients = Listeners()  # or an AR.Drone 1 would send pictures to nobody for ever
@@ -162,7 +135,8 @@ class RunningFirmware:
             trim_rad=flight.trim_rad,
             progress=flight.progress,
             flipping=flight.flipping(monotonic_ns()),
-            video=self._video.status,
+            video=self._encoding.status,
+            channel=self._shown.channel,
             link_quality=round(100 * (1 - self._settings.faults.drop)),
         )
 
@@ -175,7 +149,7 @@ class RunningFirmware:
             return bool(self._video_stream.outlets)
         return bool(self._video_clients)
 
-    def _packer(self) -> Packer:
+    def _packer(self) -> Packer[VideoSettings]:
         if self._settings.version == 1:
             return UvlcPacker()
         return PavePacker(self._clock, self._settings.header_size, self._attitude)
@@ -220,25 +194,6 @@ class RunningFirmware:
 
     # Called by the host, on its threads ------------------------------------------------------------------------
 
-    def report(self, report: Report) -> None:
-        """What the drone believes now; what was not looked at yet is overtaken."""
-        self._report = report
-        if not self._posted:
-            self._posted = True
-            self._loop.post(self._tick)
-
-    def happened(self, occurrence: Occurrence) -> None:
-        """Navdata shows what comes of it."""
-        _log.info("drone %d: %s", occurrence.drone, occurrence.text)
-
     def wants(self, camera: str) -> bool:
         """Whether a picture of this camera would be sent to anybody."""
-        return self._seen and self._video.wants(camera)
-
-    def show(self, model: CameraModel, pixels: NDArray[np.uint8], captured_ns: int) -> None:
-        """A picture is due."""
-        self._video.show(model.name, pixels, captured_ns)
-
-    def failed(self, error: Exception) -> None:
-        """The simulation or the drawing raised. Without reports no navdata goes out, as from a drone that is dead."""
-        _log.error("the simulation of drone %d failed: %r", self._drone, error)
+        return self._seen and super().wants(camera)

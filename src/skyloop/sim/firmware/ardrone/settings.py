@@ -10,7 +10,6 @@ from skyloop.sim.vehicles import AR_DRONE
 from skyloop.transport.faults import Faults
 from skyloop.wire.ardrone.ports import Ports
 
-NO_FAULTS: Final = Faults()
 REPORTS_HZ: Final = 125.0  #: as often as a world that keeps time reports
 
 

@@ -7,8 +7,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final
 
-from skyloop.sim.firmware.ardrone.datagrams import Address, bound
-from skyloop.sim.firmware.ardrone.loop import Loop
+from skyloop.sim.firmware.datagrams import Address, bound
+from skyloop.sim.firmware.loop import Loop
 
 MOST_CLIENTS: Final = 8
 MOST_BACKLOG: Final = 256 * 1024  #: bytes for one client beyond what the system holds

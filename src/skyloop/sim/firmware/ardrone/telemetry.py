@@ -14,10 +14,11 @@ from typing import Any, Final
 
 from skyloop.messages import FlightState
 from skyloop.sim.firmware.ardrone.set_points import NO_PROGRESS, Progress
+from skyloop.sim.firmware.video import NOTHING_SENT, VideoStatus
 from skyloop.sim.parameters import GRAVITY_M_S2
 from skyloop.sim.reports import VehicleFeedback
 from skyloop.wire.ardrone import options as o
-from skyloop.wire.ardrone.keys import NAVDATA_OPTIONS_USUAL
+from skyloop.wire.ardrone.keys import NAVDATA_OPTIONS_USUAL, VideoChannel
 from skyloop.wire.ardrone.navdata import ControlState
 
 STANDARD_PRESSURE_PA: Final = 101_325
@@ -37,16 +38,6 @@ _CONTROL_STATES: Final = {
 
 
 @dataclass(frozen=True, slots=True)
-class VideoStatus:
-    """What navdata tells of the video."""
-
-    pictures: int = 0
-    bytes_last: int = 0
-    bitrate_kbps: int = 0
-    channel: int = 0
-
-
-@dataclass(frozen=True, slots=True)
 class Snapshot:
     """All that the options are made from."""
 
@@ -58,7 +49,8 @@ class Snapshot:
     trim_rad: tuple[float, float] = (0.0, 0.0)  #: roll and pitch that count as level
     progress: Progress = NO_PROGRESS
     flipping: bool = False
-    video: VideoStatus = VideoStatus()
+    video: VideoStatus = NOTHING_SENT
+    channel: VideoChannel = VideoChannel.FRONT
     link_quality: int = 100
 
     @property
@@ -121,7 +113,7 @@ def _demo(s: Snapshot) -> o.Demo:
         vx=vx,
         vy=vy,
         num_frames=s.video.pictures & 0xFFFFFFFF,
-        detection_camera_type=s.video.channel,
+        detection_camera_type=int(s.channel),
     )
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from typing import ClassVar, Final
 
-from skyloop.sim.firmware.ardrone.vehicle import Vehicle
 from skyloop.sim.firmware.mavlink import parameters
 from skyloop.sim.firmware.mavlink.autopilot import (
     ACCEPTED,
@@ -27,6 +26,7 @@ from skyloop.sim.firmware.mavlink.targets import (
     attitude_target_of,
     target_of,
 )
+from skyloop.sim.firmware.vehicle import Vehicle
 from skyloop.wire.mavlink.codec import Message
 from skyloop.wire.mavlink.codec import dialect as m
 from skyloop.wire.mavlink.modes import COPTER_MODES, COPTER_NUMBERS

@@ -11,13 +11,13 @@ from collections.abc import Callable
 from typing import ClassVar, Final
 
 from skyloop.messages import FlightState
-from skyloop.sim.firmware.ardrone.vehicle import Vehicle
 from skyloop.sim.firmware.mavlink.flyer import Flyer
 from skyloop.sim.firmware.mavlink.links import Port
 from skyloop.sim.firmware.mavlink.parameters import ParameterTable
 from skyloop.sim.firmware.mavlink.streams import MAX_INTERVAL_US
 from skyloop.sim.firmware.mavlink.targets import AttitudeTarget, Target
 from skyloop.sim.firmware.mavlink.telemetry import HOME_ALTITUDE_M, MAKERS
+from skyloop.sim.firmware.vehicle import Vehicle
 from skyloop.sim.host import Report
 from skyloop.wire.mavlink.codec import Message
 from skyloop.wire.mavlink.codec import dialect as m

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Final
 
 from skyloop.errors import UsageError
+from skyloop.sim.firmware.firmware import NO_FAULTS, Firmware, checked_delay
 from skyloop.sim.firmware.mavlink.autopilot import Autopilot
 from skyloop.sim.firmware.mavlink.running import RunningFirmware
 from skyloop.sim.firmware.mavlink.settings import Kind, Ports, Settings
@@ -13,10 +14,9 @@ from skyloop.sim.host import SimHost
 from skyloop.transport.faults import Faults
 
 BOOT_S: Final = 2.0
-_NO_FAULTS: Final = Faults()
 
 
-class MavlinkFirmware:
+class MavlinkFirmware(Firmware[RunningFirmware]):
     """The autopilot of one drone of a host's world. Several may share a host, each with a drone and ports of its own.
 
     ``system``: its MAVLink system id, the drone's number plus one by default. ``boot_s``: from the start until it lets
@@ -39,7 +39,7 @@ class MavlinkFirmware:
         bind: str = "127.0.0.1",
         ports: Ports | None = None,
         system: int | None = None,
-        faults: Faults = _NO_FAULTS,
+        faults: Faults = NO_FAULTS,
         delay_s: float = 0.0,
         boot_s: float = BOOT_S,
         gps: bool = True,
@@ -52,35 +52,21 @@ class MavlinkFirmware:
             raise UsageError(f"a system id is from 1 to 255, not {number!r}")
         if version not in (1, 2):
             raise UsageError(f"there is MAVLink 1 and MAVLink 2, not {version!r}")
-        if not 0 <= delay_s <= 10:
-            raise UsageError(f"a delay is from 0 to 10 s, not {delay_s!r}")
-        self.host = host
-        self.drone = drone
+        super().__init__(host, drone)
+        delay_s = checked_delay(delay_s)
         ports = ports or Ports.standard(kind, drone)
         self.settings = Settings(kind, bind, ports, number, faults, delay_s, boot_s, gps, version, key, video)
-        self._running: RunningFirmware | None = None
 
-    def start(self) -> None:
-        """Switch the autopilot on. Raises :class:`skyloop.errors.LinkError` if a port is taken, :class:`UsageError`
-        if it is started already or somebody else has this drone."""
-        if self._running is not None:
-            raise UsageError("this firmware is started already")
-        self._running = RunningFirmware(self.host, self.drone, self.settings)
-        self.settings = replace(self.settings, ports=self._running.ports)
-
-    def stop(self) -> None:
-        """Switch it off in the middle of whatever it does; the vehicle goes on with what it was told last. When this
-        returns the ports are free again. Does nothing if it is not started."""
-        running, self._running = self._running, None
-        if running is not None:
-            running.stop()
+    def _switched_on(self) -> RunningFirmware:
+        running = RunningFirmware(self.host, self.drone, self.settings)
+        self.settings = replace(self.settings, ports=running.ports)  # found again after a restart
+        return running
 
     @property
     def autopilot(self) -> Autopilot:
-        """For tests: the running autopilot, which belongs to its thread. Raises :class:`UsageError`."""
-        if self._running is None:
-            raise UsageError("firmware that is not started has no state: call start() first")
-        return self._running.autopilot
+        """For tests: the running autopilot, which belongs to its thread. Raises :class:`UsageError` if it is not
+        started."""
+        return self._started.autopilot
 
     @property
     def address(self) -> str:
@@ -103,10 +89,3 @@ class MavlinkFirmware:
             f"{settings.kind.value} drone {self.drone}, system {settings.system}, "
             f"from udp {settings.ports.udp}: {self.address}{tcp}"
         )
-
-    def __enter__(self) -> MavlinkFirmware:
-        self.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()

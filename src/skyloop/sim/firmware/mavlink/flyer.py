@@ -8,7 +8,7 @@ from typing import Final
 from skyloop.messages import AnyAction, Attitude, EmergencyStop, FlightState, Hover, Land, ResetEmergency, Takeoff
 from skyloop.messages import Velocity as VelocityAction
 from skyloop.messages.geometry import wrap_angle
-from skyloop.sim.firmware.ardrone.vehicle import Vehicle
+from skyloop.sim.firmware.vehicle import Vehicle
 from skyloop.sim.host import Report
 from skyloop.sim.parameters import GRAVITY_M_S2, Limits
 from skyloop.wire.mavlink.axes import Vector, turned

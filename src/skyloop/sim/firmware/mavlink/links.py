@@ -8,8 +8,8 @@ from contextlib import suppress
 from typing import Final, Protocol
 
 from skyloop.clock import monotonic_ns, nanoseconds
-from skyloop.sim.firmware.ardrone.datagrams import Address, DatagramPort, bound
-from skyloop.sim.firmware.ardrone.loop import Loop
+from skyloop.sim.firmware.datagrams import Address, DatagramPort, bound
+from skyloop.sim.firmware.loop import Loop
 from skyloop.sim.firmware.mavlink.settings import Settings
 from skyloop.sim.firmware.mavlink.streams import Streams
 from skyloop.wire.mavlink.codec import Codec, Message

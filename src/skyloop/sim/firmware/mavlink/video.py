@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 
 from skyloop.errors import MissingExtraError
 from skyloop.sim.camera import FRONT_CAMERA, CameraModel
-from skyloop.sim.firmware.ardrone.board import VideoSettings
-from skyloop.sim.firmware.ardrone.encoders import GROUP
-from skyloop.sim.firmware.ardrone.video import VideoEncoding
-from skyloop.wire.ardrone.keys import VideoChannel, VideoCodec
+from skyloop.sim.firmware.encoders import GROUP
+from skyloop.sim.firmware.video import OneCamera, VideoEncoding
 
 if TYPE_CHECKING:
     from av.container import OutputContainer
@@ -23,7 +21,7 @@ if TYPE_CHECKING:
 CAMERA: Final[CameraModel] = replace(FRONT_CAMERA, fps=20.0)
 _CLOCK: Final = Fraction(1, 90_000)  #: of transport streams [s]
 _X264: Final = {"preset": "ultrafast", "tune": "zerolatency", "x264-params": "scenecut=0:repeat-headers=1:threads=1"}
-_SETTINGS: Final = VideoSettings(VideoChannel.FRONT, VideoCodec.H264_360P, CAMERA.fps, 1500)
+_SETTINGS: Final = OneCamera("front", CAMERA.fps, 1500)
 
 
 class TransportStream:
@@ -47,7 +45,7 @@ class TransportStream:
         self._begun_ns: int | None = None
         self._stamp = -1
 
-    def pack(self, picture: NDArray[np.uint8], _settings: VideoSettings, captured_ns: int) -> None:
+    def pack(self, picture: NDArray[np.uint8], _settings: OneCamera, captured_ns: int) -> None:
         """A picture (height, width, 3), BGR."""
         self._begun_ns = captured_ns if self._begun_ns is None else self._begun_ns
         frame = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="bgr24")
@@ -62,6 +60,6 @@ class TransportStream:
         self._container.close()
 
 
-def encoding(stream: TransportStream) -> VideoEncoding:
+def encoding(stream: TransportStream) -> VideoEncoding[OneCamera]:
     """The thread that encodes the newest picture."""
     return VideoEncoding(stream, lambda: _SETTINGS, lambda _: None)

@@ -13,12 +13,12 @@ from typing import Final
 
 from skyloop.clock import Clock, nanoseconds
 from skyloop.messages import EmergencyStop, FlightState, Hover, ResetEmergency, Velocity
-from skyloop.sim.firmware.ardrone.datagrams import Address
-from skyloop.sim.firmware.ardrone.vehicle import Vehicle
+from skyloop.sim.firmware.datagrams import Address
 from skyloop.sim.firmware.tello import telemetry
 from skyloop.sim.firmware.tello.grammar import MOVES, NUMBERS, numbers_of
 from skyloop.sim.firmware.tello.jobs import OK, Flipping, Going, Job, Landing, Rising, Turning
 from skyloop.sim.firmware.tello.pads import Sighting, seen
+from skyloop.sim.firmware.vehicle import Vehicle
 from skyloop.sim.host import Report
 from skyloop.sim.world import Vec3
 from skyloop.wire.tello.commands import (

@@ -6,17 +6,18 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from skyloop.errors import UsageError
-from skyloop.sim.firmware.ardrone.encoders import require_encoder
+from skyloop.sim.firmware.encoders import require_encoder
+from skyloop.sim.firmware.firmware import NO_FAULTS, Firmware, checked_delay
 from skyloop.sim.firmware.tello.board import Board
 from skyloop.sim.firmware.tello.pads import MOST
 from skyloop.sim.firmware.tello.running import RunningFirmware
-from skyloop.sim.firmware.tello.settings import NO_FAULTS, Settings
+from skyloop.sim.firmware.tello.settings import Settings
 from skyloop.sim.host import SimHost
 from skyloop.transport.faults import Faults
 from skyloop.wire.tello.commands import PORT, Sdk
 
 
-class TelloFirmware:
+class TelloFirmware(Firmware[RunningFirmware]):
     """The firmware of one drone of a host's world. Several may share a host, each with a drone and an address.
 
     ``sdk``: 1.3, 2.0 or 3.0. ``bind``: the address of this machine to listen on, at UDP ``port`` (0: any free one).
@@ -41,34 +42,17 @@ class TelloFirmware:
     ) -> None:
         if sdk not in list(Sdk):
             raise UsageError(f"there is SDK {', '.join(Sdk)} of the Tello, not {sdk!r}")
-        if not 0 <= delay_s <= 10:
-            raise UsageError(f"a delay is from 0 to 10 s, not {delay_s!r}")
         for number in pads or {}:
             if not 1 <= number <= MOST:
                 raise UsageError(f"mission pads are numbered from 1 to {MOST}, not {number!r}")
         require_encoder("the video of an emulated Tello")
-        self.host = host
-        self.drone = drone
-        self.settings = Settings(Sdk(sdk), bind, port, faults, delay_s, dict(pads or {}))
-        self._running: RunningFirmware | None = None
+        super().__init__(host, drone)
+        self.settings = Settings(Sdk(sdk), bind, port, faults, checked_delay(delay_s), dict(pads or {}))
 
-    def start(self) -> None:
-        """Switch the drone on: it waits for ``command``.
-
-        Raises :class:`skyloop.errors.LinkError` if the port is taken, and :class:`UsageError` if it is started already
-        or somebody else has this drone.
-        """
-        if self._running is not None:
-            raise UsageError("this firmware is started already")
-        self._running = RunningFirmware(self.host, self.drone, self.settings)
-        self.settings = replace(self.settings, port=self._running.port)  # found again after a restart
-
-    def stop(self) -> None:
-        """Switch it off, in the middle of whatever it does; the vehicle goes on with what it was told last. When this
-        returns the port is free again. Does nothing if it is not started."""
-        running, self._running = self._running, None
-        if running is not None:
-            running.stop()
+    def _switched_on(self) -> RunningFirmware:
+        running = RunningFirmware(self.host, self.drone, self.settings)
+        self.settings = replace(self.settings, port=running.port)  # found again after a restart
+        return running
 
     @property
     def port(self) -> int:
@@ -80,16 +64,3 @@ class TelloFirmware:
         """For tests: the state of the running firmware, which belongs to its thread. Raises :class:`UsageError` if it
         is not started."""
         return self._started.board
-
-    @property
-    def _started(self) -> RunningFirmware:
-        if self._running is None:
-            raise UsageError("firmware that is not started has no port and no state: call start() first")
-        return self._running
-
-    def __enter__(self) -> TelloFirmware:
-        self.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()

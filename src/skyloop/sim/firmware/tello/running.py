@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
@@ -10,18 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import monotonic_ns, nanoseconds
-from skyloop.sim.camera import CameraModel
-from skyloop.sim.firmware.ardrone.board import VideoSettings
-from skyloop.sim.firmware.ardrone.datagrams import Address, DatagramPort
-from skyloop.sim.firmware.ardrone.encoders import Encoder, Format
-from skyloop.sim.firmware.ardrone.loop import Loop
-from skyloop.sim.firmware.ardrone.vehicle import SimulatedVehicle
-from skyloop.sim.firmware.ardrone.video import Piece, VideoEncoding
+from skyloop.sim.firmware.datagrams import Address, DatagramPort
+from skyloop.sim.firmware.encoders import Encoder, Format
+from skyloop.sim.firmware.running import Running
 from skyloop.sim.firmware.tello.board import Board
 from skyloop.sim.firmware.tello.settings import BOTTOM, FRONT, LIMITS, Settings
+from skyloop.sim.firmware.vehicle import SimulatedVehicle
+from skyloop.sim.firmware.video import OneCamera, Piece, VideoEncoding
 from skyloop.sim.host import Report, SimHost
-from skyloop.sim.reports import Occurrence
-from skyloop.wire.ardrone.keys import VideoChannel, VideoCodec
 from skyloop.wire.ardrone.pave import Codec
 from skyloop.wire.tello.video import pieces
 
@@ -33,8 +28,6 @@ GROUP: Final = 30  #: pictures from one key to the next
 FULL_KBPS: Final = 2500  #: pictures of 10 kB
 LEAST_KBPS: Final = 300
 BUFFER_S: Final = 0.1
-
-_log = logging.getLogger(__name__)
 
 
 def automatic_kbps(loss: float) -> int:
@@ -49,7 +42,7 @@ class TelloPacker:
         self._made: tuple[tuple[int, int, float, int], Encoder] | None = None
         self.size = (FRONT.width, FRONT.height)
 
-    def pack(self, picture: NDArray[np.uint8], settings: VideoSettings, _captured_ns: int) -> Piece | None:
+    def pack(self, picture: NDArray[np.uint8], settings: OneCamera, _captured_ns: int) -> Piece | None:
         width, height = self.size
         wanted = width, height, settings.fps, settings.bitrate_kbps
         if self._made is None or self._made[0] != wanted:
@@ -60,19 +53,13 @@ class TelloPacker:
         return None if encoded is None else Piece(encoded.payload, encoded.key)
 
 
-class RunningFirmware:
-    """A passenger of the host, from its making until :meth:`stop`.
-
-    The board and the ports belong to the loop's thread; the host's threads only leave their reports and pictures, and
-    look at what is replaced as a whole.
-    """
+class RunningFirmware(Running):
+    """The board and the ports belong to the loop's thread."""
 
     def __init__(self, host: SimHost, drone: int, settings: Settings) -> None:
-        self._host, self._drone, self._settings = host, drone, settings
-        self._report: Report | None = None
-        self._posted = False
+        super().__init__(host, drone, "skyloop-tello")
+        self._settings = settings
         self._state_due_ns = 0
-        self._loop = Loop("skyloop-tello")
         vehicle = SimulatedVehicle(host.simulation, drone)
         vehicle.set_limits(LIMITS)
         self.board = Board(
@@ -86,10 +73,9 @@ class RunningFirmware:
         simulation = host.simulation
         self.board.supervise(Report(simulation.feedback(drone), simulation.truth(drone), (), monotonic_ns()))
         self._packer = TelloPacker()
-        self._shown = self._video_settings()
+        self._shown = self._wanted_video()
         self._video = VideoEncoding(self._packer, lambda: self._shown, self._encoded)
         self._cameras: tuple[Camera, ...] = ()
-        self._open: list[DatagramPort] = []
         try:
             self._commands = self._datagrams("command", settings.port)
             self._video_port = self._datagrams("video", 0)
@@ -103,14 +89,6 @@ class RunningFirmware:
     @property
     def port(self) -> int:
         return self._commands.port
-
-    def stop(self) -> None:
-        """When this returns the ports are free."""
-        self._host.leave(self._drone, self)
-        self._video.stop()
-        self._loop.stop()
-        for port in self._open:
-            port.close()
 
     def _datagrams(self, name: str, port: int) -> DatagramPort:
         settings = self._settings
@@ -130,12 +108,7 @@ class RunningFirmware:
     def _answer(self, text: str, to: Address) -> None:
         self._commands.send(text.encode("ascii"), to)
 
-    def _tick(self) -> None:
-        """There is a new report."""
-        self._posted = False
-        report = self._report
-        if report is None:
-            return
+    def _tick(self, report: Report) -> None:
         self.board.supervise(report)
         now_ns = monotonic_ns()
         state, client = self.board.state_string(), self.board.client
@@ -144,15 +117,14 @@ class RunningFirmware:
         self._state_due_ns = max(self._state_due_ns + nanoseconds(1 / STATE_HZ), now_ns)
         self._commands.send(state, (client, self.board.state_port))
 
-    def _video_settings(self) -> VideoSettings:
+    def _wanted_video(self) -> OneCamera:
         board = self.board
         kbps = board.bitrate_mbps * 1000 or automatic_kbps(self._settings.faults.drop)
-        channel = VideoChannel.BOTTOM if board.looks_down else VideoChannel.FRONT
-        return VideoSettings(channel, VideoCodec.H264_720P, board.fps, kbps)
+        return OneCamera("bottom" if board.looks_down else "front", board.fps, kbps)
 
     def _look_at_video(self) -> None:
         """Follow what was configured."""
-        board, wanted = self.board, self._video_settings()
+        board, wanted = self.board, self._wanted_video()
         self._packer.size = (BOTTOM.width, BOTTOM.height) if board.looks_down else board.size
         if wanted == self._shown:
             return
@@ -173,25 +145,6 @@ class RunningFirmware:
 
     # Called by the host, on its threads --------------------------------------------------------------------------
 
-    def report(self, report: Report) -> None:
-        """What the drone believes now; what was not looked at yet is overtaken."""
-        self._report = report
-        if not self._posted:
-            self._posted = True
-            self._loop.post(self._tick)
-
-    def happened(self, occurrence: Occurrence) -> None:
-        """The state shows what comes of it."""
-        _log.info("drone %d: %s", occurrence.drone, occurrence.text)
-
     def wants(self, camera: str) -> bool:
         """Whether a picture of this camera would be sent to anybody."""
-        return self.board.streaming and self.board.client is not None and self._video.wants(camera)
-
-    def show(self, model: CameraModel, pixels: NDArray[np.uint8], captured_ns: int) -> None:
-        """A picture is due."""
-        self._video.show(model.name, pixels, captured_ns)
-
-    def failed(self, error: Exception) -> None:
-        """The simulation or the drawing raised. Without reports no state goes out, as from a drone that is dead."""
-        _log.error("the simulation of drone %d failed: %r", self._drone, error)
+        return self.board.streaming and self.board.client is not None and super().wants(camera)

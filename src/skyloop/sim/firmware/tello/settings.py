@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 from skyloop.sim.camera import BOTTOM_CAMERA, FRONT_CAMERA
 from skyloop.sim.options import SimOptions
 from skyloop.sim.parameters import Limits, VehicleParameters
 from skyloop.transport.faults import Faults
-from skyloop.wire.tello.commands import FULL_CLIMB_M_S, FULL_SPEED_M_S, FULL_YAW_RATE_RAD_S, PORT, Sdk
+from skyloop.wire.tello.commands import FULL_CLIMB_M_S, FULL_SPEED_M_S, FULL_YAW_RATE_RAD_S, Sdk
 
-NO_FAULTS: Final = Faults()
 REPORTS_HZ: Final = 50.0
 TAKEOFF_ALTITUDE_M: Final = 0.8  #: of a recorded flight
 
@@ -66,9 +65,9 @@ def with_tellos(options: SimOptions | None = None) -> SimOptions:
 class Settings:
     """As :class:`skyloop.sim.firmware.tello.TelloFirmware` takes them."""
 
-    sdk: Sdk = Sdk.V3_0
-    bind: str = "127.0.0.1"
-    port: int = PORT
-    faults: Faults = NO_FAULTS
-    delay_s: float = 0.0
-    pads: Mapping[int, tuple[float, float]] = field(default_factory=dict)  #: by number: x, y in the world
+    sdk: Sdk
+    bind: str
+    port: int
+    faults: Faults
+    delay_s: float
+    pads: Mapping[int, tuple[float, float]]  #: by number: x, y in the world

@@ -10,7 +10,7 @@ from typing import Final
 
 from skyloop.clock import monotonic_ns, nanoseconds
 from skyloop.errors import LinkError
-from skyloop.sim.firmware.ardrone.loop import Loop
+from skyloop.sim.firmware.loop import Loop
 from skyloop.transport.faults import Faults, Way
 
 Address = tuple[str, int]

@@ -1,4 +1,4 @@
-"""What encodes an AR.Drone 2's pictures: H.264 or MPEG-4 by PyAV, which is imported when one is made."""
+"""What encodes the drones' pictures: H.264 or MPEG-4 by PyAV, which is imported when one is made."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.errors import MissingExtraError
-from skyloop.wire.ardrone.keys import VideoCodec
 from skyloop.wire.ardrone.pave import Codec
 
 if TYPE_CHECKING:
@@ -33,23 +32,6 @@ class Format:
     width: int
     height: int
     stream_id: int
-
-
-MP4_360P: Final = Format(Codec.MPEG4_VISUAL, 640, 360, 0)
-H264_360P: Final = Format(Codec.MPEG4_AVC, 640, 360, 1)
-H264_720P: Final = Format(Codec.MPEG4_AVC, 1280, 720, 2)
-#: What is sent live for each value of ``video:video_codec``.
-FORMATS: Final = {
-    VideoCodec.MP4_360P: MP4_360P,
-    VideoCodec.H264_360P: H264_360P,
-    VideoCodec.MP4_360P_H264_720P: MP4_360P,
-    VideoCodec.H264_720P: H264_720P,
-    VideoCodec.MP4_360P_SLRS: MP4_360P,
-    VideoCodec.H264_360P_SLRS: H264_360P,
-    VideoCodec.H264_720P_SLRS: H264_720P,
-    VideoCodec.H264_AUTO_RESIZE: H264_360P,
-    VideoCodec.MP4_360P_H264_360P: MP4_360P,
-}
 
 
 @dataclass(frozen=True, slots=True)
