@@ -18,7 +18,9 @@ from numpy.typing import NDArray
 
 from skyloop.clock import Clock, monotonic_ns
 from skyloop.drivers.backlog import Backlog, Coded
+from skyloop.drivers.base import Sink
 from skyloop.errors import UnsupportedError, UsageError
+from skyloop.messages import EventKind, Intrinsics, Severity, Value
 
 RETRY_S: Final = (0.25, 0.5, 1.0, 2.0)  #: waits between attempts to connect; the last one is repeated
 REFUSALS: Final = 3  #: frames in a row of a codec that is not decoded, before it is told; one may be a flipped bit
@@ -84,6 +86,10 @@ class Picture:
     captured_ns: int  #: on this host's monotonic clock; of a vehicle that gives no stamp, when it came
     number: int  #: counts the vehicle's pictures, 32 bits
 
+    def show(self, sink: Sink, camera: str, intrinsics: Intrinsics | None) -> None:
+        """Give it to the proxy."""
+        sink.frame(camera, self.pixels, self.captured_ns, width=self.width, height=self.height, intrinsics=intrinsics)
+
 
 class Notice(Enum):
     """What a receiver tells beside pictures."""
@@ -94,6 +100,19 @@ class Notice(Enum):
         "unsupported"  #: frames come that are not decoded here: another codec, or noise; told once a row of them
     )
     FAULT = "fault"  #: an error of this program, told once; it goes on
+
+    def tell(self, sink: Sink, where: str, text: str) -> None:
+        """An event, of the video or the camera."""
+        kind, severity = _EVENTS[self]
+        sink.event(kind, f"{where} {self.value}: {text}", severity, where=where)
+
+
+_EVENTS: Final = {
+    Notice.STREAMING: (EventKind.VEHICLE_MESSAGE, Severity.INFO),
+    Notice.LOST: (EventKind.VEHICLE_MESSAGE, Severity.WARNING),
+    Notice.UNSUPPORTED: (EventKind.DRIVER_ERROR, Severity.ERROR),
+    Notice.FAULT: (EventKind.DRIVER_ERROR, Severity.ERROR),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +127,10 @@ class VideoCounters:
     skipped: int = 0  #: wanted, but newer ones were there
     lost_bytes: int = 0  #: of the stream that belong to no whole frame
     reconnects: int = 0  #: connections on which frames came, after the first such
+
+    def telemetry(self, of: str) -> dict[str, Value]:
+        """For feedback's ``native``: each counter under its name behind ``of`` and a point."""
+        return {f"{of}.{name}": getattr(self, name) for name in self.__dataclass_fields__}
 
 
 class LiveVideo:

@@ -15,3 +15,8 @@ class Notice:
     text: str
     severity: Severity = Severity.INFO
     data: dict[str, Value] = field(default_factory=dict)
+
+
+def message(text: str, reason: str, severity: Severity = Severity.INFO, **data: Value) -> Notice:
+    """Of the vehicle itself, with a word for programs."""
+    return Notice(EventKind.VEHICLE_MESSAGE, text, severity, {"reason": reason, **data})

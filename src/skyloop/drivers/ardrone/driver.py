@@ -13,13 +13,14 @@ from skyloop.drivers.ardrone.encoded import EncodedStream
 from skyloop.drivers.ardrone.link import Link
 from skyloop.drivers.ardrone.options import options_of
 from skyloop.drivers.ardrone.parameters import Entry, active_camera, entries_of, taken, written
-from skyloop.drivers.ardrone.session import Session, Telling
+from skyloop.drivers.ardrone.session import Session
 from skyloop.drivers.ardrone.setup import own_ids
 from skyloop.drivers.ardrone.video import VideoReceiver
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.intrinsics import intrinsics_of
 from skyloop.drivers.live_video import Notice, Picture
 from skyloop.drivers.uri import VehicleUri
+from skyloop.drivers.vehicle_session import Telling
 from skyloop.errors import DriverError, ParameterError, SkyloopError
 from skyloop.messages import (
     AnyAction,
@@ -33,12 +34,6 @@ from skyloop.messages import (
 )
 
 ACTIONS: Final = frozenset({"idle", "takeoff", "hover", "land", "attitude", "emergency_stop", "reset_emergency"})
-_NOTICES: Final = {
-    Notice.STREAMING: (EventKind.VEHICLE_MESSAGE, Severity.INFO),
-    Notice.LOST: (EventKind.VEHICLE_MESSAGE, Severity.WARNING),
-    Notice.UNSUPPORTED: (EventKind.DRIVER_ERROR, Severity.ERROR),
-    Notice.FAULT: (EventKind.DRIVER_ERROR, Severity.ERROR),
-}
 
 
 class ArdroneDriver(Driver):
@@ -154,18 +149,10 @@ class ArdroneDriver(Driver):
         options = self.options
 
         def show(picture: Picture) -> None:
-            sink.frame(
-                self._camera,
-                picture.pixels,
-                picture.captured_ns,
-                width=picture.width,
-                height=picture.height,
-                intrinsics=self._intrinsics(picture.width, picture.height),
-            )
+            picture.show(sink, self._camera, self._intrinsics(picture.width, picture.height))
 
         def tell(notice: Notice, text: str) -> None:
-            kind, severity = _NOTICES[notice]
-            sink.event(kind, f"video {notice.value}: {text}", severity, where="video")
+            notice.tell(sink, "video", text)
 
         self._video = VideoReceiver(
             options.host,
@@ -186,7 +173,4 @@ class ArdroneDriver(Driver):
         return intrinsics_of(self.uri, width, height) if self._camera == "front" else None
 
     def _video_telemetry(self) -> dict[str, Value]:
-        if self._video is None:
-            return {}
-        counters = self._video.counters
-        return {f"video.{name}": getattr(counters, name) for name in counters.__dataclass_fields__}
+        return {} if self._video is None else self._video.counters.telemetry("video")

@@ -1,64 +1,43 @@
-"""The sockets of one drone and the thread that serves them: navdata, AT at their pace, the control port.
-
-All decisions are the session's, made under one lock; what it tells is delivered by this thread with the lock free.
-"""
+"""The sockets of one drone and the thread that serves them: navdata, AT at their pace, the control port."""
 
 from __future__ import annotations
 
 import selectors
 import socket
-import threading
 from collections.abc import Callable
 from functools import partial
 from typing import Final
 
-from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
+from skyloop.clock import Clock, monotonic_ns, nanoseconds
 from skyloop.drivers.ardrone.configuration import Exchange, Read, Write
 from skyloop.drivers.ardrone.dump_client import DumpClient
 from skyloop.drivers.ardrone.sender import Message
-from skyloop.drivers.ardrone.session import REPEATS, START_NAVDATA, Session, Telling
-from skyloop.drivers.link_thread import LinkThread, tell_failure
+from skyloop.drivers.ardrone.session import REPEATS, START_NAVDATA, Session
+from skyloop.drivers.vehicle_link import VehicleLink
+from skyloop.drivers.vehicle_session import Telling
 from skyloop.messages import AnyAction
 
 MAX_DATAGRAM: Final = 65_536
 BURST: Final = 32  #: datagrams that are read before AT commands get their turn
 WRITE_S: Final = 0.9  #: a key is written, acknowledged and read back within this, or it failed
 RENEW_NS: Final = nanoseconds(2.0)  #: pace of new sockets while nothing is heard: this host's address may have changed
-_CLOSE_S: Final = 2.0
 
 
-class Link(LinkThread):
-    """Serves a session from :meth:`start` to :meth:`stop`. ``deliver`` gets its tellings, on the link's thread."""
+class Link(VehicleLink[Session]):
+    """As :class:`VehicleLink`."""
 
     def __init__(self, session: Session, deliver: Callable[[list[Telling]], None], clock: Clock = monotonic_ns) -> None:
-        super().__init__("skyloop-ardrone", close_s=_CLOSE_S)
-        self.session = session
-        self._deliver = deliver
-        self._clock = clock
+        super().__init__("skyloop-ardrone", session, deliver, clock)
         self._navdata: socket.socket | None = None
         self._at: socket.socket | None = None
         self._renewed_ns = -RENEW_NS
         self._dump = DumpClient(session.options.ports.control, self._selector)
 
-    def stop(self) -> None:
-        """End, and give everything back. Exchanges that go on fail."""
-        self.join()
-        with self.lock:
-            self.session.close()
-
     # From the proxy's threads ----------------------------------------------------------------------------------
 
     def command(self, action: AnyAction) -> AnyAction:
         """Decide, and say it at once unless the last datagram was just sent."""
-        with self.lock:
-            now_ns = self._clock()
-            applied = self.session.command(action, now_ns)
-            due_ns = self.session.due_ns
-            if due_ns <= now_ns:
-                self._say(now_ns)
-        if now_ns < due_ns:
-            self.wake()
-        return applied
+        return self._decided(partial(self.session.command, action))
 
     def say(self, message: Message, times: int = REPEATS) -> None:
         """A command without acknowledgement, at this many ticks."""
@@ -67,60 +46,37 @@ class Link(LinkThread):
 
     def write(self, key: str, text: str) -> str | None:
         """Write a key and read it back. Returns why that failed, or None. Takes up to 0.9 s."""
-        done = threading.Event()
-        failures: list[str | None] = []
 
-        def end(failure: str | None) -> None:
-            failures.append(failure)
-            done.set()
-
-        with self.lock:
+        def ask(end: Callable[[str | None], None]) -> None:
             deadline_ns = self._clock() + nanoseconds(WRITE_S)
             self.session.submit(Exchange(iter((Write(key, text), Read())), deadline_ns, end))
-        self.wake()
-        if not done.wait(WRITE_S + 0.1):
-            return "the driver did not get to it"
-        return failures[0]
+
+        return self._answer(ask, WRITE_S + 0.1, "the driver did not get to it")
 
     # On the link's thread --------------------------------------------------------------------------------------
-
-    def _fail(self, error: Exception) -> None:
-        self._deliver([partial(tell_failure, error)])
 
     def _release(self) -> None:
         with self.lock:
             self._close_sockets()
         self._dump.close()
 
-    def _step(self) -> None:
-        now_ns = self._clock()
-        with self.lock:
-            wait_ns = self.session.due_ns - now_ns
-        ready = self._selector.select(max(0.0, seconds(wait_ns)))
-        self._renew_sockets()
-        for key, _ in ready:
-            if key.fileobj is self._awake:
-                self._slept()
-            elif key.fileobj is self._navdata:
-                self._receive(self._navdata)
-            elif key.fileobj is self._at:
-                self._drain(self._at)
-            else:
-                with self.lock:
-                    self._dump.serve(self.session.configurator)
-                    self.session.due_ns = 0  # to go on at once
-        with self.lock:
-            now_ns = self._clock()
-            if now_ns >= self.session.due_ns:
-                self._say(now_ns)
-            if self._navdata is not None and self.session.wants_start(now_ns):
-                self._send(self._navdata, START_NAVDATA)
-            self._dump.follow(self.session.configurator, now_ns)
-            tellings = self.session.tellings()
-        if not self._stopping.is_set():
-            self._deliver(tellings)
+    def _receive(self, ready: object) -> None:
+        navdata, at = self._navdata, self._at
+        if navdata is not None and ready is navdata:
+            self._receive_navdata(navdata)
+        elif at is not None and ready is at:
+            self._drain(at)
+        else:
+            with self.lock:
+                self._dump.serve(self.session.configurator)
+                self.session.due_ns = 0  # to go on at once
 
-    def _receive(self, navdata: socket.socket) -> None:
+    def _look(self, now_ns: int) -> None:
+        if self._navdata is not None and self.session.wants_start(now_ns):
+            self._send(self._navdata, START_NAVDATA)
+        self._dump.follow(self.session.configurator, now_ns)
+
+    def _receive_navdata(self, navdata: socket.socket) -> None:
         for _ in range(BURST):
             try:
                 datagram = navdata.recv(MAX_DATAGRAM)
@@ -156,7 +112,7 @@ class Link(LinkThread):
 
     # Sockets ---------------------------------------------------------------------------------------------------
 
-    def _renew_sockets(self) -> None:
+    def _renew(self) -> None:
         """Make them, and make them anew now and then while the drone is not heard."""
         now_ns = self._clock()
         with self.lock:

@@ -1,17 +1,13 @@
-"""One drone, from the first datagram on: what its navdata mean, what it is told, and how the link to it stands. Pure.
-
-The time comes as an argument; bytes go in and out. What is for the proxy's sink is collected as *tellings*, for the
-caller to deliver when it holds no lock.
-"""
+"""One drone, from the first datagram on: what its navdata mean, and what it is told. Pure."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Final, TypeAlias
+from typing import Final
 
-from skyloop.clock import nanoseconds, seconds
+from skyloop.clock import nanoseconds
 from skyloop.drivers.ardrone.configuration import Configurator, Exchange, Ids
 from skyloop.drivers.ardrone.feedback import ClimbMeter, control_state, feedback_of
 from skyloop.drivers.ardrone.health import Health
@@ -22,8 +18,8 @@ from skyloop.drivers.ardrone.reception import DroneClock, Reception
 from skyloop.drivers.ardrone.sender import Message, Sequencer
 from skyloop.drivers.ardrone.set_points import limits_of
 from skyloop.drivers.ardrone.setup import Setup
-from skyloop.drivers.base import Sink
-from skyloop.drivers.notices import Notice
+from skyloop.drivers.notices import Notice, message
+from skyloop.drivers.vehicle_session import Patience, VehicleSession
 from skyloop.messages import AnyAction, EventKind, LinkState, Severity, Value
 from skyloop.wire.ardrone.navdata import Navdata, State
 from skyloop.wire.ardrone.options import Demo
@@ -40,15 +36,17 @@ DEAF_NS: Final = nanoseconds(1.0)  #: a watchdog bit that stays so long says tha
 REPEATS: Final = 3  #: of a command that has no acknowledgement
 START_NAVDATA: Final = b"\x01\x00\x00\x00"
 
-Telling: TypeAlias = Callable[[Sink], None]
 _WATCHDOG: Final[Message] = ("COMWDG", ())
 
 
-class Session:
+class Session(VehicleSession):
     """The drone of one opened driver. Not thread-safe.
 
     ``extra`` gives telemetry of others for feedback's ``native``, such as the video's counters.
     """
+
+    PATIENCE = Patience(DEGRADED_NS, LOST_NS, FIRST_WORD_NS)
+    pilot: Pilot
 
     def __init__(
         self,
@@ -58,13 +56,12 @@ class Session:
         *,
         extra: Callable[[], Mapping[str, Value]] = dict,
     ) -> None:
+        super().__init__(now_ns)
         self.options = options
         self.version = options.version  #: None until the drone's configuration told it
         self.pilot = Pilot()
         self.configurator = Configurator()
         self.reception = Reception()
-        self.due_ns = now_ns  #: when :meth:`tick` is to be called next
-        self.link_state: LinkState | None = None  #: as told
         self.ready = False  #: whether the drone is set up and its configuration known
         self.remembered: dict[str, str] = {}  #: keys that were written, and how the drone writes them
         self._ids = ids
@@ -73,9 +70,6 @@ class Session:
         self._clock = DroneClock()
         self._climb = ClimbMeter()
         self._health = Health()
-        self._tellings: list[Telling] = []
-        self._opened_ns = now_ns
-        self._heard_ns: int | None = None  # None: not since it was opened or lost
         self._setup_ns: int | None = None
         self._setups_failed = 0
         self._state = State(0)
@@ -84,14 +78,8 @@ class Session:
         self._published_ns = 0
         self._deaf_since_ns: int | None = None
         self._once: list[list[Message]] = []  # what is to be said at the next ticks, besides
-        self._unreachable = ""
         self._place = f"{options.host}, UDP port {options.ports.navdata}"
         self._tell_link(LinkState.CONNECTING, f"waiting for navdata from {self._place}")
-
-    @property
-    def is_heard(self) -> bool:
-        """Whether navdata come, or came until just now."""
-        return self._heard_ns is not None
 
     # From the driver -------------------------------------------------------------------------------------------
 
@@ -115,15 +103,7 @@ class Session:
         self.configurator.submit(exchange)
         self.due_ns = 0
 
-    def tellings(self) -> list[Telling]:
-        """What is to be told to the sink since the last call, in order."""
-        for notice in self.pilot.notices():
-            self._notice(notice)
-        tellings, self._tellings = self._tellings, []
-        return tellings
-
     def close(self) -> None:
-        """Nothing more will come."""
         self.configurator.abandon("the driver was closed")
 
     # From the sockets ------------------------------------------------------------------------------------------
@@ -135,7 +115,7 @@ class Session:
             return
         state = navdata.state
         demo = navdata.get(Demo)
-        self._notice_break(state)
+        self._notice_break(state, now_ns)
         self._state, self._heard_ns = state, now_ns
         self.pilot.heard(Condition(state, control_state(demo) if demo is not None else None), now_ns)
         if self.configurator.heard(bool(state & State.COMMAND_ACK)):
@@ -149,18 +129,14 @@ class Session:
         if demo is not None:
             self._publish(navdata, demo, now_ns)
 
-    def unreachable(self, reason: str) -> None:
-        """The host said that nobody listens, or this host has no way to it."""
-        self._unreachable = reason
-
-    def _notice_break(self, state: State) -> None:
+    def _notice_break(self, state: State, now_ns: int) -> None:
         """What the drone forgot meanwhile is not known, even if it was away for less time than we would notice."""
         if not self.ready:
             return
         if state & State.BOOTSTRAP:
-            self._lose("the drone was started anew")
+            self._lose("the drone was started anew", now_ns)
         elif state & ~self._state & State.COMMUNICATION_LOST:
-            self._lose("the drone says that it lost its link to us")
+            self._lose("the drone says that it lost its link to us", now_ns)
 
     def _publish(self, navdata: Navdata, demo: Demo, now_ns: int) -> None:
         captured_ns = self._clock.captured_ns(navdata, now_ns)
@@ -200,18 +176,13 @@ class Session:
         return True
 
     def _look_at_silence(self, now_ns: int) -> None:
-        if self._heard_ns is None:
-            if self.link_state is LinkState.CONNECTING and now_ns - self._opened_ns >= FIRST_WORD_NS:
-                self._tell_link(LinkState.LOST, self._no_navdata())
-            return
-        silent_ns = now_ns - self._heard_ns
-        if silent_ns >= LOST_NS:
-            self._lose(self._no_navdata(silent_ns))
-        elif silent_ns >= DEGRADED_NS and self.link_state is LinkState.UP:
-            self._tell_link(LinkState.DEGRADED, self._no_navdata(silent_ns))
-        elif not self.ready and self._setup_ns is not None and now_ns - self._setup_ns >= SETUP_PATIENCE_NS:
+        super()._look_at_silence(now_ns)
+        if not self.ready and self._setup_ns is not None and now_ns - self._setup_ns >= SETUP_PATIENCE_NS:
             why = self.configurator.trouble or "the drone does not acknowledge"
             self._tell_link(LinkState.DEGRADED, f"the drone's configuration is not known: {why}")
+
+    def _silence(self, since: str, why: str) -> str:
+        return f"no navdata{since} from {self._place}{why}"
 
     def _look_at_deafness(self, now_ns: int) -> None:
         """The watchdog's bit goes when the drone takes our commands: else it may be past our sequence."""
@@ -221,15 +192,9 @@ class Session:
             self._deaf_since_ns = now_ns
             self._sequencer.restart()
 
-    def _no_navdata(self, silent_ns: int | None = None) -> str:
-        since = f" for {seconds(silent_ns):.2g} s" if silent_ns is not None else ""
-        why = f" ({self._unreachable})" if self._unreachable else ""
-        return f"no navdata{since} from {self._place}{why}"
-
     # Losing and finding ----------------------------------------------------------------------------------------
 
-    def _lose(self, reason: str) -> None:
-        """From here on everything begins anew with the next datagram."""
+    def _lose(self, reason: str, _now_ns: int) -> None:
         self._heard_ns = self._setup_ns = None
         self.ready = False
         self._once.clear()
@@ -268,7 +233,7 @@ class Session:
         self.version = setup.version or self.version
         if setup.refused_ids:
             text = "the drone keeps no settings of our own: they are shared with everybody who connects to it"
-            self._notice(Notice(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, {"reason": "ids_refused"}))
+            self._notice(message(text, "ids_refused", Severity.WARNING))
         self.ready = True
         self.read_limits()
         if self.pilot.limits is None:
@@ -279,13 +244,3 @@ class Session:
     def read_limits(self) -> None:
         """The configuration was read anew."""
         self.pilot.limits = limits_of(self.configurator.values)
-
-    # Telling ---------------------------------------------------------------------------------------------------
-
-    def _tell_link(self, state: LinkState, reason: str = "") -> None:
-        if state is not self.link_state:
-            self.link_state = state
-            self._tellings.append(lambda sink: sink.link(state, reason))
-
-    def _notice(self, notice: Notice) -> None:
-        self._tellings.append(lambda sink: sink.event(notice.kind, notice.text, notice.severity, **notice.data))

@@ -15,7 +15,7 @@ from skyloop.drivers.live_video import Decoder, LiveVideo, Notice, Picture
 from skyloop.drivers.mavlink.options import FACINGS, CameraOptions
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import MissingExtraError, UsageError
-from skyloop.messages import CameraInfo, EventKind, Severity, Value
+from skyloop.messages import CameraInfo, Value
 
 if TYPE_CHECKING:
     from skyloop.drivers.video.live import ContainerStream
@@ -30,12 +30,6 @@ _WAYS: Final = {
     "udp": {**_LIVE, "fifo_size": "100000", "overrun_nonfatal": "1"},
     "http": _LIVE,
     "tcp": _LIVE,
-}
-_NOTICES: Final = {
-    Notice.STREAMING: (EventKind.VEHICLE_MESSAGE, Severity.INFO),
-    Notice.LOST: (EventKind.VEHICLE_MESSAGE, Severity.WARNING),
-    Notice.UNSUPPORTED: (EventKind.DRIVER_ERROR, Severity.ERROR),
-    Notice.FAULT: (EventKind.DRIVER_ERROR, Severity.ERROR),
 }
 
 
@@ -93,8 +87,7 @@ class Camera:
     @property
     def telemetry(self) -> dict[str, Value]:
         """``camera.`` and the names of :class:`skyloop.drivers.live_video.VideoCounters`."""
-        counters = self._video.counters
-        return {f"camera.{name}": getattr(counters, name) for name in counters.__dataclass_fields__}
+        return self._video.counters.telemetry("camera")
 
     def _connect(self, number: int) -> ContainerStream:
         from skyloop.drivers.video.live import ContainerStream
@@ -116,18 +109,10 @@ class Camera:
         )
 
     def _show(self, picture: Picture) -> None:
-        self._sink.frame(
-            self._options.name,
-            picture.pixels,
-            picture.captured_ns,
-            width=picture.width,
-            height=picture.height,
-            intrinsics=self._intrinsics(picture.width, picture.height),
-        )
+        picture.show(self._sink, self._options.name, self._intrinsics(picture.width, picture.height))
 
     def _tell(self, notice: Notice, text: str) -> None:
-        kind, severity = _NOTICES[notice]
-        self._sink.event(kind, f"camera {notice.value}: {text}", severity, where="camera")
+        notice.tell(self._sink, "camera", text)
 
 
 def place_of(source: str) -> str:

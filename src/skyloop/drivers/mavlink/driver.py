@@ -12,9 +12,10 @@ from skyloop.drivers.mavlink.options import options_of
 from skyloop.drivers.mavlink.parameters import TAKEOFF_ALTITUDE, Entry, entries_of, entry_of, takeoff_altitude
 from skyloop.drivers.mavlink.poses import pose_message
 from skyloop.drivers.mavlink.safety import remarks_of
-from skyloop.drivers.mavlink.session import Session, Telling
+from skyloop.drivers.mavlink.session import Session
 from skyloop.drivers.seams import ExternalPose, Remark
 from skyloop.drivers.uri import VehicleUri
+from skyloop.drivers.vehicle_session import Telling
 from skyloop.errors import DriverError, ParameterError
 from skyloop.messages import (
     AnyAction,

@@ -1,57 +1,41 @@
-"""The connection to one vehicle and the thread that serves it, made anew for ever when it is lost.
-
-All decisions are the session's, made under one lock; what it tells is delivered by this thread with the lock free.
-"""
+"""The connection to one vehicle and the thread that serves it, made anew for ever when it is lost."""
 
 from __future__ import annotations
 
 import selectors
-import threading
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from typing import Final
 
-from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
-from skyloop.drivers.link_thread import LinkThread, tell_failure
+from skyloop.clock import Clock, monotonic_ns, nanoseconds
 from skyloop.drivers.mavlink.connections import Connection, connect
-from skyloop.drivers.mavlink.session import Session, Telling
+from skyloop.drivers.mavlink.session import Session
+from skyloop.drivers.vehicle_link import VehicleLink
+from skyloop.drivers.vehicle_session import Telling
 from skyloop.messages import AnyAction
 from skyloop.wire.mavlink.codec import Message
 
 RETRY_NS: Final = nanoseconds(1.0)  #: pace of new connections
 SILENT_NS: Final = nanoseconds(8.0)  #: a connected stream without a word for so long is made anew
 WRITE_S: Final = 0.9  #: a parameter is written and confirmed within this, or it failed
-_CLOSE_S: Final = 3.0
+CLOSE_S: Final = 3.0
 
 
-class Link(LinkThread):
-    """Serves a session from :meth:`start` to :meth:`stop`. ``deliver`` gets its tellings, on the link's thread."""
+class Link(VehicleLink[Session]):
+    """As :class:`VehicleLink`."""
 
     def __init__(self, session: Session, deliver: Callable[[list[Telling]], None], clock: Clock = monotonic_ns) -> None:
-        super().__init__("skyloop-mavlink", close_s=_CLOSE_S)
-        self.session = session
-        self._deliver = deliver
-        self._clock = clock
+        super().__init__("skyloop-mavlink", session, deliver, clock, close_s=CLOSE_S)
         self._connection: Connection | None = None
         self._connected_ns = -RETRY_NS
         self._broken = False  # nothing can be sent any more
-
-    def stop(self) -> None:
-        """End, and give everything back. Writes that go on fail."""
-        self.join()
-        with self.lock:
-            self.session.close()
 
     # From the proxy's threads ------------------------------------------------------------------------------------
 
     def command(self, action: AnyAction, *, alone: bool = False) -> AnyAction:
         """Decide, and say it at once."""
-        with self.lock:
-            now_ns = self._clock()
-            applied = self.session.command(action, now_ns, alone=alone)
-            self._say(now_ns)
-        return applied
+        return self._decided(partial(self.session.command, action, alone=alone))
 
     def say(self, message: Message) -> None:
         """Send a message to the vehicle now."""
@@ -61,49 +45,21 @@ class Link(LinkThread):
 
     def write(self, name: str, value: float) -> str | None:
         """Write a parameter by the autopilot's name. Returns why that failed, or None. Takes up to 0.9 s."""
-        done = threading.Event()
-        failures: list[str | None] = []
 
-        def end(failure: str | None) -> None:
-            failures.append(failure)
-            done.set()
-
-        with self.lock:
+        def ask(end: Callable[[str | None], None]) -> None:
             now_ns = self._clock()
             self.session.parameters.write(name, value, now_ns + nanoseconds(WRITE_S), end)
             self._say(now_ns)
-        if not done.wait(WRITE_S + 0.2):
-            return "the driver did not get to it"
-        return failures[0]
+
+        return self._answer(ask, WRITE_S + 0.2, "the driver did not get to it")
 
     # On the link's thread ----------------------------------------------------------------------------------------
-
-    def _fail(self, error: Exception) -> None:
-        self._deliver([partial(tell_failure, error)])
 
     def _release(self) -> None:
         with self.lock:
             self._disconnect()
 
-    def _step(self) -> None:
-        with self.lock:
-            wait_ns = self.session.due_ns - self._clock()
-        ready = self._selector.select(max(0.0, seconds(wait_ns)))
-        self._look_at_connection()
-        for key, _ in ready:
-            if key.fileobj is self._awake:
-                self._slept()
-            else:
-                self._receive()
-        with self.lock:
-            now_ns = self._clock()
-            if now_ns >= self.session.due_ns:
-                self._say(now_ns)
-            tellings = self.session.tellings()
-        if tellings and not self._stopping.is_set():
-            self._deliver(tellings)
-
-    def _receive(self) -> None:
+    def _receive(self, _ready: object) -> None:
         connection = self._connection
         if connection is None:
             return
@@ -132,7 +88,7 @@ class Link(LinkThread):
 
     # The connection ----------------------------------------------------------------------------------------------
 
-    def _look_at_connection(self) -> None:
+    def _renew(self) -> None:
         """Make it, and make a stream anew on which nothing comes."""
         now_ns = self._clock()
         connection = self._connection

@@ -1,16 +1,11 @@
-"""One vehicle, from its first heartbeat on: who it is, what it says, what it is told, how the link to it stands. Pure.
-
-The time comes as an argument; bytes go in and out. What is for the proxy's sink is collected as *tellings*, for the
-caller to deliver when it holds no lock.
-"""
+"""One vehicle, from its first heartbeat on: who it is, what it says, and what it is told. Pure."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from typing import Final, TypeAlias
 
-from skyloop.clock import nanoseconds, seconds
-from skyloop.drivers.base import Sink
+from skyloop.clock import nanoseconds
 from skyloop.drivers.mavlink.commander import Commander, Order
 from skyloop.drivers.mavlink.connections import Peer
 from skyloop.drivers.mavlink.dialects import Dialect, dialect_of
@@ -24,6 +19,7 @@ from skyloop.drivers.mavlink.requests import Requests
 from skyloop.drivers.mavlink.telemetry import Telemetry, View
 from skyloop.drivers.mavlink.times import VehicleClock
 from skyloop.drivers.notices import Notice
+from skyloop.drivers.vehicle_session import Patience, VehicleSession
 from skyloop.errors import DriverError
 from skyloop.messages import AnyAction, EventKind, FlightState, LinkState, Severity, Value
 from skyloop.wire.mavlink.codec import Codec, Message
@@ -41,20 +37,23 @@ VERSION_PACE_S: Final = 1.0
 OWN_COMPONENT: Final = 190  #: MAV_COMP_ID_MISSIONPLANNER, a ground station
 _ANSWERS: Final = ("COMMAND_ACK", "PARAM_VALUE", "TIMESYNC")
 
-Telling: TypeAlias = Callable[[Sink], None]
 Packet: TypeAlias = tuple[bytes, Peer]
 _ASK_VERSION: Final = Order(m.MAV_CMD_REQUEST_MESSAGE, (float(m.MAVLINK_MSG_ID_AUTOPILOT_VERSION),))
 
 
-class Session:
+class Session(VehicleSession):
     """The vehicle of one opened driver. Not thread-safe.
 
     ``extra`` gives telemetry of others for feedback's ``native``.
     """
 
+    PATIENCE = Patience(DEGRADED_NS, LOST_NS, FIRST_WORD_NS)
+    pilot: Pilot | None
+
     def __init__(
         self, options: MavlinkOptions, now_ns: int, *, extra: Callable[[], Mapping[str, Value]] = dict
     ) -> None:
+        super().__init__(now_ns)
         self.options = options
         self.codec = Codec(options.own_system, OWN_COMPONENT, key=options.key)
         self.telemetry = Telemetry()
@@ -62,31 +61,20 @@ class Session:
         self.commander = Commander()
         self.clock = VehicleClock()
         self.dialect: Dialect | None = None  #: None until its autopilot is known, and for one that can't be flown
-        self.pilot: Pilot | None = None
-        self.due_ns = now_ns  #: when :meth:`tick` is to be called next
-        self.link_state: LinkState | None = None  #: as told
+        self.pilot = None
         self.version: Message | None = None  #: its AUTOPILOT_VERSION
         self.takeoff_m = options.takeoff_altitude_m
         self._extra = extra
         self._identities = Identities(options.system, options.peer)
         self._health = Health()
         self._requests = Requests({})
-        self._tellings: list[Telling] = []
         self._out: list[Message] = []
-        self._opened_ns = now_ns
-        self._heard_ns: int | None = None  # None: not since it was opened or lost
         self._found_ns = 0
         self._beaten_ns = -HEARTBEAT_NS
         self._old = False  # it speaks MAVLink 1
-        self._unreachable = ""
         self._signed = 0
         self._why_not = "it is not heard"
         self._tell_link(LinkState.CONNECTING, f"waiting for a heartbeat on {options.address}")
-
-    @property
-    def is_heard(self) -> bool:
-        """Whether messages come, or came until just now."""
-        return self._heard_ns is not None
 
     @property
     def identity(self) -> Identity | None:
@@ -119,16 +107,7 @@ class Session:
         self._out.append(message)
         self.due_ns = 0
 
-    def tellings(self) -> list[Telling]:
-        """What is to be told to the sink since the last call, in order."""
-        if self.pilot is not None:
-            for notice in self.pilot.notices():
-                self._notice(notice)
-        tellings, self._tellings = self._tellings, []
-        return tellings
-
     def close(self) -> None:
-        """Nothing more will come."""
         self.parameters.abandon("the driver was closed")
 
     def view(self, now_ns: int) -> View | None:
@@ -151,10 +130,6 @@ class Session:
                 text = "the vehicle signs its messages: give its key with ?signing_key=FILE; nothing is taken without"
                 self._unreachable = text
                 self._notice(Notice(EventKind.DRIVER_ERROR, text, Severity.ERROR, {"where": "signing"}))
-
-    def unreachable(self, reason: str) -> None:
-        """The connection failed."""
-        self._unreachable = reason
 
     def connected(self) -> None:
         """There is a new connection: nothing is known of what it will bring."""
@@ -271,27 +246,13 @@ class Session:
     def _silent(self, now_ns: int) -> bool:
         return self._heard_ns is None or now_ns - self._heard_ns >= DEGRADED_NS
 
-    def _look_at_silence(self, now_ns: int) -> None:
-        if self._heard_ns is None:
-            if self.link_state is LinkState.CONNECTING and now_ns - self._opened_ns >= FIRST_WORD_NS:
-                self._tell_link(LinkState.LOST, self._no_word())
-            return
-        silent_ns = now_ns - self._heard_ns
-        if silent_ns >= LOST_NS:
-            self._lose(self._no_word(silent_ns), now_ns)
-        elif silent_ns >= DEGRADED_NS and self.link_state is LinkState.UP:
-            self._tell_link(LinkState.DEGRADED, self._no_word(silent_ns))
-
-    def _no_word(self, silent_ns: int | None = None) -> str:
-        since = f" for {seconds(silent_ns):.2g} s" if silent_ns is not None else ""
-        why = f" ({self._unreachable})" if self._unreachable else ""
+    def _silence(self, since: str, why: str) -> str:
         system = f" of system {self._identities.system}" if self._identities.system is not None else ""
         return f"no message{system}{since} on {self.options.address}{why}"
 
     # Losing and finding ------------------------------------------------------------------------------------------
 
     def _lose(self, reason: str, now_ns: int) -> None:
-        """From here on everything begins anew with the next heartbeat."""
         self._heard_ns = None
         self._identities.lose()
         self.parameters.abandon(reason)
@@ -330,16 +291,6 @@ class Session:
         self.parameters.bytewise = found.BYTEWISE
         if not self._why_not:
             self.pilot = Pilot(found, self.commander, self.takeoff_m, lambda: found.lift(self.parameters.values))
-
-    # Telling -----------------------------------------------------------------------------------------------------
-
-    def _tell_link(self, state: LinkState, reason: str = "") -> None:
-        if state is not self.link_state:
-            self.link_state = state
-            self._tellings.append(lambda sink: sink.link(state, reason))
-
-    def _notice(self, notice: Notice) -> None:
-        self._tellings.append(lambda sink: sink.event(notice.kind, notice.text, notice.severity, **notice.data))
 
 
 def observed_state(view: View | None) -> FlightState:

@@ -11,22 +11,17 @@ from skyloop.drivers.tello.cameras import cameras_of, intrinsics_for
 from skyloop.drivers.tello.decoding import TelloVideo
 from skyloop.drivers.tello.link import Link
 from skyloop.drivers.tello.options import options_of
-from skyloop.drivers.tello.session import Session, Telling
+from skyloop.drivers.tello.session import Session
 from skyloop.drivers.tello.settings import DroneSettings
 from skyloop.drivers.tello.stream import VideoStream
 from skyloop.drivers.uri import VehicleUri
+from skyloop.drivers.vehicle_session import Telling
 from skyloop.errors import DriverError, ParameterError
-from skyloop.messages import AnyAction, Capabilities, EventKind, Parameter, Refusal, Severity, Value
+from skyloop.messages import AnyAction, Capabilities, Parameter, Refusal, Value
 
 ACTIONS: Final = frozenset(
     {"idle", "takeoff", "hover", "land", "velocity", "attitude", "emergency_stop", "reset_emergency"}
 )
-_NOTICES: Final = {
-    Notice.STREAMING: (EventKind.VEHICLE_MESSAGE, Severity.INFO),
-    Notice.LOST: (EventKind.VEHICLE_MESSAGE, Severity.WARNING),
-    Notice.UNSUPPORTED: (EventKind.DRIVER_ERROR, Severity.ERROR),
-    Notice.FAULT: (EventKind.DRIVER_ERROR, Severity.ERROR),
-}
 
 
 class TelloDriver(Driver):
@@ -101,18 +96,10 @@ class TelloDriver(Driver):
     def _start_video(self, sink: Sink, link: Link, settings: DroneSettings) -> None:
         def show(picture: Picture) -> None:
             camera = settings.camera
-            sink.frame(
-                camera,
-                picture.pixels,
-                picture.captured_ns,
-                width=picture.width,
-                height=picture.height,
-                intrinsics=intrinsics_for(self._cameras[0], camera, picture.width),
-            )
+            picture.show(sink, camera, intrinsics_for(self._cameras[0], camera, picture.width))
 
         def tell(notice: Notice, text: str) -> None:
-            kind, severity = _NOTICES[notice]
-            sink.event(kind, f"video {notice.value}: {text}", severity, where="video")
+            notice.tell(sink, "video", text)
 
         def came(_coded: object) -> None:
             self._video_ns = monotonic_ns()
@@ -130,7 +117,4 @@ class TelloDriver(Driver):
         self._video.start()
 
     def _video_telemetry(self) -> dict[str, Value]:
-        if self._video is None:
-            return {}
-        counters = self._video.counters
-        return {f"video.{name}": getattr(counters, name) for name in counters.__dataclass_fields__}
+        return {} if self._video is None else self._video.counters.telemetry("video")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from skyloop.drivers.tello.notice import Notice, message
+from skyloop.drivers.notices import Notice, message
 from skyloop.messages import Severity
 from skyloop.wire.tello.state import Pad, State
 

@@ -9,7 +9,7 @@ from enum import Enum, auto
 from typing import Final
 
 from skyloop.clock import nanoseconds
-from skyloop.drivers.tello.notice import Notice, message
+from skyloop.drivers.notices import Notice, message
 from skyloop.drivers.tello.sticks import Scale, sticks_of
 from skyloop.drivers.tello.watch import FlightWatch
 from skyloop.errors import DriverError

@@ -1,23 +1,19 @@
-"""One drone, from the first datagram on: what its state means, what it is told, and how the link to it stands. Pure.
-
-The time comes as an argument; bytes go in and out. What is for the proxy's sink is collected as *tellings*, for the
-caller to deliver when it holds no lock.
-"""
+"""One drone, from the first datagram on: what its state means, and what it is told. Pure."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping
-from typing import Final, TypeAlias
+from typing import Final
 
-from skyloop.clock import nanoseconds, seconds
-from skyloop.drivers.base import Sink
+from skyloop.clock import nanoseconds
+from skyloop.drivers.notices import message
 from skyloop.drivers.tello.conversation import Conversation, Done, Request
 from skyloop.drivers.tello.feedback import feedback_of, native_of
 from skyloop.drivers.tello.health import Health
-from skyloop.drivers.tello.notice import Notice, message
 from skyloop.drivers.tello.options import TelloOptions
 from skyloop.drivers.tello.pilot import Pilot
+from skyloop.drivers.vehicle_session import Patience, VehicleSession
 from skyloop.errors import DecodeError
 from skyloop.messages import AnyAction, LinkState, Severity, Value
 from skyloop.wire.tello.commands import ENTER, Sdk, decoded, ports
@@ -35,15 +31,17 @@ DEAF: Final = 2  #: questions in a row without an answer: our commands are not h
 VIDEO_NS: Final = nanoseconds(2.0)  #: without video for so long it is asked for
 ALIVE: Final = "wifi?"
 
-Telling: TypeAlias = Callable[[Sink], None]
 _SDK: Final = {"20": Sdk.V2_0, "30": Sdk.V3_0}
 
 
-class Session:
+class Session(VehicleSession):
     """The drone of one opened driver. Not thread-safe.
 
     ``extra`` gives telemetry of others for feedback's ``native``; ``video_ns`` when video came last.
     """
+
+    PATIENCE = Patience(DEGRADED_NS, LOST_NS, FIRST_WORD_NS)
+    pilot: Pilot
 
     def __init__(
         self,
@@ -53,12 +51,11 @@ class Session:
         extra: Callable[[], Mapping[str, Value]] = dict,
         video_ns: Callable[[], int] = lambda: 0,
     ) -> None:
+        super().__init__(now_ns)
         self.options = options
         self.pilot = Pilot()
         self.conversation = Conversation()
         self.counts = Counter(dict.fromkeys(("received", "damaged"), 0))
-        self.due_ns = now_ns  #: when :meth:`tick` is to be called next
-        self.link_state: LinkState | None = None  #: as told
         self.sdk: Sdk | None = None  #: None until the drone told it, by this or by not knowing the question
         self.serial = ""
         self.ready = False  #: whether state comes and commands are answered
@@ -66,9 +63,6 @@ class Session:
         self._extra = extra
         self._video_ns = video_ns
         self._health = Health()
-        self._tellings: list[Telling] = []
-        self._opened_ns = now_ns
-        self._heard_ns: int | None = None  # None: not since it was opened or lost
         self._entered_ns = now_ns - ENTER_NS
         self._alive_ns = now_ns
         self._asked_video_ns = 0
@@ -77,18 +71,12 @@ class Session:
         self._quality: int | None = None
         self._rc_ns = 0
         self._flips: list[str] = []
-        self._unreachable = ""
         self._told_ports = False
         self._answered = False  # while no state comes
         self._place = f"{options.host}, UDP port {options.port}"
         self._tell_link(LinkState.CONNECTING, f"waiting for the state of the Tello at {self._place}")
         if options.pads:
             self.remembered["tello.mission_pads"] = "mon"
-
-    @property
-    def is_heard(self) -> bool:
-        """Whether states come, or came until just now."""
-        return self._heard_ns is not None
 
     # From the driver -------------------------------------------------------------------------------------------
 
@@ -110,15 +98,7 @@ class Session:
         self._flips.append(f"flip {direction}")
         self.due_ns = 0
 
-    def tellings(self) -> list[Telling]:
-        """What is to be told to the sink since the last call, in order."""
-        for notice in self.pilot.notices():
-            self._notice(notice)
-        tellings, self._tellings = self._tellings, []
-        return tellings
-
     def close(self) -> None:
-        """Nothing more will come."""
         self.conversation.abandon()
 
     # From the sockets ------------------------------------------------------------------------------------------
@@ -159,10 +139,6 @@ class Session:
         if motion is not None:
             self.pilot.answered(motion, reply, now_ns)
         self.due_ns = min(self.due_ns, max(now_ns, self._rc_ns + HURRY_NS))
-
-    def unreachable(self, reason: str) -> None:
-        """The host said that nobody listens, or this host has no way to it."""
-        self._unreachable = reason
 
     def _look_at_refused_ports(self, reply: str) -> None:
         if self.options.own_ports and is_error(reply) and not self._told_ports:
@@ -207,17 +183,6 @@ class Session:
             texts += self.conversation.messages(now_ns)
         return [text.encode("ascii") for text in texts]
 
-    def _look_at_silence(self, now_ns: int) -> None:
-        if self._heard_ns is None:
-            if self.link_state is LinkState.CONNECTING and now_ns - self._opened_ns >= FIRST_WORD_NS:
-                self._tell_link(LinkState.LOST, self._no_state())
-            return
-        silent_ns = now_ns - self._heard_ns
-        if silent_ns >= LOST_NS:
-            self._lose(self._no_state(silent_ns), now_ns)
-        elif silent_ns >= DEGRADED_NS and self.link_state is LinkState.UP:
-            self._tell_link(LinkState.DEGRADED, self._no_state(silent_ns))
-
     def _keep_alive(self, now_ns: int) -> None:
         """Ask something now and then: it keeps the drone up, and shows whether it hears us."""
         if self.ready and now_ns - self._alive_ns >= ALIVE_NS:
@@ -244,9 +209,7 @@ class Session:
             self._asked_video_ns = now_ns
             self.conversation.ask(Request("streamon", _whatever))
 
-    def _no_state(self, silent_ns: int | None = None) -> str:
-        since = f" for {seconds(silent_ns):.2g} s" if silent_ns is not None else ""
-        why = f" ({self._unreachable})" if self._unreachable else ""
+    def _silence(self, since: str, why: str) -> str:
         if self._answered:
             why += f", though it answers: does a firewall of this host let UDP port {self.options.state_port} in?"
         return f"no state{since} from {self._place}{why}"
@@ -254,7 +217,6 @@ class Session:
     # Losing and finding ----------------------------------------------------------------------------------------
 
     def _lose(self, reason: str, now_ns: int) -> None:
-        """From here on everything begins anew with the next state."""
         self._heard_ns = None
         self.ready = self._asking_version = False
         self.conversation.abandon()
@@ -283,16 +245,6 @@ class Session:
     def _serial_told(self, reply: str | None) -> None:
         if reply is not None and not is_error(reply):
             self.serial = reply
-
-    # Telling ---------------------------------------------------------------------------------------------------
-
-    def _tell_link(self, state: LinkState, reason: str = "") -> None:
-        if state is not self.link_state:
-            self.link_state = state
-            self._tellings.append(lambda sink: sink.link(state, reason))
-
-    def _notice(self, notice: Notice) -> None:
-        self._tellings.append(lambda sink: sink.event(notice.kind, notice.text, notice.severity, **notice.data))
 
 
 def _whatever(_reply: str | None) -> None:
