@@ -115,7 +115,7 @@ def test_descriptors_sent_to_a_server_are_not_kept() -> None:
         for _ in range(20):
             send_with(raw, b"have these", 0, 0, 0)
         wait_until(lambda: len(log.packets) == 20, "the packets came")
-        assert descriptors() == before
+        assert descriptors() <= before
 
 
 def test_connections_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
