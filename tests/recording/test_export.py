@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import csv
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import av
+import cv2
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from skyloop.errors import FileFormatError, UnknownNameError
+from skyloop.errors import FileFormatError, MissingExtraError, UnknownNameError, UsageError
 from skyloop.logfile.layout import Channel
 from skyloop.logfile.reader import Recording
+from skyloop.recording.review import export
 from skyloop.recording.review.export import export_csv, export_mp4, read
 from skyloop.recording.review.tables import Table, tables
 from tests.cli.conftest import Ended
@@ -108,7 +111,58 @@ def test_mp4_keeps_each_frames_time(log: Log, flight: Path, tmp_path: Path, burn
     assert corner > 200 if burn else corner < 160  # white figures on a dark ramp, away from the bright column
 
 
-def test_frames_that_are_damaged_are_left_out(tmp_path: Path) -> None:
+def jpeg(width: int, height: int) -> bytes:
+    return cv2.imencode(".jpg", np.full((height, width, 3), 90, np.uint8))[1].tobytes()
+
+
+def test_pictures_that_are_damaged_or_of_another_size_are_left_out(tmp_path: Path) -> None:
+    """A video has one size, that of its first picture, made even; the others keep their times."""
+    odd = {number: jpeg(65, 49) for number in range(1, 21)} | {3: b"no picture", 4: b"\xff\xd8\xff", 6: jpeg(32, 24)}
+    path = write_flight(tmp_path / "flight.mcap", Plan(packed=odd.get))
+    assert export_mp4(Recording.open(path), "alpha", "front", tmp_path / "x.mp4") == 17
+    with av.open(str(tmp_path / "x.mp4")) as container:
+        pictures = list(container.decode(video=0))
+    assert {(picture.width, picture.height) for picture in pictures} == {(64, 48)}
+    tenths = [round(float(picture.pts * picture.time_base) * 10) for picture in pictures]  # type: ignore[operator]
+    assert tenths == [0, 1, 4, *range(6, 20)]
+
+
+def test_a_camera_of_which_nothing_can_be_decoded(tmp_path: Path) -> None:
+    path = write_flight(tmp_path / "flight.mcap", Plan(packed=lambda number: b"no picture"))
+    with pytest.raises(FileFormatError, match="no frame of front can be decoded"):
+        export_mp4(Recording.open(path), "alpha", "front", tmp_path / "x.mp4")
+    assert not (tmp_path / "x.mp4").exists()
+
+
+def test_without_h264_mpeg4_is_taken(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not every build of FFmpeg has x264."""
+    monkeypatch.setattr(export, "_CODECS", ("no codec of that name", "mpeg4"))
+    assert export_mp4(Recording.open(flight), "alpha", "front", tmp_path / "x.mp4", burn_time=True) == 20
+    with av.open(str(tmp_path / "x.mp4")) as container:
+        assert container.streams.video[0].codec_context.name == "mpeg4"
+    monkeypatch.setattr(export, "_CODECS", ("no codec of that name",))
+    with pytest.raises(MissingExtraError, match="no codec of that name"):
+        export_mp4(Recording.open(flight), "alpha", "front", tmp_path / "y.mp4")
+
+
+@pytest.mark.parametrize(("missing", "to", "extra"), [("pyarrow", "parquet", "parquet"), ("av", "mp4", "video")])
+def test_what_is_not_installed_is_named(
+    log: Log, flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, missing: str, to: str, extra: str
+) -> None:
+    monkeypatch.setitem(sys.modules, missing, None)
+    ended = log("export", flight, "--to", to, "-o", tmp_path / "out")
+    assert ended.code == 1
+    assert f"skyloop[{extra}]" in ended.err
+
+
+def test_burning_times_needs_opencv(monkeypatch: pytest.MonkeyPatch) -> None:
+    image = np.zeros((48, 64, 3), np.uint8)
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    with pytest.raises(MissingExtraError, match="vision"):
+        export._burn(image, 1.0)
+
+
+def test_frames_that_are_not_there(tmp_path: Path) -> None:
     path = write_flight(tmp_path / "flight.mcap", Plan(frame_ms=0))
     with pytest.raises(UnknownNameError, match="camera of alpha"):
         export_mp4(Recording.open(path), "alpha", "front", tmp_path / "x.mp4")
@@ -135,5 +189,13 @@ def test_where_it_can_not_be_written(flight: Path, tmp_path: Path) -> None:
     found = read(Recording.open(flight), "alpha", (Channel.FEEDBACK,))
     with pytest.raises(Exception, match="can't be written: Is a directory"):
         export_csv(found, tmp_path)
+    (tmp_path / "feedback.parquet").mkdir()
+    with pytest.raises(UsageError, match=r"feedback\.parquet can't be written"):
+        export.export_parquet(found, tmp_path)
+    (tmp_path / "x.npz").mkdir()
+    with pytest.raises(UsageError, match=r"x\.npz can't be written: Is a directory"):
+        export.export_npz(found, tmp_path / "x")
+    with pytest.raises(UsageError, match="can't be written: No such file"):
+        export_mp4(Recording.open(flight), "alpha", "front", tmp_path / "nowhere" / "x.mp4")
     with pytest.raises(FileFormatError, match="holds none"):
         read(Recording.open(flight), "alpha", (Channel.ANNOTATIONS,))

@@ -7,13 +7,15 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 
 import pytest
+import zenoh
 
 from skyloop.errors import LinkError, NameTakenError, UnknownNameError, UsageError
 from skyloop.transport.base import FEEDBACK, Dialer
-from skyloop.transport.fabric import FabricServer, FabricSettings, dial, finding, list_proxies, session
+from skyloop.transport.fabric import FabricServer, FabricSettings, dial, finding, layout, list_proxies, packets, session
 from skyloop.transport.fabric.config import Part, free_port
 from skyloop.transport.fabric.seeking import renew
 from skyloop.transport.testing import ClientLog, ServerLog, wait_until
+from tests.transport.test_fabric_hostile import stranger
 
 LOCAL = "127.0.0.1"
 
@@ -176,3 +178,32 @@ def test_a_connection_is_told_when_its_proxy_stops_and_made_anew() -> None:
         server.publish(FEEDBACK, b"f")
         wait_until(lambda: again.packets == [b"f"], "it is served")
         client.close()
+
+
+def test_answers_that_make_no_sense_are_no_proxies() -> None:
+    """Somebody else on the network answers for proxies, and is alive as what no proxy is."""
+    at, lair = place(), place()
+    about = packets.ProxyInfo("bravo", layout.new_id(), 1, "there", 1, "fake://bravo", "nowhere")
+    with serving("alpha", at), ExitStack() as ends:
+        other = stranger(listen=[f"tcp/{lair}"], connect=[f"tcp/{at}"])
+        ends.callback(other.close)
+
+        def answer(name: str, payload: bytes) -> None:
+            queryable = other.declare_queryable(layout.info(name), lambda query: query.reply(query.key_expr, payload))
+            ends.callback(queryable.undeclare)
+
+        def refuse(query: zenoh.Query) -> None:
+            query.reply_err(b"no")
+
+        answer("charlie", b"\xc1 no MessagePack")
+        answer("delta", packets.encode_own(about))  # of another name
+        ends.callback(other.declare_queryable(layout.info("echo"), refuse).undeclare)
+        for rest in ("alpha/alive/zz", "-/alive/0123456789abcdef"):
+            ends.callback(other.liveliness().declare_token(f"{layout.ROOT}/{rest}").undeclare)
+        asked = session.acquire(calling(at, lair), Part.APP)
+        ends.callback(session.release, asked)
+        wait_until(lambda: len(list(asked.zenoh.info.peers_zid())) == 2, "it is connected to both")
+        wait_until(lambda: [a.name for a in finding.oldest_first(asked, "*")] == ["alpha"], "only the proxy is found")
+        for name in ("charlie", "delta", "echo"):
+            assert finding.oldest_first(asked, name) == []
+        assert {name for name, _ in finding.runs(asked)} == {"alpha"}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -69,6 +70,47 @@ def test_nothing_is_found_where_nothing_is(renderer: PlanarRenderer) -> None:
     for gate in WORLD.gates:
         assert GateDetector(gate.colour).detect(picture, FRONT_CAMERA.intrinsics()) == []
     assert BlobDetector((235, 110, 20)).detect(GREY, FRONT_CAMERA.intrinsics()) == []
+
+
+def hole(*corners: tuple[float, float]) -> Picture:
+    """A red patch with a hole of this shape."""
+    picture = GREY.copy()
+    cv2.rectangle(picture, (40, 20), (280, 220), (0, 0, 255), -1)
+    cv2.fillPoly(picture, [np.array(corners, np.int32)], (90, 90, 90))
+    return picture
+
+
+def round_hole(radius: float) -> Picture:
+    return hole(*((160 + radius * math.cos(a), 120 + radius * math.sin(a)) for a in np.linspace(0, math.tau, 60)))
+
+
+SQUARE = ((100, 60), (220, 60), (220, 180), (100, 180))
+
+
+@pytest.mark.parametrize(
+    ("picture", "found"),
+    [
+        (hole(*SQUARE), 1),
+        (hole((160, 50), (230, 190), (90, 190)), 0),  # three corners
+        (hole((100, 60), (220, 60), (160, 120), (220, 180), (100, 180)), 0),  # a bite is missing
+        (round_hole(60), 0),  # no straight sides
+        (hole((157, 117), (163, 117), (163, 123), (157, 123)), 0),  # too small
+        (hole((100, 60), (101, 60), (101, 180), (100, 180)), 0),  # a slit
+        (cv2.rectangle(GREY.copy(), (40, 20), (280, 220), (0, 0, 255), -1), 0),  # no hole
+    ],
+    ids=["square", "triangle", "bitten", "round", "tiny", "slit", "whole"],
+)
+def test_only_openings_of_four_straight_sides_are_gates(picture: Picture, found: int) -> None:
+    seen = GateDetector((255, 0, 0)).detect(picture, FRONT_CAMERA.intrinsics())
+    assert len(seen) == found
+    for gate in seen:
+        assert gate.corners == pytest.approx(np.array(SQUARE), abs=1.5)
+
+
+def test_a_gate_that_is_too_far_away_is_left_out() -> None:
+    picture = hole(*SQUARE)
+    assert len(GateDetector((255, 0, 0)).detect(picture, FRONT_CAMERA.intrinsics())) == 1
+    assert GateDetector((255, 0, 0), (40.0, 40.0)).detect(picture, FRONT_CAMERA.intrinsics()) == []
 
 
 def test_what_makes_no_sense_is_refused() -> None:

@@ -19,7 +19,7 @@ from skyloop.recording.review.tables import Table, begin_ns, tables
 
 #: Channels that make a table; frames are listed with their times.
 TABLES: Final = tuple(Channel)
-_TIME_BASE: Final = Fraction(1, 90_000)  #: of MP4: each picture keeps its own time
+_TIME_BASE: Final = Fraction(1, 60_000)  #: of MP4: each picture keeps its own time; MPEG-4 takes no more than 65535
 _CODECS: Final = ("libx264", "libopenh264", "mpeg4")  #: the first that this PyAV has
 
 
@@ -102,10 +102,10 @@ def export_mp4(
     newest = -1
     count = 0
     try:
-        container = av.open(str(path), "w", format="mp4")
+        file = path.open("wb")  # PyAV would open it with the first picture, and call the reason by a name of its own
     except OSError as error:
         raise UsageError(f"{path} can't be written: {error.strerror}") from error
-    with container:
+    with file, av.open(file, "w", format="mp4") as container:
         stream: Any = None
         for picture in recording.pictures(drone, camera, progress=progress):
             try:
