@@ -109,6 +109,7 @@ def test_a_proxy_that_follows_one_that_was_killed_finds_it_in_the_air(
         drone.wait("hovering", timeout_s=20.0)
         first.signal(signal.SIGKILL)
         first.wait()
+        drone.close()  # the block's end might wait for a proxy that lands it, for longer than a Tello stays up unheard
     proxy(addresses.uri(video=0), "beta")
     with skyloop.connect("beta", access="observe") as observer:
         observer.wait("hovering", timeout_s=10.0)
