@@ -214,4 +214,10 @@ def test_a_worker_that_fails_or_is_silent_is_told(capfd: pytest.CaptureFixture[s
             workers.start(working.is_silent).answer(0.2)
         echo = workers.start(working.echo, 3)
         assert echo.answer(20.0) == 3
+        addresses = "127.0.0.1 " * 100
+        talkative = workers.start(working.echo, addresses)
+        assert talkative.answer(20.0) == addresses
+        with pytest.raises(NoAnswerError) as caught:
+            talkative.answer(0.0)
+        assert len(str(caught.value)) < 150, "no list of all addresses"
     assert "RuntimeError: on purpose" in capfd.readouterr().err

@@ -18,6 +18,7 @@ from skyloop.bench.scale import OBSERVED, UNIT_CASES, Case, CaseResult, Scale, b
 from skyloop.bench.units import Fleet, Units, derive, needs
 from skyloop.cli.app import build
 from skyloop.errors import UsageError
+from tests.bench import working
 from tests.bench.conftest import summary_of
 
 MACHINE = Machine("A processor", 2, "An OS", "Linux 6.1", "3.11.7", {}, 0.1)
@@ -165,6 +166,18 @@ def test_the_command_measures_prints_draws_and_writes(tmp_path: Path, monkeypatc
         assert case.memory_mb["proxies"] > 1.0
     assert "More and more proxies" in ended.output
     assert results.jpeg_us > 0
+
+
+@pytest.mark.process
+def test_a_case_that_fails_is_left_out_and_the_others_are_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("zenoh")
+    monkeypatch.setattr(scale, "observe", working.fails)
+    results = scale.measure(0.3, [Case(1, 1), Case(1, 0, video=False)])
+    assert [case.observers for case in results.cases] == [0]
+    [(name, told)] = results.skipped.items()
+    assert name == "1 proxy, 1 observer"
+    assert told.startswith("the measuring process of fails [")
+    assert told.endswith("ended; its error stands above")
 
 
 @pytest.mark.process

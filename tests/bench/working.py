@@ -13,6 +13,6 @@ def is_silent(pipe: Pipe) -> None:
     pipe.recv()
 
 
-def echo(pipe: Pipe, what: int) -> None:
+def echo(pipe: Pipe, what: int | str) -> None:
     pipe.send(what)
     pipe.recv()

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
+from textwrap import shorten
 from types import TracebackType
 from typing import Any, Final, Protocol, Self
 
@@ -16,6 +17,7 @@ from skyloop.errors import LinkError, NoAnswerError
 
 STARTS_WITHIN_S: Final = 30.0
 ENDS_WITHIN_S: Final = 5.0
+_WHAT_LENGTH: Final = 80
 _PACKAGES: Final = Path(__file__).parents[2]  # where ``skyloop`` is found
 # At the end of the path: another interpreter has its own packages, made for its own version, before ours.
 _BOOT: Final = "import sys; sys.path.append(sys.argv[1]); from skyloop.bench.workers import child; child(sys.argv[2])"
@@ -39,7 +41,7 @@ class Worker:
             number = theirs.fileno()
             self._process = subprocess.Popen([*command, "-c", _BOOT, str(_PACKAGES), str(number)], pass_fds=[number])
         self.pid = self._process.pid
-        self._what = " ".join([work.__name__, *map(str, arguments[:1])])
+        self._what = shorten(" ".join([work.__name__, *map(str, arguments[:1])]), _WHAT_LENGTH, placeholder=" …")
         self.pipe.send((work.__module__, work.__qualname__, arguments))
 
     def answer(self, timeout_s: float) -> Any:
