@@ -32,7 +32,7 @@ def busy(port: int) -> bool:
 
 @pytest.fixture(params=["vicon", "qualisys", "vrpn"])
 def address(request: pytest.FixtureRequest) -> Iterator[str]:
-    """Of a server that runs. It ends with its client."""
+    """Of a server that runs."""
     system = str(request.param)
     if system == "qualisys" and busy(QUALISYS_FRAMES_PORT):
         pytest.skip(f"UDP port {QUALISYS_FRAMES_PORT} of this host, which the package uses, is taken")

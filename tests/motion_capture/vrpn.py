@@ -44,21 +44,42 @@ def frame(number: int) -> bytes:
 
 
 def serve(port: int) -> None:
-    """One client, until it goes."""
+    """One client after the other, until it is killed. One that calls again from elsewhere has given up the last try."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as knock:
         knock.bind(("127.0.0.1", port))
         print(f"ready {knock.getsockname()[1]}", flush=True)
-        host, client_port = knock.recv(1024).rstrip(b"\0").decode().split()[:2]
-        with socket.create_connection((host, int(client_port))) as client, contextlib.suppress(ConnectionError):
-            client.sendall(COOKIE)
-            assert client.recv(len(COOKIE), socket.MSG_WAITALL)[:11] == COOKIE[:11]
-            for number, name in enumerate(SENDERS):
-                client.sendall(description(SENDER_DESCRIPTION, number, name))
-            for number, name in enumerate(TYPES):
-                client.sendall(description(TYPE_DESCRIPTION, number, name))
-            for number in itertools.count(1):
-                client.sendall(frame(number))
-                time.sleep(PERIOD_S)
+        place = heard(knock)
+        while True:
+            newest = place
+            with contextlib.suppress(OSError), socket.create_connection(place) as client:
+                greet(client)
+                knock.setblocking(False)
+                for number in itertools.count(1):
+                    with contextlib.suppress(BlockingIOError):
+                        newest = heard(knock)
+                    if newest != place:
+                        break
+                    client.sendall(frame(number))
+                    time.sleep(PERIOD_S)
+            knock.setblocking(True)
+            place = newest if newest != place else heard(knock)
+
+
+def heard(knock: socket.socket) -> tuple[str, int]:
+    """Where a client listens."""
+    host, port = knock.recv(1024).rstrip(b"\0").decode().split()[:2]
+    return host, int(port)
+
+
+def greet(client: socket.socket) -> None:
+    """Say who is here, and what the senders and types are called."""
+    client.sendall(COOKIE)
+    if client.recv(len(COOKIE), socket.MSG_WAITALL)[:11] != COOKIE[:11]:
+        raise ConnectionError("that is no client, or it is gone")
+    for number, name in enumerate(SENDERS):
+        client.sendall(description(SENDER_DESCRIPTION, number, name))
+    for number, name in enumerate(TYPES):
+        client.sendall(description(TYPE_DESCRIPTION, number, name))
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ The one command that is taken whatever its number, age and lease, the emergency 
 
 from __future__ import annotations
 
+import itertools
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -49,12 +50,16 @@ def bench(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> It
             yield bench
 
 
-def fly(bench: Bench, pilot: App, forward: float = 0.25) -> Command:
-    """Have a command of the pilot executed, which is what somebody records. Datagrams may be lost or overtaken."""
+_numbers = itertools.count()
+
+
+def fly(bench: Bench, pilot: App) -> Command:
+    """Have a command of the pilot executed, which is what somebody records. No two commands are alike, so that the one
+    that was executed is this one; datagrams may be lost or overtaken."""
     sent: list[Command] = []
 
     def executed() -> bool:
-        sent.append(pilot.command(Velocity(forward + len(sent) / 1000)))
+        sent.append(pilot.command(Velocity(0.25 + next(_numbers) / 10_000)))
         return wait_briefly(lambda: sent[-1].action in bench.driver.told)
 
     wait_until(executed, "the command is executed")
@@ -99,7 +104,7 @@ def test_at_once_by_the_same_connection(bench: Bench, jane: App) -> None:
     recorded = fly(bench, jane)
     for _ in range(5):
         assert jane.end.send(encode(recorded))
-    fly(bench, jane, 0.5)
+    fly(bench, jane)
     assert bench.driver.told.count(recorded.action) == 1
 
 

@@ -418,6 +418,42 @@ def test_when_a_lost_link_returns_nothing_old_is_flown(autopilot: int) -> None:
     assert set(bench.commands()) == {HOLD[autopilot][1]}
 
 
+@AUTOPILOTS
+def test_who_is_found_again_in_the_air_does_not_stand_before_it_says_so(autopilot: int) -> None:
+    """Heartbeat and attitude come first: neither tells of the ground, and a hold given up here would be missed."""
+    bench = steering(autopilot)
+    bench.go_on(4.0, silent=True)
+    bench.said.clear()
+    bench.sink.feedbacks.clear()
+    for _ in range(20):
+        bench.clock.advance(0.02)
+        bench.vehicle.boot_ms += 20
+        bench.hear(bench.vehicle.heartbeat(), bench.vehicle.telemetry()[-1])
+        bench.tick()
+    assert {each.state for each in bench.sink.feedbacks} == {FlightState.UNKNOWN}
+    assert set(bench.commands()) == {HOLD[autopilot][1]}
+    bench.go_on(0.5)
+    assert bench.state() in (FlightState.FLYING, FlightState.HOVERING)
+    assert set(bench.commands()) == {HOLD[autopilot][1]}
+
+
+@AUTOPILOTS
+def test_an_armed_one_that_tells_nothing_of_the_ground(autopilot: int) -> None:
+    bench = Bench(Vehicle(autopilot))
+    bench.vehicle.armed = True
+    bench.hear(bench.vehicle.heartbeat())
+    assert bench.state() is FlightState.UNKNOWN
+    with pytest.raises(DriverError, match="does not tell yet whether it is in the air"):
+        bench.apply(Takeoff())
+    assert bench.apply(Velocity(forward=1.0)) == Idle()
+    bench.go_on(2.0, silent=True)
+    assert bench.heard_of(SET_POINT) == []
+    bench.apply(Land())
+    bench.hear(bench.vehicle.heartbeat())
+    bench.tick()
+    assert LAND[autopilot][1] in bench.commands(), "whoever lands it does not disarm what may fly"
+
+
 # Motors ------------------------------------------------------------------------------------------------------------
 
 

@@ -149,6 +149,8 @@ class Pilot:
             self._takeoff.asked_ns = now_ns
             if self._takeoff.refused and not self._takeoff.started:
                 raise DriverError(f"the vehicle does not start yet, it is tried again: {self._takeoff.refused}")
+        elif view.airborne is None:
+            raise DriverError("the vehicle is armed, and does not tell yet whether it is in the air")
         elif not view.airborne:
             self._end()
             self.intent, self._takeoff = Intent.TAKE_OFF, TakeOff(self._dialect, self.takeoff_m, now_ns)
@@ -166,7 +168,7 @@ class Pilot:
     def _hover(self, action: Hover, view: View | None, now_ns: int, *, alone: bool) -> AnyAction:
         if self.stopped or self.intent is Intent.TAKE_OFF:
             return action  # a take-off ends in a hover
-        if view is not None and not view.airborne:
+        if view is not None and view.airborne is False:
             self._end()
         elif alone or view is None:
             self._end()
@@ -178,8 +180,10 @@ class Pilot:
     def _steer(self, action: Velocity | Attitude, view: View | None, now_ns: int) -> AnyAction:
         if view is None:
             raise DriverError("the vehicle is not heard: it takes no set-points")
-        if self.stopped or not view.airborne or self.intent is Intent.TAKE_OFF:
+        if self.stopped or view.airborne is False or self.intent is Intent.TAKE_OFF:
             return Idle()  # a set-point would cancel a take-off
+        if view.airborne is None and self.intent is not Intent.FOLLOW:
+            return Idle()  # on the ground some would start by it
         if isinstance(action, Velocity):
             if isinstance(self._set_point, Steer) and self.intent is Intent.FOLLOW:
                 self._set_point.action = action
@@ -234,6 +238,8 @@ class Pilot:
             return FlightState.EMERGENCY
         if self.intent is Intent.TAKE_OFF and self._takeoff is not None and self._takeoff.started:
             return FlightState.TAKING_OFF
+        if view.airborne is None:
+            return FlightState.UNKNOWN
         if not view.airborne:
             return FlightState.LANDED
         if view.mode in self._dialect.LANDING or view.landed is Landed.LANDING:
@@ -289,7 +295,7 @@ class Pilot:
 
     def _step_following(self, view: View, now_ns: int) -> list[Message]:
         assert self._set_point is not None
-        if not view.airborne:
+        if view.airborne is False:
             self._end()
             return []
         inside = view.mode == self._dialect.GUIDED
@@ -332,7 +338,7 @@ class Pilot:
             self.intent = Intent.HOLD  # nobody may hold the sticks: without them it sinks
 
     def _step_hold(self, view: View, now_ns: int) -> list[Message]:
-        if not view.airborne:
+        if view.airborne is False:
             self._end()
             return []
         if view.mode in self._dialect.HOLDING or view.mode in self._dialect.LANDING:
@@ -348,7 +354,7 @@ class Pilot:
         inside = view.mode in self._dialect.LANDING
         if not view.armed:
             self._end()
-        elif not view.airborne:
+        elif view.airborne is False:
             self._commander.say(DISARM, now_ns)
         elif self._strayed(view.mode, inside, now_ns):
             self._leave(view)

@@ -295,7 +295,7 @@ class Session(VehicleSession):
 
 def observed_state(view: View | None) -> FlightState:
     """Of a vehicle that is not flown from here."""
-    if view is None:
+    if view is None or view.airborne is None:
         return FlightState.UNKNOWN
     return FlightState.FLYING if view.airborne else FlightState.LANDED
 

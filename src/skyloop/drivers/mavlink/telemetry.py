@@ -36,11 +36,14 @@ class View:
     amsl_m: float | None  #: altitude above mean sea level
 
     @property
-    def airborne(self) -> bool:
-        """Whether it is off the ground under its own power."""
+    def airborne(self) -> bool | None:
+        """Whether it is off the ground under its own power; None while an armed one tells neither that nor its height,
+        as when it was just found again: that is no reason to think that it stands."""
         if not self.armed or self.landed is Landed.ON_GROUND:
             return False
-        return self.landed is not Landed.UNKNOWN or (self.altitude_m or 0.0) > AIRBORNE_M
+        if self.landed is Landed.UNKNOWN:
+            return None if self.altitude_m is None else self.altitude_m > AIRBORNE_M
+        return True
 
     @property
     def failsafe(self) -> bool:
