@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from skyloop.messages import Takeoff
+from skyloop.messages import Takeoff, Velocity
 from skyloop.sim import STEP_S, Simulation, VehicleParameters, Wind, World, parse_world
 from skyloop.sim.parameters import with_ideal_sensors
 
@@ -30,4 +30,18 @@ def flying(
     for drone in range(drones):
         simulation.command(drone, Takeoff())
     simulation.step(steps(seconds))
+    return simulation
+
+
+def above_another(parameters: VehicleParameters) -> Simulation:
+    """Drone 1 in the air above drone 0, which stands."""
+    world = parse_world(
+        "[room]\nsize = [5, 5, 3]\n[[spawn]]\nposition = [0, 0, 0]\n[[spawn]]\nposition = [1.5, 0, 0]\nyaw_deg = 180\n"
+    )
+    simulation = Simulation(world, 2, parameters=parameters)
+    simulation.command(1, Takeoff())
+    simulation.step(steps(4))
+    while simulation.truth(1).position_m[0] > 0.05:
+        simulation.command(1, Velocity(forward=0.5))
+        simulation.step(5)
     return simulation

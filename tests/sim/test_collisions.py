@@ -12,7 +12,7 @@ from skyloop.errors import UsageError
 from skyloop.messages import Attitude, EmergencyStop, FlightState, Land, Takeoff, Velocity
 from skyloop.sim import Limits, OccurrenceKind, Simulation, World, load_world, parse_world
 from skyloop.sim.parameters import GRAVITY_M_S2
-from tests.sim.helpers import HALL, IDEAL, flying, steps
+from tests.sim.helpers import HALL, IDEAL, above_another, flying, steps
 
 FAST = Limits(tilt_rad=0.5, climb_m_s=3.0, altitude_m=20.0, speed_m_s=10.0)
 TOUGH = replace(IDEAL, crash_speed_m_s=100.0)
@@ -179,15 +179,7 @@ def test_drones_do_not_pass_through_one_another() -> None:
 
 
 def test_a_drone_that_lands_on_another_does_not_push_it_into_the_floor() -> None:
-    world = parse_world(
-        "[room]\nsize = [5, 5, 3]\n[[spawn]]\nposition = [0, 0, 0]\n[[spawn]]\nposition = [1.5, 0, 0]\nyaw_deg = 180\n"
-    )
-    simulation = Simulation(world, 2, parameters=replace(TOUGH, restitution=0.0))
-    simulation.command(1, Takeoff())
-    simulation.step(steps(4))
-    while simulation.truth(1).position_m[0] > 0.05:
-        simulation.command(1, Velocity(forward=0.5))
-        simulation.step(5)
+    simulation = above_another(replace(TOUGH, restitution=0.0))
     simulation.command(1, Velocity(up=-2.0))
     for _ in range(steps(4)):
         simulation.step()

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from skyloop.messages import Attitude, FlightState, Land, Takeoff, Velocity
 from skyloop.sim import Limits, Simulation, VehicleParameters, World, parse_world
 from skyloop.sim.parameters import LIMIT_RANGES
-from tests.sim.helpers import IDEAL, flying, steps
+from tests.sim.helpers import IDEAL, above_another, flying, steps
 
 TOUGH = replace(VehicleParameters(), crash_speed_m_s=100.0)
 CORNERS = "[room]\nsize = [5, 5, 3]\n"
@@ -73,15 +73,7 @@ def test_a_landing_without_hindrance_is_a_landing_as_before() -> None:
 
 
 def test_a_drone_that_lands_on_one_that_stands_has_landed() -> None:
-    world = parse_world(
-        "[room]\nsize = [5, 5, 3]\n[[spawn]]\nposition = [0, 0, 0]\n[[spawn]]\nposition = [1.5, 0, 0]\nyaw_deg = 180\n"
-    )
-    simulation = Simulation(world, 2, parameters=replace(IDEAL, restitution=0.0))
-    simulation.command(1, Takeoff())
-    simulation.step(steps(4))
-    while simulation.truth(1).position_m[0] > 0.05:
-        simulation.command(1, Velocity(forward=0.5))
-        simulation.step(5)
+    simulation = above_another(replace(IDEAL, restitution=0.0))
     seconds_to_land(simulation)
     assert simulation.truth(1).position_m[2] == pytest.approx(3 * IDEAL.half_height_m, abs=1e-3)
     simulation.command(1, Takeoff())

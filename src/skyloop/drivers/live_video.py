@@ -96,9 +96,7 @@ class Notice(Enum):
 
     STREAMING = "streaming"  #: frames come
     LOST = "lost"  #: no connection, or no more; told once for each reason, tried again for ever
-    UNSUPPORTED = (
-        "unsupported"  #: frames come that are not decoded here: another codec, or noise; told once a row of them
-    )
+    UNSUPPORTED = "unsupported"  #: frames come in another codec, or are noise; told once a row of them
     FAULT = "fault"  #: an error of this program, told once; it goes on
 
     def tell(self, sink: Sink, where: str, text: str) -> None:

@@ -8,6 +8,7 @@ import socket
 import sys
 import tty
 from collections.abc import Iterator
+from contextlib import closing, contextmanager
 
 import pytest
 
@@ -23,6 +24,17 @@ def came(connection: Connection) -> bytes:
     """All that comes within a while, until something has."""
     assert select.select([connection], [], [], 5.0)[0], "nothing comes"
     return b"".join(data for data, _ in connection.receive())
+
+
+@contextmanager
+def by_tcp() -> Iterator[tuple[Connection, socket.socket]]:
+    """Our end, and the vehicle's."""
+    with (
+        socket.create_server((LOCAL, 0)) as server,
+        closing(connect(Address(Way.TCP, LOCAL, server.getsockname()[1]))) as ours,
+        server.accept()[0] as vehicle,
+    ):
+        yield ours, vehicle
 
 
 @pytest.fixture
@@ -73,33 +85,26 @@ def test_a_port_that_speaks_first_needs_no_peer() -> None:
 
 
 def test_tcp_brings_bytes_and_says_when_it_ends() -> None:
-    with socket.create_server((LOCAL, 0)) as server:
-        ours = connect(Address(Way.TCP, LOCAL, server.getsockname()[1]))
-        vehicle, _ = server.accept()
-        with vehicle:
-            assert ours.receive() == [], "nothing yet"
-            ours.send(b"hello", None)
-            assert vehicle.recv(100) == b"hello"
-            vehicle.sendall(b"heartbeat")
-            assert came(ours) == b"heartbeat"
+    with by_tcp() as (ours, vehicle):
+        assert ours.receive() == [], "nothing yet"
+        ours.send(b"hello", None)
+        assert vehicle.recv(100) == b"hello"
+        vehicle.sendall(b"heartbeat")
+        assert came(ours) == b"heartbeat"
+        vehicle.close()
         assert select.select([ours], [], [], 5.0)[0]
         with pytest.raises(ConnectionError, match="the vehicle ended the connection"):
             ours.receive()
-        ours.close()
 
 
 def test_tcp_ends_rather_than_send_half_a_frame() -> None:
     """What follows half a frame would be noise to the vehicle; a whole one that finds no room is merely lost."""
-    with socket.create_server((LOCAL, 0)) as server:
-        ours = connect(Address(Way.TCP, LOCAL, server.getsockname()[1]))
-        vehicle, _ = server.accept()
-        with vehicle:
-            with pytest.raises(ConnectionError, match="takes nothing any more"):
-                ours.send(bytes(64 << 20), None)
-            # Freed room may take a moment to be known on both sides: here nobody reads, so none is freed.
-            wait_until(lambda: not select.select([], [ours], [], 0.0)[1], "there is no room at all")
-            ours.send(b"lost without a word", None)
-        ours.close()
+    with by_tcp() as (ours, _):
+        with pytest.raises(ConnectionError, match="takes nothing any more"):
+            ours.send(bytes(64 << 20), None)
+        # Freed room may take a moment to be known on both sides: here nobody reads, so none is freed.
+        wait_until(lambda: not select.select([], [ours], [], 0.0)[1], "there is no room at all")
+        ours.send(b"lost without a word", None)
 
 
 def test_a_serial_line_carries_bytes_both_ways(line: tuple[int, str]) -> None:

@@ -19,14 +19,14 @@ from skyloop.wire.mavlink.codec import Message
 RETRY_NS: Final = nanoseconds(1.0)  #: pace of new connections
 SILENT_NS: Final = nanoseconds(8.0)  #: a connected stream without a word for so long is made anew
 WRITE_S: Final = 0.9  #: a parameter is written and confirmed within this, or it failed
-CLOSE_S: Final = 3.0
+_CLOSE_S: Final = 3.0
 
 
 class Link(VehicleLink[Session]):
     """As :class:`VehicleLink`."""
 
     def __init__(self, session: Session, deliver: Callable[[list[Telling]], None], clock: Clock = monotonic_ns) -> None:
-        super().__init__("skyloop-mavlink", session, deliver, clock, close_s=CLOSE_S)
+        super().__init__("skyloop-mavlink", session, deliver, clock, close_s=_CLOSE_S)
         self._connection: Connection | None = None
         self._connected_ns = -RETRY_NS
         self._broken = False  # nothing can be sent any more
