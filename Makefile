@@ -3,32 +3,47 @@ PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 ARGS   ?=
+# LOCKED=1 installs the exact versions of requirements-dev.lock instead of the newest that fit.
+LOCKED ?=
+PIP    := $(BIN)/python -m pip install --quiet --disable-pip-version-check $(if $(LOCKED),--constraint requirements-dev.lock)
 
-.PHONY: help demo test check format coverage page pictures clean
+.PHONY: help demo test test-all explore check chaos fuzz format coverage page pictures lock clean
 help:
 	@echo "make demo [ARGS='--seconds 30 --headless']   a simulated drone that flies by its camera"
-	@echo "make test [ARGS='-k authority']              the tests"
+	@echo "make test [ARGS='-k authority']              the tests of every day, 5 minutes; with ARGS, those that they select of all"
+	@echo "make test-all                                all tests"
+	@echo "make explore [SECONDS=3600]                  new examples for the tests of properties, for a minute"
 	@echo "make check                                   lint, format, types, import contracts"
+	@echo "make chaos [ARGS='--seconds 180']            drones flown while processes die, stall, starve and are flooded"
+	@echo "make fuzz [ARGS='--seconds 60 recording']    decoders, file readers and servers against hostile input"
 	@echo "make page                                    the cockpit's page anew from its sources, where node and npm are"
-	@echo "make format | coverage | pictures | clean"
+	@echo "make format | coverage | pictures | lock | clean"
 
 # One stamp for what the demo needs and one for what the tests need besides; both are made again when the project changes.
 $(VENV)/.installed: pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Skyloop needs Python 3.11 or newer, this is " + sys.version.split()[0])'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[sim,vision,cockpit]'
+	$(PIP) --editable '.[sim,vision,cockpit]'
 	@touch $@
 
-$(VENV)/.installed-dev: $(VENV)/.installed requirements-dev.txt
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[all]' --requirement requirements-dev.txt
+$(VENV)/.installed-dev: $(VENV)/.installed requirements-dev.txt requirements-dev.lock
+	$(PIP) --editable '.[all]' --requirement requirements-dev.txt
 	@touch $@
 
 demo: $(VENV)/.installed
 	@$(BIN)/skyloop demo $(ARGS)
 
-# As many tests at a time as the machine has cores: most wait more than they compute.
+# As many tests at a time as the machine has cores: most wait more than they compute. ARGS select from all tests.
 test: $(VENV)/.installed-dev
+	$(BIN)/python -m pytest --numprocesses auto $(or $(ARGS),-m "not slow" --durations 10 --durations-min 3)
+
+test-all: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest --numprocesses auto $(ARGS)
+
+# New examples for the tests of properties, for a minute by default: make explore SECONDS=3600.
+SECONDS ?= 60
+explore: $(VENV)/.installed-dev
+	SKYLOOP_EXPLORE=$(SECONDS) $(BIN)/python -m pytest --numprocesses 0 -m "not process" $(ARGS)
 
 check: $(VENV)/.installed-dev
 	$(BIN)/ruff check .
@@ -36,12 +51,30 @@ check: $(VENV)/.installed-dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+# Three minutes by default; an hour by hand: make chaos ARGS="--seconds 3600".
+chaos: $(VENV)/.installed-dev
+	$(BIN)/python -m tests.chaos $(ARGS)
+
+# A minute for each target by default.
+fuzz: $(VENV)/.installed-dev
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check 'atheris>=3'
+	$(BIN)/python -m tests.fuzz $(ARGS)
+
 format: $(VENV)/.installed-dev
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
 coverage: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest --numprocesses auto --cov --cov-report=term $(ARGS)
+	$(BIN)/coverage json --quiet -o .coverage.json
+	$(BIN)/python scripts/coverage_floor.py .coverage.json
+
+# The newest versions that fit, for LOCKED=1; without the places they come from.
+lock: $(VENV)/.installed-dev
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
+	(sed '/^\#/!d' requirements-dev.lock; $(BIN)/uv pip compile --quiet --universal --upgrade --python-version 3.11 --extra all \
+	  --no-annotate --no-header --no-emit-index-url --no-emit-find-links pyproject.toml requirements-dev.txt) >.lock.new
+	mv .lock.new requirements-dev.lock
 
 page:
 	cd cockpit-page && npm ci --no-audit --no-fund && npm run check && npm test && npm run build
@@ -50,4 +83,4 @@ pictures: $(VENV)/.installed-dev
 	$(BIN)/python scripts/pictures.py
 
 clean:
-	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache htmlcov .coverage
+	rm -rf $(VENV) .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache htmlcov .coverage .coverage.json

@@ -10,7 +10,7 @@ import skyloop
 from skyloop.control import ApproachMarker, OrbitMarker
 
 
-def main(target="sim://?cameras=front&fps=15", marker=12, size_m=0.25):
+def main(target: str = "sim://?cameras=front&fps=15", marker: int | str = 12, size_m: float | str = 0.25) -> None:
     with skyloop.connect(target) as drone:
         drone.takeoff()
         with drone.on_event(lambda event: print(event.text)):

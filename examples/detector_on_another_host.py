@@ -22,10 +22,10 @@ class Sighting:
 class Detector:
     """Looks for markers in each frame. Imagine something here that needs the GPU of another machine."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.markers = MarkerDetector("4x4_50", size_m=0.3)
 
-    def process(self, frame):  # BGR, shape (h, w, 3), uint8
+    def process(self, frame: skyloop.Frame) -> Output:  # BGR, shape (h, w, 3), uint8
         seen = self.markers.detect(frame)
         outlines = [skyloop.Polyline(tuple(map(tuple, one.corners.tolist())), closed=True) for one in seen]
         return Output([Sighting(right=one.position[0], ahead=one.position[2]) for one in seen], outlines)
@@ -37,13 +37,13 @@ class Face(skyloop.Controller):
     processors = ("detector",)
     result_max_age_s = 0.5  # older results are left out, and counted
 
-    def on_result(self, result):
+    def on_result(self, result: skyloop.Result) -> None:
         sightings = result.to(list[Sighting])
         yaw_rate = -1.5 * sightings[0].right / sightings[0].ahead if sightings else 0.7
         self.drone.velocity(yaw_rate=yaw_rate)  # rad/s, counter-clockwise
 
 
-def main(name, seconds=20.0):
+def main(name: str, seconds: float = 20.0) -> None:
     with skyloop.connect(name) as drone:
         drone.takeoff()
         print(Face(drone).run(seconds=seconds))

@@ -7,20 +7,26 @@ python examples/fly_a_path.py alpha    # a running proxy: skyloop sim --name alp
 import sys
 
 import numpy as np
+from numpy.typing import NDArray
 
 import skyloop
 from skyloop.control import AlongPath, FollowPath, FunctionPath, Lemniscate, LookAt, Waypoint, Waypoints
 from skyloop.control.rehearsal import Radio, rehearse
 
 
-def helix(t):
+def helix(t: float) -> NDArray[np.float64]:
     """Two turns of 0.8 m radius, 0.6 m up; any function of the time [s] is a path. World axes [m]."""
     angle = 2 * np.pi * t / 12
     return np.array([0.8 * np.cos(angle), 0.8 * np.sin(angle), 0.8 + 0.6 * t / 24])
 
 
-def main(*target):
-    corners = [(1, -1, 1), (1, 1, 1), (-1, 1, 1), Waypoint(-1, -1, 1, yaw=0.0)]
+def main(*target: str) -> None:
+    corners: list[Waypoint | tuple[float, float, float]] = [
+        (1, -1, 1),
+        (1, 1, 1),
+        (-1, 1, 1),
+        Waypoint(-1, -1, 1, yaw=0.0),
+    ]
     with (
         skyloop.connect(*target)
         if target

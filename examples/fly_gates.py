@@ -10,14 +10,14 @@ import skyloop
 from skyloop.control import FIVE_GATES, FlyThroughGates
 
 
-def main(target="sim://?world=gates&cameras=front&fps=15", seconds=120.0):
+def main(target: str = "sim://?world=gates&cameras=front&fps=15", seconds: float | str = 120.0) -> None:
     with skyloop.connect(target) as drone:
         drone.takeoff()
         course = FlyThroughGates(drone, FIVE_GATES)
         with drone.on_event(lambda event: print(event.text)):
-            print(course.run(seconds=seconds))
+            print(course.run(seconds=float(seconds)))
         print("passed", course.passed, "of", len(FIVE_GATES), "gates")
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:2], *map(float, sys.argv[2:3]))
+    main(*sys.argv[1:])

@@ -14,18 +14,18 @@ from skyloop.control.follow import FollowMarker
 class Follow(FollowMarker):
     """The controller of ``skyloop demo``, telling what it does. The README has a simpler one, from scratch."""
 
-    def on_frame(self, frame):
+    def on_frame(self, frame: skyloop.Frame) -> None:
         before = self.mode
         super().on_frame(frame)
         if self.mode is not before:
             print(f"{frame.header.seq}: {before} → {self.mode}", flush=True)
 
 
-def main(target="sim://", seconds=30.0):
+def main(target: str = "sim://", seconds: float | str = 30.0) -> None:
     with skyloop.connect(target) as drone:
         drone.takeoff()
         controller = Follow(drone, 7, size_m=0.3)  # marker 7 of ArUco's 4x4_50, with 0.3 m from edge to edge
-        print(controller.run(seconds=seconds))
+        print(controller.run(seconds=float(seconds)))
         drone.land()
     score = controller.score
     print(f"in view in {score.share_in_view or 0.0:.0%} of {score.frames} frames since it was found")
@@ -35,4 +35,4 @@ def main(target="sim://", seconds=30.0):
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:2], *map(float, sys.argv[2:3]))
+    main(*sys.argv[1:])

@@ -10,18 +10,21 @@ import skyloop
 from skyloop.control import LandOnMarker
 
 
-def main(target="sim://?world=platform&cameras=bottom&fps=15", seconds=90.0):
+def main(target: str = "sim://?world=platform&cameras=bottom&fps=15", seconds: float | str = 90.0) -> None:
     with skyloop.connect(target) as drone:
         drone.takeoff()
         landing = LandOnMarker(drone, marker_id=30, size_m=0.2)
         with drone.on_event(lambda event: print(event.text)):
-            print(landing.run(seconds=seconds))
+            print(landing.run(seconds=float(seconds)))
         print("it stands" if landing.landed else f"not landed: {landing.phase}")
         truth = drone.feedback().native or {}
         if "truth.target.x" in truth:  # the simulator tells where both really are
-            east, north = (truth[f"truth.{axis}"] - truth[f"truth.target.{axis}"] for axis in "xy")
+            x, y, marker_x, marker_y = (
+                float(str(truth[f"truth.{name}"])) for name in ("x", "y", "target.x", "target.y")
+            )
+            east, north = x - marker_x, y - marker_y
             print(f"{(east**2 + north**2) ** 0.5:.2f} m from the marker's centre")
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:2], *map(float, sys.argv[2:3]))
+    main(*sys.argv[1:])

@@ -7,6 +7,7 @@ python examples/orbit_and_map.py alpha 0.25          # a running proxy that know
 import sys
 
 import numpy as np
+from numpy.typing import NDArray
 
 import skyloop
 from skyloop.control import OrbitPlace
@@ -15,17 +16,17 @@ from skyloop.vision import MarkerDetector
 
 
 class Map(OrbitPlace):
-    def __init__(self, drone, size_m, **options):
-        super().__init__(drone, (0.0, 0.0, 1.5), 1.0, look="out", **options)
+    def __init__(self, drone: skyloop.Drone, size_m: float, laps: float) -> None:
+        super().__init__(drone, (0.0, 0.0, 1.5), 1.0, look="out", laps=laps)
         self.detector = MarkerDetector(size_m=size_m)
         self.mounting = drone.capabilities.cameras[0]
-        self.places = {}
+        self.places: dict[int, list[NDArray[np.float64]]] = {}
 
-    def on_frame(self, frame):  # on_feedback flies, this one maps
+    def on_frame(self, frame: skyloop.Frame) -> None:  # on_feedback flies, this one maps
         state = frame.feedback
         if state is None or state.position is None:
             return
-        shapes = []
+        shapes: list[skyloop.Polyline | skyloop.Text] = []
         for marker in self.detector.detect(frame):
             place = target_in_world(marker.pose, self.mounting, state).translation
             self.places.setdefault(marker.id, []).append(place)
@@ -35,10 +36,10 @@ class Map(OrbitPlace):
         self.drone.annotate(frame, shapes)
 
 
-def main(target="sim://?position=1&cameras=front&fps=15", size_m=0.25):
+def main(target: str = "sim://?position=1&cameras=front&fps=15", size_m: float | str = 0.25) -> None:
     with skyloop.connect(target) as drone:
         drone.takeoff()
-        survey = Map(drone, size_m, laps=1.2)
+        survey = Map(drone, float(size_m), laps=1.2)
         print(survey.run(seconds=60.0))
         for number, places in sorted(survey.places.items()):
             x, y, z = np.median(places, axis=0)
@@ -46,4 +47,4 @@ def main(target="sim://?position=1&cameras=front&fps=15", size_m=0.25):
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:2], *map(float, sys.argv[2:3]))
+    main(*sys.argv[1:])

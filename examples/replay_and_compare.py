@@ -17,12 +17,12 @@ from skyloop.vision import MarkerDetector
 class Face(skyloop.Controller):
     """Turns towards marker 7 and keeps 1.5 m away; looks around for it while it is not seen."""
 
-    def __init__(self, drone, gain):
+    def __init__(self, drone: skyloop.Drone, gain: float) -> None:
         super().__init__(drone)
         self.gain = gain
         self.detector = MarkerDetector("4x4_50", size_m=0.3)
 
-    def on_frame(self, frame):
+    def on_frame(self, frame: skyloop.Frame) -> None:
         seen = [marker for marker in self.detector.detect(frame) if marker.id == 7]
         if not seen:
             self.drone.velocity(yaw_rate=0.7)  # rad/s, counter-clockwise
@@ -31,19 +31,21 @@ class Face(skyloop.Controller):
         self.drone.velocity(forward=0.8 * (ahead - 1.5), up=-0.8 * down, yaw_rate=-self.gain * right / ahead)
 
 
-def main(folder=None, seconds=10.0):
-    folder = Path(folder or tempfile.mkdtemp(prefix="flights-"))
+def main(into: str = "", seconds: float | str = 10.0) -> None:
+    folder = Path(into or tempfile.mkdtemp(prefix="flights-"))
     folder.mkdir(parents=True, exist_ok=True)
     flight, old, new = (folder / f"{name}.mcap" for name in ("flight", "old", "new"))
     with skyloop.connect("sim://?cameras=front&seed=4") as drone, skyloop.record(drone, flight, overwrite=True):
         drone.takeoff()
-        print("flown:", Face(drone, gain=1.5).run(seconds=seconds))
+        print("flown:", Face(drone, gain=1.5).run(seconds=float(seconds)))
         drone.land()
 
     # The same pictures, all of them, as fast as each controller takes them: what they ask for is kept, and none flies.
     for path, gain in ((old, 1.5), (new, 2.5)):
-        kept = {"channels": ["commands", "feedback"], "overwrite": True}
-        with skyloop.connect(f"replay://{flight}?speed=max") as drone, skyloop.record(drone, path, **kept):
+        with (
+            skyloop.connect(f"replay://{flight}?speed=max") as drone,
+            skyloop.record(drone, path, channels=["commands", "feedback"], overwrite=True),
+        ):
             print("replayed:", Face(drone, gain).run())
 
     for field in compare(Recording.open(old), Recording.open(new)).fields:
@@ -52,4 +54,4 @@ def main(folder=None, seconds=10.0):
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:2], *map(float, sys.argv[2:3]))
+    main(*sys.argv[1:])

@@ -11,7 +11,7 @@ from skyloop.control import SeeAndAvoid
 from skyloop.control.avoid import avoidance
 
 
-def main(target="sim://?world=pillars&cameras=front&fps=15", distance_m=12.5):
+def main(target: str = "sim://?world=pillars&cameras=front&fps=15", distance_m: float | str = 12.5) -> None:
     rules = avoidance()
     print("aside, 1 left to -1 right, by bearing (across, left positive) and width (down):")
     bearings = (0.4, 0.2, 0.0, -0.2, -0.4)
@@ -20,11 +20,11 @@ def main(target="sim://?world=pillars&cameras=front&fps=15", distance_m=12.5):
         print(f"{width:6.2f}", *(f"{rules.step(bearing=bearing, width=width):6.2f}" for bearing in bearings))
     with skyloop.connect(target) as drone:
         drone.takeoff()
-        flight = SeeAndAvoid(drone, distance_m)
+        flight = SeeAndAvoid(drone, float(distance_m))
         with drone.on_event(lambda event: print(event.text)):
             print(flight.run(seconds=90.0))
         print(f"{flight.ahead_m:.1f} m ahead", "and arrived" if flight.done else "")
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:2], *map(float, sys.argv[2:3]))
+    main(*sys.argv[1:])

@@ -12,10 +12,15 @@ import time
 import skyloop
 
 
-def pilot(name, seconds=60.0):
+def pilot(name: str, seconds: float = 60.0) -> None:
     """Turns on the spot, and hands over to whoever asks unless the battery is nearly empty."""
     with skyloop.connect(name, name="pilot", on_exit="land") as drone:
-        drone.on_takeover(lambda _: drone.feedback().battery > 0.2 or "landing, the battery is nearly empty")
+
+        def may_have_it(_: object) -> bool | str:
+            battery = drone.feedback().battery  # None where the vehicle does not tell
+            return battery is None or battery > 0.2 or "landing, the battery is nearly empty"
+
+        drone.on_takeover(may_have_it)
         drone.takeoff()
         end = time.monotonic() + seconds
         while time.monotonic() < end:
@@ -28,18 +33,19 @@ def pilot(name, seconds=60.0):
             time.sleep(0.1)
 
 
-def look(name, seconds=60.0):
+def look(name: str, seconds: float = 60.0) -> None:
     """Tells whenever somebody else flies."""
     with skyloop.connect(name, access="observe") as drone:
         owner, end = "", time.monotonic() + seconds
         while time.monotonic() < end:
             feedback = drone.next_feedback(timeout_s=5.0)
-            if feedback.owner != owner:
-                owner = feedback.owner
-                print(owner or "nobody", "flies, battery", f"{feedback.battery:.0%}", flush=True)
+            if (feedback.owner or "nobody") != owner:
+                owner = feedback.owner or "nobody"
+                battery = "unknown" if feedback.battery is None else f"{feedback.battery:.0%}"
+                print(owner, "flies, battery", battery, flush=True)
 
 
-def turn(name, seconds=5.0):
+def turn(name: str, seconds: float = 5.0) -> None:
     """Asks politely, waits for the answer, climbs a little, and gives it back."""
     with skyloop.connect(name, name="colleague", priority=8, takeover="ask", wait_s=30, on_exit="hover") as drone:
         print("my turn", flush=True)

@@ -12,7 +12,7 @@ from skyloop.control.formation import circle, placed, vee
 from skyloop.control.formation_flight import Formation
 
 
-def main(*targets, seconds=6.0):
+def main(*targets: str, seconds: float = 6.0) -> None:
     # What fails at one drone is told at the end of the block; until then the others go on without it.
     with skyloop.swarm(*targets, on_error="continue") as drones:
         drones.takeoff()
@@ -28,7 +28,9 @@ def main(*targets, seconds=6.0):
         leader, *followers = drones.active
         offsets = {name: (-1.0 * k, 0.0, 0.0) for k, name in enumerate(followers, 1)}  # ahead, left, up [m]
         report = formation.follow(leader, offsets, seconds, lead=lambda _: skyloop.Velocity(0.2, yaw_rate=0.2))
-        print(f"never closer than {report.closest_m:.2f} m; set-points left within {report.spread_s * 1000:.2f} ms")
+        print(f"never closer than {report.closest_m:.2f} m")
+        if report.spread_s is not None:
+            print(f"set-points left within {report.spread_s * 1000:.2f} ms")
 
 
 if __name__ == "__main__":

@@ -25,11 +25,11 @@ from skyloop.control import (
     OrbitMarker,
     SeeAndAvoid,
 )
-from skyloop.control.rehearsal import Radio, rehearse
 from skyloop.messages import Event, EventKind, Feedback, FlightState
 from skyloop.sim.render import use_one_core
 from skyloop.sim.world import Gate
 from skyloop.sim.world_file import load_world
+from skyloop.stepping.rehearsal import Radio, rehearse
 
 FOLLOW_S: Final = 40.0
 FOLLOW_RMS_M: Final = 0.25

@@ -169,7 +169,8 @@ def flight(command: list[str], fliers: list[Fly]) -> Iterator[tuple[Browser, str
             world.stdout.readline()  # says that it is ready
         cockpit = stack.enter_context(CockpitProcess(recordings=Path(folder) / "recordings"))
         threads = [threading.Thread(target=fly, args=(stop,)) for fly in fliers]
-        stack.callback(lambda: [thread.join() for thread in threads])
+        for thread in threads:
+            stack.callback(thread.join)
         stack.callback(stop.set)
         for thread in threads:
             thread.start()
@@ -183,7 +184,7 @@ def flight(command: list[str], fliers: list[Fly]) -> Iterator[tuple[Browser, str
 def open_page(chromium: Browser, address: str, size: dict[str, int], scheme: str) -> Page:
     for context in chromium.contexts:
         context.close()
-    context = chromium.new_context(viewport=size, color_scheme=scheme, has_touch=size is PHONE)  # type: ignore[arg-type]
+    context = chromium.new_context(viewport=size, color_scheme=scheme, has_touch=size is PHONE)
     page = context.new_page()
     page.goto(address)
     return page

@@ -13,8 +13,8 @@ from typing import Final, NamedTuple
 
 from skyloop.client import Drone
 from skyloop.control import AlongPath, Circle, FollowPath, Lemniscate, LookAt, TrackingError, Waypoints
-from skyloop.control.rehearsal import Radio, rehearse
 from skyloop.messages import Feedback
+from skyloop.stepping.rehearsal import Radio, rehearse
 
 Flyer = Waypoints | FollowPath
 

@@ -221,7 +221,7 @@ def learn_to_reach(folder: Path) -> None:  # noqa: ARG001
 
 def first_flight_notebook(folder: Path) -> None:
     """The notebook's own plot."""
-    notebook = nbformat.read(EXAMPLES / "first_flight.ipynb", as_version=4)
+    notebook = nbformat.read(EXAMPLES / "first_flight.ipynb", as_version=4)  # type: ignore[no-untyped-call]
     NotebookClient(notebook, kernel_name="python3", resources={"metadata": {"path": str(folder)}}).execute()
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", ())]
     plots = [output.data["image/png"] for output in outputs if "image/png" in output.get("data", {})]

@@ -70,7 +70,7 @@ class View:
         corners = self.pixels(np.array(list(itertools.product(*zip(low, high, strict=True)))))
         inside = np.zeros((HEIGHT, WIDTH), np.uint8)
         cv2.fillConvexPoly(inside, cv2.convexHull(np.round(corners).astype(np.int32)), 1)
-        return inside == 0
+        return np.equal(inside, 0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,16 +1,18 @@
 """Identifies the flight model of the simulated AR.Drone from recorded pitch steps, judges it, and draws it.
 
     python scripts/identify_ardrone.py
-    python scripts/identify_ardrone.py --data tests/data/ardrone-flights --picture steps.png
+    python scripts/identify_ardrone.py --data ../shared/fixtures/ardrone-flights --picture steps.png
 
-The parameters are fitted to the recordings but one, and judged on that one, for each of them in turn. What the code
-has, ``AR_DRONE`` in ``skyloop.sim.vehicles``, is the fit that is judged on ``1sImpulseNH1``; it is compared with all
-recordings, and drawn. Figures are RMS over 3 s. Needs scipy and matplotlib (requirements-dev.txt).
+The recordings are no part of the project: docs/ardrone-model.md says where they come from. The parameters are fitted to
+the recordings but one, and judged on that one, for each of them in turn. What the code has, ``AR_DRONE`` in
+``skyloop.sim.vehicles``, is the fit that is judged on ``1sImpulseNH1``; it is compared with all recordings, and drawn.
+Figures are RMS over 3 s. Needs scipy and matplotlib (requirements-dev.txt).
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,7 +30,8 @@ from skyloop.sim.streams import Floats
 from skyloop.sim.vehicles import AR_DRONE
 
 ROOT = Path(__file__).parents[1]
-DATA = ROOT / "tests" / "data" / "ardrone-flights"
+DATA = Path(os.environ.get("SKYLOOP_FIXTURES") or ROOT.parent / "shared" / "fixtures") / "ardrone-flights"
+RUNS = ("0.5sImpulseNH5", "1sImpulseNH1", "8sStepHalfMagNH1")
 PICTURE = ROOT / "docs" / "pictures" / "ardrone-identification.png"
 JUDGED = "1sImpulseNH1"  # the run that the parameters in the code have not seen
 AGREES_PITCH_RAD = np.radians(2.0)
@@ -61,7 +64,10 @@ def main() -> None:
     usage.add_argument("--data", type=Path, default=DATA, help="folder of the recordings, one folder each")
     usage.add_argument("--picture", type=Path, default=PICTURE, help="where the picture goes")
     given = usage.parse_args()
-    folders = sorted(path for path in given.data.iterdir() if path.is_dir())
+    folders = [given.data / name for name in RUNS]
+    missing = [str(folder) for folder in folders if not folder.is_dir()]
+    if missing:
+        usage.error(f"no recording at {', '.join(missing)}: give the folder that holds them with --data")
     runs = [from_first_step(read_recording(folder)) for folder in folders]
     for left_out in runs:
         fitted = fit([run for run in runs if run is not left_out])

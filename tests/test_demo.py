@@ -119,6 +119,7 @@ def run(*options: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([*DEMO, *options], capture_output=True, text=True, timeout=60, check=False)
 
 
+@pytest.mark.daily
 @pytest.mark.process
 def test_headless_flight_is_good() -> None:
     done = run("--headless", "--seconds", "2.5", "--seed", "7")

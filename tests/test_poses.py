@@ -68,7 +68,7 @@ def test_what_is_not_known_is_said() -> None:
 def test_a_marker_that_is_carried_about_is_placed_in_the_world_from_a_flight() -> None:
     """With the simulator's noise in pictures, attitude and position, and the state at each picture's capture."""
     pytest.importorskip("cv2", reason="markers are found with OpenCV")
-    from skyloop.control.rehearsal import rehearse
+    from skyloop.stepping.rehearsal import rehearse
     from skyloop.vision import MarkerDetector
 
     detector, errors = MarkerDetector("4x4_50", 0.3), []

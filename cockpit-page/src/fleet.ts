@@ -4,6 +4,7 @@ import { Battery } from "./battery.js";
 import { count, figure, words } from "./format.js";
 import { h, setAttribute, setHidden, setText, setTone, type Tone } from "./dom.js";
 import type { DroneRow } from "./model.js";
+import { isRecording } from "./safety.js";
 
 const LINKS: Readonly<Record<string, Tone>> = { up: "ok", degraded: "warn", connecting: "busy", lost: "bad", closed: "bad" };
 
@@ -26,19 +27,21 @@ class Card {
   }
 
   update(row: DroneRow, open: boolean): void {
+    const recorded = isRecording(row);
     const lost = row.links.application === "lost";
-    setTone(this.element, lost ? "bad" : row.alarms.length ? "warn" : row.airborne ? "ok" : "quiet");
-    setText(this.state, lost ? "lost" : row.airborne && row.altitude !== null ? `${words(row.state)} · ${figure(row.altitude, 1)} m` : words(row.state));
+    const over = recorded && (lost || row.links.vehicle === "closed"); // as every recording is some time
+    setTone(this.element, over ? "quiet" : lost ? "bad" : row.alarms.length ? "warn" : row.airborne ? "ok" : "quiet");
+    setText(this.state, over ? "recording over" : lost ? "lost" : row.airborne && row.altitude !== null ? `${words(row.state)} · ${figure(row.altitude, 1)} m` : words(row.state));
     this.battery.show(lost ? null : row.battery);
-    setText(this.owner, row.owner === null ? "nobody has control" : `${row.owner} has control`);
+    setText(this.owner, recorded ? "recording, nothing flies" : row.owner === null ? "nobody has control" : `${row.owner} has control`);
     const [application, vehicle] = [row.links.application, row.links.vehicle];
-    setTone(this.hops[0] as Element, LINKS[application] ?? "quiet");
-    setTone(this.hops[1] as Element, LINKS[vehicle] ?? "quiet");
+    setTone(this.hops[0] as Element, over ? "quiet" : (LINKS[application] ?? "quiet"));
+    setTone(this.hops[1] as Element, over ? "quiet" : (LINKS[vehicle] ?? "quiet"));
     const told = `link to the proxy ${application}, to the vehicle ${vehicle}`;
     setAttribute(this.linked, "title", told);
     setHidden(this.recording, !row.recording);
-    setText(this.alarms, row.alarms.join(" · "));
-    setHidden(this.alarms, row.alarms.length === 0);
+    setText(this.alarms, over ? "" : row.alarms.join(" · "));
+    setHidden(this.alarms, over || row.alarms.length === 0);
     setAttribute(this.main, "aria-label", `Open ${row.name}: ${this.state.textContent}, ${this.owner.textContent}, ${told}`);
     setAttribute(this.element, "data-open", String(open));
     setAttribute(this.beside, "aria-pressed", String(open));

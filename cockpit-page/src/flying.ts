@@ -1,7 +1,7 @@
 // Keys, gamepad and thumbs fly the selected drone; nothing else of the page does.
 
 import { connected, GamepadReader } from "./gamepad.js";
-import { type Deed, Keys } from "./keys.js";
+import { type Deed, Keys, stopKeys } from "./keys.js";
 import type { Sticks } from "./model.js";
 import { type Pilot, STEER_MS } from "./pilot.js";
 import { CENTRED, isCentred, merge, PACES, type Pace, ramp, scale } from "./sticks.js";
@@ -14,6 +14,10 @@ export interface Cabin {
   selected(): Pilot | null;
   /** A deed by key or gamepad, for the selected drone. */
   act(deed: Deed): void;
+  /** The emergency stop is held by keys or gamepad: of the drone that is seen, or of all; null: it was let go. */
+  hold(which: "one" | "all" | null): void;
+  /** Escape: close what is open. Whether anything was. */
+  escape(): boolean;
   /** What the inputs look like now. */
   inputs(view: InputView): void;
 }
@@ -36,11 +40,12 @@ export class Flying {
   private ramped: Sticks = { ...CENTRED };
   private flown: Pilot | null = null;
   private held = false;
+  private stopping: "keys" | "pad" | null = null;
 
   constructor(private readonly cabin: Cabin) {
     // Seen before anything else on the page can keep a key to itself.
     window.addEventListener("keydown", (event) => this.down(event), { capture: true });
-    window.addEventListener("keyup", (event) => this.keys.up(event.code), { capture: true });
+    window.addEventListener("keyup", (event) => this.up(event), { capture: true });
     window.addEventListener("blur", () => this.rest());
     window.addEventListener("pagehide", () => this.rest());
     document.addEventListener("visibilitychange", () => document.hidden && this.rest());
@@ -58,8 +63,16 @@ export class Flying {
   }
 
   private down(event: KeyboardEvent): void {
+    const stops = stopKeys(event);
+    if (stops !== null) {
+      event.preventDefault(); // also in a text field: it writes nothing there
+      event.stopImmediatePropagation();
+      if (!event.repeat) this.stop("keys", stops);
+      return;
+    }
+    if (event.code === "Escape" && this.cabin.escape()) event.preventDefault();
     const modified = event.ctrlKey || event.altKey || event.metaKey;
-    const press = { code: event.code, repeat: event.repeat, modified, typing: this.typing(), at_ms: event.timeStamp };
+    const press = { code: event.code, repeat: event.repeat, modified, typing: this.typing() };
     const meant = this.keys.down(press);
     if (meant === null) return;
     if (meant === "stick") {
@@ -67,8 +80,19 @@ export class Flying {
       if (this.cabin.selected()?.mine) event.preventDefault();
       return;
     }
-    if (event.code !== "Escape") event.preventDefault();
+    event.preventDefault();
     this.cabin.act(meant);
+  }
+
+  private up(event: KeyboardEvent): void {
+    this.keys.up(event.code);
+    const lets = event.code === "Enter" || event.code === "NumpadEnter" || event.key === "Control" || event.key === "Shift";
+    if (lets && this.stopping === "keys") this.stop("keys", null);
+  }
+
+  private stop(by: "keys" | "pad", which: "one" | "all" | null): void {
+    this.stopping = which === null ? null : by;
+    this.cabin.hold(which);
   }
 
   private typing(): boolean {
@@ -79,13 +103,17 @@ export class Flying {
     const selected = this.cabin.selected();
     const reading = this.pad.read(connected());
     const focused = document.hasFocus() && !document.hidden;
-    const mine = selected?.mine ?? false;
+    // What is not heard is not flown, and goes on only after keys and sticks were let go.
+    const mine = (selected?.mine ?? false) && (selected?.isLive ?? false);
+    if (this.held && !mine) this.keys.clear();
     // Sticks that are pushed when control begins, or another drone is selected, must come back to the centre first.
     if (selected !== this.flown || mine !== this.held) this.pad.reset();
     if (reading.lost) this.rest();
     this.flown = selected;
     this.held = mine;
     if (focused) for (const deed of reading.deeds) this.cabin.act(deed);
+    if (focused && reading.stops && this.stopping === null) this.stop("pad", "one");
+    if (!reading.stops && this.stopping === "pad") this.stop("pad", null);
     const held = this.keys.sticks();
     this.ramped = ramp(this.ramped, held, STEER_MS / 1000);
     const sticks = focused ? merge(this.ramped, reading.sticks, this.thumbs) : { ...CENTRED };

@@ -19,6 +19,8 @@ export interface PadReading {
   deeds: Deed[];
   /** Its name; null without one. */
   name: string | null;
+  /** Both bumpers are pressed, which is to be held. */
+  stops: boolean;
   /** It was there a moment ago. */
   lost: boolean;
 }
@@ -47,7 +49,7 @@ export class GamepadReader {
     if (pad === null) {
       this.before = [];
       this.latch.reset();
-      return { sticks: { ...CENTRED }, deeds: [], name: null, lost };
+      return { sticks: { ...CENTRED }, deeds: [], name: null, stops: false, lost };
     }
     const pressed = this.pressed(pad);
     const deeds = pressed.filter((deed) => !this.before.includes(deed));
@@ -56,13 +58,16 @@ export class GamepadReader {
     // Axes of sticks: right and down are positive.
     const sticks = { yaw_rate: axis(0), up: axis(1), left: axis(2), forward: axis(3) };
     for (const name of Object.keys(sticks) as (keyof Sticks)[]) sticks[name] += 0; // no negative zero
-    return { sticks: this.latch.pass(sticks), deeds, name: pad.id, lost: false };
+    return { sticks: this.latch.pass(sticks), deeds, name: pad.id, stops: this.is(pad, LEFT_BUMPER) && this.is(pad, RIGHT_BUMPER), lost: false };
+  }
+
+  private is(pad: Pad, button: number): boolean {
+    return pad.buttons[button]?.pressed ?? false;
   }
 
   private pressed(pad: Pad): Deed[] {
-    const is = (button: number): boolean => pad.buttons[button]?.pressed ?? false;
+    const is = (button: number): boolean => this.is(pad, button);
     const deeds: Deed[] = [];
-    if (is(LEFT_BUMPER) && is(RIGHT_BUMPER)) deeds.push("stop");
     if (is(START)) deeds.push("takeoff");
     if (is(A)) deeds.push("hover");
     if (is(B)) deeds.push("land");

@@ -71,9 +71,10 @@ export class Instruments {
   private links(state: State | null, connected: boolean, round_trip_s: number | null): void {
     const slow = round_trip_s !== null && round_trip_s > SLOW_S;
     this.page.show(connected ? (round_trip_s === null ? "up" : `${Math.max(1, Math.round(round_trip_s * 1000))} ms`) : "lost", connected ? (slow ? "warn" : "ok") : "bad");
-    const hop = (name: string | undefined): [string, Tone] => (connected && name ? [name, LINK_TONES[name] ?? "quiet"] : ["not known", "quiet"]);
+    const hop = (name: string | undefined): [string, Tone] => (connected && name ? [name, LINK_TONES[name] ?? "quiet"] : ["–", "quiet"]);
+    const over = state?.links.vehicle === "closed"; // a recording, which ends some time
     this.application.show(...hop(state?.links.application));
-    this.vehicle.show(...hop(state?.links.vehicle));
+    this.vehicle.show(...(over && connected ? (["over", "quiet"] as [string, Tone]) : hop(state?.links.vehicle)));
     setText(this.reason, connected ? (state?.links.reason ?? "") : "");
     setHidden(this.reason, !this.reason.textContent);
   }
@@ -89,11 +90,17 @@ export function commandText(state: State | null): string {
   return `Applied: ${words(applied.action)}${shown ? ` · ${shown}` : ""}${age_s > 1 ? ` · ${duration(age_s)} ago` : ""}`;
 }
 
+/** Who has control, in words, when the newest news is too old to be sure. */
+export function oldHolderText(mine: boolean): { who: string; more: string; tone: Tone } {
+  return { who: "Not known", more: mine ? "you had control" : "who has control", tone: "quiet" };
+}
+
 /** Who has control, in words; `authority` is what this page's own line says, where there is one. */
 export function holderText(state: State | null, authority: Authority | null): { who: string; more: string; tone: Tone } {
   if (authority?.mine) return { who: "You", more: `have control, priority ${authority.priority ?? "–"}`, tone: "busy" };
   const { holder = null, priority = null } = authority?.holder ? authority : (state?.authority ?? {});
-  if (!holder) return { who: "Nobody", more: "has control", tone: "quiet" };
+  const down = state?.links.application === "lost";
+  if (!holder) return { who: "Nobody", more: down ? "has control: the link is down" : "has control", tone: "quiet" };
   const waits = authority?.state === "queued" || authority?.state === "preempted" ? ", you are in line" : "";
   return { who: holder, more: `has control, priority ${priority ?? "–"}${waits}`, tone: "ok" };
 }

@@ -3,7 +3,7 @@
 import type { Sticks } from "./model.js";
 import { CENTRED } from "./sticks.js";
 
-export type Deed = "takeoff" | "hover" | "land" | "stop" | "take" | "release" | "question" | "help";
+export type Deed = "takeoff" | "hover" | "land" | "take" | "release" | "question" | "help";
 
 type Axis = keyof Sticks;
 
@@ -28,11 +28,9 @@ const DEEDS: Readonly<Record<string, Deed>> = {
   Slash: "help",
 };
 
-/** Two presses of Escape within this time cut the motors [ms]. The first one hovers. */
-export const TWICE_MS = 1000;
-
 export const KEY_MAP: readonly { keys: string[]; does: string }[] = [
-  { keys: ["Esc", "Esc"], does: "Motors off, at once. The first Esc hovers." },
+  { keys: ["Ctrl", "Enter"], does: "Hold: motors off, of the drone that is named above" },
+  { keys: ["Ctrl", "Shift", "Enter"], does: "Hold: motors off, of all drones" },
   { keys: ["C"], does: "Take control" },
   { keys: ["R"], does: "Release, or stop waiting for control" },
   { keys: ["Q"], does: "To the question of who asks for control" },
@@ -43,11 +41,11 @@ export const KEY_MAP: readonly { keys: string[]; does: string }[] = [
   { keys: ["A", "D"], does: "Left, right" },
   { keys: ["↑", "↓"], does: "Up, down" },
   { keys: ["←", "→"], does: "Turn left, right" },
-  { keys: ["?"], does: "This list" },
+  { keys: ["?"], does: "This list; Esc closes it" },
 ];
 
 export const GAMEPAD_MAP: readonly { keys: string[]; does: string }[] = [
-  { keys: ["LB", "RB"], does: "Both together: motors off" },
+  { keys: ["LB", "RB"], does: "Hold both: motors off" },
   { keys: ["Start"], does: "Take off" },
   { keys: ["A"], does: "Hover" },
   { keys: ["B"], does: "Land" },
@@ -62,22 +60,21 @@ export interface Press {
   modified: boolean;
   /** What has the focus takes letters and arrows itself: a text field, a list. */
   typing: boolean;
-  at_ms: number;
+}
+
+/** Ctrl and Enter, held: motors off, whatever has the focus. With Shift those of all drones; null: something else. */
+export function stopKeys(event: { code: string; ctrlKey: boolean; shiftKey: boolean; altKey: boolean; metaKey: boolean }): "one" | "all" | null {
+  if (!event.ctrlKey || event.altKey || event.metaKey) return null;
+  if (event.code !== "Enter" && event.code !== "NumpadEnter") return null;
+  return event.shiftKey ? "all" : "one";
 }
 
 /** Keys that are held, and what single presses mean. */
 export class Keys {
   private readonly held = new Set<string>();
-  private escaped_ms = Number.NEGATIVE_INFINITY;
 
   /** What a press means: a deed, "stick" for one that flies, or null. */
   down(press: Press): Deed | "stick" | null {
-    if (press.code === "Escape") {
-      if (press.repeat) return null;
-      const twice = press.at_ms - this.escaped_ms <= TWICE_MS;
-      this.escaped_ms = press.at_ms;
-      return twice ? "stop" : "hover";
-    }
     if (press.modified || press.typing) return null;
     if (press.code in STICKS) {
       this.held.add(press.code);

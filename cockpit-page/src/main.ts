@@ -5,19 +5,24 @@ import "./style/base.css";
 import "./style/layout.css";
 import "./style/parts.css";
 import { post } from "./api.js";
-import { h, setAttribute, setDisabled, setHidden, setText } from "./dom.js";
+import { ServerClock } from "./clock.js";
+import { h, setAttribute, setHidden, setText } from "./dom.js";
 import { Flying, type InputView } from "./flying.js";
 import { FleetList } from "./fleet.js";
 import { Help } from "./help.js";
+import { Countdown } from "./hold.js";
 import type { Deed } from "./keys.js";
 import { session } from "./login.js";
 import type { DroneRow, Session, Sticks } from "./model.js";
 import { Pane } from "./pane.js";
 import { RecordingList } from "./recordings.js";
+import { Safety } from "./safety.js";
 import { LastingSocket } from "./socket.js";
 import { themeButton } from "./theme.js";
 
 const DRAW_MS = 45;
+/** The list of drones comes twice a second; when it is older than this it is grey [ms]. */
+const OLD_LIST_MS = 2000;
 
 class Page {
   private rows: DroneRow[] = [];
@@ -26,9 +31,15 @@ class Page {
   private readonly fleet = new FleetList((name, alone) => this.open(name, alone));
   private readonly main = h("main", { id: "panes", tabindex: -1, "aria-label": "Opened drones" });
   private readonly empty = h("p", { class: "empty nobody" }, "No drone is opened. Choose one of the list.");
-  private readonly lost = h("div", { class: "banner lost", role: "alert", "data-tone": "bad", hidden: true }, "This page lost the cockpit: what it shows is old. Trying again…");
-  private readonly stopName = h("span", { class: "stop-name" });
-  private readonly stop = h("button", { type: "button", class: "stop", "aria-keyshortcuts": "Escape Escape", onclick: () => this.selected?.act("stop") }, h("span", {}, "Motors off"), this.stopName, h("kbd", { "aria-hidden": "true" }, "Esc Esc"));
+  private readonly lostAge = h("span", { "aria-hidden": "true" });
+  private readonly lost = h("div", { class: "banner lost", role: "alert", "data-tone": "bad", hidden: true }, "This page does not hear the cockpit: what it shows is old. Trying again…", this.lostAge);
+  private readonly countdown = new Countdown();
+  private readonly safety: Safety | null;
+  private readonly clock = new ServerClock();
+  private listed_ms = performance.now();
+  /** How much of each pane is on the screen [pixels²]. */
+  private readonly seen = new Map<string, number>();
+  private readonly sight = new IntersectionObserver((entries) => this.look(entries), { threshold: [0, 0.05, 0.25, 0.5, 0.75, 1] });
   private readonly help: Help;
   private readonly flying: Flying;
 
@@ -37,23 +48,26 @@ class Page {
     private readonly who: Session,
   ) {
     this.help = new Help(() => this.flying);
+    this.safety = who.role === "pilot" ? new Safety((handlers) => new LastingSocket("/ws/control", handlers), new ServerClock(), this.countdown) : null;
     const theme = themeButton(() => this.repaint());
     const person = h("span", { class: "person", title: who.name || who.role || "" }, who.name ? `${who.name} · ${who.role}` : (who.role ?? ""));
     const leave = who.login ? h("button", { type: "button", class: "small", onclick: () => void post("/api/logout").finally(() => location.reload()) }, "Log out") : null;
     const brand = h("h1", { class: "brand" }, h("img", { src: "/static/icon.svg", alt: "", width: 24, height: 24 }), "Skyloop");
-    const bar = h("header", { class: "bar" }, brand, h("span", { class: "spring" }), person, leave, this.help.chip, theme, who.role === "pilot" ? this.stop : null);
+    const bar = h("header", { class: "bar" }, brand, h("span", { class: "spring" }), person, leave, this.help.chip, theme, this.safety?.element ?? null);
     const recordings = new RecordingList(() => [...this.panes.keys()], (name) => this.open(name, true), who.role === "pilot");
     this.main.append(this.empty);
-    root.replaceChildren(bar, this.lost, h("div", { class: "deckhouse" }, this.fleet.element, this.main, recordings.element), this.help.element);
+    root.replaceChildren(bar, this.lost, this.safety?.told ?? "", h("div", { class: "deckhouse" }, this.fleet.element, this.main, recordings.element), this.help.element, this.countdown.element);
     this.flying = new Flying({
       pilots: () => [...this.panes.values()].flatMap((pane) => pane.pilot ?? []),
       selected: () => this.selected?.pilot ?? null,
       act: (deed) => this.act(deed),
+      hold: (which) => this.safety?.hold(which),
+      escape: () => this.help.close(),
       inputs: (view) => this.inputs(view),
     });
     for (const name of decodeURIComponent(location.hash.slice(1)).split(",")) if (name) this.open(name, false);
     new LastingSocket("/ws/overview", {
-      message: (data) => this.see((JSON.parse(data as string) as { drones: DroneRow[] }).drones),
+      message: (data) => this.see(JSON.parse(data as string) as { now_s: number; drones: DroneRow[] }),
       state: (open, code) => this.linked(open, code),
     });
     // All of them at once, and no faster than the news comes: painting is what costs most.
@@ -62,6 +76,7 @@ class Page {
       requestAnimationFrame(draw);
       if (now_ms - drawn_ms < DRAW_MS) return;
       drawn_ms = now_ms;
+      this.age(now_ms);
       for (const pane of this.panes.values()) pane.tick(now_ms);
     };
     requestAnimationFrame(draw);
@@ -71,15 +86,27 @@ class Page {
     return (this.chosen !== null && this.panes.get(this.chosen)) || null;
   }
 
-  private see(rows: DroneRow[]): void {
+  private see({ now_s, drones: rows }: { now_s: number; drones: DroneRow[] }): void {
+    const now_ms = performance.now();
+    this.clock.told(now_ms, now_s);
+    this.listed_ms = now_ms - (this.clock.age_s(now_s, now_ms) ?? 0) * 1000;
     this.rows = rows;
+    this.safety?.know(rows);
     const only = rows[0];
     if (this.panes.size === 0 && rows.length === 1 && only) this.open(only.name, true);
     this.fleet.update(rows, new Set(this.panes.keys()));
   }
 
+  /** The list of drones is grey when it is old. */
+  private age(now_ms: number): void {
+    const old_ms = now_ms - this.listed_ms;
+    setHidden(this.lost, old_ms <= OLD_LIST_MS);
+    setAttribute(this.fleet.element, "data-old", String(old_ms > OLD_LIST_MS));
+    if (old_ms > OLD_LIST_MS) setText(this.lostAge, `${(old_ms / 1000).toFixed(0)} s`);
+  }
+
   private linked(open: boolean, code: number): void {
-    setHidden(this.lost, open);
+    if (open) this.clock.reset();
     if (code === 4401) location.reload(); // the session has ended: log in again
   }
 
@@ -89,8 +116,8 @@ class Page {
       this.close(name);
       return;
     }
-    if (alone) for (const other of [...this.panes.keys()]) if (other !== name) this.panes.get(other)?.close();
-    if (alone) for (const other of [...this.panes.keys()]) if (other !== name) this.panes.delete(other);
+    // What this page flies stays open: to look at something else is no reason to let go of it.
+    if (alone) for (const [other, pane] of [...this.panes]) if (other !== name && !pane.pilot?.mine) this.drop(other, pane);
     if (!this.panes.has(name)) {
       const pane = new Pane(name, this.who.role === "pilot", {
         rows: () => this.rows,
@@ -98,8 +125,11 @@ class Page {
         close: (one) => this.close(one),
         push: (one, sticks) => this.push(one, sticks),
         help: () => this.help.toggle(),
+        aimed: (one) => one === this.chosen && this.aim(),
+        countdown: this.countdown,
       });
       this.panes.set(name, pane);
+      this.sight.observe(pane.element);
       this.main.append(pane.element);
     }
     this.select(name);
@@ -107,10 +137,29 @@ class Page {
   }
 
   private close(name: string): void {
-    this.panes.get(name)?.close();
-    this.panes.delete(name);
+    const pane = this.panes.get(name);
+    if (pane) this.drop(name, pane);
     if (this.chosen === name) this.select([...this.panes.keys()][0] ?? null);
     this.arrange();
+  }
+
+  private drop(name: string, pane: Pane): void {
+    this.sight.unobserve(pane.element);
+    this.seen.delete(name);
+    pane.close();
+    this.panes.delete(name);
+  }
+
+  /** Keys and the emergency stop are for what is seen: one that is scrolled away is not chosen any more. */
+  private look(entries: readonly IntersectionObserverEntry[]): void {
+    for (const entry of entries) {
+      const name = (entry.target as HTMLElement).dataset["drone"] ?? "";
+      const { width, height } = entry.intersectionRect;
+      if (this.panes.has(name)) this.seen.set(name, entry.isIntersecting ? width * height : 0);
+    }
+    if (this.chosen === null || this.seen.get(this.chosen) !== 0) return;
+    const [most, area] = [...this.seen].reduce((best, one) => (one[1] > best[1] ? one : best), ["", 0]);
+    if (area > 0) this.select(most);
   }
 
   private arrange(): void {
@@ -124,8 +173,11 @@ class Page {
   private select(name: string | null): void {
     this.chosen = name;
     for (const pane of this.panes.values()) pane.selected(pane.name === name);
-    setText(this.stopName, this.panes.size > 1 && name !== null ? name : "");
-    setAttribute(this.stop, "aria-label", name === null ? "Emergency stop" : `Emergency stop: motors of ${name} off`);
+    this.aim();
+  }
+
+  private aim(): void {
+    this.safety?.aim(this.selected?.target ?? null);
   }
 
   private push(name: string, sticks: Sticks): void {
@@ -140,8 +192,7 @@ class Page {
 
   private inputs(view: InputView): void {
     const pilot = this.selected?.pilot ?? null;
-    this.help.update(view, pilot?.mine ?? false);
-    setDisabled(this.stop, !pilot?.connected);
+    this.help.update(view, (pilot?.mine ?? false) && (pilot?.isLive ?? false));
   }
 
   private repaint(): void {

@@ -1,6 +1,6 @@
 // The map from above: north is up. A click is a waypoint, where the position is known and this page has control.
 
-import { colour, fit, h, setDisabled, setText } from "./dom.js";
+import { colour, fit, h, setDisabled, setHidden, setText } from "./dom.js";
 import { figure } from "./format.js";
 import type { Vector } from "./model.js";
 import { around, gridStep, type Size, toMetres, toPixels, type View, zoomed } from "./view.js";
@@ -21,6 +21,7 @@ export class MapView {
   private readonly inputs = ["x", "y", "z"].map((name) => h("input", { type: "number", step: "0.1", "aria-label": `Waypoint ${name} in metres`, placeholder: name }));
   private readonly go = h("button", { type: "submit", class: "small" }, "Fly there");
   private readonly follow = h("button", { type: "button", class: "small", "aria-pressed": "true", onclick: () => this.refit() }, "Fit");
+  private readonly form: HTMLElement;
   private view: View | null = null;
   private fitted = true;
   private drag: { x: number; y: number; view: View; moved: boolean } | null = null;
@@ -33,7 +34,7 @@ export class MapView {
     private readonly goTo: (x: number, y: number, z: number) => void,
   ) {
     const zoom = (sign: string, factor: number): HTMLElement => h("button", { type: "button", class: "small", "aria-label": factor > 1 ? "Zoom in" : "Zoom out", onclick: () => this.zoom(factor) }, sign);
-    const form = h("form", { class: "waypoint", "aria-label": "Waypoint", onsubmit: (event: Event) => this.submit(event) }, ...this.inputs, this.go);
+    const form = (this.form = h("form", { class: "waypoint", "aria-label": "Waypoint", onsubmit: (event: Event) => this.submit(event) }, ...this.inputs, this.go));
     const buttons = h("div", { class: "map-buttons" }, zoom("+", 1.4), zoom("−", 1 / 1.4), this.follow);
     this.element = h("div", { class: "filling mapping" }, h("div", { class: "map-box" }, this.canvas, buttons), form, this.told);
     this.canvas.addEventListener("pointerdown", (event) => this.press(event));
@@ -48,6 +49,11 @@ export class MapView {
   repaint(): void {
     const names = ["well", "line", "muted", "text", "accent", "ok", "warn", "bad", "target"];
     this.ink = Object.fromEntries(names.map((name) => [name, colour(name)]));
+  }
+
+  /** Nothing can be flown to: it is a recording. */
+  watchOnly(only: boolean): void {
+    setHidden(this.form, only);
   }
 
   /** Whether a click is a waypoint now; `why` not. */

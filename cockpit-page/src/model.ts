@@ -34,6 +34,8 @@ export interface DroneRow {
   position: Vector | null;
   altitude: number | null;
   yaw: number | null;
+  /** Played by this cockpit. */
+  replay: boolean;
 }
 
 export interface Vehicle {
@@ -75,6 +77,8 @@ export interface Place {
 
 export interface State {
   type: "state";
+  /** When it was made, on the cockpit's clock. */
+  now_s: number;
   links: Links;
   feedback: { age_s: number | null; failsafe: string } | null;
   attitude: { roll: number | null; pitch: number | null; yaw: number | null } | null;
@@ -118,6 +122,8 @@ export interface Authority {
   holder: string | null;
   priority: number | null;
   mine: boolean;
+  /** How this page lost the control that it had; null if it did not. */
+  why: string | null;
   /** Where this page waits; null while it does not. */
   line: Line | null;
 }
@@ -150,8 +156,9 @@ export type Told =
   | Authority
   | { type: "asked"; questions: Question[] }
   | { type: "done"; do: string; name?: string; value?: Value }
-  | { type: "refused"; do: string; why: string }
-  | { type: "pong"; n: number };
+  | { type: "sent"; do: string; n: number }
+  | { type: "refused"; do: string; n: number; why: string }
+  | { type: "pong"; n: number; now_s: number };
 
 export interface Sticks {
   forward: number;
@@ -166,8 +173,7 @@ export type Order =
   | { do: "release" | "takeoff" | "hover" | "land" | "stop" | "reset" }
   | ({ do: "fly" } & Sticks)
   | { do: "goto"; x: number; y: number; z: number; yaw?: number }
-  | { do: "set"; name: string; value: Value }
-  | { do: "ping"; n: number };
+  | { do: "set"; name: string; value: Value };
 
 export interface Session {
   role: "pilot" | "observer" | null;

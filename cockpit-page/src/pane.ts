@@ -3,24 +3,28 @@
 import { post, told as problemOf } from "./api.js";
 import { Battery } from "./battery.js";
 import { Channels } from "./channels.js";
+import { ServerClock } from "./clock.js";
 import { Deck } from "./deck.js";
 import { h, setAttribute, setHidden, setText, setTone, type Tone } from "./dom.js";
 import { Events } from "./events.js";
 import { words } from "./format.js";
 import { History, Trail } from "./history.js";
+import type { Countdown } from "./hold.js";
 import { Instruments } from "./instruments.js";
 import type { Deed } from "./keys.js";
 import { MapView } from "./map.js";
 import type { DroneRow, State, Sticks, Vehicle } from "./model.js";
+import { STALE_MS } from "./orders.js";
 import { Parameters } from "./parameters.js";
 import { Pilot } from "./pilot.js";
 import { Plots } from "./plots.js";
+import { isRecording, type Target } from "./safety.js";
 import type { SceneView } from "./scene.js";
 import { LastingSocket } from "./socket.js";
 import { Strip } from "./strip.js";
 import { Thumbs } from "./thumbs.js";
 import { Stage } from "./video.js";
-import type { Body, Scene } from "./world.js";
+import { type Body, othersOf, type Scene } from "./world.js";
 
 export interface PaneHost {
   /** Of the last overview. */
@@ -29,6 +33,9 @@ export interface PaneHost {
   close(name: string): void;
   push(name: string, sticks: Sticks): void;
   help(): void;
+  /** What its emergency stop is, or what became of it, may have changed. */
+  aimed(name: string): void;
+  readonly countdown: Countdown;
 }
 
 const NOTICE_MS = 9000;
@@ -43,6 +50,11 @@ export class Pane {
   private connected = false;
   private absent = "";
   private news = false;
+  private readonly clock = new ServerClock();
+  /** When the newest that is known of the drone was true, and when the cockpit answered last, on this page's clock. */
+  private fresh_ms: number | null = null;
+  private answered_ms = performance.now();
+  private isOld = false;
   private readonly socket: LastingSocket;
   private readonly history = new History();
   private readonly trail = new Trail();
@@ -52,6 +64,9 @@ export class Pane {
   private readonly flight = h("span", {}, "no feedback yet");
   private readonly pill = h("p", { class: "pill", role: "status", "aria-label": "Flight state", "data-tone": "quiet" }, h("i", { class: "dot" }), this.flight);
   private readonly alarms = h("div", { class: "banner alarms", role: "alert", "data-tone": "bad" });
+  private readonly oldAge = h("b", { "aria-hidden": "true" });
+  private readonly oldWhat = h("span", {});
+  private readonly old = h("p", { class: "banner old", role: "alert", "data-tone": "warn", hidden: true }, h("span", {}, "Old"), this.oldAge, this.oldWhat);
   private readonly notice = h("p", { class: "banner notice", role: "alert", "data-tone": "warn" });
   private readonly stage: Stage;
   private readonly instruments = new Instruments();
@@ -74,7 +89,11 @@ export class Pane {
   ) {
     const base = `/ws/drones/${encodeURIComponent(name)}`;
     this.stage = new Stage(name);
-    this.strip = new Strip((deed) => this.act(deed), (id, grant, reason) => this.pilot?.answer(id, grant, reason));
+    this.strip = new Strip(name, (deed) => this.act(deed), (id, grant, reason) => this.pilot?.answer(id, grant, reason), {
+      countdown: host.countdown,
+      deadly: () => (this.target === null ? null : { what: `Motors of ${name} off`, act: () => this.target?.stop() }),
+      understood: () => this.pilot?.understood(),
+    });
     this.thumbs = new Thumbs((sticks) => host.push(name, sticks));
     this.map = new MapView(() => this.world(), (x, y, z) => this.pilot?.goTo(x, y, z));
     this.plots = new Plots(this.history, now_s);
@@ -89,7 +108,7 @@ export class Pane {
       message: (data) => this.hear(JSON.parse(data as string) as Vehicle | State),
       state: (open, code) => this.linked(open, code),
     });
-    this.pilot = pilots ? new Pilot((handlers) => new LastingSocket(`${base}/control`, handlers), this.listener()) : null;
+    this.pilot = pilots ? new Pilot((handlers) => new LastingSocket(`${base}/control`, handlers), this.clock, this.listener()) : null;
     this.update();
   }
 
@@ -106,6 +125,18 @@ export class Pane {
     return this.strip.question.isOpen;
   }
 
+  /** It is what was recorded: nothing flies. */
+  get isRecording(): boolean {
+    return this.vehicle !== null && isRecording(this.vehicle);
+  }
+
+  /** What an emergency stop here stops; null where nothing flies, or who looks may not. */
+  get target(): Target | null {
+    const { pilot } = this;
+    if (pilot === null || this.isRecording || this.vehicle?.can_fly === false) return null;
+    return { name: this.name, result: pilot.result("stop"), stop: () => pilot.act("stop") };
+  }
+
   selected(selected: boolean): void {
     setAttribute(this.element, "data-selected", String(selected));
   }
@@ -113,15 +144,16 @@ export class Pane {
   act(deed: Deed | "reset"): void {
     this.host.select(this.name);
     if (deed === "help") this.host.help();
+    else if (this.isRecording) this.say("a recording: nothing flies here", "quiet");
     else if (this.pilot === null) this.say("you may watch, not fly", "warn");
     else if (deed === "question") this.strip.question.focus();
     else if (deed === "take") this.pilot.take(this.strip.wanted, this.strip.asks);
     else if (deed === "release") this.pilot.release();
-    // Escape hovers what this page flies; pressed by who does not fly it does nothing yet.
-    else if (deed !== "hover" || this.pilot.mine) this.pilot.act(deed);
+    else this.pilot.act(deed);
   }
 
   tick(now_ms: number): void {
+    this.age(now_ms);
     if (this.news) this.update();
     this.strip.count(this.pilot);
     this.stage.update(now_ms);
@@ -142,17 +174,18 @@ export class Pane {
     const close = h("button", { type: "button", class: "bare close", "aria-label": `Close ${this.name}`, onclick: () => this.host.close(this.name) }, "×");
     const head = h("header", { class: "pane-head" }, h("h2", {}, this.name), this.kind, this.endReplay, this.pill, this.battery.element, close);
     const body = h("div", { class: "pane-body" }, this.stage.element, this.decks.space.element, this.instruments.element, this.decks.plots.element, this.decks.lists.element, this.channels.element);
-    const element = h("article", { class: "pane", "data-drone": this.name, "aria-label": `Drone ${this.name}`, tabindex: -1 }, head, this.alarms, this.notice, body, this.thumbs.element, this.strip.element);
+    const element = h("article", { class: "pane", "data-drone": this.name, "aria-label": `Drone ${this.name}`, tabindex: -1 }, head, this.old, this.alarms, this.notice, body, this.thumbs.element, this.strip.element);
     element.addEventListener("pointerdown", () => this.host.select(this.name), { capture: true });
     element.addEventListener("focusin", () => this.host.select(this.name));
     return element;
   }
 
-  private listener(): ConstructorParameters<typeof Pilot>[1] {
+  private listener(): ConstructorParameters<typeof Pilot>[2] {
     return {
       changed: () => this.update(),
       refused: (order, why) => {
         if (order === "set" && this.parameters.refused(why)) return;
+        if (order === "fly" && this.isOld) return; // the whole pane tells
         this.say(order ? `${words(order)}: ${why}` : why, "warn");
       },
       done: (order, name, value) => {
@@ -175,9 +208,12 @@ export class Pane {
       this.vehicle = told;
       this.stage.cameras(told.cameras);
       setHidden(this.endReplay, this.pilot === null || !told.uri.startsWith("replay:"));
+      setAttribute(this.element, "data-recording", String(this.isRecording));
+      this.map.watchOnly(this.isRecording);
     } else {
       this.state = told;
       this.absent = "";
+      this.dated(told);
       this.history.add(now_s(), told.values);
       const place = told.position ?? told.truth?.position;
       if (place) this.trail.add(now_s(), place);
@@ -186,28 +222,61 @@ export class Pane {
     this.news = true; // shown with the next tick
   }
 
+  /** From when the news is: it may have been long on its way, and old when it was sent. */
+  private dated(state: State): void {
+    const now_ms = performance.now();
+    this.clock.told(now_ms, state.now_s);
+    if (state.links.application === "lost") return;
+    const feedback_s = this.isRecording ? 0 : (state.feedback?.age_s ?? 0); // what was recorded is old anyhow
+    this.fresh_ms = now_ms - ((this.clock.age_s(state.now_s, now_ms) ?? 0) + feedback_s) * 1000;
+  }
+
+  /** Tell how old it is, if it is. */
+  private age(now_ms: number): void {
+    const answer_ms = this.pilot?.age_ms(now_ms) ?? null;
+    if (answer_ms !== null) this.answered_ms = now_ms - answer_ms;
+    const silent_ms = this.pilot === null ? 0 : now_ms - this.answered_ms;
+    const old_ms = this.fresh_ms === null ? 0 : now_ms - this.fresh_ms;
+    const age_ms = Math.max(silent_ms, old_ms);
+    const isOld = age_ms > STALE_MS;
+    if (isOld) {
+      setText(this.oldAge, `${(age_ms / 1000).toFixed(1)} s`);
+      setText(this.oldWhat, old_ms >= silent_ms ? `nothing new is known of ${this.name}: what is shown is not now` : "the cockpit does not answer: nothing that you press is sent");
+    }
+    if (isOld === this.isOld) return;
+    this.isOld = isOld;
+    setHidden(this.old, !isOld);
+    this.news = true;
+  }
+
   private update(): void {
     this.news = false;
-    const { state, vehicle, pilot } = this;
-    // What came before the link broke is no news.
+    const { state, vehicle, pilot, isOld, isRecording: recording } = this;
+    // What came before the link broke is not known any more; what is merely old is shown in grey.
     const live = this.connected && state?.links.application !== "lost" ? state : null;
+    const over = recording && (live === null || live.links.vehicle === "closed");
     setText(this.kind, vehicle ? vehicle.description || vehicle.vehicle : "");
-    setText(this.flight, live ? words(live.flight) : "not known");
-    setTone(this.pill, live ? (FLIGHT_TONES[live.flight] ?? "quiet") : "quiet");
+    const flight = live ? words(live.flight) : "not known";
+    setText(this.flight, over ? "recording over" : live && isOld ? `was ${flight}` : flight);
+    setTone(this.pill, live && !isOld && !over ? (FLIGHT_TONES[live.flight] ?? "quiet") : "quiet");
     this.battery.show(live?.battery ?? null);
-    this.instruments.update(live, this.connected, pilot?.round_trip_s ?? null);
+    this.instruments.update(live, this.connected && !isOld, pilot?.round_trip_s ?? null);
     if (live) this.channels.update(live);
     if (this.connected && state && !live) this.instruments.lost(state);
-    this.strip.update(vehicle, state, pilot);
-    const [mine, placed] = [pilot?.mine ?? false, (live?.position ?? null) !== null];
+    this.stage.over(over);
+    this.strip.update(vehicle, state, pilot, isOld, recording);
+    const [mine, placed] = [(pilot?.mine ?? false) && !isOld && !recording, (live?.position ?? null) !== null];
     const inAir = live?.airborne ?? false;
-    this.map.allow(mine && placed && inAir, !placed ? "Position not known." : !mine ? "Take control to fly to a place." : "It must be in the air to fly to a place.");
-    this.parameters.allow(mine, "Take control to change them.");
-    const told = !this.connected ? [this.absent || `no news of ${this.name} from the cockpit: what is shown is old`] : (state?.alarms ?? []);
+    const nowhere = recording ? "A recording: nothing flies here." : isOld ? "What is shown is old." : !placed ? "Position not known." : !mine ? "Take control to fly to a place." : "It must be in the air to fly to a place.";
+    this.map.allow(mine && placed && inAir, nowhere);
+    this.parameters.allow(mine, recording ? "As they were recorded." : "Take control to change them.");
+    const told = over ? [] : !this.connected ? [this.absent || `no news of ${this.name} from the cockpit: what is shown is old`] : (state?.alarms ?? []);
     setText(this.alarms, told.join(" · "));
     setHidden(this.alarms, told.length === 0);
-    setAttribute(this.element, "data-lost", String(!live));
+    setAttribute(this.element, "data-lost", String(!live || isOld));
+    setAttribute(this.element, "data-old", String(isOld || (!live && !over)));
     setAttribute(this.element, "data-mine", String(mine));
+    this.host.aimed(this.name);
   }
 
   private say(text: string, tone: Tone): void {
@@ -232,7 +301,7 @@ export class Pane {
     return {
       own: state?.position ? { ...body(this.name, state.position, yaw), roll: roll ?? 0, pitch: pitch ?? 0 } : null,
       truth: state?.truth ? { ...body("truth", state.truth.position, state.truth.yaw), roll: roll ?? 0, pitch: pitch ?? 0 } : null,
-      others: this.host.rows().flatMap((row) => (row.name !== this.name && row.position ? [body(row.name, row.position, row.yaw)] : [])),
+      others: othersOf({ name: this.name, recorded: this.isRecording }, this.host.rows()),
       targets: (state?.targets ?? []).map((target) => body(target.name, target.position, target.yaw)),
       waypoints: (state?.waypoints ?? []).map((one) => ({ position: one.position, own: one.app !== null })),
       trail: this.trail,

@@ -1,22 +1,18 @@
 // One drone's controls, as this page has them: orders go out, and what became of them comes back.
 //
-// While this page holds the authority it tells the cockpit several times a second that it is alive; sticks that are off
-// the centre are sent twenty times a second. Sticks that come back to the centre, a page that loses the focus and a
+// While this page holds the authority it tells the cockpit several times a second that it is there and hears; sticks that
+// are off the centre are sent twenty times a second. Sticks that come back to the centre, a page that loses the focus and a
 // gamepad that goes away make the vehicle hover; a connection that breaks makes the cockpit do that.
 
+import type { ServerClock } from "./clock.js";
 import type { Authority, Order, Question, Sticks, Told, Value } from "./model.js";
+import { type Line, OrderLine, type Result } from "./orders.js";
 import type { Handlers } from "./socket.js";
 import { isCentred } from "./sticks.js";
 
 export const STEER_MS = 50;
 const ALIVE_MS = 150;
-
-/** As much of a socket as is used. */
-export interface Line {
-  readonly isOpen: boolean;
-  send(message: object): boolean;
-  close(): void;
-}
+const WATCH_MS = 300; // so that what is older than a second is known to be
 
 export interface PilotListener {
   /** Who has control or asks for it, or the connection, has changed. */
@@ -25,34 +21,62 @@ export interface PilotListener {
   done(order: string, name?: string, value?: Value): void;
 }
 
-const NOBODY: Authority = { type: "authority", state: "none", holder: null, priority: null, mine: false, line: null };
+const NOBODY: Authority = { type: "authority", state: "none", holder: null, priority: null, mine: false, why: null, line: null };
 
 export class Pilot {
   authority: Authority = NOBODY;
   /** Who asks for the control that this page has; who would get it first is the first. */
   questions: readonly Question[] = [];
-  /** There and back to the cockpit [s]; null while not known. */
-  round_trip_s: number | null = null;
   connected = false;
   /** On the way to a place that was chosen on this page. */
   going = false;
+  /** How this page lost the control that it had; it stays until the person takes control or puts it away. */
+  ended = "";
   private steering = false;
-  private wanted = false;
-  private readonly line: Line;
+  private readonly orders: OrderLine;
   private told_ms = 0; // when the authority was told
   private questioned_ms = 0; // and the questions
-  private number = 0;
-  private asked_ms = Number.NEGATIVE_INFINITY;
-  private readonly pings = new Map<number, number>();
 
   constructor(
     connect: (handlers: Handlers) => Line,
+    clock: ServerClock,
     private readonly listener: PilotListener,
     private readonly now_ms: () => number = () => performance.now(),
   ) {
-    this.line = connect({ message: (data) => this.hear(data), state: (open) => this.linked(open) });
+    this.orders = new OrderLine(
+      connect,
+      clock,
+      { linked: (open) => this.linked(open), told: (message) => this.hear(message as Told), refused: (order, why) => this.refused(order, why), changed: () => listener.changed() },
+      now_ms,
+    );
   }
 
+  /** There and back to the cockpit [s]; null while not known. */
+  get round_trip_s(): number | null {
+    return this.orders.round_trip_s;
+  }
+
+  /** The cockpit has answered on this connection. */
+  get isReady(): boolean {
+    return this.connected && this.orders.age_ms() !== null;
+  }
+
+  /** What is sent now is known to arrive in time, as far as can be known. */
+  get isLive(): boolean {
+    return this.orders.isLive;
+  }
+
+  /** How old the cockpit's newest answer is [ms]; null while there was none. */
+  age_ms(now_ms: number): number | null {
+    return this.orders.age_ms(now_ms);
+  }
+
+  /** What became of the newest order of this kind. */
+  result(what: string): Result | null {
+    return this.orders.result(what);
+  }
+
+  /** As far as the cockpit said last. */
   get mine(): boolean {
     return this.connected && this.authority.mine;
   }
@@ -75,7 +99,6 @@ export class Pilot {
 
   /** `ask`: who has control is asked first. */
   take(priority: number, ask: boolean): void {
-    this.wanted = true;
     this.order({ do: "take", priority, ask });
   }
 
@@ -85,7 +108,6 @@ export class Pilot {
   }
 
   release(): void {
-    this.wanted = false;
     this.end();
     this.order({ do: "release" });
   }
@@ -105,83 +127,72 @@ export class Pilot {
     this.order({ do: "set", name, value });
   }
 
+  /** The person has read how control was lost. */
+  understood(): void {
+    this.ended = "";
+    this.listener.changed();
+  }
+
   /** Called every STEER_MS with the sticks as they are, as velocities. */
   steer(sticks: Sticks): void {
     if (this.mine && !isCentred(sticks)) {
       this.going = false;
-      this.steering = this.line.send({ do: "fly", ...sticks } satisfies Order);
+      this.steering = this.orders.steer({ do: "fly", ...sticks } satisfies Order);
     } else if (this.steering) {
       this.rest();
     }
-    const pause_ms = this.mine ? ALIVE_MS : 10 * ALIVE_MS;
-    if (this.now_ms() - this.asked_ms >= pause_ms) this.ping();
+    this.orders.tick(this.mine ? ALIVE_MS : WATCH_MS);
   }
 
   /** Hover if this page has it under way: when it loses the focus, or what it is flown with. */
   rest(): void {
     const moving = this.steering || this.going;
     this.end();
-    if (moving && this.mine) this.line.send({ do: "hover" } satisfies Order);
+    if (moving && this.mine) this.orders.steer({ do: "hover" } satisfies Order);
   }
 
   close(): void {
-    this.line.close();
+    this.orders.close();
   }
 
   private order(order: Order): boolean {
-    const sent = this.line.send(order);
-    if (!sent) this.listener.refused(order.do, "not sent: this page has no connection to the cockpit");
-    return sent;
+    return this.orders.order(order);
   }
 
   private end(): void {
     this.steering = this.going = false;
   }
 
-  private ping(): void {
-    this.asked_ms = this.now_ms();
-    this.number += 1;
-    if (this.pings.size >= 20) this.pings.clear(); // no answers: an old one says nothing any more
-    if (this.line.send({ do: "ping", n: this.number } satisfies Order)) this.pings.set(this.number, this.asked_ms);
-  }
-
   private linked(open: boolean): void {
-    const lost = !open && this.mine;
+    if (!open && this.mine) this.ended = "the connection to the cockpit broke while you had control: it hovers, and nobody has control";
     this.connected = open;
     this.end();
     this.authority = NOBODY;
     this.questions = [];
-    this.round_trip_s = null;
-    this.pings.clear();
-    if (lost) this.listener.refused("", "the connection to the cockpit broke: it makes the vehicle hover; take control again");
     this.listener.changed();
   }
 
-  private hear(data: string | ArrayBuffer): void {
-    if (typeof data !== "string") return;
-    const told = JSON.parse(data) as Told;
+  private refused(order: string, why: string): void {
+    if (order === "goto" || order === "fly") this.end();
+    this.listener.refused(order, why);
+  }
+
+  private hear(told: Told): void {
     if (told.type === "authority") {
-      const lost = this.authority.mine && !told.mine && this.wanted;
       this.authority = told;
       this.told_ms = this.now_ms();
+      if (told.mine) this.ended = "";
+      else if (told.why) this.ended = told.why;
       if (!told.mine) this.end();
       if (!told.mine) this.questions = [];
-      if (lost) this.listener.refused("", `${told.holder ?? "somebody else"} has control now`);
       this.listener.changed();
     } else if (told.type === "asked") {
       this.questions = told.questions;
       this.questioned_ms = this.now_ms();
       this.listener.changed();
-    } else if (told.type === "refused") {
-      if (told.do === "goto" || told.do === "fly") this.end();
-      this.listener.refused(told.do, told.why);
     } else if (told.type === "done") {
       if (told.do === "goto") this.going = false;
       this.listener.done(told.do, told.name, told.value);
-    } else {
-      const sent_ms = this.pings.get(told.n);
-      this.pings.delete(told.n);
-      if (sent_ms !== undefined) this.round_trip_s = (this.now_ms() - sent_ms) / 1000;
     }
   }
 }

@@ -2,17 +2,20 @@
 
 import { h, memory, setAttribute, setDisabled, setHidden, setText, setTone } from "./dom.js";
 import { lasting } from "./format.js";
-import { holderText } from "./instruments.js";
+import { type Countdown, type Deadly, holdButton } from "./hold.js";
+import { holderText, oldHolderText } from "./instruments.js";
 import type { Deed } from "./keys.js";
 import type { Authority, State, Vehicle } from "./model.js";
 import type { Pilot } from "./pilot.js";
 import { QuestionPanel } from "./question.js";
+import { showFate } from "./safety.js";
 
 const USUAL_PRIORITY = 8; // before the controllers' usual 16
 
-/** A button with its key beside it. */
+/** A button with its key beside it, and on it what became of its order. */
 function keyed(name: string, key: string, kind: string, act: () => void): HTMLButtonElement {
-  return h("button", { type: "button", class: kind, onclick: act, "aria-keyshortcuts": key }, h("span", {}, name), h("kbd", { "aria-hidden": "true" }, key));
+  const keys = key ? h("kbd", { "aria-hidden": "true" }, key) : null;
+  return h("button", { type: "button", class: kind, onclick: act, ...(key ? { "aria-keyshortcuts": key } : {}) }, h("span", {}, name), keys, h("span", { class: "fate", role: "status" }));
 }
 
 /** Where this page waits, in words; empty while it does not. */
@@ -43,8 +46,16 @@ export class Strip {
   private readonly reset: HTMLButtonElement;
   private readonly stop: HTMLButtonElement;
   private readonly why = h("p", { class: "note" });
+  private readonly endedText = h("span", {});
+  private readonly ended: HTMLElement;
+  private readonly orders: readonly [string, HTMLButtonElement][];
 
-  constructor(act: (deed: Deed | "reset") => void, answer: (id: number, grant: boolean, reason: string) => void) {
+  constructor(
+    drone: string,
+    act: (deed: Deed | "reset") => void,
+    answer: (id: number, grant: boolean, reason: string) => void,
+    stop: { countdown: Countdown; deadly: () => Deadly | null; understood: () => void },
+  ) {
     this.question = new QuestionPanel(answer);
     this.holder = h("div", { class: "holder", role: "status", "aria-live": "polite", "aria-label": "Who has control" }, this.who, this.more);
     this.priority.value = memory.get("priority") ?? String(USUAL_PRIORITY);
@@ -55,9 +66,11 @@ export class Strip {
     this.takeOff = keyed("Take off", "T", "", () => act("takeoff"));
     this.hover = keyed("Hover", "H", "", () => act("hover"));
     this.land = keyed("Land", "L", "", () => act("land"));
-    this.reset = h("button", { type: "button", onclick: () => act("reset") }, "Reset emergency");
-    this.stop = h("button", { type: "button", class: "stop", onclick: () => act("stop"), "aria-keyshortcuts": "Escape Escape" }, h("span", {}, "Motors off"), h("kbd", { "aria-hidden": "true" }, "Esc Esc"));
-    this.element = h("div", { class: "strip", role: "group", "aria-label": "Flying" }, this.question.voice, this.question.element, this.waiting, this.holder, h("span", { class: "taking" }, this.priority, this.ask, this.take, this.release), h("span", { class: "deeds" }, this.takeOff, this.hover, this.land, this.reset), this.why, this.stop);
+    this.reset = keyed("Reset emergency", "", "", () => act("reset"));
+    this.stop = holdButton(stop.countdown, stop.deadly, { class: "stop", "aria-label": `Motors off, ${drone}: press and hold`, title: "Press and hold" }, h("span", {}, "Motors off"), h("span", { class: "stop-name" }, drone), h("span", { class: "fate" }));
+    this.ended = h("p", { class: "ended", role: "alert", "data-tone": "bad", hidden: true }, this.endedText, h("button", { type: "button", class: "small", onclick: stop.understood }, "Understood"));
+    this.orders = [["take", this.take], ["release", this.release], ["takeoff", this.takeOff], ["hover", this.hover], ["land", this.land], ["reset", this.reset], ["stop", this.stop]];
+    this.element = h("div", { class: "strip", role: "group", "aria-label": "Flying" }, this.question.voice, this.question.element, this.ended, this.waiting, this.holder, h("span", { class: "taking" }, this.priority, this.ask, this.take, this.release), h("span", { class: "deeds" }, this.takeOff, this.hover, this.land, this.reset), this.why, this.stop);
   }
 
   /** What was chosen, within its range. */
@@ -71,14 +84,15 @@ export class Strip {
     return this.ask.getAttribute("aria-pressed") === "true";
   }
 
-  /** `pilot` is null for who may only look. */
-  update(vehicle: Vehicle | null, state: State | null, pilot: Pilot | null): void {
-    const { who, more, tone } = holderText(state, pilot?.authority ?? null);
+  /** `pilot` is null for who may only look; `old`: what was heard last is no news. A recording has no flight controls. */
+  update(vehicle: Vehicle | null, state: State | null, pilot: Pilot | null, old: boolean, recording: boolean): void {
+    setHidden(this.element, recording);
+    const { who, more, tone } = old ? oldHolderText(pilot?.mine ?? false) : holderText(state, pilot?.authority ?? null);
     setTone(this.holder, tone);
     setText(this.who, who);
     setText(this.more, more);
     const flies = vehicle?.can_fly ?? true;
-    const [can, mine] = [flies && (pilot?.connected ?? false), pilot?.mine ?? false];
+    const [can, mine] = [flies && (pilot?.isReady ?? false), pilot?.mine ?? false];
     const emergency = state?.flight === "emergency";
     setHidden(this.take, mine || pilot === null || !flies);
     for (const choice of [this.priority, this.ask]) setHidden(choice, mine || pilot === null || !flies);
@@ -96,10 +110,12 @@ export class Strip {
     setHidden(this.reset, !emergency || pilot === null);
     setDisabled(this.reset, !mine);
     setHidden(this.stop, pilot === null || !flies);
-    setDisabled(this.stop, !can);
     setText(this.why, vehicle && !flies ? `It can't fly: ${vehicle.why_not}` : pilot === null ? "You may watch, not fly." : "");
     setHidden(this.why, !this.why.textContent);
-    setAttribute(this.element, "data-mine", String(mine));
+    setAttribute(this.element, "data-mine", String(mine && !old));
+    setText(this.endedText, pilot?.ended ? `You lost control. ${pilot.ended[0]?.toUpperCase()}${pilot.ended.slice(1)}.` : "");
+    setHidden(this.ended, !this.endedText.textContent);
+    for (const [what, button] of this.orders) showFate(button, button.lastElementChild as HTMLElement, pilot?.result(what) ?? null);
   }
 
   /** What runs out, as of now. */

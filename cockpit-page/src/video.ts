@@ -21,6 +21,8 @@ interface Shown extends FrameHead {
 export class VideoView {
   readonly element: HTMLElement;
   overlay = true;
+  /** It was recorded, and the recording is over. */
+  over = false;
   private readonly canvas: HTMLCanvasElement;
   private readonly sheet = h("canvas", { class: "overlay", "aria-hidden": "true" });
   private readonly age = h("span");
@@ -61,9 +63,9 @@ export class VideoView {
     const age_s = this.age_s(now_ms);
     while (this.arrivals[0] !== undefined && this.arrivals[0] < now_ms - RATE_MS) this.arrivals.shift();
     if (age_s === null || this.shown === null) return;
-    const stale = age_s > STALE_S;
-    setTone(this.ageChip, stale ? "bad" : age_s > LATE_S ? "warn" : "ok");
-    setText(this.age, stale ? `${duration(age_s)} old` : `${(age_s * 1000).toFixed(0)} ms`);
+    const stale = age_s > STALE_S && !this.over;
+    setTone(this.ageChip, this.over ? "quiet" : stale ? "bad" : age_s > LATE_S ? "warn" : "ok");
+    setText(this.age, this.over ? "last picture" : stale ? `${duration(age_s)} old` : `${(age_s * 1000).toFixed(0)} ms`);
     setAttribute(this.element, "data-age-ms", (age_s * 1000).toFixed(0));
     setAttribute(this.element, "data-seq", String(this.shown.seq));
     setAttribute(this.element, "data-stale", String(stale));
@@ -157,6 +159,11 @@ export class Stage {
 
   close(): void {
     for (const view of this.views.values()) view.close();
+  }
+
+  /** A recording is over, or goes on again: that there are no new pictures is no fault. */
+  over(over: boolean): void {
+    for (const view of this.views.values()) view.over = over;
   }
 
   private choose(camera: Camera): void {

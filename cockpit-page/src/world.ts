@@ -1,7 +1,8 @@
 // What map and 3-D view show: where everything is. World axes: x east, y north, z up [m].
 
 import type { Trail } from "./history.js";
-import type { Vector } from "./model.js";
+import type { DroneRow, Vector } from "./model.js";
+import { isRecording } from "./safety.js";
 
 export interface Body {
   name: string;
@@ -21,3 +22,9 @@ export interface Scene {
   waypoints: { position: Vector; own: boolean }[];
   trail: Trail;
 }
+
+/** What else flies, for the map of one of them: what was recorded is no part of what flies now, nor the other way round. */
+export const othersOf = (own: { name: string; recorded: boolean }, rows: readonly DroneRow[]): Body[] =>
+  rows.flatMap(({ name, uri, position, yaw }) =>
+    name === own.name || own.recorded || isRecording({ uri }) || position === null ? [] : [{ name, position, roll: 0, pitch: 0, yaw }],
+  );

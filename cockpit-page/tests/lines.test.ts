@@ -6,6 +6,7 @@ import type { Authority, FrameHead, Question } from "../src/model.js";
 import { NewestFrame, unpack } from "../src/newest.js";
 import { Pilot } from "../src/pilot.js";
 import { FIRST_PAUSE_MS, type Handlers, LastingSocket, LONGEST_PAUSE_MS, type Wire } from "../src/socket.js";
+import { ServerClock } from "../src/clock.js";
 import { CENTRED } from "../src/sticks.js";
 
 const head = (ack: number): FrameHead => ({ ack, camera: "front", seq: ack, captured_ns: "1", age_s: 0, width: 4, height: 3 });
@@ -136,38 +137,59 @@ test("nothing is sent or kept while it is not open; closed is closed", () => {
   assert.deepEqual(heard, []);
 });
 
-function flown(): { pilot: Pilot; sent: Record<string, unknown>[]; told: string[]; hear: (message: object) => void; link: (open: boolean) => void; at: (ms: number) => void } {
-  const [sent, told]: [Record<string, unknown>[], string[]] = [[], []];
+type Sent = Record<string, unknown>;
+interface Flown {
+  pilot: Pilot;
+  sent: Sent[];
+  told: string[];
+  hear: (message: object) => void;
+  link: (open: boolean) => void;
+  at: (ms: number) => void;
+  /** The cockpit answers the newest ping, at once. */
+  pong: () => void;
+  /** The line is open and known to be alive. */
+  live: () => void;
+}
+
+/** A page's pilot, and a cockpit whose clock is 1000 s ahead. */
+function flown(): Flown {
+  const [sent, told]: [Sent[], string[]] = [[], []];
   let [now_ms, open] = [0, false];
   let handlers: Handlers | null = null;
   const pilot = new Pilot(
     (given) => {
       handlers = given;
-      return { get isOpen() { return open; }, send: (message) => open && sent.push(message as Record<string, unknown>) > 0, close: () => undefined };
+      return { get isOpen() { return open; }, send: (message) => open && sent.push(message as Sent) > 0, close: () => undefined };
     },
+    new ServerClock(),
     { changed: () => undefined, refused: (order, why) => told.push(`${order}: ${why}`), done: (order) => told.push(`done ${order}`) },
     () => now_ms,
   );
+  const hear = (message: object): void => handlers?.message(JSON.stringify(message));
+  const pong = (): void => hear({ type: "pong", n: sent.findLast((message) => message["do"] === "ping")?.["n"], now_s: 1000 + now_ms / 1000 });
+  const link = (up: boolean): void => {
+    open = up;
+    handlers?.state?.(up, 0, "");
+  };
   return {
-    pilot, sent, told,
-    hear: (message) => handlers?.message(JSON.stringify(message)),
-    link: (up) => {
-      open = up;
-      handlers?.state?.(up, 0, "");
-    },
+    pilot, sent, told, hear, link, pong,
     at: (ms) => {
       now_ms = ms;
+    },
+    live: () => {
+      link(true);
+      pong();
     },
   };
 }
 
-const held = (mine: boolean, holder: string | null = mine ? "cockpit 1" : null): Authority => ({ type: "authority", state: mine ? "held" : "none", holder, priority: 8, mine, line: null });
+const held = (mine: boolean, holder: string | null = mine ? "cockpit 1" : null): Authority => ({ type: "authority", state: mine ? "held" : "none", holder, priority: 8, mine, why: null, line: null });
 const doings = (sent: Record<string, unknown>[]): unknown[] => sent.map((message) => message["do"]).filter((one) => one !== "ping");
 const FORWARD = { ...CENTRED, forward: 0.5 };
 
 test("sticks fly only with the authority, and hover once when they are let go", () => {
-  const { pilot, sent, hear, link } = flown();
-  link(true);
+  const { pilot, sent, hear, live } = flown();
+  live();
   pilot.steer(FORWARD);
   assert.deepEqual(doings(sent), []);
   hear(held(true));
@@ -179,8 +201,8 @@ test("sticks fly only with the authority, and hover once when they are let go", 
 });
 
 test("a page that loses the focus hovers what it has under way, and nothing else", () => {
-  const { pilot, sent, hear, link } = flown();
-  link(true);
+  const { pilot, sent, hear, live } = flown();
+  live();
   hear(held(true));
   pilot.rest();
   assert.deepEqual(doings(sent), []);
@@ -195,9 +217,9 @@ test("a page that loses the focus hovers what it has under way, and nothing else
   assert.deepEqual(doings(sent).slice(4), ["goto"], "there already");
 });
 
-test("while it holds control it tells that it is there, and measures how long that takes", () => {
-  const { pilot, sent, hear, link, at } = flown();
-  link(true);
+test("while it holds control it tells that it is there and what it hears, and measures how long that takes", () => {
+  const { pilot, sent, hear, live, at } = flown();
+  live();
   hear(held(true));
   for (let ms = 0; ms <= 1000; ms += 50) {
     at(ms);
@@ -206,33 +228,114 @@ test("while it holds control it tells that it is there, and measures how long th
   const pings = sent.filter((message) => message["do"] === "ping");
   assert.ok(pings.length >= 6, `${pings.length} pings in a second: the cockpit waits 0.5 s`);
   at(1004);
-  hear({ type: "pong", n: pings.at(-1)?.["n"] });
+  hear({ type: "pong", n: pings.at(-1)?.["n"], now_s: 1001 });
   assert.ok(pilot.round_trip_s !== null && pilot.round_trip_s <= 0.154 && pilot.round_trip_s >= 0.004);
+  at(1200);
+  pilot.steer(CENTRED);
+  assert.equal(sent.at(-1)?.["seen_s"], 1001, "when the newest pong that it heard was sent");
+  assert.ok(Math.abs((sent.at(-1)?.["at_s"] as number) - 1001.2) < 0.1);
 });
 
-test("an emergency stop needs no control; without a connection it is told that it was not sent", () => {
-  const { pilot, sent, told, link } = flown();
+test("each order carries when it was asked for, on the cockpit's clock, and is pending until the cockpit has it", () => {
+  const { pilot, sent, hear, live, at } = flown();
+  live();
+  at(300);
+  hear(held(true));
+  pilot.act("takeoff");
+  const order = sent.at(-1) as Sent;
+  assert.equal(order["do"], "takeoff");
+  assert.ok(Math.abs((order["at_s"] as number) - 1000.3) < 0.01);
+  assert.ok((order["unsure_s"] as number) < 0.02);
+  assert.equal(pilot.result("takeoff")?.fate, "pending");
+  hear({ type: "sent", do: "takeoff", n: (order["n"] as number) - 1 });
+  assert.equal(pilot.result("takeoff")?.fate, "pending", "that was another one");
+  hear({ type: "sent", do: "takeoff", n: order["n"] });
+  assert.equal(pilot.result("takeoff")?.fate, "sent");
+  hear({ type: "refused", do: "takeoff", n: 0, why: "battery low" });
+  assert.deepEqual(pilot.result("takeoff"), { ...pilot.result("takeoff"), fate: "refused", why: "battery low" });
+});
+
+test("a page that has no answer for a second sends nothing, and says so on the control", () => {
+  const { pilot, sent, told, hear, live, at } = flown();
+  live();
+  hear(held(true));
+  at(1500);
+  const before = sent.length;
+  pilot.act("takeoff");
+  pilot.steer(FORWARD);
+  assert.deepEqual(doings(sent.slice(before)), []);
+  assert.equal(pilot.result("takeoff")?.fate, "not sent");
+  assert.match(told.at(-1) ?? "", /no answer from the cockpit for 1\.5 s/);
+});
+
+test("what left and was never answered is told as that, not as sent", () => {
+  const { pilot, hear, live, at } = flown();
+  live();
+  hear(held(true));
+  pilot.act("land");
+  for (let ms = 0; ms <= 2000; ms += 50) {
+    at(ms);
+    pilot.steer(CENTRED);
+  }
+  assert.equal(pilot.result("land")?.fate, "no answer");
+});
+
+test("an emergency stop needs no control, stays pending for two seconds, and goes when the link is back by then", () => {
+  const { pilot, sent, live, at, hear } = flown();
   pilot.act("stop");
-  assert.match(told[0] ?? "", /stop: not sent/);
-  link(true);
+  assert.equal(pilot.result("stop")?.fate, "pending");
+  at(1500);
+  live();
+  const order = sent.at(-1) as Sent;
+  assert.equal(order["do"], "stop");
+  assert.ok(Math.abs((order["at_s"] as number) - 1000) < 0.01, "it says when it was pressed, not when it was sent");
+  hear({ type: "sent", do: "stop", n: order["n"] });
+  assert.equal(pilot.result("stop")?.fate, "sent");
+});
+
+test("an emergency stop that did not go within two seconds never goes, and is told as not sent", () => {
+  const { pilot, sent, told, live, at } = flown();
   pilot.act("stop");
-  assert.deepEqual(doings(sent), ["stop"]);
+  at(2100);
+  pilot.steer(CENTRED);
+  assert.equal(pilot.result("stop")?.fate, "not sent");
+  assert.match(told.at(-1) ?? "", /stop: not sent/);
+  live();
+  pilot.steer(CENTRED);
+  assert.deepEqual(doings(sent), []);
+});
+
+test("how control was lost stays to be read until control is taken again or it was understood", () => {
+  const { pilot, hear, live, link } = flown();
+  live();
+  hear(held(true));
+  hear({ ...held(false), why: "the link to the proxy of alpha is down: nobody has control" });
+  assert.match(pilot.ended, /nobody has control/);
+  hear(held(false));
+  assert.match(pilot.ended, /nobody has control/, "still to be read");
+  pilot.understood();
+  assert.equal(pilot.ended, "");
+  hear(held(true));
+  link(false);
+  assert.match(pilot.ended, /connection to the cockpit broke/);
+  live();
+  hear(held(true));
+  assert.equal(pilot.ended, "");
 });
 
 test("who loses control is told to whom; after a broken connection nothing is flown on", () => {
-  const { pilot, sent, told, hear, link } = flown();
-  link(true);
+  const { pilot, sent, hear, link, live } = flown();
+  live();
   pilot.take(8, false);
   hear(held(true));
   pilot.steer(FORWARD);
-  hear(held(false, "follow.py"));
-  assert.match(told.at(-1) ?? "", /follow\.py has control/);
+  hear({ ...held(false, "follow.py"), why: "follow.py has control now" });
+  assert.match(pilot.ended, /follow\.py has control/);
   pilot.steer(FORWARD);
   hear(held(true));
   pilot.steer(FORWARD);
   link(false);
   assert.equal(pilot.mine, false);
-  assert.match(told.at(-1) ?? "", /connection to the cockpit broke/);
   link(true);
   pilot.steer(FORWARD);
   assert.deepEqual(doings(sent), ["take", "fly", "fly"]);
@@ -241,19 +344,24 @@ test("who loses control is told to whom; after a broken connection nothing is fl
 const asks = (id: number, more: Partial<Question> = {}): Question => ({ id, by: `app ${id}`, priority: 4, for_s: null, left_s: 10, declined: false, ...more });
 
 test("who has control is asked for it, and answers; the time runs out here too", () => {
-  const { pilot, sent, hear, link, at } = flown();
-  link(true);
+  const { pilot, sent, hear, link, live, at, pong } = flown();
+  live();
   hear(held(true));
   at(1000);
+  pilot.steer(CENTRED);
+  pong();
   hear({ type: "asked", questions: [asks(3)] });
   assert.equal(pilot.questions.length, 1);
   at(5000);
   assert.equal(pilot.left_s(pilot.questions[0] as Question), 6);
   at(12_000);
   assert.equal(pilot.left_s(pilot.questions[0] as Question), 0);
+  pilot.steer(CENTRED);
+  pong();
   pilot.answer(3, false, "landing");
   pilot.answer(3, true, "");
-  assert.deepEqual(sent.filter((message) => message["do"] === "answer"), [
+  const orders = (what: string): Sent[] => sent.filter((message) => message["do"] === what).map(({ n: _, at_s: __, unsure_s: ___, ...order }) => order);
+  assert.deepEqual(orders("answer"), [
     { do: "answer", id: 3, grant: false, reason: "landing" },
     { do: "answer", id: 3, grant: true, reason: "" },
   ]);
@@ -266,10 +374,10 @@ test("who has control is asked for it, and answers; the time runs out here too",
 });
 
 test("who asks first waits, and sees for how long", () => {
-  const { pilot, sent, told, hear, link, at } = flown();
-  link(true);
+  const { pilot, sent, hear, live, at, pong } = flown();
+  live();
   pilot.take(8, true);
-  assert.deepEqual(sent.filter((message) => message["do"] === "take"), [{ do: "take", priority: 8, ask: true }]);
+  assert.deepEqual([sent.at(-1)?.["do"], sent.at(-1)?.["priority"], sent.at(-1)?.["ask"]], ["take", 8, true]);
   assert.equal(pilot.wait_s, null);
   hear({ ...held(false, "follow.py"), state: "queued", line: { position: 1, wait_s: 9, asked: true, declined: null } });
   at(4000);
@@ -277,8 +385,10 @@ test("who asks first waits, and sees for how long", () => {
   assert.equal(pilot.wait_s, 5);
   hear({ ...held(false, "follow.py"), state: "queued", line: { position: 1, wait_s: null, asked: true, declined: "" } });
   assert.equal(pilot.wait_s, null, "not known");
+  pilot.steer(CENTRED);
+  pong();
   pilot.release();
   hear(held(false, "follow.py"));
   assert.equal(pilot.wait_s, null);
-  assert.deepEqual(told, [], "control that was never had is not lost");
+  assert.equal(pilot.ended, "", "control that was never had is not lost");
 });

@@ -3,17 +3,21 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 import { passes } from "../src/events.js";
+import { ServerClock } from "../src/clock.js";
 import { bytes, clock, duration, figure, heading, headingText, lasting, plain, short } from "../src/format.js";
 import { GamepadReader, type Pad } from "../src/gamepad.js";
 import { History, Trail } from "../src/history.js";
-import { type Press, Keys, TWICE_MS } from "../src/keys.js";
-import type { Authority, Line, Question, Sticks } from "../src/model.js";
+import { Hold, HOLD_MS } from "../src/hold.js";
+import { type Press, Keys, stopKeys } from "../src/keys.js";
+import type { Authority, DroneRow, Line, Question, Sticks } from "../src/model.js";
 import { grouped } from "../src/plots.js";
 import { explained, pending, wins } from "../src/question.js";
 import { lacking } from "../src/recordings.js";
+import { isRecording, outcome } from "../src/safety.js";
 import { CENTRED, DEAD_BAND, deadBand, isCentred, Latch, merge, PACES, type Pace, ramp, RAMP_S, scale } from "../src/sticks.js";
 import { lineText } from "../src/strip.js";
 import { parse, rangeText } from "../src/values.js";
+import { othersOf } from "../src/world.js";
 import { around, gridStep, toMetres, toPixels, zoomed } from "../src/view.js";
 
 const near = (value: number, wanted: number): void => assert.ok(Math.abs(value - wanted) < 1e-9, `${value} is not ${wanted}`);
@@ -51,7 +55,7 @@ test("a stick that is pushed already must come back first", () => {
   assert.ok(isCentred(latch.pass(push({ up: 1 }))));
 });
 
-const press = (code: string, more: Partial<Press> = {}): Press => ({ code, repeat: false, modified: false, typing: false, at_ms: 0, ...more });
+const press = (code: string, more: Partial<Press> = {}): Press => ({ code, repeat: false, modified: false, typing: false, ...more });
 
 test("keys: sticks by place, deeds once, nothing while somebody types", () => {
   const keys = new Keys();
@@ -71,13 +75,72 @@ test("keys: sticks by place, deeds once, nothing while somebody types", () => {
   assert.ok(isCentred(keys.sticks()));
 });
 
-test("Escape hovers, twice it stops, also while somebody types; too late is not twice", () => {
+const keyed = (code: string, more: Partial<Parameters<typeof stopKeys>[0]> = {}): Parameters<typeof stopKeys>[0] => ({ code, ctrlKey: false, shiftKey: false, altKey: false, metaKey: false, ...more });
+
+test("the emergency stop is Ctrl and Enter; Escape flies and stops nothing", () => {
   const keys = new Keys();
-  assert.equal(keys.down(press("Escape", { typing: true })), "hover");
-  assert.equal(keys.down(press("Escape", { repeat: true, at_ms: 200 })), null, "a held key is one press");
-  assert.equal(keys.down(press("Escape", { modified: true, at_ms: 300 })), "stop");
-  assert.equal(keys.down(press("Escape", { at_ms: 400 })), "stop", "who goes on pressing means it");
-  assert.equal(keys.down(press("Escape", { at_ms: 401 + TWICE_MS })), "hover");
+  for (const typing of [true, false]) assert.equal(keys.down(press("Escape", { typing })), null);
+  assert.equal(stopKeys(keyed("Escape")), null);
+  assert.equal(stopKeys(keyed("Enter")), null);
+  assert.equal(stopKeys(keyed("Enter", { ctrlKey: true })), "one");
+  assert.equal(stopKeys(keyed("NumpadEnter", { ctrlKey: true, shiftKey: true })), "all");
+  assert.equal(stopKeys(keyed("Enter", { ctrlKey: true, altKey: true })), null, "AltGr is no Ctrl");
+  assert.equal(stopKeys(keyed("KeyX", { ctrlKey: true })), null);
+});
+
+test("what is held counts, once, and starts anew when it was let go", () => {
+  const hold = new Hold();
+  assert.equal(hold.share(0), null);
+  hold.press(1000);
+  hold.press(1500); // another one meanwhile begins nothing
+  assert.equal(hold.share(1400), 0.5);
+  assert.ok(!hold.isDone(1799));
+  hold.release();
+  assert.ok(!hold.isDone(5000), "let go: nobody does it by chance");
+  hold.press(6000);
+  assert.ok(hold.isDone(6000 + HOLD_MS));
+  assert.ok(!hold.isDone(6000 + HOLD_MS), "once");
+});
+
+test("what became of an order to all drones, the worst first", () => {
+  const each = new Map([["a", { state: "sent", why: "" }], ["b", { state: "refused", why: "link lost" }]]);
+  assert.deepEqual(outcome("stop_all", ["a", "b", "c"], each), { text: "Stop all · NOT stopped: b: link lost · pending: c · sent: a", bad: true });
+  each.set("b", { state: "done", why: "" });
+  assert.deepEqual(outcome("land_all", ["a", "b"], each), { text: "Land all · sent: a · landed: b", bad: false });
+  assert.match(outcome("land_all", [], new Map()).text, /no drone/);
+});
+
+test("the cockpit's clock: to half of the time there and back, and what is told late is old", () => {
+  const clock = new ServerClock();
+  assert.equal(clock.at(0), null);
+  assert.equal(clock.age_s(5, 0), null);
+  clock.pong(1000, 1100, 51.05); // it is 50 s ahead
+  const stamp = clock.at(2000);
+  assert.ok(stamp && Math.abs(stamp.at_s - 52) < 1e-6 && stamp.unsure_s >= 0.05 && stamp.unsure_s < 0.06);
+  clock.pong(3000, 11_000, 60.9); // answered after a stall: known no better by that
+  const later = clock.at(11_000);
+  assert.ok(later && Math.abs(later.at_s - 61) < 1e-6 && later.unsure_s < 0.06);
+  clock.told(12_000, 61.99);
+  near(clock.age_s(61.99, 12_000) as number, 0);
+  clock.told(13_000, 55); // seven seconds in some buffer
+  assert.ok((clock.age_s(55, 13_000) as number) > 7.9);
+  assert.ok((clock.age_s(61.99, 12_000 + 3_600_000) as number) > 3598, "an hour later it is an hour old");
+});
+
+test("a clock that jumps, as after sleep, is measured anew", () => {
+  const clock = new ServerClock();
+  clock.pong(1000, 1010, 51.005);
+  clock.pong(2000, 2100, 652.05); // the page's machine slept for ten minutes
+  const stamp = clock.at(3000);
+  assert.ok(stamp && Math.abs(stamp.at_s - 653) < 1e-6);
+  assert.ok((clock.age_s(652.05, 2100) as number) < 0.1);
+});
+
+test("who observes knows how old news is without asking anything", () => {
+  const clock = new ServerClock();
+  for (let ms = 0; ms < 5000; ms += 55) clock.told(ms + 5, 100 + ms / 1000);
+  assert.ok((clock.age_s(105, 5010) as number) < 0.02);
+  assert.ok((clock.age_s(105, 8000) as number) > 2.9);
 });
 
 const pad = (axes: number[], pressed: number[] = []): Pad => ({
@@ -95,8 +158,9 @@ test("gamepad: sticks after they were centred, buttons once, and told when it go
   assert.deepEqual(reader.read(pad([1, 0, -1, -1])).sticks, push({ yaw_rate: -1, left: 1, forward: 1 }));
   assert.deepEqual(reader.read(pad([0, 0, 0, 0], [9])).deeds, ["takeoff"]);
   assert.deepEqual(reader.read(pad([0, 0, 0, 0], [9])).deeds, []);
-  assert.deepEqual(reader.read(pad([0, 0, 0, 0], [4])).deeds, [], "one bumper alone does nothing");
-  assert.deepEqual(reader.read(pad([0, 0, 0, 0], [4, 5])).deeds, ["stop"]);
+  assert.ok(!reader.read(pad([0, 0, 0, 0], [4])).stops, "one bumper alone does nothing");
+  assert.ok(reader.read(pad([0, 0, 0, 0], [4, 5])).stops, "both are to be held");
+  assert.deepEqual(reader.read(pad([0, 0, 0, 0], [4, 5])).deeds, []);
   assert.equal(reader.read(null).lost, true);
   assert.equal(reader.read(null).lost, false);
   assert.ok(isCentred(reader.read(pad([1, 0, 0, 0])).sticks), "after it came back it must be centred again");
@@ -197,6 +261,18 @@ test("numbers to plot are grouped; what a recording lacks is added up", () => {
 
 const asks = (more: Partial<Question> = {}): Question => ({ id: 3, by: "survey.py", priority: 4, for_s: 120, left_s: 10, declined: false, ...more });
 
+test("maps show what flies, and of recordings what was recorded", () => {
+  const row = (name: string, uri: string): DroneRow => ({ name, uri, position: [1, 2, 3], yaw: 0 }) as unknown as DroneRow;
+  const rows = [row("alpha", "sim://"), row("beta", "sim://"), row("flight", "replay:///flight.mcap")];
+  assert.deepEqual(othersOf({ name: "alpha", recorded: false }, rows).map((body) => body.name), ["beta"]);
+  assert.deepEqual(othersOf({ name: "flight", recorded: true }, rows), [], "no live drone on the map of a recording");
+});
+
+test("recordings are known by their address", () => {
+  assert.ok(isRecording({ uri: "replay:///home/me/flight.mcap" }));
+  assert.ok(!isRecording({ uri: "sim://?seed=1" }));
+});
+
 test("a question for control says what becomes of it", () => {
   assert.ok(wins(asks(), 8));
   assert.ok(!wins(asks({ priority: 8 }), 8));
@@ -209,7 +285,7 @@ test("a question for control says what becomes of it", () => {
 
 test("the place in the line, with what was answered", () => {
   const waits = (line: Partial<Line>, state: Authority["state"] = "queued"): string =>
-    lineText({ type: "authority", state, holder: "follow.py", priority: 16, mine: false, line: { position: 2, wait_s: null, asked: false, declined: null, ...line } });
+    lineText({ type: "authority", state, holder: "follow.py", priority: 16, mine: false, why: null, line: { position: 2, wait_s: null, asked: false, declined: null, ...line } });
   assert.equal(waits({}), "You are number 2 in line");
   assert.equal(waits({ position: null }, "preempted"), "You wait in line");
   assert.equal(waits({ asked: true }), "follow.py was asked · you are number 2 in line");

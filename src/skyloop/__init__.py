@@ -8,7 +8,7 @@
         drone.takeoff()
         drone.velocity(forward=0.3)
 
-Everything here is imported when it is first used.
+Every name is imported when it is first used, so that ``import skyloop`` loads nothing heavy.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The same drone for ``asyncio``: what waits is awaitable, what does not is a plain call.
+"""The drone for ``asyncio``: methods that wait are coroutines, the others plain calls.
 
 ::
 
@@ -7,8 +7,8 @@
         async for frame in drone.frames():
             drone.velocity(forward=0.3)
 
-A thin face over :class:`skyloop.client.Drone`, which does the work on its own threads; :attr:`Drone.sync` is it.
-A call that is cancelled while it waits is given up here; what it was waiting for is not undone.
+It wraps :class:`skyloop.client.Drone`, which works on threads of its own and is available as :attr:`Drone.sync`.
+Cancelling a call ends the waiting; what it was waiting for is not undone.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from types import TracebackType
 from typing import Any, TypeVar, Unpack
 
 from skyloop import client
+from skyloop.client.authority import TakeoverAnswer
+from skyloop.client.channels import VideoOptions
 from skyloop.client.frame import Arrival
 from skyloop.client.logbook import Logbook
-from skyloop.client.reading import VideoOptions, Wanted
-from skyloop.client.result_reading import silence
-from skyloop.client.results import ResultSlot, checked_age
-from skyloop.client.slots import Buffer
-from skyloop.client.takeover import TakeoverAnswer
+from skyloop.client.mailbox import Mailbox, Notifier
+from skyloop.client.results import ResultMailbox, checked_age, silence
+from skyloop.client.telemetry import Wanted
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import NoAnswerError, UsageError
 from skyloop.messages import (
@@ -46,18 +46,24 @@ from skyloop.messages import (
 from skyloop.messages.annotation import Shape
 
 T = TypeVar("T")
-#: A listener of an asyncio application: a function or a coroutine function. It runs on the event loop.
+#: A callback of an asyncio application, a function or a coroutine function. It runs on the event loop.
 Callback = Callable[[T], object] | Callable[[T], Awaitable[object]]
 
 
 class connect:  # noqa: N801  (used like the function skyloop.connect)
-    """``async with connect(target, …) as drone``, or ``drone = await connect(…)``; see :func:`skyloop.connect`.
+    """Connect to a drone: ``async with connect(target, …) as drone``, or ``drone = await connect(…)``.
 
-    Raises :class:`UsageError` also for a replay in step (``speed=max``), whose time moves only while its application
-    waits with the calls of :class:`skyloop.client.Drone`.
+    Raises what :func:`skyloop.connect` raises, and :class:`UsageError` for a stepped replay (``speed=max``), whose time
+    advances only while its application waits in calls of :class:`skyloop.client.Drone`.
     """
 
     def __init__(self, target: str, **options: Any) -> None:
+        """Keep the arguments; awaiting or entering connects.
+
+        Args:
+            target: As for :func:`skyloop.connect`.
+            **options: As for :func:`skyloop.connect`.
+        """
         self._target = target
         self._options = options
         self._drone: Drone | None = None
@@ -82,13 +88,13 @@ class connect:  # noqa: N801  (used like the function skyloop.connect)
 
 
 class Config:
-    """The parameters; see :class:`skyloop.client.Config`."""
+    """Parameters; see :class:`skyloop.client.Config` for what each method raises."""
 
     def __init__(self, sync: client.Config) -> None:
         self._sync = sync
 
     async def get(self, name: str) -> Value:
-        """The present value."""
+        """Return the present value."""
         return await _in_thread(lambda: self._sync[name])
 
     async def set(self, name: str, value: object) -> None:
@@ -96,19 +102,24 @@ class Config:
         await _in_thread(lambda: self._sync.__setitem__(name, value))
 
     async def items(self) -> list[tuple[str, Value]]:
-        """(name, value) of all."""
+        """Return (name, value) of all parameters, sorted by name."""
         return await _in_thread(self._sync.items)
 
     async def describe(self, name: str) -> Parameter:
-        """All that is known of one."""
+        """Return all that is known of a parameter: type, unit, range, default, value, description."""
         return await _in_thread(lambda: self._sync.describe(name))
 
 
 class Drone:
-    """One vehicle, connected. Made by :class:`connect`; names and errors are those of :class:`skyloop.client.Drone`."""
+    """A connected vehicle, made by :class:`connect`.
+
+    Methods have the names, arguments, results and errors of :class:`skyloop.client.Drone`; those that wait are
+    coroutines. Callbacks, plain or coroutine functions, run on the event loop that was running when they were added.
+    """
 
     def __init__(self, sync: client.Drone) -> None:
-        self.sync = sync  #: the drone behind it
+        """Wrap a connected drone."""
+        self.sync = sync  #: the wrapped drone
         self.config = Config(sync.config)
 
     async def __aenter__(self) -> Drone:
@@ -120,128 +131,171 @@ class Drone:
         await _in_thread(lambda: self.sync.__exit__(kind, error, traceback))
 
     async def close(self) -> None:
-        """Give the authority back and end the connection. Does not land."""
+        """Release the authority and end the connection. Does not land."""
         await _in_thread(self.sync.close)
 
-    # What it is: nothing here waits ----------------------------------------------------------------------------
+    # Properties; nothing here waits ----------------------------------------------------------------------------
 
     @property
     def name(self) -> str:
+        """Name of the proxy."""
         return self.sync.name
 
     @property
     def uri(self) -> str:
+        """Address of the vehicle."""
         return self.sync.uri
 
     @property
     def app_id(self) -> int:
+        """Number of this application in this run of the proxy."""
         return self.sync.app_id
 
     @property
     def capabilities(self) -> Capabilities:
+        """Actions and cameras of the vehicle."""
         return self.sync.capabilities
 
     @property
     def authority(self) -> client.AuthorityStatus:
+        """Current state of this application's authority."""
         return self.sync.authority
 
     @property
     def link(self) -> client.LinkStatus:
+        """State of both hops, application to proxy and proxy to vehicle."""
         return self.sync.link
 
     async def stats(self) -> client.Stats:
-        """Statistics by channel."""
+        """Return statistics by channel; see :attr:`skyloop.client.Drone.stats`."""
         return await _in_thread(lambda: self.sync.stats)
 
     def recent_events(self) -> list[Event]:
+        """Return the last 256 events, oldest first."""
         return self.sync.recent_events()
 
     # Commands --------------------------------------------------------------------------------------------------
 
     async def takeoff(self, *, wait: bool = True, timeout_s: float = 15.0) -> bool:
+        """Take off, then hover; see :meth:`skyloop.client.Drone.takeoff`."""
         return await _in_thread(lambda: self.sync.takeoff(wait=wait, timeout_s=timeout_s))
 
     async def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> bool:
+        """Land at the present position; see :meth:`skyloop.client.Drone.land`."""
         return await _in_thread(lambda: self.sync.land(wait=wait, timeout_s=timeout_s))
 
     def hover(self) -> bool:
+        """Stop and hold the position."""
         return self.sync.hover()
 
     def idle(self) -> bool:
+        """Ask for nothing: keep the authority and leave the vehicle as it is."""
         return self.sync.idle()
 
     def velocity(self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, yaw_rate: float = 0.0) -> bool:
-        """Body's levelled axes [m/s]; counter-clockwise [rad/s]."""
+        """Fly with a velocity in the levelled body axes.
+
+        Args:
+            forward: Along x, forward [m/s].
+            left: Along y, to the left [m/s].
+            up: Along z, up [m/s].
+            yaw_rate: Counter-clockwise seen from above [rad/s].
+        """
         return self.sync.velocity(forward=forward, left=left, up=up, yaw_rate=yaw_rate)
 
     def attitude(self, *, roll: float = 0.0, pitch: float = 0.0, climb: float = 0.0, yaw_rate: float = 0.0) -> bool:
-        """Right side down, nose down [rad], up [m/s], counter-clockwise [rad/s]."""
+        """Hold an attitude with a climb rate.
+
+        Args:
+            roll: Right side down is positive [rad].
+            pitch: Nose down is positive [rad].
+            climb: Vertical velocity, up [m/s].
+            yaw_rate: Counter-clockwise seen from above [rad/s].
+        """
         return self.sync.attitude(roll=roll, pitch=pitch, climb=climb, yaw_rate=yaw_rate)
 
     def emergency_stop(self) -> bool:
+        """Cut the motors at once: the vehicle falls. Needs no authority, only ``access="pilot"``."""
         return self.sync.emergency_stop()
 
     def reset_emergency(self) -> bool:
+        """Leave the emergency state, on the ground."""
         return self.sync.reset_emergency()
 
     def command(self, action: AnyAction) -> bool:
+        """Make ``action`` the newest set-point."""
         return self.sync.command(action)
 
     async def request_authority(self, priority: int | None = None, **options: Any) -> client.AuthorityStatus:
+        """Ask for the authority and wait for it; see :meth:`skyloop.client.Drone.request_authority`."""
         return await _in_thread(lambda: self.sync.request_authority(priority, **options))
 
     def on_takeover(
         self, function: Callable[[client.TakeoverRequest], TakeoverAnswer | Awaitable[TakeoverAnswer]]
     ) -> Listener:
-        """See :meth:`skyloop.client.Drone.on_takeover`; runs on the event loop."""
+        """Call ``function`` when another application asks for the authority that this one holds.
+
+        See :meth:`skyloop.client.Drone.on_takeover`; here it runs on the event loop and may be a coroutine function.
+        """
         return Listener(self.sync.on_takeover(_on_loop(function)))
 
     async def release_authority(self) -> None:
+        """Release the authority, or leave the queue."""
         await _in_thread(self.sync.release_authority)
 
     # Reading ---------------------------------------------------------------------------------------------------
 
     def feedback(self, *, max_age_s: float | None = None) -> Feedback:
+        """Return the newest feedback; see :meth:`skyloop.client.Drone.feedback`."""
         return self.sync.feedback(max_age_s=max_age_s)
 
     async def next_feedback(self, timeout_s: float = 1.0) -> Feedback:
+        """Wait for feedback that was not read before, and return the newest."""
         return await _in_thread(lambda: self.sync.next_feedback(timeout_s))
 
     def frame(self, camera: str | None = None, *, max_age_s: float | None = None) -> client.Frame | None:
+        """Return the newest frame without waiting; see :meth:`skyloop.client.Drone.frame`.
+
+        A JPEG is decoded on the event loop; :meth:`next_frame` and :meth:`frames` decode on another thread.
+        """
         return self.sync.frame(camera, max_age_s=max_age_s)
 
     async def next_frame(self, camera: str | None = None, *, timeout_s: float = 1.0) -> client.Frame:
+        """Wait for a frame that this method has not returned before, and return the newest."""
         return await _in_thread(lambda: self.sync.next_frame(camera, timeout_s=timeout_s))
 
     async def wait(self, state: Wanted, timeout_s: float = 10.0) -> Feedback:
+        """Wait until the newest feedback is as wanted; see :meth:`skyloop.client.Drone.wait`.
+
+        A predicate is called on another thread.
+        """
         return await _in_thread(lambda: self.sync.wait(state, timeout_s))
 
     async def frames(
         self, camera: str | None = None, *, timeout_s: float = 5.0, **how: Unpack[VideoOptions]
     ) -> AsyncIterator[client.Frame]:
-        """Each newest frame, until the drone is closed; ``how``: as of a drone without asyncio.
+        """Yield each newest frame until the drone is closed; a slow loop skips frames.
 
-        Raises :class:`NoAnswerError`.
+        Args:
+            camera: Name of the camera; None: the vehicle's first.
+            timeout_s: How long to wait for each frame [s].
+            **how: As for :meth:`skyloop.client.Drone.frames`.
+
+        Raises:
+            NoAnswerError: If no frame comes within ``timeout_s``.
         """
         channel = self.sync.channel(camera, **how)
-        buffer: Buffer[Arrival] = Buffer()
-        came = asyncio.Event()
-        loop = asyncio.get_running_loop()
-
-        def sink(arrival: Arrival) -> None:
-            buffer.put(arrival)
-            with contextlib.suppress(RuntimeError):  # the loop has ended
-                loop.call_soon_threadsafe(came.set)
-
-        channel.topic.add(sink, lambda: buffer.dropped)
-        try:
+        notifier = _LoopNotifier()
+        came = notifier.came
+        mailbox: Mailbox[Arrival] = Mailbox(notifier=notifier)
+        with self.sync._closing(mailbox), channel.into(mailbox):
             while not self.sync.closed:
                 try:
                     await asyncio.wait_for(came.wait(), timeout_s)
                 except TimeoutError:
                     raise NoAnswerError(f"no frame of {channel.camera.name} came within {timeout_s:g} s") from None
                 came.clear()
-                arrival = buffer.take()
+                arrival = mailbox.take()
                 if arrival is None:
                     continue
                 if arrival.header.encoding is Encoding.JPEG:
@@ -250,71 +304,85 @@ class Drone:
                     frame = channel.picture(arrival)
                 if frame is not None:
                     yield frame
-        finally:
-            channel.topic.remove(sink)
 
     def result(self, processor: str, *, max_age_s: float | None = None) -> client.Result | None:
+        """Return a processor's newest result without waiting; see :meth:`skyloop.client.Drone.result`."""
         return self.sync.result(processor, max_age_s=max_age_s)
 
     async def results(
         self, processor: str, *, max_age_s: float | None = None, timeout_s: float = 5.0
     ) -> AsyncIterator[client.Result]:
-        """Each newest result of a processor, until the drone is closed. Raises :class:`NoAnswerError`."""
-        topic = self.sync.result_channel(processor).topic
-        slot = ResultSlot(checked_age(max_age_s))
-        came = asyncio.Event()
-        loop = asyncio.get_running_loop()
+        """Yield each newest result of a processor until the drone is closed; a slow loop skips results.
 
-        def sink(result: client.Result) -> None:
-            slot.put(result)
-            with contextlib.suppress(RuntimeError):  # the loop has ended
-                loop.call_soon_threadsafe(came.set)
+        Args:
+            processor: Name of the processor.
+            max_age_s: Oldest age since the frame's capture that is accepted [s]; None: any.
+            timeout_s: How long to wait for each result [s].
 
-        topic.add(sink, lambda: slot.dropped)
-        try:
+        Raises:
+            NoAnswerError: If no result that is new enough comes in time.
+        """
+        notifier = _LoopNotifier()
+        came, loop = notifier.came, notifier.loop
+        mailbox = ResultMailbox(checked_age(max_age_s), notifier)
+        with self.sync._closing(mailbox), self.sync.result_channel(processor).into(mailbox):
             deadline = loop.time() + timeout_s
             while not self.sync.closed:
                 try:
                     await asyncio.wait_for(came.wait(), deadline - loop.time())
                 except TimeoutError:
-                    raise NoAnswerError(silence(processor, timeout_s, slot.expired)) from None
+                    raise NoAnswerError(silence(processor, timeout_s, mailbox.expired)) from None
                 came.clear()
-                result = slot.take()
+                result = mailbox.take()
                 if result is not None:
                     yield result
                     deadline = loop.time() + timeout_s
-        finally:
-            topic.remove(sink)
 
-    # Listening -------------------------------------------------------------------------------------------------
+    # Callbacks -------------------------------------------------------------------------------------------------
 
     def on_feedback(self, function: Callback[Feedback]) -> Listener:
+        """Call ``function`` with the newest feedback, on the event loop."""
         return Listener(self.sync.on_feedback(_on_loop(function)))
 
     def on_event(self, function: Callback[Event]) -> Listener:
+        """Call ``function`` with each event, on the event loop."""
         return Listener(self.sync.on_event(_on_loop(function)))
 
     def on_link(self, function: Callback[client.LinkStatus]) -> Listener:
+        """Call ``function`` on the event loop whenever one of the two hops changes its state."""
         return Listener(self.sync.on_link(_on_loop(function)))
 
     def on_command(self, function: Callback[Applied]) -> Listener:
+        """Call ``function`` with what the proxy made of each command of any application, on the event loop."""
         return Listener(self.sync.on_command(_on_loop(function)))
 
     def on_annotation(self, function: Callback[Annotation]) -> Listener:
+        """Call ``function`` with what any application draws on a frame, on the event loop."""
         return Listener(self.sync.on_annotation(_on_loop(function)))
 
     def on_log(self, function: Callback[LogEntry]) -> Listener:
+        """Call ``function`` with what any application logs, on the event loop."""
         return Listener(self.sync.on_log(_on_loop(function)))
 
     def on_result(
         self, function: Callback[client.Result], processor: str | None = None, *, max_age_s: float | None = None
     ) -> Listener:
+        """Call ``function`` with results, on the event loop; see :meth:`skyloop.client.Drone.on_result`."""
         return Listener(self.sync.on_result(_on_loop(function), processor, max_age_s=max_age_s))
 
     def add_processor(
         self, function: Callable[[client.Frame], object], camera: str | None = None, **options: Any
     ) -> client.Processor[Any]:
-        """On a thread of its own, as in the other face: looking at pictures would hold up the event loop."""
+        """Call ``function`` with frames, on a thread of its own, as processing images would block the event loop.
+
+        Args:
+            function: A plain function.
+            camera: Name of the camera; None: the vehicle's first.
+            **options: As for :meth:`skyloop.client.Drone.add_processor`.
+
+        Raises:
+            UsageError: If it is a coroutine function.
+        """
         if inspect.iscoroutinefunction(function):
             raise UsageError(
                 "a processor is a plain function, which runs on its own thread; else iterate over frames()"
@@ -322,38 +390,59 @@ class Drone:
         return self.sync.add_processor(function, camera, **options)
 
     def annotate(self, frame: client.Frame, shapes: Iterable[Shape], source: str | None = None) -> bool:
+        """Publish shapes drawn over a frame; see :meth:`skyloop.client.Drone.annotate`."""
         return self.sync.annotate(frame, shapes, source)
 
     @property
     def log(self) -> Logbook:
+        """Publishes text and numbers beside the flight; see :class:`skyloop.client.Logbook`."""
         return self.sync.log
 
 
 class Listener:
-    """A listener whose function runs on the event loop, one call at a time, with the newest."""
+    """A callback that runs on the event loop, one call at a time."""
 
     def __init__(self, sync: client.Listener[Any]) -> None:
+        """Wrap a listener whose function hands over to the event loop."""
         self._sync = sync
 
     def cancel(self) -> None:
-        """Call the function no more."""
+        """Stop calling the function. Does not wait for a call that is under way."""
         self._sync.cancel(wait=False)  # its thread may be waiting for this very event loop
 
     @property
     def delivered(self) -> int:
+        """How often the function was called."""
         return self._sync.delivered
 
     @property
     def dropped(self) -> int:
+        """Samples that newer ones pushed out before the function was ready for them."""
         return self._sync.dropped
 
     @property
     def errors(self) -> int:
+        """Calls that raised."""
         return self._sync.errors
 
 
+class _LoopNotifier(Notifier):
+    """Wakes the coroutine that waits for :attr:`came`, from any thread."""
+
+    __slots__ = ("came", "loop")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.came = asyncio.Event()
+        self.loop = asyncio.get_running_loop()
+
+    def notify(self) -> None:
+        with contextlib.suppress(RuntimeError):  # the loop has ended
+            self.loop.call_soon_threadsafe(self.came.set)
+
+
 def _reject_in_step(target: str) -> None:
-    """Raises :class:`UsageError` for a replay whose time would stand still here."""
+    """Raise :class:`UsageError` for a stepped replay, whose time would stand still here."""
     if isinstance(target, str) and target.startswith("replay://") and parse_uri(target).options.get("speed") == "max":
         raise UsageError(
             f"{target}: speed=max is in step with the one thread that waits, which an event loop never does: use "
@@ -362,7 +451,7 @@ def _reject_in_step(target: str) -> None:
 
 
 def _on_loop(function: Callback[T]) -> Callable[[T], Any]:
-    """The function, to be called from another thread, run on this event loop and waited for."""
+    """Wrap ``function`` so that another thread can call it: it runs on this event loop and is waited for."""
     loop = asyncio.get_running_loop()
 
     async def call(sample: T) -> object:
@@ -376,9 +465,9 @@ def _on_loop(function: Callback[T]) -> Callable[[T], Any]:
 
 
 async def _in_thread(function: Callable[[], T], *, abandoned: Callable[[T], object] | None = None) -> T:
-    """Run what waits on a thread of its own, so that no pool can be full when the vehicle has to land.
+    """Run a function that waits on a thread of its own: a pool could be full when the vehicle has to land.
 
-    If the caller is cancelled meanwhile, ``abandoned`` gets the result that nobody waits for.
+    If the caller is cancelled meanwhile, ``abandoned`` is called with the result that nobody waits for.
     """
     loop = asyncio.get_running_loop()
     future: asyncio.Future[T] = loop.create_future()

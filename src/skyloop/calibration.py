@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import msgspec
 
-from skyloop.errors import FileFormatError, UsageError
+from skyloop import files
+from skyloop.errors import UsageError
 from skyloop.messages import Intrinsics
 
+MAX_BYTES: Final = 1 << 20  #: of a file; it takes less than a kilobyte
 _Side = Annotated[int, msgspec.Meta(ge=1, le=16384)]
 _Count = Annotated[int, msgspec.Meta(ge=0)]
 _LENGTHS = {"pinhole": (0, 4, 5, 8), "fisheye": (0, 4)}
@@ -73,17 +75,9 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
 
     def save(self, path: str | Path) -> None:
         """Write it as JSON. Raises :class:`UsageError` where that can't be written."""
-        try:
-            Path(path).write_bytes(msgspec.json.format(msgspec.json.encode(self)) + b"\n")
-        except OSError as error:
-            raise UsageError(f"{path} can't be written: {error.strerror or error}") from error
+        files.write(Path(path), msgspec.json.format(msgspec.json.encode(self)) + b"\n")
 
 
 def load_calibration(path: str | Path) -> Calibration:
     """Raises :class:`FileFormatError` for a file that can't be read or is no calibration."""
-    try:
-        return msgspec.json.decode(Path(path).read_bytes(), type=Calibration)
-    except OSError as error:
-        raise FileFormatError(f"{path}: can't be read: {error.strerror or error}") from error
-    except (msgspec.DecodeError, UsageError, UnicodeDecodeError) as error:
-        raise FileFormatError(f"{path}: no calibration of a camera: {error}") from error
+    return files.read_json(path, Calibration, "a calibration of a camera", MAX_BYTES)

@@ -1,13 +1,16 @@
-"""Time. All times in Skyloop are integer nanoseconds on a monotonic clock; decisions take the time as an argument.
+"""Times and clocks: all times are integer nanoseconds on a monotonic clock, and decisions take the time as an argument.
 
-``time.monotonic_ns`` is ``CLOCK_MONOTONIC``: one clock for all processes of a host, so that ages across processes
-of one host need no estimation. Wall-clock time is never used for ages.
+``time.monotonic_ns`` is ``CLOCK_MONOTONIC``: one clock for all processes of a host, so that ages across processes of
+one host need no estimation. The exception are time namespaces, as containers may have: :func:`clock_identity` tells
+them apart. Wall-clock time is never used for ages.
 """
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Final
 
 #: A source of the time: returns integer nanoseconds that never go backwards.
@@ -19,26 +22,49 @@ monotonic_ns: Clock = time.monotonic_ns
 
 
 def seconds(ns: int) -> float:
-    """Nanoseconds to seconds."""
+    """Convert nanoseconds to seconds."""
     return ns / NS_PER_S
 
 
 def nanoseconds(s: float) -> int:
-    """Seconds to whole nanoseconds."""
+    """Convert seconds to whole nanoseconds, rounded to nearest."""
     return round(s * NS_PER_S)
 
 
+@functools.cache
+def clock_identity() -> str:
+    """Return which monotonic clock this process reads; processes with the same identity read the same clock.
+
+    It names the boot of the host's kernel and the time namespace. Empty where the boot can't be told, as on systems
+    other than Linux.
+    """
+    try:
+        boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    except OSError:
+        return ""
+    try:
+        namespace = Path("/proc/self/ns/time").stat().st_ino
+    except OSError:  # a kernel without them
+        namespace = 0
+    return f"{boot}/{namespace}"
+
+
 class ManualClock:
-    """A clock that stands still until it is told to move: for tests and for simulation faster than real time."""
+    """A clock that stands still until it is advanced, for tests and for simulation faster than real time."""
 
     def __init__(self, start_ns: int = NS_PER_S) -> None:
         self.now_ns = start_ns
 
     def __call__(self) -> int:
+        """Return the present time [ns]."""
         return self.now_ns
 
     def advance(self, seconds_: float) -> int:
-        """Move forward by ``seconds_`` and return the new time."""
+        """Advance by ``seconds_`` and return the new time [ns].
+
+        Raises:
+            ValueError: If ``seconds_`` is negative.
+        """
         if seconds_ < 0:
             raise ValueError(f"a monotonic clock cannot go back by {-seconds_} s")
         self.now_ns += nanoseconds(seconds_)

@@ -3,43 +3,59 @@
 ::
 
     SkyloopError
-    ├── UsageError (also ValueError)      the caller's argument is wrong: says what was given and what would be right
+    ├── UsageError (also ValueError)      an argument is wrong: says what was given and what is allowed
     │   ├── UnknownNameError (also KeyError)   no such proxy, camera, parameter …; carries ``suggestions``
     │   ├── FileFormatError               a file cannot be understood; names the file and the place
-    │   └── NameTakenError                the name asked for is in use; says by whom
-    ├── DecodeError (also ValueError)     bytes from elsewhere are no Skyloop packet, or not what a vehicle sends
+    │   └── NameTakenError                the name is in use; says by whom
+    ├── DecodeError (also ValueError)     received bytes are no valid packet, of Skyloop or a vehicle
     ├── MissingExtraError (also ImportError)   an optional part is not installed; names the ``pip install``
     ├── UnsupportedError                  this platform or this vehicle cannot do what was asked
-    ├── RefusedError                      the other end understood and said no; carries ``code`` and its reason
+    ├── RefusedError                      the other end understood and refused; carries ``code`` and its reason
     │   ├── AuthorityError                commanding or writing without holding the authority
     │   └── ParameterError                the value is out of range, of the wrong type, or the parameter is read-only
-    ├── LinkError                         an end of a link is not there or stopped answering
+    ├── LinkError                         the other end of a link is not there or stopped answering
     │   ├── NoAnswerError (also TimeoutError)  nothing came within the time given
     │   └── ClosedError                   this end was closed by its own user
     ├── SwarmError                        some drones of a swarm failed; carries the ``errors`` by name
-    └── DriverError                       the vehicle's driver failed; carries what the vehicle said
+    └── DriverError                       the vehicle's driver failed; carries what the vehicle reported
 
-Leaves say who is at fault and in which phase; catch the branch that you can do something about.
+Leaves say who is at fault and in which phase; catch the branch that you can handle.
 """
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Mapping
+from functools import partial
 
 
 class SkyloopError(Exception):
-    """Base of all errors raised on purpose by Skyloop."""
+    """Base of all errors that Skyloop raises on purpose."""
 
 
 class UsageError(SkyloopError, ValueError):
-    """An argument is of the wrong type, not finite, out of range, or otherwise unusable."""
+    """Raised when an argument is of the wrong type, not finite, out of range, or otherwise unusable."""
 
 
 class UnknownNameError(UsageError, KeyError):
-    """A name that nothing here answers to. ``suggestions`` holds the nearest known names, best first."""
+    """Raised when nothing of this name exists; ``suggestions`` holds the nearest known names, best first.
+
+    Attributes:
+        kind: What was looked up, for example ``camera``.
+        name: The name that was given.
+        known: All known names, sorted.
+        suggestions: Up to three known names that are similar.
+        message: The error's text.
+    """
 
     def __init__(self, kind: str, name: str, known: Iterable[str]) -> None:
+        """Compose the message, with suggestions from the known names.
+
+        Args:
+            kind: What was looked up, for example ``camera``.
+            name: The name that was given.
+            known: Names that exist.
+        """
         choices = sorted(set(known))
         self.kind = kind
         self.name = name
@@ -58,34 +74,55 @@ class UnknownNameError(UsageError, KeyError):
     def __str__(self) -> str:  # KeyError would show the repr of the message
         return self.message
 
+    def __reduce__(self) -> tuple[object, ...]:  # errors of worker processes come back pickled
+        return type(self), (self.kind, self.name, self.known)
+
 
 class FileFormatError(UsageError):
-    """A file cannot be understood. The message names the file and, where known, the place in it."""
+    """Raised when a file cannot be understood; the message names the file and, where known, the place in it."""
 
 
 class NameTakenError(UsageError):
-    """The name asked for is already in use on this host."""
+    """Raised when the name asked for is already in use; the message says by whom."""
 
 
 class DecodeError(SkyloopError, ValueError):
-    """Bytes that are no valid packet, of Skyloop or a vehicle: wrong signature, version, kind, length or range."""
+    """Raised for bytes that are no valid packet, of Skyloop or a vehicle.
+
+    Signature, version, kind, length or range is wrong.
+    """
 
 
 class MissingExtraError(SkyloopError, ImportError):
-    """An optional part of Skyloop is not installed."""
+    """Raised when an optional part of Skyloop is not installed; ``extra`` is its name for ``pip install``."""
 
     def __init__(self, what: str, extra: str, *, cause: str = "") -> None:
+        """Compose the message.
+
+        Args:
+            what: What needs the optional part.
+            extra: Name of the extra, as in ``skyloop[extra]``.
+            cause: Why the import failed, if known.
+        """
         self.extra = extra
+        self._arguments = (what, extra, cause)
         detail = f" ({cause})" if cause else ""
         super().__init__(f"{what} needs an optional part that is not installed{detail}: pip install 'skyloop[{extra}]'")
 
+    def __reduce__(self) -> tuple[object, ...]:
+        what, extra, cause = self._arguments
+        return partial(type(self), cause=cause), (what, extra)
+
 
 class UnsupportedError(SkyloopError):
-    """This platform or this vehicle cannot do what was asked; the message says what can be done instead."""
+    """Raised when this platform or this vehicle cannot do what was asked; the message says what is possible instead."""
 
 
 class RefusedError(SkyloopError):
-    """The other end understood the request and refused it. ``code`` is one of :class:`skyloop.messages.Refusal`."""
+    """Raised when the other end understood the request and refused it.
+
+    ``code`` is the value of a :class:`skyloop.messages.Refusal`, or one of the client's own such as ``"busy"``.
+    """
 
     def __init__(self, message: str, *, code: str = "refused") -> None:
         super().__init__(message)
@@ -93,37 +130,50 @@ class RefusedError(SkyloopError):
 
 
 class AuthorityError(RefusedError):
-    """Commanding a vehicle, or writing a parameter, without holding the authority over it."""
+    """Raised when a vehicle is commanded, or a parameter written, without holding the authority over it."""
 
 
 class ParameterError(RefusedError):
-    """A parameter was not written: unknown range, type, or read-only."""
+    """Raised when a parameter was not written: the value is out of range or of the wrong type, or it is read-only."""
 
 
 class LinkError(SkyloopError):
-    """The other end of a link is not there, refused the connection, or went away."""
+    """Raised when the other end of a link is not there, refuses the connection, or goes away."""
 
 
 class NoAnswerError(LinkError, TimeoutError):
-    """Nothing came within the time given."""
+    """Raised when nothing comes within the time given."""
 
 
 class ClosedError(LinkError):
-    """The object was closed by its own user and can't be used any more."""
+    """Raised when an object is used that its own user has closed."""
 
 
 class SwarmError(SkyloopError):
-    """Something went wrong at some drones of a swarm. ``errors`` has what, by the drones' names; ``total`` of how many.
+    """Raised when something fails at some drones of a swarm; the message names each of them on a line of its own.
 
-    The message names all of them, one a line.
+    Attributes:
+        errors: What failed, by name of the drone.
+        total: Number of drones in the swarm.
     """
 
     def __init__(self, what: str, errors: Mapping[str, Exception], total: int) -> None:
+        """Compose the message.
+
+        Args:
+            what: What the drones failed at.
+            errors: Why, by name of the drone.
+            total: Number of drones in the swarm.
+        """
         self.errors = dict(errors)
         self.total = total
+        self._what = what
         lines = "".join(f"\n  {name}: {type(error).__name__}: {error}" for name, error in self.errors.items())
         super().__init__(f"{what} failed for {len(self.errors)} of {total} drones:{lines}")
 
+    def __reduce__(self) -> tuple[object, ...]:
+        return type(self), (self._what, self.errors, self.total)
+
 
 class DriverError(SkyloopError):
-    """A vehicle's driver failed or the vehicle refused."""
+    """Raised when a vehicle's driver fails or the vehicle refuses."""

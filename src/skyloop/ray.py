@@ -1,6 +1,6 @@
 """Processors on a Ray cluster: what ``skyloop process`` runs, as actors that Ray places. Needs the extra ``ray``.
 
-Frames and results travel between proxy and actors as always; Ray starts the actors, and starts them anew when they die.
+Frames and results travel between proxy and actors as always; Ray starts the actors and restarts them when they die.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from typing import Any, Final, Self
 from skyloop.errors import LinkError, MissingExtraError, NoAnswerError, SkyloopError, UsageError
 from skyloop.processing import Code, Settings, Status, Worker, load_processor
 
-_ASK_S: Final = 10.0  #: how long an actor may take to say how it does
+_ASK_S: Final = 10.0  #: time for an actor to return its status
 _LOOK_S: Final = 0.1
-_START_S: Final = 60.0  #: for Ray to place and start all actors
-#: Of the driver's environment, what decides whether a worker finds the proxy.
+_START_S: Final = 60.0  #: time for Ray to place and start all actors
+#: Variables of this program's environment by which a worker finds the proxy.
 _ENVIRONMENT: Final = ("SKYLOOP_RUNTIME_DIR", "SKYLOOP_GROUP", "SKYLOOP_NETWORK", "SKYLOOP_KEYS")
 
 
@@ -34,15 +34,20 @@ class _Order:
 
 
 class Workers:
-    """The actors of one processor; made by :func:`process`. A context manager that ends them."""
+    """The actors of one processor, made by :func:`process`. A context manager that ends them."""
 
     def __init__(self, actors: list[Any]) -> None:
+        """Keep Ray's handles of the actors."""
         self.actors = actors  #: Ray's handles
 
     def statuses(self, timeout_s: float = _ASK_S) -> list[Status | None]:
-        """How each does; None for one that does not answer, as while Ray starts it anew.
+        """Return the statistics of each actor; None for one that does not answer, as while Ray restarts it.
 
-        Raises :class:`LinkError` with what ended an actor that can't go on, as when other code took the name.
+        Args:
+            timeout_s: How long to wait for all of them [s].
+
+        Raises:
+            LinkError: If an actor can't go on, as when other code took the name; says why.
         """
         ray = _ray()
         asked = [actor.status.remote() for actor in self.actors]
@@ -88,12 +93,27 @@ def process(
     stuck_s: float = 2.0,
     **options: Any,
 ) -> Workers:
-    """Run a processor as actors of the Ray cluster that this program is connected to; starts one here if there is none.
+    """Run a processor as actors of a Ray cluster; returns when all of them work.
 
-    ``target``: the class, or where it is (``module:Class``, ``file.py:Class``). ``drone``: as found from the host of
-    each actor. ``options`` are for Ray: ``num_cpus``, ``num_gpus``, ``resources`` … The rest is as for
-    ``skyloop process``. Returns when all work. Raises :class:`MissingExtraError`, :class:`UsageError`,
-    :class:`NoAnswerError` where Ray has no room for so many, :class:`LinkError` with what an actor said.
+    Uses the cluster that this program is connected to, and starts one on this host if there is none.
+
+    Args:
+        target: The class, or where it is: ``module:Class`` or ``file.py:Class``.
+        drone: Name or address of the drone, as found from the host of each actor.
+        workers: Number of actors, at least 1.
+        camera: Name of the camera; None: the vehicle's first.
+        name: Name of the processor; None: the class's in lower case.
+        shared: Each frame goes to one of the workers; if False, each worker gets all.
+        max_age_s: Frames older than this when their turn comes are left out [s]; None: none are.
+        max_fps: Most frames a second for each worker; None: all.
+        stuck_s: A call of ``process`` that takes longer gives the worker's share to the others [s].
+        **options: For Ray's actors: ``num_cpus``, ``num_gpus``, ``resources``, …
+
+    Raises:
+        MissingExtraError: If Ray is not installed.
+        UsageError: If an argument is out of range, or the class is no processor.
+        NoAnswerError: If Ray has no room for so many actors within 60 s.
+        LinkError: If an actor fails; says why.
     """
     ray = _ray()
     if not isinstance(workers, int) or workers < 1:
@@ -103,7 +123,7 @@ def process(
     if not ray.is_initialized():
         ray.init(include_dashboard=False, log_to_driver=False)
     module = sys.modules[code.kind.__module__]
-    if module.__name__.startswith("skyloop_user_"):  # a file's: not to be imported elsewhere
+    if module.__name__.startswith("skyloop_user_"):  # loaded from a file: can't be imported on another host
         ray.cloudpickle.register_pickle_by_value(module)
     variables = {key: os.environ[key] for key in _ENVIRONMENT if key in os.environ}
     options = {"max_restarts": -1, "runtime_env": {"env_vars": variables}, **options}
@@ -130,7 +150,7 @@ def _await_start(workers: Workers) -> None:
 
 
 class _Actor:
-    """One worker, on a host of Ray's choosing."""
+    """One worker, on a host that Ray chooses."""
 
     def __init__(self, order: _Order) -> None:
         self._trouble = ""
@@ -162,7 +182,7 @@ class _Actor:
             self._trouble = str(error)
 
     def status(self) -> tuple[Status | None, str]:
-        """How it does, and why it does no more."""
+        """The worker's statistics, and why it has ended, if it has."""
         return None if self._worker is None else self._worker.status, self._trouble
 
 

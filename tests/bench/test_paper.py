@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 import skyloop
+from skyloop.bench.contenders import OURS
 from skyloop.bench.paper import evaluation, report
 from skyloop.bench.paper.evaluation import RECORDER, Experiment, distances_to_round, evaluate, numbered
 from skyloop.bench.paper.flight import PaperFlight
 from skyloop.bench.paper.marks import CORNERS
-from skyloop.bench.peers import OURS
 from skyloop.bench.schedule import CHANNELS, COMMAND, FEEDBACK, VIDEO
 from skyloop.control.position import Fix, fix_of
 from skyloop.errors import FileFormatError

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from skyloop.cli import checkup
-from skyloop.sim.firmware.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
+from skyloop.emulators.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from tests.cli.conftest import Run
@@ -25,8 +25,15 @@ def test_safety_nets_that_are_off_are_reported(run: Run, kind: Kind, name: str, 
     assert f"→ set the parameter mavlink.{advice}" in ended.out
 
 
-def test_a_vehicle_that_is_not_there(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(checkup, "PATIENCE_S", 0.2)
+def test_a_vehicle_that_is_not_there(run: Run) -> None:
+    ended = run("doctor", f"mavlink://udpin:127.0.0.1:{Ports.free(Kind.PX4).remote}")
+    assert ended.code == 1
+    assert "✗ vehicle: its link is lost: no message on udpin" in ended.out
+    assert "→ have the vehicle send to UDP port" in ended.out
+
+
+def test_a_vehicle_that_has_not_been_looked_for_long_enough(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(checkup, "HEARD_S", 0.05)
     ended = run("doctor", f"mavlink://udpin:127.0.0.1:{Ports.free(Kind.PX4).remote}")
     assert ended.code == 1
     assert "✗ vehicle: its link is connecting" in ended.out

@@ -15,8 +15,7 @@ from skyloop.drivers.uri import parse_uri
 from skyloop.errors import UsageError
 from tests.cli.conftest import Run
 from tests.processes.conftest import Process
-
-PAVE = Path(__file__).parents[1] / "data" / "ardrone2" / "video-8s.pave"
+from tests.recordings import recorded
 
 GOOD = """
 import skyloop
@@ -38,6 +37,7 @@ class Raising(skyloop.Controller):
 """
 LOOKING = """
 import skyloop
+from tests.recordings import recorded
 
 class Looking(skyloop.Controller):
     frames = 0
@@ -67,6 +67,7 @@ def landed(name: str = "alpha") -> bool:
         return feedback.state is skyloop.FlightState.LANDED and feedback.owner is None
 
 
+@pytest.mark.daily
 @pytest.mark.process
 def test_a_controller_flies_and_lands(run: Run, alpha: Process, write: Write) -> None:
     ended = run("fly", write(GOOD), "--on", "alpha", "--seconds", "0.4")
@@ -162,11 +163,12 @@ def test_a_controller_of_frames_needs_a_camera(run: Run, alpha: Process, write: 
 
 @pytest.mark.process
 def test_a_recording_serves_a_controller_that_only_looks(run: Run, write: Write) -> None:
-    ended = run("fly", write(LOOKING), "--on", f"video://{PAVE}", "--seconds", "20")
+    video = f"video://{recorded('ardrone2/video-8s.pave')}"
+    ended = run("fly", write(LOOKING), "--on", video, "--seconds", "20")
     assert ended.code == 0, ended.err
     assert "5 frames" in ended.err
     assert "taking off" not in ended.err
-    flying = run("fly", write(GOOD), "--on", f"video://{PAVE}", "--seconds", "20")
+    flying = run("fly", write(GOOD), "--on", video, "--seconds", "20")
     assert flying.code == 1
     assert "velocity is not possible" in flying.err
     assert "line 6, in on_feedback" in flying.err

@@ -96,6 +96,7 @@ def test_several_are_a_table_and_one_is_told_in_full() -> None:
 # With a proxy --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.daily
 @pytest.mark.process
 def test_all_some_and_one_are_shown(run: Run, alpha: Process) -> None:
     every = run("param", "alpha")

@@ -67,6 +67,7 @@ def test_a_drone_without_a_camera(run: Run, file: Path, alpha: Process) -> None:
     assert "no camera: this vehicle gives no pictures" in ended.err
 
 
+@pytest.mark.daily
 def test_one_worker_in_this_process(run: Run, file: Path, bravo: str) -> None:
     ended = run("process", str(file), "--drone", bravo, "--seconds", "2.3")
     assert ended.code == 0

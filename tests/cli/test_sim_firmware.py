@@ -11,11 +11,11 @@ from collections.abc import Callable
 import pytest
 
 from skyloop.cli.firmware import address_from, ports_from
+from skyloop.emulators.ardrone import Ports
 from skyloop.errors import UsageError
-from skyloop.sim.firmware.ardrone import Ports
 from tests.cli.conftest import Run
+from tests.emulators.pilot import HERE, Pilot
 from tests.processes.conftest import Process
-from tests.sim.firmware.pilot import HERE, Pilot
 
 pytest.importorskip("av")
 
@@ -109,8 +109,8 @@ def test_a_port_that_is_taken_is_named(run: Run) -> None:
 
 
 def test_the_autopilots_ports() -> None:
-    from skyloop.sim.firmware.mavlink import Kind
-    from skyloop.sim.firmware.mavlink import Ports as MavlinkPorts
+    from skyloop.emulators.mavlink import Kind
+    from skyloop.emulators.mavlink import Ports as MavlinkPorts
 
     assert MavlinkPorts.counted(Kind.PX4, None, 1) == MavlinkPorts(14581, 14541)
     assert MavlinkPorts.counted(Kind.ARDUCOPTER, None, 1) == MavlinkPorts(5773, 14560, 5770)

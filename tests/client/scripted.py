@@ -10,10 +10,10 @@ from typing import Any, Self
 
 import numpy as np
 
+from skyloop.client.connection import RedialPolicy
 from skyloop.client.drone import Drone
-from skyloop.client.link import RedialPolicy
-from skyloop.client.monitor import Thresholds
-from skyloop.client.slots import Bell
+from skyloop.client.link_monitor import Thresholds
+from skyloop.client.mailbox import Notifier
 from skyloop.messages import (
     ACTION_NAMES,
     AnyAction,
@@ -70,7 +70,7 @@ class ScriptedProxy:
 
     def __init__(self, *, faults: Faults | None = None, can_fly: bool = True) -> None:
         self.server = MemoryServer("scripted", faults=faults)
-        self.bell = Bell()
+        self.notifier = Notifier()
         self.commands: list[Command] = []
         self.requests: list[AnyRequest] = []
         self.others: list[Sample] = []
@@ -120,7 +120,7 @@ class ScriptedProxy:
         return [command.action for command in list(self.commands)]
 
     def until(self, ready: Callable[[], bool], what: str = "what was waited for") -> None:
-        assert self.bell.wait_for(ready, WAIT_S), f"{what} did not happen"
+        assert self.notifier.wait_for(ready, WAIT_S), f"{what} did not happen"
 
     def until_commanded(self, action: AnyAction, after: int = 0) -> Command:
         """The first such command after so many."""
@@ -190,11 +190,16 @@ class ScriptedProxy:
 
     def refused(self, peer: Peer, reason: str) -> None: ...
 
+    def topic_problem(self, topic: str) -> str:
+        return ""
+
+    def malformed(self, peer: Peer, reason: str) -> None: ...
+
     def peer_left(self, peer: Peer, reason: str) -> None:
         self._peers.pop(peer.id, None)
         if self.owner is not None and self.owner[0] == peer.id:
             self.owner = None
-        self.bell.ring()
+        self.notifier.notify()
 
     def packet(self, peer: Peer, packet: bytes) -> None:
         sample = decode(packet)
@@ -207,7 +212,7 @@ class ScriptedProxy:
                 self.server.send(peer, encode(Reply(sample.id, answer)))
         else:
             self.others.append(sample)
-        self.bell.ring()
+        self.notifier.notify()
 
     def _answer(self, peer: Peer, body: AnyRequest) -> AnyReply | None:
         if isinstance(body, Hello):

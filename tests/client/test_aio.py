@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Coroutine, Iterator
+import time
+from collections.abc import AsyncIterator, Coroutine, Iterator
 from typing import Any
 
 import pytest
@@ -121,6 +122,24 @@ def test_frames(proxy: ScriptedProxy) -> None:
             with pytest.raises(NoAnswerError, match="no frame of bottom"):
                 async for _ in drone.frames("bottom", timeout_s=0.02):
                     pass
+
+    run(look())
+
+
+def test_what_is_waited_for_ends_when_the_drone_is_closed(proxy: ScriptedProxy) -> None:
+    async def look() -> None:
+        async with aio.connect("me") as drone:
+
+            async def all_of(samples: AsyncIterator[object]) -> list[object]:
+                return [sample async for sample in samples]
+
+            frames = asyncio.ensure_future(all_of(drone.frames(timeout_s=WAIT_S)))
+            found = asyncio.ensure_future(all_of(drone.results("detector", timeout_s=WAIT_S)))
+            await drone.wait(lambda _: proxy.server.subscribers(results("detector")) == 1)
+            begin = time.monotonic()
+            await drone.close()
+            assert await frames == await found == []
+            assert time.monotonic() - begin < WAIT_S / 2
 
     run(look())
 

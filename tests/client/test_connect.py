@@ -15,9 +15,9 @@ from pathlib import Path
 import pytest
 
 import skyloop
-from skyloop.client import private
+from skyloop.client import private_proxy
 from skyloop.client.connect import _script_name, connect
-from skyloop.client.private import PrivateProxy
+from skyloop.client.private_proxy import PrivateProxy
 from skyloop.errors import LinkError, NoAnswerError, UnknownNameError, UsageError
 from skyloop.messages import FlightState, LinkState
 from skyloop.transport.local import LocalServer
@@ -95,6 +95,7 @@ def test_wrong_name(alpha: ScriptedProxy) -> None:
         {"target": "Not A Name"},
         {"target": "alpha", "priority": 32},
         {"target": "alpha", "wait_s": -1.0},
+        {"target": "alpha", "wait_s": "1"},
         {"target": "alpha", "timeout_s": float("nan")},
         {"target": "alpha", "rate_hz": 0.0},
         {"target": "alpha", "name": ""},
@@ -143,7 +144,7 @@ def test_a_private_proxy_ends_with_the_drone() -> None:
 
 @pytest.mark.process
 def test_by_address(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(private, "PrivateProxy", lambda uri: PrivateProxy(uri, command(CHILD)))
+    monkeypatch.setattr(private_proxy, "PrivateProxy", lambda uri: PrivateProxy(uri, command(CHILD)))
     with connect("fake://here") as drone:
         assert drone.authority.state == "held"
     with pytest.raises(UsageError, match="rate_hz"):
@@ -180,7 +181,7 @@ def test_a_private_proxy_that_cannot_start() -> None:
 
 @pytest.mark.process
 def test_a_private_proxy_that_takes_too_long_and_does_not_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(private, "_GRACE_S", 0.2)
+    monkeypatch.setattr(private_proxy, "_GRACE_S", 0.2)
     code = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('x', flush=True); time.sleep(60)"
     proxy = PrivateProxy("fake://", [sys.executable, "-c", code])
     try:
@@ -199,7 +200,7 @@ def test_a_private_proxy_ends_when_its_parent_is_killed(tmp_path: Path) -> None:
         """
         import sys, time
         sys.path.insert(0, {root!r})
-        from skyloop.client.private import PrivateProxy
+        from skyloop.client.private_proxy import PrivateProxy
         proxy = PrivateProxy("fake://", {command!r})
         print(proxy.pid, flush=True)
         time.sleep(60)

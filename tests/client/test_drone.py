@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ from skyloop.messages import (
     Polyline,
     ReleaseAuthority,
     Statistics,
+    Takeoff,
     Text,
 )
 from skyloop.transport.base import ANNOTATIONS, COMMANDS, video
@@ -275,7 +276,9 @@ def test_inline_listeners_must_not_wait(proxy: ScriptedProxy, drone: Drone) -> N
     problems: list[str] = []
 
     def waiting(feedback: Feedback) -> None:
-        for call in (lambda: drone.wait("flying"), drone.takeoff, drone.next_feedback, drone.next_frame):
+        waits: list[Callable[[], object]] = [drone.takeoff, drone.next_feedback, drone.next_frame]
+        waits += [lambda: drone.wait("flying"), lambda: next(drone.frames())]
+        for call in waits:
             try:
                 call()
             except UsageError as error:
@@ -286,8 +289,9 @@ def test_inline_listeners_must_not_wait(proxy: ScriptedProxy, drone: Drone) -> N
             problems.append(str(error))
 
     with drone.on_feedback(waiting, inline=True):
-        drone.wait(lambda _: len(problems) >= 5, WAIT_S)
+        drone.wait(lambda _: len(problems) >= 6, WAIT_S)
     assert all("inline listener can't wait" in problem for problem in problems)
+    assert Takeoff() not in proxy.actions()
 
 
 def test_not_callable(drone: Drone) -> None:

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from skyloop.client.feedback_history import FeedbackHistory
 from skyloop.client.frame import Arrival, size_error, to_bgr
-from skyloop.client.history import FeedbackHistory
 from skyloop.errors import DecodeError, MissingExtraError
 from skyloop.messages import Encoding, Feedback, FrameHeader, Intrinsics
 
@@ -108,6 +108,14 @@ def test_a_broken_jpeg(data: bytes) -> None:
     broken = np.frombuffer(data, np.uint8)
     with pytest.raises(DecodeError, match="not a JPEG of 8 × 6"):
         arrival(header(Encoding.JPEG, size=broken.size), broken).frame()
+
+
+def test_a_jpeg_of_another_size_than_announced_is_not_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
+    cv2 = pytest.importorskip("cv2")
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it came to the decoder"))
+    large = cv2.imencode(".jpg", np.zeros((600, 800, 3), np.uint8))[1]
+    with pytest.raises(DecodeError, match="not a JPEG of 8 × 6"):
+        arrival(header(Encoding.JPEG, size=large.size), large).frame()
 
 
 def test_a_jpeg_without_opencv(monkeypatch: pytest.MonkeyPatch) -> None:

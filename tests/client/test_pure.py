@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.client.history import FeedbackHistory, interpolate
+from skyloop.client.clock_offset import MAX_DRIFT, OffsetEstimator
+from skyloop.client.feedback_history import FeedbackHistory, interpolate
 from skyloop.client.statistics import DEPTH, ChannelCounter, distribution
-from skyloop.client.timing import MAX_DRIFT, OffsetEstimator
 from skyloop.messages import Feedback, FlightState
 
 angles = st.floats(-math.pi, math.pi)

@@ -44,10 +44,18 @@ class Deck:
 
     def cockpit(self, *options: str) -> str:
         """Another cockpit, with options of ``skyloop cockpit``; its address."""
+        usual = self.address
+        self.own_cockpit(*options)
+        other, self.address = self.address, usual
+        return other
+
+    def own_cockpit(self, *options: str) -> Process:
+        """Another cockpit whose pages are opened from now on, and which can be stopped."""
         process = Process("-m", "skyloop", "cockpit", *options)
         self._processes.append(process)
         process.until("/\n")
-        return process.text.split("cockpit: ")[1].strip()
+        self.address = process.text.split("cockpit: ")[1].strip()
+        return process
 
     def page(self, *names: str, prepare: str = "", **options: Any) -> DronePage:
         """The page with these drones opened, once it shows the last of them. ``prepare``: a script that runs first."""
@@ -98,6 +106,17 @@ class DronePage:
     def wait_for_text(self, selector: str, text: str) -> None:
         self.until(lambda: text in self.says(selector), f"{selector} says {text!r}, not {self.says(selector)!r}")
 
+    @contextmanager
+    def holding(self, *keys: str) -> Iterator[None]:
+        """Keys that are held meanwhile."""
+        for key in keys:
+            self.page.keyboard.down(key)
+        try:
+            yield
+        finally:
+            for key in reversed(keys):
+                self.page.keyboard.up(key)
+
     def attribute(self, selector: str, name: str) -> str:
         return self.pane.locator(selector).first.get_attribute(name) or ""
 
@@ -119,15 +138,23 @@ class DronePage:
             if time.monotonic() - pressed_s > 3.0:
                 pressed_s = time.monotonic()
                 self.press("c")
-            return self.pane.get_attribute("data-mine") == "true"
+            return bool(self.pane.get_attribute("data-mine") == "true")
 
         self.until(mine, "this page has control")
 
     def take_off(self) -> None:
-        """Take control, and wait until it hovers."""
+        """Take control, and wait until it hovers: pressed again if it came too late to count, as on a busy machine."""
         self.take_control()
-        self.press("t")
-        self.wait_for_text(".pill", "hovering")
+        pressed_s = 0.0
+
+        def up() -> bool:
+            nonlocal pressed_s
+            if "anded" in self.says(".pill") and time.monotonic() - pressed_s > 3.0:
+                pressed_s = time.monotonic()
+                self.press("t")
+            return "hovering" in self.says(".pill")
+
+        self.until(up, "it hovers", timeout_s=2 * PATIENCE_S)
 
 
 @contextmanager

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 
 from skyloop.client import Drone
+from skyloop.client.feedback_history import FeedbackHistory
 from skyloop.client.frame import Arrival, Frame
-from skyloop.client.history import FeedbackHistory
 from skyloop.client.statistics import ChannelStats, Distribution
 from skyloop.cockpit.access import Gate, OpenGate
 from skyloop.cockpit.app import create_app
-from skyloop.cockpit.finder import Found
+from skyloop.cockpit.discovery import Found
 from skyloop.cockpit.fleet import Fleet
 from skyloop.cockpit.recordings import Recordings
 from skyloop.cockpit.security import own_names
@@ -82,7 +82,7 @@ class FakeDrone:
     def __init__(self, width: int = 64, height: int = 48) -> None:
         cameras = (CameraInfo("front", width, height, 15.0), CameraInfo("bottom", width, height, 15.0))
         self.capabilities = Capabilities("sim", frozenset({"velocity"}), cameras, "simulated quadrotor")
-        self.link = SimpleNamespace(application=LinkState.UP, vehicle=LinkState.UP, reason="")
+        self.link = SimpleNamespace(application=LinkState.UP, vehicle=LinkState.UP, reason="", remedy="")
         delay = Distribution(0.0002, 0.0009, 0.002, 0.0003, 100)
         self.stats = {"feedback": ChannelStats(count=100, rate_hz=32.0, delay_s=delay, age_s=0.01)}
         self.newest: Feedback | None = None
@@ -179,10 +179,11 @@ class Flyer(Driver):
 
     PERIOD_S = 0.02
 
-    def __init__(self, *, position: bool = True) -> None:
-        super().__init__(VehicleUri("fake", text="fake://flyer"))
+    def __init__(self, *, position: bool = True, uri: str = "fake://flyer") -> None:
+        super().__init__(VehicleUri("fake", text=uri))
         self.state = FlightState.LANDED
         self.applied: list[AnyAction] = []
+        self.deaf = False  #: does nothing of what it is told
         self.place = [0.0, 0.0, 0.0]
         self.yaw = 0.0
         self._velocity = Velocity()
@@ -206,6 +207,8 @@ class Flyer(Driver):
 
     def _apply(self, action: AnyAction) -> AnyAction:
         self.applied.append(action)
+        if self.deaf:
+            return action
         self.state = NEXT.get(type(action), self.state)
         if ACTION_NAMES[type(action)] != "idle":
             self._velocity = action if isinstance(action, Velocity) else Velocity()
@@ -271,7 +274,7 @@ class Nodes:
     def __call__(self) -> list[Found]:
         return [Found(node.name, "memory", node.dial) for node in self.nodes if node.up]
 
-    def also(self, name: str) -> None:
+    def add_name(self, name: str) -> None:
         self.wanted.append(name)
 
     def close(self) -> None: ...
@@ -310,7 +313,7 @@ def fake_fleet(drones: Mapping[str, FakeDrone]) -> Fleet:
         def __call__(self) -> list[Found]:
             return [Found(name, "memory", dial) for name in drones]
 
-        def also(self, name: str) -> None: ...
+        def add_name(self, name: str) -> None: ...
 
         def close(self) -> None: ...
 

@@ -21,10 +21,11 @@ from skyloop.cockpit.access import (
     Person,
     Token,
     TokenGate,
+    peer_uid,
     person_of,
     read_tokens,
+    uid_in,
 )
-from skyloop.cockpit.peers import peer_uid, uid_in
 from skyloop.errors import FileFormatError, UsageError
 from skyloop.messages import Role
 

@@ -13,9 +13,9 @@ import pytest
 from starlette.websockets import WebSocketDisconnect
 
 from skyloop.client import AuthorityStatus, Drone
+from skyloop.cockpit.commands import decode_command
 from skyloop.cockpit.control import SILENT_S
 from skyloop.cockpit.fleet import Fleet
-from skyloop.cockpit.orders import decode_order
 from skyloop.control import Controller
 from skyloop.control.follow import FollowMarker
 from skyloop.errors import DecodeError
@@ -37,7 +37,27 @@ class Page:
         self.told: list[dict[str, Any]] = []
 
     def say(self, do: str, **values: Any) -> None:
-        self.socket.send_json({"do": do, **values})
+        """What a page says that sees and hears all: it has the cockpit's clock, being in one process with it."""
+        now_s = time.monotonic()
+        seen = {"seen_s": now_s} if do == "ping" else {}
+        self.socket.send_json({"do": do, "at_s": now_s, **seen, **values})
+
+    @contextmanager
+    def staying(self) -> Iterator[None]:
+        """It pings all the time."""
+        ended = threading.Event()
+
+        def stay() -> None:
+            while not ended.wait(0.1):
+                self.say("ping")
+
+        thread = threading.Thread(target=stay)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
 
     def wait(self, kind: str, **values: Any) -> dict[str, Any]:
         """The next message of that kind with these values."""
@@ -132,7 +152,7 @@ def test_without_control_nothing_is_flown(client: TestClient, node: Node) -> Non
 )
 def test_what_makes_no_sense_is_no_order(text: str) -> None:
     with pytest.raises(DecodeError, match="not understood"):
-        decode_order(text)
+        decode_command(text)
 
 
 def test_nonsense_is_refused_and_flies_nothing(client: TestClient, node: Node) -> None:
@@ -183,7 +203,7 @@ def test_who_was_pre_empted_is_not_told_of_a_silence(client: TestClient, node: N
         second.wait("refused", do="fly")  # the second page is the silent one: longer than the first could be
         first.say("ping")
         first.wait("pong")
-        assert not [told for told in first.told if "silent" in told.get("why", "")]
+        assert not [told for told in first.told if "silent" in (told.get("why") or "")]
 
 
 def test_a_page_that_dies_in_flight_leaves_a_hovering_drone(client: TestClient, node: Node) -> None:
@@ -236,19 +256,8 @@ def test_flying_to_a_place(client: TestClient, node: Node) -> None:
             while not state.get("waypoints"):
                 state = telemetry.receive_json()
             assert state["waypoints"][0]["position"] == [0.3, -0.2, 0.3]
-        alive = threading.Event()
-
-        def stay() -> None:
-            while not alive.wait(0.1):
-                pilot.say("ping")
-
-        pinging = threading.Thread(target=stay)
-        pinging.start()
-        try:
+        with pilot.staying():
             pilot.wait("done", do="goto")
-        finally:
-            alive.set()
-            pinging.join()
         assert math.dist(node.flyer.place, (0.3, -0.2, 0.3)) < 0.2
         assert node.flyer.yaw == pytest.approx(0.3, abs=0.15)
         until(lambda: node.flyer.state is FlightState.HOVERING)
@@ -366,7 +375,7 @@ class Following(FollowMarker):
 
 @pytest.mark.parametrize("kind", [Turning, Following])
 def test_a_controller_is_told_when_a_person_takes_over_and_goes_on_afterwards(
-    client: TestClient, node: Node, kind: type[Turning] | type[Following]
+    client: TestClient, node: Node, kind: type[Turning | Following]
 ) -> None:
     with node.connect("demo") as drone, page(client) as pilot:
         drone.takeoff()
@@ -421,21 +430,34 @@ def test_a_controller_that_ends_while_a_person_flies_leaves_the_drone_to_the_per
 # Lost and found -------------------------------------------------------------------------------------------------
 
 
-def test_a_killed_proxy_comes_back_and_the_page_flies_on(client: TestClient, node: Node) -> None:
-    with page(client) as pilot, open_socket(client, "drones/alpha/telemetry") as telemetry:
+def test_after_a_proxys_death_nobody_has_control_until_the_person_takes_it_again(
+    client: TestClient, node: Node
+) -> None:
+    with page(client) as pilot, open_socket(client, "drones/alpha/telemetry") as telemetry, pilot.staying():
         pilot.take()
         node.stop()
-        pilot.wait("authority", mine=False)
+        told = pilot.wait("authority", mine=False, state="none", holder=None)
+        assert "nobody has control" in told["why"]
+        assert "not known" in told["why"]
         message: dict[str, Any] = {"type": ""}
         while message["type"] != "state" or message["links"]["application"] != "lost":
             message = telemetry.receive_json()
         assert message["alarms"][0].startswith("link to the proxy lost")
+        assert message["set_points"] is None, "what is applied now is not known"
         pilot.say("takeoff")
         pilot.wait("refused", do="takeoff")
+        pilot.say("take", priority=4)
+        assert "link to the proxy is lost" in pilot.wait("refused", do="take")["why"]
         node.restart()
-        pilot.wait("authority", mine=True)
         while message["type"] != "state" or message["links"]["application"] != "up":
             message = telemetry.receive_json()
+        told = pilot.wait("authority", mine=False)
+        assert "flew meanwhile is not known" in told["why"]
+        with node.connect("witness", access="observe") as witness:
+            for _ in range(20):
+                assert witness.next_feedback().owner is None, "control does not come back by itself"
+        pilot.take()
+        assert pilot.told[-1]["why"] is None
         pilot.take_off()
 
 
@@ -445,7 +467,7 @@ def test_a_stop_over_a_lost_link_says_so(client: TestClient, node: Node) -> None
         for _ in range(3):
             watcher.next_feedback()
         node.stop()
-        pilot.say("stop")
+        pilot.say("stop", at_s=time.monotonic() - 1.5)
         assert "not sent" in pilot.wait("refused", do="stop")["why"]
 
 
@@ -461,7 +483,7 @@ def test_what_was_refused_is_told_once_and_does_not_happen_later(client: TestCli
         pilot.wait("pong")
         assert watcher.next_feedback().state is FlightState.LANDED
         assert not count(node, Takeoff())
-        assert sum(told.get("do") == "takeoff" for told in pilot.told) == 1
+        assert sum((told["type"], told.get("do")) == ("refused", "takeoff") for told in pilot.told) == 1
 
 
 def test_an_observer_gets_no_controls(node: Node) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,8 @@ from typing import Any
 import pytest
 
 from skyloop.clock import ManualClock
-from skyloop.cockpit.finder import Found, LocalFinder
-from skyloop.cockpit.fleet import FORGET_S, Fleet
-from skyloop.cockpit.overview import Overview
+from skyloop.cockpit.discovery import Found, LocalFinder
+from skyloop.cockpit.fleet import FORGET_S, Fleet, Overview
 from skyloop.cockpit.recordings import Recordings
 from skyloop.errors import LinkError, NoAnswerError
 from skyloop.messages import LinkState
@@ -39,7 +39,7 @@ class Hangar:
     def __call__(self) -> list[Found]:
         return [Found(name, "memory", dial) for name in self.found]
 
-    def also(self, name: str) -> None: ...
+    def add_name(self, name: str) -> None: ...
 
     def close(self) -> None: ...
 
@@ -147,13 +147,13 @@ def test_a_lost_drone_on_a_page_is_not_forgotten_and_one_that_is_back_neither() 
         await settle(fleet)
         station = fleet.stations["alpha"]
         wake = asyncio.Event()
-        station.beat.join(wake.set)
+        station.broadcast.subscribe(wake.set)
         hangar.found.clear()
         hangar.drones["alpha"].link.application = LinkState.LOST
         clock.advance(FORGET_S + 1)
         await settle(fleet)
         assert "alpha" in fleet.stations, "a page shows it"
-        station.beat.leave(wake.set)
+        station.broadcast.unsubscribe(wake.set)
         hangar.drones["alpha"].link.application = LinkState.UP
         await settle(fleet)
         hangar.drones["alpha"].link.application = LinkState.LOST
@@ -227,7 +227,7 @@ def test_drones_come_and_go_in_the_overview(nodes: Nodes) -> None:
 
 def test_the_overview_tells_who_holds_control(nodes: Nodes) -> None:
     with cockpit(Fleet(nodes, look_s=0.02)) as client, open_socket(client, "drones/alpha/control") as control:
-        control.send_json({"do": "take", "priority": 3})
+        control.send_json({"do": "take", "priority": 3, "at_s": time.monotonic()})
         until(lambda: rows(client)[0]["me"])
         first, second = rows(client)
         assert first["owner"].startswith("cockpit ")
@@ -252,7 +252,7 @@ def test_sockets_are_found_without_being_noticed(tmp_path: Path, monkeypatch: py
         assert finder()[0] is finder()[0], "the same, so that it is connected to once"
         some = LocalFinder(["beta", "gone"])
         assert [found.name for found in some()] == ["beta"]
-        some.also("alpha")
+        some.add_name("alpha")
         assert [found.name for found in some()] == ["alpha", "beta"]
         assert not log.joined
     finally:

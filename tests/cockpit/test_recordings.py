@@ -12,8 +12,9 @@ from starlette.websockets import WebSocketDisconnect
 
 from skyloop.client import Drone
 from skyloop.cockpit.fleet import Fleet
-from skyloop.cockpit.recordings import Recordings, describe
+from skyloop.cockpit.recordings import Recordings
 from skyloop.errors import LinkError, UnknownNameError
+from skyloop.logfile.listing import Described, describe
 from skyloop.recording import Recorder, record
 from tests.cockpit.fake import ORIGIN, FakeRecorder, Node, Nodes, cockpit, open_socket, until
 from tests.cockpit.testclient import TestClient, WebSocketTestSession
@@ -192,7 +193,7 @@ def test_a_replay_shows_up_and_can_be_ended(nodes: Nodes, folder: Path) -> None:
 def test_files_are_looked_into_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     looked: list[str] = []
 
-    def look(path: Path) -> dict[str, Any]:
+    def look(path: Path) -> Described:
         looked.append(path.name)
         return describe(path)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -162,6 +163,12 @@ def test_whatever_changes_something_needs_a_pilot(rest: str, method: str) -> Non
     assert needed("http", method, f"/api/recordings/{rest}") is Role.PILOT
 
 
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A wrong token is answered at once: these tests tell many. ``tests/security`` has how long it takes else."""
+    monkeypatch.setattr("skyloop.cockpit.access.LONGEST_S", 0.0)
+
+
 @pytest.fixture
 def node() -> Iterator[Node]:
     node = Node()
@@ -201,7 +208,8 @@ def test_without_the_right_token_there_is_nothing(guarded: TestClient, node: Nod
         assert guarded.post(path, headers={**ORIGIN, **given}, json={"drones": ["alpha"]}).status_code == 401
     for path in STREAMS:
         assert ended(guarded, path, **given) == 4401
-    assert guarded.get("/api/session", headers=given).json()["role"] is None
+    session = guarded.get("/api/session", headers=given)
+    assert session.status_code == 401 if given else session.json()["role"] is None
     assert not node.flyer.applied
 
 
@@ -234,12 +242,12 @@ def test_an_observer_sees_everything_and_changes_nothing(guarded: TestClient, no
 
 def test_a_pilot_flies_under_a_name(guarded: TestClient, node: Node) -> None:
     with open_socket(guarded, "drones/alpha/control", **bearer(PILOT)) as control:
-        control.send_json({"do": "take", "priority": 4})
+        control.send_json({"do": "take", "priority": 4, "at_s": time.monotonic()})
         message = control.receive_json()
         while not message.get("mine"):
             message = control.receive_json()
         assert message["holder"].startswith("ann (cockpit ")
-        control.send_json({"do": "takeoff"})
+        control.send_json({"do": "takeoff", "at_s": time.monotonic()})
         until(lambda: node.flyer.state is FlightState.HOVERING)
 
 

@@ -12,6 +12,7 @@ import ssl
 import subprocess
 import sys
 import threading
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -104,7 +105,7 @@ def test_missing_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     real = builtins.__import__
 
     def refuse(name: str, *args: Any, **kwargs: Any) -> Any:
-        if name.split(".")[0] == "uvicorn":
+        if name.split(".", maxsplit=1)[0] == "uvicorn":
             raise ImportError("No module named 'uvicorn'")
         return real(name, *args, **kwargs)
 
@@ -261,6 +262,7 @@ def test_tokens_over_tls(certificates: Path, tokens: Path) -> None:
 # As a process of its own --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.daily
 @pytest.mark.process
 def test_page_of_a_real_drone(tmp_path: Path) -> None:
     with connect("sim://?cameras=front&width=64&fps=10&position=1") as drone, CockpitProcess(drone.name) as page:
@@ -295,11 +297,11 @@ def test_page_of_a_real_drone(tmp_path: Path) -> None:
             assert pages.newest_age_s is not None
         assert page.statistics()["frames_encoded"] <= drone.stats["video/front"].count + 5
         with open_socket(f"{streams}/control", origin=Origin(own)) as control:
-            control.send('{"do":"take","priority":2}')
+            control.send(f'{{"do":"take","priority":2,"at_s":{time.monotonic()}}}')
             told: dict[str, Any] = {}
             while told != {"type": "done", "do": "take"}:
                 told = json.loads(control.recv(5))
-            control.send('{"do":"takeoff"}')
+            control.send(f'{{"do":"takeoff","at_s":{time.monotonic()}}}')
             drone.wait("taking_off", 5)
         drone.wait(lambda feedback: feedback.owner_id == drone.app_id, 5)
         assert drone.feedback().state is not FlightState.LANDED, "left as it was, for who is next"

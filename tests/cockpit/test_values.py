@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 
-from skyloop.cockpit.alarms import alarms
 from skyloop.cockpit.api import parameter_values
 from skyloop.cockpit.telemetry import encode_json
 from skyloop.cockpit.values import (
+    alarms,
     feedback_values,
     flat_values,
     motion_values,
@@ -37,8 +37,9 @@ from skyloop.messages import (
 )
 
 
-def link(application: str = "up", vehicle: str = "up", reason: str = "") -> Any:
-    return SimpleNamespace(application=LinkState(application), vehicle=LinkState(vehicle), reason=reason)
+def link(application: str = "up", vehicle: str = "up", reason: str = "", remedy: str = "") -> Any:
+    hops = {"application": LinkState(application), "vehicle": LinkState(vehicle)}
+    return SimpleNamespace(**hops, reason=reason, remedy=remedy)
 
 
 def flying(**values: Any) -> Feedback:
@@ -54,6 +55,9 @@ def flying(**values: Any) -> Feedback:
         ((link("lost", "up", "killed"), flying(battery=0.01), 9.0, {}), ["link to the proxy lost: killed"]),
         ((link("closed"), None, None, {}), ["link to the proxy lost"]),
         ((link("up", "lost", "radio"), flying(), 0.1, {}), ["link to the vehicle lost: radio"]),
+        ((link("up", "lost", "radio", "plug it in"), None, None, {}), ["link to the vehicle lost: radio: plug it in"]),
+        ((link("up", "connecting", "waiting"), None, None, {}), ["no vehicle yet: waiting"]),
+        ((link("up", "closed", "end of the recording"), flying(battery=0.01), 9.0, {"front": 9.0}), []),
         ((link("degraded"), flying(), 0.1, {}), ["link to the proxy degraded"]),
         ((link(), flying(state=FlightState.EMERGENCY), 0.1, {}), ["emergency: the motors are off"]),
         ((link(), flying(failsafe=Failsafe.HOVER), 0.1, {}), ["failsafe: hovering by itself"]),

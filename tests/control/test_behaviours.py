@@ -11,9 +11,9 @@ import pytest
 
 from skyloop.control import FlowHover, FlyThroughGates, GateKind, ImageServo, LandOnMarker, SeeAndAvoid
 from skyloop.control.gate_law import GatePhase
-from skyloop.control.rehearsal import Radio, rehearse
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.messages import Annotation, Severity
+from skyloop.stepping.rehearsal import Radio, rehearse
 
 
 @pytest.fixture(scope="module")
@@ -28,6 +28,7 @@ def script() -> ModuleType:
     return module
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "seed", "gust"),
     [("gates", 0, 0.0), ("gates", 3, 1.0), ("landing", 0, 0.0), ("landing", 5, 1.0), ("approach", 1, 1.0)],
@@ -43,12 +44,14 @@ def test_follows_in_gusts(script: ModuleType) -> None:
     assert flight.error_m <= script.FOLLOW_RMS_M
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["servo", "orbit", "avoid", "flow"])
 def test_does_what_it_should_in_calm_air(script: ModuleType, name: str) -> None:
     flight = script.GOALS[name].fly(1, 0.0)
     assert flight.good, flight.note
 
 
+@pytest.mark.slow
 def test_two_flights_with_the_same_seed_are_the_same(script: ModuleType) -> None:
     first, second = (script.avoid(4, 0.5) for _ in range(2))
     assert first == second
@@ -83,6 +86,7 @@ def test_a_gate_that_is_not_there_is_searched_and_not_flown_to(script: ModuleTyp
         assert drawn[-1].source == "gates"
 
 
+@pytest.mark.slow
 def test_pictures_that_stop_make_it_hover_and_say_so() -> None:
     with rehearse("sim://?world=gates&cameras=front&fps=15&wind=0", radio=Radio(drop=0.0)) as drone:
         drone.takeoff()

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from skyloop.client.feedback_history import FeedbackHistory
 from skyloop.client.frame import Arrival, Frame
-from skyloop.client.history import FeedbackHistory
 from skyloop.control.follow import FollowMarker, FollowScore
 from skyloop.control.follow_law import Mode
 from skyloop.errors import UnknownNameError

@@ -65,6 +65,7 @@ def test_tilt_is_taken_out(roll: float, pitch: float) -> None:
     assert levelled(tilted, FORWARD, roll, pitch) == pytest.approx(level, abs=1e-9)
 
 
+@pytest.mark.slow
 @given(st.tuples(st.floats(-1.0, 0.7), small, small), st.floats(-0.4, 0.4))
 def test_flies_to_where_the_points_look_as_wanted(start: tuple[float, float, float], yaw: float) -> None:
     wanted, _ = seen(np.zeros(3), 0.0)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from skyloop.control.motion_profile import MotionProfile
@@ -81,10 +81,39 @@ def test_a_way_back_and_a_straight_joint() -> None:
     assert straight.position(straight.duration_s) == pytest.approx([2, 0, 1])
 
 
+def test_what_can_not_be_divided_by_is_refused() -> None:
+    for numbers in (
+        {"speed_m_s": 5e-324},
+        {"acceleration_m_s2": 5e-324},
+        {"speed_m_s": 1e300},
+        {"speed_m_s": math.nan},
+    ):
+        for make in (
+            lambda **one: Polyline(SQUARE, **one),
+            lambda **one: Circle((0, 0, 1), 1.0, **one),
+            lambda **one: Lemniscate((0, 0, 1), 1.0, **one),
+        ):
+            with pytest.raises(UsageError, match="must be from 1e-06 to 1e"):
+                make(**numbers)
+    for radius in (5e-324, 1e300):
+        with pytest.raises(UsageError, match="radius_m"):
+            Circle((0, 0, 1), radius)
+        with pytest.raises(UsageError, match="half_width_m"):
+            Lemniscate((0, 0, 1), radius)
+    with pytest.raises(UsageError, match="at most"):
+        Polyline([(0, 0, 0), (1e300, 0, 0)])
+    with pytest.raises(UsageError, match="at least"):
+        Spline([(0, 0, 0), (1, 0, 0)], [0.0, 5e-324])
+    with pytest.raises(UsageError, match="has no end"):
+        MotionProfile([(1.0, 0.0)], 1.0)
+
+
 @given(
     st.lists(st.tuples(st.floats(0.0, 10.0), st.floats(0.01, 5.0)), min_size=1, max_size=8),
     st.floats(0.05, 10.0),
 )
+@example([(0.5, 1.0), (5e-324, 1.0)], 0.4)
+@example([(5e-324, 1.0), (0.5, 1.0), (1e-200, 0.01)], 0.05)
 def test_profiles_keep_each_stretch_s_limit(stretches: list[tuple[float, float]], acceleration: float) -> None:
     total = sum(length for length, _ in stretches)
     assume(total > 0.01)

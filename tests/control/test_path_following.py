@@ -13,9 +13,9 @@ import pytest
 
 from skyloop.client import Drone
 from skyloop.control import Circle, DeadReckoning, Fix, FixedYaw, FollowPath, Polyline, Waypoint, Waypoints
-from skyloop.control.rehearsal import Radio, rehearse
 from skyloop.errors import UsageError
 from skyloop.messages import Feedback
+from skyloop.stepping.rehearsal import Radio, rehearse
 
 CALM = "sim://?world=empty&position=1&cameras=none&wind=0"
 

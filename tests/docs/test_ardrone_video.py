@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import fields
 
-from skyloop.drivers.ardrone.video import VideoCounters
+from skyloop.drivers.live_video import VideoCounters
 from tests.docs.pages import rows, section
 
 

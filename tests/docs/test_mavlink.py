@@ -7,8 +7,8 @@ import re
 import pytest
 
 from skyloop.drivers.mavlink import options
-from skyloop.drivers.mavlink.metadata import COMMON
-from skyloop.drivers.mavlink.session import DEGRADED_NS, FIRST_WORD_NS, LOST_NS, PARAMETERS_NS
+from skyloop.drivers.mavlink.options import OWN_LIMITS
+from skyloop.drivers.mavlink.protocol import DEGRADED_NS, FIRST_WORD_NS, LOST_NS, PARAMETERS_NS
 from tests.docs.pages import rows, section
 
 PAGE = "docs/mavlink.md"
@@ -20,19 +20,14 @@ def names(cell: str) -> list[str]:
 
 def test_the_options_of_addresses() -> None:
     told = [name for row in rows(section(PAGE, "### `mavlink://`")) for name in names(row[0])]
-    assert sorted(name for name in told if ":" not in name) == sorted(options._KNOWN)
-    ways = {name.removeprefix("mavlink://").partition(":")[0] for name in told if ":" in name}
-    assert ways == {way.value for way in options.Way}
+    assert sorted(name for name in told if ":" not in name) == sorted(options.KNOWN)
+    kinds = {name.removeprefix("mavlink://").partition(":")[0] for name in told if ":" in name}
+    assert kinds == {kind.value for kind in options.ConnectionKind}
 
 
-def test_the_names_that_all_drivers_share() -> None:
-    told = {
-        (names(row[0])[0], native)
-        for row in rows(section(PAGE, "### Parameters"))
-        for native in names(row[1] + row[2])
-        if native != "FENCE_ENABLE"
-    }
-    assert told == {(common.name, common.native) for common in COMMON}
+def test_the_drivers_own_limits() -> None:
+    told = {names(row[0])[0]: (names(row[1])[0], float(row[2])) for row in rows(section(PAGE, "### Parameters"))}
+    assert told == {limit.name: (limit.option, limit.usual) for limit in OWN_LIMITS}
 
 
 @pytest.mark.parametrize("ns", [DEGRADED_NS, LOST_NS, FIRST_WORD_NS, PARAMETERS_NS])

@@ -12,6 +12,7 @@ import skyloop
 from skyloop.control.controller import Controller, RunSummary
 from skyloop.messages import Feedback
 from tests.docs.pages import ROOT, Block, blocks
+from tests.recordings import recorded
 
 LONGEST_RUN_S = 10.0  # of a controller, whatever the example says
 BLOCKS = blocks("python")
@@ -20,6 +21,8 @@ Flight = tuple[RunSummary, Feedback]
 
 #: What an example must have printed.
 PRINTS = {"vehicles.md": "pictures, in order: True"}
+#: What stands for a file of the reader's: something that was recorded from a real vehicle.
+FILES = {"flight.pave": "ardrone2/video-8s.pave"}
 
 
 @pytest.fixture
@@ -39,8 +42,12 @@ def flights(monkeypatch: pytest.MonkeyPatch) -> list[Flight]:
 
 
 def execute(block: Block) -> None:
+    code = block.code
+    for name, recording in FILES.items():
+        if name in code:
+            code = code.replace(name, str(recorded(recording)))
     names: dict[str, Any] = {"__name__": "__main__"}
-    exec(compile("\n" * (block.line - 1) + block.code, str(block.page), "exec", dont_inherit=True), names)
+    exec(compile("\n" * (block.line - 1) + code, str(block.page), "exec", dont_inherit=True), names)
 
 
 @pytest.mark.process

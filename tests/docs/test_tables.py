@@ -9,16 +9,15 @@ import pytest
 
 from skyloop.cockpit.server import _LARGEST_MESSAGE
 from skyloop.drivers.sim import options as sim_options
-from skyloop.drivers.video import driver as video_driver
-from skyloop.messages import FlightState, Hover, Land, ResetEmergency, Takeoff, Velocity
-from skyloop.proxy.gate import PLANS, Plan
+from skyloop.drivers.video import options as video_options
+from skyloop.messages import Action, FlightState, Hover, Land, ResetEmergency, Takeoff, Velocity
+from skyloop.proxy.core.command_checks import STATE_POLICIES, StatePolicy
 from skyloop.proxy.parameters import OWN
-from skyloop.proxy.proxy import MAX_ANNOTATION
+from skyloop.proxy.relay import MAX_ANNOTATION
 from skyloop.proxy.requests import MAX_PENDING
 from skyloop.proxy.sessions import MAX_MALFORMED
 from skyloop.sim.world_file import shipped_worlds
-from skyloop.transport.base import MAX_PACKET
-from skyloop.transport.local.connection import MAX_SUBSCRIPTIONS
+from skyloop.transport.base import MAX_PACKET, MAX_SUBSCRIPTIONS
 from skyloop.transport.local.frames import MAX_LEASES
 from skyloop.transport.local.server import MAX_CLIENTS
 from tests.docs.pages import ROOT, rows, section
@@ -47,20 +46,20 @@ def test_the_proxys_parameters() -> None:
 
 
 def test_what_is_done_in_which_flight_state() -> None:
-    columns = (Takeoff, Hover, Land, Velocity, ResetEmergency)
-    words = {"done": Plan.APPLY, "refused": Plan.REFUSE, "hover": Plan.HOVER}
+    columns: tuple[type[Action], ...] = (Takeoff, Hover, Land, Velocity, ResetEmergency)
+    words = {"done": StatePolicy.APPLY, "refused": StatePolicy.REFUSE, "hover": StatePolicy.HOVER}
     seen = set()
     for states, *cells in rows(section("docs/proxy.md", "## Which commands are executed")):
         for state in states.split(", "):
             seen.add(FlightState(state.replace(" ", "_")))
             for action, cell in zip(columns, cells, strict=True):
-                plan = PLANS[action][FlightState(state.replace(" ", "_"))]
-                assert plan is words.get(cell, Plan.HOLD), (state, action.__name__)
+                plan = STATE_POLICIES[action][FlightState(state.replace(" ", "_"))]
+                assert plan is words.get(cell, StatePolicy.HOLD), (state, action.__name__)
     assert seen == set(FlightState)
 
 
 @pytest.mark.parametrize(
-    ("heading", "known"), [("### `sim://`", sim_options._KNOWN), ("### `video://`", video_driver._OPTIONS)]
+    ("heading", "known"), [("### `sim://`", sim_options.KNOWN), ("### `video://`", video_options.KNOWN)]
 )
 def test_the_options_of_addresses(heading: str, known: set[str]) -> None:
     table = rows(section("docs/drivers.md", heading))

@@ -18,8 +18,8 @@ from skyloop.clock import ManualClock
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.registry import make_driver
 from skyloop.drivers.replay import ReplayDriver
-from skyloop.drivers.replay.driver import _OPTIONS
-from skyloop.drivers.replay.tape import Tape, Timeline
+from skyloop.drivers.replay.options import KNOWN
+from skyloop.drivers.replay.source import ReplaySource, Timeline
 from skyloop.errors import ParameterError, UnknownNameError, UsageError
 from skyloop.logfile.layout import (
     META_CLOCK,
@@ -345,13 +345,13 @@ def test_a_timeline() -> None:
     assert timeline.at(1000) == 50_100
 
 
-def test_a_tape_knows_its_begin(flight: Path) -> None:
+def test_a_source_knows_its_begin(flight: Path) -> None:
     recording = Recording.open(flight)
-    tape = Tape(recording, recording.drone())
-    assert tape.begin_ns == BEGIN_NS
-    assert not tape.empty
-    assert Tape(recording, recording.drone(), 1e4).empty
-    first = tape.first_feedback()
+    source = ReplaySource(recording, recording.drone())
+    assert source.begin_ns == BEGIN_NS
+    assert not source.empty
+    assert ReplaySource(recording, recording.drone(), 1e4).empty
+    first = source.first_feedback()
     assert first is not None
     assert first.seq == 1
 
@@ -366,7 +366,7 @@ def test_closing_ends_the_thread(flight: Path) -> None:
 def test_the_page_lists_the_options_and_what_is_added_to_the_telemetry(flight: Path) -> None:
     text = section("docs/replay.md", "## `replay://`")
     options, _, rest = text.partition("What the vehicle told")
-    assert {row[0].strip("`") for row in rows(options)} == _OPTIONS
+    assert {row[0].strip("`") for row in rows(options)} == KNOWN
     with played(flight) as (_, sink):
         assert sink.wait(lambda: sink.link_state is LinkState.CLOSED, WAIT_S)
         newest = sink.newest

@@ -45,8 +45,8 @@ class Altered(Toy):  # type: ignore[misc, valid-type]
             def feedback(self, feedback: Feedback) -> None:
                 sink.feedback(driver.alter(feedback))
 
-            def link(self, state: LinkState, reason: str = "") -> None:
-                sink.link(state, reason)
+            def link(self, state: LinkState, reason: str = "", remedy: str = "") -> None:
+                sink.link(state, reason, remedy)
 
         super()._open(Between())
 

@@ -18,13 +18,14 @@ from skyloop.clock import monotonic_ns
 from skyloop.drivers.base import Driver
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.registry import make_driver
-from skyloop.drivers.video.player import LivePlayer, Screen
-from skyloop.drivers.video.sources import ContainerSource, Picture, Source
+from skyloop.drivers.video.player import CameraPublisher, LivePlayer
+from skyloop.drivers.video.sources import ContainerSource, DecodedImage, Source
 from skyloop.errors import DriverError, FileFormatError, MissingExtraError, UnknownNameError, UsageError
 from skyloop.messages import Hover, LinkState
 from skyloop.wire.ardrone.pave import PaveParser
+from tests.recordings import recorded
 
-DATA = Path(__file__).parents[1] / "data" / "ardrone2"
+LONG, TORN = "ardrone2/video-8s.pave", "ardrone2/video-64-byte-headers.pave"
 FAST = "speed=1000"
 FRAMES = 24
 
@@ -68,7 +69,7 @@ def play(uri: str, *, keep_pixels: bool = False, timeout_s: float = 20.0) -> Rec
 
 
 def test_all_240_pictures_of_a_real_drone_come_in_order() -> None:
-    sink = play(f"video://{DATA / 'video-8s.pave'}?{FAST}")
+    sink = play(f"video://{recorded(LONG)}?{FAST}")
     assert sink.frame_counts == {"front": 240}
     assert sink.links == [(LinkState.UP, ""), (LinkState.CLOSED, "end of the recording after 240 pictures")]
     assert {(frame.width, frame.height, frame.intrinsics) for frame in sink.frames} == {(640, 360, None)}
@@ -80,17 +81,17 @@ def test_all_240_pictures_of_a_real_drone_come_in_order() -> None:
 
 def test_pictures_of_a_real_drone_are_handed_on_as_they_came() -> None:
     sink = RecordingSink(watch=set(), record=True)  # which is why it begins: nobody looks
-    with playing(f"video://{DATA}/video-8s.pave?{FAST}", sink) as driver:
+    with playing(f"video://{recorded(LONG)}?{FAST}", sink) as driver:
         assert [camera.stream for camera in driver.capabilities().cameras] == ["h264"]
         assert sink.wait(lambda: len(sink.pictures) == 240, 20.0)
-    sent = PaveParser().feed((DATA / "video-8s.pave").read_bytes())
+    sent = PaveParser().feed(recorded(LONG).read_bytes())
     assert [(seen.data, seen.key) for seen in sink.pictures] == [(frame.payload, frame.is_key) for frame in sent]
     assert not sink.frames
 
 
 def test_who_comes_late_gets_pictures_from_the_next_key_on() -> None:
     sink = RecordingSink(keep_pixels=False)
-    with playing(f"video://{DATA}/video-8s.pave?speed=20&fx=500", sink):
+    with playing(f"video://{recorded(LONG)}?speed=20&fx=500", sink):
         assert sink.wait(lambda: sink.frame_counts["front"] > 3, 20.0)
         sink.record = True
         assert sink.wait(lambda: len(sink.pictures) > 20, 20.0)
@@ -104,14 +105,14 @@ def test_a_clip_has_no_stream(clip: Path) -> None:
 
 
 def test_a_torn_start_is_waited_out() -> None:
-    sink = play(f"video://{DATA / 'video-64-byte-headers.pave'}?{FAST}", keep_pixels=True)
+    sink = play(f"video://{recorded(TORN)}?{FAST}", keep_pixels=True)
     assert sink.frame_counts == {"front": 17}
     assert sink.frames[0].pixels.std() > 20  # a picture, not the grey of a decoder without its key frame
 
 
 def test_pictures_come_at_the_times_of_their_stamps() -> None:
     begun_ns = monotonic_ns()
-    sink = play(f"video://{DATA / 'video-64-byte-headers.pave'}?camera=nose")
+    sink = play(f"video://{recorded(TORN)}?camera=nose")
     took_s = (monotonic_ns() - begun_ns) / 1e9
     captured = np.array([frame.captured_ns for frame in sink.frames])
     stamps_ms = np.array([248, 271, 303])  # of the header, less 1792577000: see the parser's test
@@ -275,7 +276,7 @@ def test_a_bad_file_is_told_when_opened(
 
 
 def test_without_pyav_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in [name for name in sys.modules if name.startswith("skyloop.drivers.video") or name.startswith("av.")]:
+    for name in [name for name in sys.modules if name.startswith(("skyloop.drivers.video", "av."))]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'skyloop\[video\]'"):
@@ -287,7 +288,7 @@ def test_without_pyav_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> Non
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
 def test_a_stream_that_was_cut_off_plays_as_far_as_it_goes(tmp_path: Path, share: float) -> None:
-    whole = (DATA / "video-8s.pave").read_bytes()
+    whole = recorded(LONG).read_bytes()
     path = tmp_path / "cut.pave"
     path.write_bytes(whole[: int(len(whole) * share)])
     sink = play(f"video://{path}?{FAST}")
@@ -296,13 +297,13 @@ def test_a_stream_that_was_cut_off_plays_as_far_as_it_goes(tmp_path: Path, share
 
 
 @pytest.mark.parametrize("seed", range(6))
-@pytest.mark.parametrize("name", ["video-64-byte-headers.pave", "clip.mp4"])
+@pytest.mark.parametrize("name", [TORN, "clip.mp4"])
 def test_flipped_bits_end_in_no_error(tmp_path: Path, clip: Path, name: str, seed: int) -> None:
-    data = bytearray((clip if name == "clip.mp4" else DATA / name).read_bytes())
+    data = bytearray((clip if name == "clip.mp4" else recorded(name)).read_bytes())
     chance = random.Random(seed)
     for _ in range(12):
         data[chance.randrange(len(data))] ^= 1 << chance.randrange(8)
-    path = tmp_path / name
+    path = tmp_path / Path(name).name
     path.write_bytes(data)
     try:
         sink = play(f"video://{path}?{FAST}")
@@ -313,7 +314,7 @@ def test_flipped_bits_end_in_no_error(tmp_path: Path, clip: Path, name: str, see
 
 
 def test_damaged_pictures_are_left_out_up_to_the_next_key_frame(tmp_path: Path) -> None:
-    data = bytearray((DATA / "video-8s.pave").read_bytes())
+    data = bytearray(recorded(LONG).read_bytes())
     at = data.find(b"PaVE", 20_000)
     data[at : at + 4] = b"xxxx"  # the header of the sixth frame or so
     path = tmp_path / "hole.pave"
@@ -323,7 +324,7 @@ def test_damaged_pictures_are_left_out_up_to_the_next_key_frame(tmp_path: Path) 
 
 
 def test_a_stream_without_a_key_frame_shows_nothing_and_says_so(tmp_path: Path) -> None:
-    torn = (DATA / "video-64-byte-headers.pave").read_bytes()
+    torn = recorded(TORN).read_bytes()
     path = tmp_path / "headless.pave"
     path.write_bytes(torn[:7431])  # the stale frame and the two P frames after it
     sink = play(f"video://{path}?{FAST}")
@@ -353,7 +354,7 @@ def test_a_file_that_is_no_camera_is_told() -> None:
 @contextmanager
 def live(open_source: Callable[[], Source], sink: RecordingSink) -> Iterator[None]:
     stop = threading.Event()
-    player = LivePlayer(Screen(sink, "front", lambda *_: None, stop), open_source, retry_s=0.01)
+    player = LivePlayer(CameraPublisher(sink, "front", lambda *_: None, stop), open_source, retry_s=0.01)
     thread = threading.Thread(target=player.run)
     thread.start()
     try:
@@ -387,19 +388,20 @@ class StalledCamera:
     """Twelve pictures at 25 a second, by the stamps, that all come half a second after the first one."""
 
     width, height, fps, damaged = 64, 48, 25.0, 0
+    stream = ""
 
     def __init__(self) -> None:
         self.decoded = 0
 
-    def pictures(self, late: Callable[[float], bool] | None = None) -> Iterator[Picture]:
+    def images(self, late: Callable[[float], bool] | None = None) -> Iterator[DecodedImage]:
         assert late is not None
         image = av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), format="bgr24")
-        yield Picture(7.0, image)
+        yield DecodedImage(7.0, image)
         time.sleep(0.5)
         for n in range(1, 13):
             if not late(7.0 + n * 0.04):
                 self.decoded += 1
-                yield Picture(7.0 + n * 0.04, image)
+                yield DecodedImage(7.0 + n * 0.04, image)
 
     def close(self) -> None:
         pass

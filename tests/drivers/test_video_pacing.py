@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.clock import NS_PER_S
-from skyloop.drivers.video.pacing import FilePacer, LiveClock
+from skyloop.drivers.live_clock import LiveClock
+from skyloop.drivers.video.player import FilePacer
 
 MS = 1_000_000
 

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from skyloop.drivers.suite import DriverSuite
+from tests.recordings import FIXTURES, needs_recordings
 
-DATA = Path(__file__).parents[1] / "data" / "ardrone2"
 
-
+@needs_recordings
 class TestPaveVideo(DriverSuite):
-    uri = f"video://{DATA / 'video-8s.pave'}?loop=1"
+    uri = f"video://{FIXTURES}/ardrone2/video-8s.pave?loop=1"

@@ -12,7 +12,7 @@ import pytest
 
 import skyloop
 from skyloop.client import Drone
-from skyloop.control.rehearsal import rehearse
+from skyloop.stepping.rehearsal import rehearse
 
 FOLDER = Path(__file__).parents[2] / "examples"
 Run = Callable[[str], str]

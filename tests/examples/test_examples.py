@@ -48,6 +48,7 @@ def numbers(pattern: str, process: Process) -> list[float]:
     return [float(found) for found in re.findall(pattern, process.text)]
 
 
+@pytest.mark.daily
 def test_a_first_flight(start: Start) -> None:
     process = example(start, "first_flight")
     assert process.wait(60.0) == 0

@@ -90,6 +90,7 @@ def test_many_drones_begin_anew_on_their_own() -> None:
         seen, _, failed, over, told = envs.step(steer(seen))
     assert over.all()
     assert not failed.any()
+    assert told["is_success"].tolist() == (told["distance_m"] < NEAR_M).tolist()
     near = told["distance_m"].copy()
     _, rewards, failed, over, told = envs.step(steer(seen))
     none = np.concatenate([rewards != 0.0, failed, over])

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from skyloop.client import Drone, Frame
-from skyloop.client.pace import Pace
+from skyloop.client.scheduler import Scheduler
 from skyloop.errors import UsageError
 from skyloop.messages import Applied, FlightState, Velocity
 from skyloop.proxy.proxy import Proxy
@@ -189,7 +189,7 @@ class Wrong:
 @pytest.mark.parametrize("ahead_s", [-300.0, 86_400.0])
 def test_ages_are_true_to_their_uncertainty_whatever_the_clocks_say(far: Node, ahead_s: float) -> None:
     clock = Wrong(ahead_s, drift=150e-6)
-    with far.connected(pace=Pace(clock)) as drone:
+    with far.connected(scheduler=Scheduler(clock)) as drone:
         drone.takeoff()
         for _ in range(20):
             before_ns = clock.truth_ns
@@ -209,7 +209,7 @@ def test_ages_are_true_to_their_uncertainty_whatever_the_clocks_say(far: Node, a
         delay = stats["feedback"].delay_s
         assert delay is not None
         assert delay.median > -stats["feedback"].uncertainty_s - 0.01
-        assert far.proxy.watch.airborne, "commands were not taken for stale"
+        assert far.proxy.handler.airborne, "commands were not taken for stale"
 
 
 def test_one_host_needs_no_estimate() -> None:

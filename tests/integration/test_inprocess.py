@@ -224,6 +224,7 @@ def test_a_restarted_proxy(node: Node, drone: Drone) -> None:
     node.proxy.stop()
     node.vehicle.applied.clear()
     node.proxy = Proxy(node.vehicle, node.server, name="alpha")
+    node.proxy.handler.ownership.began_before()  # as the note of its flight says to a named proxy that was killed
     started_s = time.monotonic()
     node.proxy.start()
     drone.wait(lambda _: drone.link.application is LinkState.UP and drone.authority.state == "held", WAIT_S)
@@ -239,11 +240,11 @@ def test_a_restarted_proxy(node: Node, drone: Drone) -> None:
 
 def test_the_vehicle_s_link(node: Node, drone: Drone) -> None:
     drone.takeoff()
-    node.proxy.vehicle.link(LinkState.LOST, "cable")
+    node.proxy.publisher.link(LinkState.LOST, "cable")
     drone.wait(lambda _: drone.link.vehicle is LinkState.LOST, WAIT_S)
     assert "cable" in drone.link.reason
     assert drone.authority.state == "held"
-    node.proxy.vehicle.link(LinkState.UP)
+    node.proxy.publisher.link(LinkState.UP)
     drone.wait(lambda _: drone.link.vehicle is LinkState.UP, WAIT_S)
     drone.velocity(forward=0.1)
     drone.wait(lambda _: applied(node, Velocity(forward=0.1)), WAIT_S)
@@ -270,7 +271,7 @@ def test_a_pilot_whose_link_is_cut_leaves_a_hovering_then_landing_vehicle(node: 
         pilot.takeoff()
         pilot.velocity(forward=0.5)
         pilot.wait("flying", WAIT_S)
-        pilot._link.close()  # as if it were killed
+        pilot._supervisor.close()  # as if it were killed
         eye.wait("landed", WAIT_S)
         pilot.close()
     order = [step for number, step in enumerate(steps) if number == 0 or step is not steps[number - 1]]
@@ -316,7 +317,7 @@ def test_forged_commands_change_nothing(node: Node, drone: Drone) -> None:
 def test_statistics_of_all_channels(node: Node, drone: Drone) -> None:
     drone.takeoff()
     drone.frame()
-    drone.wait(lambda _: drone._reception.channels["front"].counter.count > 10, WAIT_S)
+    drone.wait(lambda _: drone._state.channels["front"].counter.count > 10, WAIT_S)
     stats = drone.stats
     for name in ("command", "feedback", "video/front"):
         delay = stats[name].delay_s

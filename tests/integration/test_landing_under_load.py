@@ -5,7 +5,7 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 
 from skyloop.client import Drone
-from skyloop.client.pace import Pace
+from skyloop.client.scheduler import Scheduler
 from skyloop.messages import EventKind, Failsafe, FlightState, Hover, Land, Refusal, Takeoff
 from skyloop.transport.testing import wait_until
 from tests.proxy.fake import Bench
@@ -15,16 +15,21 @@ WAIT_S = 10.0
 
 def test_a_landing_whose_commands_all_came_too_late_is_completed() -> None:
     with Bench() as bench, ThreadPoolExecutor(1) as user:
-        driver, flight, witness = bench.driver, bench.proxy.flight, bench.join("witness")
-        opening = user.submit(Drone(bench.dial, app="me", pace=Pace(bench.clock)).open, timeout_s=WAIT_S)
-        wait_until(lambda: driver.report() or opening.done(), "it is connected")
+        driver, checks, witness = bench.driver, bench.proxy.handler.checks, bench.join("witness")
+
+        def reported() -> bool:
+            driver.report()
+            return False
+
+        opening = user.submit(Drone(bench.dial, app="me", scheduler=Scheduler(bench.clock)).open, timeout_s=WAIT_S)
+        wait_until(lambda: reported() or opening.done(), "it is connected")
         with opening.result() as drone:
             drone.takeoff(wait=False)
             wait_until(lambda: Takeoff() in driver.told, "it takes off")
             driver.report(state=FlightState.HOVERING)
             drone.wait(lambda feedback: feedback.state is FlightState.HOVERING, WAIT_S)
 
-            usual_ns, flight.max_age_ns = flight.max_age_ns, -1  # nothing is young enough
+            usual_ns, checks.max_age_ns = checks.max_age_ns, -1  # nothing is young enough
             landing = user.submit(drone.land, timeout_s=3 * WAIT_S)
             wait_until(lambda: any(echo.asked == Land() for echo in list(witness.applied)), "the command came")
             bench.run(0.6, driver.report)
@@ -32,7 +37,7 @@ def test_a_landing_whose_commands_all_came_too_late_is_completed() -> None:
             assert {event.data["reason"] for event in bench.published(EventKind.COMMAND_REFUSED)} == {Refusal.STALE}
             drone.wait(lambda feedback: feedback.failsafe is Failsafe.HOVER, WAIT_S)
 
-            flight.max_age_ns = usual_ns
+            checks.max_age_ns = usual_ns
             bench.run(0.1, driver.report)
             wait_until(lambda: Land() in driver.told, "it lands")
             bench.run(0.2, driver.report)

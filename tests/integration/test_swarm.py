@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -13,10 +14,10 @@ import pytest
 
 import skyloop
 from skyloop.client import Drone, Swarm
-from skyloop.client.gather import choose
-from skyloop.client.link import RedialPolicy
-from skyloop.client.monitor import Thresholds
-from skyloop.client.parallel import in_parallel
+from skyloop.client.connect import choose
+from skyloop.client.connection import RedialPolicy
+from skyloop.client.link_monitor import Thresholds
+from skyloop.client.swarm import in_parallel
 from skyloop.errors import (
     AuthorityError,
     ClosedError,
@@ -78,7 +79,7 @@ class Field:
     def _become(self, names: tuple[str, ...], state: FlightState) -> None:
         for name in names:
             self.vehicles[name].state = state
-            assert self.proxies[name].vehicle.wait_for(lambda now: now is state, 10.0)
+            assert self.proxies[name].publisher.wait_for(lambda now: now is state, 10.0)
 
     def states(self) -> set[FlightState]:
         return {vehicle.state for vehicle in self.vehicles.values()}
@@ -451,7 +452,7 @@ def test_connecting_reports_all_that_failed_and_leaves_the_others(
             raise UnknownNameError("running proxy", target, NAMES)
         return field.connect(target, **options)
 
-    monkeypatch.setattr("skyloop.client.gather.connect", connect)
+    monkeypatch.setattr(sys.modules["skyloop.client.connect"], "connect", connect)
     with pytest.raises(SwarmError) as raised:
         skyloop.swarm("alpha", "delta", "echo")
     assert list(raised.value.errors) == ["delta", "echo"]

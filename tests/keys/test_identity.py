@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from skyloop.errors import UsageError
 from skyloop.keys.identity import MAX_PATTERNS, KeyRole, make_identity, parse_drones
+from skyloop.transport.base import NAME
 from skyloop.transport.fabric.layout import check_identity
-from skyloop.transport.names import NAME
 
 NAMES = st.from_regex(NAME, fullmatch=True)
 

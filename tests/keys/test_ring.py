@@ -24,40 +24,40 @@ def ring(lab: Lab) -> KeyRing:
 
 
 def test_nothing_is_to_be_said_of_good_keys(ring: KeyRing) -> None:
-    assert ring.look(NOW) == []
+    assert ring.poll(NOW) == []
 
 
 def test_an_end_is_told_at_once_and_then_every_hour(ring: KeyRing) -> None:
     late = NOW + 25 * DAY
-    assert [len(ring.look(late + wait)) for wait in (0 * HOUR, HOUR / 2, HOUR, HOUR * 1.5, HOUR * 2)] == [1, 0, 1, 0, 1]
-    assert ring.look(NOW + 26 * DAY)[0].startswith("the key of alpha expires in 4 days")
+    assert [len(ring.poll(late + wait)) for wait in (0 * HOUR, HOUR / 2, HOUR, HOUR * 1.5, HOUR * 2)] == [1, 0, 1, 0, 1]
+    assert ring.poll(NOW + 26 * DAY)[0].startswith("the key of alpha expires in 4 days")
 
 
 def test_a_new_name_on_the_roster_is_told_once(ring: KeyRing, lab: Lab) -> None:
     lab.issue(make_identity("olga", "observer"), now=NOW)
-    (news,) = ring.look(NOW)
+    (news,) = ring.poll(NOW)
     assert "roster has changed (number 5)" in news
     assert "revoked" not in news
-    assert ring.look(NOW) == []
+    assert ring.poll(NOW) == []
     assert ring.shut_out == frozenset()
 
 
 def test_a_renewed_key_is_no_news(ring: KeyRing, lab: Lab) -> None:
     lab.issue(make_identity("jane", "pilot", "alpha*"), now=NOW + DAY)
-    assert ring.look(NOW) == []
+    assert ring.poll(NOW) == []
     assert ring.credentials.roster.number == 5
 
 
 def test_who_is_revoked_or_changed_is_shut_out_at_once(ring: KeyRing, lab: Lab) -> None:
     lab.revoke("eve")
-    (news,) = ring.look(NOW)
+    (news,) = ring.poll(NOW)
     assert "revoked or changed: eve" in news
     lab.issue(make_identity("jane", "observer"), now=NOW)
-    (news,) = ring.look(NOW)
+    (news,) = ring.poll(NOW)
     assert "revoked or changed: eve, jane" in news
     assert ring.shut_out == {"eve", "jane"}
     lab.issue(make_identity("jane", "pilot", "alpha*"), now=NOW)
-    ring.look(NOW)
+    ring.poll(NOW)
     assert ring.shut_out == {"eve"}
 
 
@@ -66,19 +66,19 @@ def test_a_damaged_or_older_roster_changes_nothing(ring: KeyRing, lab: Lab, tmp_
     good = mine.read_bytes()
     lab.revoke("eve")
     newer = mine.read_bytes()
-    ring.look(NOW)
+    ring.poll(NOW)
     mine.write_bytes(newer[:50])
-    (news,) = ring.look(NOW)
+    (news,) = ring.poll(NOW)
     assert "is no roster" in news
     assert "stays in force" in news
-    assert ring.look(NOW) == []
+    assert ring.poll(NOW) == []
     mine.write_bytes(good)
-    assert ring.look(NOW) == []
+    assert ring.poll(NOW) == []
     mine.unlink()
-    (news,) = ring.look(NOW)
+    (news,) = ring.poll(NOW)
     assert "can't be read" in news
     assert ring.shut_out == {"eve"}
     mine.write_bytes(newer)
     os.utime(mine)
-    assert ring.look(NOW) == []
+    assert ring.poll(NOW) == []
     assert ring.shut_out == {"eve"}

@@ -35,6 +35,7 @@ from skyloop.messages import (
 )
 from skyloop.messages.codec import HEADER, HEADER_SIZE, KINDS, MAX_BODY, SIGNATURE, VERSION
 from skyloop.messages.encoded import MAX_ENCODED
+from skyloop.messages.numbers import LATEST_NS
 from tests.messages.samples import CAMERA, SAMPLES
 
 PACKETS = Path(__file__).parents[1] / "data" / "packets"
@@ -60,6 +61,19 @@ def test_a_camera_told_by_an_older_proxy_has_no_stream() -> None:
     assert camera == msgspec.structs.replace(CAMERA, stream="")
 
 
+@pytest.mark.parametrize("name", ["feedback", "feedback-minimal"])
+def test_feedback_of_an_older_proxy_has_no_reason_of_its_link_and_nobody_else_who_flies(name: str) -> None:
+    older = decode((PACKETS / "older" / f"{name}.bin").read_bytes())
+    assert older == msgspec.structs.replace(SAMPLES[name], link_reason="", link_remedy="", others=None)
+
+
+def test_an_older_proxy_does_not_tell_its_clock() -> None:
+    older = decode((PACKETS / "older" / "reply-welcome-without-clock.bin").read_bytes())
+    newer = SAMPLES["reply-welcome"]
+    assert isinstance(newer, Reply)
+    assert older == Reply(newer.id, msgspec.structs.replace(newer.body, clock=""))
+
+
 @pytest.mark.parametrize(
     ("name", "known"),
     [
@@ -82,7 +96,9 @@ def test_the_largest_picture_that_is_handed_on_fits_a_packet() -> None:
     camera = "\N{GRINNING FACE}" * 64
     last = 2**63 - 1
     intrinsics = Intrinsics(0.1, 0.1, 0.1, 0.1, (0.1,) * 14, "fisheye")
-    picture = EncodedFrame(camera, last, last, last, 16384, 16384, "h264", True, bytes(MAX_ENCODED), intrinsics)
+    picture = EncodedFrame(
+        camera, last, LATEST_NS, LATEST_NS, 16384, 16384, "h264", True, bytes(MAX_ENCODED), intrinsics
+    )
     assert decode(encode(picture)) == picture
     with pytest.raises(DecodeError, match="length"):
         decode(encode(msgspec.structs.replace(picture, camera="front", data=bytes(MAX_ENCODED + 1))))

@@ -13,9 +13,8 @@ import pytest
 
 from skyloop import messages
 from skyloop.messages import annotation, codec, command, config, encoded
-from skyloop.transport.base import MAX_PACKET, MAX_TOPIC
+from skyloop.transport.base import MAX_PACKET, MAX_SUBSCRIPTIONS, MAX_TOPIC
 from skyloop.transport.local import packets
-from skyloop.transport.local.connection import MAX_SUBSCRIPTIONS
 from skyloop.transport.local.frames import MAX_LEASES
 
 PAGE = (Path(__file__).parents[2] / "docs" / "wire-format.md").read_text()

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from skyloop.transport.base import MAX_TOPIC
-from skyloop.transport.fabric import config, frames, layout, packets, server, window
+from skyloop.transport.fabric import config, delivery, frames, layout, packets, registry, sealing
 from tests.messages.test_codec import PACKETS
 from tests.messages.test_wire_format import FABRIC
 
@@ -17,6 +17,7 @@ GOLDEN: dict[str, packets.Message] = {
     "taken": packets.Taken("feedback", 9),
     "seen": packets.Seen("video/front", 1000),
     "bye": packets.Bye("closed by the application"),
+    "key": packets.Key(2, bytes(range(32))),
 }
 
 
@@ -64,8 +65,12 @@ def test_numbers_in_the_text() -> None:
     assert f"1 to {MAX_TOPIC} characters" in FABRIC
     assert f"at most {packets.MAX_REASON} bytes" in FABRIC
     assert f"Lease {config.LEASE_MS} ms" in FABRIC
-    assert f"seen within {server.CONFIRM_S:g} s" in FABRIC
-    assert f"At most {window.DEPTH} packets or {window.MAX_BYTES >> 20} MiB" in FABRIC
-    assert f"every {window.ACKNOWLEDGE_AFTER} packets, or {window.MAX_BYTES >> 13} KiB" in FABRIC
+    assert f"seen within {registry.CONFIRM_S:g} s" in FABRIC
+    assert f"at most {delivery.DEPTH} packets or {delivery.MAX_BYTES >> 20} MiB" in FABRIC
+    assert f"every {delivery.ACKNOWLEDGE_AFTER} packets" in FABRIC
     assert f"At most {frames.WINDOW} frames of a request" in FABRIC
     assert f"nothing is heard for {frames.LOST_NS / 1e9:g} s" in FABRIC
+    assert f"longer by {sealing.TRAILER} bytes" in FABRIC
+    assert f"{sealing.TAG} bytes\nlonger" in FABRIC
+    assert f"more than {sealing.WIDTH} numbers behind" in FABRIC
+    assert f"uses it {sealing.SWITCH_S:g} s later" in FABRIC

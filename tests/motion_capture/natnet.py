@@ -11,12 +11,13 @@ import struct
 import sys
 import time
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Final, NamedTuple
 
-RECORDING: Final = Path(__file__).parents[1] / "data" / "mocap" / "natnet3-motive2.1.pcapng"
+from tests.recordings import recorded
+
 SERVER_INFO, MODEL_DEFINITIONS, FRAME = 1, 5, 7  # what the server sends
 CONNECT, REQUEST_MODELS = 0, 4  # what a client asks
+SESSION: Final = "mocap/natnet3-motive2.1.pcapng"
 BODY: Final = "RaceQuad"
 _DATA_PORT_AT: Final = 4 + 256 + 4 + 4 + 8  # in the server's description: after name, versions and clock frequency
 
@@ -31,7 +32,7 @@ class Recorded(NamedTuple):
 
 def datagrams() -> Iterator[bytes]:
     """What was sent over UDP, in order."""
-    data, at = RECORDING.read_bytes(), 0
+    data, at = recorded(SESSION).read_bytes(), 0
     while at < len(data):
         kind, size = struct.unpack_from("<II", data, at)
         if kind == 6:  # an enhanced packet block

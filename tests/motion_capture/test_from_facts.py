@@ -1,5 +1,5 @@
-"""Vicon, Qualisys and VRPN: the clients that the ``motioncapture`` package carries, against small servers that are
-written from public facts."""
+"""Vicon and Qualisys by the clients that the ``motioncapture`` package carries, and VRPN by ours, against small servers
+that are written from public facts."""
 
 from __future__ import annotations
 
@@ -30,25 +30,12 @@ def busy(port: int) -> bool:
     return False
 
 
-def names_protocols() -> bool:
-    """Without that VRPN's client throws most connections away that it has just accepted."""
-    try:
-        socket.getprotobyname("tcp")
-    except OSError:
-        return False
-    return True
-
-
 @pytest.fixture(params=["vicon", "qualisys", "vrpn"])
 def address(request: pytest.FixtureRequest) -> Iterator[str]:
     """Of a server that runs."""
     system = str(request.param)
     if system == "qualisys" and busy(QUALISYS_FRAMES_PORT):
         pytest.skip(f"UDP port {QUALISYS_FRAMES_PORT} of this host, which the package uses, is taken")
-    if system == "vrpn" and not names_protocols():
-        pytest.skip(
-            "VRPN's client can't look up protocols here: install /etc/protocols (on Debian and Ubuntu: netbase)"
-        )
     process = Process("-m", f"tests.motion_capture.{system}", "0")
     try:
         process.until("ready")

@@ -16,6 +16,7 @@ from skyloop.motion_capture.source import ChildSource
 from skyloop.transport.testing import wait_until
 from tests.motion_capture import natnet
 from tests.processes.conftest import Process
+from tests.recordings import recorded
 
 pytest.importorskip("motioncapture", reason="needs the motioncapture package: pip install 'skyloop[mocap]'")
 pytestmark = pytest.mark.process
@@ -24,6 +25,7 @@ ENOUGH = 200
 
 @pytest.fixture
 def server() -> Iterator[Process]:
+    recorded(natnet.SESSION)
     process = Process("-m", "tests.motion_capture.natnet", "0")
     try:
         process.until("ready")
@@ -42,9 +44,9 @@ def connect(server: Process) -> MotionCapture:
 
 
 def test_the_recorded_poses_come_out_in_our_axes(server: Process) -> None:
-    recorded = [natnet.rigid_body(frame) for frame in natnet.frames()]
-    assert len(recorded) == 518
-    expected = {z_up(body.position, body.quaternion) for body in recorded if body.tracked}
+    bodies = [natnet.rigid_body(frame) for frame in natnet.frames()]
+    assert len(bodies) == 518
+    expected = {z_up(body.position, body.quaternion) for body in bodies if body.tracked}
     seen: list[BodyPose] = []
     with connect(server) as capture:
         pose = capture.wait("alpha")

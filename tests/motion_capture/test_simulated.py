@@ -39,7 +39,7 @@ def test_a_path_is_flown_by_motion_capture_recorded_and_the_truth(proxy: Proxy, 
             assert follow.done, summary
             pose = capture.wait("alpha")
             assert math.dist(pose.position, (0.6, 0.0, 1.0)) < 0.3
-            assert pose.velocity is not None
+            wait_until(lambda: capture.wait("alpha").velocity is not None, "two poses in a row tell its velocity")
             with pytest.raises(UsageError, match="alpha flies"):
                 capture.calibrate(drone)
             drone.land()
@@ -116,4 +116,14 @@ def test_a_listener_must_be_a_function_and_one_that_fails_costs_only_itself(
 
         with capture.on_pose(fail), capture.on_pose(seen.append):
             wait_until(lambda: seen, "the other one was called")
+
+        others: list[BodyPose] = []
+        registration = capture.on_pose(others.append)  # without a block
+        wait_until(lambda: others, "it is called from then on")
+        registration.close()
+        registration.close()
+        count, before = len(others), len(seen)
+        with capture.on_pose(seen.append):
+            wait_until(lambda: len(seen) > before + 1, "others go on")
+        assert len(others) <= count + 1, "one may have been under way"
     assert "a motion capture listener failed" in caplog.text

@@ -50,7 +50,7 @@ def seeing(name: str) -> Iterator[MotionCapture]:
 
 
 def test_an_autopilot_without_gps_flies_by_them() -> None:
-    from skyloop.sim.firmware.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
+    from skyloop.emulators.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
     from skyloop.sim.host import SimHost
     from skyloop.sim.options import SimOptions
 

@@ -1,8 +1,9 @@
-"""A small VRPN server: ``python -m tests.motion_capture.vrpn PORT``.
+"""A small VRPN server: ``python -m tests.motion_capture.vrpn PORT [SENSOR...]``.
 
 Written from the protocol's public description (``Format_Of_Protocol.txt`` and ``vrpn_Connection.C`` of
-https://github.com/vrpn/vrpn, Boost licence): the client tells by UDP where it listens, the server connects there, both
-say who they are, and the server names its senders and types and sends poses. All big endian, padded to eight bytes.
+https://github.com/vrpn/vrpn, Boost licence): a client connects by TCP, or tells by UDP where it listens and the server
+connects there; both say who they are, and the server names its senders and types and sends poses. All big endian,
+padded to eight bytes.
 """
 
 from __future__ import annotations
@@ -11,76 +12,90 @@ import contextlib
 import itertools
 import math
 import socket
-import struct
 import sys
+import threading
 import time
 from typing import Final
 
+from skyloop.wire.vrpn import (
+    COOKIE,
+    POS_QUAT,
+    SENDER_DESCRIPTION,
+    TYPE_DESCRIPTION,
+    encode_description,
+    encode_pose,
+)
 from tests.motion_capture.moving import BODIES, PERIOD_S, pose
 
-COOKIE: Final = b"vrpn: ver. 07.38  0".ljust(24, b"\0")
-SENDER_DESCRIPTION, TYPE_DESCRIPTION = -1, -2  #: types of messages that describe
 SENDERS: Final = ("VRPN Control", *BODIES)
-TYPES: Final = ("vrpn_Base ping_message", "vrpn_Base pong_message", "vrpn_Tracker Pos_Quat")
+TYPES: Final = ("vrpn_Base ping_message", "vrpn_Base pong_message", POS_QUAT)
+APART_M: Final = 10.0  #: how far along x each sensor is from the one before
 
 
-def message(sender: int, kind: int, payload: bytes) -> bytes:
-    """The length leaves out the padding at the end; the sixth number, after the header, is not looked at."""
-    seconds, fraction = divmod(time.time(), 1.0)
-    head = struct.pack(">IIIiiI", 24 + len(payload), int(seconds), int(fraction * 1e6), sender, kind, 0)
-    return head + payload + bytes(-len(payload) % 8)
-
-
-def description(kind: int, number: int, name: str) -> bytes:
-    words = name.encode() + b"\0"
-    return message(number, kind, struct.pack(">I", len(words)) + words)
-
-
-def frame(number: int) -> bytes:
-    """The pose of the first body; nothing is sent of one that is hidden."""
-    place, yaw = pose(number)
+def frame(number: int, sensor: int = 0) -> bytes:
+    """The pose of a sensor of the first body; nothing is sent of the body that is hidden."""
+    (x, y, z), yaw = pose(number)
     turn = (0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
-    return message(SENDERS.index(BODIES[0]), 2, struct.pack(">ii7d", 0, 0, *place, *turn))
+    seconds, fraction = divmod(time.time(), 1.0)
+    return encode_pose(
+        SENDERS.index(BODIES[0]),
+        TYPES.index(POS_QUAT),
+        sensor,
+        (x + APART_M * sensor, y, z),
+        turn,
+        seconds=int(seconds),
+        microseconds=int(fraction * 1e6),
+    )
 
 
-def serve(port: int) -> None:
-    """One client after the other, until it is killed. One that calls again from elsewhere has given up the last try."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as knock:
-        knock.bind(("127.0.0.1", port))
-        print(f"ready {knock.getsockname()[1]}", flush=True)
-        place = heard(knock)
+def descriptions() -> bytes:
+    """What the senders and types are called."""
+    return b"".join(
+        encode_description(kind, number, name)
+        for kind, names in ((SENDER_DESCRIPTION, SENDERS), (TYPE_DESCRIPTION, TYPES))
+        for number, name in enumerate(names)
+    )
+
+
+def stream(client: socket.socket, sensors: list[int], ended: threading.Event) -> None:
+    """Greet a client, and send it poses for as long as it takes them."""
+    with contextlib.suppress(OSError), client:
+        client.sendall(COOKIE)
+        if client.recv(len(COOKIE), socket.MSG_WAITALL)[:11] != COOKIE[:11]:
+            return
+        client.sendall(descriptions())
+        for number in itertools.count(1):
+            if ended.wait(PERIOD_S):
+                return
+            client.sendall(b"".join(frame(number, sensor) for sensor in sensors))
+
+
+def serve(port: int, sensors: list[int]) -> None:
+    """Serve whoever connects, until it is killed. One that calls by UDP again has given up the last try."""
+    with socket.create_server(("127.0.0.1", port)) as server, socket.socket(type=socket.SOCK_DGRAM) as knock:
+        knock.bind(server.getsockname())
+        threading.Thread(target=accept, args=(server, sensors), daemon=True).start()
+        print(f"ready {server.getsockname()[1]}", flush=True)
+        last: tuple[tuple[str, int], threading.Event] | None = None
         while True:
-            newest = place
-            with contextlib.suppress(OSError), socket.create_connection(place) as client:
-                greet(client)
-                knock.setblocking(False)
-                for number in itertools.count(1):
-                    with contextlib.suppress(BlockingIOError):
-                        newest = heard(knock)
-                    if newest != place:
-                        break
-                    client.sendall(frame(number))
-                    time.sleep(PERIOD_S)
-            knock.setblocking(True)
-            place = newest if newest != place else heard(knock)
+            host, theirs = knock.recv(1024).rstrip(b"\0").decode().split()[:2]
+            place = (host, int(theirs))
+            if last is not None:
+                if last[0] == place:
+                    continue
+                last[1].set()
+            ended = threading.Event()
+            last = place, ended
+            with contextlib.suppress(OSError):
+                client = socket.create_connection(place)
+                threading.Thread(target=stream, args=(client, sensors, ended), daemon=True).start()
 
 
-def heard(knock: socket.socket) -> tuple[str, int]:
-    """Where a client listens."""
-    host, port = knock.recv(1024).rstrip(b"\0").decode().split()[:2]
-    return host, int(port)
-
-
-def greet(client: socket.socket) -> None:
-    """Say who is here, and what the senders and types are called."""
-    client.sendall(COOKIE)
-    if client.recv(len(COOKIE), socket.MSG_WAITALL)[:11] != COOKIE[:11]:
-        raise ConnectionError("that is no client, or it is gone")
-    for number, name in enumerate(SENDERS):
-        client.sendall(description(SENDER_DESCRIPTION, number, name))
-    for number, name in enumerate(TYPES):
-        client.sendall(description(TYPE_DESCRIPTION, number, name))
+def accept(server: socket.socket, sensors: list[int]) -> None:
+    while True:
+        client, _ = server.accept()
+        threading.Thread(target=stream, args=(client, sensors, threading.Event()), daemon=True).start()
 
 
 if __name__ == "__main__":
-    serve(int(sys.argv[1]))
+    serve(int(sys.argv[1]), [int(text) for text in sys.argv[2:]] or [0])

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
-from skyloop.bench.hosts.namespaces import Host
+from benchmarks.hosts.namespaces import Host
 from skyloop.bench.workers import STARTS_WITHIN_S, Pipe, Workers
 from skyloop.client import Drone
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from skyloop.bench.hosts.impairments import Impairments
-from skyloop.bench.hosts.namespaces import Lab
-from skyloop.bench.hosts.path import Path
+from benchmarks.hosts.impairments import Impairments
+from benchmarks.hosts.namespaces import Lab
+from benchmarks.hosts.path import Path
 from skyloop.transport.testing import wait_until
 from tests.network import flying
 from tests.network.remote import Remote

@@ -13,9 +13,9 @@ from pathlib import Path as File
 
 import pytest
 
-from skyloop.bench.hosts.impairments import Impairments
-from skyloop.bench.hosts.namespaces import Host, Lab
-from skyloop.bench.hosts.path import Path
+from benchmarks.hosts.impairments import Impairments
+from benchmarks.hosts.namespaces import Host, Lab
+from benchmarks.hosts.path import Path
 from skyloop.errors import UnsupportedError, UsageError
 from skyloop.transport.testing import wait_until
 from tests.processes.conftest import Process
@@ -110,7 +110,7 @@ def test_a_clock_set_apart(lab: Lab) -> None:
 def test_nothing_outlives_whoever_made_it() -> None:
     """Killed with no chance to clean up, it leaves no process that holds a namespace."""
     script = (
-        "from skyloop.bench.hosts.namespaces import Lab\n"
+        "from benchmarks.hosts.namespaces import Lab\n"
         "lab = Lab(); a = lab.host('alpha'); lab.segment('10.77.1.0/24').join(a); print(a.pid, flush=True); input()"
     )
     maker = subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.bench.hosts.impairments import Impairments, Way
+from benchmarks.hosts.impairments import Impairments, Way
 from skyloop.clock import nanoseconds
 from skyloop.errors import UsageError
 

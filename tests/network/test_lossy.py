@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from skyloop.bench import network
-from skyloop.bench.network import DATAGRAMS, PATH, TCP
+from benchmarks import network
+from benchmarks.network import DATAGRAMS, PATH, TCP
 from skyloop.bench.schedule import COMMAND, FEEDBACK, VIDEO
 
 pytest.importorskip("zenoh")

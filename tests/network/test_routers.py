@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from skyloop.bench.hosts.namespaces import Lab
+from benchmarks.hosts.namespaces import Lab
 from tests.network import flying
 from tests.network.conftest import FAST
 from tests.network.remote import Remote

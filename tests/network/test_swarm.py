@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from skyloop.bench import swarm
+from benchmarks import swarm
 
 pytest.importorskip("zenoh")
 pytest.importorskip("cv2")

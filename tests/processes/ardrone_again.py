@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 
-from skyloop.sim.firmware.ardrone import ArdroneFirmware, Ports
+from skyloop.emulators.ardrone import ArdroneFirmware, Ports
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 

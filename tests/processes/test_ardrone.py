@@ -11,8 +11,8 @@ import pytest
 
 import skyloop
 from skyloop.control.follow import FollowMarker
+from skyloop.emulators.ardrone.video import FRONT_1
 from skyloop.messages import EventKind, Failsafe, FlightState, LinkState
-from skyloop.sim.firmware.ardrone.cameras import FRONT_1
 from tests.processes.conftest import Process, eventually
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(180)]
@@ -69,6 +69,7 @@ def test_the_marker_follower_flies_it_unchanged_with_and_without_loss(
         eventually(lambda: drone.feedback().state is FlightState.LANDED, "it stands again", 15.0)
 
 
+@pytest.mark.daily
 def test_a_killed_pilot_leaves_it_hovering_and_then_landing(
     firmware: Firmware, proxy: Callable[..., Process], start: Callable[..., Process]
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -92,7 +93,7 @@ def test_a_proxy_tells_that_its_roster_has_changed(place: str, lab: Lab) -> None
 
 
 def test_through_a_router_with_keys(
-    start: Callable[..., Process], lab: Lab, sockets: Path, monkeypatch: pytest.MonkeyPatch
+    start: Callable[..., Process], lab: Lab, sockets: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     lab.issue(make_identity("hub", "router"))
     place = f"{LOCAL}:{free_port(LOCAL)}"
@@ -113,3 +114,10 @@ def test_through_a_router_with_keys(
         skyloop.connect("alpha", network=place, timeout_s=1.0)
     lab.revoke("bob")
     hub.until("revoked or changed: bob")
+    stolen = Path(shutil.copytree(lab.folder("olga"), tmp_path / "stolen"))
+    with skyloop.connect("alpha", network=place, keys=stolen, access="observe") as olga:
+        lab.revoke("olga")
+        hub.until("begins anew without olga")
+        eventually(lambda: olga.link.application == "lost", "olga is shut out")
+    with skyloop.connect("alpha", network=place, keys=lab.folder("jane"), access="observe") as jane:
+        assert jane.feedback() is not None

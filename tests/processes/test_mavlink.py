@@ -13,8 +13,8 @@ import pytest
 
 import skyloop
 from skyloop.control.follow import FollowMarker
+from skyloop.emulators.mavlink.video import CAMERA
 from skyloop.messages import EventKind, Failsafe, FlightState, LinkState
-from skyloop.sim.firmware.mavlink.video import CAMERA
 from tests.processes.conftest import Process, eventually
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(180)]
@@ -77,6 +77,7 @@ def test_the_marker_follower_flies_it_unchanged_with_and_without_loss(
         eventually(lambda: drone.feedback().state is FlightState.LANDED, "it stands again", 15.0)
 
 
+@pytest.mark.daily
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_killed_pilot_leaves_it_hovering_and_then_landing(
     firmware: Firmware, proxy: Callable[..., Process], start: Callable[..., Process], kind: str

@@ -77,7 +77,7 @@ def test_a_proxy_on_the_network_says_that_anyone_can_fly_and_is_flown(far: Calla
     assert (row.name, row.transport, row.host, row.pid) == ("alpha", "fabric", os.uname().nodename, alpha.pid)
     assert (row.vehicle, row.state, row.owner, row.problem) == ("sim", "landed", None, "")
     with skyloop.connect("alpha", network=place) as drone:
-        assert f"(pid {alpha.pid})" in drone._link._connection.address  # type: ignore[union-attr]
+        assert f"(pid {alpha.pid})" in drone._connection._session.address  # type: ignore[union-attr]
         assert drone.reach is None, "a process that was not told of the network does not find it"
         drone.takeoff()
         drone.velocity(forward=0.3)
@@ -116,6 +116,7 @@ drone.wait(lambda feedback: False, 100)
 """
 
 
+@pytest.mark.daily
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_dead_or_stopped_pilot_is_told_and_the_vehicle_fails_safe(
     far: Callable[..., Process], start: Callable[..., Process], place: str, how: signal.Signals

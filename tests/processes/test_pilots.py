@@ -30,6 +30,7 @@ pytestmark = pytest.mark.process
 PILOTS = str(Path(__file__).with_name("pilots.py"))
 
 
+@pytest.mark.daily
 def test_a_pilot_killed_in_flight_leaves_a_drone_that_hovers_at_once_and_lands_after_five_seconds(
     proxy: Callable[..., Process], start: Callable[..., Process]
 ) -> None:
@@ -61,6 +62,7 @@ def test_a_pilot_killed_in_flight_leaves_a_drone_that_hovers_at_once_and_lands_a
         assert observer.feedback().owner is None
 
 
+@pytest.mark.daily
 def test_one_flies_priority_takes_over_and_no_command_of_an_old_lease_is_ever_executed(
     proxy: Callable[..., Process],
 ) -> None:
@@ -133,10 +135,10 @@ def test_a_pilot_that_hangs_keeps_its_name_on_a_drone_that_fails_safe_until_some
 
 def forge(drone: skyloop.Drone, lease: int, action: Velocity | Land) -> None:
     """Send a command under another lease over this application's own connection."""
-    pilot = drone._pilot
-    packet = encode(Command(pilot.seq + 1, lease, pilot._commander.intent, time.monotonic_ns(), action))
+    pilot = drone._commands
+    packet = encode(Command(pilot.seq + 1, lease, pilot._schedule.intent, time.monotonic_ns(), action))
     pilot._seq += 1
-    assert drone._link.transmit(packet)
+    assert drone._connection.transmit(packet)
 
 
 def count_events(drone: skyloop.Drone, reason: str) -> int:

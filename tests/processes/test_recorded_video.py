@@ -12,10 +12,15 @@ from skyloop.errors import UnsupportedError
 from skyloop.logfile.reader import Recording
 from skyloop.wire.ardrone.pave import PaveParser
 from tests.processes.conftest import eventually
+from tests.recordings import recorded
 
 pytestmark = pytest.mark.process
 
-RECORDING = Path(__file__).parents[1] / "data" / "ardrone2" / "video-8s.pave"
+
+def stream() -> Path:
+    return recorded("ardrone2/video-8s.pave")
+
+
 FRAMES = 240
 
 
@@ -35,7 +40,7 @@ class Look(skyloop.Controller):
 
 def test_all_frames_reach_a_processor_and_a_controller_in_order() -> None:
     pytest.importorskip("av", reason="reading recorded video needs PyAV: pip install 'skyloop[video]'")
-    with skyloop.connect(f"video://{RECORDING}") as drone:
+    with skyloop.connect(f"video://{stream()}") as drone:
         with pytest.raises(UnsupportedError, match="record"):
             drone.takeoff()
         processed: list[int] = []
@@ -55,7 +60,7 @@ def test_its_h264_reaches_a_recorder_in_a_process_of_its_own_as_it_was(tmp_path:
     pytest.importorskip("av", reason="reading recorded video needs PyAV: pip install 'skyloop[video]'")
     path = tmp_path / "flight.mcap"
     with (
-        skyloop.connect(f"video://{RECORDING}?speed=4") as drone,
+        skyloop.connect(f"video://{stream()}?speed=4") as drone,
         skyloop.record(drone, path, min_free_mb=0) as recorder,
     ):
         drone.wait(lambda feedback: feedback.vehicle_link == "closed", timeout_s=20.0)
@@ -63,7 +68,7 @@ def test_its_h264_reaches_a_recorder_in_a_process_of_its_own_as_it_was(tmp_path:
         eventually(lambda: recorder.status.seconds > closed_s + 2.0, "what was on the way is written", 30.0)
     recording = Recording.open(path)
     pictures = list(recording.pictures(recording.drone().name, "front"))
-    sent = [frame.payload for frame in PaveParser().feed(RECORDING.read_bytes())]
+    sent = [frame.payload for frame in PaveParser().feed(stream().read_bytes())]
     places = [sent.index(picture.compressed) for picture in pictures]
     assert places == sorted(set(places))
     if not recorder.dropped and not recorder.missed:  # a busy machine may leave some out, and says so

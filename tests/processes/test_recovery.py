@@ -16,6 +16,7 @@ from tests.processes.conftest import Process, eventually
 pytestmark = pytest.mark.process
 
 
+@pytest.mark.daily
 def test_a_killed_and_restarted_proxy_is_back_within_a_second_with_everything_as_it_was(
     proxy: Callable[..., Process],
 ) -> None:
@@ -76,6 +77,7 @@ def test_a_lost_vehicle_is_told_and_only_fresh_commands_fly_it_again(proxy: Call
         drone.land()
 
 
+@pytest.mark.daily
 def test_a_private_proxy_ends_with_its_block_and_with_its_parent(start: Callable[..., Process]) -> None:
     from skyloop.transport.local import list_names
 

@@ -35,6 +35,7 @@ def alpha(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
                     process.end()
 
 
+@pytest.mark.daily
 def test_it_turns_by_the_results_of_another_process(alpha: str, capsys: pytest.CaptureFixture[str]) -> None:
     drawn: list[Annotation] = []
     yaws: list[float] = []

@@ -4,6 +4,7 @@ that stands still. A Ping's answer shows that everything sent before it was deal
 from __future__ import annotations
 
 import queue
+import time
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -77,6 +78,8 @@ class FakeDriver(Driver):
         self.native = list(parameters)
         self.while_setting: Callable[[], None] = lambda: None
         self.closed = False
+        self.left = ""  #: what others made of the vehicle
+        self.repeats = 0
         self.answers = True  #: whether feedback follows a command
         self._actions = frozenset(actions)
 
@@ -113,9 +116,17 @@ class FakeDriver(Driver):
     def _close(self) -> None:
         self.closed = True
 
+    def left_to(self) -> str:
+        return self.left
+
+    def _repeat(self, action: AnyAction) -> AnyAction:
+        self.repeats += 1
+        return self._apply(action)
+
     def _apply(self, action: AnyAction) -> AnyAction:
         self._may_fail("apply")
         self.told.append(action)
+        self.left = ""
         if self.answers and type(action) in _NEXT:
             self.report(state=_NEXT[type(action)])
         return action
@@ -283,10 +294,19 @@ class Bench:
     def airborne(self, name: str = "pilot", priority: int = 16) -> App:
         """A pilot whose vehicle hovers, with the record of the driver cleared."""
         app = self.pilot(name, priority)
+        self.take_off(app)
+        return app
+
+    def take_off(self, app: App) -> None:
+        """Begin a flight of this pilot, up to where the vehicle hovers, and clear the record of the driver."""
         app.command(Takeoff())
+        deadline = time.monotonic() + WAIT_S
+        while Takeoff() not in self.driver.told:  # a datagram may be lost
+            assert time.monotonic() < deadline, "the take-off was never executed"
+            time.sleep(0.01)
+            app.command(Takeoff())
         self.driver.report(state=FlightState.HOVERING)
         self.driver.told.clear()
-        return app
 
     def run(self, seconds: float, each: Callable[[], object] = lambda: None) -> None:
         """Let time pass in steps of 20 ms, the proxy's tick after each, then ``each``."""

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.clock import NS_PER_S
-from skyloop.proxy.authority import (
+from skyloop.proxy.core.authority import (
     Asked,
     Authority,
     Declined,
@@ -106,27 +106,27 @@ def test_a_silent_holder_loses_the_lease_exactly_at_the_time_out() -> None:
     authority = Authority(timeout_s=2.0)
     authority.request(1, 16, True, 10 * S)
     authority.request(2, 20, True, 10 * S)
-    assert authority.tick(12 * S - 1) == []
+    assert authority.update(12 * S - 1) == []
     authority.heard_ns = 11 * S
-    assert authority.tick(13 * S - 1) == []
-    assert authority.tick(13 * S) == [Lost(1, 1, "silent"), Granted(2, 20, 2)]
+    assert authority.update(13 * S - 1) == []
+    assert authority.update(13 * S) == [Lost(1, 1, "silent"), Granted(2, 20, 2)]
     assert authority.position(1) == 0  # silent ones do not wait on
-    assert authority.tick(15 * S - 1) == []  # the grant counts as heard
+    assert authority.update(15 * S - 1) == []  # the grant counts as heard
 
 
 def test_nobody_is_silent_when_nobody_holds_it() -> None:
-    assert Authority().tick(100 * S) == []
+    assert Authority().update(100 * S) == []
 
 
 def test_a_silent_holder_keeps_the_name_until_somebody_asks() -> None:
     authority = Authority(timeout_s=2.0)
     authority.request(1, 4, True, 0)
-    assert authority.tick(2 * S) == [Lost(1, 1, "silent")]
+    assert authority.update(2 * S) == [Lost(1, 1, "silent")]
     assert authority.holder is None
     assert authority.lease == 0
     assert authority.owner is not None
     assert (authority.owner.app_id, authority.owner.priority) == (1, 4)
-    assert authority.tick(9 * S) == []
+    assert authority.update(9 * S) == []
     assert authority.request(2, 31, False, 9 * S) == [Granted(2, 31, 2)]  # of whatever priority
     assert authority.owner is authority.holder
     assert authority.position(1) == 0
@@ -135,7 +135,7 @@ def test_a_silent_holder_keeps_the_name_until_somebody_asks() -> None:
 def test_a_silent_holder_that_is_back_asks_like_anybody() -> None:
     authority = Authority(timeout_s=2.0)
     authority.request(1, 4, True, 0)
-    authority.tick(2 * S)
+    authority.update(2 * S)
     assert authority.request(1, 4, True, 3 * S) == [Granted(1, 4, 2)]
     assert authority.silent is None
 
@@ -144,7 +144,7 @@ def test_a_silent_holder_that_gives_back_or_is_gone_leaves_no_name() -> None:
     for end in (Authority.release, Authority.gone):
         authority = Authority(timeout_s=2.0)
         authority.request(1, 4, True, 0)
-        authority.tick(2 * S)
+        authority.update(2 * S)
         assert end(authority, 1, 3 * S) == []
         assert authority.owner is None
 
@@ -153,7 +153,7 @@ def test_who_waits_when_the_holder_falls_silent_follows_at_once() -> None:
     authority = Authority(timeout_s=2.0)
     authority.request(1, 4, True, 0)
     authority.request(2, 9, True, 0)
-    assert authority.tick(2 * S) == [Lost(1, 1, "silent"), Granted(2, 9, 2)]
+    assert authority.update(2 * S) == [Lost(1, 1, "silent"), Granted(2, 9, 2)]
     assert authority.silent is None
 
 
@@ -163,9 +163,9 @@ def test_who_waits_when_the_holder_falls_silent_follows_at_once() -> None:
 def test_a_holder_whose_time_is_over_is_told_once_and_keeps_it_while_nobody_waits() -> None:
     authority = Authority(timeout_s=1000.0)
     assert authority.request(1, 16, True, 0, term_ns=60 * S) == [Granted(1, 16, 1, 60 * S)]
-    assert authority.tick(60 * S - 1) == []
-    assert authority.tick(60 * S) == [Expired(1, 1)]
-    assert authority.tick(61 * S) == []
+    assert authority.update(60 * S - 1) == []
+    assert authority.update(60 * S) == [Expired(1, 1)]
+    assert authority.update(61 * S) == []
     assert authority.request(2, 31, True, 70 * S) == [Lost(1, 1, "expired"), Granted(2, 31, 2)]
     assert authority.position(1) == 0
 
@@ -174,7 +174,7 @@ def test_who_waits_gets_it_when_the_holders_time_is_over_whatever_the_priorities
     authority = Authority(timeout_s=1000.0)
     authority.request(1, 0, True, 0, term_ns=60 * S)
     assert authority.request(2, 16, True, 10 * S) == [Queued(2, 16, 1, 50 * S)]
-    assert authority.tick(60 * S) == [Lost(1, 1, "expired"), Granted(2, 16, 2)]
+    assert authority.update(60 * S) == [Lost(1, 1, "expired"), Granted(2, 16, 2)]
 
 
 def test_a_higher_priority_takes_over_within_the_time_and_leaves_what_is_left_of_it() -> None:
@@ -195,15 +195,15 @@ def test_a_holder_can_lengthen_its_time_only_while_nobody_waits() -> None:
     authority.request(1, 16, True, 30 * S, term_ns=100 * S)
     assert authority.until_ns == 110 * S
     authority.request(1, 16, True, 30 * S, term_ns=10 * S)
-    assert authority.tick(40 * S) == [Lost(1, 1, "expired"), Granted(2, 16, 2)]
+    assert authority.update(40 * S) == [Lost(1, 1, "expired"), Granted(2, 16, 2)]
 
 
 def test_a_time_that_was_over_and_is_lengthened_is_told_again() -> None:
     authority = Authority(timeout_s=1000.0)
     authority.request(1, 16, True, 0, term_ns=10 * S)
-    assert authority.tick(10 * S) == [Expired(1, 1)]
+    assert authority.update(10 * S) == [Expired(1, 1)]
     authority.request(1, 16, True, 11 * S, term_ns=10 * S)
-    assert authority.tick(21 * S) == [Expired(1, 1)]
+    assert authority.update(21 * S) == [Expired(1, 1)]
 
 
 def test_the_expected_wait_is_what_those_ahead_have_said() -> None:
@@ -228,9 +228,9 @@ def test_a_holder_that_is_asked_and_does_not_answer_keeps_it_until_the_time_is_o
     asked = Asked(1, 1, 2, 4, 15 * S, 60 * S)
     assert authority.request(2, 4, True, 5 * S, term_ns=60 * S, ask=True) == [Queued(2, 4, 1, 10 * S), asked]
     assert authority.asking(2, 5 * S)
-    assert authority.tick(15 * S - 1) == []
+    assert authority.update(15 * S - 1) == []
     took_over = [Preempted(1, 1, 2, 4), Granted(2, 4, 2, 75 * S), Queued(1, 16, 1, 60 * S)]
-    assert authority.tick(15 * S) == took_over
+    assert authority.update(15 * S) == took_over
     assert not authority.asking(2, 15 * S)
 
 
@@ -239,7 +239,7 @@ def test_asking_twice_is_asking_once() -> None:
     authority.request(1, 16, True, 0)
     authority.request(2, 4, True, 5 * S, ask=True)
     assert authority.request(2, 4, True, 6 * S, ask=True) == [Queued(2, 4, 1, 9 * S)]
-    assert authority.tick(15 * S)[0] == Preempted(1, 1, 2, 4)
+    assert authority.update(15 * S)[0] == Preempted(1, 1, 2, 4)
 
 
 def test_who_asked_and_can_not_wait_any_longer_takes_over() -> None:
@@ -264,14 +264,14 @@ def test_who_grants_to_a_lower_priority_does_not_take_it_back_at_once() -> None:
     assert authority.request(2, 16, True, 0, ask=True) == [Queued(2, 16, 1), Asked(1, 1, 2, 16, 10 * S)]
     granted = authority.answer(1, 1, 2, True, "", 3 * S)
     assert granted == [Preempted(1, 1, 2, 16, granted=True), Granted(2, 16, 2), Queued(1, 16, 1)]
-    assert authority.tick(4 * S) == []
+    assert authority.update(4 * S) == []
 
 
 def test_one_that_is_not_higher_may_ask_and_waits_on_when_nobody_answers() -> None:
     authority = Authority(timeout_s=1000.0, ask_s=10.0)
     authority.request(1, 16, True, 0)
     authority.request(2, 16, True, 0, ask=True)
-    assert authority.tick(10 * S) == []
+    assert authority.update(10 * S) == []
     assert authority.position(2) == 1
     assert authority.request(2, 16, True, 11 * S, ask=True)[-1] == Asked(1, 1, 2, 16, 21 * S)  # asked anew
 
@@ -281,8 +281,8 @@ def test_a_holder_declines_and_the_higher_priority_wins_all_the_same() -> None:
     authority.request(1, 16, True, 0)
     authority.request(2, 4, True, 0, ask=True)
     assert authority.answer(1, 1, 2, False, "landing", 1 * S) == [Declined(2, 1, "landing")]
-    assert authority.tick(10 * S - 1) == []
-    assert authority.tick(10 * S)[0] == Preempted(1, 1, 2, 4)
+    assert authority.update(10 * S - 1) == []
+    assert authority.update(10 * S)[0] == Preempted(1, 1, 2, 4)
 
 
 def test_answers_that_mean_nothing_any_more() -> None:
@@ -366,7 +366,7 @@ def step(authority: Authority, what: str, app: int, priority: int, now: int, ter
     if what == "heard":
         authority.heard_ns = now
         return []
-    return authority.tick(now)
+    return authority.update(now)
 
 
 @given(steps)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from skyloop.clock import NS_PER_S
 from skyloop.messages import Attitude, Feedback, FlightState, Hover, Land, Takeoff, Velocity
-from skyloop.proxy.autopilot import PERIOD_S, Autopilot, AutopilotSettings, software_actions
+from skyloop.proxy.core.autopilot import PERIOD_S, Autopilot, AutopilotSettings, software_actions
 
 ATTITUDE = frozenset({"attitude"})
 GRAVITY = 9.81

@@ -5,11 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from skyloop.messages import FlightState, Refusal
-from skyloop.proxy import failsafe, gate, proxy, requests, serve, sessions, vehicle
+from skyloop.proxy import publisher, relay, requests, serve, sessions
+from skyloop.proxy.core import command_checks, failsafe
 from skyloop.proxy.parameters import MAX_PARAMETER, OWN
 
 PAGE = (Path(__file__).parents[2] / "docs" / "proxy.md").read_text(encoding="utf-8")
-_PLANS = {"done": "APPLY", "hover": "HOVER", "refused": "REFUSE", "nothing to do": "HOLD"}
+_POLICIES = {"done": "APPLY", "hover": "HOVER", "refused": "REFUSE", "nothing to do": "HOLD"}
 
 
 def rows(first_cell: str) -> list[list[str]]:
@@ -36,7 +37,7 @@ def test_the_table_of_parameters_is_the_one_in_force() -> None:
 
 def test_the_table_of_flight_states_is_the_one_in_force() -> None:
     kinds = ["Takeoff", "Hover", "Land", "Velocity", "ResetEmergency"]
-    plans = {kind.__name__: plan for kind, plan in gate.PLANS.items()}
+    plans = {kind.__name__: plan for kind, plan in command_checks.STATE_POLICIES.items()}
     assert plans["Attitude"] == plans["Velocity"]
     seen = set()
     for names, *cells in rows("state"):
@@ -44,7 +45,7 @@ def test_the_table_of_flight_states_is_the_one_in_force() -> None:
             state = FlightState(name.replace(" ", "_"))
             seen.add(state)
             for kind, cell in zip(kinds, cells, strict=True):
-                expected = _PLANS.get(cell, "HOLD" if cell.endswith("goes on") else "?")
+                expected = _POLICIES.get(cell, "HOLD" if cell.endswith("goes on") else "?")
                 assert plans[kind][state].name == expected, (kind, state)
     assert seen == set(FlightState)
 
@@ -67,13 +68,13 @@ def test_every_reason_for_refusing_a_command_is_named() -> None:
 
 def test_the_numbers_that_are_no_parameters_are_those_of_the_code() -> None:
     for sentence in (
-        f"at most {gate.MAX_AHEAD_S:g} s in the future",
+        f"at most {command_checks.MAX_AHEAD_S:g} s in the future",
         f"than {sessions.MAX_MALFORMED} malformed packets within a second",
         f"At most {requests.MAX_PENDING}\nrequests",
         f"more than {MAX_PARAMETER} bytes",
-        f"up to {proxy.MAX_ANNOTATION} bytes",
+        f"up to {relay.MAX_ANNOTATION} bytes",
         f"it rose by {failsafe.BATTERY_REARM:g} above",
         f"for at most {serve.LAND_WITHIN_S:g} s",
-        f"at least {1e9 / vehicle.KEEP_ALIVE_NS:g} times a second",
+        f"at least {1e9 / publisher.KEEP_ALIVE_NS:g} times a second",
     ):
         assert sentence in PAGE

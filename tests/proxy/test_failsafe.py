@@ -11,63 +11,71 @@ from hypothesis import strategies as st
 
 from skyloop.clock import NS_PER_S
 from skyloop.messages import Failsafe, FlightState, Hover, Land
-from skyloop.proxy.failsafe import BatteryLow, Do, Effect, Ladder, LadderSettings, Step, View
+from skyloop.proxy.core.failsafe import (
+    BatteryLow,
+    Effect,
+    FailsafeAction,
+    FailsafeInputs,
+    FailsafeLadder,
+    FailsafeSettings,
+    StepChange,
+)
 
 S = NS_PER_S
 MS = S // 1000
 T0 = 100 * S
-FLYING = View(FlightState.FLYING, True, T0, "held", True, 0.9)
+FLYING = FailsafeInputs(FlightState.FLYING, True, T0, "held", True, 0.9)
 LANDED = replace(FLYING, state=FlightState.LANDED, airborne=False)
 
 
-def taken(ladder: Ladder, now_ns: int, view: View, ok: bool = True) -> list[Effect]:
-    effects = ladder.tick(now_ns, view)
-    if any(isinstance(effect, Do) for effect in effects):
-        ladder.tried(ok)
+def taken(ladder: FailsafeLadder, now_ns: int, view: FailsafeInputs, ok: bool = True) -> list[Effect]:
+    effects = ladder.update(now_ns, view)
+    if any(isinstance(effect, FailsafeAction) for effect in effects):
+        ladder.attempted(ok)
     return effects
 
 
 def test_silence_makes_it_hover_and_then_land_to_the_nanosecond() -> None:
-    ladder = Ladder()
+    ladder = FailsafeLadder()
     assert taken(ladder, T0 + 500 * MS - 1, FLYING) == []
-    assert taken(ladder, T0 + 500 * MS, FLYING) == [Step(Failsafe.HOVER, "silent"), Do(Hover())]
+    assert taken(ladder, T0 + 500 * MS, FLYING) == [StepChange(Failsafe.HOVER, "silent"), FailsafeAction(Hover())]
     hovering = replace(FLYING, state=FlightState.HOVERING)
     assert taken(ladder, T0 + 5 * S - 1, hovering) == []
-    assert taken(ladder, T0 + 5 * S, hovering) == [Step(Failsafe.LAND, "silent"), Do(Land())]
+    assert taken(ladder, T0 + 5 * S, hovering) == [StepChange(Failsafe.LAND, "silent"), FailsafeAction(Land())]
 
 
 @pytest.mark.parametrize("pilot", ["released", "silent", "none"])
 def test_without_a_pilot_the_reason_is_why(pilot: str) -> None:
-    ladder = Ladder()
+    ladder = FailsafeLadder()
     view = replace(FLYING, pilot=pilot)
     assert taken(ladder, T0 + 499 * MS, view) == []
-    assert taken(ladder, T0 + 500 * MS, view) == [Step(Failsafe.HOVER, pilot), Do(Hover())]
+    assert taken(ladder, T0 + 500 * MS, view) == [StepChange(Failsafe.HOVER, pilot), FailsafeAction(Hover())]
 
 
 def test_a_dead_connection_makes_it_hover_at_once_and_land_after_the_same_five_seconds() -> None:
-    ladder = Ladder()
+    ladder = FailsafeLadder()
     gone = replace(FLYING, pilot="gone")
-    assert taken(ladder, T0 + MS, gone) == [Step(Failsafe.HOVER, "gone"), Do(Hover())]
+    assert taken(ladder, T0 + MS, gone) == [StepChange(Failsafe.HOVER, "gone"), FailsafeAction(Hover())]
     gone = replace(gone, state=FlightState.HOVERING)
     assert taken(ladder, T0 + 5 * S - 1, gone) == []
-    assert taken(ladder, T0 + 5 * S, gone) == [Step(Failsafe.LAND, "gone"), Do(Land())]
+    assert taken(ladder, T0 + 5 * S, gone) == [StepChange(Failsafe.LAND, "gone"), FailsafeAction(Land())]
 
 
 def test_nothing_happens_on_the_ground() -> None:
-    ladder = Ladder()
+    ladder = FailsafeLadder()
     assert taken(ladder, T0 + 100 * S, replace(LANDED, pilot="gone")) == []
     assert ladder.idle
 
 
 def test_a_fresh_command_ends_a_step() -> None:
-    ladder = Ladder()
+    ladder = FailsafeLadder()
     taken(ladder, T0 + S, FLYING)
-    assert ladder.fresh_command() == [Step(Failsafe.NONE, "fresh command")]
+    assert ladder.fresh_command() == [StepChange(Failsafe.NONE, "fresh command")]
     assert taken(ladder, T0 + S, replace(FLYING, heard_ns=T0 + S)) == []
 
 
 def test_being_heard_without_a_fresh_command_keeps_the_step_but_does_not_land() -> None:
-    ladder = Ladder()
+    ladder = FailsafeLadder()
     taken(ladder, T0 + S, FLYING)
     heard = replace(FLYING, state=FlightState.HOVERING, heard_ns=T0 + 60 * S)
     assert taken(ladder, T0 + 60 * S, heard) == []
@@ -75,113 +83,118 @@ def test_being_heard_without_a_fresh_command_keeps_the_step_but_does_not_land() 
 
 
 def test_landing_ends_the_step() -> None:
-    ladder = Ladder()
+    ladder = FailsafeLadder()
     taken(ladder, T0 + 6 * S, FLYING)
-    assert taken(ladder, T0 + 9 * S, LANDED) == [Step(Failsafe.NONE, "landed")]
+    assert taken(ladder, T0 + 9 * S, LANDED) == [StepChange(Failsafe.NONE, "landed")]
 
 
 def test_what_the_driver_did_not_take_is_tried_again_at_the_set_pace() -> None:
-    ladder = Ladder(LadderSettings(retry_s=0.25))
+    ladder = FailsafeLadder(FailsafeSettings(retry_s=0.25))
     view = replace(FLYING, state=FlightState.HOVERING)
-    tries = [now for now in range(T0, T0 + 2 * S, 20 * MS) if Do(Hover()) in taken(ladder, now, view, ok=False)]
+    tries = [
+        now for now in range(T0, T0 + 2 * S, 20 * MS) if FailsafeAction(Hover()) in taken(ladder, now, view, ok=False)
+    ]
     assert tries[0] == T0 + 500 * MS
     assert all(later - earlier == 260 * MS for earlier, later in pairwise(tries))  # next tick
     assert len(tries) == 6
 
 
 def test_what_was_taken_is_repeated_only_while_the_state_contradicts_it() -> None:
-    ladder = Ladder()
+    ladder = FailsafeLadder()
     taken(ladder, T0 + S, FLYING)
     assert taken(ladder, T0 + S + 100 * MS, FLYING) == []
-    assert taken(ladder, T0 + S + 250 * MS, FLYING) == [Do(Hover())]
+    assert taken(ladder, T0 + S + 250 * MS, FLYING) == [FailsafeAction(Hover())]
     assert taken(ladder, T0 + 2 * S, replace(FLYING, state=FlightState.HOVERING)) == []
 
 
 @pytest.mark.parametrize("state", [FlightState.TAKING_OFF, FlightState.LANDING])
 def test_hover_never_breaks_off_a_manoeuvre(state: FlightState) -> None:
-    ladder = Ladder()
+    ladder = FailsafeLadder()
     view = replace(FLYING, state=state, pilot="gone")
-    assert Do(Hover()) not in taken(ladder, T0 + S, view)
+    assert FailsafeAction(Hover()) not in taken(ladder, T0 + S, view)
     expected = Failsafe.HOVER if state is FlightState.TAKING_OFF else Failsafe.NONE
     assert ladder.step is expected
     up = replace(view, state=FlightState.HOVERING)
-    assert Do(Hover()) in taken(ladder, T0 + 2 * S, up)
+    assert FailsafeAction(Hover()) in taken(ladder, T0 + 2 * S, up)
 
 
 def test_land_does_break_off_a_take_off() -> None:
-    ladder = Ladder()
-    assert Do(Land()) in taken(ladder, T0 + 5 * S, replace(FLYING, state=FlightState.TAKING_OFF))
+    ladder = FailsafeLadder()
+    assert FailsafeAction(Land()) in taken(ladder, T0 + 5 * S, replace(FLYING, state=FlightState.TAKING_OFF))
 
 
 def test_a_low_battery_is_told_once_and_again_only_after_it_rose() -> None:
-    ladder = Ladder()
+    ladder = FailsafeLadder()
     levels = [0.21, 0.19, 0.18, 0.21, 0.19, 0.26, 0.19]
-    told = [ladder.tick(T0, replace(LANDED, battery=level)) for level in levels]
+    told = [ladder.update(T0, replace(LANDED, battery=level)) for level in levels]
     assert told == [[], [BatteryLow(0.19)], [], [], [], [], [BatteryLow(0.19)]]
 
 
 def test_an_empty_battery_lands_and_bars_set_points_until_down() -> None:
-    ladder = Ladder()
+    ladder = FailsafeLadder()
     empty = replace(FLYING, battery=0.09)
-    assert taken(ladder, T0, empty) == [BatteryLow(0.09), Step(Failsafe.LAND, "battery"), Do(Land())]
+    assert taken(ladder, T0, empty) == [BatteryLow(0.09), StepChange(Failsafe.LAND, "battery"), FailsafeAction(Land())]
     assert ladder.barred == "battery"
     assert ladder.fresh_command() == []
     assert taken(ladder, T0, replace(empty, battery=0.12, state=FlightState.LANDING)) == []
     assert ladder.barred == "battery"  # it rises when the load falls: that is no new charge
-    assert taken(ladder, T0, replace(LANDED, battery=0.12)) == [Step(Failsafe.NONE, "landed")]
+    assert taken(ladder, T0, replace(LANDED, battery=0.12)) == [StepChange(Failsafe.NONE, "landed")]
     assert ladder.barred == ""
 
 
 def test_an_empty_battery_on_the_ground_bars_a_take_off() -> None:
-    ladder = Ladder()
-    ladder.tick(T0, replace(LANDED, battery=0.05))
+    ladder = FailsafeLadder()
+    ladder.update(T0, replace(LANDED, battery=0.05))
     assert ladder.barred == "battery"
-    ladder.tick(T0, replace(LANDED, battery=0.95))
+    ladder.update(T0, replace(LANDED, battery=0.95))
     assert ladder.barred == ""
 
 
 def test_zero_disables_the_battery_steps() -> None:
-    ladder = Ladder(LadderSettings(battery_warn=0.0, battery_land=0.0))
+    ladder = FailsafeLadder(FailsafeSettings(battery_warn=0.0, battery_land=0.0))
     assert taken(ladder, T0, replace(FLYING, battery=0.0)) == []
 
 
 def test_an_unknown_battery_is_no_low_battery() -> None:
-    assert taken(Ladder(), T0, replace(FLYING, battery=None)) == []
+    assert taken(FailsafeLadder(), T0, replace(FLYING, battery=None)) == []
 
 
 def test_a_lost_vehicle_link_makes_it_hover() -> None:
-    ladder = Ladder()
-    assert taken(ladder, T0, replace(FLYING, link_up=False)) == [Step(Failsafe.HOVER, "vehicle_link"), Do(Hover())]
+    ladder = FailsafeLadder()
+    assert taken(ladder, T0, replace(FLYING, link_up=False)) == [
+        StepChange(Failsafe.HOVER, "vehicle_link"),
+        FailsafeAction(Hover()),
+    ]
 
 
 def test_handing_over_hovers_without_a_step() -> None:
-    ladder = Ladder()
+    ladder = FailsafeLadder()
     ladder.hand_over(T0)
     assert not ladder.idle
-    assert taken(ladder, T0, FLYING) == [Do(Hover())]
+    assert taken(ladder, T0, FLYING) == [FailsafeAction(Hover())]
     assert ladder.step is Failsafe.NONE
     assert ladder.fresh_command() == []
     assert ladder.idle
 
 
 def test_handing_over_does_not_break_off_the_ladders_landing() -> None:
-    ladder = Ladder()
+    ladder = FailsafeLadder()
     taken(ladder, T0 + 5 * S, FLYING)
     ladder.hand_over(T0 + 5 * S)
-    assert taken(ladder, T0 + 6 * S, FLYING) == [Do(Land())]
+    assert taken(ladder, T0 + 6 * S, FLYING) == [FailsafeAction(Land())]
 
 
 def test_an_ordered_landing_stays() -> None:
-    ladder = Ladder()
+    ladder = FailsafeLadder()
     ladder.order_landing()
-    assert taken(ladder, T0, FLYING) == [Step(Failsafe.LAND, "closing"), Do(Land())]
+    assert taken(ladder, T0, FLYING) == [StepChange(Failsafe.LAND, "closing"), FailsafeAction(Land())]
     assert ladder.fresh_command() == []
-    ladder.tick(T0, LANDED)
+    ladder.update(T0, LANDED)
     assert ladder.barred == "closing"
 
 
 views = st.builds(
-    View,
+    FailsafeInputs,
     state=st.sampled_from(list(FlightState)),
     airborne=st.booleans(),
     heard_ns=st.integers(0, 8 * S),
@@ -192,8 +205,10 @@ views = st.builds(
 
 
 @given(st.lists(st.tuples(views, st.integers(0, S), st.booleans(), st.booleans()), max_size=40))
-def test_any_history_keeps_the_pace_and_climbs_only_upwards(history: list[tuple[View, int, bool, bool]]) -> None:
-    ladder = Ladder()
+def test_any_history_keeps_the_pace_and_climbs_only_upwards(
+    history: list[tuple[FailsafeInputs, int, bool, bool]],
+) -> None:
+    ladder = FailsafeLadder()
     now, last_try, new = 0, -S, True
     for view, later, fresh, ok in history:
         now += later
@@ -203,11 +218,11 @@ def test_any_history_keeps_the_pace_and_climbs_only_upwards(history: list[tuple[
         effects = taken(ladder, now, view, ok)
         if not view.airborne:
             assert ladder.step is Failsafe.NONE
-            assert not any(isinstance(effect, Do) for effect in effects)
+            assert not any(isinstance(effect, FailsafeAction) for effect in effects)
         elif before is Failsafe.LAND:
             assert ladder.step is Failsafe.LAND
-        new = new or any(isinstance(effect, Step) for effect in effects)  # since the last try
+        new = new or any(isinstance(effect, StepChange) for effect in effects)  # since the last try
         for effect in effects:
-            if isinstance(effect, Do):
+            if isinstance(effect, FailsafeAction):
                 assert new or now - last_try >= S // 4
                 last_try, new = now, False

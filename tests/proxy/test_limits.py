@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from skyloop.clock import NS_PER_S
 from skyloop.messages import Attitude, Velocity
-from skyloop.proxy.limits import Clamp, Episodes, Limits
+from skyloop.proxy.core.limits import SLACK_M, Ceiling, Clamp, Episodes, Limits
 
 LIMITS = Limits(tilt=0.3, climb=1.0, yaw_rate=1.5, speed=2.0, altitude=5.0)
 numbers = st.floats(-1e6, 1e6)
@@ -32,7 +32,13 @@ def test_what_is_within_is_the_same_object() -> None:
         (Velocity(up=3.0), 1.0, Velocity(up=1.0), ["limits.climb"]),
         (Velocity(up=-3.0), 9.0, Velocity(up=-1.0), ["limits.climb"]),
         (Velocity(up=0.8), 4.5, Velocity(up=0.5), ["limits.altitude"]),
-        (Velocity(up=0.8), 7.0, Velocity(), ["limits.altitude"]),
+        (Velocity(up=0.8), 5.1, Velocity(), ["limits.altitude"]),
+        (Velocity(), 5.1, Velocity(), []),
+        (Velocity(up=0.8), 5.5, Velocity(up=-0.5), ["limits.altitude"]),
+        (Velocity(1.0), 7.0, Velocity(1.0, up=-1.0), ["limits.altitude"]),
+        (Velocity(up=-0.2), 5.5, Velocity(up=-0.5), ["limits.altitude"]),
+        (Velocity(up=-0.8), 5.5, Velocity(up=-0.8), []),
+        (Attitude(0.1), 7.0, Attitude(0.1, climb=-1.0), ["limits.altitude"]),
         (Velocity(up=0.8), None, Velocity(up=0.8), []),
         (Velocity(yaw_rate=-2.0), 1.0, Velocity(yaw_rate=-1.5), ["limits.yaw_rate"]),
         (Attitude(roll=0.6), 1.0, Attitude(roll=0.3), ["limits.tilt"]),
@@ -56,6 +62,18 @@ def test_what_is_beyond_is_shortened(
     assert [clamp.limit for clamp in clamps] == limits
 
 
+def test_a_vehicle_that_hovers_above_the_limit_is_brought_down_below_it() -> None:
+    ceiling, altitude, steps = Ceiling(), 7.4, 0
+    assert ceiling.instead(LIMITS, None) == (None, ())
+    assert ceiling.instead(LIMITS, 5.2) == (None, ())
+    while (sink := ceiling.instead(LIMITS, altitude)[0]) is not None:
+        assert -1.0 <= sink.up <= -0.2
+        altitude += sink.up / 32
+        steps += 1
+    assert altitude == pytest.approx(5.15, abs=0.05)
+    assert steps < 32 * 6
+
+
 def test_the_clamp_says_what_was_asked() -> None:
     assert LIMITS.clamp(Velocity(3.0, 4.0), 1.0)[1] == (Clamp("limits.speed", 5.0, 2.0),)
 
@@ -70,7 +88,10 @@ def test_nothing_leaves_the_limits_and_directions_stay(
     assert math.hypot(allowed.forward, allowed.left) <= LIMITS.speed * (1 + 1e-9)
     assert abs(allowed.up) <= LIMITS.climb
     assert abs(allowed.yaw_rate) <= LIMITS.yaw_rate
-    assert allowed.up * up >= 0
+    if altitude is None or altitude <= LIMITS.altitude + SLACK_M:
+        assert allowed.up * up >= 0
+    else:
+        assert allowed.up <= max(LIMITS.altitude - altitude, -LIMITS.climb) * (1 - 1e-9), "it comes down"
     assert allowed.forward * left == pytest.approx(allowed.left * forward, rel=1e-6, abs=1e-6)
     if altitude is not None and altitude >= LIMITS.altitude:
         assert allowed.up <= 0

@@ -150,7 +150,7 @@ def test_a_hand_over_on_the_ground_tells_the_vehicle_nothing(bench: Bench) -> No
     bench.pilot("bob", 0)
     bench.run(1.0)
     assert bench.driver.told == []
-    assert bench.proxy.helm.state is FlightState.LANDED
+    assert bench.proxy.handler._executor.state is FlightState.LANDED
 
 
 def test_a_silent_holder_keeps_its_name_on_the_vehicle_which_fails_safe(bench: Bench) -> None:

@@ -151,7 +151,7 @@ def test_repeated_refusals_are_told_at_once_and_then_once_a_second(bench: Bench)
     assert len(pilot.refusals()) == 5  # a new one is told at once again
 
 
-@pytest.mark.parametrize("odd", [{}, {"seq": 0}, {"sent_ns": 0}, {"lease": 55}, {"sent_ns": 2**62}])
+@pytest.mark.parametrize("odd", [{}, {"seq": 0}, {"sent_ns": 0}, {"lease": 55}, {"sent_ns": 2**62}, {"sent_ns": 2**63}])
 def test_any_pilot_can_stop_the_motors(bench: Bench, odd: dict[str, Any]) -> None:
     alice, bob = bench.airborne("alice"), bench.join("bob")
     alice.command(Velocity(0.5))
@@ -326,3 +326,21 @@ def test_echoes_are_made_only_for_subscribers(bench: Bench) -> None:
     pilot.end.subscribe("commands", False)
     pilot.command(Velocity(0.1))
     assert all(echo.asked != Velocity(0.1) for echo in pilot.applied)
+
+
+@pytest.mark.parametrize("action", [Hover(), Velocity(), Velocity(up=1.0), Attitude()])
+def test_above_the_limit_of_altitude_the_vehicle_comes_down_while_it_is_steered(
+    bench: Bench, action: AnyAction
+) -> None:
+    pilot = bench.airborne()
+    bench.driver.report(altitude=7.4)
+    for at in range(5):
+        pilot.command(action, repeat=at > 0)
+    applied = bench.driver.told[-1]
+    assert isinstance(applied, Velocity | Attitude)
+    assert (applied.up if isinstance(applied, Velocity) else applied.climb) == -1.0
+    (told,) = pilot.told(EventKind.COMMAND_CLAMPED)
+    assert told.data["limit"] == "limits.altitude"
+    bench.driver.report(altitude=5.0)
+    pilot.command(Hover())
+    assert bench.driver.told[-1] == Hover()

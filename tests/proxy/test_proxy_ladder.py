@@ -8,6 +8,7 @@ from skyloop.messages import (
     Attitude,
     EventKind,
     Failsafe,
+    Feedback,
     FlightState,
     Hover,
     Idle,
@@ -23,6 +24,10 @@ from tests.proxy.fake import App, Bench
 
 def steps(app: App) -> list[tuple[object, object]]:
     return [(event.data["step"], event.data["reason"]) for event in app.told(EventKind.FAILSAFE)]
+
+
+def messages(app: App, reason: str) -> list[str]:
+    return [event.text for event in app.told(EventKind.VEHICLE_MESSAGE) if event.data["reason"] == reason]
 
 
 def test_a_silent_pilot(bench: Bench) -> None:
@@ -139,15 +144,21 @@ def test_nothing_is_done_on_the_ground(bench: Bench) -> None:
     assert steps(pilot) == []
 
 
-def test_a_vehicle_found_flying_waits_for_its_pilot(bench: Bench) -> None:
-    witness = bench.join("witness")
-    bench.driver.report(state=FlightState.FLYING)
-    bench.run(0.48)
-    assert bench.driver.told == []
-    bench.run(0.02)
-    assert steps(witness) == [("hover", "none")]
-    bench.run(4.5)
-    assert bench.driver.told == [Hover(), Land()]
+def test_a_flight_that_an_earlier_run_began_waits_for_its_pilot_and_is_ended() -> None:
+    bench = Bench()
+    bench.driver.now = Feedback(captured_ns=0)
+    bench.proxy.handler.ownership.began_before()
+    with bench:
+        witness = bench.join("witness")
+        bench.run(20.0)  # until the vehicle is heard
+        bench.driver.report(state=FlightState.FLYING)
+        bench.run(0.5)
+        assert bench.driver.told == []
+        bench.run(0.02)
+        assert steps(witness) == [("hover", "none")]
+        bench.run(4.5)
+        assert bench.driver.told == [Hover(), Land()]
+        assert "before it was started anew" in messages(witness, "flight")[0]
 
 
 def test_a_vehicle_that_never_tells_its_state_is_watched_from_its_first_command_on(bench: Bench) -> None:
@@ -164,7 +175,7 @@ def test_a_vehicle_that_never_tells_its_state_is_watched_from_its_first_command_
 
 def test_landing_before_the_end(bench: Bench) -> None:
     pilot = bench.airborne()
-    assert bench.proxy.watch.order_landing(bench.clock())
+    assert bench.proxy.handler.order_landing(bench.clock())
     assert bench.driver.told == [Land()]
     pilot.command(Velocity(0.5))
     assert pilot.refusals() == [Refusal.WRONG_STATE]

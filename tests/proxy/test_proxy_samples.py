@@ -76,7 +76,7 @@ def test_a_silent_vehicle_leaves_the_proxys_own_feedback(bench: Bench) -> None:
 def test_before_anything_was_heard_there_is_feedback_without_invented_data() -> None:
     with Bench() as bench:
         app = bench.join("me")
-        bench.proxy.vehicle._raw = None
+        bench.proxy.publisher._raw = None
         bench.run(0.3)
         feedback = app.last_feedback()
         assert (feedback.state, feedback.altitude, feedback.battery) == (FlightState.UNKNOWN, None, None)
@@ -221,7 +221,7 @@ def test_events_that_could_not_be_handed_over_are_told(bench: Bench) -> None:
 
     bench.proxy.events._publish = publish
     for number in range(5):
-        bench.proxy.events.tell(EventKind.VEHICLE_MESSAGE, str(number))
+        bench.proxy.events.publish(EventKind.VEHICLE_MESSAGE, str(number))
     bench.run(1.0)
     (event,) = witness.told(EventKind.SAMPLES_LOST)
     assert event.data == {"count": 3}
@@ -331,8 +331,11 @@ def test_the_ticker_takes_the_ladders_step_by_itself() -> None:
     driver = Clocked(monotonic_ns)
     assert driver.uri == VehicleUri("fake", text="fake://")
     with Proxy(driver, server, name="real"):
-        driver.report(state=FlightState.FLYING)
         pilot = App(server.dial, monotonic_ns)
+        pilot.hello("pilot")
+        pilot.take_authority()
+        pilot.command(Takeoff())
+        driver.report(state=FlightState.FLYING)
         assert driver.hovered.wait(WAIT_S)
         pilot.end.close()
     assert not any(thread.name == "skyloop-ticker" for thread in threading.enumerate())

@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.clock import NS_PER_S
-from skyloop.control.rehearsal import Radio, rehearse
 from skyloop.errors import ParameterError
 from skyloop.messages import AnyAction, Attitude, EventKind, Feedback, Hover, Refused, SetParameter, Value, Velocity
-from skyloop.proxy.zones import BOX, MARGIN_M, ZONES, Box, Cylinder, Safety, check_written, parse_zones, safety_of
+from skyloop.proxy.core.zones import BOX, MARGIN_M, ZONES, Box, Cylinder, Safety, check_written, parse_zones, safety_of
+from skyloop.stepping.rehearsal import Radio, rehearse
 from tests.proxy.fake import Bench
 
 ROOM = Safety(Box((-2.0, -2.0, 0.0), (2.0, 2.0, 3.0)), deceleration=1.0, reaction_s=0.3)

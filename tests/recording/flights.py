@@ -204,7 +204,7 @@ def write_flight(path: Path, plan: Plan | None = None) -> Path:
         Parameter("sim.battery", ParameterType.FLOAT, 1.0, "", 0.0, 1.0),
     ):
         tape.own(Channel.PARAMETERS, parameter, 0.0, 0.0)
-    for at_ms in range(0, round(plan.seconds * 1000)):
+    for at_ms in range(round(plan.seconds * 1000)):
         _moment(tape, plan, at_ms)
     tape.close()
     return path

@@ -21,6 +21,8 @@ from skyloop.client import Drone
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.registry import make_driver
 from skyloop.drivers.video.decoder import PaveDecoder
+from skyloop.emulators.ardrone import ArdroneFirmware, Ports
+from skyloop.emulators.ardrone.settings import with_ardrones
 from skyloop.errors import FileFormatError, MissingExtraError, UnknownNameError, UsageError
 from skyloop.logfile import layout
 from skyloop.logfile.h264 import Group, Groups
@@ -33,24 +35,26 @@ from skyloop.recording.options import Options
 from skyloop.recording.review.export import export_mp4
 from skyloop.recording.review.report import write_report
 from skyloop.recording.review.summary import summarise
-from skyloop.sim.firmware.ardrone import ArdroneFirmware, Ports
-from skyloop.sim.firmware.ardrone.settings import with_ardrones
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.transport.memory import MemoryServer
 from skyloop.wire.ardrone.pave import PaveFrame, PaveParser
 from tests.integration.fake_vehicle import FakeVehicle
 from tests.recording import files
+from tests.recordings import recorded
 
 WAIT_S = 20.0
-STREAM = Path(__file__).parents[1] / "data" / "ardrone2" / "video-8s.pave"
 IMAGE, VIDEO, FRAMES = (f"/alpha/{name}" for name in ("camera/front/image", "camera/front/video", "frames/front"))
 Log = Callable[..., Any]
 
 
+def stream() -> Path:
+    return recorded("ardrone2/video-8s.pave")
+
+
 @functools.cache
 def sent() -> tuple[PaveFrame, ...]:
-    return tuple(PaveParser().feed(STREAM.read_bytes()))
+    return tuple(PaveParser().feed(stream().read_bytes()))
 
 
 @functools.cache
@@ -64,7 +68,7 @@ def shown() -> tuple[NDArray[np.uint8], ...]:
 def record_stream(path: Path, **options: Any) -> skyloop.recording.Recorder:
     """Plays the drone's eight seconds, twenty times as fast, to a recorder and to nobody else."""
     server = MemoryServer("alpha")
-    with Proxy(make_driver(f"video://{STREAM}?speed=20"), server, name="alpha"):
+    with Proxy(make_driver(f"video://{stream()}?speed=20"), server, name="alpha"):
         drone = Drone(server.dial, app="me").open(timeout_s=WAIT_S)
         with drone, skyloop.record(drone, path, min_free_mb=0, **options) as recorder:
             drone.wait(lambda feedback: feedback.vehicle_link is LinkState.CLOSED, timeout_s=WAIT_S)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +18,8 @@ from skyloop.errors import FileFormatError, MissingExtraError, UnknownNameError,
 from skyloop.logfile.layout import Channel
 from skyloop.logfile.reader import Recording
 from skyloop.recording.review import export
-from skyloop.recording.review.export import export_csv, export_mp4, read
+from skyloop.recording.review.export import export_csv, export_mp4, export_npz, export_parquet, read
+from skyloop.recording.review.report import write_report
 from skyloop.recording.review.tables import Table, tables
 from tests.cli.conftest import Ended
 from tests.recording.flights import BEGIN_NS, MS, Plan, write_flight
@@ -199,3 +201,60 @@ def test_where_it_can_not_be_written(flight: Path, tmp_path: Path) -> None:
         export_mp4(Recording.open(flight), "alpha", "front", tmp_path / "nowhere" / "x.mp4")
     with pytest.raises(FileFormatError, match="holds none"):
         read(Recording.open(flight), "alpha", (Channel.ANNOTATIONS,))
+
+
+def test_what_fails_leaves_an_existing_file_alone(tmp_path: Path, flight: Path, log: Log) -> None:
+    target = tmp_path / "film.mp4"
+    target.write_bytes(b"an earlier export")
+    ended = log("export", flight, "--to", "mp4", "--camera", "wrong", "-o", target)
+    assert ended.code == 2
+    assert "no camera of alpha" in ended.err
+    bad = write_flight(tmp_path / "bad.mcap", Plan(seconds=0.5, packed=lambda _: b"no picture"))
+    assert log("export", bad, "--to", "mp4", "-o", target).code == 2
+    assert target.read_bytes() == b"an earlier export"
+    assert {path.name for path in tmp_path.iterdir()} == {"film.mp4", "bad.mcap"}
+
+
+def full_disk(*_: object, **__: object) -> None:
+    raise OSError(28, "No space left on device")
+
+
+def test_a_full_disk_leaves_an_existing_file_alone(
+    tmp_path: Path, flight: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = read(Recording.open(flight), "alpha", [Channel.LOGS])
+    for name in ("logs.csv", "logs.parquet", "logs.npz", "report.html"):
+        (tmp_path / name).write_bytes(b"an earlier export")
+    monkeypatch.setattr(os, "fsync", full_disk)
+    for write, path in (
+        (export_csv, tmp_path),
+        (export_parquet, tmp_path),
+        (export_npz, tmp_path / "logs.npz"),
+        (lambda _, path: write_report(Recording.open(flight), "alpha", path), tmp_path / "report.html"),
+    ):
+        with pytest.raises(UsageError, match="No space left"):
+            write(found, path)
+    assert {path.read_bytes() for path in tmp_path.iterdir()} == {b"an earlier export"}
+    assert len(list(tmp_path.iterdir())) == 4
+
+
+@pytest.mark.parametrize(
+    ("given", "written"),
+    [
+        ('=HYPERLINK("http://x")', '\'=HYPERLINK("http://x")'),
+        ("+1+cmd|' /C calc'!A0", "'+1+cmd|' /C calc'!A0"),
+        ("-2+3", "'-2+3"),
+        ("@SUM(A1)", "'@SUM(A1)"),
+        ("\t=1", "'\t=1"),
+        ("＝1", "'＝1"),
+        ("-0.5 1.25 -3e-07", "-0.5 1.25 -3e-07"),
+        ("-inf", "-inf"),
+        ("-12", "-12"),
+        ("a=b", "a=b"),
+    ],
+)
+def test_no_cell_is_a_formula(tmp_path: Path, given: str, written: str) -> None:
+    table = Table("logs", {"text": np.array([given]), given: np.array([1.0])})
+    export_csv({"logs": table}, tmp_path)
+    with (tmp_path / "logs.csv").open(newline="", encoding="utf-8") as file:
+        assert list(csv.reader(file)) == [["text", written], [written, "1.0"]]

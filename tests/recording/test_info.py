@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import io
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
+from skyloop.cli import log_tables
 from skyloop.logfile.reader import Recording
 from skyloop.recording.review.summary import summarise
 from tests.cli.conftest import Ended
@@ -48,6 +52,29 @@ def test_drops_are_those_told_last(tmp_path: Path, flight: Path) -> None:
     assert told.missed == {"alpha": {"feedback": 4}}
     assert any("never closed" in note for note in told.notes)
     assert summarise(Recording.open(flight)).dropped == {}  # the recorder's last word
+
+
+@pytest.mark.process
+def test_in_a_pipe_nothing_is_cut(tmp_path: Path) -> None:
+    name = "alpha-of-the-long-name-" * 3
+    flight = write_flight(tmp_path / "flight.mcap", Plan(drone=name))
+    command = [sys.executable, "-m", "skyloop", "log", "info", str(flight)]
+    environment = {key: value for key, value in os.environ.items() if key != "COLUMNS"}
+    shown = subprocess.run(command, capture_output=True, text=True, check=True, env=environment).stdout
+    for topic in {one.topic for one in Recording.open(flight).series}:
+        assert sum(topic in line.split() for line in shown.splitlines()) == 1, (
+            "each row in one line, with its whole topic"
+        )
+
+
+def test_a_narrow_terminal_folds_what_tells_rows_apart(flight: Path) -> None:
+    recording = Recording.open(flight)
+    screen = Console(width=60, file=io.StringIO())
+    for part in log_tables.info(recording, summarise(recording)):
+        screen.print(part)
+    assert isinstance(screen.file, io.StringIO)
+    first = "".join(line[:20].strip() for line in screen.file.getvalue().splitlines())
+    assert "…" not in first
 
 
 def test_the_table(log: Log, flight: Path) -> None:

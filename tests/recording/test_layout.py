@@ -89,8 +89,7 @@ def test_numbers_that_are_not_finite_come_back_as_nan(numbers: list[float], nati
     for before, after in zip(numbers, msgspec.structs.astuple(back), strict=True):
         assert after == before if math.isfinite(before) else math.isnan(after)
     feedback = decode(encode(Feedback(captured_ns=1, velocity=(1.0, math.inf, 0.0), native=dict(native))), Feedback)
-    assert feedback.velocity is not None
-    assert math.isnan(feedback.velocity[1])
+    assert feedback.velocity is None, "a vector that is not known in one part is not known"
     assert feedback.native is not None
     assert all(math.isnan(feedback.native[k]) or feedback.native[k] == v for k, v in native.items())  # type: ignore[arg-type]
 

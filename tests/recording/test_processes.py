@@ -73,6 +73,7 @@ def count(path: Path, topic: str) -> int:
     return len(files.of(path, topic))
 
 
+@pytest.mark.daily
 def test_a_flight_is_recorded_and_the_file_is_complete(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     with skyloop.connect(SIM, on_exit="hover") as drone, skyloop.record(drone, path, min_free_mb=0) as recorder:

@@ -23,8 +23,8 @@ from skyloop.logfile.layout import Channel
 from skyloop.logfile.reader import Recording
 from skyloop.messages import Applied, Event, EventKind, Feedback, Hover, Velocity
 from skyloop.proxy.proxy import Proxy
-from skyloop.recording.lockstep import Lockstep, connector
 from skyloop.recording.review.compare import compare
+from skyloop.stepping.replay import SteppedReplay, connector
 from skyloop.transport.memory import MemoryServer
 from tests.recording.flights import BEGIN_NS, CAPABILITIES, MS, Plan, write_flight
 
@@ -184,11 +184,11 @@ def test_a_set_point_decays_in_the_recordings_time(flight: Path) -> None:
 
 def test_it_is_of_one_application_alone(flight: Path) -> None:
     way = connector(f"replay://{flight}?speed=max")
-    assert isinstance(way, Lockstep)
+    assert isinstance(way, SteppedReplay)
     dial = way.dialer(0.0)
     try:
         with (
-            Drone(dial, app="first", pace=way.pace, on_exit="hover").open(),
+            Drone(dial, app="first", scheduler=way.scheduler, on_exit="hover").open(),
             pytest.raises(LinkError, match="in step with one application, and that one is connected"),
         ):
             Drone(dial, app="second").open(timeout_s=0.5)

@@ -113,7 +113,7 @@ def test_the_numbers_for_the_cursor(page: str) -> None:
     assert text is not None
     data = json.loads(text[1])
     assert data["end"] == pytest.approx(1.98, abs=0.02)
-    heads = {name: page.split(f'data-chart="{name}"')[1].split("</header>")[0] for name in data["charts"]}
+    heads = {name: page.split(f'data-chart="{name}"')[1].split("</header>", maxsplit=1)[0] for name in data["charts"]}
     legends = {name: head.count("<li") for name, head in heads.items()}
     assert legends == {name: len(series) for name, series in data["charts"].items()}
     times, heights = data["charts"]["chart0"][0]

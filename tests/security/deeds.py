@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import zenoh
 
+from skyloop.errors import LinkError
+from skyloop.keys.agreement import Agreement
 from skyloop.messages import (
     Command,
     EmergencyStop,
@@ -26,11 +29,14 @@ from skyloop.messages import (
 )
 from skyloop.messages.config import ParameterValue
 from skyloop.transport.base import EVENTS, FEEDBACK
-from skyloop.transport.fabric import finding, layout, packets
+from skyloop.transport.fabric import discovery, layout, packets
+from skyloop.transport.fabric.admission import JoinRequest
 from skyloop.transport.fabric.config import Part
+from skyloop.transport.fabric.sealing import Seal
 from skyloop.transport.fabric.session import Session, acquire, release
 from tests.security.rig import DRONE, Intruder, Rig
 
+LIAR = "f" * 16  #: RUN of a proxy that is none
 PUSH = Velocity(0.111)  #: a command that nobody else gives
 LIE = 0.123  #: a battery that the vehicle never reports
 PARAMETER = "limits.tilt"
@@ -68,7 +74,7 @@ def _request_authority(rig: Rig, intruder: Intruder) -> None:
 
 
 def _has_authority(rig: Rig, _: Intruder) -> bool:
-    holder = rig.bench.proxy.watch.authority.holder
+    holder = rig.bench.proxy.handler.authority.holder
     return holder is None or holder.app_id != rig.jane.app_id
 
 
@@ -94,6 +100,7 @@ def _number(rig: Rig) -> bytes:
 
 
 def _false_feedback(rig: Rig, intruder: Intruder) -> None:
+    intruder.see()
     intruder.put(
         layout.topic(DRONE, FEEDBACK), encode(Feedback(captured_ns=rig.bench.clock(), battery=LIE)), _number(rig)
     )
@@ -108,6 +115,7 @@ def _lie(rig: Rig) -> Event:
 
 
 def _false_event(rig: Rig, intruder: Intruder) -> None:
+    intruder.see()
     intruder.put(layout.topic(DRONE, EVENTS), encode(_lie(rig)), _number(rig))
 
 
@@ -116,6 +124,7 @@ def _alarmed(rig: Rig, _: Intruder) -> bool:
 
 
 def _false_picture(rig: Rig, intruder: Intruder) -> None:
+    intruder.see()
     header = FrameHeader("front", 10**6, 1, 1, 2, 2, Encoding.MONO8, 4)
     intruder.put(layout.video(DRONE, "front"), b"LIE!", packets.frame(rig.run_bytes(), 10**6, encode(header)))
 
@@ -147,20 +156,41 @@ def _stand_in(rig: Rig, intruder: Intruder) -> None:
 
 
 def _stands_in(rig: Rig, _: Intruder) -> bool:
-    return _as_wendy(rig, lambda session: any(about.host == "a lie" for about in finding.oldest_first(session, DRONE)))
+    return _as_wendy(
+        rig, lambda session: any(about.host == "a lie" for about in discovery.oldest_first(session, DRONE))
+    )
 
 
 def _let_in(rig: Rig, intruder: Intruder) -> None:
-    key = layout.join(DRONE, "*", "*")
-    intruder.held.append(intruder.session.declare_queryable(key, lambda query: query.reply(query.key_expr, b"a lie")))
+    def answer(query: Any) -> None:
+        sender = layout.parse_sender(str(query.key_expr))
+        wish = packets.decode_join(bytes(query.payload))
+        welcome = packets.Welcome(packets.REVISION, LIAR)
+        if intruder.ring is not None:  # with what it has
+            terms = (DRONE, wish.run, sender.who, sender.id)
+            proof, agreed = Agreement(intruder.ring, *terms).answer(wish.proof)
+            topics, trailer = Seal(agreed.down).seal(str(query.key_expr), b"", packets.key(1, bytes(32)))
+            welcome = packets.Welcome(packets.REVISION, LIAR, proof, trailer + topics)
+        query.reply(query.key_expr, packets.encode_own(welcome))
+
+    intruder.held.append(intruder.session.declare_queryable(layout.join(DRONE, "*", "*"), answer))
 
 
 def _lets_in(rig: Rig, _: Intruder) -> bool:
     def joins(session: Session) -> bool:
-        key = layout.join(DRONE, rig.who("wendy"), "0" * 16)
-        target, consolidation = zenoh.QueryTarget.ALL, zenoh.ConsolidationMode.NONE
-        replies = session.zenoh.get(key, target=target, consolidation=consolidation, timeout=0.3)
-        return any(reply.ok is not None and bytes(reply.ok.payload) == b"a lie" for reply in replies)
+        sender = layout.Sender("join", rig.who("wendy"), layout.new_id())
+        request = JoinRequest(session.settings.ring, DRONE, LIAR, sender)
+        wish = packets.encode_own(packets.Join(packets.REVISION, LIAR, proof=request.proof))
+        key, target = layout.join(DRONE, sender.who, sender.id), zenoh.QueryTarget.ALL
+        for reply in session.zenoh.get(
+            key, payload=wish, target=target, consolidation=zenoh.ConsolidationMode.NONE, timeout=0.3
+        ):
+            welcome = packets.decode_welcome(bytes(reply.ok.payload)) if reply.ok is not None else None
+            if welcome is not None and welcome.run == LIAR:
+                with contextlib.suppress(LinkError):
+                    request.accept(welcome)
+                    return True
+        return False
 
     return _as_wendy(rig, joins)
 
@@ -170,7 +200,7 @@ def _live_as_a_proxy(_: Rig, intruder: Intruder) -> None:
 
 
 def _lives(rig: Rig, _: Intruder) -> bool:
-    return _as_wendy(rig, lambda session: ("zulu", "f" * 16) in finding.runs(session))
+    return _as_wendy(rig, lambda session: ("zulu", "f" * 16) in discovery.runs(session))
 
 
 def _say_bye(rig: Rig, intruder: Intruder) -> None:
@@ -212,11 +242,13 @@ def _eavesdrop_answers(rig: Rig, intruder: Intruder) -> None:
 
 
 def _watch(rig: Rig, intruder: Intruder) -> None:
+    intruder.see()
     intruder.listen(layout.topic(DRONE, FEEDBACK))
     rig.bench.driver.report()
 
 
 def _look(rig: Rig, intruder: Intruder) -> None:
+    intruder.see()
     intruder.listen(f"{layout.ROOT}/{DRONE}/video/**")
     rig.frames += 1
     header = FrameHeader("front", rig.frames, 1, 1, 2, 2, Encoding.MONO8, 4)

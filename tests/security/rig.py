@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import struct
 from collections.abc import Callable
 from contextlib import ExitStack
 from datetime import UTC, datetime, timedelta
@@ -12,20 +14,24 @@ from typing import Any
 
 import zenoh
 
-from skyloop.keys import Lab, load
+from skyloop.errors import DecodeError
+from skyloop.keys import KeyRing, Lab, load
 from skyloop.keys.identity import make_identity
-from skyloop.messages import AnyRequest, FlightState, Hello, Request, Role, Sample, encode
+from skyloop.messages import AnyRequest, Hello, Request, Role, Sample, encode
 from skyloop.transport.base import Dialer
 from skyloop.transport.fabric import FabricServer, FabricSettings, layout, packets
 from skyloop.transport.fabric import dial as fabric_dial
-from skyloop.transport.fabric.access import secured
+from skyloop.transport.fabric.admission import Admission, JoinRequest
 from skyloop.transport.fabric.client import FabricClient
 from skyloop.transport.fabric.config import free_port
+from skyloop.transport.fabric.sealing import Open
+from skyloop.transport.fabric.settings import secured
 from tests.proxy.fake import App, Bench
 
 DRONE = "alpha"
 ANSWER_S = 0.3
 NOW = datetime.now(UTC)
+_NUMBERS = itertools.count(10**6)
 
 
 def make_lab(directory: Path) -> Lab:
@@ -60,11 +66,14 @@ def keys_of(lab: Lab, name: str, directory: Path) -> Path:
 
 class Rig:
     """A proxy named ``alpha`` with a fake vehicle, jane who flies it, and wendy who looks on. ``keys`` is None for a
-    network without keys, where everybody is called ``anyone``."""
+    network without keys, where everybody is called ``anyone``. ``routed``: applications were given a router's address,
+    too."""
 
-    def __init__(self, keys: Callable[[str], Path] | None) -> None:
+    def __init__(self, keys: Callable[[str], Path] | None, *, routed: bool = False) -> None:
         self._keys = keys
         self.place = f"127.0.0.1:{free_port('127.0.0.1')}"
+        #: Where applications call the intruder: without keys whoever they find, as by multicast, with keys a router.
+        self.lair = f"127.0.0.1:{free_port('127.0.0.1')}" if keys is None or routed else ""
         self.frames = 0  #: that were published
         self._ends = ExitStack()
 
@@ -73,7 +82,7 @@ class Rig:
         self.bench = self._ends.enter_context(Bench(transport=(server, self.dialer("jane"))))
         self.server = server
         self.jane = self.bench.pilot("jane")
-        self.bench.driver.report(state=FlightState.HOVERING)
+        self.bench.take_off(self.jane)
         self.bench.dial = self.dialer("wendy")
         self.wendy = self.bench.join("wendy", Role.OBSERVER)
         self.wendy.end.subscribe("video/front")
@@ -91,14 +100,17 @@ class Rig:
 
     def settings(self, who: str) -> FabricSettings:
         """An application's."""
-        return self._settings(who, connect=(self.place,))
+        return self._settings(who, connect=(self.place, self.lair) if self.lair else (self.place,))
 
     def dialer(self, who: str) -> Dialer:
         return fabric_dial(DRONE, self.settings(who))
 
     @property
     def endpoint(self) -> str:
-        return f"tcp/{self.place}" if self._keys is None else f"quic/{self.place}?mixed_rel=1"
+        return self._endpoint(self.place)
+
+    def _endpoint(self, place: str) -> str:
+        return f"tcp/{place}" if self._keys is None else f"quic/{place}?mixed_rel=1"
 
     def who(self, name: str) -> str:
         """What somebody is called on this network."""
@@ -113,24 +125,41 @@ class Rig:
         return bytes.fromhex(self.server._run)
 
     def intruder(self, name: str) -> Intruder:
-        session = third_party(self.endpoint, None if self._keys is None else self._keys(name))
-        return Intruder(session, self.who(name), self)
+        """Somebody who is linked to the proxy, and to the applications where they call. It ends with this rig."""
+        keys = None if self._keys is None else self._keys(name)
+        listen = (self._endpoint(self.lair),) if self.lair else ()
+        somebody = Intruder(third_party(self.endpoint, keys, listen=listen), self.who(name), self, keys)
+        self._ends.callback(somebody.close)
+        return somebody
 
 
-def third_party(endpoint: str, keys: Path | None, *, authority: Path | None = None, timeout_ms: int = 3000) -> Any:
+def third_party(
+    endpoint: str,
+    keys: Path | None,
+    *,
+    authority: Path | None = None,
+    timeout_ms: int = 3000,
+    mode: str = "peer",
+    listen: tuple[str, ...] = (),
+) -> Any:
     """A session of the plain API, configured by whoever wants something; raises ``zenoh.ZError`` if nothing answers."""
     config = zenoh.Config()
     tls: dict[str, Any] = {"enable_mtls": True, "verify_name_on_connect": False}
     if keys is not None:
         certificate, key = str(keys / "identity.pem"), str(keys / "identity.key")
-        tls |= {"connect_certificate": certificate, "connect_private_key": key}
+        tls |= {
+            f"{end}_{part}": file
+            for end in ("connect", "listen")
+            for part, file in (("certificate", certificate), ("private_key", key))
+        }
         authority = authority or keys / "ca.pem"
     else:
         tls["enable_mtls"] = False
     if authority is not None:
         tls["root_ca_certificate"] = str(authority)
     wishes = {
-        "mode": "client",
+        "mode": mode,
+        "listen/endpoints": list(listen),
         "connect/endpoints": [endpoint],
         "connect/timeout_ms": timeout_ms,
         "connect/exit_on_failure": True,
@@ -143,37 +172,62 @@ def third_party(endpoint: str, keys: Path | None, *, authority: Path | None = No
 
 
 class Intruder:
-    """Somebody with a session of the plain API, who knows the layout of keys and the packets as they are documented."""
+    """Somebody with a session of the plain API, who knows the layout of keys, the packets and how they are sealed as it
+    is documented. ``got`` is what it could read."""
 
-    def __init__(self, session: Any, who: str, rig: Rig) -> None:
+    def __init__(self, session: Any, who: str, rig: Rig, keys: Path | None = None) -> None:
         self.session = session
         self.who = who
         self.rig = rig
         self.id = layout.new_id()
         self.got: list[tuple[str, bytes]] = []
         self.held: list[Any] = []
+        self.ring = None if keys is None else KeyRing(load(keys))
+        self.admission = Admission()  #: with keys: how the proxy has let it in, if it has
 
     def close(self) -> None:
-        self.session.close()
+        if not self.session.is_closed():
+            self.session.close()
 
     def put(self, key: str, packet: bytes, attachment: bytes = bytes(8)) -> None:
         """By both links. A put without a publisher is sent whether or not this end was told that somebody listens, so
         what is kept from arriving is kept by the other end."""
+        packet, attachment = self.seal(key, packet, attachment)
         self.session.put(key, packet, attachment=attachment, congestion_control=zenoh.CongestionControl.BLOCK)
         publisher = self.session.declare_publisher(key, reliability=zenoh.Reliability.BEST_EFFORT)
         publisher.put(packet, attachment=attachment)
         self.held.append(publisher)
 
+    def seal(self, key: str, packet: bytes, attachment: bytes) -> tuple[bytes, bytes]:
+        """Packet and attachment as somebody seals them who has these keys: for its own connection, and what is
+        published with the key that all have who may see the drone."""
+        if self.id in key:
+            return self.admission.sealer.seal(key, attachment, packet)
+        if isinstance(self.admission.topics, Open) and ("/topic/" in key or "/video/" in key):
+            generation, cipher = max(self.admission.topics._ciphers.items())
+            attachment += struct.pack("<IQ", generation, next(_NUMBERS))
+            return cipher.encrypt(attachment[-12:], packet, key.encode() + b"\0" + attachment), attachment
+        return packet, attachment
+
     def send(self, way: str, sample: Sample, *, who: str | None = None, connection: str | None = None) -> None:
         """As an application, by one of its keys or by somebody else's."""
-        self.put(layout.upward(way, DRONE, who or self.who, connection or self.id), encode(sample))
+        key = layout.upward(way, DRONE, who or self.who, connection or self.id)
+        self.put(key, encode(sample))
 
     def request(self, way: str, body: AnyRequest, **to: str) -> None:
         self.send(way, Request(7, body), **to)
 
     def listen(self, key: str) -> None:
         def heard(sample: Any) -> None:
-            self.got.append((str(sample.key_expr), bytes(sample.payload)))
+            where, admission = str(sample.key_expr), self.admission
+            opener = admission.opener if f"/to/{self.id}" in where else admission.topics
+            if self.ring is None or admission.offer:
+                try:
+                    opened = opener.open(where, bytes(sample.attachment or b""), bytes(sample.payload))
+                except DecodeError:
+                    return
+                if opened is not None:
+                    self.got.append((where, opened[0]))
 
         self.held.append(self.session.declare_subscriber(key, heard))
 
@@ -187,7 +241,15 @@ class Intruder:
         who = who or self.who
         self.listen(layout.to(DRONE, self.id))
         self.held.append(self.session.liveliness().declare_token(layout.app(DRONE, who, self.id)))
-        wish = packets.encode_own(packets.Join(packets.REVISION, self.rig.server._run))
-        joined = bool(self.ask(layout.join(DRONE, who, self.id), wish))
-        self.request(layout.ASK, Hello("intruder", Role.PILOT), who=who)
-        return joined
+        request = JoinRequest(self.ring, DRONE, self.rig.server._run, layout.Sender("join", who, self.id))
+        wish = packets.encode_own(packets.Join(packets.REVISION, self.rig.server._run, proof=request.proof))
+        for welcome in self.ask(layout.join(DRONE, who, self.id), wish):
+            self.admission = request.accept(packets.decode_welcome(welcome))
+            self.request(layout.ASK, Hello("intruder", Role.PILOT), who=who)
+            return True
+        return False
+
+    def see(self) -> None:
+        """Be among those who may read what is published, if these keys let it in."""
+        if self.ring is not None and not self.admission.offer:
+            self.join()

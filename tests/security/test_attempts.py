@@ -20,16 +20,17 @@ COLUMNS = {
     "olga": "an observer",
     "oscar": "an observer of others",
     "bravo": "another drone's proxy",
+    "hub": "a router",
     "eve": "revoked",
 }
 #: What works, by the deed's words; everything else has no effect.
 SEEN = {"nobody", "kim", "bob", "olga"}
 WORKS = {
-    "find the drone": {*SEEN, "oscar", "bravo"},
+    "find the drone": {*SEEN, "oscar", "bravo", "hub"},
+    "say who the proxy is in its place": {"nobody"},  # with keys a proxy hands on nothing of others
     "see its feedback": SEEN,
     "see its video": SEEN,
     "read its parameters": SEEN,
-    "hear the answers to another pilot": SEEN,  # parameters, statistics, leases: what is no secret
     "request the authority": {"nobody", "kim"},
     "stop its motors": {"nobody", "kim"},
     "take over the token of another pilot's life, and end it": set(),  # Zenoh: it lives while one of the two does

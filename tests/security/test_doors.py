@@ -188,7 +188,7 @@ def test_an_order_by_the_key_for_questions_is_refused_and_told(
     """The one key of an observer that reaches the proxy carries no orders, whoever sends them by it."""
     intruder = joined(who)
     before = len(rig.bench.published(EventKind.COMMAND_REFUSED))
-    told, holder = list(rig.bench.driver.told), rig.bench.proxy.watch.authority.holder
+    told, holder = list(rig.bench.driver.told), rig.bench.proxy.handler.authority.holder
     if what in ORDERS:
         intruder.send(layout.ASK, ORDERS[what](rig))
     else:
@@ -197,7 +197,7 @@ def test_an_order_by_the_key_for_questions_is_refused_and_told(
     event = rig.bench.published(EventKind.COMMAND_REFUSED)[before]
     assert (event.app, event.data["reason"]) == ("intruder", Refusal.OBSERVER)
     assert rig.bench.driver.told == told
-    assert rig.bench.proxy.watch.authority.holder is holder
+    assert rig.bench.proxy.handler.authority.holder is holder
     assert rig.bench.proxy.parameters.get("limits.tilt").value != 0.0567
 
 
@@ -237,11 +237,11 @@ def test_commands_of_a_connection_that_never_was_are_refused_and_told(rig: Rig) 
 def test_who_is_revoked_in_flight_loses_the_drone_and_does_not_come_back(tmp_path: Path) -> None:
     lab = make_lab(tmp_path / "lab")
     with Rig(lab.folder) as rig:
-        ring = rig.server._ring
+        ring = rig.server._settings.ring
         assert ring is not None
         jane, jane_settings = rig.jane, rig.settings("jane")
         lab.revoke("jane")
-        (news,) = ring.look()
+        (news,) = ring.poll()
         assert "revoked or changed: jane" in news
 
         def ended() -> bool:
@@ -272,6 +272,7 @@ def test_our_ends_refuse_keys_of_another_role_or_name(rig: Rig, lab: Lab) -> Non
 def test_the_echoes_of_commands_are_seen_by_observers(rig: Rig) -> None:
     """Not a secret: who flies how is published, as on one host; only the commands themselves can't be listened to."""
     olga = rig.intruder("olga")
+    olga.see()
     olga.listen(layout.topic(DRONE, COMMANDS))
 
     def seen() -> bool:
@@ -317,24 +318,23 @@ def test_a_router_applies_the_rules_to_those_who_connect_to_it(lab: Lab) -> None
 
     heard: list[str] = []
     with node("hub", "router", "listen"), node("alpha", "peer", "connect") as alpha:
-        for way in (layout.ASK, layout.ORDER, layout.COMMAND):
+        for way in (layout.COMMAND, layout.ORDER, layout.ASK):  # known to the others in this order
             alpha.declare_subscriber(
                 layout.upward(way, DRONE, "*", "*"), lambda sample: heard.append(str(sample.key_expr))
             )
         passed = {}
         for who in ("kim", "olga", "bob"):
-            session = third_party(endpoint, lab.folder(who))
             keys = [layout.upward(way, DRONE, who, "0" * 16) for way in (layout.COMMAND, layout.ORDER, layout.ASK)]
             false = layout.upward(layout.COMMAND, DRONE, "jane", "0" * 16)
+            with third_party(endpoint, lab.folder(who), mode="client") as session:
 
-            def asked() -> bool:
-                for key in (false, *keys):  # noqa: B023  called at once
-                    session.put(key, b"x")  # noqa: B023
-                return keys[-1] in heard  # noqa: B023  put last, so the others would have come before
+                def asked() -> bool:
+                    for key in (false, *keys):  # noqa: B023  called at once
+                        session.put(key, b"x")
+                    return keys[-1] in heard  # noqa: B023  put last, so the others would have come before
 
-            wait_until(asked, "a question arrives")
+                wait_until(asked, "a question arrives")
             passed[who] = {key for key in heard if key in (false, *keys)}
-            session.close()
     mine = {who: {layout.upward(way, DRONE, who, "0" * 16) for way in ("command", "order", "ask")} for who in passed}
     assert passed == {
         "kim": mine["kim"],

@@ -13,12 +13,12 @@ from pathlib import Path
 
 import pytest
 
-from skyloop.messages import Command, EmergencyStop, EventKind, FlightState, Hover, Refusal, Role, Velocity, encode
+from skyloop.messages import Command, EmergencyStop, EventKind, Hover, Refusal, Role, Velocity, encode
 from skyloop.transport.base import Dialer, ServerEnd
 from skyloop.transport.fabric import FabricServer, FabricSettings
 from skyloop.transport.fabric import dial as fabric_dial
 from skyloop.transport.fabric.config import free_port
-from skyloop.transport.fabric.window import RECENT_PACKETS
+from skyloop.transport.fabric.delivery import RECENT_PACKETS
 from skyloop.transport.local import LocalServer
 from skyloop.transport.local import dial as local_dial
 from skyloop.transport.memory import MemoryServer
@@ -94,9 +94,7 @@ def send_until_refused(bench: Bench, sender: App, packet: bytes) -> str:
 @pytest.fixture
 def jane(bench: Bench) -> App:
     """Who flies."""
-    pilot = bench.pilot("jane")
-    bench.driver.report(state=FlightState.HOVERING)
-    return pilot
+    return bench.airborne("jane")
 
 
 def test_at_once_by_the_same_connection(bench: Bench, jane: App) -> None:

@@ -28,17 +28,21 @@ from skyloop.sim.parameters import GRAVITY_M_S2, with_ideal_sensors
 from skyloop.sim.streams import Floats
 from skyloop.sim.vehicles import AR_DRONE
 from tests.docs.pages import rows, section
+from tests.recordings import recorded
 from tests.sim.helpers import HALL, IDEAL, flying, steps
 
-FLIGHTS = Path(__file__).parents[1] / "data" / "ardrone-flights"
 JUDGED = "1sImpulseNH1"
 FITTED = ("0.5sImpulseNH5", "8sStepHalfMagNH1")
 
 
+def folder_of(name: str) -> Path:
+    return recorded(f"ardrone-flights/{name}")
+
+
 @cache
-def recorded(name: str) -> Recording:
+def step_of(name: str) -> Recording:
     """A run, with times from its step on."""
-    recording = read_recording(FLIGHTS / name)
+    recording = read_recording(folder_of(name))
     return recording.since(recording.steps()[0])
 
 
@@ -47,7 +51,7 @@ def recorded(name: str) -> Recording:
 
 @pytest.mark.parametrize("name", [*FITTED, JUDGED])
 def test_each_step_is_answered_as_recorded(name: str) -> None:
-    run = recorded(name)
+    run = step_of(name)
     [misfit] = compare(replay(run.command, [AR_DRONE]), run)
     assert len(misfit.pitch) > 550
     assert degrees(misfit.pitch_rms) < 2.0
@@ -56,13 +60,13 @@ def test_each_step_is_answered_as_recorded(name: str) -> None:
 
 def test_the_vehicle_by_default_would_not_pass() -> None:
     """So the recordings tell vehicles apart."""
-    run = recorded(JUDGED)
+    run = step_of(JUDGED)
     ours, default = compare(replay(run.command, [AR_DRONE, VehicleParameters()]), run)
     assert degrees(default.pitch_rms) > 2.0 > 2 * degrees(ours.pitch_rms)
 
 
 def test_half_a_command_tilted_the_recorded_drone_as_far_as_a_whole_one() -> None:
-    runs = {name: recorded(name) for name in FITTED}
+    runs = {name: step_of(name) for name in FITTED}
     commands = {name: run.command.values.max() for name, run in runs.items()}
     tilts = {name: degrees(run.pitch.between(0.2, 0.5).values.max()) for name, run in runs.items()}
     assert commands == {FITTED[0]: 1.0, FITTED[1]: 0.5}
@@ -71,14 +75,14 @@ def test_half_a_command_tilted_the_recorded_drone_as_far_as_a_whole_one() -> Non
 
 @pytest.mark.parametrize(("name", "length_s"), [(FITTED[0], 0.5), (JUDGED, 1.02), (FITTED[1], 2.02)])
 def test_a_run_holds_one_step_and_its_release(name: str, length_s: float) -> None:
-    assert recorded(name).steps() == pytest.approx([0.0, length_s], abs=0.001)
+    assert step_of(name).steps() == pytest.approx([0.0, length_s], abs=0.001)
 
 
 # Reading --------------------------------------------------------------------------------------------------------------
 
 
 def test_signs_and_units_are_ours() -> None:
-    run, raw = read_recording(FLIGHTS / JUDGED), np.loadtxt(FLIGHTS / JUDGED / "theta_dump.dat")
+    run, raw = read_recording(folder_of(JUDGED)), np.loadtxt(folder_of(JUDGED) / "theta_dump.dat")
     assert run.name == JUDGED
     assert run.pitch.values == pytest.approx(np.radians(-raw[:, 1] / 1000))
     assert run.command.values.min() == 0.0
@@ -86,8 +90,8 @@ def test_signs_and_units_are_ours() -> None:
 
 
 def test_times_of_receipt_are_kept_on_demand() -> None:
-    raw = np.loadtxt(FLIGHTS / JUDGED / "theta_dump.dat")
-    stamped, evened = (read_recording(FLIGHTS / JUDGED, as_stamped=flag).pitch.times_s for flag in (True, False))
+    raw = np.loadtxt(folder_of(JUDGED) / "theta_dump.dat")
+    stamped, evened = (read_recording(folder_of(JUDGED), as_stamped=flag).pitch.times_s for flag in (True, False))
     assert (stamped == raw[:, 0]).all()
     assert (stamped - evened).max() > 0.3  # so long the link hung around the step
 
@@ -131,7 +135,7 @@ def test_a_recording_that_is_not_there_is_named(tmp_path: Path) -> None:
 
 def test_a_recording_that_is_no_text_is_named(tmp_path: Path) -> None:
     (tmp_path / "command_dump.dat").write_bytes(b"\xff\xfe\x80")
-    with pytest.raises(FileFormatError, match=r"command_dump\.dat is no text"):
+    with pytest.raises(FileFormatError, match=r"command_dump\.dat is not UTF-8 text"):
         read_recording(tmp_path)
 
 
@@ -254,7 +258,7 @@ def test_the_page_has_the_figures_that_are_reached() -> None:
     table = rows(section(PAGE, "## Figures"))
     assert {row[0]: row[1] for row in table} == {**dict.fromkeys(FITTED, "fitted"), JUDGED: "judged"}
     for name, _, pitch, forward in table:
-        run = recorded(name)
+        run = step_of(name)
         [misfit] = compare(replay(run.command, [AR_DRONE]), run)
         assert degrees(misfit.pitch_rms) == pytest.approx(float(pitch.rstrip("°")), abs=0.011)
         assert misfit.forward_rms == pytest.approx(float(forward.removesuffix(" m/s")), abs=0.0011)

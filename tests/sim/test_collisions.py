@@ -48,6 +48,7 @@ set_points = st.builds(
 ) | st.builds(Attitude, roll=st.floats(-0.5, 0.5), pitch=st.floats(-0.5, 0.5), climb=st.floats(-3, 3))
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None)
 @example("gates", [Attitude(pitch=-0.5), Velocity(up=-1.0), Velocity(up=-2.0)], 0)  # one came down upon the other
 @given(st.sampled_from(["room", "gates"]), st.lists(set_points, min_size=1, max_size=6), st.integers(0, 1000))

@@ -45,6 +45,7 @@ def pressed(world: World, action: Velocity | Attitude, limits: Limits, seed: int
     return simulation
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("climb_m_s", [0.1, 0.3, 0.7])
 @pytest.mark.parametrize("tilt_rad", [0.21, 0.6])
 @pytest.mark.parametrize("action", [Velocity(1.0), Velocity(1.0, 1.0), Velocity(0.2, 0.2), Attitude(0.2, 0.2)])
@@ -54,6 +55,7 @@ def test_a_drone_in_a_corner_gets_down(action: Velocity | Attitude, tilt_rad: fl
     assert math.hypot(*simulation.truth(0).velocity_m_s) < 1.0
 
 
+@pytest.mark.slow
 @settings(max_examples=12, deadline=None)
 @given(
     st.floats(-25.0, -2.0),

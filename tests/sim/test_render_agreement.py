@@ -16,7 +16,7 @@ from skyloop.sim.render.base import SceneState
 from skyloop.sim.render.planar import PlanarRenderer, Quality
 from skyloop.sim.render.quads import QuadBuilder, Quads
 from skyloop.sim.render.scene import Posed
-from skyloop.sim.render.visibility import DepthBuffer, Grid, look
+from skyloop.sim.render.visibility import DepthBuffer, Grid, visible_quads
 
 PLAIN = replace(FRONT_CAMERA.scaled(0.5), distortion=(0.0,) * 5)
 BENT = FRONT_CAMERA.scaled(0.5)
@@ -144,6 +144,7 @@ def stage() -> Stage:
     return build_stage()
 
 
+@pytest.mark.slow
 def test_no_quad_is_lost_and_depth_is_true_at_200_poses(stage: Stage) -> None:
     """Coverage: apart from pixels on an edge, each sample shows the very quad that the ray caster finds, and none shows
     nothing. Depth: within 1e-9 of the distance."""
@@ -151,7 +152,7 @@ def test_no_quad_is_lost_and_depth_is_true_at_200_poses(stage: Stage) -> None:
     buffer = DepthBuffer(grid)
     rays = pixel_rays(PLAIN)
     for number, pose in enumerate(random_poses(200)):
-        view = look(stage.quads, np.ones(len(stage.quads), np.bool_), pose, grid)
+        view = visible_quads(stage.quads, np.ones(len(stage.quads), np.bool_), pose, grid)
         buffer.draw(view, stage.quads.priority[view.index])
         assert buffer.seen.min() > 0, f"pose {number}: a hole in a closed room"
         hit, depth = cast(stage.quads, pose, rays)
@@ -164,6 +165,7 @@ def test_no_quad_is_lost_and_depth_is_true_at_200_poses(stage: Stage) -> None:
         assert np.abs(inverse * depth - 1.0)[same].max() < 1e-9, f"pose {number}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", [PLAIN, BENT], ids=["pinhole", "barrel"])
 @pytest.mark.parametrize("quality", list(Quality))
 def test_colours_agree_away_from_edges(stage: Stage, model: CameraModel, quality: Quality) -> None:

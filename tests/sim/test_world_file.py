@@ -51,7 +51,7 @@ def test_files_load_by_path(tmp_path: Path) -> None:
     path.write_text(ROOM)
     assert load_world(path).name == "mine"
     assert load_world(str(path)).room.size_m == (8, 6, 3)
-    with pytest.raises(FileFormatError, match=r"other\.toml: can't be read"):
+    with pytest.raises(FileFormatError, match=r"other\.toml can't be read"):
         load_world(tmp_path / "other.toml")
     path.write_bytes(b"\xff\xfe")
     with pytest.raises(FileFormatError, match="not UTF-8"):
@@ -60,6 +60,11 @@ def test_files_load_by_path(tmp_path: Path) -> None:
 
 # What is wrong with the text, and what the message has to say about it.
 BAD = [
+    (
+        ROOM + '[[target]]\nmarker_size = 0.2\nid = 1\n[target.path]\nkind = "waypoints"\nspeed = 1\n'
+        "points = [[0, 0, 1], [5e-324, 0, 1]]\n",
+        "less than 0.01 m apart",
+    ),
     ("", "key 'room': missing"),
     ("[room]\nsize = [8, 6", "not valid TOML"),
     ("[room]\nsize = [8, 6]\n", r"\[room\], key 'size': .* a list of 3 numbers"),

@@ -13,9 +13,9 @@ from typing import Any, NoReturn
 
 import pytest
 
+from skyloop.emulators.ardrone import ArdroneFirmware
+from skyloop.emulators.ardrone.settings import with_ardrones
 from skyloop.errors import LinkError
-from skyloop.sim.firmware.ardrone import ArdroneFirmware
-from skyloop.sim.firmware.ardrone.settings import with_ardrones
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 

@@ -1,4 +1,5 @@
-"""MAVSDK 4.1.0 and MAVProxy 1.8.75, which we did not write, fly both emulated autopilots."""
+"""MAVSDK 4.1.0 and MAVProxy 1.8.75, which we did not write, fly both emulated autopilots, and dronekit2 3.0.0 the
+ArduCopter."""
 
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from skyloop.sim.firmware.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
+from skyloop.emulators.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from tests.third_party.conftest import HERE, INSTALLED, PATIENCE_S, absent
@@ -66,3 +67,23 @@ def test_mavproxy_takes_off_flies_by_velocity_and_lands(firmware: MavlinkFirmwar
     kind, master = firmware.settings.kind.value, f"udpin:127.0.0.1:{firmware.settings.ports.remote}"
     seen = flown(firmware, tmp_path, python, str(HERE / "fly_mavproxy.py"), kind, master)
     assert "Detected vehicle 1:1" in seen["said"]
+
+
+@pytest.mark.parametrize("firmware", [Kind.ARDUCOPTER], indirect=True)
+def test_dronekit_waits_until_it_is_armable_takes_off_goes_somewhere_and_comes_home(
+    firmware: MavlinkFirmware, tmp_path: Path
+) -> None:
+    python, tcp = python_of("dronekit2", "3.0.0"), firmware.settings.ports.tcp
+    command = [python, str(HERE / "fly_dronekit.py"), f"tcp:127.0.0.1:{tcp}"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=150, cwd=tmp_path, check=False)
+    assert done.returncode == 0, f"{done.stdout[-3000:]}\n{done.stderr[-3000:]}"
+    seen: dict[str, Any] = json.loads([line for line in done.stdout.splitlines() if line.startswith("{")][-1])
+    assert seen["high_m"] > 2.3
+    assert seen["there_m"] < 0.6
+    assert seen["fastest_m_s"] < 1.8, "slower, by its own command"
+    assert seen["highest_m"] == pytest.approx(5.0, abs=0.5), "RTL_ALT"
+    assert seen["home_m"] < 0.1
+    assert not firmware.autopilot.armed
+    east, north, up = firmware.host.simulation.truth(0).position_m
+    assert math.hypot(east, north) < 0.7
+    assert up < 0.2

@@ -15,8 +15,8 @@ import zenoh
 from skyloop.keys import Lab, load
 from skyloop.keys.identity import make_identity
 from skyloop.transport.fabric import layout
-from skyloop.transport.fabric.access import HEARS, SAYS, access_control, secured
-from skyloop.transport.fabric.settings import FabricSettings
+from skyloop.transport.fabric.access import EGRESS, INGRESS, access_control
+from skyloop.transport.fabric.settings import FabricSettings, secured
 
 LAB = [
     make_identity("jane", "pilot", "alpha*"),
@@ -122,23 +122,23 @@ EVERY = ["alpha", "alpha7", "bravo", "charlie"]
     ],
 )
 def test_what_each_may_say(who: str, may: set[str]) -> None:
-    assert permitted(who, SAYS) == may
+    assert permitted(who, INGRESS) == may
 
 
 def test_a_router_carries_all_that_is_skyloops_and_nothing_else() -> None:
     every = {what for what, _, _ in deeds()} - {"everything", "another's keys", "administration"}
-    assert permitted("hub", SAYS) == permitted("hub", HEARS) == every
+    assert permitted("hub", INGRESS) == permitted("hub", EGRESS) == every
 
 
 @pytest.mark.parametrize(("speaker", "hearer"), [("jane", "hangar"), ("olga", "hangar")])
 def test_proxies_hear_what_applications_may_say_to_them(speaker: str, hearer: str) -> None:
-    served = {what for what in permitted(speaker, SAYS) if "charlie" not in what} | {"query info charlie"}
-    assert served - permitted(hearer, HEARS) == set()
+    served = {what for what in permitted(speaker, INGRESS) if "charlie" not in what} | {"query info charlie"}
+    assert served - permitted(hearer, EGRESS) == set()
 
 
 @pytest.mark.parametrize("hearer", ["jane", "olga"])
 def test_applications_hear_what_a_proxy_may_say_to_them(hearer: str) -> None:
-    lost = permitted("hangar", SAYS) - permitted(hearer, HEARS)
+    lost = permitted("hangar", INGRESS) - permitted(hearer, EGRESS)
     seen = ["alpha", "bravo"] if hearer == "olga" else EVERY
     flown = ["alpha", "alpha7"] if hearer == "jane" else []
     unseen = {what for what in lost if not any(name in what.split() for name in seen)}
@@ -148,7 +148,7 @@ def test_applications_hear_what_a_proxy_may_say_to_them(hearer: str) -> None:
 
 @pytest.mark.parametrize("hearer", ["jane", "olga"])
 def test_applications_are_not_told_what_others_send_to_a_proxy(hearer: str) -> None:
-    heard = permitted(hearer, HEARS)
+    heard = permitted(hearer, EGRESS)
     assert not any(what.startswith(("ask", "order", "command", "live at")) for what in heard)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import random
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from typing import Any
@@ -13,10 +14,12 @@ import pytest
 import zenoh
 
 from skyloop.messages import Command, Hello, ReleaseAuthority, Request, Takeoff, encode
-from skyloop.transport.base import FEEDBACK, MAX_PACKET, video
+from skyloop.transport.base import FEEDBACK, MAX_PACKET, Peer, results, video
 from skyloop.transport.fabric import FabricServer, FabricSettings, dial, layout, packets
 from skyloop.transport.fabric.client import FabricClient
 from skyloop.transport.fabric.config import free_port
+from skyloop.transport.fabric.connection import ServerConnection
+from skyloop.transport.fabric.registry import STALLED_S
 from skyloop.transport.testing import FRONT, ClientLog, ServerLog, header, picture, wait_until
 
 LOCAL = "127.0.0.1"
@@ -113,9 +116,66 @@ def test_garbage_on_every_key(scene: Scene) -> None:
 def test_garbage_by_the_key_of_an_application_is_handed_on_as_garbage(scene: Scene) -> None:
     """Whoever has no keys of his own can send as anybody; the handler judges what comes."""
     key = layout.upward(layout.ASK, "alpha", "anyone", scene.id)
-    scene.intruder.put(key, b"nonsense", attachment=packets.number(7))
+    scene.intruder.put(key, b"nonsense", attachment=packets.number(0))
     wait_until(lambda: scene.log.packets, "it came")
     assert scene.log.packets == [(scene.log.joined[0], b"nonsense")]
+    scene.still_serves()
+
+
+def test_a_handler_that_raises_on_a_refusal_leaves_the_applications_heard(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    told: list[str] = []
+
+    def refused(_peer: Peer, reason: str) -> None:
+        told.append(reason)
+        raise RuntimeError("in the handler")
+
+    monkeypatch.setattr(scene.log, "refused", refused)
+    key = layout.upward(layout.COMMAND, "alpha", "anyone", layout.new_id())
+
+    def seen() -> list[str]:
+        scene.intruder.put(key, encode(Command(1, 0, 1, 0, Takeoff())), attachment=packets.number(1))
+        return told
+
+    wait_until(seen, "it is told of commands from nobody")
+    scene.still_serves()
+    assert any("could not be checked" in record.getMessage() for record in caplog.records)
+    caplog.clear()
+
+
+def test_an_application_that_takes_nothing_is_let_go_and_counted(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ServerConnection, "stalled_s", lambda _connection, _now: STALLED_S + 1.0)
+    wait_until(lambda: scene.log.left, "it is let go")
+    assert "it took nothing of what was sent to it for 3 s" in str(scene.log.left)
+    assert scene.server.counters["network.dropped"] == 1
+
+
+def test_topics_that_do_not_exist_are_refused_and_leave_nothing(scene: Scene) -> None:
+    before = threading.active_count()
+    made_up = [video(f"made-up-{number}") for number in range(20)]
+    scene.log.problems.update(dict.fromkeys(made_up, "no such camera"))
+    for topic in made_up:
+        scene.app.subscribe(topic)
+    wait_until(lambda: len(scene.log.complaints) == len(made_up), "the handler was told of each")
+    assert set(scene.log.complaints) == {(scene.log.joined[0], "no such camera")}
+    assert threading.active_count() <= before
+    assert list(scene.server._publisher.video._variants) == [FRONT]
+    for topic in made_up:
+        scene.app.subscribe(topic, False)
+    for number in range(3):  # those that exist, by names that applications choose
+        topic = results(f"detector-{number}")
+        scene.app.subscribe(topic)
+        wait_until(lambda: scene.server.subscribers(topic), "it is subscribed to")  # noqa: B023
+        assert scene.server.publish(topic, b"found") == 0
+        wait_until(lambda: scene.app_log.packets[-1:] == [b"found"], "it came")
+        scene.app_log.packets.clear()
+        scene.app.subscribe(topic, False)
+        wait_until(lambda: not scene.server.subscribers(topic), "it is no longer")  # noqa: B023
+    assert not any(
+        topic.startswith(results(""))
+        for topic in (*scene.server._publisher._publishers, *scene.server._publisher._numbers)
+    )
     scene.still_serves()
 
 
@@ -150,7 +210,7 @@ def test_whoever_speaks_another_revision_is_told(scene: Scene) -> None:
 
 
 def test_whoever_joins_and_shows_no_token_is_let_go(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("skyloop.transport.fabric.server.CONFIRM_S", 0.1)
+    monkeypatch.setattr("skyloop.transport.fabric.registry.CONFIRM_S", 0.1)
     wish = packets.encode_own(packets.Join(packets.REVISION, scene.server._run))
     (reply,) = scene.intruder.get(layout.join("alpha", "anyone", layout.new_id()), payload=wish, timeout=2)
     assert reply.ok is not None

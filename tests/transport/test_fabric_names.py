@@ -11,9 +11,18 @@ import zenoh
 
 from skyloop.errors import LinkError, NameTakenError, UnknownNameError, UsageError
 from skyloop.transport.base import FEEDBACK, Dialer
-from skyloop.transport.fabric import FabricServer, FabricSettings, dial, finding, layout, list_proxies, packets, session
+from skyloop.transport.fabric import (
+    FabricServer,
+    FabricSettings,
+    dial,
+    discovery,
+    layout,
+    list_proxies,
+    packets,
+    session,
+)
 from skyloop.transport.fabric.config import Part, free_port
-from skyloop.transport.fabric.seeking import renew
+from skyloop.transport.fabric.discovery import renew
 from skyloop.transport.testing import ClientLog, ServerLog, wait_until
 from tests.transport.test_fabric_hostile import stranger
 
@@ -67,7 +76,7 @@ def test_of_two_with_one_name_the_older_keeps_it() -> None:
     """A network that was in two parts when they started."""
     one, two = place(), place()
     with serving("alpha", one) as (_, older), serving("alpha", two) as (_, younger):
-        assert [about.address for about in finding.ask(calling(one, two), "alpha")] == [
+        assert [about.address for about in discovery.ask(calling(one, two), "alpha")] == [
             f"fabric:alpha ({one})",
             f"fabric:alpha ({two})",
         ]
@@ -105,7 +114,7 @@ def test_a_proxy_that_appears_while_it_is_looked_for_is_found() -> None:
 
 
 def test_a_proxy_that_is_full_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("skyloop.transport.fabric.server.MAX_CLIENTS", 1)
+    monkeypatch.setattr("skyloop.transport.fabric.registry.MAX_CLIENTS", 1)
     at = place()
     with serving("alpha", at) as (_, log):
         dialer: Dialer = dial("alpha", calling(at))
@@ -124,7 +133,7 @@ def test_an_application_has_so_many_subscriptions_at_most() -> None:
         client = dial("alpha", calling(at))(ClientLog())
         for number in range(70):
             client.subscribe(f"topic {number}")
-        wait_until(lambda: len(log.packets) == 6, "what is too much is refused as garbage is")
+        wait_until(lambda: len(log.complaints) == 6, "what is too much is refused as garbage is")
         assert server.subscribers("topic 63") == 1
         assert server.subscribers("topic 64") == 0
         client.close()
@@ -203,7 +212,7 @@ def test_answers_that_make_no_sense_are_no_proxies() -> None:
         asked = session.acquire(calling(at, lair), Part.APP)
         ends.callback(session.release, asked)
         wait_until(lambda: len(list(asked.zenoh.info.peers_zid())) == 2, "it is connected to both")
-        wait_until(lambda: [a.name for a in finding.oldest_first(asked, "*")] == ["alpha"], "only the proxy is found")
+        wait_until(lambda: [a.name for a in discovery.oldest_first(asked, "*")] == ["alpha"], "only the proxy is found")
         for name in ("charlie", "delta", "echo"):
-            assert finding.oldest_first(asked, name) == []
-        assert {name for name, _ in finding.runs(asked)} == {"alpha"}
+            assert discovery.oldest_first(asked, name) == []
+        assert {name for name, _ in discovery.runs(asked)} == {"alpha"}

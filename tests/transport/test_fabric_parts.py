@@ -37,11 +37,10 @@ from skyloop.transport.fabric import (
     environment,
     layout,
     packets,
-    rights,
 )
 from skyloop.transport.fabric.config import Part
-from skyloop.transport.fabric.seeking import FORGET_S, Strangers
-from skyloop.transport.fabric.window import ACKNOWLEDGE_AFTER, DEPTH, MAX_BYTES, Recent, Taker, Window
+from skyloop.transport.fabric.delivery import ACKNOWLEDGE_AFTER, AckPolicy, RecentPackets
+from skyloop.transport.fabric.discovery import FORGET_S, UnreachablePeers
 from skyloop.transport.testing import header
 
 TOPICS = st.text(min_size=1, max_size=MAX_TOPIC).filter(lambda text: text.isprintable())
@@ -145,65 +144,34 @@ BODIES: list[tuple[AnyRequest, str]] = [
 @pytest.mark.parametrize(("body", "way"), BODIES)
 def test_requests_need_what_they_do(body: AnyRequest, way: str) -> None:
     packet = encode(Request(1, body))
-    assert rights.way_of(packet) == way
-    assert rights.allows(way, packet)
-    assert rights.allows(layout.ORDER, packet)
-    assert rights.allows(layout.ASK, packet) is (way == layout.ASK)
+    assert layout.way_of(packet) == way
+    assert layout.allows(way, packet)
+    assert layout.allows(layout.ORDER, packet)
+    assert layout.allows(layout.ASK, packet) is (way == layout.ASK)
 
 
 TAKEOFF = encode(Command(1, 1, 1, 1, Takeoff()))
 
 
 def test_other_packets_need_what_they_are() -> None:
-    assert rights.way_of(TAKEOFF) == layout.COMMAND
-    assert rights.way_of(encode(Annotation("me", "front", 1, 32, 24))) == layout.ASK
-    assert rights.way_of(encode(LogEntry("me", "", 1, text="x"))) == layout.ASK
-    assert not rights.allows(layout.ORDER, TAKEOFF)
-    assert rights.way_of(encode(VehiclePose(1, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))) == layout.ORDER
+    assert layout.way_of(TAKEOFF) == layout.COMMAND
+    assert layout.way_of(encode(Annotation("me", "front", 1, 32, 24))) == layout.ASK
+    assert layout.way_of(encode(LogEntry("me", "", 1, text="x"))) == layout.ASK
+    assert not layout.allows(layout.ORDER, TAKEOFF)
+    assert layout.way_of(encode(VehiclePose(1, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)))) == layout.ORDER
 
 
 @given(st.binary(max_size=60))
 def test_garbage_needs_no_right_unless_it_looks_like_a_command_or_a_pose(data: bytes) -> None:
-    assert rights.way_of(data) == {b"\1": layout.COMMAND, b"\15": layout.ORDER}.get(data[5:6], layout.ASK)
+    assert layout.way_of(data) == {b"\1": layout.COMMAND, b"\15": layout.ORDER}.get(data[5:6], layout.ASK)
 
 
 # --- windows ---
 
 
-def test_a_window_is_full_and_opens_as_packets_are_taken() -> None:
-    window = Window()
-    assert [window.send(10) for _ in range(DEPTH + 2)] == [*range(1, DEPTH + 1), 0, 0]
-    window.taken(1)
-    assert window.send(10) == DEPTH + 1
-    assert window.send(10) == 0
-    window.taken(0)
-    window.taken(10**6)  # never sent: it says nothing
-    assert window.send(10) == 0
-    window.taken(DEPTH + 1)
-    assert window.send(10) == DEPTH + 2
-
-
-def test_a_window_counts_bytes_too_but_lets_one_packet_pass() -> None:
-    window = Window()
-    assert window.send(2 * MAX_BYTES) == 1
-    assert window.send(1) == 0
-    window.taken(1)
-    assert window.send(MAX_BYTES) == 2
-
-
-@given(st.lists(st.integers(1, 60_000), max_size=400))
-def test_what_is_taken_in_order_never_closes_the_window(sizes: list[int]) -> None:
-    window, taker = Window(), Taker()
-    for size in sizes:
-        number = window.send(size)
-        assert number
-        if taker.took(number, size):
-            window.taken(number)
-
-
 def test_taking_is_told_now_and_then() -> None:
-    taker = Taker()
-    told = [number for number in range(1, 101) if taker.took(number, 1)]
+    policy = AckPolicy()
+    told = [number for number in range(1, 101) if policy.count(number, 1)]
     assert told == [ACKNOWLEDGE_AFTER * n for n in range(1, 100 // ACKNOWLEDGE_AFTER + 1)]
 
 
@@ -307,14 +275,14 @@ def test_without_zenoh_it_is_said_what_to_install(monkeypatch: pytest.MonkeyPatc
 
 
 def test_somebody_new_is_tried_once_until_somebody_was_reached() -> None:
-    strangers = Strangers()
-    assert strangers.news({"a"}, set(), 0.0)
-    assert not strangers.news({"a"}, set(), 1.0)
-    assert not strangers.news({"a", "b"}, {"b"}, 1.0)
-    assert strangers.news({"a", "b"}, set(), 1.0)
-    strangers.reached()
-    assert strangers.news({"a"}, set(), 2.0)
-    assert strangers.news({"a"}, set(), 2.0 + FORGET_S)
+    unreachable = UnreachablePeers()
+    assert unreachable.any_new({"a"}, set(), 0.0)
+    assert not unreachable.any_new({"a"}, set(), 1.0)
+    assert not unreachable.any_new({"a", "b"}, {"b"}, 1.0)
+    assert unreachable.any_new({"a", "b"}, set(), 1.0)
+    unreachable.clear()
+    assert unreachable.any_new({"a"}, set(), 2.0)
+    assert unreachable.any_new({"a"}, set(), 2.0 + FORGET_S)
 
 
 # --- requests for video ---
@@ -386,7 +354,7 @@ def test_a_filter_starts_anew_with_a_camera_that_does() -> None:
 
 
 def test_what_comes_twice_is_told_from_what_is_sent_twice() -> None:
-    recent = Recent(depth=2)
+    recent = RecentPackets(depth=2)
     assert [recent.is_new(*packet) for packet in ((1, b"a"), (1, b"a"), (2, b"a"), (0, b"b"), (1, b"a"))] == [
         *(True, False, True, True),
         True,  # forgotten meanwhile

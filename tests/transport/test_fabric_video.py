@@ -11,8 +11,8 @@ import pytest
 from skyloop.clock import ManualClock
 from skyloop.messages import Encoding, FrameHeader, Intrinsics
 from skyloop.messages.video import VideoRequest
-from skyloop.transport import pictures
-from skyloop.transport.fabric.frames import LOST_NS, WINDOW, Variant, Video
+from skyloop.transport import frame_encoding
+from skyloop.transport.fabric.frames import LOST_NS, WINDOW, FramePublisher, Variant
 from skyloop.transport.testing import header, picture, wait_until
 
 cv2 = pytest.importorskip("cv2", reason="encoded video needs the extra 'network'")
@@ -31,7 +31,7 @@ class Network:
         self.gate = threading.Event()
         self.gate.set()
         self.clock = ManualClock()
-        self.video = Video(self.send, "alpha", self.clock)
+        self.video = FramePublisher(self.send, "alpha", self.clock)
 
     def send(
         self, variant: Variant, number: int, head: FrameHeader, data: bytes, to: tuple[Hashable, ...] | None
@@ -63,7 +63,7 @@ def test_nobody_there(network: Network) -> None:
     assert network.video.readers("front") == 0
     assert not network.video.subscribe("a", "video/front?scale=7")
     network.video.unsubscribe("a", "video/front?scale=7")
-    network.video.took("a", PLAIN, 1)
+    network.video.taken("a", PLAIN, 1)
     network.video.leave("a")
 
 
@@ -80,12 +80,12 @@ def test_a_slow_reader_is_left_out_while_the_others_go_on_and_gets_the_newest(ne
     for seq in range(WINDOW):
         assert network.publish(seq) == 0
         network.sends(seq + 1)
-        network.video.took("fast", PLAIN, network.numbers[-1])
+        network.video.taken("fast", PLAIN, network.numbers[-1])
     for seq in range(WINDOW, 5):
         assert network.publish(seq) == 1
         assert network.sends(seq + 1)[-1] == (PLAIN, seq, ("fast",))
-        network.video.took("fast", PLAIN, network.numbers[-1])
-    network.video.took("slow", PLAIN, network.numbers[0])
+        network.video.taken("fast", PLAIN, network.numbers[-1])
+    network.video.taken("slow", PLAIN, network.numbers[0])
     assert network.sends(6)[-1] == (PLAIN, 4, ("slow",))
 
 
@@ -133,7 +133,7 @@ def test_without_what_encodes_frames_go_as_they_are_and_that_is_said_once(
         network.publish(seq)
         network.sends(seq + 1)
         assert network.headers[-1].encoding is Encoding.BGR8
-        network.video.took("a", JPEG, network.numbers[-1])
+        network.video.taken("a", JPEG, network.numbers[-1])
     assert len([record for record in caplog.records if "is sent as it is" in record.getMessage()]) == 1
 
 
@@ -145,7 +145,7 @@ def test_a_send_that_fails_costs_one_frame(caplog: pytest.LogCaptureFixture) -> 
             raise OSError("on purpose")
         sent.append(head.seq)
 
-    video = Video(send, "alpha")
+    video = FramePublisher(send, "alpha")
     video.subscribe("a", PLAIN)
     for seq in range(2):
         video.publish(header(seq), picture(header(seq)))
@@ -166,7 +166,9 @@ def test_jpeg_of_each_encoding() -> None:
         (Encoding.MONO8, gradient),
     ):
         head = FrameHeader("front", 1, 1, 1, 32, 24, encoding, pixels.size)
-        made, data = pictures.encode_frame(head, np.ascontiguousarray(pixels), VideoRequest("front", encoding="jpeg"))
+        made, data = frame_encoding.encode_frame(
+            head, np.ascontiguousarray(pixels), VideoRequest("front", encoding="jpeg")
+        )
         assert made.encoding is Encoding.JPEG
         assert made.size == len(data) < pixels.size
         shown = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
@@ -182,19 +184,19 @@ def test_quality_is_a_choice_and_jpeg_is_not_encoded_again() -> None:
     noise = np.random.default_rng(1).integers(0, 255, (48, 64, 3), np.uint8)
     head = FrameHeader("front", 1, 1, 1, 64, 48, Encoding.BGR8, noise.size)
     sizes = [
-        pictures.encode_frame(head, noise, VideoRequest("front", encoding="jpeg", quality=quality))[0].size
+        frame_encoding.encode_frame(head, noise, VideoRequest("front", encoding="jpeg", quality=quality))[0].size
         for quality in (10, 50, 95)
     ]
     assert sizes == sorted(sizes)
-    made, data = pictures.encode_frame(head, noise, VideoRequest("front", encoding="jpeg"))
-    again = pictures.encode_frame(made, np.frombuffer(data, np.uint8), VideoRequest("front", scale=0.5))
+    made, data = frame_encoding.encode_frame(head, noise, VideoRequest("front", encoding="jpeg"))
+    again = frame_encoding.encode_frame(made, np.frombuffer(data, np.uint8), VideoRequest("front", scale=0.5))
     assert again == (made, data)
 
 
 def test_intrinsics_follow_the_size() -> None:
     lens = Intrinsics(300.0, 300.0, 159.5, 119.5)
     head = FrameHeader("front", 1, 1, 1, 320, 240, Encoding.BGR8, 320 * 240 * 3, lens)
-    small = pictures.scaled_header(head, 0.5)
+    small = frame_encoding.scaled_header(head, 0.5)
     assert (small.width, small.height, small.size) == (160, 120, 160 * 120 * 3)
     assert small.intrinsics == Intrinsics(150.0, 150.0, 79.5, 59.5)
-    assert pictures.scaled_header(head, 0.001).width == 1
+    assert frame_encoding.scaled_header(head, 0.001).width == 1

@@ -17,9 +17,8 @@ import pytest
 
 from skyloop.messages import encode
 from skyloop.messages.codec import HEADER
-from skyloop.transport.base import MAX_PACKET, ClientEnd
+from skyloop.transport.base import MAX_PACKET, MAX_SUBSCRIPTIONS, ClientEnd
 from skyloop.transport.local import LocalServer, dial, packets
-from skyloop.transport.local.connection import MAX_SUBSCRIPTIONS
 from skyloop.transport.local.directory import find_directory
 from skyloop.transport.local.slots import SlotMemory
 from skyloop.transport.local.sockets import Socket
@@ -101,11 +100,56 @@ def test_what_makes_no_sense_is_left_to_the_handler() -> None:
         assert log.left == []
 
 
+def test_the_wake_up_that_older_applications_send_before_a_command_is_ignored() -> None:
+    with raw_client(packets.hello(), packets.WAKE, b"x") as (_, log, _):
+        wait_until(lambda: log.packets, "the handler has what came after it")
+        assert log.from_peer(log.joined[1]) == [b"x"]
+        assert log.complaints == []
+
+
 def test_subscriptions_are_bounded() -> None:
     wishes = [packets.subscribe(f"topic-{number}", True) for number in range(MAX_SUBSCRIPTIONS + 1)]
     with raw_client(packets.hello(), *wishes, *wishes[:3]) as (_, log, _):
-        wait_until(lambda: log.packets, "one too many was left to the handler")
-        assert log.packets[0][1] == wishes[-1]
+        wait_until(lambda: log.complaints, "the handler was told of one too many")
+        assert "'topic-64' would be one more than the 64 topics" in log.complaints[0][1]
+        assert log.packets == []
+
+
+@contextmanager
+def joined(log: ServerLog) -> Iterator[tuple[LocalServer, ClientEnd]]:
+    """A server and its one client."""
+    server = LocalServer("alpha")
+    server.start(log)
+    client = dial("alpha")(ClientLog())
+    try:
+        wait_until(lambda: log.joined, "it joined")
+        yield server, client
+    finally:
+        client.close()
+        server.stop()
+
+
+def test_topics_that_do_not_exist_are_refused_and_leave_nothing() -> None:
+    log = ServerLog()
+    log.problems["video/made-up"] = "no such camera"
+    with joined(log) as (server, client):
+        client.subscribe("video/made-up")
+        client.subscribe("video/front?scale=0.5")
+        wait_until(lambda: len(log.complaints) == 2, "the handler was told")
+        assert log.complaints[0][1] == "no such camera"
+        assert "subscribe to 'video/front'" in log.complaints[1][1]
+        assert server.subscribers("video/made-up") == 0
+        assert server._exchange._cameras == {}
+
+
+def test_a_camera_that_nobody_reads_any_more_leaves_nothing() -> None:
+    log = ServerLog()
+    with joined(log) as (server, client):
+        client.subscribe("video/front")
+        wait_until(lambda: server._exchange._cameras, "it is read")
+        client.close()
+        wait_until(lambda: log.left, "it is gone")
+        assert server._exchange._cameras == {}
 
 
 def test_descriptors_sent_to_a_server_are_not_kept() -> None:
@@ -120,13 +164,18 @@ def test_descriptors_sent_to_a_server_are_not_kept() -> None:
 
 def test_connections_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("skyloop.transport.local.server.MAX_CLIENTS", 2)
-    late = ClientLog()
-    with raw_client() as (_, log, _):
+    late, log = ClientLog(), ServerLog()
+    with joined(log) as (server, _):
+        second = dial("alpha")(ClientLog())
+        wait_until(lambda: len(log.joined) == 2, "both joined")
+        for peer in log.joined:
+            assert server.admit(peer, pilot=True) == ""
         client = dial("alpha")(late)
         wait_until(lambda: late.closings, "it was turned away")
         assert "has 2 connections already" in late.closings[0]
         client.close()
-        assert len(log.joined) == 1
+        second.close()
+        assert len(log.joined) == 2
 
 
 def test_a_server_out_of_descriptors_accepts_when_there_are_some_again() -> None:

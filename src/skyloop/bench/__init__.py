@@ -1,1 +1,1 @@
-"""Measurements of Skyloop's own delays, against the bare hand-over of the same bytes in the same run."""
+"""Measurements of Skyloop's own delays, beside the bare hand-over of the same bytes in the same run."""

@@ -1,10 +1,10 @@
-"""What every contender is measured by: two processes that each have one end of it, and stamps on one clock.
+"""The contract by which every contender is measured: two processes with one end each, and stamps on one clock.
 
 A contender is a module with two classes, ``Vehicle(address, heard)`` and ``Application(address, heard)``. The
 sender's stamp is taken when the user's data are there and before the contender is called; ``heard(channel, sent_ns)``
 is called when the receiver's user has them, a frame as an array. Stamps travel with the samples.
 
-Imported by interpreters that have no more than NumPy and the contender: nothing else is imported here.
+Interpreters that have no more than NumPy and the contender import this, so nothing else is imported here.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from skyloop.bench.waypoints import Setpoint, fly
 from skyloop.bench.workers import Pipe
 
 Image = NDArray[np.uint8]
-#: Told of each sample that is in its receiver's hands: its channel, and when it was sent [ns, monotonic].
+#: Called for each sample that its receiver has: its channel, and when it was sent [ns, monotonic].
 Heard = Callable[[str, int], None]
-#: By channel: when each sample was sent, and when it was heard.
+#: By channel: when each sample was sent, and when it was received [ns].
 Arrivals = dict[str, list[tuple[int, int]]]
 
 
 class VehicleEnd(Protocol):
-    """Where feedback and frames come from and commands arrive."""
+    """The end that sends feedback and frames and receives commands."""
 
     def feedback(self, sent_ns: int) -> None: ...
     def frame(self, sent_ns: int, image: Image) -> None: ...
@@ -38,25 +38,26 @@ class VehicleEnd(Protocol):
 
 
 class ApplicationEnd(Protocol):
-    """The user's: where commands come from and feedback and frames arrive. Opened after the vehicle's."""
+    """The user's end, which sends commands and receives feedback and frames. Opened after the vehicle's."""
 
     def command(self, sent_ns: int, setpoint: Setpoint) -> None: ...
     def close(self) -> None: ...
 
 
 class Recorder:
-    """Keeps what was heard; its :meth:`heard` is called by any thread."""
+    """Keeps what was received."""
 
     def __init__(self) -> None:
         self.arrivals: Arrivals = {}
 
     def heard(self, channel: str, sent_ns: int) -> None:
+        """Note that a sample of a channel was received now. Any thread."""
         now_ns = time.monotonic_ns()
         self.arrivals.setdefault(channel, []).append((sent_ns, now_ns))
 
 
 def vehicle_side(pipe: Pipe, module: str, address: str) -> None:
-    """The vehicle's process: a turn after the other."""
+    """Run the vehicle's process, one turn after the other."""
     contender = import_module(module)
     for turn in _turns(pipe):
         recorder = Recorder()
@@ -73,7 +74,7 @@ def vehicle_side(pipe: Pipe, module: str, address: str) -> None:
 
 
 def application_side(pipe: Pipe, module: str, address: str) -> None:
-    """The application's process: a turn after the other."""
+    """Run the application's process, one turn after the other."""
     contender = import_module(module)
     for turn in _turns(pipe):
         recorder = Recorder()
@@ -90,7 +91,13 @@ def application_side(pipe: Pipe, module: str, address: str) -> None:
 
 
 def produce(end: VehicleEnd, turn: Turn, begin_ns: int) -> None:
-    """Feedback from one thread and frames from another, as drivers do."""
+    """Send feedback from one thread and frames from another, as drivers do.
+
+    Args:
+        end: Sends them.
+        turn: What is sent when.
+        begin_ns: When counting begins, on the monotonic clock.
+    """
 
     def tell() -> None:
         for _ in paced(turn.deadlines_ns(FEEDBACK, begin_ns)):
@@ -105,7 +112,7 @@ def produce(end: VehicleEnd, turn: Turn, begin_ns: int) -> None:
 
 
 def picture(size: Size) -> Image:
-    """Noise, shape (height, width, 3): nothing that could be left out on the way."""
+    """Return noise, shape (height, width, 3), dtype uint8, which can't be compressed on the way."""
     return np.random.default_rng(1).integers(0, 255, (size.height, size.width, 3), np.uint8)
 
 

@@ -1,4 +1,4 @@
-"""``skyloop bench delays``: the paper's experiment, against the bare hand-over and other libraries in turns."""
+"""``skyloop bench delays``: the paper's experiment, in turns with the bare hand-over and other libraries."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ from typing import Final
 
 import msgspec
 
+from skyloop.bench.contenders import FLOOR, OURS, Contender
 from skyloop.bench.contract import Arrivals
 from skyloop.bench.machine import Machine
 from skyloop.bench.pair import Pair
-from skyloop.bench.peers import FLOOR, OURS, Contender
 from skyloop.bench.schedule import CHANNELS, Size, Turn
 from skyloop.bench.statistics import Summary, summarize
 from skyloop.bench.workers import Workers
 from skyloop.errors import LinkError
+from skyloop.files import MAX_RESULTS, read_json
 
 TURN_S: Final = 5.0
 
@@ -44,7 +45,7 @@ class Series(msgspec.Struct, frozen=True):
 
 
 class Delays(msgspec.Struct, frozen=True, tag_field="what", tag="delays"):
-    """A whole run; what ``delays.json`` holds. ``seconds``: that each contender was measured with each size."""
+    """A whole run, as in ``delays.json``. ``seconds``: how long each contender was measured with each size."""
 
     machine: Machine
     seconds: float
@@ -56,7 +57,7 @@ class Delays(msgspec.Struct, frozen=True, tag_field="what", tag="delays"):
     series: list[Series]
 
     def summary(self, contender: str, size: str, channel: str) -> Summary | None:
-        """None if that was not measured."""
+        """Return the figures of one channel of one contender; None if that was not measured."""
         for cell in self.cells:
             if (cell.contender, cell.size, cell.channel) == (contender, size, channel):
                 return cell.summary
@@ -70,10 +71,17 @@ def measure(
     skipped: dict[str, str] | None = None,
     progress: Progress = lambda _share, _what: None,
 ) -> Delays:
-    """Measure Skyloop, the floor and ``peers``, each for ``seconds`` with each size of frames, in turns.
+    """Measure Skyloop, the floor and other contenders in turns.
 
-    ``progress`` is told the share that is done, 0 to 1, and what comes next. Raises :class:`LinkError` if a
-    contender's processes do not find each other.
+    Args:
+        seconds: How long each is measured with each size of frames [s].
+        sizes: Of the frames.
+        peers: Further contenders.
+        skipped: Contenders that can't be measured, and why, for the results.
+        progress: Called with the share that is done, 0 to 1, and what comes next.
+
+    Raises:
+        LinkError: A contender's processes do not find each other, or nothing arrives.
     """
     machine = Machine.here()
     contenders = [FLOOR, OURS, *peers]
@@ -98,7 +106,7 @@ def measure(
 
 
 def turns_of(seconds: float, sizes: Sequence[Size]) -> list[Turn]:
-    """Turns of about five seconds, the sizes one after the other. Pure."""
+    """Return turns of about five seconds, the sizes one after the other."""
     rounds = max(1, round(seconds / TURN_S))
     return [Turn(number, seconds / rounds, size) for number in range(rounds) for size in sizes]
 
@@ -128,5 +136,9 @@ def _series(channel: str, done: Sequence[tuple[Turn, Arrivals]]) -> Series:
 
 
 def load(path: Path) -> Delays:
-    """What ``delays.json`` holds. Raises ``msgspec.ValidationError`` for anything else."""
-    return msgspec.json.decode(path.read_bytes(), type=Delays)
+    """Read ``delays.json``.
+
+    Raises:
+        FileFormatError: It is anything else.
+    """
+    return read_json(path, Delays, "the results of bench delays", MAX_RESULTS)

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from skyloop.bench.contenders import FLOOR, OURS
 from skyloop.bench.delays import PAPER_MEAN_MS, Delays, Series
-from skyloop.bench.peers import FLOOR, OURS
 from skyloop.bench.schedule import CHANNELS, COMMAND, VIDEO
 from skyloop.errors import MissingExtraError
+from skyloop.files import replacing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -40,12 +41,19 @@ _SETTINGS: Final[Any] = {
 
 
 def draw(results: Delays, folder: Path) -> list[Path]:
-    """All figures of a run into ``folder``; returns the files. Raises :class:`MissingExtraError`."""
+    """Draw all figures of a run into a folder.
+
+    Returns:
+        The files.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+    """
     return save(lambda: {**paper_figures(results), "delays-comparison": comparison(results)}, folder)
 
 
 def paper_figures(results: Delays) -> dict[str, Figure]:
-    """The paper's figures 3, 4 and 5, by the names of their files."""
+    """Return the paper's figures 3, 4 and 5, by the names of their files."""
     series = {one.channel: one for one in results.series}
     return {
         "delays-command": distribution(series[COMMAND], f"Delay of commands, {_where(results)}"),
@@ -55,8 +63,19 @@ def paper_figures(results: Delays) -> dict[str, Figure]:
 
 
 def save(make: Callable[[], dict[str, Figure]], folder: Path, endings: Sequence[str] = ("png", "svg")) -> list[Path]:
-    """Make figures in the pages' style and write them by their names; returns the files. Raises
-    :class:`MissingExtraError`."""
+    """Make figures in the pages' style and write them by their names.
+
+    Args:
+        make: Makes the figures, by their names.
+        folder: Where they are written.
+        endings: A file of each kind is written for each figure.
+
+    Returns:
+        The files.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+    """
     check_installed()
     import matplotlib as mpl
 
@@ -66,13 +85,18 @@ def save(make: Callable[[], dict[str, Figure]], folder: Path, endings: Sequence[
             for ending in endings:
                 file = folder / f"{name}.{ending}"
                 metadata: dict[str, Any] = {"Date": None} if ending == "svg" else {}
-                figure.savefig(file, dpi=110, bbox_inches="tight", metadata=metadata)
+                with replacing(file) as part:
+                    figure.savefig(part, dpi=110, bbox_inches="tight", metadata=metadata)
                 files.append(file)
     return files
 
 
 def check_installed() -> None:
-    """Raises :class:`MissingExtraError` if figures can't be drawn here."""
+    """Check that figures can be drawn here.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed.
+    """
     try:
         import matplotlib  # noqa: F401
     except ImportError as error:
@@ -80,7 +104,7 @@ def check_installed() -> None:
 
 
 def distribution(series: Series, title: str) -> Figure:
-    """How often which delay occurred; as the paper's figures 3 and 4."""
+    """Draw how often which delay occurred, as the paper's figures 3 and 4."""
     figure, axes = new_figure(7.2, 3.2)
     delays_us = np.asarray(series.delay_us)
     shown = delays_us[delays_us <= np.percentile(delays_us, _SHOWN)]
@@ -105,7 +129,7 @@ def distribution(series: Series, title: str) -> Figure:
 
 
 def evolution(results: Delays) -> Figure:
-    """All three channels over the time of the run; as the paper's figure 5."""
+    """Draw all three channels over the time of the run, as the paper's figure 5."""
     figure, axes = new_figure(7.2, 3.6)
     for series in results.series:
         axes.plot(
@@ -126,7 +150,7 @@ def evolution(results: Delays) -> Figure:
 
 
 def comparison(results: Delays) -> Figure:
-    """Medians of everybody, with the 99th percentile as a whisker."""
+    """Draw the medians of all contenders, with the 99th percentile as a whisker."""
     groups = [(results.sizes[0], channel) for channel in CHANNELS if channel != VIDEO]
     groups += [(size, VIDEO) for size in results.sizes]
     figure, axes = new_figure(7.2, 3.6)
@@ -159,7 +183,7 @@ def comparison(results: Delays) -> Figure:
 
 
 def _label_decades(axes: Axes) -> None:
-    """1, 2 and 5 of each decade as plain numbers."""
+    """Label 1, 2 and 5 of each decade as plain numbers."""
     from matplotlib.ticker import LogLocator, NullLocator
 
     axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
@@ -168,7 +192,7 @@ def _label_decades(axes: Axes) -> None:
 
 
 def new_figure(width: float, height: float) -> tuple[Figure, Axes]:
-    """Of so many inches, with one diagram."""
+    """Return a figure with one diagram; width and height are in inches."""
     from matplotlib.figure import Figure
 
     figure = Figure((width, height))

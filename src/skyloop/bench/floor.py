@@ -28,6 +28,8 @@ MEMORY_BYTES = LARGE.frame_bytes
 
 
 class Vehicle:
+    """The vehicle's end; see :class:`skyloop.bench.contract.VehicleEnd`."""
+
     def __init__(self, address: str, heard: Heard) -> None:
         self._path = Path(address) / "floor"
         descriptor = os.memfd_create("skyloop-bench-floor")
@@ -70,6 +72,8 @@ class Vehicle:
 
 
 class Application:
+    """The application's end; see :class:`skyloop.bench.contract.ApplicationEnd`."""
+
     def __init__(self, address: str, heard: Heard) -> None:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._socket.connect(str(Path(address) / "floor"))

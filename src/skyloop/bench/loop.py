@@ -1,4 +1,4 @@
-"""``skyloop bench loop``: from the capture of a frame to the command that it caused being applied, by stage."""
+"""``skyloop bench loop``: from the capture of a frame until the command that it caused is applied, by stage."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from skyloop.bench.workers import STARTS_WITHIN_S, Pipe, Workers
 from skyloop.client import Drone, Frame, connect
 from skyloop.control import Controller
 from skyloop.errors import LinkError
+from skyloop.files import MAX_RESULTS, read_json
 from skyloop.messages import Applied, Velocity
 
 FRAME_PERIOD_S: Final = 1 / 30
@@ -41,7 +42,7 @@ Progress = Callable[[float, str], None]
 
 
 class Trip(NamedTuple):
-    """When a frame, and then its command, got where [ns]."""
+    """When a frame, and then its command, reached each stage [ns]."""
 
     captured: int
     published: int
@@ -51,7 +52,7 @@ class Trip(NamedTuple):
     applied: int
 
     def stages_ns(self) -> dict[str, int]:
-        """How long each stage took, and all together."""
+        """Return how long each stage took, and all together [ns]."""
         stages = {name: self[number + 1] - self[number] for number, name in enumerate(STAGES)}
         return stages | {TOTAL: self.applied - self.captured}
 
@@ -64,7 +65,7 @@ class SizeResult(msgspec.Struct, frozen=True):
 
 
 class Loop(msgspec.Struct, frozen=True, tag_field="what", tag="loop"):
-    """A whole run; what ``loop.json`` holds. ``seconds``: that each size was measured."""
+    """A whole run, as in ``loop.json``. ``seconds``: how long each size was measured."""
 
     machine: Machine
     seconds: float
@@ -73,7 +74,16 @@ class Loop(msgspec.Struct, frozen=True, tag_field="what", tag="loop"):
 
 
 def measure(seconds: float, sizes: Sequence[Size], progress: Progress = lambda _share, _what: None) -> Loop:
-    """Measure with each size of frames for ``seconds``, in turns."""
+    """Measure the loop with each size of frames, in turns.
+
+    Args:
+        seconds: How long each size is measured [s].
+        sizes: Of the frames.
+        progress: Called with the share that is done, 0 to 1, and what comes next.
+
+    Raises:
+        LinkError: Not one command was applied.
+    """
     machine = Machine.here()
     rounds = max(1, round(seconds / TURN_S))
     turns = [Turn(number, seconds / rounds, size, FRAME_PERIOD_S) for number in range(rounds) for size in sizes]
@@ -112,7 +122,11 @@ def _size_result(size: Size, trips: Sequence[Trip], sent: int) -> SizeResult:
 
 
 class Answering(Controller):
-    """Answers each frame with a command at once: what is left is Skyloop's own share of the loop."""
+    """Answers each frame with a command at once, so that only Skyloop's own share of the loop is left.
+
+    Args:
+        drone: The drone.
+    """
 
     camera = CAMERA
 
@@ -121,13 +135,19 @@ class Answering(Controller):
         self.called: dict[int, tuple[int, int, int]] = {}  # by capture: published, delivered, called [ns]
 
     def on_frame(self, frame: Frame) -> None:
+        """Note when it was called, and send a command that carries the frame's stamp."""
         now_ns = time.monotonic_ns()
         self.called[frame.captured_ns] = (frame.published_ns, frame.received_ns, now_ns)
         self.drone.velocity(forward=0.1, up=stamped(frame.captured_ns))
 
 
 def control(pipe: Pipe, proxy: str) -> None:
-    """The application's process: a controller, turn by turn."""
+    """Run the application's process: a controller, turn by turn.
+
+    Args:
+        pipe: To the measuring process.
+        proxy: The proxy's name.
+    """
     pipe.send("ready")
     while (turn := pipe.recv()) is not None:
         echoes: dict[int, tuple[int, int]] = {}  # by capture: sent, applied [ns]; repeats come later and change nothing
@@ -151,5 +171,9 @@ def control(pipe: Pipe, proxy: str) -> None:
 
 
 def load(path: Path) -> Loop:
-    """What ``loop.json`` holds. Raises ``msgspec.ValidationError`` for anything else."""
-    return msgspec.json.decode(path.read_bytes(), type=Loop)
+    """Read ``loop.json``.
+
+    Raises:
+        FileFormatError: It is anything else.
+    """
+    return read_json(path, Loop, "the results of bench loop", MAX_RESULTS)

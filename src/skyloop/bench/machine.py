@@ -14,7 +14,7 @@ PACKAGES = ("skyloop", "numpy", "msgspec", "opencv-python-headless")
 
 
 class Machine(msgspec.Struct, frozen=True):
-    """What the figures were taken on."""
+    """The machine that the figures were taken on."""
 
     cpu: str
     cores: int  #: that this process may use
@@ -26,6 +26,7 @@ class Machine(msgspec.Struct, frozen=True):
 
     @classmethod
     def here(cls) -> Machine:
+        """Describe this machine."""
         return cls(
             cpu=cpu_model(_read("/proc/cpuinfo")) or platform.machine(),
             cores=len(os.sched_getaffinity(0)),
@@ -42,25 +43,25 @@ class Machine(msgspec.Struct, frozen=True):
 
 
 def cpu_model(cpuinfo: str) -> str:
-    """The model's name in ``/proc/cpuinfo``."""
+    """Return the model's name in ``/proc/cpuinfo``; empty if there is none."""
     found = re.search(r"^model name\s*:\s*(.+)$", cpuinfo, re.MULTILINE)
     return " ".join(found[1].split()) if found else ""
 
 
 def os_name(os_release: str) -> str:
-    """The name for people in ``/etc/os-release``."""
+    """Return the name for people in ``/etc/os-release``; empty if there is none."""
     found = re.search(r'^PRETTY_NAME="?([^"\n]+)"?$', os_release, re.MULTILINE)
     return found[1] if found else ""
 
 
 def numbers_of(release: str) -> str:
-    """A kernel's release without what its builder added, which may name a machine."""
+    """Return a kernel's release without what its builder added, which may name a machine."""
     found = re.match(r"\d+(\.\d+)*", release)
     return found[0] if found else ""
 
 
 def cpu_time_s(pid: int) -> float:
-    """Processor time that a process has used so far, all threads, user and system [s]; 0 if it is gone."""
+    """Return the processor time that a process has used so far, all threads, user and system [s]; 0 if it is gone."""
     stat = _read(f"/proc/{pid}/stat")
     if not stat:
         return 0.0
@@ -69,7 +70,7 @@ def cpu_time_s(pid: int) -> float:
 
 
 def memory_bytes(pid: int) -> int:
-    """Memory that a process shares with no other; 0 if it is gone."""
+    """Return the memory that a process shares with no other [bytes]; 0 if it is gone."""
     found = re.findall(r"^Private_(?:Clean|Dirty):\s+(\d+) kB$", _read(f"/proc/{pid}/smaps_rollup"), re.MULTILINE)
     return 1024 * sum(map(int, found))
 

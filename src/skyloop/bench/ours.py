@@ -9,7 +9,7 @@ from skyloop.bench.schedule import FEEDBACK, VIDEO
 from skyloop.bench.vehicle import CAMERA, BenchVehicle, stamped
 from skyloop.bench.waypoints import Setpoint
 from skyloop.client import Drone, Frame, connect
-from skyloop.client.reading import VideoOptions
+from skyloop.client.channels import VideoOptions
 from skyloop.messages import Feedback
 from skyloop.proxy import Proxy
 from skyloop.transport.base import ServerEnd
@@ -17,12 +17,16 @@ from skyloop.transport.local import LocalServer
 
 
 def proxy_name(address: str) -> str:
-    """Of the proxy that is measured; ``address`` is a folder of this run alone."""
+    """Return the name of the proxy that is measured.
+
+    Args:
+        address: A folder of this run alone.
+    """
     return Path(address).name.lower()
 
 
 class Vehicle:
-    """The proxy's process."""
+    """The vehicle's end; see :class:`skyloop.bench.contract.VehicleEnd`."""
 
     def __init__(self, address: str, heard: Heard) -> None:
         name, server = self._server(address)
@@ -46,23 +50,29 @@ class Vehicle:
 
 
 class Listening:
-    """Tells of feedback and frames on the link's receiving thread, each once."""
+    """Reports each feedback and frame once, on the connection's receiving thread.
+
+    Args:
+        heard: Called with each.
+    """
 
     def __init__(self, heard: Heard) -> None:
         self._heard = heard
         self._known_ns = 0
 
     def feedback(self, feedback: Feedback) -> None:
+        """Report feedback that is new."""
         if feedback.captured_ns > self._known_ns:  # the proxy repeats an old state when somebody took the authority
             self._known_ns = feedback.captured_ns
             self._heard(FEEDBACK, feedback.captured_ns)
 
     def frame(self, frame: Frame) -> None:
+        """Report a frame."""
         self._heard(VIDEO, frame.captured_ns)
 
 
 class Application:
-    """The pilot."""
+    """The application's end; see :class:`skyloop.bench.contract.ApplicationEnd`."""
 
     looks = True  #: at the video
     video = VideoOptions()  #: how it wants that

@@ -16,9 +16,15 @@ _AHEAD_NS: Final = 50_000_000
 
 
 class Pair:
-    """``module`` holds the contender's ends (see :mod:`skyloop.bench.contract`), and ``address`` is a folder of its own
-    for its sockets. ``python`` is the interpreter that it runs under. ``prefixes``: put before it, for the vehicle's
-    side and the application's.
+    """The vehicle's and the application's process of one contender.
+
+    Args:
+        workers: Starts the processes, and ends them.
+        module: Holds the contender's ends; see :mod:`skyloop.bench.contract`.
+        address: A folder of its own for its sockets.
+        python: The interpreter that it runs under.
+        application_module: Holds the application's end, if that is another module.
+        prefixes: Put before the interpreter, for the vehicle's side and the application's.
     """
 
     def __init__(
@@ -40,31 +46,31 @@ class Pair:
             worker.answer(STARTS_WITHIN_S)
 
     def open(self, turn: Turn) -> None:
-        """Connect the two for a turn."""
+        """Connect the two ends for a turn."""
         for worker in (self.vehicle, self.application):
             worker.pipe.send(turn)
             worker.answer(STARTS_WITHIN_S)
 
     def begin(self) -> int:
-        """Let the samples flow; returns when counting begins [ns]."""
+        """Let the samples flow; return when counting begins [ns]."""
         begin_ns = time.monotonic_ns() + round(WARM_UP_S * 1e9) + _AHEAD_NS
         for worker in (self.vehicle, self.application):
             worker.pipe.send(begin_ns)
         return begin_ns
 
     def arrivals(self, turn: Turn, begin_ns: int) -> Arrivals:
-        """What was sent in the turn and arrived; waits for its end."""
+        """Wait for the turn's end, and return what was sent in it and arrived."""
         found: Arrivals = {channel: [] for channel in CHANNELS}
         for worker in (self.application, self.vehicle):
             found |= worker.answer(turn.seconds + WARM_UP_S + SETTLE_S + _LATE_S)
         return since(found, begin_ns)
 
     def measure(self, turn: Turn) -> Arrivals:
-        """A whole turn."""
+        """Measure a whole turn."""
         self.open(turn)
         return self.arrivals(turn, self.begin())
 
 
 def since(arrivals: Arrivals, begin_ns: int) -> Arrivals:
-    """Without what was sent before."""
+    """Return the arrivals without those that were sent before."""
     return {channel: [pair for pair in pairs if pair[0] >= begin_ns] for channel, pairs in arrivals.items()}

@@ -1,4 +1,4 @@
-"""What goes when: the channels, their periods, and absolute deadlines. Pure, and of the standard library alone."""
+"""What is sent when: the channels, their periods, and absolute deadlines. Needs the standard library alone."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _GOLDEN: Final = 0.618034  # multiples of it, less whole numbers, are spread eve
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """Of a raw frame with three bytes a pixel."""
+    """The size of a raw frame with three bytes a pixel."""
 
     width: int
     height: int
@@ -32,6 +32,7 @@ class Size:
 
     @property
     def frame_bytes(self) -> int:
+        """Bytes of a frame."""
         return self.width * self.height * 3
 
 
@@ -54,14 +55,20 @@ class Turn:
     frame_period_s: float = FRAME_PERIOD_S
 
     def period_s(self, channel: str) -> float:
+        """Return the period of a channel [s]."""
         return self.frame_period_s if channel == VIDEO else PACKET_PERIOD_S
 
     def count(self, channel: str) -> int:
-        """Samples that are sent after the warm-up."""
+        """Return how many samples of a channel are sent after the warm-up."""
         return max(1, int(self.seconds / self.period_s(channel)))
 
     def deadlines_ns(self, channel: str, begin_ns: int) -> Iterator[int]:
-        """When to send, from the warm-up on; ``begin_ns``: when counting begins."""
+        """Yield when to send the samples of a channel, from the warm-up on [ns].
+
+        Args:
+            channel: The channel.
+            begin_ns: When counting begins.
+        """
         period_s = self.period_s(channel)
         phase = CHANNELS.index(channel) * (1 + self.number) * _GOLDEN % 1.0
         for index in range(-int(WARM_UP_S / period_s), self.count(channel)):
@@ -73,7 +80,13 @@ def paced(
     clock: Callable[[], int] = time.monotonic_ns,
     sleep: Callable[[float], None] = time.sleep,
 ) -> Iterator[None]:
-    """Come round at each deadline; a late one does not shift those after it."""
+    """Yield at each deadline; a late one does not shift those after it.
+
+    Args:
+        deadlines_ns: On the clock.
+        clock: Returns the time [ns].
+        sleep: Waits for some seconds.
+    """
     for deadline_ns in deadlines_ns:
         wait_ns = deadline_ns - clock()
         if wait_ns > 0:
@@ -82,5 +95,5 @@ def paced(
 
 
 def sleep_until(at_ns: int) -> None:
-    """Until this time on the monotonic clock; not at all if it has passed."""
+    """Sleep until a time on the monotonic clock; not at all if it has passed."""
     time.sleep(max(0, at_ns - time.monotonic_ns()) / 1e9)

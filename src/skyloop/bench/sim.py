@@ -1,4 +1,4 @@
-"""``skyloop bench sim``: the simulator on this machine. Its physics alone, and the drawing of its cameras."""
+"""``skyloop bench sim``: the simulator on this machine, its physics alone and the drawing of its cameras."""
 
 from __future__ import annotations
 
@@ -43,7 +43,10 @@ Progress = Callable[[float], None]
 
 
 class PhysicsRow(msgspec.Struct, frozen=True):
-    """So many drones flying circles, nothing drawn. ``step``: of batches of :data:`BATCH_STEPS`, for each step."""
+    """Drones that fly circles, with nothing drawn.
+
+    ``step`` is the time of a step, taken from batches of :data:`BATCH_STEPS`.
+    """
 
     world: str
     drones: int
@@ -53,7 +56,7 @@ class PhysicsRow(msgspec.Struct, frozen=True):
 
 
 class DrawingRow(msgspec.Struct, frozen=True):
-    """Pictures with the flaws of the sensor on them. ``round``: the time that ``pictures`` of them take."""
+    """Pictures with the flaws of the sensor. ``round``: the time that ``pictures`` of them take."""
 
     cameras: str
     width: int
@@ -65,15 +68,19 @@ class DrawingRow(msgspec.Struct, frozen=True):
 
 
 class SimResults(msgspec.Struct, frozen=True):
+    """A whole run."""
+
     machine: Machine
     physics: list[PhysicsRow]
     drawing: list[DrawingRow]
 
 
 def measure(seconds: float, progress: Progress = lambda _: None) -> SimResults:
-    """Measure in about ``seconds``, beside some for making the scenes; ``progress`` is told the share that is done.
+    """Measure physics and drawing in the calling thread, to which OpenCV is kept meanwhile.
 
-    Everything runs in the calling thread; OpenCV is kept to it meanwhile.
+    Args:
+        seconds: About how long, beside the time for making the scenes [s].
+        progress: Called with the share that is done, 0 to 1.
     """
     parts = len(FLEETS) + len(SIZES) + 1
     share_s = seconds / parts
@@ -93,7 +100,14 @@ def measure(seconds: float, progress: Progress = lambda _: None) -> SimResults:
 
 
 def measure_physics(world: str, drones: int, seconds: float, progress: Progress) -> PhysicsRow:
-    """Step a world full of flying drones for so long."""
+    """Step a world full of flying drones.
+
+    Args:
+        world: The world's name.
+        drones: How many.
+        seconds: How long [s].
+        progress: Called with the share that is done, 0 to 1.
+    """
     simulation = _circling(world, drones)
     batches: list[int] = []
     for _ in rounds(seconds, progress):
@@ -106,7 +120,13 @@ def measure_physics(world: str, drones: int, seconds: float, progress: Progress)
 
 
 def measure_pair(factor: float, seconds: float, progress: Progress) -> list[DrawingRow]:
-    """The two cameras of one drone in turn, in pictures ``factor`` times as wide as the usual ones."""
+    """Draw the two cameras of one drone in turn.
+
+    Args:
+        factor: How many times as wide as usual the pictures are.
+        seconds: How long [s].
+        progress: Called with the share that is done, 0 to 1.
+    """
     models = [FRONT_CAMERA.scaled(factor), BOTTOM_CAMERA.scaled(factor)]
     flight = Flight(1, [(0, model) for model in models])
     front: list[int] = []
@@ -124,7 +144,12 @@ def measure_pair(factor: float, seconds: float, progress: Progress) -> list[Draw
 
 
 def measure_many(seconds: float, progress: Progress) -> DrawingRow:
-    """The front cameras of ten drones that see one another."""
+    """Draw the front cameras of ten drones that see one another.
+
+    Args:
+        seconds: How long [s].
+        progress: Called with the share that is done, 0 to 1.
+    """
     flight = Flight(CAMERAS_AT_ONCE, [(drone, FRONT_CAMERA) for drone in range(CAMERAS_AT_ONCE)])
     times = [sum(flight.draw(n) for n in range(CAMERAS_AT_ONCE)) for _ in rounds(seconds, progress)]
     return _drawing_row(f"{CAMERAS_AT_ONCE} × front", FRONT_CAMERA, CAMERAS_AT_ONCE, times)
@@ -138,7 +163,12 @@ class _Camera:
 
 
 class Flight:
-    """Drones that circle in the furnished room, and their cameras, which expose one after the other."""
+    """Drones that circle in the furnished room, and their cameras, which expose one after the other.
+
+    Args:
+        drones: How many.
+        cameras: The drone and the model of each.
+    """
 
     def __init__(self, drones: int, cameras: list[tuple[int, CameraModel]]) -> None:
         self._simulation = _circling(DRAWING_WORLD, drones)
@@ -151,7 +181,14 @@ class Flight:
             self.draw(at)  # the first picture of a lens makes its tables
 
     def draw(self, at: int) -> int:
-        """Fly on, then draw what a camera sees with the flaws of its sensor; returns the time of the drawing [ns]."""
+        """Fly on, then draw what a camera sees with the flaws of its sensor.
+
+        Args:
+            at: The camera's index.
+
+        Returns:
+            The time of the drawing [ns].
+        """
         simulation, camera = self._simulation, self._cameras[at]
         simulation.step(self._steps)
         positions, rotations = simulation.poses()
@@ -166,7 +203,7 @@ class Flight:
 
 
 def _circling(world: str, drones: int) -> Simulation:
-    """A world whose drones have taken off and fly circles."""
+    """Return a world whose drones have taken off and fly circles."""
     simulation = Simulation(load_world(world), drones, seed=1)
     for action in (Takeoff(), _CIRCLING):
         for drone in range(drones):
@@ -176,7 +213,7 @@ def _circling(world: str, drones: int) -> Simulation:
 
 
 def rounds(seconds: float, progress: Progress) -> Iterator[None]:
-    """Goes round until the time is up, and at least :data:`LEAST_ROUNDS` times."""
+    """Yield until the time is up, and at least :data:`LEAST_ROUNDS` times."""
     begin, limit = monotonic_ns(), nanoseconds(seconds)
     done = 0
     while done < LEAST_ROUNDS or monotonic_ns() - begin < limit:
@@ -194,7 +231,7 @@ def _drawing_row(
 
 @contextmanager
 def _one_core() -> Iterator[None]:
-    """OpenCV keeps to the calling thread; afterwards it may use as many as before."""
+    """Keep OpenCV to the calling thread; afterwards it may use as many threads as before."""
     before = cv2.getNumThreads()
     use_one_core()
     try:

@@ -1,4 +1,4 @@
-"""Distributions of delays. Pure."""
+"""Distributions of delays."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Summary(msgspec.Struct, frozen=True):
     """A distribution of delays of samples that were sent at a period."""
 
     samples: int
-    lost: int  #: sent and never heard
+    lost: int  #: sent and never received
     period_ms: float
     mean_us: float
     minimum_us: float
@@ -39,13 +39,29 @@ class Summary(msgspec.Struct, frozen=True):
 
 
 def spread(delays_ns: Sequence[float]) -> Spread:
-    """Median and 99th percentile. Raises ``ValueError`` for no samples at all: something did not flow."""
+    """Return the median and the 99th percentile of some times.
+
+    Args:
+        delays_ns: The times [ns].
+
+    Raises:
+        ValueError: There are none: something did not flow.
+    """
     values = _microseconds(delays_ns)
     return Spread(float(np.median(values)), float(np.percentile(values, 99)), len(delays_ns))
 
 
 def summarize(delays_ns: Sequence[float], *, sent: int, period_s: float) -> Summary:
-    """All figures of ``sent`` samples of which these arrived. Raises ``ValueError`` for none at all."""
+    """Return all figures of the delays of one channel.
+
+    Args:
+        delays_ns: The delays of the samples that arrived [ns].
+        sent: How many samples were sent.
+        period_s: The channel's [s].
+
+    Raises:
+        ValueError: Not one arrived.
+    """
     values = _microseconds(delays_ns)
     median, p99, p999 = (float(value) for value in np.percentile(values, [50.0, 99.0, 99.9]))
     return Summary(

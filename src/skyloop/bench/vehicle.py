@@ -1,4 +1,4 @@
-"""A vehicle that is nothing but a source of samples and a sink of commands, so that only Skyloop is measured."""
+"""A vehicle that is only a source of samples and a sink of commands, so that nothing but Skyloop is measured."""
 
 from __future__ import annotations
 
@@ -26,17 +26,28 @@ _UNIT_M_S: Final = 2.0**-46
 
 
 def stamped(sent_ns: int) -> float:
-    """A time as a climb rate of less than 2 cm/s, which a command carries to the last bit within all limits."""
+    """Encode a time as a climb rate of less than 2 cm/s, which a command carries to the last bit within all limits."""
     return (sent_ns % _WRAPS_NS) * _UNIT_M_S
 
 
 def stamp_of(up: float, now_ns: int) -> int:
-    """The time within the last 18 minutes that :func:`stamped` made this of [ns]."""
+    """Return the time within the last 18 minutes that :func:`stamped` made this of [ns].
+
+    Args:
+        up: The climb rate [m/s].
+        now_ns: The present time, on the same clock.
+    """
     return now_ns - (now_ns - round(up / _UNIT_M_S)) % _WRAPS_NS
 
 
 class BenchVehicle(Driver):
-    """Hovers for ever; gives feedback and frames when it is told to, and ``heard`` is told of each new set-point."""
+    """A vehicle that hovers for ever, and gives feedback and frames when it is told to.
+
+    Args:
+        heard: Called with each new set-point, on the thread that applies it.
+    """
+
+    shared = False
 
     def __init__(self, heard: Heard) -> None:
         super().__init__(parse_uri("bench://"))
@@ -68,7 +79,7 @@ class BenchVehicle(Driver):
             sink.frame(CAMERA, image, captured_ns, width=width, height=height)
 
     def tell(self, captured_ns: int) -> None:
-        """Give feedback as full as a real vehicle's."""
+        """Give feedback with as many values as a real vehicle's."""
         sink = self._sink
         if sink is None:
             return

@@ -1,4 +1,4 @@
-"""The load of commands: an ideal point that is flown through waypoints. Pure."""
+"""The commands that are measured: those of an ideal point that is flown through waypoints."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Setpoint(NamedTuple):
 
 
 def fly(period_s: float = PACKET_PERIOD_S) -> Iterator[Setpoint]:
-    """For ever: a set-point each period, as a controller gives them that flies to one waypoint after the other."""
+    """Yield a set-point each period, for ever, as a controller does that flies from waypoint to waypoint."""
     x = y = yaw = 0.0
     for target_x, target_y in cycle(WAYPOINTS_M):
         while (away := math.hypot(target_x - x, target_y - y)) > REACHED_M:

@@ -32,10 +32,16 @@ class Pipe(Protocol):
 
 
 class Worker:
-    """A process that does ``work(pipe, *arguments)``."""
+    """A process that runs ``work(pipe, *arguments)``."""
 
     def __init__(self, command: Sequence[str], work: Callable[..., None], arguments: tuple[Any, ...]) -> None:
-        """``command`` starts the interpreter."""
+        """Start the process.
+
+        Args:
+            command: Starts the interpreter.
+            work: A function of a module.
+            arguments: Pickled and sent to the process.
+        """
         self.pipe, theirs = multiprocessing.Pipe()
         with theirs:
             number = theirs.fileno()
@@ -45,7 +51,15 @@ class Worker:
         self.pipe.send((work.__module__, work.__qualname__, arguments))
 
     def answer(self, timeout_s: float) -> Any:
-        """What it says next. Raises :class:`NoAnswerError` if that does not come, :class:`LinkError` if it ended."""
+        """Return what the process sends next.
+
+        Args:
+            timeout_s: How long to wait for it [s].
+
+        Raises:
+            NoAnswerError: Nothing came in time.
+            LinkError: The process has ended.
+        """
         if not self.pipe.poll(timeout_s):
             raise NoAnswerError(f"the measuring process of {self._what} said nothing for {timeout_s:g} s")
         try:
@@ -55,12 +69,12 @@ class Worker:
         return answer
 
     def end(self) -> None:
-        """``None`` on the pipe ends the work."""
+        """Send ``None``, which ends the work."""
         with contextlib.suppress(OSError):  # it ended already
             self.pipe.send(None)
 
     def wait(self) -> None:
-        """Until it has ended, by force if need be."""
+        """Wait until the process has ended, for at most :data:`ENDS_WITHIN_S`; then kill it."""
         try:
             self._process.wait(ENDS_WITHIN_S)
         except subprocess.TimeoutExpired:
@@ -70,7 +84,7 @@ class Worker:
 
 
 class Workers:
-    """All of them end with the block."""
+    """The processes of a measurement, which all end with the ``with`` block."""
 
     def __init__(self) -> None:
         self._running: list[Worker] = []
@@ -78,9 +92,13 @@ class Workers:
     def start(
         self, work: Callable[..., None], *arguments: Any, python: str = sys.executable, prefix: Sequence[str] = ()
     ) -> Worker:
-        """Start ``work(pipe, *arguments)``, a function of a module; it says ``"ready"`` first.
+        """Start a process that runs ``work(pipe, *arguments)``; it sends ``"ready"`` first.
 
-        ``prefix``: put before the interpreter, such as what makes it run on another host.
+        Args:
+            work: A function of a module.
+            *arguments: Of the function.
+            python: The interpreter.
+            prefix: Put before the interpreter, such as what makes it run on another host.
         """
         worker = Worker([*prefix, python], work, arguments)
         self._running.append(worker)
@@ -100,7 +118,7 @@ class Workers:
 
 
 def child(number: str) -> None:
-    """What a worker's process does."""
+    """Run a worker's process; ``number`` is the descriptor of its pipe."""
     from importlib import import_module
 
     with Connection(int(number)) as pipe:

@@ -17,7 +17,7 @@ INTERRUPTED: Final = 130  #: 128 + SIGINT, as shells count
 
 
 class Entry(NamedTuple):
-    """One command: where its function is, what the list of commands says of it, and how it is called."""
+    """One command: where its function is, its line in the list of commands, and how it is called."""
 
     module: str
     function: str
@@ -66,7 +66,7 @@ COMMANDS: Final = {
 
 
 def build(names: Iterable[str] = COMMANDS) -> typer.Typer:
-    """The command line with these commands; only their modules are imported."""
+    """Return the command line with these commands; only their modules are imported."""
     app = typer.Typer(
         name="skyloop",
         add_completion=False,
@@ -87,15 +87,19 @@ def build(names: Iterable[str] = COMMANDS) -> typer.Typer:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command line; exits with 2 for a wrong word or value, 1 for what failed, 0 for what worked."""
+    """Run the command line and exit: with 2 for a wrong word or value, 1 for what failed, 0 for what worked."""
     given = sys.argv[1:] if arguments is None else arguments
-    app = build([given[0]] if given and given[0] in COMMANDS else COMMANDS)
+    run(build([given[0]] if given and given[0] in COMMANDS else COMMANDS), given or ["--help"])
+
+
+def run(app: typer.Typer, arguments: list[str], name: str = "skyloop") -> None:
+    """Run a command line under its name, and exit as :func:`main` does."""
     try:
-        app(given or ["--help"], prog_name="skyloop")
+        app(arguments, prog_name=name)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
     except SkyloopError as error:
-        print(f"skyloop: {error}", file=sys.stderr)
+        print(f"{name}: {error}", file=sys.stderr)
         sys.exit(USAGE_ERROR if isinstance(error, ValueError | ParameterError) else FAILED)
 
 

@@ -53,7 +53,7 @@ def audit(
 
 
 def lines(rows: Sequence[Tenure]) -> list[str]:
-    """As a table of text."""
+    """Return the tenures as a table of text."""
     cells = [HEAD]
     cells += [
         (

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Self
 import typer
 
 from skyloop.errors import NoAnswerError, UnknownNameError, UsageError
+from skyloop.files import read_bytes
+from skyloop.messages.image_header import image_size, why_not_decoded
 
 if TYPE_CHECKING:
     import numpy as np
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
 camera = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 
 _EXAMPLE: Final = "Example: skyloop camera "
+_MAX_BYTES: Final = 256 << 20  #: of a picture's file
 _PICTURES: Final = frozenset({".bmp", ".jpeg", ".jpg", ".png", ".tif", ".tiff", ".webp"})
 _GOOD_COVERAGE: Final = 0.5
 _GOOD_RMS_PX: Final = 1.0
@@ -187,7 +190,11 @@ def _report(found: Calibration, rejected: list[BoardView], output: Path) -> None
 
 
 def _are_files(source: list[str]) -> bool:
-    """Whether the sources are files; raises :class:`UsageError` for a mixture."""
+    """Return whether the sources are files.
+
+    Raises:
+        UsageError: Some are, others not.
+    """
     files = [Path(name).is_file() for name in source]
     if any(files) and not all(files):
         raise UsageError(f"no file {source[files.index(False)]!r}: give files only, or one vehicle")
@@ -210,12 +217,21 @@ def _from_files(names: list[str]) -> Iterator[Picture]:
     cv = opencv("reading pictures")
     for name in names:
         if _is_picture(name):
-            picture = cv.imread(name, cv.IMREAD_COLOR)
-            if picture is None:
-                raise UsageError(f"{name} can't be read as a picture")
-            yield name, picture
+            yield name, _from_picture(cv, name)
         else:
             yield from _from_video(cv, name)
+
+
+def _from_picture(cv: Any, name: str) -> Any:
+    import numpy as np
+
+    content = read_bytes(name, "the picture", _MAX_BYTES)
+    picture = None
+    if image_size(content) is None or not why_not_decoded(content):  # others are left to OpenCV's own limit
+        picture = cv.imdecode(np.frombuffer(content, np.uint8), cv.IMREAD_COLOR) if content else None
+    if picture is None:
+        raise UsageError(f"{name} can't be read as a picture")
+    return picture
 
 
 def _from_video(cv: Any, name: str) -> Iterator[Picture]:

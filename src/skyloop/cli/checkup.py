@@ -1,31 +1,46 @@
-"""``skyloop doctor ADDRESS``: talks to one vehicle and says what of its settings wants attention. It flies nothing."""
+"""``skyloop doctor ADDRESS``: connects to one vehicle and says which of its settings need attention.
+
+It flies nothing.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from skyloop.cli.findings import Finding, Health
+from skyloop.messages import EventKind, LinkState, Severity
 
-PATIENCE_S: Final = 40.0  #: for a vehicle to be heard and read
+if TYPE_CHECKING:
+    from skyloop.drivers.recording_sink import RecordingSink
+
+HEARD_S: Final = 3.5  #: for a vehicle to be heard; who asks is answered within 5 s
+PATIENCE_S: Final = 40.0  #: for one that is heard to be read
 FEEDBACK_S: Final = 3.0
 
 
 def examine_vehicle(address: str) -> Iterator[Finding]:
-    """What is found, in the order to be read. Raises :class:`skyloop.errors.SkyloopError` for a wrong address."""
+    """Return what is found, in the order to be read.
+
+    Raises:
+        SkyloopError: The address is not valid.
+    """
     from skyloop.drivers.recording_sink import RecordingSink
     from skyloop.drivers.registry import make_driver
-    from skyloop.messages import EventKind, LinkState, Severity
 
     driver, sink = make_driver(address), RecordingSink(watch=set())
     driver.open(sink)
     try:
-        up = sink.wait(lambda: sink.link_state is LinkState.UP, PATIENCE_S)
-        if up:
+        sink.wait(lambda: sink.link_state not in (None, LinkState.CONNECTING), HEARD_S)
+        if sink.link_state not in (LinkState.UP, LinkState.DEGRADED):
+            yield _unreachable(sink)
+            return
+        if sink.link_state is LinkState.DEGRADED:
+            yield Finding("vehicle", Health.GOOD, f"it is heard: {sink.links[-1][1] or 'being read'}")
+        if sink.wait(lambda: sink.link_state is LinkState.UP, PATIENCE_S):
             sink.wait(lambda: sink.newest is not None and sink.newest.battery is not None, FEEDBACK_S)
         else:
-            state, reason = sink.links[-1]
-            yield Finding("vehicle", Health.BAD, f"its link is {state.value}: {reason}", "check power, cable, address")
+            yield _unreachable(sink)
         newest = sink.newest
         if newest is not None:
             battery = "unknown" if newest.battery is None else f"{newest.battery:.0%}"
@@ -38,3 +53,9 @@ def examine_vehicle(address: str) -> Iterator[Finding]:
             yield Finding(remark.what, health, remark.detail, remark.advice)
     finally:
         driver.close()
+
+
+def _unreachable(sink: RecordingSink) -> Finding:
+    state, reason = sink.links[-1] if sink.links else (LinkState.CONNECTING, "nothing is known")
+    advice = sink.remedy or "check power, cable, address"
+    return Finding("vehicle", Health.BAD, f"its link is {state.value}: {reason}", advice)

@@ -45,7 +45,7 @@ def cockpit(
 
     It is open to programs of the same user on this machine only, unless tokens or certificates let others in.
     """
-    from skyloop.client.by_name import network_settings
+    from skyloop.client.connect import network_settings
     from skyloop.cockpit import Access, serve_cockpit
 
     access = Access(host, token_file, tls_cert, tls_key, client_ca, role, tuple(hostname or ()))

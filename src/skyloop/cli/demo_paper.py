@@ -57,8 +57,10 @@ def paper(
     port: Annotated[int, typer.Option(min=0, max=65535, metavar="N", help="Of the page; 0 takes a free one")] = 0,
     browser: Annotated[bool, typer.Option(help="Open the page in the browser")] = False,
 ) -> None:
-    """Fly a simulated AR.Drone through waypoints by motion capture, record it, and make the paper's Table 1 and figures
-    3 to 5 from the recording, with the tracking error. The page flies too: take control there, and release it.
+    """Fly the paper's test flight on a simulated AR.Drone, record it, and make the paper's table and figures from it.
+
+    It flies through waypoints by motion capture. The recording gives the paper's Table 1 and figures 3 to 5, with the
+    tracking error. The page flies too: take control there, and release it.
 
     Ctrl-C lands, and the figures are of what was flown until then.
     """
@@ -77,7 +79,7 @@ def paper(
 
 
 def _prepared(output: Path | None) -> Path:
-    """The folder, made. Raises before anything flies what would be found out only afterwards."""
+    """Make the folder; check before anything flies what would otherwise fail only afterwards."""
     from skyloop.bench.figures import check_installed as check_figures
     from skyloop.recording.child import check_installed as check_recording
 

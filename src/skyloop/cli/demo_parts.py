@@ -1,4 +1,4 @@
-"""What both demos need besides their flights: the page beside them, and a Ctrl-C that ends them in good order."""
+"""What both demos share besides their flights: the page beside them, and a Ctrl-C that ends them in good order."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def show_page(page: CockpitProcess, console: Console, browser: bool) -> None:
-    """A demo without its page is still a demo."""
+    """Show the page's address, and open it; a demo goes on without its page."""
     try:
         address = page.address()
     except LinkError as error:
@@ -31,7 +31,7 @@ def show_page(page: CockpitProcess, console: Console, browser: bool) -> None:
 
 
 def land(drone: Drone, console: Console) -> None:
-    """Unless somebody else flies it."""
+    """Land, unless somebody else flies the drone."""
     status = drone.authority
     if status.state != "held":
         console.print(f"[yellow]{status.holder or 'somebody else'} took over: the drone is left to them[/]")
@@ -42,7 +42,7 @@ def land(drone: Drone, console: Console) -> None:
 
 @contextmanager
 def interrupted_by_signals(stop: Callable[[], None]) -> Iterator[None]:
-    """SIGINT and SIGTERM call ``stop``; a second one of either acts as it did before."""
+    """Call ``stop`` on SIGINT and SIGTERM; a second one of either acts as it did before."""
     before: dict[int, Any] = {}
 
     def put_back() -> None:

@@ -1,4 +1,4 @@
-"""What the demo tells at its end: how well the marker was followed, and how long everything took on its way."""
+"""The report at the end of the demo: how well the marker was followed, and how long everything took on its way."""
 
 from __future__ import annotations
 
@@ -44,7 +44,14 @@ class Spread:
 
 
 def true_range(native: dict[str, Value] | None) -> float | None:
-    """Distance from the vehicle's centre to the carried board's, from a simulated vehicle's telemetry [m]."""
+    """Return the true distance from the vehicle's centre to the carried board's [m].
+
+    Args:
+        native: A simulated vehicle's telemetry.
+
+    Returns:
+        None where it is not known.
+    """
     if native is None:
         return None
     places = [[native.get(name) for name in names] for names in (OWN_PLACE, BOARD_PLACE)]
@@ -53,8 +60,14 @@ def true_range(native: dict[str, Value] | None) -> float | None:
 
 
 class TruthMeter:
-    """Compares the true distance with the wanted one, while the marker is followed. Listens for as long as its block
-    lasts."""
+    """Compares the true distance with the wanted one while the marker is followed.
+
+    It does so for as long as its ``with`` block lasts.
+
+    Args:
+        drone: Simulated; its telemetry has the truth.
+        follower: Flies it.
+    """
 
     def __init__(self, drone: Drone, follower: FollowMarker) -> None:
         self.errors_m: list[float] = []
@@ -91,7 +104,7 @@ class DemoReport:
     collisions: int = 0
 
     def take(self, drone: Drone, score: FollowScore, truth: TruthMeter, page: dict[str, Any] | None) -> None:
-        """Everything that must be asked while the drone is connected."""
+        """Note everything that must be asked while the drone is connected."""
         self.frames = score.frames
         self.share_in_view = score.share_in_view
         self.estimated = Spread.of(score.range_errors_m(SETTLING_S))
@@ -100,17 +113,17 @@ class DemoReport:
         self.page = page
 
     def good(self, enough: float) -> bool:
-        """Whether the marker was found, and in view for at least this share of the frames since."""
+        """Return whether the marker was found, and in view for at least this share of the frames since."""
         return self.share_in_view is not None and self.share_in_view >= enough
 
     def verdict(self, enough: float) -> str:
-        """Why it was not good."""
+        """Return why it was not good."""
         if self.share_in_view is None:
             return "the marker was never seen"
         return f"the marker was in view in {self.share_in_view:.1%} of the frames, less than {enough:.0%}"
 
     def table(self) -> Table:
-        """For the terminal."""
+        """Return the figures for the terminal."""
         table = Table(title="The flight", title_justify="left", show_header=False)
         seen = "never seen" if self.share_in_view is None else f"{self.share_in_view:.1%} of {self.frames} frames"
         rows = [

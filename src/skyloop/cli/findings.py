@@ -1,4 +1,4 @@
-"""What a check-up finds, as lines for people."""
+"""The findings of a check-up, as lines for people."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ MARKS: Final = {Health.GOOD: ("✓", "green"), Health.MISSING: ("–", "yellow")
 
 
 def as_text(finding: Finding) -> Text:
-    """For people."""
+    """Return a finding as text for people."""
     mark, colour = MARKS[finding.health]
     text = Text.assemble((mark, colour), f" {finding.what}: {finding.detail}")
     return text.append(f"\n  → {finding.advice}", "bold") if finding.advice else text

@@ -1,4 +1,4 @@
-"""What ``skyloop sim --firmware`` does: simulated drones that are real vehicles' firmware on the network."""
+"""``skyloop sim --firmware``: simulated drones that behave as real vehicles' firmware on the network."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
-    from skyloop.sim.firmware.ardrone import ArdroneFirmware, Ports
-    from skyloop.sim.firmware.mavlink import MavlinkFirmware
-    from skyloop.sim.firmware.tello import TelloFirmware
+    from skyloop.emulators.ardrone import ArdroneFirmware, Ports
+    from skyloop.emulators.mavlink import MavlinkFirmware
+    from skyloop.emulators.tello import TelloFirmware
+    from skyloop.faults import Faults
     from skyloop.sim.options import SimOptions
-    from skyloop.transport.faults import Faults
 
     Emulated: TypeAlias = ArdroneFirmware | MavlinkFirmware | TelloFirmware
 
@@ -28,7 +28,7 @@ LOOK_UP_S: Final = 0.2
 
 
 class Firmware(StrEnum):
-    """What can be emulated."""
+    """The kinds of firmware that can be emulated."""
 
     ARDRONE1 = "ardrone1"
     ARDRONE2 = "ardrone2"
@@ -42,7 +42,7 @@ MAVLINK: Final = (Firmware.ARDUCOPTER, Firmware.PX4)
 
 @dataclass(frozen=True, slots=True)
 class Serving:
-    """How the emulated drones are reached, and what befalls their datagrams."""
+    """Where the emulated drones listen, and what happens to their datagrams."""
 
     bind: str
     port_base: int | None  #: None: the usual ports
@@ -54,8 +54,11 @@ class Serving:
 def serve(options: SimOptions, drones: int, firmware: Firmware, serving: Serving) -> None:
     """Run the drones until SIGINT or SIGTERM. On the main thread.
 
-    Writes one line that begins with ``ready`` for each drone when all of them listen. Raises :class:`UsageError`, and
-    :class:`skyloop.errors.LinkError` for a port that is taken.
+    One line that begins with ``ready`` is written for each drone when all of them listen.
+
+    Raises:
+        UsageError: An option is not valid.
+        LinkError: A port is taken.
     """
     if firmware in MAVLINK:
         _run(_autopilots(options, drones, firmware, serving))
@@ -68,7 +71,7 @@ def serve(options: SimOptions, drones: int, firmware: Firmware, serving: Serving
 
 
 def _ardrones(options: SimOptions, drones: int, firmware: Firmware, serving: Serving) -> list[ArdroneFirmware]:
-    from skyloop.sim.firmware.ardrone import ArdroneFirmware, with_ardrones
+    from skyloop.emulators.ardrone import ArdroneFirmware, with_ardrones
     from skyloop.sim.host import SimHost
 
     host = SimHost(with_ardrones(options), drones)
@@ -89,7 +92,7 @@ def _ardrones(options: SimOptions, drones: int, firmware: Firmware, serving: Ser
 
 
 def _autopilots(options: SimOptions, drones: int, firmware: Firmware, serving: Serving) -> list[MavlinkFirmware]:
-    from skyloop.sim.firmware.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
+    from skyloop.emulators.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
     from skyloop.sim.host import SimHost
 
     kind, video = Kind(firmware.value), serving.video_port
@@ -111,7 +114,7 @@ def _autopilots(options: SimOptions, drones: int, firmware: Firmware, serving: S
 
 
 def _tellos(options: SimOptions, drones: int, serving: Serving) -> list[TelloFirmware]:
-    from skyloop.sim.firmware.tello import TelloFirmware, with_tellos
+    from skyloop.emulators.tello import TelloFirmware, with_tellos
     from skyloop.sim.host import SimHost
     from skyloop.wire.tello.commands import PORT
 
@@ -130,7 +133,11 @@ def _tellos(options: SimOptions, drones: int, serving: Serving) -> list[TelloFir
 
 
 def address_from(base: str, drone: int) -> str:
-    """Of a Tello: all have the same port, and each further one the next address. Raises :class:`UsageError`."""
+    """Return the address of a Tello: all have the same port, and each further one the next address.
+
+    Raises:
+        UsageError: The first address is not IPv4, or there is no next one.
+    """
     if drone == 0:
         return base
     try:
@@ -140,11 +147,16 @@ def address_from(base: str, drone: int) -> str:
 
 
 def ports_from(base: int, drone: int) -> Ports:
-    """The usual ports are those from 5550. Each further drone's are 10 higher; base 0 stands for any free ones.
+    """Return the ports of an AR.Drone; each further drone's are 10 higher.
 
-    Raises :class:`UsageError` if they don't fit.
+    Args:
+        base: From where the first drone's ports count, usually 5550; 0 for any free ones.
+        drone: The drone's index.
+
+    Raises:
+        UsageError: There are no such ports.
     """
-    from skyloop.sim.firmware.ardrone import Ports
+    from skyloop.emulators.ardrone import Ports
 
     if base == 0:
         return Ports.free()
@@ -172,9 +184,9 @@ def _run(firmwares: Sequence[Emulated]) -> None:
 
 
 def describe(firmware: Emulated) -> str:
-    """One line: where it listens."""
-    from skyloop.sim.firmware.ardrone import ArdroneFirmware
-    from skyloop.sim.firmware.tello import TelloFirmware
+    """Return one line that says where a drone listens."""
+    from skyloop.emulators.ardrone import ArdroneFirmware
+    from skyloop.emulators.tello import TelloFirmware
 
     if isinstance(firmware, TelloFirmware):
         tello = firmware.settings

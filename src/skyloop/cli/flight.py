@@ -1,4 +1,4 @@
-"""A flight with a controller from a file: what is run, in which order, and what happens when it fails or is saved."""
+"""A flight with a controller from a file: what runs, in which order, and what happens when it fails or is saved."""
 
 from __future__ import annotations
 
@@ -21,7 +21,13 @@ _LOOK_S: Final = 0.1  #: how often a flight that waits for a mended file looks w
 
 
 class Flight:
-    """Runs a controller to its end, and what takes its place when its file is saved. Use once."""
+    """Runs a controller to its end, and what takes its place when its file is saved. Use once.
+
+    Args:
+        drone: Connected, and in the air if the controller expects that.
+        controller: Of that drone.
+        say: Shows a line to the user.
+    """
 
     def __init__(self, drone: Drone, controller: Controller, say: Callable[[str], None]) -> None:
         self._drone = drone
@@ -29,7 +35,14 @@ class Flight:
         self._say = say
 
     def run(self, seconds: float | None) -> bool:
-        """Fly it; whether it ended as it should. What it raises is shown, and leaves the vehicle hovering."""
+        """Run the controller; what it raises is shown, and leaves the vehicle hovering.
+
+        Args:
+            seconds: For how long; None until it ends by itself.
+
+        Returns:
+            Whether it ended without an error.
+        """
         try:
             summary = self._controller.run(seconds=seconds)
         except Exception as error:  # noqa: BLE001  the user's code may raise anything
@@ -40,7 +53,16 @@ class Flight:
         return True
 
     def run_reloading(self, seconds: float | None, reloader: Reloader, make: Make) -> bool:
-        """As :meth:`run`; a saved file takes over in flight, and one that failed hovers until it is saved again."""
+        """Run the controller; a saved file takes over in flight, and one that failed hovers until it is saved again.
+
+        Args:
+            seconds: For how long; None until it ends by itself.
+            reloader: Watches the file.
+            make: Makes a controller of the loaded class.
+
+        Returns:
+            Whether it ended without an error.
+        """
         deadline = math.inf if seconds is None else time.monotonic() + seconds
         while True:
             try:
@@ -83,9 +105,9 @@ class Flight:
 
 
 def what_failed(error: Exception) -> str:
-    """What a person needs to mend it: the traceback without Skyloop's own lines.
+    """Return what a person needs to mend an error: the traceback without Skyloop's own lines.
 
-    An error that Skyloop raised on purpose with no line of the user in it is one line; any other is told in full.
+    An error that Skyloop raised on purpose with no line of the user in it is one line; any other is shown in full.
     """
     home = str(Path(__file__).parents[1])
     told = traceback.TracebackException.from_exception(error)

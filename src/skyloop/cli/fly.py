@@ -62,7 +62,11 @@ def fly(
 
 
 def make(controller_class: type[Controller], drone: Drone) -> Controller:
-    """The user's controller. Raises :class:`UsageError` for a class that can't be made as one is here."""
+    """Make the user's controller.
+
+    Raises:
+        UsageError: The class can't be made as one is here.
+    """
     name = controller_class.__name__
     try:
         inspect.signature(controller_class).bind(drone)

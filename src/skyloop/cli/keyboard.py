@@ -1,7 +1,7 @@
-"""Keys of a terminal as a pilot's sticks and orders. :class:`Sticks` is pure; :class:`Keyboard` reads the terminal.
+"""The keys of a terminal as a pilot's sticks and orders. :class:`Sticks` is pure; :class:`Keyboard` reads the terminal.
 
-A terminal tells of presses and repeats, never that a key was let go: a press moves its stick for :data:`HOLD_S`, longer
-than terminals wait before they repeat a key, and repeats keep it there.
+A terminal sends presses and repeats, never that a key was released. So a press moves its stick for :data:`HOLD_S`,
+longer than terminals wait before they repeat a key, and repeats keep it there.
 """
 
 from __future__ import annotations
@@ -71,14 +71,14 @@ class Deflection(NamedTuple):
 
 
 class Sticks:
-    """What the presses of keys mean over time. Pure: the time [s] is an argument."""
+    """The meaning of key presses over time; the time [s] is an argument."""
 
     def __init__(self) -> None:
         self._pressed: dict[Axis, tuple[int, float]] = {}
         self._escaped_s = -TWICE_S * 2
 
     def press(self, key: str, now_s: float) -> Order | None:
-        """What a press orders; None for a key that moves a stick or means nothing."""
+        """Handle a press; return what it orders, None for a key that moves a stick or means nothing."""
         if key == "esc":
             twice = now_s - self._escaped_s <= TWICE_S
             self._escaped_s = now_s
@@ -94,12 +94,12 @@ class Sticks:
         return order
 
     def deflection(self, now_s: float) -> Deflection:
-        """Where the sticks are now."""
+        """Return where the sticks are now."""
         return Deflection(**{axis: sign for axis, (sign, at_s) in self._pressed.items() if now_s - at_s < HOLD_S})
 
 
 def split_keys(data: bytes) -> tuple[list[str], bytes]:
-    """The keys in what a terminal sent, and what is left of a sequence that is not complete yet."""
+    """Split what a terminal sent into keys, and what is left of a sequence that is not complete yet."""
     keys: list[str] = []
     while data:
         if data[:1] != b"\x1b":
@@ -117,9 +117,10 @@ def split_keys(data: bytes) -> tuple[list[str], bytes]:
 
 
 class Keyboard:
-    """The terminal's keys, one by one, without waiting for Enter. A context manager that puts the terminal back.
+    """The terminal's keys, one by one, without waiting for Enter; a context manager that restores the terminal.
 
-    Raises :class:`UsageError` where standard input is no terminal.
+    Raises:
+        UsageError: Standard input is no terminal.
     """
 
     def __init__(self) -> None:
@@ -139,7 +140,14 @@ class Keyboard:
         termios.tcsetattr(self._fd, termios.TCSADRAIN, self._before)
 
     def keys(self, within_s: float) -> list[str]:
-        """What was pressed; returns at once when something was. Raises ``EOFError`` when the terminal is gone."""
+        """Return the keys that were pressed, as soon as there are any.
+
+        Args:
+            within_s: How long to wait for one [s].
+
+        Raises:
+            EOFError: The terminal is gone.
+        """
         if not self._ready(_ESC_ALONE_S if self._rest else within_s):
             alone, self._rest = self._rest, b""
             return ["esc"] if alone else []

@@ -10,6 +10,7 @@ import msgspec
 import typer
 
 from skyloop.cli.text import columns
+from skyloop.files import expand
 
 if TYPE_CHECKING:
     from skyloop.keys import Entry
@@ -122,7 +123,7 @@ def _state(entry: Entry, now: datetime) -> str:
 
 def _place(directory: Path | None) -> Path:
     if directory is not None:
-        return directory.expanduser()
+        return expand(directory)
     import platformdirs
 
     return platformdirs.user_config_path("skyloop", appauthor=False) / "keys"

@@ -34,6 +34,8 @@ class Row(msgspec.Struct, frozen=True):
     owner: str | None = None
     vehicle_link: str = ""
     problem: str = ""
+    link_reason: str = ""  #: why the vehicle's link is not up
+    link_remedy: str = ""  #: what to do about it
 
 
 def list_proxies(
@@ -48,7 +50,7 @@ def list_proxies(
 
     Those of this host, and with --network those that can be reached over the network.
     """
-    from skyloop.client.by_name import network_settings
+    from skyloop.client.connect import network_settings
 
     settings = network_settings(network, keys)
     rows = running(settings)
@@ -63,9 +65,9 @@ def list_proxies(
 
 
 def running(settings: FabricSettings | None = None) -> list[Row]:
-    """All proxies of this host and, with settings for it, of the network, by name.
+    """Return all proxies of this host and, with settings for it, of the network, by name.
 
-    They are asked at the same time: one that is stopped delays the list once.
+    They are asked at the same time, so one that is stopped delays the list only once.
     """
     from skyloop.transport.local import list_names
 
@@ -80,7 +82,7 @@ def running(settings: FabricSettings | None = None) -> list[Row]:
 
 
 def merged(near: list[Row], settings: FabricSettings) -> list[Row]:
-    """With those of the network; one that is reached both ways has one row."""
+    """Return these proxies with those of the network; one that is reached both ways has one row."""
     from skyloop.transport.fabric import list_proxies as far
 
     rows = {(row.host, row.pid, row.name): row for row in near}
@@ -92,14 +94,14 @@ def merged(near: list[Row], settings: FabricSettings) -> list[Row]:
 
 
 def describe(name: str) -> Row:
-    """What the proxy with this name says of itself, wherever it is."""
-    from skyloop.client.by_name import network_settings
+    """Return what the proxy with this name says of itself, on this host or the network."""
+    from skyloop.client.connect import network_settings
 
     return described(Row(name, transport=""), network_settings())
 
 
 def described(row: Row, settings: FabricSettings | None) -> Row:
-    """What a proxy says of itself; one that does not answer is described by the reason."""
+    """Return what a proxy says of itself; for one that does not answer, the reason."""
     from skyloop.client import connect
 
     far = "local" not in row.transport
@@ -120,13 +122,15 @@ def described(row: Row, settings: FabricSettings | None) -> Row:
                 battery=feedback.battery,
                 owner=feedback.owner,
                 vehicle_link=feedback.vehicle_link.value,
+                link_reason=feedback.link_reason,
+                link_remedy=feedback.link_remedy,
             )
     except SkyloopError as error:
         return msgspec.structs.replace(row, problem=str(error))
 
 
 def lines(rows: Iterable[Row]) -> list[str]:
-    """As a table of text, the address last because it may be long."""
+    """Return the rows as a table of text, the address last because it may be long."""
     cells = [("NAME", "HOST", "BY", "STATE", "BATTERY", "PILOT", "LINK", "ADDRESS")]
     cells += [
         (
@@ -137,7 +141,7 @@ def lines(rows: Iterable[Row]) -> list[str]:
             "" if row.battery is None else f"{row.battery:.0%}",
             row.owner or ("?" if row.problem else "nobody"),
             row.vehicle_link or "?",
-            row.problem or row.uri,
+            row.problem or ": ".join(filter(None, (row.uri, row.link_reason, row.link_remedy))),
         )
         for row in rows
     ]

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 from rich.console import Console
 
+from skyloop.cli.text import console
 from skyloop.errors import FileFormatError, UsageError
 
 if TYPE_CHECKING:
@@ -64,9 +65,34 @@ def info(
     if json:
         typer.echo(log_tables.as_json(recording, summary))
         return
-    console = Console(highlight=False)
+    screen = console()
     for part in log_tables.info(recording, summary):
-        console.print(part)
+        screen.print(part)
+
+
+@log.command("list", short_help="The recordings of a folder", epilog=f"{_EXAMPLE}list flights")
+def list_recordings(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where the recordings are")] = Path(),
+    json: Annotated[bool, typer.Option("--json", help="For programs: one JSON array")] = False,
+) -> None:
+    """The recordings of a folder: which drones, when and for how long. What is wrong with a file stands in its row."""
+    import msgspec
+
+    from skyloop.cli import log_tables
+    from skyloop.logfile.listing import ENDING, describe
+
+    try:
+        paths = sorted(path for path in folder.iterdir() if path.suffix == ENDING)
+    except OSError as error:
+        raise UsageError(f"{folder}: {error.strerror}") from None
+    rows = [(path, describe(path)) for path in paths]
+    if json:
+        found = [{"name": path.name, **msgspec.structs.asdict(told)} for path, told in rows]
+        typer.echo(msgspec.json.encode(found).decode())
+    elif rows:
+        console().print(log_tables.listing(rows))
+    else:
+        typer.echo(f"No recording is in {folder}. Make one: skyloop record alpha")
 
 
 @log.command(short_help="A page that shows a flight", epilog=f"{_EXAMPLE}report flight.mcap -o report.html")
@@ -150,7 +176,7 @@ def compare(
         raise UsageError(f"{output} can't be drawn: its name must end in .html or .png")
     older, newer = _open(old), _open(new)
     found = commands_of(older, newer, drone=drone, what=what.value, part=part)
-    Console(highlight=False).print(log_tables.comparison(found, str(old), str(new)))
+    console().print(log_tables.comparison(found, str(old), str(new)))
     if output is not None:
         from skyloop.recording.review.compare_page import write_comparison
 

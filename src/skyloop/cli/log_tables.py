@@ -1,9 +1,10 @@
-"""How recordings look in the terminal."""
+"""Recordings as tables for the terminal."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import msgspec
 from rich.console import RenderableType
@@ -11,13 +12,14 @@ from rich.table import Table
 from rich.text import Text
 
 from skyloop.clock import NS_PER_S
+from skyloop.logfile.listing import Described
 from skyloop.logfile.reader import Recording
 from skyloop.recording.review.compare import Comparison
 from skyloop.recording.review.summary import Delay, Row, Summary
 
 
 def info(recording: Recording, summary: Summary) -> Iterator[RenderableType]:
-    """All that ``skyloop log info`` shows."""
+    """Return all that ``skyloop log info`` shows."""
     yield _head(recording, summary)
     yield _channels(summary)
     for words in _losses(summary):
@@ -26,8 +28,24 @@ def info(recording: Recording, summary: Summary) -> Iterator[RenderableType]:
         yield Text(note, "bold yellow")
 
 
+def listing(rows: Sequence[tuple[Path, Described]]) -> Table:
+    """Return the recordings of a folder as a table."""
+    table = Table(box=None)
+    for title in ("recording", "begun", "lasts", "drones", "problem"):
+        table.add_column(title, overflow="fold")
+    for path, told in rows:
+        table.add_row(
+            Text(path.name),
+            "" if told.started is None else time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(told.started)),
+            "" if told.seconds is None else f"{told.seconds:.1f} s",
+            Text(", ".join(told.drones)),
+            Text(told.problem),
+        )
+    return table
+
+
 def as_json(recording: Recording, summary: Summary) -> str:
-    """The same for programs."""
+    """Return all that ``skyloop log info --json`` prints."""
     head = {"file": str(recording.path), "drones": recording.drones, "started_unix_ns": recording.start.started_unix_ns}
     return msgspec.json.encode(head | {"summary": summary}, enc_hook=str).decode()
 
@@ -49,7 +67,8 @@ def _head(recording: Recording, summary: Summary) -> Table:
 
 
 def _channels(summary: Summary) -> Table:
-    table = Table("topic", box=None)
+    table = Table(box=None)
+    table.add_column("topic", overflow="fold")  # never cut: it tells the rows apart
     for title in ("count", "rate", "gaps", "longest", "missing", "size"):
         table.add_column(title, justify="right", no_wrap=True)
     table.add_column("delay [ms]: median (p99)")
@@ -88,7 +107,7 @@ def _losses(summary: Summary) -> Iterator[str]:
 
 
 def comparison(found: Comparison, old: str, new: str) -> Table:
-    """The differences of two recordings."""
+    """Return the differences of two recordings."""
     parts = "they never part" if found.part_at_s is None else f"they part at {found.part_at_s:.2f} s"
     table = Table(
         "set-point",

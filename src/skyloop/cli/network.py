@@ -46,7 +46,11 @@ def settings_of(
     multicast: bool,
     keys: Path | None,
 ) -> FabricSettings | None:
-    """What the options say; None to stay on this host. Raises :class:`UsageError` for options without --network."""
+    """Return the settings that the options give; None to stay on this host.
+
+    Raises:
+        UsageError: An option needs ``--network``, or is not valid.
+    """
     if not network:
         given = {"--listen": listen, "--connect": connect, "--keys": keys, "--no-multicast": not multicast}
         for option, value in given.items():
@@ -59,7 +63,12 @@ def settings_of(
 
 
 def server_ends(settings: FabricSettings | None, group: str | None = None) -> MakeEnd:
-    """How to make server ends for these settings: on this host, and with settings on the network too."""
+    """Return what makes a proxy's server end: on this host, and with settings on the network too.
+
+    Args:
+        settings: How to join the network, None for this host only.
+        group: The group of users that may connect on this host.
+    """
     from skyloop.transport.local import LocalServer
 
     if settings is None:
@@ -73,12 +82,12 @@ def server_ends(settings: FabricSettings | None, group: str | None = None) -> Ma
 
 
 def key_news(settings: FabricSettings | None) -> Callable[[], list[str]] | None:
-    """What there is to say about the keys, for :func:`skyloop.proxy.serve.serve`."""
-    return None if settings is None or settings.ring is None else settings.ring.look
+    """Return what reports on the keys, for :func:`skyloop.proxy.serve.serve`; None without keys."""
+    return None if settings is None or settings.ring is None else settings.ring.poll
 
 
 def warn_if_open(settings: FabricSettings | None, names: list[str]) -> None:
-    """Say in plain words, each time, what the network means without keys."""
+    """Warn in plain words, each time, what the network means without keys."""
     if settings is not None and settings.tls is None:
         typer.echo(
             OPEN.format(names=" and ".join(names) if len(names) < 4 else f"these {len(names)} vehicles"), err=True

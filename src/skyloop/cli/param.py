@@ -65,7 +65,11 @@ def _write(name: str, key: str, value: str, priority: int) -> list[Parameter]:
 
 
 def parse_value(parameter: Parameter, text: str) -> Value:
-    """The value that a person typed, by the parameter's type. Raises :class:`UsageError`."""
+    """Parse the value that a person typed, by the parameter's type.
+
+    Raises:
+        UsageError: It is not of that type.
+    """
     try:
         match parameter.type:
             case ParameterType.BOOL:
@@ -83,13 +87,13 @@ def parse_value(parameter: Parameter, text: str) -> Value:
 
 
 def table(parameters: list[Parameter]) -> list[str]:
-    """A line each: name, value with unit, what is allowed."""
+    """Return a line for each parameter: name, value with unit, what is allowed."""
     rows = [(p.name, f"{show(p.value)} {p.unit}".rstrip(), allowed(p)) for p in parameters]
     return columns([("PARAMETER", "VALUE", "ALLOWED"), *rows])
 
 
 def details(parameter: Parameter) -> list[str]:
-    """All that is known of one."""
+    """Return all that is known of one parameter."""
     p = parameter
     rows = [
         (p.name, f"{show(p.value)} {p.unit}".rstrip()),
@@ -101,7 +105,7 @@ def details(parameter: Parameter) -> list[str]:
 
 
 def allowed(parameter: Parameter) -> str:
-    """Which values it takes, for people."""
+    """Return which values a parameter takes, for people."""
     p = parameter
     if p.read_only:
         return "read-only"
@@ -116,7 +120,7 @@ def allowed(parameter: Parameter) -> str:
 
 
 def show(value: Value) -> str:
-    """As it can be typed."""
+    """Return a value as it can be typed."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, tuple):

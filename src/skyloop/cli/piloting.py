@@ -1,4 +1,4 @@
-"""Connecting with the wish to command, from the command line."""
+"""Connecting as a pilot from the command line."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from skyloop.errors import AuthorityError
 
 
 def connect_pilot(target: str, advice: str, **options: Any) -> Drone:
-    """As :func:`skyloop.connect`; where somebody else flies, the error says who, and what to do on the command line."""
+    """Connect as :func:`skyloop.connect` does; where somebody else flies, the error says who, and what to do."""
     try:
         return connect(target, **options)
     except AuthorityError as error:

@@ -98,7 +98,7 @@ def _work(
 
 
 def _lines(line: Callable[[], str], ended: threading.Event) -> None:
-    """One each second, by absolute deadlines."""
+    """Print a line each second, by absolute deadlines."""
     due = time.monotonic() + LINE_EVERY_S
     while not ended.wait(max(0.0, due - time.monotonic())):
         due = max(due + LINE_EVERY_S, time.monotonic())
@@ -113,7 +113,7 @@ def _lead(
     seconds: float | None,
     show: Callable[[Status], str],
 ) -> None:
-    """Several, each in a process of its own, so that none waits for another's interpreter."""
+    """Run several workers, each in a process of its own, so that none waits for another's interpreter."""
     from skyloop.processing.group import Group, child_command
 
     if "://" in drone:
@@ -131,7 +131,7 @@ def _lead(
 
 
 def _arguments(settings: Settings, target: str, drone: str, seconds: float | None) -> list[str]:
-    """The command of one worker of several."""
+    """Return the command of one worker of several."""
     options: dict[str, object] = {
         "--drone": drone,
         "--name": settings.name,

@@ -1,4 +1,4 @@
-"""``skyloop record``: everything that drones tell, into a file."""
+"""``skyloop record``: everything that drones send, into a file."""
 
 from __future__ import annotations
 
@@ -91,12 +91,14 @@ def _show(recorder: Recorder, seconds: float) -> None:
         line = progress(status, before)
         typer.echo(f"\r\x1b[K{line}" if live else line, nl=not live)
         before = status
+        if status.state.value == "failed":  # it does not come back
+            break
     if live:
         typer.echo()
 
 
 def progress(status: Status, before: Status) -> str:
-    """How it goes, in one line; the rates are since ``before``."""
+    """Return the progress in one line; rates are since ``before``."""
     span_s = max(1e-3, status.seconds - before.seconds)
     minutes, seconds = divmod(round(status.seconds), 60)
     parts = [
@@ -111,7 +113,7 @@ def progress(status: Status, before: Status) -> str:
 
 
 def counts(by_drone: dict[str, dict[str, int]]) -> str:
-    """``alpha feedback 3, alpha video.front 12``, or ``none``."""
+    """Return counts as ``alpha feedback 3, alpha video.front 12``, or ``none``."""
     found = [f"{drone} {name} {count}" for drone, channels in by_drone.items() for name, count in channels.items()]
     return ", ".join(found) or "none"
 

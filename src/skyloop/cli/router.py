@@ -32,7 +32,7 @@ def router(
     from skyloop.transport.fabric import config
     from skyloop.transport.fabric.config import Part
     from skyloop.transport.fabric.environment import settings
-    from skyloop.transport.fabric.session import acquire, release
+    from skyloop.transport.fabric.session import Session, acquire, release, renewed
 
     everywhere = f"{config.all_interfaces()}:{PORT}"
     chosen = settings(
@@ -54,9 +54,16 @@ def router(
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, end)
-    session = acquire(chosen, Part.ROUTER)
+    session: Session = acquire(chosen, Part.ROUTER)
     typer.echo(f"ready: a router at {', '.join(session.listens)}")
     while not ended.wait(_POLL_S):  # looks up now and then: the kernel may hand a signal to any thread
-        for news in chosen.ring.look() if chosen.ring is not None else ():
+        if chosen.ring is None:
+            continue
+        for news in chosen.ring.poll():
             typer.echo(f"skyloop: {news}", err=True)
+        out = session.shut_out()
+        if out:
+            typer.echo(f"skyloop: begins anew without {', '.join(sorted(out))}", err=True)
+            session = renewed(session)
+            chosen = session.settings
     release(session, linger=False)

@@ -1,5 +1,7 @@
-"""``skyloop sim``: several simulated drones in one world, each with a proxy of its own, or each the firmware of a real
-one for other people's programs."""
+"""``skyloop sim``: several simulated drones in one world.
+
+Each has a proxy of its own, or is the firmware of a real drone for other people's programs.
+"""
 
 from __future__ import annotations
 
@@ -122,7 +124,7 @@ def sim(
     if network:
         raise UsageError("--network is for proxies, and with --firmware there is none: say --bind ADDRESS instead")
     _refuse_for_firmware(name, uri)
-    from skyloop.sim.firmware.ardrone import Faults
+    from skyloop.emulators.ardrone import Faults
 
     settle(options)
     faults = Faults(seed=fault_seed or 0, drop=lose or 0.0, duplicate=repeat or 0.0, reorder=reorder or 0.0)
@@ -152,7 +154,11 @@ def _serve_proxies(
 
 
 def address(world: str, seed: int, speed: float, others: list[str]) -> str:
-    """The vehicles' address. Raises :class:`UsageError` for what is no option."""
+    """Return the vehicles' address.
+
+    Raises:
+        UsageError: There is no such option, or its value is not valid.
+    """
     settings = {"world": world, "seed": str(seed), "speed": f"{speed:g}"}
     for text in others:
         key, equals, value = text.partition("=")

@@ -1,4 +1,4 @@
-"""What a process that only simulates does for itself."""
+"""Settings of a process that only simulates."""
 
 from __future__ import annotations
 
@@ -14,8 +14,11 @@ SWITCH_INTERVAL_S: Final = 0.001
 def settle(options: SimOptions) -> None:
     """Make room, in this whole process, for the threads that pass commands on beside those that step and draw.
 
-    The interpreter lock is handed over after a millisecond, not five, and OpenCV keeps to one core. Not for a process
-    that is the user's. Raises :class:`MissingExtraError` if cameras are wanted and what draws is not installed.
+    The interpreter lock is handed over after a millisecond, not five, and OpenCV keeps to one core. Do not call it in
+    the user's process.
+
+    Raises:
+        MissingExtraError: Cameras are wanted, and what draws them is not installed.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     if options.cameras:

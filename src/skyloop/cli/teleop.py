@@ -63,7 +63,11 @@ class Teleop:
         self._said = ""
 
     def run(self, keyboard: Keyboard) -> None:
-        """Until Q. Raises ``EOFError`` when the terminal is gone."""
+        """Fly until Q is pressed.
+
+        Raises:
+            EOFError: The terminal is gone.
+        """
         shown_s = 0.0
         with keyboard, Live(console=Console(), auto_refresh=False) as live:
             while True:
@@ -80,7 +84,7 @@ class Teleop:
                     live.update(self.picture(), refresh=True)
 
     def obey(self, order: Order) -> None:
-        """Do what a key orders; what can't be done is said and changes nothing."""
+        """Carry out a key's order; one that is not possible is reported and changes nothing."""
         try:
             self._said = self._obey(order)
         except SkyloopError as error:
@@ -110,7 +114,7 @@ class Teleop:
         return order
 
     def steer(self, sticks: Deflection) -> None:
-        """Send where the sticks are while one is moved, and one hover when all are let go."""
+        """Send where the sticks are while one is moved, and one hover when all are released."""
         moved = any(sticks)
         if not moved and not self._moving:
             return
@@ -132,7 +136,7 @@ class Teleop:
         self._moving = moved
 
     def picture(self) -> Group:
-        """All that is shown at one time, what matters most on top: what does not fit is cut at the bottom."""
+        """Return all that is shown at one time, what matters most on top: what does not fit is cut at the bottom."""
         from skyloop.cli.watch import channels, events, state_panel
 
         drone = self._drone

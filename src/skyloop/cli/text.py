@@ -2,11 +2,31 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Iterable
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+_PIPE_COLUMNS: Final = 10_000
 
 
 def columns(rows: Iterable[tuple[str, ...]]) -> list[str]:
-    """Rows of as many cells each, as lines in which the cells stand below one another."""
+    """Return rows of as many cells each as lines with aligned columns."""
     table = list(rows)
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in table]
+
+
+def console() -> Console:
+    """Return a console for tables on standard output.
+
+    It is as wide as the terminal, and in a pipe as wide as the tables are, so that nothing is cut there. ``COLUMNS``
+    overrides both.
+    """
+    from rich.console import Console
+
+    wide = sys.stdout.isatty() or "COLUMNS" in os.environ
+    return Console(highlight=False, width=None if wide else _PIPE_COLUMNS)

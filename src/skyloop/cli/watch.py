@@ -81,7 +81,7 @@ def _live(drone: Drone, duration_s: float) -> None:
 
 
 def state_line(drone: Drone) -> str:
-    """The state at one time, short."""
+    """Return the present state as a short line."""
     feedback, link = drone.feedback(), drone.link
     rates = [f"{name} {channel.rate_hz:.0f}/s" for name, channel in drone.stats.items() if channel.count > 1]
     parts = [
@@ -99,7 +99,7 @@ def state_line(drone: Drone) -> str:
 
 
 def event_line(event: Event) -> str:
-    """An event as a line of its own."""
+    """Return an event as a line of its own."""
     return f"{time.strftime('%H:%M:%S')}  {event.severity.value}: {event.text}"
 
 
@@ -116,17 +116,17 @@ def _event_json(event: Event) -> str:
 
 
 def picture(drone: Drone) -> Group:
-    """All that is shown at one time."""
+    """Return all that is shown at one time."""
     return Group(state_panel(drone), channels(drone), *events(drone, EVENTS_SHOWN))
 
 
 def state_panel(drone: Drone) -> Panel:
-    """What the drone and its links are doing."""
+    """Return what the drone and its links are doing."""
     return Panel(_state(drone), title=Text(f"{drone.name} · {drone.uri}"), title_align="left")
 
 
 def events(drone: Drone, count: int) -> list[Text]:
-    """The newest events, a line each."""
+    """Return the newest events, a line each."""
     newest_ns = drone.feedback().captured_ns
     return [
         Text.assemble((f"{(event.at_ns - newest_ns) / 1e9:+7.1f} s", COLOURS[event.severity]), f" {event.text}")
@@ -146,7 +146,7 @@ def _state(drone: Drone) -> Table:
 
 
 def channels(drone: Drone) -> Table:
-    """Rates, delays and ages, a line a channel."""
+    """Return rates, delays and ages, a line for each channel."""
     table = Table("channel", "rate", "delay median", "p99", "age", "lost", "dropped", box=None)
     for name, channel in drone.stats.items():
         delay = channel.delay_s

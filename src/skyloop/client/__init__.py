@@ -1,20 +1,18 @@
-"""The application's side: :func:`connect` gives a :class:`Drone`."""
+"""The application's side: :func:`connect` returns a :class:`Drone`."""
 
-from skyloop.client.authority import AuthorityState, AuthorityStatus
-from skyloop.client.config import Config
-from skyloop.client.connect import connect
-from skyloop.client.delivery import Listener, Processor
+from skyloop.client.authority import AuthorityState, AuthorityStatus, TakeoverRequest
+from skyloop.client.channels import Listener, Processor
+from skyloop.client.connect import connect, swarm
+from skyloop.client.connection import RedialPolicy
 from skyloop.client.drone import Drone
 from skyloop.client.frame import Frame
-from skyloop.client.gather import swarm
-from skyloop.client.link import RedialPolicy
+from skyloop.client.link_monitor import Thresholds
 from skyloop.client.logbook import Logbook
-from skyloop.client.monitor import Thresholds
-from skyloop.client.reception import LinkStatus
+from skyloop.client.parameters import Config
 from skyloop.client.results import Result
 from skyloop.client.statistics import ChannelStats, Distribution
 from skyloop.client.swarm import Swarm
-from skyloop.client.takeover import TakeoverRequest
+from skyloop.client.telemetry import LinkStatus
 
 #: Statistics by channel: ``command``, ``feedback``, ``video/<camera>``, ``results/<processor>``.
 Stats = dict[str, ChannelStats]

@@ -1,15 +1,30 @@
-"""Who may fly, as this application knows it from replies, events and feedback. Pure.
+"""What this application knows of its authority from replies, events and feedback, and requests to hand it over.
 
-Replies and events can be lost, and feedback can be older than a grant: leases grow, so the higher one is the newer.
+Pure. Replies and events can be lost, and feedback can be older than a grant: lease numbers grow, so the higher one is
+the newer.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
 from skyloop.clock import nanoseconds
-from skyloop.messages import DEFAULT_PRIORITY, Event, EventKind, Feedback, RequestAuthority
+from skyloop.errors import UsageError
+from skyloop.messages import (
+    DEFAULT_PRIORITY,
+    HIGHEST_PRIORITY,
+    LONGEST_TERM_S,
+    LOWEST_PRIORITY,
+    Event,
+    EventKind,
+    Feedback,
+    RequestAuthority,
+    Takeover,
+    Value,
+)
 
 AuthorityState = Literal["none", "queued", "held", "preempted"]
 
@@ -18,11 +33,15 @@ AuthorityState = Literal["none", "queued", "held", "preempted"]
 class AuthorityStatus:
     """This application's right to command.
 
-    ``none``: not asked for, or given back; ``queued``: waiting in line; ``held``: may fly; ``preempted``: taken away by
-    a higher priority, and waiting to have it back. ``lease`` is its number while held, else 0; ``position`` the place
-    in line (1 is next), 0 if not known. ``holder`` names who flies now. ``expected_wait_s``: how long it will take if
-    each ahead in the line keeps to the time that it said; None: not known. ``until_ns``: when the time is over that
-    this application asked for, on the proxy's clock; None: not limited.
+    Attributes:
+        state: ``none``: not requested, or released. ``queued``: waiting in the queue. ``held``: may command.
+            ``preempted``: taken over by another application, and waiting in the queue to get it back.
+        lease: Number of the lease while held, else 0.
+        priority: Of the last request, 0 (highest) to 31.
+        holder: Name of the application that holds it; None if nobody does or it is not known.
+        position: Position in the queue from 1, the next; 0 if not known.
+        expected_wait_s: Wait if each ahead in the queue keeps to the time it announced [s]; None if not known.
+        until_ns: When the time that this application asked for is over, on the proxy's clock; None: not limited.
     """
 
     state: AuthorityState = "none"
@@ -35,7 +54,7 @@ class AuthorityStatus:
 
 
 class Authority:
-    """Follows the authority of one application. Each method that takes news returns whether the status changed."""
+    """Follows the authority of one application. Methods that return a bool tell whether the status changed."""
 
     #: Feedback that names no owner may be older than the grant for this long.
     SETTLE_NS = nanoseconds(0.5)
@@ -46,59 +65,75 @@ class Authority:
         self.wanted = False  #: the application asked for it and has not given it back
         self.pending = False  #: asked for on this connection, and not answered yet
         self.status = AuthorityStatus()
-        self.wish = RequestAuthority()  #: how it is asked for, also anew on another connection
-        self.declined = ""  #: what was told when the holder declined
-        self._lease = 0  #: the newest lease that was ever ours on this connection
+        self.wish = RequestAuthority()  #: the last request, repeated on another connection
+        self.declined = ""  #: why the holder declined
+        #: Whether to request it again by itself after a lost connection, or after the lease was lost by silence.
+        self.renews = True
+        self._lease = 0  #: the newest lease that this application has held on this connection
         self._granted_ns = 0
 
     @property
     def held(self) -> bool:
+        """Whether this application may command."""
         return self.status.state == "held"
 
     def connected(self, app_id: int) -> None:
-        """A connection was made: leases of the one before mean nothing here."""
+        """Reset on a new connection, on which older leases mean nothing."""
         self.app_id = app_id
         self._lease = 0
 
     def disconnected(self) -> bool:
-        """The connection is gone, and the authority with it."""
+        """The connection is lost, and the authority with it; it stays wanted if it is to be renewed."""
         self.pending = False
+        self.wanted = self.wanted and self.renews
         return self._set(AuthorityStatus("none", priority=self.status.priority))
 
     def asked(self, wish: RequestAuthority) -> None:
-        """The authority is being asked for."""
+        """Note that the authority is being requested."""
         self.wanted = self.pending = True
         self.wish = wish
         self.declined = ""
         self.status = replace(self.status, priority=wish.priority)
 
     def granted(self, lease: int, now_ns: int, until_ns: int | None = None) -> bool:
-        """By reply, by event or seen in feedback."""
+        """Note a grant, known from a reply, an event or feedback.
+
+        Args:
+            lease: Number of the lease; an old one that was lost since is ignored.
+            now_ns: On this process's clock.
+            until_ns: When its time is over, on the proxy's clock; None: not limited, or known from before.
+        """
         self.pending = False
         if lease <= self._lease and not self.held:
-            return False  # an old lease, told again: it was lost since
+            return False  # an old lease, reported late: it was lost since
         if until_ns is None and lease == self._lease:
-            until_ns = self.status.until_ns  # told before, and not again
+            until_ns = self.status.until_ns  # feedback and some events do not repeat it
         self._lease, self._granted_ns = lease, now_ns
         return self._set(AuthorityStatus("held", lease, self.status.priority, self._name, until_ns=until_ns))
 
     def queued(self, position: int, holder: str, expected_wait_s: float | None = None) -> bool:
-        """In line."""
+        """Note the position in the queue.
+
+        Args:
+            position: From 1, the next.
+            holder: Name of the application that holds the authority.
+            expected_wait_s: As in :class:`AuthorityStatus`.
+        """
         self.pending = False
         state: AuthorityState = "preempted" if self.status.state == "preempted" else "queued"
         return self._set(AuthorityStatus(state, 0, self.status.priority, holder, position, expected_wait_s))
 
     def given_back(self) -> bool:
-        """Released by the application, or refused for good."""
+        """Note that it was released by the application, or refused for good."""
         self.wanted = self.pending = False
         return self._set(AuthorityStatus("none", priority=self.status.priority))
 
     def refused(self) -> bool:
-        """Not given and not in line."""
+        """Note that it was neither granted nor queued."""
         return self.given_back()
 
     def event(self, event: Event, now_ns: int) -> bool:
-        """News from the stream of events."""
+        """Update from an event."""
         data = event.data
         ours = data.get("app_id") == self.app_id
         if event.kind is EventKind.AUTHORITY_GRANTED and ours:
@@ -114,13 +149,13 @@ class Authority:
         if event.kind is EventKind.AUTHORITY_PREEMPTED:
             return self._lost(str(data.get("by", "")) or None)
         if event.kind is EventKind.AUTHORITY_LOST:
-            if data.get("reason") == "expired":  # its time is over: it is not asked for again by itself
+            if data.get("reason") == "expired":  # its time is over: not requested again by itself
                 return self.given_back()
             return self._lost(None)
         return False
 
     def feedback(self, feedback: Feedback, now_ns: int) -> bool:
-        """Feedback names the owner and the lease in force: what the events said, should they have been lost."""
+        """Update from the owner and the lease in feedback, in case events were lost."""
         if feedback.owner_id == self.app_id and feedback.lease:
             return (
                 self.wanted
@@ -136,7 +171,9 @@ class Authority:
         return False
 
     def _lost(self, holder: str | None) -> bool:
-        """Taken by somebody, or ended by the proxy because this application was silent."""
+        """Note that it was taken over by ``holder``, or ended by the proxy because this application was silent."""
+        if not holder and not self.renews:
+            return self.given_back()
         state: AuthorityState = "preempted" if holder else "none"
         return self._set(AuthorityStatus(state, 0, self.status.priority, holder))
 
@@ -147,3 +184,92 @@ class Authority:
 
 def _whole(value: object) -> int:
     return value if isinstance(value, int) else 0
+
+
+TakeoverWay = Literal["now", "ask"]
+#: True: hand it over; False, or the reason as a text: decline; None: leave it to the proxy.
+TakeoverAnswer = bool | str | None
+
+
+@dataclass(frozen=True, slots=True)
+class TakeoverRequest:
+    """Another application asks for the authority that this one holds."""
+
+    by: str  #: name of that application
+    priority: int  #: 0 is the highest
+    within_s: float  #: after this time it wins if its priority is strictly higher
+    for_s: float | None  #: for how long it wants the authority; None: open
+    lease: int  #: the lease that is to be given up
+    by_id: int = 0  #: number of that application in this run of the proxy
+
+
+def authority_wish(priority: int, for_s: float | None = None, takeover: TakeoverWay = "now") -> RequestAuthority:
+    """Return the request for the authority.
+
+    Args:
+        priority: 0 (highest) to 31 (lowest).
+        for_s: How long it is wanted [s], at most a day; None: open.
+        takeover: ``"now"`` or ``"ask"``.
+
+    Raises:
+        UsageError: If an argument is out of range.
+    """
+    if not isinstance(priority, int) or not HIGHEST_PRIORITY <= priority <= LOWEST_PRIORITY:
+        raise UsageError(f"priority is {priority!r} and must be a whole number from 0 (highest) to 31 (lowest)")
+    if takeover not in ("now", "ask"):
+        raise UsageError(f'takeover is {takeover!r} and must be "now" or "ask"')
+    if for_s is not None and not (isinstance(for_s, int | float) and 0.0 < for_s <= LONGEST_TERM_S):
+        raise UsageError(f"for_s is {for_s!r} and must be a number of seconds, more than 0 and at most a day")
+    return RequestAuthority(priority, True, None if for_s is None else float(for_s), Takeover(takeover))
+
+
+def answering(
+    function: Callable[[TakeoverRequest], TakeoverAnswer],
+    app_id: Callable[[], int],
+    answer: Callable[[int, int, bool, str], None],
+) -> Callable[[Event], None]:
+    """Return a callback for events that calls ``function`` when this application is asked to hand the authority over.
+
+    Args:
+        function: Decides; see :data:`TakeoverAnswer`.
+        app_id: Returns the number of this application.
+        answer: Sends the decision: lease, number of the application that asks, whether it is granted, the reason.
+
+    Raises:
+        UsageError: If ``function`` can't be called.
+    """
+    if not callable(function):
+        raise UsageError(f"{function!r:.80} can't be called: a function with one argument is needed")
+
+    def on_event(event: Event) -> None:
+        request = takeover_request(event, app_id())
+        if request is None:
+            return
+        said = function(request)
+        if said is not None:
+            answer(request.lease, request.by_id, said is True, said if isinstance(said, str) else "")
+
+    return on_event
+
+
+def takeover_request(event: Event, app_id: int) -> TakeoverRequest | None:
+    """Return the request that an event makes of the application ``app_id``; None if it makes none of it."""
+    data = event.data
+    if event.kind is not EventKind.AUTHORITY_ASKED or data.get("app_id") != app_id:
+        return None
+    lease, by_id = data.get("lease"), data.get("by_id")
+    if not isinstance(lease, int) or not isinstance(by_id, int):
+        return None
+    priority = data.get("by_priority")
+    return TakeoverRequest(
+        str(data.get("by", "")),
+        priority if isinstance(priority, int) else LOWEST_PRIORITY,
+        _number(data.get("within_s")) or 0.0,
+        _number(data.get("for_s")),
+        lease,
+        by_id,
+    )
+
+
+def _number(value: Value | None) -> float | None:
+    return float(value) if isinstance(value, int | float) and math.isfinite(value) else None

@@ -1,26 +1,32 @@
-"""Connecting: to a proxy by its name, or to a vehicle by its address through a private proxy."""
+"""Connect to a proxy by name, to a vehicle by address through a private proxy, or to several drones at once."""
 
 from __future__ import annotations
 
+import fnmatch
 import math
+import os
 import sys
 import time
+from collections.abc import Callable, Iterable, Mapping
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
 
+from skyloop.client.authority import TakeoverWay, authority_wish
 from skyloop.client.drone import Access, Drone, OnExit
-from skyloop.client.pace import Way
-from skyloop.client.takeover import TakeoverWay, authority_wish
-from skyloop.errors import UsageError
+from skyloop.client.scheduler import Scheduler
+from skyloop.client.swarm import OnError, Swarm, in_parallel
+from skyloop.errors import LinkError, SwarmError, UnknownNameError, UsageError
 from skyloop.messages import DEFAULT_PRIORITY
+from skyloop.transport.base import ClientEnd, ClientHandler, Dialer, check_name
 
 if TYPE_CHECKING:
     from skyloop.transport.fabric.environment import Network
+    from skyloop.transport.fabric.settings import FabricSettings
 
 NAME_TIMEOUT_S: Final = 5.0
 START_TIMEOUT_S: Final = 20.0  #: for a private proxy and its vehicle
-#: Entry points by the scheme of an address: a function that takes the address and returns a :class:`Way`, or None.
+#: Entry points by the scheme of an address: functions that take the address and return a :class:`Connector`, or None.
 CONNECTORS: Final = "skyloop.connectors"
 
 
@@ -41,42 +47,59 @@ def connect(
     takeover: TakeoverWay = "now",
     stay: bool = False,
 ) -> Drone:
-    """Connect to a drone; returns when its state is known and, with ``access="pilot"``, when it may be commanded.
+    """Connect to a drone.
 
-    ``target``: the name of a running proxy, or a vehicle's address such as ``sim://?seed=3`` or
-    ``video://flight.mp4``, for which a private proxy is started that ends with the drone and with this process.
-    A name is looked for on this host first and then, if ``network`` says so, on the network: True searches by
-    multicast, ``"10.0.0.5:7447"`` calls an address (several: with commas, and ``multicast`` among them to search as
-    well), False stays on this host; default: the variable ``SKYLOOP_NETWORK``, without which nothing leaves this host.
-    ``keys``: the folder of an identity for the network (default: the variable ``SKYLOOP_KEYS``).
-    ``access``: ``"pilot"`` requests the authority, ``"observe"`` only looks on. ``priority``: 0 is the highest, 31 the
-    lowest; a higher one takes over. ``name``: of this application (default: of its script). ``wait_s``: how long to
-    wait in line while somebody else flies. ``timeout_s``: for the proxy to answer (default 5 s, with an address 20 s).
-    ``rate_hz``: of repeated commands. ``stall_s``: without a call for this long a velocity or attitude decays to hover
-    (``math.inf``: never). ``on_exit``: what an airborne vehicle does at the block's end, ``"land"`` or ``"hover"``.
-    ``for_s``, ``takeover``, ``stay``: for how long the authority is wanted, whether its holder is asked first, and
-    whether to stay in line without it; see :meth:`Drone.request_authority`.
+    Returns when the vehicle's state is known and, with ``access="pilot"``, when it may be commanded.
 
-    Raises :class:`UnknownNameError` (no such proxy), :class:`NoAnswerError`, :class:`AuthorityError` (naming who
-    flies), :class:`LinkError`, :class:`UsageError`.
+    Args:
+        target: Name of a running proxy, or address of a vehicle such as ``sim://?seed=3`` or ``video://flight.mp4``.
+            For an address a private proxy is started, which ends with the drone and with this process. A name is
+            looked up on this host first and then, if ``network`` allows, on the network.
+        access: ``"pilot"`` requests the authority, ``"observe"`` only reads.
+        priority: Of the request for the authority, 0 (highest) to 31; a higher one pre-empts a lower one.
+        name: Name of this application, 1 to 64 characters; None: the running script's.
+        wait_s: How long to wait in the queue while another application holds the authority [s].
+        timeout_s: Time for the proxy to answer [s]; None or 0: 5 s for a name, 20 s for an address.
+        rate_hz: Rate at which commands are repeated, 1 to 200 Hz.
+        stall_s: Time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never.
+        on_exit: What an airborne vehicle does at the end of the block, ``"land"`` or ``"hover"``.
+        network: True searches by multicast; ``"10.0.0.5:7447"`` connects to an address (several with commas, with
+            ``multicast`` among them to search as well); False stays on this host. None: as the variable
+            ``SKYLOOP_NETWORK`` says, without which nothing leaves this host.
+        keys: Folder of an identity for the network; None: as the variable ``SKYLOOP_KEYS`` says.
+        for_s: How long the authority is wanted; see :meth:`Drone.request_authority`.
+        takeover: Whether its holder is asked first; see :meth:`Drone.request_authority`.
+        stay: Whether to stay in the queue without it; see :meth:`Drone.request_authority`.
+
+    Raises:
+        UnknownNameError: If no proxy of this name runs; carries suggestions.
+        NoAnswerError: If the proxy does not answer in time, or sends no feedback.
+        AuthorityError: If the authority can't be had; names its holder.
+        RefusedError: If the proxy refuses the connection.
+        LinkError: If the proxy or the private proxy can't be reached, or ends.
+        UsageError: If an argument is out of range, or the address makes no sense.
+        MissingExtraError: If the network is asked for and the extra ``network`` is not installed.
     """
     if not isinstance(target, str) or not target:
         raise UsageError(f"{target!r} is neither the name of a proxy nor a vehicle's address such as sim://")
     authority_wish(priority, for_s, takeover)
     for what, seconds in (("wait_s", wait_s), ("timeout_s", timeout_s)):
-        if seconds is not None and not (0.0 <= seconds < math.inf):
+        if seconds is not None and not (isinstance(seconds, int | float) and 0.0 <= seconds < math.inf):
             raise UsageError(f"{what} is {seconds!r} and must be a number of seconds")
     app = name if name is not None else _script_name()
     deadline = time.monotonic() + (timeout_s or (START_TIMEOUT_S if "://" in target else NAME_TIMEOUT_S))
     if "://" in target:
-        way = _way(target)
-        dial, end, reach, pace = way.dialer(deadline), way.close, way.reach, way.pace
+        connector = _connector(target)
+        dial, end, reach, scheduler = connector.dialer(deadline), connector.close, connector.reach, connector.scheduler
     else:
-        from skyloop.client.by_name import dial_by_name
-
-        # Another process finds it by the name alone only where it would look by itself.
+        # Another process can use the name alone only if it finds the proxy without network settings.
         others_find_it = keys is None and (network is None or network is False)
-        dial, end, reach, pace = dial_by_name(target, network, keys), None, target if others_find_it else None, None
+        dial, end, reach, scheduler = (
+            dial_by_name(target, network, keys),
+            None,
+            target if others_find_it else None,
+            None,
+        )
     try:
         drone = Drone(
             dial,
@@ -85,7 +108,7 @@ def connect(
             rate_hz=rate_hz,
             stall_s=stall_s,
             on_exit=on_exit,
-            pace=pace,
+            scheduler=scheduler,
             on_close=end,
             reach=reach,
         )
@@ -97,13 +120,13 @@ def connect(
     return drone.open(priority=priority, wait_s=wait_s, timeout_s=left_s, for_s=for_s, takeover=takeover, stay=stay)
 
 
-def _way(uri: str) -> Way:
-    """A private proxy, unless an installed package has another way to this address."""
+def _connector(uri: str) -> Connector:
+    """The connector that an installed package has for this scheme, else a private proxy."""
     for entry in entry_points(group=CONNECTORS, name=uri.partition("://")[0]):
-        own: Way | None = entry.load()(uri)
+        own: Connector | None = entry.load()(uri)
         if own is not None:
             return own
-    from skyloop.client.private import PrivateProxy
+    from skyloop.client.private_proxy import PrivateProxy
 
     return PrivateProxy(uri)
 
@@ -113,3 +136,196 @@ def _script_name() -> str:
     script = Path(sys.argv[0] if sys.argv and sys.argv[0] else "python")
     stem = script.parent.name if script.stem == "__main__" else script.stem
     return (stem.strip("-") or "python")[:64]
+
+
+class Connector(Protocol):
+    """How a vehicle's address is reached: by a private proxy, or within this process."""
+
+    scheduler: Scheduler
+
+    @property
+    def reach(self) -> str | None:
+        """What another process connects to for the same vehicle; None if it can't."""
+
+    def dialer(self, deadline_s: float) -> Dialer:
+        """Return a dialer that at first waits until the proxy serves.
+
+        Args:
+            deadline_s: Until when it waits at most, on ``time.monotonic``.
+        """
+
+    def close(self) -> None:
+        """End whatever was started. Idempotent."""
+
+
+NETWORK_VARIABLE: Final = "SKYLOOP_NETWORK"
+_HINT: Final = "; only this host was looked at (network=True, or the variable SKYLOOP_NETWORK, looks further)"
+
+
+def network_settings(network: Network = None, keys: Path | str | None = None) -> FabricSettings | None:
+    """Return how to search the network; None if it is not to be searched. Arguments are those of :func:`connect`."""
+    if network is False or (network is None and keys is None and not os.environ.get(NETWORK_VARIABLE)):
+        return None  # without importing the network's packages
+    from skyloop.transport.fabric.environment import choose
+
+    return choose(network, keys)
+
+
+def dial_by_name(name: str, network: Network = None, keys: Path | str | None = None) -> Dialer:
+    """Return the dialer of the proxy with this name.
+
+    Each time it prefers a proxy on this host, where Linux' local transport is available. It raises
+    :class:`UnknownNameError`, which says where it searched, and :class:`LinkError`.
+
+    Args:
+        name: Name of the proxy.
+        network: As for :func:`connect`.
+        keys: As for :func:`connect`.
+
+    Raises:
+        UsageError: If ``name`` can't be a name.
+    """
+    check_name(name)
+    settings = network_settings(network, keys)
+    if settings is None:
+        return _hinting(_local(name))
+    from skyloop.transport.fabric import dial
+
+    far = dial(name, settings)
+    if sys.platform != "linux":
+        return far
+    near = _local(name)
+
+    def dialer(handler: ClientHandler) -> ClientEnd:
+        try:
+            return near(handler)
+        except LinkError:
+            return far(handler)  # a killed proxy has left its socket, or it belongs to another user
+        except UnknownNameError as here:
+            known = here.known
+        try:
+            return far(handler)
+        except UnknownNameError as there:
+            place = f"proxy on this host or the network ({settings.reach})"
+            raise UnknownNameError(place, name, {*known, *there.known}) from None
+
+    return dialer
+
+
+def _local(name: str) -> Dialer:
+    from skyloop.transport.local import dial
+
+    return dial(name)
+
+
+def _hinting(near: Dialer) -> Dialer:
+    def dialer(handler: ClientHandler) -> ClientEnd:
+        try:
+            return near(handler)
+        except UnknownNameError as error:
+            error.message += _HINT
+            raise
+
+    return dialer
+
+
+Target = str | Mapping[str, str]
+Missing = Literal["raise", "skip"]
+_WILD: Final = frozenset("*?[")
+
+
+def swarm(*targets: Target, on_error: OnError = "continue", missing: Missing = "raise", **options: Any) -> Swarm:
+    """Connect to several drones at the same time; returns when all are connected.
+
+    Args:
+        *targets: Names of running proxies, patterns such as ``"drone*"`` for all that run now, addresses of vehicles
+            such as ``"sim://?seed=1"`` (named ``sim1``, ``sim2``, …), or mappings from a name of your choice to
+            either, ``{"left": "sim://?seed=1"}``.
+        on_error: What happens to the others when one fails; see :class:`Swarm`.
+        missing: A drone that can't be connected to fails the call (``"raise"``) or is left out (``"skip"``), as long
+            as one is left.
+        **options: As for :func:`skyloop.connect`, for each drone.
+
+    Returns:
+        The swarm, a context manager.
+
+    Raises:
+        SwarmError: With the reason of each drone that can't be connected to, after leaving the others.
+        UnknownNameError: If a pattern matches no running proxy.
+        UsageError: If a drone is named twice, none is named, or ``on_error`` or ``missing`` is unknown.
+    """
+    if missing not in ("raise", "skip"):
+        raise UsageError(f'missing is {missing!r} and must be "raise" or "skip"')
+    Swarm.check_policy(on_error)
+    chosen = choose(targets, lambda: running_names(options.get("network"), options.get("keys")))
+
+    def join(target: str) -> Callable[[], Drone]:
+        return lambda: connect(target, **options)
+
+    drones, errors = in_parallel({name: join(target) for name, target in chosen.items()})
+    if errors and (missing == "raise" or not drones):
+        in_parallel({name: drone.leave for name, drone in drones.items()})
+        raise SwarmError("connecting", errors, len(chosen))
+    return Swarm(drones, on_error=on_error, missing=errors)
+
+
+def choose(targets: Iterable[Target], running: Callable[[], Iterable[str]]) -> dict[str, str]:
+    """Return what to connect to, by name, in the order given. Pure.
+
+    Args:
+        targets: As for :func:`swarm`.
+        running: Returns the names of running proxies; called only if there is a pattern.
+
+    Raises:
+        UsageError: If a target makes no sense or is named twice, or there is none.
+        UnknownNameError: If a pattern matches no running proxy.
+    """
+    chosen: dict[str, str] = {}
+    counts: dict[str, int] = {}
+    for target in targets:
+        for name, address in _named(target, running, counts):
+            if name in chosen:
+                raise UsageError(f"{name!r} is named twice: each drone can be in a swarm once")
+            chosen[name] = address
+    if not chosen:
+        raise UsageError('a swarm needs at least one drone: swarm("alpha", "bravo"), or a pattern as swarm("drone*")')
+    return chosen
+
+
+def _named(target: Target, running: Callable[[], Iterable[str]], counts: dict[str, int]) -> Iterable[tuple[str, str]]:
+    if isinstance(target, Mapping):
+        for name, address in target.items():
+            if not isinstance(name, str) or not name or not isinstance(address, str) or not address:
+                raise UsageError(f"{name!r}: {address!r} is no drone: a name and what to connect to are needed")
+        return list(target.items())
+    if not isinstance(target, str) or not target:
+        raise UsageError(f"{target!r} is neither the name of a proxy, a pattern, nor a vehicle's address")
+    if "://" in target:
+        scheme = target.partition("://")[0]
+        counts[scheme] = counts.get(scheme, 0) + 1
+        return [(f"{scheme}{counts[scheme]}", target)]
+    if _WILD.isdisjoint(target):
+        return [(target, target)]
+    known = sorted(running())
+    found = fnmatch.filter(known, target)
+    if not found:
+        raise UnknownNameError("running proxy", target, known)
+    return [(name, name) for name in found]
+
+
+def running_names(network: Network = None, keys: Path | str | None = None) -> list[str]:
+    """Return the names of running proxies, sorted: on this host, and on the network if it is asked for.
+
+    Args:
+        network: As for :func:`connect`.
+        keys: As for :func:`connect`.
+    """
+    from skyloop.transport.local import list_names
+
+    near = {proxy.name for proxy in list_names()}
+    settings = network_settings(network, keys)
+    if settings is None:
+        return sorted(near)
+    from skyloop.transport.fabric import list_proxies
+
+    return sorted(near | {about.name for about in list_proxies(settings)})

@@ -1,215 +1,393 @@
-"""One connection to a proxy, from its first packet to its last: what its transport calls."""
+"""The connection to a proxy: one session after the other, supervised, and made again whenever it is lost."""
 
 from __future__ import annotations
 
+import logging
 import threading
+import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final
+from dataclasses import dataclass, field
+from typing import Final
 
-from skyloop.client.frame import size_error
-from skyloop.client.monitor import LinkMonitor, StallWatch, Thresholds
-from skyloop.client.requests import Requests
-from skyloop.client.timing import Offset, OffsetEstimator
+from skyloop.client.link_monitor import Thresholds
+from skyloop.client.mailbox import Notifier
+from skyloop.client.session import ConnectionHandler, ProxySession
 from skyloop.clock import Clock, nanoseconds
-from skyloop.errors import DecodeError, LinkError
+from skyloop.errors import ClosedError, LinkError, NoAnswerError, RefusedError, SkyloopError
 from skyloop.messages import (
-    Annotation,
     AnyReply,
-    Applied,
-    EncodedFrame,
-    Event,
-    Feedback,
-    FrameHeader,
-    LogEntry,
-    Ping,
-    Pong,
-    ProcessorResult,
-    ProcessorShare,
-    Reply,
-    Sample,
-    VideoRequest,
+    AnyRequest,
+    Hello,
+    LinkState,
+    Refused,
     Welcome,
-    decode,
 )
-from skyloop.transport.base import ClientEnd, Dialer, Pixels, video
+from skyloop.transport.base import FEEDBACK, Dialer
 
-if TYPE_CHECKING:
-    from skyloop.client.link import LinkUser
-
-_VIDEO: Final = video("")
-_PING_CLOCK_NS: Final = nanoseconds(1.0)  #: how often a proxy on another clock is asked for its time
-_PING_FIRST_NS: Final = nanoseconds(0.1)  #: the same at first, until there are some answers to choose from
-_FIRST: Final = 5
+_LOOK_NS: Final = nanoseconds(0.05)  #: how often the link's state is judged
+_log = logging.getLogger("skyloop")
 
 
-class Connection:
-    """Takes what arrives on the transport's receiving thread, decodes and counts it, and hands it on."""
+@dataclass(frozen=True, slots=True)
+class RedialPolicy:
+    """How a lost proxy is reconnected to: for as long as it takes, with growing pauses [s]."""
 
-    def __init__(self, user: LinkUser, poke: Callable[[], None], thresholds: Thresholds, clock: Clock) -> None:
-        self._user = user
-        self._poke = poke
+    first_s: float = 0.02
+    factor: float = 2.0
+    cap_s: float = 0.3
+    hello_s: float = 1.0  #: time for a reached proxy to answer Hello
+    thresholds: Thresholds = field(default_factory=Thresholds)
+
+    def pause_s(self, failures: int) -> float:
+        """Return the pause before the next attempt after ``failures`` failed ones [s]."""
+        return float(min(self.cap_s, self.first_s * self.factor ** min(failures, 30)))
+
+
+class _EndedError(LinkError):
+    """The proxy ended the connection before it said welcome."""
+
+
+class ProxyConnection:
+    """What an application sends and asks through, whichever session with the proxy there is. Any thread.
+
+    It is made before everything that uses it; a :class:`ConnectionSupervisor` makes the sessions.
+    """
+
+    def __init__(self, clock: Clock = time.monotonic_ns) -> None:
+        #: Hands a packet to the transport of the present session; False if it could not be handed over.
+        self.transmit: Callable[[bytes], bool] = _nowhere
+        self.state = LinkState.CONNECTING
+        self.reason = ""
+        self.poked = False  #: the supervisor is to attend to it now
+        self.closing = False
+        self.woken = Notifier()  #: wakes the supervisor
         self._clock = clock
-        self._end: ClientEnd | None = None
-        self._late_ns = nanoseconds(thresholds.late_s)  # a proxy that is silent for so long is asked if it is there
-        self._quiet = False  # closed by us: what still comes is not wanted
-        self._up = False
-        self._pinged_ns = 0
-        self._trips = OffsetEstimator()
-        self._users: dict[str, set[str]] = {}  # requests for video that a camera's plain frames are to meet
-        self._handlers: dict[type, Callable[..., None]] = {
-            Event: user.event,
-            Applied: user.applied,
-            Annotation: user.annotation,
-            LogEntry: user.log_entry,
-            EncodedFrame: user.encoded,
-            ProcessorResult: user.result,
-            ProcessorShare: user.share,
-            Reply: self._reply,
-        }
-        self._take_feedback = user.feedback
-        self._feedback_watch = StallWatch(1.0, clock())
-        self.monitor = LinkMonitor(thresholds, clock())
-        self.requests = Requests(self.send)
-        self.offset_ns = 0  #: the proxy's clock less ours
-        self.closed_reason: str | None = None  #: why it ended, once it has
-        self.receiver = 0  #: identity of the receiving thread
-        self.look_ns = 0  #: when to judge its state next; kept here for the link
-
-    # Set-up and end --------------------------------------------------------------------------------------------
-
-    def dial(self, dialer: Dialer) -> None:
-        """Connect; raises what the dialer raises."""
-        self._end = dialer(self)
-
-    def welcomed(self, welcome: Welcome, sent_ns: int) -> None:
-        """The answer to Hello is the first measure of the offset between the clocks."""
-        if self._end is not None and not self._end.same_clock:
-            self._take_offset(self._trips.add(sent_ns, welcome.now_ns, self._clock()))
-
-    def close(self, error: LinkError) -> None:
-        """End it; open questions get ``error``."""
-        self._quiet = True
-        if self._end is not None:
-            self._end.close()
-        self.requests.fail(error)
+        self._topics: list[str] = []
+        self._lock = threading.Lock()  # guards the topics and the change of session
+        self._session: ProxySession | None = None
+        self._malformed_before = 0  # in earlier sessions
 
     @property
-    def open(self) -> bool:
-        return self.closed_reason is None and not self._quiet
+    def connected(self) -> bool:
+        """Whether, as far as is known, a proxy that has answered Hello is at the other end now."""
+        session = self._session
+        return session is not None and session.open
 
     @property
-    def address(self) -> str:
-        return self._end.address if self._end is not None else "nowhere"
-
-    # Sending ---------------------------------------------------------------------------------------------------
-
-    @property
-    def transmit(self) -> Callable[[bytes], bool]:
-        """The transport's own way to send, for what is sent often."""
-        assert self._end is not None
-        return self._end.send
+    def malformed(self) -> int:
+        """Packets and frames that could not be decoded, in all sessions."""
+        session = self._session
+        return self._malformed_before + (0 if session is None else session.monitor.malformed_count)
 
     @property
-    def knock(self) -> Callable[[], None]:
-        """The transport's way to say that a packet follows at once."""
-        assert self._end is not None
-        return self._end.knock
+    def receiving(self) -> bool:
+        """Whether the calling thread is the receiving one, which must not wait for what it would itself receive."""
+        session = self._session
+        return session is not None and session.receiver == threading.get_ident()
 
-    def send(self, packet: bytes) -> bool:
-        end = self._end
-        return end is not None and not self._quiet and end.send(packet)
+    @property
+    def offset_ns(self) -> int:
+        """Estimate of the proxy's clock minus this process's clock [ns]."""
+        session = self._session
+        return 0 if session is None else session.offset_ns
 
-    def subscribe(self, topic: str, on: bool) -> None:
-        end = self._end
-        if end is None:
-            return
-        if not end.variants and topic.startswith(_VIDEO):
-            # All frames come as they are here, and who wants them otherwise sees to that on this side.
-            plain = VideoRequest.parse(topic).plain.topic
-            users = self._users.setdefault(plain, set())
-            had_users = bool(users)
-            (users.add if on else users.discard)(topic)
-            topic, on = plain, bool(users)
-            if on == had_users:
-                return
-        end.subscribe(topic, on)
-
-    def tick(self, now_ns: int) -> None:
-        """Questions that are due again, and a ping where one is needed."""
-        self.requests.tick(now_ns)
-        end = self._end
-        if end is None:
-            return
-        silent = now_ns - self.monitor.heard_ns > self._late_ns
-        usual_ns = _PING_CLOCK_NS if len(self._trips) >= _FIRST else _PING_FIRST_NS
-        if (silent or not end.same_clock) and now_ns - self._pinged_ns > (self._late_ns if silent else usual_ns):
-            self._pinged_ns = now_ns
-            self.requests.ask(Ping(now_ns), self._ponged, 1.0, now_ns)
-
-    def feedback_stalled(self, now_ns: int) -> bool:
-        """Whether feedback stands still although the proxy answers, and should be subscribed to anew."""
-        self._feedback_watch.heard_ns = self.monitor.feedback_ns
-        return self._feedback_watch.stalled(now_ns - self.monitor.heard_ns < 2 * self._late_ns, now_ns)
-
-    def _ponged(self, answer: AnyReply | LinkError) -> None:
-        if isinstance(answer, Pong) and self._end is not None and not self._end.same_clock:
-            self._take_offset(self._trips.add(answer.sent_ns, answer.now_ns, self._clock()))
-
-    def _take_offset(self, offset: Offset) -> None:
-        self.offset_ns = offset.ns
+    @property
+    def now_ns(self) -> int:
+        """Estimate of the time on the proxy's clock [ns]."""
+        return self._clock() + self.offset_ns
 
     @property
     def uncertainty_ns(self) -> int:
-        """How wrong :attr:`offset_ns` may be by now; 0 where both ends read one clock."""
-        if not self._trips:
-            return 0
-        now = self._trips.at(self._clock())
-        return now.uncertainty_ns + abs(now.ns - self.offset_ns)
+        """Largest error of :attr:`offset_ns` [ns]; 0 where both ends read one clock."""
+        session = self._session
+        return 0 if session is None else session.uncertainty_ns
 
-    # What the transport calls ----------------------------------------------------------------------------------
+    def poke(self) -> None:
+        """Wake the supervisor, so that it attends to the connection now."""
+        self.poked = True
+        self.woken.notify()
 
-    def packet(self, packet: bytes) -> None:
-        now_ns = self._clock()
+    def subscribe(self, topic: str, on: bool = True) -> None:
+        """Subscribe to a topic or unsubscribe, in this session and all that follow.
+
+        Args:
+            topic: Name of the topic.
+            on: False unsubscribes.
+        """
+        with self._lock:
+            if on == (topic in self._topics):
+                return
+            if on:
+                self._topics.append(topic)
+            else:
+                self._topics.remove(topic)
+            if self._session is not None:
+                self._session.subscribe(topic, on)
+
+    def resubscribe(self, topic: str) -> None:
+        """Subscribe again to a topic that seems to have stopped."""
+        with self._lock:
+            if topic in self._topics and self._session is not None:
+                self._session.subscribe(topic, False)
+                self._session.subscribe(topic, True)
+
+    def ask(self, body: AnyRequest, done: Callable[[AnyReply | LinkError], None], timeout_s: float = 2.0) -> None:
+        """Send a request without waiting.
+
+        Args:
+            body: The request.
+            done: Called once with the answer or an error, on another thread or this one; must be quick.
+            timeout_s: After which ``done`` gets a :class:`NoAnswerError` [s].
+        """
+        session = self._session
+        if session is None:
+            done(LinkError(f"the link is {self.state.value}: {self.reason}"))
+        else:
+            session.requests.ask(body, done, timeout_s, self._clock())
+
+    def call(self, body: Callable[[], AnyRequest], timeout_s: float = 2.0) -> AnyReply:
+        """Send a request and wait for the answer. While the link is lost, wait for it to come back.
+
+        Args:
+            body: Makes the request, anew for each attempt.
+            timeout_s: For all of it [s].
+
+        Raises:
+            NoAnswerError: If there is no answer in time.
+            ClosedError: If the drone is closed.
+            LinkError: If called from an inline callback.
+        """
+        if self.receiving:
+            raise LinkError("an inline listener can't wait for an answer, which it would itself have to receive")
+        notifier = Notifier()
+        answers: list[AnyReply | LinkError] = []
+
+        def done(answer: AnyReply | LinkError) -> None:
+            answers.append(answer)
+            notifier.notify()
+
+        deadline = time.monotonic() + timeout_s
+        while not self.closing:
+            left_s = deadline - time.monotonic()
+            self.ask(body(), done, max(left_s, 0.001))
+            notifier.wait_for(lambda: bool(answers), left_s + 1.0)
+            answer = answers.pop() if answers else NoAnswerError("the link's thread has ended")
+            if not isinstance(answer, LinkError):
+                return answer
+            if isinstance(answer, NoAnswerError) or left_s <= 0.02:
+                raise NoAnswerError(f"{answer} ({timeout_s:g} s were given)") from answer
+            notifier.wait_for(lambda: self.closing, 0.02)
+        raise ClosedError("this drone was closed")
+
+    # For the supervisor ----------------------------------------------------------------------------------------
+
+    @property
+    def session(self) -> ProxySession | None:
+        """The present session; None while there is none."""
+        return self._session
+
+    def attach(self, session: ProxySession) -> None:
+        """Send through ``session`` from now on, and subscribe in it to all topics that are wanted."""
+        with self._lock:
+            for topic in self._topics:
+                session.subscribe(topic, True)
+            self._session = session
+            self.transmit = session.transmit
+        self.poke()
+
+    def detach(self) -> ProxySession | None:
+        """Send nowhere until there is another session; return the previous one."""
+        with self._lock:
+            session, self._session = self._session, None
+            self.transmit = _nowhere
+        if session is not None:
+            self._malformed_before += session.monitor.malformed_count
+        return session
+
+
+class ConnectionSupervisor:
+    """Makes one session with the proxy after the other, judges each, and drops those that are lost."""
+
+    def __init__(
+        self,
+        connection: ProxyConnection,
+        handler: ConnectionHandler,
+        dial: Dialer,
+        hello: Hello,
+        *,
+        policy: RedialPolicy | None = None,
+        clock: Clock = time.monotonic_ns,
+        begin: Callable[[ConnectionSupervisor], None] | None = None,
+    ) -> None:
+        """Prepare to connect; :meth:`start` does it.
+
+        Args:
+            connection: Gets each session.
+            handler: Gets what arrives.
+            dial: Makes a connection.
+            hello: First request on each connection.
+            policy: When to reconnect and when a link counts as lost.
+            clock: This process's clock.
+            begin: Sees to it that :meth:`attend` is called from the first session on; None: a thread does.
+        """
+        self.connection = connection
+        self._handler = handler
+        self._dial = dial
+        self._hello = hello
+        self._policy = policy or RedialPolicy()
+        self._clock = clock
+        self._begin = begin or ConnectionSupervisor.attend_for_ever
+        self._failures = 0
+        self._thread = threading.Thread(target=self._run, name="skyloop-link", daemon=True)
+
+    def start(self, timeout_s: float = 5.0) -> None:
+        """Connect for the first time, and keep connected from then on.
+
+        Args:
+            timeout_s: For how long to try again if the proxy does not answer Hello [s].
+
+        Raises:
+            NoAnswerError: If the proxy does not answer Hello.
+            RefusedError: If the proxy refuses the connection.
+            SkyloopError: Whatever else the dialer raises.
+        """
+        deadline = time.monotonic() + timeout_s
+        ended = False
+        while True:
+            try:
+                self._connect()
+                break
+            except NoAnswerError:  # Hello may have been lost, or the proxy starts slowly
+                if time.monotonic() > deadline:
+                    raise
+            except _EndedError:  # the proxy has just failed to start: dialing again raises why
+                if ended:
+                    raise
+                ended = True
+        self._begin(self)
+
+    def close(self) -> None:
+        """End the connection and the thread. Idempotent."""
+        self.connection.closing = True
+        self.connection.poke()
+        started, me = self._thread.ident, threading.get_ident()
+        if started not in (None, me) and not self.connection.receiving:
+            self._thread.join()  # not from an inline callback or the thread itself
+        self._drop(ClosedError("this drone was closed"), "closed by the application")
+        self._set_state(LinkState.CLOSED, "closed by the application")
+
+    def attend_for_ever(self) -> None:
+        """Attend to the connection on a thread of its own until :meth:`close`."""
+        self._thread.start()
+
+    def attend(self) -> float:
+        """Do what is due now.
+
+        Returns:
+            For how long there is nothing to do [s], unless the connection is poked.
+        """
+        self.connection.poked = False
         try:
-            sample: Sample = decode(packet)
-        except DecodeError:
-            self._malformed()
-            return
-        if self._quiet:
-            return
-        if type(sample) is Feedback:
-            if self.monitor.feedback(sample.seq, now_ns):
-                self._take_feedback(sample, now_ns)
-                if not self._up:  # the first one: the link's thread has to say so
-                    self._up = True
-                    self._poke()
-            return
-        handler = self._handlers.get(type(sample))
-        if handler is None:  # nothing that a proxy sends
-            self._malformed()
-            return
-        self.monitor.heard_ns = now_ns
-        handler(sample, now_ns)
+            return self._step()
+        except Exception:  # noqa: BLE001  (whatever goes wrong, the link has to come back)
+            _log.exception("the link's thread failed; it connects anew")
+            self._drop(LinkError("an error in the link"), "an error in the link")
+            return self._policy.cap_s
 
-    def frame(self, header: FrameHeader, pixels: Pixels, topic: str = "") -> None:
+    # On its thread ---------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        while not self.connection.closing:
+            pause_s = self.attend()
+            self.connection.woken.wait_for(lambda: self.connection.poked, pause_s)
+
+    def _step(self) -> float:
+        """Do what is due; return for how long there is nothing to do [s]."""
+        session = self.connection.session
+        if session is None:
+            return self._redial()
         now_ns = self._clock()
-        if self._quiet:
+        if now_ns >= session.look_ns or session.closed_reason is not None or self.connection.state is not LinkState.UP:
+            session.look_ns = now_ns + _LOOK_NS
+            if not self._judge(session, now_ns):
+                return self._policy.pause_s(self._failures)
+        due_ns = min(session.look_ns, self._handler.tick(now_ns))
+        return max(0.0, (due_ns - self._clock()) / 1e9)
+
+    def _judge(self, session: ProxySession, now_ns: int) -> bool:
+        """Update the state of the link; return False if the session was dropped."""
+        session.tick(now_ns)
+        verdict = session.monitor.verdict(now_ns)
+        reason = session.closed_reason or (verdict.reason if verdict.restart else None)
+        if reason is not None:
+            self._drop(LinkError(f"the link was lost: {reason}"), reason)
+            return False
+        if verdict.state is LinkState.UP:
+            self._failures = 0
+        elif session.feedback_stalled(now_ns):
+            self.connection.resubscribe(FEEDBACK)
+        if verdict.state is not LinkState.CONNECTING:
+            self._set_state(verdict.state, verdict.reason)
+        return True
+
+    def _redial(self) -> float:
+        try:
+            self._connect()
+        except (SkyloopError, OSError) as error:
+            self.connection.reason = str(error)
+            return self._policy.pause_s(self._failures)
+        return 0.0
+
+    def _connect(self) -> None:
+        """Dial and say Hello. Counts as a failure until feedback comes, so that pauses grow if it never does."""
+        self._failures += 1
+        session = ProxySession(self._handler, self.connection.poke, self._policy.thresholds, self._clock)
+        session.dial(self._dial)
+        try:
+            welcome = self._welcome(session)
+            self._handler.connected(welcome)
+            self.connection.attach(session)
+        except BaseException:
+            session.close(LinkError("the connection was given up"))
+            raise
+
+    def _welcome(self, session: ProxySession) -> Welcome:
+        answers: list[AnyReply | LinkError] = []
+
+        def done(answer: AnyReply | LinkError) -> None:
+            answers.append(answer)
+            self.connection.woken.notify()
+
+        sent_ns = self._clock()
+        session.requests.ask(self._hello, done, self._policy.hello_s, sent_ns)
+        self.connection.woken.wait_for(
+            lambda: bool(answers) or session.closed_reason is not None or self.connection.closing, self._policy.hello_s
+        )
+        answer = answers[0] if answers else None
+        if isinstance(answer, Welcome):
+            session.welcomed(answer, sent_ns)
+            return answer
+        if isinstance(answer, Refused):
+            raise RefusedError(f"the proxy refused the connection: {answer.message}", code=answer.code.value)
+        if session.closed_reason is not None:
+            raise _EndedError(f"the proxy ended the connection: {session.closed_reason}")
+        raise NoAnswerError(f"the proxy at {session.address} was reached but did not answer: is it stopped?")
+
+    def _drop(self, error: LinkError, reason: str) -> None:
+        session = self.connection.detach()
+        if session is None:
             return
-        if size_error(header, pixels.size):
-            self._malformed()
-            return
-        self.monitor.heard_ns = now_ns
-        self._user.frame(header, pixels, now_ns, topic)
+        session.close(error)
+        self._handler.disconnected(reason)
+        if not self.connection.closing:
+            self._set_state(LinkState.LOST, reason)
 
-    def closed(self, reason: str) -> None:
-        self.closed_reason = reason
-        self._poke()
+    def _set_state(self, state: LinkState, reason: str) -> None:
+        connection = self.connection
+        if state is not connection.state:
+            connection.state, connection.reason = state, reason
+            self._handler.link_changed(state, reason)
 
-    def _reply(self, reply: Reply, now_ns: int) -> None:  # noqa: ARG002  (all handlers are called alike)
-        if not self.receiver:
-            self.receiver = threading.get_ident()
-        self.requests.answered(reply)
 
-    def _malformed(self) -> None:
-        self.monitor.malformed()
-        self._poke()
+def _nowhere(packet: bytes) -> bool:  # noqa: ARG001  (there is no connection to hand it to)
+    return False

@@ -1,52 +1,126 @@
-"""A drone as an application sees it: what it is, and from connecting to closing."""
+"""A drone as an application sees it: commands, readings, callbacks, and the end of a flight."""
 
 from __future__ import annotations
 
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Set
+from contextlib import contextmanager
 from dataclasses import replace
 from types import TracebackType
-from typing import Literal, Self
+from typing import Any, Final, Literal, Protocol, Self, TypeVar, Unpack
 
-from skyloop.client.commander import Commander
-from skyloop.client.config import Config
-from skyloop.client.delivery import Listener
-from skyloop.client.flying import Flying
-from skyloop.client.link import Link, RedialPolicy
-from skyloop.client.logbook import Logbook
-from skyloop.client.pace import Pace
-from skyloop.client.pilot import Pilot
-from skyloop.client.reception import LinkStatus, Reception
-from skyloop.client.result_reading import ResultReading
+import msgspec
+import numpy as np
+
+from skyloop.client.authority import (
+    Authority,
+    AuthorityStatus,
+    TakeoverAnswer,
+    TakeoverRequest,
+    TakeoverWay,
+    answering,
+    authority_wish,
+)
+from skyloop.client.channels import Channel, Listener, Processor, VideoChannel, VideoOptions
+from skyloop.client.command_schedule import CommandSchedule
+from skyloop.client.commands import CommandSender, checked, number
+from skyloop.client.completion import ActionWait
+from skyloop.client.connection import ConnectionSupervisor, ProxyConnection, RedialPolicy
+from skyloop.client.frame import Arrival, Frame
+from skyloop.client.logbook import Logbook, checked_time
+from skyloop.client.mailbox import Mailbox
+from skyloop.client.parameters import Config
+from skyloop.client.results import (
+    Result,
+    ResultChannel,
+    ResultListener,
+    ResultMailbox,
+    checked_age,
+    checked_name,
+    is_old,
+    silence,
+)
+from skyloop.client.scheduler import Scheduler
 from skyloop.client.statistics import ChannelStats, Distribution
-from skyloop.client.takeover import TakeoverAnswer, TakeoverRequest, TakeoverWay, answering
-from skyloop.errors import AuthorityError, LinkError, NoAnswerError, SkyloopError, UsageError
+from skyloop.client.telemetry import ClientState, LinkStatus, Mailboxes, Receiver, Wanted, as_predicate
+from skyloop.client.worker import Membership
+from skyloop.errors import (
+    AuthorityError,
+    ClosedError,
+    LinkError,
+    NoAnswerError,
+    SkyloopError,
+    UnknownNameError,
+    UnsupportedError,
+    UsageError,
+)
 from skyloop.messages import (
+    Annotation,
+    AnyAction,
+    Applied,
+    Attitude,
+    Capabilities,
+    EmergencyStop,
     Event,
+    EventKind,
+    Feedback,
+    FlightState,
     GetStatistics,
     Hello,
+    Hover,
+    Idle,
+    Land,
     LinkState,
+    LogEntry,
+    ResetEmergency,
     Role,
+    Severity,
     Statistics,
+    Takeoff,
     Vector,
     VehiclePose,
+    Velocity,
     encode,
 )
+from skyloop.messages.annotation import Shape
+from skyloop.messages.result import MAX_CODE
+from skyloop.messages.video import DEFAULT_QUALITY, VideoEncoding, VideoRequest
 from skyloop.transport.base import EVENTS, FEEDBACK, Dialer
 
+T = TypeVar("T")
 Access = Literal["pilot", "observe"]
 OnExit = Literal["land", "hover"]
+EVENT_DEPTH: Final = 256  #: how many events, log entries and the like wait for a slow callback
+_UP: Final = frozenset({FlightState.HOVERING, FlightState.FLYING})
+_DOWN: Final = frozenset({FlightState.LANDED})
 _log = logging.getLogger("skyloop")
 
 
-class Drone(Flying, ResultReading):
-    """One vehicle, connected; made by :func:`skyloop.connect`. A context manager; every method may be called from any
-    thread.
+class _Closable(Protocol):
+    def close(self) -> None: ...
 
-    At the end of its block a drone that is in the air and held by this application is landed, and the authority
-    given back. A lost proxy is looked for until it is back, and everything is put back then but old set-points.
+
+class Drone:
+    """A connected vehicle, made by :func:`skyloop.connect`.
+
+    It is a context manager, and every method may be called from any thread. At the end of its block a drone that is in
+    the air and whose authority this application holds is landed, and the authority released. A lost proxy is
+    reconnected to for as long as it takes; then everything is restored except old set-points.
+
+    Body axes are x forward, y left, z up (REP 103); units are SI and radians. Every command is the full desired state:
+    it is sent at once and repeated at ``rate_hz`` until the next one. Each command returns True if it was handed to the
+    transport now, and False if it could not be because the link is down or the authority is still awaited; it is then
+    sent when both are there, if it is less than half a second old. Every command raises:
+
+    - :class:`AuthorityError` while another application holds the authority or none was requested,
+    - :class:`UsageError` for numbers that are not finite,
+    - :class:`UnsupportedError` for a vehicle that takes no commands,
+    - :class:`ClosedError` after :meth:`close`.
+
+    The names of the reading methods say what they give: the newest sample (:meth:`feedback`, :meth:`frame`), the next
+    unread one (:meth:`next_feedback`, :meth:`next_frame`), or all that come (:meth:`frames`, :meth:`on_feedback`).
     """
 
     def __init__(
@@ -59,45 +133,72 @@ class Drone(Flying, ResultReading):
         stall_s: float = 1.0,
         on_exit: OnExit = "land",
         policy: RedialPolicy | None = None,
-        pace: Pace | None = None,
+        scheduler: Scheduler | None = None,
         on_close: Callable[[], None] | None = None,
         reach: str | None = None,
     ) -> None:
+        """Prepare a drone without connecting; :meth:`open` connects.
+
+        Args:
+            dial: Makes a connection to the proxy each time one is needed.
+            app: Name of this application, 1 to 64 characters.
+            access: ``"pilot"`` may command, ``"observe"`` only reads.
+            rate_hz: Rate at which commands are repeated, 1 to 200 Hz.
+            stall_s: Time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never.
+            on_exit: What an airborne vehicle does at the end of the block, ``"land"`` or ``"hover"``.
+            policy: When to reconnect and when a link counts as lost.
+            scheduler: Source of the time and of waiting; None: real time.
+            on_close: Called at the end of :meth:`close`, on the closing thread.
+            reach: Name or address under which another process reaches the same vehicle; None if none can.
+
+        Raises:
+            UsageError: If ``access``, ``on_exit``, ``app``, ``rate_hz`` or ``stall_s`` is out of range.
+        """
         if access not in ("pilot", "observe"):
             raise UsageError(f'access is {access!r} and must be "pilot" or "observe"')
         if on_exit not in ("land", "hover"):
             raise UsageError(f'on_exit is {on_exit!r} and must be "land" or "hover"')
         if not 1 <= len(app) <= 64:
             raise UsageError(f"an application's name has 1 to 64 characters, not {len(app)}: {app!r:.80}")
-        super().__init__()
         role = Role.PILOT if access == "pilot" else Role.OBSERVER
+        scheduler = scheduler or Scheduler()
         self._app = app
         self._role = role
         self._on_exit = on_exit
         self._on_close = on_close
-        #: What another process connects to for the same vehicle; None if only this process can reach it.
+        self._closed = False
+        self._listeners: list[Listener[Any]] = []
+        self._to_close: list[_Closable] = []  # what ends with the drone
+        self._read: Feedback | None = None  # the last sample that feedback() or next_feedback() returned
+        #: Name or address under which another process reaches the same vehicle; None if none can.
         self.reach = reach
-        commander = Commander(rate_hz=rate_hz, stall_s=stall_s)
-        pace = pace or Pace()
-        reception = self._reception = Reception(app, pace)
-        self._link = reception.link = Link(
-            dial, Hello(app, role), reception, policy=policy, clock=pace.clock, begin=pace.begin
-        )
-        reception.results.link = self._link
-        self.config = reception.config = Config(self._link, lambda: self._pilot.status.lease, reception.tell)
-        self.log = Logbook(self._link, app, self._now_ns)
-        self._pilot = reception.pilot = Pilot(
-            app,
+        # Each part uses those before it; the receiver handles what arrives in every session.
+        connection = self._connection = ProxyConnection(scheduler.clock)
+        authority = Authority(app)
+        state = self._state = ClientState(app, connection, scheduler)
+        self.config = Config(connection, authority, state.emit)
+        self.log = Logbook(connection, app)
+        self._commands = CommandSender(
             role,
-            commander,
-            pace,
-            tell=reception.tell,
-            changed=lambda _: reception.bell.ring(),
+            authority,
+            CommandSchedule(rate_hz=rate_hz, stall_s=stall_s),
+            connection,
+            scheduler,
+            emit=state.emit,
+            changed=state.notifier.notify,
             granted=self.config.granted,
         )
-        self._pilot.link = self._link
+        self._supervisor = ConnectionSupervisor(
+            connection,
+            Receiver(app, state, connection, self._commands, self.config),
+            dial,
+            Hello(app, role),
+            policy=policy,
+            clock=scheduler.clock,
+            begin=scheduler.begin,
+        )
         for topic in (EVENTS, FEEDBACK):
-            self._link.subscribe(topic)
+            connection.subscribe(topic)
 
     def open(
         self,
@@ -109,87 +210,87 @@ class Drone(Flying, ResultReading):
         takeover: TakeoverWay = "now",
         stay: bool = False,
     ) -> Self:
-        """Connect, and wait for feedback and (as a pilot) for the authority. What :func:`skyloop.connect` calls."""
+        """Connect, then wait for feedback and, as a pilot, for the authority.
+
+        :func:`skyloop.connect` calls it. Closes the drone if anything fails.
+
+        Args:
+            priority: Of the request for the authority, 0 (highest) to 31.
+            wait_s: How long to wait in the queue for the authority [s].
+            timeout_s: Time for the proxy to answer and to send its first feedback [s].
+            for_s: See :meth:`request_authority`.
+            takeover: See :meth:`request_authority`.
+            stay: See :meth:`request_authority`.
+
+        Returns:
+            The drone itself.
+
+        Raises:
+            NoAnswerError: If no answer or no feedback comes in time.
+            RefusedError: If the proxy refuses the connection.
+            AuthorityError: If the authority can't be had.
+            LinkError: If the proxy can't be reached.
+        """
         try:
             deadline = time.monotonic() + timeout_s
-            self._link.start(timeout_s)
+            self._supervisor.start(timeout_s)
             left_s = max(0.1, deadline - time.monotonic())
-            if not self._reception.bell.wait_for(self._known, left_s):
+            if not self._state.notifier.wait_for(self._known, left_s):
                 raise NoAnswerError(f"{self.name} answered, but told nothing of its vehicle within {timeout_s:g} s")
             if self._role is Role.PILOT:
                 self.request_authority(priority, wait_s=wait_s, for_s=for_s, takeover=takeover, stay=stay)
-            self._reception.pace.opened()
+            self._state.scheduler.opened()
         except BaseException:
             self.close()
             raise
         return self
 
-    # For vehicles that fly by what others see ------------------------------------------------------------------
-
-    def tell_pose(
-        self,
-        position: Vector,
-        quaternion: tuple[float, float, float, float],
-        *,
-        at_ns: int | None = None,
-        position_std_m: float | None = None,
-        attitude_std_rad: float | None = None,
-    ) -> bool:
-        """Tell the vehicle itself where it was seen from outside: for an autopilot that flies by that, without GPS.
-
-        ``position``: x east, y north, z up [m]; ``quaternion``: x, y, z, w, from body axes (x forward, y left, z up) to
-        the world's; ``at_ns``: when, on the proxy's clock (default: now); standard deviations if they are known. Any
-        thread; nothing waits, and the authority is not needed. Returns whether it was handed over; a vehicle that
-        takes none is told of by an event (``command_refused``).
-
-        Raises :class:`AuthorityError` for an observer and :class:`UsageError` for what is no pose.
-        """
-        if self._role is not Role.PILOT:
-            raise AuthorityError('tell_pose: this application observes; connect with access="pilot"', code="observer")
-        numbers = (*position, *quaternion, position_std_m or 0.0, attitude_std_rad or 0.0)
-        if len(position) != 3 or len(quaternion) != 4 or not all(map(math.isfinite, numbers)):
-            raise UsageError(f"a pose has three and four finite numbers, not {position!r} and {quaternion!r}")
-        known_ns = self._now_ns() if at_ns is None else at_ns
-        pose = VehiclePose(known_ns, position, quaternion, position_std_m, attitude_std_rad)
-        return self._link.transmit(encode(pose))
-
-    # What it is ------------------------------------------------------------------------------------------------
+    # Properties --------------------------------------------------------------------------------------------------
 
     @property
     def name(self) -> str:
-        """The proxy's name."""
-        return "" if self._reception.welcome is None else self._reception.welcome.proxy
+        """Name of the proxy; empty before the first connection."""
+        return "" if self._state.welcome is None else self._state.welcome.proxy
 
     @property
     def uri(self) -> str:
-        """The vehicle's address."""
-        return "" if self._reception.welcome is None else self._reception.welcome.uri
+        """Address of the vehicle; empty before the first connection."""
+        return "" if self._state.welcome is None else self._state.welcome.uri
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """Actions and cameras of the vehicle; ``vehicle`` is ``unknown`` before the first connection."""
+        welcome = self._state.welcome
+        return Capabilities("unknown") if welcome is None else welcome.capabilities
 
     @property
     def clock_offset_ns(self) -> int:
-        """The proxy's clock less this process's [ns], as estimated."""
-        return self._link.offset_ns
+        """Estimate of the proxy's clock minus this process's clock [ns]."""
+        return self._connection.offset_ns
 
     @property
     def now_ns(self) -> int:
-        """The time on the proxy's clock [ns], as estimated; in a replay in step, the flight's."""
-        return self._link.now_ns
+        """Estimate of the time on the proxy's clock [ns]; in a stepped replay, the time of the recorded flight."""
+        return self._connection.now_ns
 
     @property
     def clock_uncertainty_ns(self) -> int:
-        """How wrong :attr:`clock_offset_ns` may be [ns], and with it each age and delay; 0 on the proxy's own host."""
-        return self._link.uncertainty_ns
+        """Largest error of :attr:`clock_offset_ns` [ns], and so of each age and delay; 0 where both share one clock."""
+        return self._connection.uncertainty_ns
 
     @property
     def app_id(self) -> int:
-        """This application's number in this run of the proxy."""
-        return self._pilot.app_id
+        """Number of this application in this run of the proxy."""
+        return self._commands.app_id
 
     @property
     def link(self) -> LinkStatus:
-        """State of both hops; the reason is of the last change, or why the last attempt to connect again failed."""
-        status = self._reception.status
-        return replace(status, reason=self._link.reason) if status.application is LinkState.LOST else status
+        """State of both hops, application to proxy and proxy to vehicle.
+
+        ``reason`` is that of the last change or, while the proxy is lost, why the last attempt to reconnect failed.
+        """
+        status = self._state.status
+        return replace(status, reason=self._connection.reason) if status.application is LinkState.LOST else status
 
     @property
     def closed(self) -> bool:
@@ -200,50 +301,784 @@ class Drone(Flying, ResultReading):
     def stats(self) -> dict[str, ChannelStats]:
         """Statistics by channel: ``command``, ``feedback``, ``video/<camera>``, ``results/<processor>``.
 
-        The command delay is that of this application's echoes while somebody listens to them (:meth:`on_command`),
-        else what the proxy measured over all pilots, for which it is asked.
+        The delay of ``command`` comes from the echoes of this application's commands while :meth:`on_command` has a
+        callback. Otherwise the proxy is asked for the delay over all pilots, which waits up to 0.2 s.
         """
-        found = self._reception.stats()
+        found = self._state.stats(self._commands.sends)
         uncertainty_s = self.clock_uncertainty_ns / 1e9
         found = {name: replace(stats, uncertainty_s=uncertainty_s) for name, stats in found.items()}
-        if found["command"].delay_s is None and self._link.connected and not self._link.receiving:
+        if found["command"].delay_s is None and self._connection.connected and not self._connection.receiving:
             found["command"] = _with_delay(found["command"], self._proxy_statistics())
         return found
 
     def recent_events(self) -> list[Event]:
-        """The last 256 events, oldest first."""
-        return list(self._reception.recent)
+        """Return the last 256 events, oldest first."""
+        return list(self._state.recent)
 
     def on_takeover(self, function: Callable[[TakeoverRequest], TakeoverAnswer]) -> Listener[Event]:
-        """Call when another application asks for the authority that this one holds, on a thread of its own.
+        """Call ``function`` when another application asks for the authority that this one holds.
 
-        The function returns True to hand it over, False or a text (the reason) to decline, None to leave it to the
-        proxy: after its ``authority.ask_s`` a strictly higher priority wins in any case.
+        Args:
+            function: Called on a thread of its own. It returns True to hand the authority over, False or a reason (a
+                text) to decline, and None to leave the decision to the proxy. In any case a strictly higher priority
+                wins after the proxy's ``authority.ask_s``.
+
+        Returns:
+            The listener; ``cancel()`` ends it.
+
+        Raises:
+            UsageError: If ``function`` can't be called.
+            ClosedError: If the drone was closed.
         """
-        return self.on_event(answering(function, self._pilot))
+        return self.on_event(answering(function, lambda: self.app_id, self._commands.answer))
+
+    # Authority and commands --------------------------------------------------------------------------------------
+
+    @property
+    def authority(self) -> AuthorityStatus:
+        """Current state of this application's authority."""
+        return self._commands.status
+
+    def request_authority(
+        self,
+        priority: int | None = None,
+        *,
+        wait_s: float = 0.0,
+        for_s: float | None = None,
+        takeover: TakeoverWay = "now",
+        stay: bool = False,
+    ) -> AuthorityStatus:
+        """Ask for the authority and wait for it.
+
+        A holder of lower priority is pre-empted at once, or with ``takeover="ask"`` asked first, and pre-empted when it
+        agrees or after the proxy's ``authority.ask_s``. With ``"ask"`` a holder of the same or higher priority is asked
+        too, and may decline. Once held the authority is kept: after a lost link it is requested again, and after a
+        pre-emption it comes back when the other application releases it.
+
+        Args:
+            priority: 0 (highest) to 31 (lowest); None: as in the last request.
+            wait_s: How long to wait in the queue [s].
+            for_s: How long the authority is wanted [s], up to a day; then it goes to whoever wants it. None: open.
+            takeover: ``"now"`` pre-empts a lower holder at once, ``"ask"`` asks the holder first.
+            stay: Stay in the queue after ``wait_s`` instead of raising.
+
+        Returns:
+            The status: held, or with ``stay`` also queued, with the position and the expected wait.
+
+        Raises:
+            AuthorityError: If it is not held after ``wait_s`` (the message names the holder), if the proxy refuses it,
+                or if this application only observes.
+            NoAnswerError: If the proxy does not answer the request.
+            UsageError: If ``priority``, ``for_s`` or ``takeover`` is out of range.
+            ClosedError: If the drone was closed.
+        """
+        self._check_open()
+        wish = authority_wish(self._commands.status.priority if priority is None else priority, for_s, takeover)
+        return self._commands.request(wish, wait_s, stay=stay)
+
+    def release_authority(self) -> None:
+        """Release the authority, or leave the queue, and wait until the proxy has confirmed it.
+
+        Does nothing if the authority is neither held nor wanted.
+
+        Raises:
+            NoAnswerError: If the proxy does not answer.
+            ClosedError: If the drone was closed.
+        """
+        self._check_open()
+        self._commands.release()
+
+    def command(self, action: AnyAction) -> bool:
+        """Make ``action`` the newest set-point.
+
+        Returns:
+            Whether it was handed to the transport now; see :class:`Drone` for this and for what is raised.
+        """
+        return self._command(checked(action))
+
+    @property
+    def open_ns(self) -> int:
+        """Time on this process's clock from which a new set-point is sent at once [ns]: 5 ms after the last new one."""
+        return self._commands.open_ns
+
+    def takeoff(self, *, wait: bool = True, timeout_s: float = 15.0) -> bool:
+        """Take off, then hover.
+
+        Args:
+            wait: Wait until the vehicle hovers or flies.
+            timeout_s: How long to wait [s].
+
+        Returns:
+            Whether the command was handed to the transport at once.
+
+        Raises:
+            NoAnswerError: If the vehicle does not hover in time; names its state and, if known, the reason.
+            RefusedError: If the proxy refuses to take off in the present state.
+            UnsupportedError: If the vehicle can't take off.
+            AuthorityError: If the authority is not held, or another application takes it over meanwhile.
+            ClosedError: If the drone is closed.
+            UsageError: If called with ``wait`` from an inline callback; nothing is sent.
+        """
+        return self._complete(Takeoff(), _UP, wait, timeout_s)
+
+    def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> bool:
+        """Land at the present position.
+
+        While this waits, a landing that was ended by a failsafe, a lost link or a lost lease is commanded again.
+
+        Args:
+            wait: Wait until the vehicle has landed.
+            timeout_s: How long to wait [s].
+
+        Returns:
+            Whether the command was handed to the transport at once.
+
+        Raises:
+            NoAnswerError: If the vehicle has not landed in time; names its state and, if known, the reason.
+            RefusedError: If the proxy refuses to land in the present state.
+            UnsupportedError: If the vehicle can't land.
+            AuthorityError: If the authority is not held, or another application takes it over meanwhile.
+            ClosedError: If the drone is closed.
+            UsageError: If called with ``wait`` from an inline callback; the landing is commanded all the same.
+        """
+        return self._complete(Land(), _DOWN, wait, timeout_s)
+
+    def hover(self) -> bool:
+        """Stop and hold the position. Returns and raises as every command; see :class:`Drone`."""
+        return self._command(Hover())
+
+    def idle(self) -> bool:
+        """Ask for nothing: keep the authority and leave the vehicle as it is."""
+        return self._command(Idle())
+
+    def velocity(self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, yaw_rate: float = 0.0) -> bool:
+        """Fly with a velocity in the levelled body axes, which turn with the yaw but not with roll and pitch.
+
+        Args:
+            forward: Along x, forward [m/s].
+            left: Along y, to the left [m/s].
+            up: Along z, up [m/s].
+            yaw_rate: Counter-clockwise seen from above [rad/s].
+
+        Returns:
+            Whether it was handed to the transport now; see :class:`Drone` for this and for what is raised.
+        """
+        return self._command(
+            Velocity(number("forward", forward), number("left", left), number("up", up), number("yaw_rate", yaw_rate))
+        )
+
+    def attitude(self, *, roll: float = 0.0, pitch: float = 0.0, climb: float = 0.0, yaw_rate: float = 0.0) -> bool:
+        """Hold an attitude with a climb rate.
+
+        Args:
+            roll: Right side down is positive and accelerates to the right [rad].
+            pitch: Nose down is positive and accelerates forward [rad].
+            climb: Vertical velocity, up [m/s].
+            yaw_rate: Counter-clockwise seen from above [rad/s].
+
+        Returns:
+            Whether it was handed to the transport now; see :class:`Drone` for this and for what is raised.
+        """
+        return self._command(
+            Attitude(number("roll", roll), number("pitch", pitch), number("climb", climb), number("yaw_rate", yaw_rate))
+        )
+
+    def emergency_stop(self) -> bool:
+        """Cut the motors at once: the vehicle falls.
+
+        Needs no authority, only ``access="pilot"``.
+
+        Raises:
+            AuthorityError: If this application only observes.
+            UnsupportedError: If the vehicle takes no commands.
+            ClosedError: If the drone was closed.
+        """
+        return self._command(EmergencyStop())
+
+    def reset_emergency(self) -> bool:
+        """Leave the emergency state, on the ground."""
+        return self._command(ResetEmergency())
+
+    def tell_pose(
+        self,
+        position: Vector,
+        quaternion: tuple[float, float, float, float],
+        *,
+        at_ns: int | None = None,
+        position_std_m: float | None = None,
+        attitude_std_rad: float | None = None,
+    ) -> bool:
+        """Send the vehicle its own pose as measured from outside, for an autopilot that flies by it instead of GPS.
+
+        May be called from any thread, does not wait, and needs no authority. A vehicle that takes no poses answers with
+        an event (``command_refused``).
+
+        Args:
+            position: x east, y north, z up [m].
+            quaternion: x, y, z, w of the rotation from body axes (x forward, y left, z up) to world axes.
+            at_ns: When it was measured, on the proxy's clock [ns]; None: now.
+            position_std_m: Standard deviation of the position [m], if known.
+            attitude_std_rad: Standard deviation of the attitude [rad], if known.
+
+        Returns:
+            Whether it was handed to the transport.
+
+        Raises:
+            AuthorityError: If this application only observes.
+            UsageError: If a number is missing or not finite, or ``at_ns`` is out of range.
+        """
+        if self._role is not Role.PILOT:
+            raise AuthorityError('tell_pose: this application observes; connect with access="pilot"', code="observer")
+        numbers = (*position, *quaternion, position_std_m or 0.0, attitude_std_rad or 0.0)
+        if len(position) != 3 or len(quaternion) != 4 or not all(map(math.isfinite, numbers)):
+            raise UsageError(f"a pose has three and four finite numbers, not {position!r} and {quaternion!r}")
+        known_ns = self.now_ns if at_ns is None else checked_time(at_ns)
+        pose = VehiclePose(known_ns, position, quaternion, position_std_m, attitude_std_rad)
+        return self._connection.transmit(encode(pose))
+
+    # Reading ---------------------------------------------------------------------------------------------------
+
+    def feedback(self, *, max_age_s: float | None = None) -> Feedback:
+        """Return the newest feedback.
+
+        Args:
+            max_age_s: Oldest age since capture that is accepted [s]; None: any.
+
+        Raises:
+            NoAnswerError: If no feedback has come yet, or the newest is older than ``max_age_s``.
+            ClosedError: If the drone was closed.
+        """
+        self._check_open()
+        newest = self._state.newest
+        if newest is None:
+            raise NoAnswerError("no feedback has come yet")
+        if max_age_s is not None:
+            age_s = self.age_s(newest)
+            if age_s > max_age_s:
+                raise NoAnswerError(f"the newest feedback is {age_s:.3f} s old, {max_age_s:g} s were allowed")
+        self._read = newest
+        return newest
+
+    def age_s(self, sample: Feedback | Frame) -> float:
+        """Return the time since the sample's capture [s], within ``clock_uncertainty_ns``."""
+        return (self.now_ns - sample.captured_ns) / 1e9
+
+    def next_feedback(self, timeout_s: float = 1.0) -> Feedback:
+        """Wait for feedback that was not read before, and return the newest.
+
+        Args:
+            timeout_s: How long to wait [s].
+
+        Raises:
+            NoAnswerError: If none comes in time.
+            ClosedError: If the drone is closed.
+            UsageError: If called from an inline callback.
+        """
+        self._check_open()
+        self._check_may_wait()
+        state = self._state
+        if not state.notifier.wait_for(lambda: state.newest is not self._read or self._closed, timeout_s):
+            raise NoAnswerError(f"no feedback came within {timeout_s:g} s: the link is {self._connection.state.value}")
+        return self.feedback()
+
+    def frame(self, camera: str | None = None, *, max_age_s: float | None = None) -> Frame | None:
+        """Return the newest frame without waiting.
+
+        The first call subscribes to the camera, for good.
+
+        Args:
+            camera: Name of the camera; None: the vehicle's first.
+            max_age_s: Oldest age since capture that is accepted [s]; None: any.
+
+        Returns:
+            The frame; None if none has come yet, it is too old, or it can't be decoded.
+
+        Raises:
+            UnknownNameError: If the vehicle has no camera of this name.
+            UnsupportedError: If the vehicle has no camera.
+            ClosedError: If the drone was closed.
+        """
+        channel = self.channel(camera)
+        channel.keep()
+        arrival = channel.newest
+        if arrival is None or (max_age_s is not None and arrival.age_s > max_age_s):
+            return None
+        return channel.picture(arrival)
+
+    def next_frame(self, camera: str | None = None, *, timeout_s: float = 1.0) -> Frame:
+        """Wait for a frame that this method has not returned before, and return the newest.
+
+        The first call subscribes to the camera, for good.
+
+        Args:
+            camera: Name of the camera; None: the vehicle's first.
+            timeout_s: How long to wait [s].
+
+        Raises:
+            NoAnswerError: If none comes in time.
+            UnknownNameError: If the vehicle has no camera of this name.
+            UnsupportedError: If the vehicle has no camera.
+            ClosedError: If the drone is closed.
+            UsageError: If called from an inline callback.
+        """
+        channel = self.channel(camera)
+        channel.keep()
+        self._check_may_wait()
+        deadline = time.monotonic() + timeout_s
+        while channel.notifier.wait_for(lambda: channel.unread or self._closed, deadline - time.monotonic()):
+            self._check_open()
+            frame = channel.read()
+            if frame is not None:
+                return frame
+        raise NoAnswerError(f"no frame of {channel.camera.name} came within {timeout_s:g} s")
+
+    def frames(
+        self,
+        camera: str | None = None,
+        *,
+        timeout_s: float = 5.0,
+        **how: Unpack[VideoOptions],
+    ) -> Iterator[Frame]:
+        """Yield each newest frame until the drone is closed; a slow loop skips frames.
+
+        Errors are raised by the first iteration, not by the call.
+
+        Args:
+            camera: Name of the camera; None: the vehicle's first.
+            timeout_s: How long to wait for each frame [s].
+            **how: ``max_fps``: at most so many frames a second. ``scale``: factor for width and height, above 0 and up
+                to 1. ``part``: (k, n), only every n-th frame, for n workers with k from 0 that share them.
+                ``encoding``: how frames travel over a network, ``"jpeg"`` (of ``quality`` 1 to 100, default 80) or
+                ``"raw"``; on one host all travel raw.
+
+        Raises:
+            NoAnswerError: If no frame comes within ``timeout_s``.
+            UnknownNameError: If the vehicle has no camera of this name.
+            UnsupportedError: If the vehicle has no camera.
+            UsageError: If an option is out of range, or from an inline callback.
+            ClosedError: If the drone was closed before.
+        """
+        channel = self.channel(camera, **how)
+        mailbox: Mailbox[Arrival] = Mailbox(notifier=self._state.scheduler.notifier())
+        self._check_may_wait()
+        with self._closing(mailbox), channel.into(mailbox):
+            while not self._closed:
+                arrival = mailbox.wait(timeout_s)
+                if arrival is not None:
+                    frame = channel.picture(arrival)
+                    if frame is not None:
+                        yield frame
+                elif not mailbox.closed:
+                    raise NoAnswerError(f"no frame of {channel.camera.name} came within {timeout_s:g} s")
+
+    def wait(self, state: Wanted, timeout_s: float = 10.0) -> Feedback:
+        """Wait until the newest feedback is as wanted.
+
+        Args:
+            state: A flight state or its name, several of them, or a predicate on feedback, which is called on this
+                thread.
+            timeout_s: How long to wait [s].
+
+        Returns:
+            The feedback that met it.
+
+        Raises:
+            NoAnswerError: If it is not met in time; names the present state.
+            UnknownNameError: If there is no flight state of that name.
+            ClosedError: If the drone is closed.
+            UsageError: If called from an inline callback.
+        """
+        self._check_open()
+        self._check_may_wait()
+        wanted, what = as_predicate(state)
+        met: list[Feedback] = []
+
+        def look() -> bool:
+            newest = self._state.newest
+            if newest is not None and wanted(newest):
+                met.append(newest)
+            return bool(met) or self._closed
+
+        if not self._state.notifier.wait_for(look, timeout_s):
+            newest = self._state.newest
+            now = "nothing is known of it" if newest is None else f"it is {newest.state.value}"
+            raise NoAnswerError(f"the vehicle was not {what} within {timeout_s:g} s: {now}")
+        if not met:
+            raise ClosedError("this drone was closed")
+        return met[0]
+
+    # Callbacks -------------------------------------------------------------------------------------------------
+
+    def on_feedback(self, function: Callable[[Feedback], object], *, inline: bool = False) -> Listener[Feedback]:
+        """Call ``function`` with the newest feedback.
+
+        Like every ``on_...`` method it returns a :class:`Listener`, whose ``cancel()`` ends it, and raises
+        :class:`UsageError` if ``function`` can't be called and :class:`ClosedError` if the drone was closed.
+
+        Args:
+            function: Called on a thread of its own; feedback that newer feedback overtakes is dropped and counted.
+            inline: Call it on the receiving thread instead, with every sample. It must be quick and must not wait.
+        """
+        return self._listen(self._state.on_feedback, function, "feedback", inline=inline)
+
+    def on_event(self, function: Callable[[Event], object], *, inline: bool = False) -> Listener[Event]:
+        """Call ``function`` with each event, including the client's own (number 0).
+
+        Args:
+            function: Called on a thread of its own; up to 256 events wait for it.
+            inline: Call it on the receiving thread instead, or for the client's own events on the thread that emits
+                them.
+        """
+        return self._listen(self._state.on_event, function, "event", depth=EVENT_DEPTH, inline=inline)
+
+    def on_link(self, function: Callable[[LinkStatus], object]) -> Listener[LinkStatus]:
+        """Call ``function``, on a thread of its own, whenever one of the two hops changes its state; up to 256 wait."""
+        return self._listen(self._state.on_link, function, "link", depth=EVENT_DEPTH)
+
+    def on_command(self, function: Callable[[Applied], object], *, inline: bool = False) -> Listener[Applied]:
+        """Call ``function`` with what the proxy made of each command of any application.
+
+        Args:
+            function: Called on a thread of its own; up to 256 wait for it.
+            inline: Call it on the receiving thread instead.
+        """
+        return self._listen(self._state.on_command, function, "command", depth=EVENT_DEPTH, inline=inline)
+
+    def on_annotation(self, function: Callable[[Annotation], object], *, inline: bool = False) -> Listener[Annotation]:
+        """Call ``function`` with what any application draws on a frame.
+
+        Args:
+            function: Called on a thread of its own; up to 256 wait for it.
+            inline: Call it on the receiving thread instead.
+        """
+        return self._listen(self._state.on_annotation, function, "annotation", depth=EVENT_DEPTH, inline=inline)
+
+    def on_log(self, function: Callable[[LogEntry], object], *, inline: bool = False) -> Listener[LogEntry]:
+        """Call ``function`` with what any application logs, this one included (see ``drone.log``).
+
+        Args:
+            function: Called on a thread of its own; up to 256 entries wait for it.
+            inline: Call it on the receiving thread instead.
+        """
+        return self._listen(self._state.on_log, function, "log", depth=EVENT_DEPTH, inline=inline)
+
+    def add_processor(
+        self,
+        function: Callable[[Frame], object],
+        camera: str | None = None,
+        *,
+        name: str | None = None,
+        depth: int = 1,
+        inline: bool = False,
+        **how: Unpack[VideoOptions],
+    ) -> Processor[Arrival]:
+        """Call ``function`` with frames.
+
+        Args:
+            function: Called on a thread of its own with the newest ``depth`` frames that it has not seen.
+            camera: Name of the camera; None: the vehicle's first.
+            name: For threads and error messages; None: the function's.
+            depth: How many frames may wait, at least 1; older ones are dropped and counted.
+            inline: Call it on the receiving thread instead, with every frame. It must be quick and must not wait.
+            **how: As for :meth:`frames`.
+
+        Returns:
+            The listener; ``cancel()`` ends it.
+
+        Raises:
+            UsageError: If ``function`` can't be called or an option is out of range.
+            UnknownNameError: If the vehicle has no camera of this name.
+            UnsupportedError: If the vehicle has no camera.
+            ClosedError: If the drone was closed.
+        """
+        if depth < 1:
+            raise UsageError(f"depth is {depth!r} and must be at least 1 frame")
+        channel = self.channel(camera, **how)
+
+        def process(arrival: Arrival) -> None:
+            frame = channel.picture(arrival)
+            if frame is not None:
+                function(frame)
+
+        label = name or getattr(function, "__name__", "processor")
+        return self._listen(channel, process, f"processor {label}", depth=depth, inline=inline)
+
+    def inbox(
+        self,
+        *,
+        feedback: bool = True,
+        frames: bool = True,
+        camera: str | None = None,
+        results: bool = False,
+        processors: Iterable[str] | None = None,
+        max_age_s: float | None = None,
+    ) -> Mailboxes:
+        """Return mailboxes of the newest feedback, frame and results, for one thread that waits for all of them.
+
+        Controllers run on them. They fill while they are open as a context manager.
+
+        Args:
+            feedback: Whether feedback is wanted.
+            frames: Whether frames are wanted.
+            camera: Name of the camera; None: the vehicle's first.
+            results: Whether results of processors are wanted.
+            processors: Names of the processors whose results are wanted; None: all.
+            max_age_s: Oldest age of a result that is accepted [s]; None: any.
+
+        Raises:
+            UsageError: If ``max_age_s`` or the name of a processor is unusable.
+            UnknownNameError: If the vehicle has no camera of this name.
+            UnsupportedError: If frames are wanted and the vehicle has no camera.
+        """
+        channels = self._state.results
+        named = None if processors is None else [checked_name(one) for one in processors]
+        wanted = [channels.everything] if named is None else [channels.channel(one) for one in named]
+        return Mailboxes(
+            self._state.scheduler,
+            feedback=self._state.on_feedback if feedback else None,
+            frames=self.channel(camera) if frames else None,
+            results=wanted if results else [],
+            max_age_s=checked_age(max_age_s),
+        )
+
+    def annotate(self, frame: Frame, shapes: Iterable[Shape], source: str | None = None) -> bool:
+        """Publish shapes drawn over a frame, for the cockpit and for recordings.
+
+        Args:
+            frame: The frame that they belong to.
+            shapes: Shapes in this frame's pixels; coordinates may be NumPy's.
+            source: Name of what drew them; None: this application. The newest drawing of each source in each camera
+                counts.
+
+        Returns:
+            Whether it was handed to the transport.
+
+        Raises:
+            UsageError: If something is no shape, there are too many, coordinates are not finite, or colours are not
+                within 0 to 255.
+        """
+        height, width = frame.shape[:2]
+        fields = (source or self._app, frame.camera, frame.captured_ns, width, height, tuple(shapes))
+        try:
+            annotation = msgspec.convert(msgspec.to_builtins(fields, enc_hook=_from_numpy), Annotation)
+            packet = encode(annotation)
+        except (msgspec.ValidationError, TypeError, ValueError) as error:
+            raise UsageError(f"this can't be drawn on a frame: {error}") from None
+        return self._connection.transmit(packet)
+
+    def tell(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: str) -> None:
+        """Emit an event of this application's own (number 0), which only its own callbacks get.
+
+        Args:
+            kind: Kind of the event.
+            text: What happened, for people.
+            severity: How serious it is.
+            **data: Details, by name.
+        """
+        self._state.emit(kind, text, severity, **data)
+
+    def channel(
+        self,
+        camera: str | None = None,
+        *,
+        encoding: VideoEncoding | None = None,
+        quality: int | None = None,
+        max_fps: float | None = None,
+        scale: float = 1.0,
+        part: tuple[int, int] | None = None,
+    ) -> VideoChannel:
+        """Return the channel of a camera whose frames come as requested; see :meth:`frames` for the options.
+
+        Args:
+            camera: Name of the camera; None: the vehicle's first.
+            encoding: ``"jpeg"`` or ``"raw"``; None: ``"jpeg"``.
+            quality: Of JPEG, 1 to 100; None: 80.
+            max_fps: Most frames a second; None: all.
+            scale: Factor for width and height, above 0 and up to 1.
+            part: (k, n): only every n-th frame, from k; None: all.
+
+        Raises:
+            UnknownNameError: If the vehicle has no camera of this name.
+            UnsupportedError: If the vehicle has no camera.
+            UsageError: If an option is out of range, or ``quality`` is given for raw frames.
+            ClosedError: If the drone was closed.
+        """
+        self._check_open()
+        channels = self._state.channels
+        if not channels:
+            raise UnsupportedError("no camera: this vehicle gives no pictures")
+        channel = next(iter(channels.values())) if camera is None else channels.get(camera)
+        if channel is None:
+            raise UnknownNameError("camera", str(camera), channels)
+        if encoding == "raw" and quality is not None:
+            raise UsageError(f'quality={quality!r} is of encoding="jpeg", and the encoding is "raw"')
+        request = VideoRequest(
+            channel.camera.name,
+            encoding="jpeg" if encoding is None else encoding,
+            quality=DEFAULT_QUALITY if quality is None else quality,
+            max_fps=max_fps,
+            scale=scale,
+            part=part,
+        )
+        return channel if request == channel.request else self._state.video(channel.camera, request)
+
+    # Results of processors ---------------------------------------------------------------------------------------
+
+    def result(self, processor: str, *, max_age_s: float | None = None) -> Result | None:
+        """Return a processor's newest result without waiting.
+
+        The first call subscribes to the processor, for good.
+
+        Args:
+            processor: Name of the processor.
+            max_age_s: Oldest age since the frame's capture that is accepted [s]; None: any.
+
+        Returns:
+            The result; None if none has come yet or it is too old.
+
+        Raises:
+            UsageError: If ``processor`` can't be a name or ``max_age_s`` is negative.
+            ClosedError: If the drone was closed.
+        """
+        checked_age(max_age_s)
+        channel = self.result_channel(processor)
+        channel.keep()
+        newest = channel.newest
+        return None if newest is None or is_old(newest, max_age_s) else newest
+
+    def results(self, processor: str, *, max_age_s: float | None = None, timeout_s: float = 5.0) -> Iterator[Result]:
+        """Yield each newest result of a processor until the drone is closed.
+
+        A slow loop skips results; these and those that are too old are counted in :attr:`stats`. Errors are raised by
+        the first iteration, not by the call.
+
+        Args:
+            processor: Name of the processor.
+            max_age_s: Oldest age since the frame's capture that is accepted [s]; None: any.
+            timeout_s: How long to wait for each result [s].
+
+        Raises:
+            NoAnswerError: If no result that is new enough comes in time.
+            UsageError: If ``processor`` can't be a name, ``max_age_s`` is negative, or from an inline callback.
+            ClosedError: If the drone was closed before.
+        """
+        mailbox = ResultMailbox(checked_age(max_age_s), self._state.scheduler.notifier())
+        channel = self.result_channel(processor)
+        self._check_may_wait()
+        with self._closing(mailbox), channel.into(mailbox):
+            while not self._closed:
+                result = mailbox.wait(timeout_s)
+                if result is not None:
+                    yield result
+                elif not mailbox.closed:
+                    raise NoAnswerError(silence(processor, timeout_s, mailbox.expired))
+
+    def on_result(
+        self,
+        function: Callable[[Result], object],
+        processor: str | None = None,
+        *,
+        max_age_s: float | None = None,
+        depth: int | None = None,
+        inline: bool = False,
+    ) -> ResultListener:
+        """Call ``function`` with the results of one processor, or of all.
+
+        Args:
+            function: Called on a thread of its own.
+            processor: Name of the processor; None: all processors.
+            max_age_s: Results older than this when their turn comes are left out, and counted in ``expired`` of the
+                listener [s]; None: none are.
+            depth: How many results may wait, at least 1; None: 1 for one processor, 256 for all.
+            inline: Call it on the receiving thread instead. It must be quick and must not wait.
+
+        Returns:
+            The listener; ``cancel()`` ends it.
+
+        Raises:
+            UsageError: If ``function`` can't be called or another argument is out of range.
+            ClosedError: If the drone was closed.
+        """
+        if depth is not None and depth < 1:
+            raise UsageError(f"depth is {depth!r} and must be at least 1 result")
+        self._check_listener(function)
+        channel = self._state.results.everything if processor is None else self.result_channel(processor)
+        listener = ResultListener(
+            function,
+            channel,
+            self._report,
+            name="results" if processor is None else f"results of {processor}",
+            depth=depth or (EVENT_DEPTH if processor is None else 1),
+            inline=inline or self._state.scheduler.in_step,
+            on_cancel=self._cancelled,
+            max_age_s=checked_age(max_age_s),
+        )
+        self._listeners.append(listener)
+        return listener
+
+    def join_processor(
+        self, name: str, *, code: str, camera: str | None = None, shared: bool = True, timeout_s: float = 5.0
+    ) -> Membership:
+        """Become a worker of a processor, as ``skyloop process`` does, for programs with a loop of their own.
+
+        The membership ends with the drone.
+
+        Args:
+            name: Name of the processor.
+            code: Identifies the code that runs, the same for all workers of a name; at most 128 characters.
+            camera: Name of the camera; None: the vehicle's first.
+            shared: Each frame goes to one of the workers; if False, each worker gets all.
+            timeout_s: How long to wait for the proxy's answer [s].
+
+        Raises:
+            NameTakenError: If another application runs other code under this name.
+            RefusedError: If the proxy refuses for another reason.
+            NoAnswerError: If the proxy does not answer in time.
+            UsageError: If ``name`` or ``code`` is unusable, or from an inline callback.
+            UnknownNameError: If the vehicle has no camera of this name.
+        """
+        self._check_may_wait()
+        if not isinstance(code, str) or len(code) > MAX_CODE:
+            raise UsageError(f"code is {code!r:.80} and must be a text of at most {MAX_CODE} characters")
+        membership = Membership(
+            self._connection, self._state, checked_name(name), code, self.channel(camera).camera.name, shared=shared
+        )
+        membership.start(timeout_s)
+        self._to_close.append(membership)  # ends with the drone
+        return membership
+
+    def result_channel(self, processor: str) -> ResultChannel:
+        """Return the channel of a processor's results, whether or not such a processor runs.
+
+        Raises:
+            UsageError: If ``processor`` can't be a name.
+            ClosedError: If the drone was closed.
+        """
+        self._check_open()
+        return self._state.results.channel(checked_name(processor))
 
     # The end ---------------------------------------------------------------------------------------------------
 
     def close(self) -> None:
-        """Give the authority back and end the connection, all threads and a private proxy. Does not land. Idempotent.
+        """Release the authority, then end the connection, all threads and a private proxy.
 
-        Whoever waits for this drone gets :class:`ClosedError`.
+        Does not land. Idempotent. Threads that wait for this drone get :class:`ClosedError`.
         """
         if self._closed:
             return
         self._closed = True
         try:
-            if self._link.connected:
-                self._pilot.release(wait=not self._link.receiving)
+            if self._connection.connected:
+                self._commands.release(wait=not self._connection.receiving)
         except LinkError:
-            pass  # gone already, and the authority with it
+            pass  # the link is lost already, and the authority with it
         finally:
-            self._link.close()
+            self._supervisor.close()
             for listener in list(self._listeners):
                 listener.cancel()
-            for buffer in list(self._buffers):
-                buffer.close()
-            self._reception.wake_all()
+            for one in list(self._to_close):
+                one.close()
+            self._state.wake_all()
             if self._on_close is not None:
                 self._on_close()
 
@@ -259,9 +1094,12 @@ class Drone(Flying, ResultReading):
             _log.warning("%s could not be left as it should: %s", self.name, problem)
 
     def leave(self) -> SkyloopError | None:
-        """What the end of a block does: land what this application flies (or hover, as ``on_exit`` said), and close.
+        """Do what the end of a block does: land what this application flies, or hover (see ``on_exit``), and close.
 
-        Waits until it has landed. Returns what went wrong on the way, None if nothing did. Idempotent.
+        Waits until the vehicle has landed. Idempotent.
+
+        Returns:
+            What went wrong; None if nothing did.
         """
         problem = None
         try:
@@ -274,21 +1112,31 @@ class Drone(Flying, ResultReading):
         return problem
 
     def __repr__(self) -> str:
-        return f"<Drone {self.name or '?'} ({self._link.state.value}, authority {self.authority.state})>"
+        return f"<Drone {self.name or '?'} ({self._connection.state.value}, authority {self.authority.state})>"
 
-    # Inside ----------------------------------------------------------------------------------------------------
+    # Inside ------------------------------------------------------------------------------------------------------
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise ClosedError("this drone was closed: connect again")
+
+    def _check_may_wait(self) -> None:
+        if self._connection.receiving:
+            raise UsageError("an inline listener can't wait for what it would itself have to receive")
 
     def _known(self) -> bool:
-        """Whether the vehicle's state is known and the link was judged."""
-        return self._reception.newest is not None and self._reception.status.application is not LinkState.CONNECTING
+        """Whether feedback has come and the link's state was judged."""
+        return self._state.newest is not None and self._state.status.application is not LinkState.CONNECTING
 
     def _flies(self) -> bool:
-        """Whether this application has the vehicle in the air, or has just told it to take off."""
-        newest = self._reception.newest
-        if self._reception.status.vehicle is LinkState.CLOSED:
-            return False  # a recording that is over: nothing can be landed any more
+        """Whether this application has the vehicle in the air, or has just commanded a take-off."""
+        newest = self._state.newest
+        if self._state.status.vehicle is LinkState.CLOSED:
+            return False  # a recording that has ended: nothing to land
         airborne = newest is not None and newest.state.airborne
-        return self._pilot.status.state == "held" and (airborne or self._pilot.wants_flight)
+        if newest is not None and newest.others:
+            return False  # flown by others too: not ours to land or to stop
+        return self._commands.status.state == "held" and (airborne or self._commands.wants_flight)
 
     def _end_flight(self) -> None:
         if self._on_exit == "land":
@@ -298,14 +1146,83 @@ class Drone(Flying, ResultReading):
 
     def _proxy_statistics(self) -> Statistics | None:
         try:
-            answer = self._link.call(GetStatistics, 0.2)
+            answer = self._connection.call(GetStatistics, 0.2)
         except LinkError:
             return None
         return answer if isinstance(answer, Statistics) else None
 
+    def _command(self, action: AnyAction) -> bool:
+        if self._closed:
+            self._check_open()
+        welcome = self._state.welcome
+        if welcome is not None and not welcome.capabilities.actions:
+            why_not = welcome.capabilities.why_not or "the vehicle takes no commands"
+            raise UnsupportedError(f"{action.name} is not possible: {why_not}")
+        return self._commands.command(action)
+
+    def _complete(self, action: AnyAction, states: Set[FlightState], wait: bool, timeout_s: float) -> bool:
+        """Send the command and, if ``wait``, wait until feedback shows one of ``states``."""
+        if not wait:
+            return self._command(action)
+        if type(action) is not Land:  # a landing is commanded all the same: nothing is safer
+            self._check_may_wait()
+        deadline_s = time.monotonic() + timeout_s
+        waiting = ActionWait(
+            action, states, self._command, lambda: self._closed, self._commands, self._state, self._connection
+        )
+        self._check_may_wait()
+        waiting.wait(timeout_s, deadline_s)
+        return waiting.sent
+
+    @contextmanager
+    def _closing(self, mailbox: _Closable) -> Iterator[None]:
+        """Close ``mailbox``, which wakes its consumer, if the drone is closed within the block."""
+        self._to_close.append(mailbox)
+        try:
+            yield
+        finally:
+            self._to_close.remove(mailbox)
+
+    def _listen(
+        self,
+        channel: Channel[T],
+        function: Callable[[T], object],
+        name: str,
+        *,
+        depth: int = 1,
+        inline: bool = False,
+    ) -> Listener[T]:
+        self._check_listener(function)
+        inline = inline or self._state.scheduler.in_step
+        listener = Listener(
+            function, channel, self._report, name=name, depth=depth, inline=inline, on_cancel=self._cancelled
+        )
+        self._listeners.append(listener)
+        return listener
+
+    def _check_listener(self, function: Callable[[Any], object]) -> None:
+        self._check_open()
+        if not callable(function):
+            raise UsageError(f"{function!r:.80} can't be called: a function with one argument is needed")
+
+    def _cancelled(self, listener: Listener[Any]) -> None:
+        if listener in self._listeners:
+            self._listeners.remove(listener)
+
+    def _report(self, where: str, error: Exception) -> None:
+        text = f"{where} raised {type(error).__name__}: {error}"
+        self._state.emit(EventKind.CALLBACK_ERROR, text, Severity.ERROR, where=where)
+
+
+def _from_numpy(value: Any) -> Any:
+    """NumPy's scalars and arrays as plain numbers and lists."""
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} is neither a shape nor a number")
+
 
 def _with_delay(stats: ChannelStats, statistics: Statistics | None) -> ChannelStats:
-    """With the delay that the proxy measured between sending and applying."""
+    """The same statistics with the delay from sending to applying that the proxy has measured."""
     counters = {} if statistics is None else statistics.counters
     count = int(counters.get("commands.delay.count", 0))
     if not count:

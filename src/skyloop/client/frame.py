@@ -1,10 +1,11 @@
-"""Frames as an application sees them: NumPy arrays that know where and when they were taken."""
+"""Frames as an application sees them: NumPy arrays that know their camera, times and the vehicle's state."""
 
 from __future__ import annotations
 
 import threading
 import time
 import weakref
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final, Literal, NoReturn
 
 import msgspec
@@ -14,10 +15,11 @@ from numpy.typing import NDArray
 from skyloop.clock import Clock
 from skyloop.errors import DecodeError, MissingExtraError
 from skyloop.messages import Encoding, Feedback, FrameHeader, Intrinsics
-from skyloop.transport.pictures import resized, scaled_header
+from skyloop.messages.image_header import image_size, why_not_decoded
+from skyloop.transport.frame_encoding import resized, scaled_header
 
 if TYPE_CHECKING:
-    from skyloop.client.history import FeedbackHistory
+    from skyloop.client.feedback_history import FeedbackHistory
     from skyloop.transport.base import Pixels
 
     _Base = NDArray[np.uint8]
@@ -32,18 +34,18 @@ _ATTRIBUTES: Final = frozenset(
 
 
 class Frame(_Base):
-    """One picture: BGR, shape (height, width, 3), uint8, read-only; draw on ``frame.copy()``.
+    """An image as a read-only BGR array of shape (height, width, 3) and dtype uint8; draw on ``frame.copy()``.
 
-    It is the memory into which the transport received it wherever that is possible, without a copy. Slices, copies and
-    results of arithmetic do not have the attributes below. Times are in ns: ``captured_ns`` (middle of the
-    exposure) and ``published_ns`` on the proxy's clock, ``received_ns`` on this host's.
+    Where possible it is the memory that the transport received, without a copy. Slices, copies and results of
+    arithmetic are plain arrays or lack the attributes below. Times are in ns: ``captured_ns`` (middle of the exposure)
+    and ``published_ns`` on the proxy's clock, ``received_ns`` on this host's.
     """
 
     _arrival: Arrival
 
     @property
     def header(self) -> FrameHeader:
-        """What came with the pixels."""
+        """The header that came with the pixels."""
         return self._arrival.header
 
     @property
@@ -53,7 +55,7 @@ class Frame(_Base):
 
     @property
     def seq(self) -> int:
-        """Grows by one with each frame that the camera gave."""
+        """Number of the frame; grows by one with each that the camera captures, dropped ones included."""
         return self._arrival.header.seq
 
     @property
@@ -63,22 +65,22 @@ class Frame(_Base):
 
     @property
     def published_ns(self) -> int:
-        """When the proxy had it, on its clock [ns]."""
+        """When the proxy had the frame, on its clock [ns]."""
         return self._arrival.header.published_ns
 
     @property
     def received_ns(self) -> int:
-        """When it was here, on this host's clock [ns]."""
+        """When this process received the frame, on this host's clock [ns]."""
         return self._arrival.received_ns
 
     @property
     def intrinsics(self) -> Intrinsics | None:
-        """Of the camera, in pixels of this frame."""
+        """Intrinsics of the camera in pixels of this frame; None if unknown."""
         return self._arrival.header.intrinsics
 
     @property
     def image(self) -> NDArray[np.uint8]:
-        """The same pixels as a plain read-only array."""
+        """The same pixels as a plain read-only array, without a copy."""
         return self.view(np.ndarray)
 
     @property
@@ -88,24 +90,28 @@ class Frame(_Base):
 
     @property
     def feedback(self) -> Feedback | None:
-        """The vehicle's state at the capture, interpolated from the samples on both sides of it.
+        """The vehicle's state at the capture, interpolated between the samples before and after it.
 
-        While only an earlier sample is known (the later one is still to come), that one as it is; see
-        :attr:`feedback_reach_s`. None if nothing is known.
+        While the later sample is still to come it is the earlier one unchanged; see :attr:`feedback_reach_s`. None if
+        nothing is known.
         """
         return self._arrival.state_at_capture()[0]
 
     @property
     def feedback_reach_s(self) -> float | None:
-        """How far from the capture the farther sample behind :attr:`feedback` lies [s]; None if there is none."""
+        """Time from the capture to the farther sample used for :attr:`feedback` [s]; None if there is none."""
         return self._arrival.state_at_capture()[1]
 
     def copy(self, order: Literal["K", "A", "C", "F"] | None = "C") -> NDArray[np.uint8]:  # type: ignore[override]
-        """A plain array of one's own, to draw on."""
+        """Return a writable plain array with the same pixels, to draw on.
+
+        Args:
+            order: Memory layout, as for :meth:`numpy.ndarray.copy`.
+        """
         return self.image.copy(order)
 
     def __array_wrap__(self, array: Any, context: Any = None, return_scalar: bool = False) -> Any:
-        """What arithmetic gives is a plain array or number."""
+        """Return results of arithmetic as plain arrays or numbers."""
         plain = np.asarray(array)
         return plain if plain.ndim else plain[()]
 
@@ -118,7 +124,7 @@ class Frame(_Base):
 
 
 class Arrival:
-    """A frame as it came. The picture is made by the first consumer that looks, in its thread, once for all."""
+    """A received frame. The first consumer that asks for the image decodes it, in its own thread, for all."""
 
     __slots__ = (
         "_clock",
@@ -142,6 +148,16 @@ class Arrival:
         history: FeedbackHistory,
         clock: Clock = time.monotonic_ns,
     ) -> None:
+        """Keep what was received.
+
+        Args:
+            header: Describes the pixels.
+            pixels: Bytes of the frame, shape (size,), uint8.
+            received_ns: When they came, on this host's clock.
+            offset_ns: The proxy's clock minus ``clock``.
+            history: Looked up for the state at the capture.
+            clock: This host's clock.
+        """
         self.header = header
         self.received_ns = received_ns
         self._pixels: Pixels | None = pixels
@@ -159,21 +175,26 @@ class Arrival:
         return (self._clock() + self._offset_ns - self.header.captured_ns) / 1e9
 
     def as_came(self) -> Pixels | None:
-        """The bytes as the transport gave them, shape (size,); None once somebody has looked at the picture."""
+        """Return the bytes as the transport gave them, shape (size,); None once the image was decoded."""
         with self._lock:
             return self._pixels
 
     def frame(self) -> Frame:
-        """The picture. Raises :class:`DecodeError` if the pixels are not what the header says."""
+        """Return the frame, decoded on the first call.
+
+        Raises:
+            DecodeError: If the pixels are not what the header says.
+            MissingExtraError: If it is a JPEG and OpenCV is not installed.
+        """
         with self._lock:
             frame = self._frame() if self._frame is not None else None
             if frame is None:
                 frame = self._make()
-                self._frame = weakref.ref(frame)  # the frame refers to us: no circle that only the collector breaks
+                self._frame = weakref.ref(frame)  # weak, as the frame refers to this: no reference cycle
             return frame
 
     def _picture(self) -> NDArray[np.uint8]:
-        """As BGR. Raises :class:`DecodeError`."""
+        """Decode to BGR. Raises :class:`DecodeError`."""
         assert self._pixels is not None
         return to_bgr(self.header, self._pixels)
 
@@ -189,7 +210,10 @@ class Arrival:
         return frame
 
     def state_at_capture(self) -> tuple[Feedback | None, float | None]:
-        """State and reach; looked up anew until there was a sample on either side of the capture."""
+        """Return the vehicle's state at the capture and its reach [s]; see :attr:`Frame.feedback_reach_s`.
+
+        Looked up anew until there is a sample on both sides of the capture.
+        """
         if self._state is not None:
             return self._state
         feedback, reach_s, final = self._history.at(self.header.captured_ns)
@@ -199,7 +223,7 @@ class Arrival:
 
 
 class SmallArrival(Arrival):
-    """A frame that came larger than this consumer wants it, and is made smaller when somebody looks."""
+    """A frame that was received larger than this consumer wants, and is scaled down when it is decoded."""
 
     __slots__ = ("_full",)
 
@@ -213,13 +237,24 @@ class SmallArrival(Arrival):
         clock: Clock,
         scale: float,
     ) -> None:
+        """Keep what was received; arguments are those of :class:`Arrival`.
+
+        Args:
+            header: Describes the pixels as received.
+            pixels: Bytes of the frame as received.
+            received_ns: When they came, on this host's clock.
+            offset_ns: The proxy's clock minus ``clock``.
+            history: Looked up for the state at the capture.
+            clock: This host's clock.
+            scale: Factor for width and height, above 0 and up to 1.
+        """
         small = msgspec.structs.replace(scaled_header(header, scale), encoding=Encoding.BGR8)
         small = msgspec.structs.replace(small, size=small.width * small.height * 3)
         super().__init__(small, pixels, received_ns, offset_ns, history, clock)
         self._full = header
 
     def as_came(self) -> Pixels | None:
-        """None: it did not come so."""
+        """Return None: the frame was not received in this size."""
         return None
 
     def _picture(self) -> NDArray[np.uint8]:
@@ -229,7 +264,7 @@ class SmallArrival(Arrival):
 
 
 def size_error(header: FrameHeader, size: int) -> str:
-    """Why ``size`` bytes can't be the frame that the header announces; empty if they can."""
+    """Return why ``size`` bytes can't be the frame that ``header`` announces; empty if they can."""
     channels = _CHANNELS.get(header.encoding)
     expected = header.size if channels is None else header.width * header.height * channels
     if size == expected:
@@ -238,7 +273,19 @@ def size_error(header: FrameHeader, size: int) -> str:
 
 
 def to_bgr(header: FrameHeader, pixels: Pixels) -> NDArray[np.uint8]:
-    """Pixels as BGR, shape (height, width, 3), uint8; the same memory if they are BGR already."""
+    """Convert received pixels to BGR.
+
+    Args:
+        header: Describes the pixels.
+        pixels: Bytes of the frame, shape (size,), uint8.
+
+    Returns:
+        Shape (height, width, 3), uint8; the same memory if the pixels are BGR already.
+
+    Raises:
+        DecodeError: If the pixels are no JPEG of the size that the header says.
+        MissingExtraError: If they are a JPEG and OpenCV is not installed.
+    """
     height, width = header.height, header.width
     encoding = header.encoding
     if encoding is Encoding.BGR8:
@@ -255,10 +302,10 @@ def _decode_jpeg(header: FrameHeader, pixels: Pixels) -> NDArray[np.uint8]:
         import cv2
     except ImportError as error:
         raise MissingExtraError("reading JPEG frames", "vision", cause=str(error)) from None
-    try:
-        image: Any = cv2.imdecode(pixels, cv2.IMREAD_COLOR)
-    except cv2.error:
-        image = None
+    image: Any = None
+    if image_size(pixels.data) == (header.width, header.height) and not why_not_decoded(pixels.data):
+        with suppress(cv2.error):
+            image = cv2.imdecode(pixels, cv2.IMREAD_COLOR)
     if image is None or image.shape != (header.height, header.width, 3):
         raise DecodeError(f"frame {header.seq} of {header.camera} is not a JPEG of {header.width} × {header.height}")
     result: NDArray[np.uint8] = image

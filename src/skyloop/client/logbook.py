@@ -1,37 +1,42 @@
-"""``drone.log``: what the application itself wants to be seen and recorded beside the flight."""
+"""``drone.log``: text and numbers that an application publishes beside the flight, for plots and recordings."""
 
 from __future__ import annotations
 
 import math
 import numbers
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from skyloop.client.link import Link
+from skyloop.client.connection import ProxyConnection
 from skyloop.errors import UsageError
 from skyloop.messages import LogEntry, Severity, encode
 from skyloop.messages.log import MAX_TEXT, MAX_VALUES
+from skyloop.messages.numbers import LATEST_NS
 
 MAX_DIMENSIONS = 8
 
 
 class Logbook:
-    """Tells text, numbers and arrays to whoever listens: recorders, plots. Any thread; nothing waits.
+    """Publishes text, numbers and arrays. Any thread; nothing waits.
 
-    Each method returns whether it was handed over; raises :class:`UsageError` for what can't be logged.
+    Each method returns whether everything was handed to the transport, and raises :class:`UsageError` for what can't be
+    logged. Names of series have 1 to 64 characters.
     """
 
-    def __init__(self, link: Link, source: str, now_ns: Callable[[], int]) -> None:
-        """``now_ns``: the time on the proxy's clock."""
-        self._link = link
+    def __init__(self, connection: ProxyConnection, source: str) -> None:
+        self._connection = connection
         self._source = source
-        self._now_ns = now_ns
 
     def text(self, text: str, *, name: str = "", severity: Severity | str = Severity.INFO) -> bool:
-        """A line for people, of at most 4096 characters. ``name`` of a series, if it belongs to one."""
+        """Publish a line for people.
+
+        Args:
+            text: At most 4096 characters.
+            name: Of the series that it belongs to, if any.
+            severity: How serious it is, or its name.
+        """
         if name != "":
             _named(name)
         if not isinstance(text, str) or len(text) > MAX_TEXT:
@@ -44,17 +49,22 @@ class Logbook:
         return self._send(name, text=text, severity=known)
 
     def number(self, name: str, value: float) -> bool:
-        """One value of the series ``name``."""
+        """Publish one finite value of the series ``name``."""
         return self._send(_named(name), number=_finite(name, value))
 
     def numbers(self, **values: float) -> bool:
-        """One value of each series named: ``drone.log.numbers(range_m=1.2, bearing=0.1)``."""
+        """Publish one finite value of each series named: ``drone.log.numbers(range_m=1.2, bearing=0.1)``."""
         known = [(_named(name), _finite(name, value)) for name, value in values.items()]
         return sum(self._send(name, number=value) for name, value in known) == len(known)
 
     def array(self, name: str, values: ArrayLike, *, at_ns: int | None = None) -> bool:
-        """An array of at most 4096 real numbers in up to 8 dimensions, of the series ``name``; ``at_ns``: when it was
-        so, on the proxy's clock (default: now)."""
+        """Publish an array of the series ``name``.
+
+        Args:
+            name: Of the series.
+            values: At most 4096 finite real numbers in up to 8 dimensions.
+            at_ns: When it was measured, on the proxy's clock [ns]; None: now.
+        """
         try:
             array = np.asarray(values, dtype=np.float64)
         except (TypeError, ValueError):
@@ -69,8 +79,21 @@ class Logbook:
         return self._send(_named(name), at_ns, values=tuple(array.ravel().tolist()), shape=array.shape)
 
     def _send(self, name: str, at_ns: int | None = None, **fields: Any) -> bool:
-        known_ns = self._now_ns() if at_ns is None else at_ns
-        return self._link.transmit(encode(LogEntry(self._source, name, known_ns, **fields)))
+        known_ns = self._connection.now_ns if at_ns is None else checked_time(at_ns)
+        return self._connection.transmit(encode(LogEntry(self._source, name, known_ns, **fields)))
+
+
+def checked_time(at_ns: object) -> int:
+    """Return ``at_ns`` if it can be a time on the proxy's clock [ns].
+
+    Raises:
+        UsageError: If it is no int or out of range.
+    """
+    if not isinstance(at_ns, int) or not -LATEST_NS <= at_ns <= LATEST_NS:
+        raise UsageError(
+            f"at_ns is {at_ns!r:.80} and must be a time on the proxy's clock, whole ns within ±{LATEST_NS}"
+        )
+    return at_ns
 
 
 def _named(name: object) -> str:

@@ -1,4 +1,4 @@
-"""What processors find, as it arrives: one channel a processor, and slots in which the newest wins."""
+"""Results of processors: one channel for each processor, and mailboxes in which the newest wins."""
 
 from __future__ import annotations
 
@@ -7,13 +7,16 @@ import re
 import threading
 import time
 from collections import Counter
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import Any, Final, TypeVar
 
 import msgspec
 
-from skyloop.client.delivery import Listener, Topic
-from skyloop.client.slots import Bell, Buffer
-from skyloop.client.statistics import ChannelCounter
+from skyloop.client.channels import Channel, Listener
+from skyloop.client.connection import ProxyConnection
+from skyloop.client.feedback_history import FeedbackHistory
+from skyloop.client.mailbox import Mailbox, Notifier
+from skyloop.client.scheduler import Scheduler
+from skyloop.client.statistics import ChannelCounter, ChannelStats
 from skyloop.clock import Clock
 from skyloop.errors import DecodeError, UsageError
 from skyloop.messages import Feedback, ProcessorResult
@@ -21,13 +24,10 @@ from skyloop.messages.payload import unpack
 from skyloop.messages.result import PROCESSOR_NAME
 from skyloop.transport.base import RESULTS, results
 
-if TYPE_CHECKING:
-    from skyloop.client.history import FeedbackHistory
-    from skyloop.client.link import Link
-    from skyloop.client.pace import Pace
-
 T = TypeVar("T")
 _UNREAD: Final = object()
+MAX_CHANNELS: Final = 256  #: processors known at a time, besides subscribed ones
+MAX_WORKERS: Final = 1024  #: workers of one processor whose last numbers are kept
 
 
 class Result:
@@ -38,7 +38,16 @@ class Result:
     def __init__(
         self, header: ProcessorResult, received_ns: int, offset_ns: int, history: FeedbackHistory, clock: Clock
     ) -> None:
-        self.header = header  #: as it came
+        """Keep what was received; the value is decoded when it is first read.
+
+        Args:
+            header: The packet.
+            received_ns: When it came, on this host's clock.
+            offset_ns: The proxy's clock minus ``clock``.
+            history: Looked up for the state at the capture.
+            clock: This host's clock.
+        """
+        self.header = header  #: the packet as received
         self.received_ns = received_ns  #: on this host's clock
         self.overtaken = False  #: a result of a later frame of the same camera came before it
         self._offset_ns = offset_ns
@@ -58,7 +67,7 @@ class Result:
 
     @property
     def camera(self) -> str:
-        """The camera of the frame."""
+        """Name of the frame's camera."""
         return self.header.camera
 
     @property
@@ -73,7 +82,7 @@ class Result:
 
     @property
     def made_ns(self) -> int:
-        """When the processor was done with it."""
+        """When the processor had finished it."""
         return self.header.made_ns
 
     @property
@@ -88,14 +97,21 @@ class Result:
 
     @property
     def value(self) -> Any:
-        """What ``process`` returned: dataclasses as dicts, tuples as lists, arrays read-only. Raises
-        :class:`DecodeError` for a payload that is none, as only somebody else's program can send."""
+        """What ``process`` returned, with dataclasses as dicts, tuples as lists, and arrays read-only.
+
+        Raises:
+            DecodeError: If the payload is malformed, as only another program can send it.
+        """
         if self._value is _UNREAD:
             self._value = unpack(self.header.payload)
         return self._value
 
     def to(self, kind: type[T]) -> T:
-        """The value as a dataclass, ``msgspec.Struct`` or other type. Raises :class:`DecodeError` if it is none."""
+        """Return the value as a dataclass, ``msgspec.Struct`` or other type.
+
+        Raises:
+            DecodeError: If it can't be converted.
+        """
         try:
             return msgspec.convert(self.value, kind, dec_hook=_as_it_is)
         except (msgspec.ValidationError, TypeError) as error:
@@ -103,7 +119,7 @@ class Result:
 
     @property
     def feedback(self) -> Feedback | None:
-        """The vehicle's state when the frame was captured, interpolated; None if nothing is known of that time."""
+        """The vehicle's state at the frame's capture, interpolated; None if nothing is known of that time."""
         return self._history.at(self.header.captured_ns)[0]
 
     def __repr__(self) -> str:
@@ -115,29 +131,39 @@ def _as_it_is(kind: type, value: Any) -> Any:  # noqa: ARG001  (as msgspec calls
     return value
 
 
-class ResultSlot:
-    """The newest result of each processor, to be taken by one thread; those that are too old by then are left out."""
+class ResultMailbox:
+    """Keeps the newest result of each processor for one consumer, and leaves out those that are too old when taken."""
 
-    def __init__(self, max_age_s: float | None = None, bell: Bell | None = None) -> None:
-        self.bell = bell or Bell()
+    def __init__(self, max_age_s: float | None = None, notifier: Notifier | None = None) -> None:
+        """Make an empty mailbox.
+
+        Args:
+            max_age_s: Oldest age that is accepted [s]; None: any.
+            notifier: Notified with each result; None: an own one.
+        """
+        self.notifier = notifier or Notifier()
         self.expired = 0  #: results that were too old when their turn came
         self.closed = False
         self._max_age_s = max_age_s
-        self._buffers: dict[str, Buffer[Result]] = {}
+        self._mailboxes: dict[str, Mailbox[Result]] = {}
 
     def put(self, result: Result) -> None:
-        """Offer one; on the receiving thread alone."""
+        """Add a result, on the receiving thread alone. One that was overtaken is ignored."""
         if result.overtaken:
             return  # counted by its channel
-        buffer = self._buffers.get(result.processor)
-        if buffer is None:
-            buffer = Buffer(1, self.bell)
-            self._buffers = {**self._buffers, result.processor: buffer}
-        buffer.put(result)
+        mailbox = self._mailboxes.get(result.processor)
+        if mailbox is None:
+            mailbox = Mailbox(1, self.notifier)
+            known = {**self._mailboxes, result.processor: mailbox}
+            if len(known) > MAX_CHANNELS:
+                oldest = known.pop(next(iter(known)))
+                self.expired += oldest.dropped + oldest.waiting
+            self._mailboxes = known
+        mailbox.put(result)
 
     def take(self) -> Result | None:
-        """The oldest of those that wait, one a processor; None if there is none. Does not wait."""
-        while waiting := [buffer for buffer in self._buffers.values() if buffer.waiting]:
+        """Take the oldest of the waiting results, one for each processor; None if there is none. Does not wait."""
+        while waiting := [mailbox for mailbox in self._mailboxes.values() if mailbox.waiting]:
             result = min(waiting, key=_captured_ns).take()
             if result is None or not is_old(result, self._max_age_s):
                 return result
@@ -145,39 +171,45 @@ class ResultSlot:
         return None
 
     def wait(self, timeout_s: float) -> Result | None:
-        """Like :meth:`take`, but waits; None if nothing came in time or it was closed."""
+        """Take a result like :meth:`take`, but wait for one; None if none comes in ``timeout_s`` or it is closed."""
         deadline = time.monotonic() + timeout_s
-        while self.bell.wait_for(lambda: self.waiting or self.closed, deadline - time.monotonic()):
+        while self.notifier.wait_for(lambda: self.waiting or self.closed, deadline - time.monotonic()):
             result = None if self.closed else self.take()
             if result is not None or self.closed:
                 return result
         return None
 
     def close(self) -> None:
-        """Let nobody wait here any more."""
+        """Wake everybody who waits here; nothing can be waited for any more."""
         self.closed = True
-        self.bell.ring()
+        self.notifier.notify()
 
     @property
     def waiting(self) -> bool:
-        """Whether there is one to take, maybe too old."""
-        return any(buffer.waiting for buffer in self._buffers.values())
+        """Whether there is a result, possibly too old."""
+        return any(mailbox.waiting for mailbox in self._mailboxes.values())
+
+    @property
+    def pushed_out(self) -> int:
+        """Results that newer ones pushed out."""
+        return self.dropped - self.expired
 
     @property
     def dropped(self) -> int:
-        """How many newer ones pushed out, or were too old."""
-        return self.expired + sum(buffer.dropped for buffer in self._buffers.values())
+        """Results that newer ones pushed out, or that were too old."""
+        return self.expired + sum(mailbox.dropped for mailbox in self._mailboxes.values())
 
 
 def is_old(result: Result, max_age_s: float | None) -> bool:
-    """Whether it is past a consumer's limit now."""
+    """Return whether a result is now older than ``max_age_s``; False for None."""
     return max_age_s is not None and result.age_s > max_age_s
 
 
 class ResultListener(Listener[Result]):
-    """A listener that leaves out what is older than its limit when its turn comes; ``expired`` counts that."""
+    """A listener that leaves out results that are too old when their turn comes, counted in ``expired``."""
 
     def __init__(self, *arguments: Any, max_age_s: float | None, **options: Any) -> None:
+        """Start calling; arguments are those of :class:`Listener`, and ``max_age_s`` [s], None for no limit."""
         self.expired = 0  #: results that were too old when their turn came
         self._max_age_s = max_age_s
         super().__init__(*arguments, **options)
@@ -194,39 +226,30 @@ class ResultListener(Listener[Result]):
             super()._call(sample)
 
 
-class ResultChannel:
-    """What one processor finds. ``topic`` has no result of a frame that is older than one that came before."""
+class ResultChannel(Channel[Result]):
+    """Results of one processor; leaves out a result of an older frame than one that came before."""
 
-    def __init__(self, processor: str, link: Link, pace: Pace) -> None:
-        self.processor = processor
+    def __init__(self, processor: str, connection: ProxyConnection, scheduler: Scheduler) -> None:
+        self.name = results(processor)  #: name of the topic
+        super().__init__(lambda on: connection.subscribe(self.name, on))
         self.newest: Result | None = None
-        self.bell = pace.bell()
+        self.notifier = scheduler.notifier()  #: notified with each result
         self.counter = ChannelCounter()
-        self.overtaken = 0
-        self.topic: Topic[Result] = Topic(lambda on: link.subscribe(results(processor), on or self.keep))
-        self.keep = False  #: subscribed for good, by ``result()``
-        self._link = link
-        self._numbers: dict[int, int] = {}  # the last one of each worker
-        self._captured: dict[str, int] = {}  # the newest frame of each camera
-
-    @property
-    def name(self) -> str:
-        """The topic's name."""
-        return results(self.processor)
-
-    def keep_newest(self) -> None:
-        """Subscribe for good."""
-        if not self.keep:
-            self.keep = True
-            self._link.subscribe(self.name)
+        self._overtaken = 0
+        self._numbers: dict[int, int] = {}  # last number of each worker
+        self._captured: dict[str, int] = {}  # capture time of the newest frame of each camera
 
     def restart(self) -> None:
-        """A proxy was connected: numbers of workers mean something else now."""
+        """Forget the numbers of workers and frames, which a newly connected proxy counts from the start."""
         self._numbers.clear()
         self._captured.clear()
 
-    def arrived(self, result: Result) -> bool:
-        """Take one in; False if it came before, by the other topic."""
+    def stats(self, now_ns: int) -> ChannelStats:
+        """Return the statistics at ``now_ns``; overtaken results count as dropped."""
+        return self.counter.stats(now_ns, dropped=self.dropped + self._overtaken)
+
+    def receive(self, result: Result) -> bool:
+        """Publish a result, unless it was overtaken; return False if it came before, by the other topic."""
         header = result.header
         last = self._numbers.get(header.worker)
         if last is not None and header.number <= last:
@@ -234,75 +257,113 @@ class ResultChannel:
         if last is not None:
             self.counter.lost += header.number - last - 1
         self._numbers[header.worker] = header.number
+        if len(self._numbers) > MAX_WORKERS:
+            del self._numbers[next(iter(self._numbers))]
         result.overtaken = header.captured_ns < self._captured.get(header.camera, header.captured_ns)
         if result.overtaken:
-            self.overtaken += 1
+            self._overtaken += 1
         else:
             self._captured[header.camera] = header.captured_ns
             self.newest = result
-            self.topic.publish(result)
-            self.bell.ring()
+            self.publish(result)
+            self.notifier.notify()
         return True
 
 
 class ResultChannels:
     """The channels of all processors. Asked for on any thread; results arrive on the receiving one."""
 
-    def __init__(self, pace: Pace, history: FeedbackHistory) -> None:
-        self.link: Link
-        self.everything: Topic[Result] = Topic(lambda on: self.link.subscribe(RESULTS, on))
-        self._pace = pace
+    def __init__(self, connection: ProxyConnection, scheduler: Scheduler, history: FeedbackHistory) -> None:
+        self._connection = connection
+        self.everything: Channel[Result] = Channel(lambda on: connection.subscribe(RESULTS, on))
+        self._scheduler = scheduler
         self._history = history
         self._lock = threading.Lock()
         self._channels: dict[str, ResultChannel] = {}
         self._sent: Counter[str] = Counter()
 
     def channel(self, processor: str) -> ResultChannel:
-        """The one of this processor, from now on."""
+        """Return the channel of this processor, made on the first call."""
         with self._lock:
             found = self._channels.get(processor)
             if found is None:
-                found = ResultChannel(processor, self.link, self._pace)
+                found = ResultChannel(processor, self._connection, self._scheduler)
                 self._channels = {**self._channels, processor: found}
             return found
 
     def all(self) -> list[ResultChannel]:
+        """Return all channels."""
         return list(self._channels.values())
 
     def next_number(self, processor: str) -> int:
-        """For a result that this application sends itself; one worker of a processor at a time."""
+        """Return the number of the next result that this application sends, for one worker of a processor at a time."""
         self._sent[processor] += 1
         return self._sent[processor]
 
     def restart(self) -> None:
-        """A proxy was connected."""
+        """Reset all channels: a proxy was connected."""
         for channel in self.all():
             channel.restart()
 
-    def arrived(self, header: ProcessorResult, now_ns: int) -> None:
-        """A result came."""
-        offset_ns = self.link.offset_ns
-        result = Result(header, now_ns, offset_ns, self._history, self._pace.clock)
-        channel = self._channels.get(header.processor) or self.channel(header.processor)
-        if channel.arrived(result):
+    def receive(self, header: ProcessorResult, now_ns: int) -> None:
+        """Publish a result that came at ``now_ns``."""
+        offset_ns = self._connection.offset_ns
+        result = Result(header, now_ns, offset_ns, self._history, self._scheduler.clock)
+        channel = self._channels.get(header.processor)
+        if channel is None:
+            self._make_room()
+            channel = self.channel(header.processor)
+        if channel.receive(result):
             channel.counter.add(now_ns + offset_ns - header.made_ns, header.captured_ns - offset_ns, now_ns)
             self.everything.publish(result)
 
+    def _make_room(self) -> None:
+        """Forget channels without consumers, oldest first, while there are too many: any program may invent names."""
+        with self._lock:
+            unused = [name for name, one in self._channels.items() if not one.subscribed]
+            surplus = len(self._channels) + 1 - MAX_CHANNELS
+            for name in unused[: max(0, surplus)]:
+                self._channels = {known: one for known, one in self._channels.items() if known != name}
 
-def _captured_ns(buffer: Buffer[Result]) -> int:
-    newest = buffer.peek()
+
+def _captured_ns(mailbox: Mailbox[Result]) -> int:
+    newest = mailbox.peek()
     return 0 if newest is None else newest.captured_ns
 
 
 def checked_name(processor: str) -> str:
-    """Raises :class:`UsageError` for what can't be the name of a processor."""
+    """Return ``processor`` if it can be the name of a processor.
+
+    Raises:
+        UsageError: If it can't.
+    """
     if not isinstance(processor, str) or not re.fullmatch(PROCESSOR_NAME, processor):
         raise UsageError(f"the name of a processor has 1 to 64 letters, digits and any of _ . -, not {processor!r:.80}")
     return processor
 
 
 def checked_age(max_age_s: float | None) -> float | None:
-    """Raises :class:`UsageError` for what can't be a limit of age [s]."""
+    """Return ``max_age_s`` if it can be a limit of age [s].
+
+    Raises:
+        UsageError: If it is no number, NaN or negative.
+    """
     if max_age_s is not None and (not isinstance(max_age_s, int | float) or math.isnan(max_age_s) or max_age_s < 0):
         raise UsageError(f"max_age_s is {max_age_s!r} and must be a number of seconds")
     return max_age_s
+
+
+def silence(processor: str, timeout_s: float, expired: int) -> str:
+    """Return the message of the error when no result came.
+
+    Args:
+        processor: Name of the processor.
+        timeout_s: How long was waited [s].
+        expired: How many results were too old meanwhile.
+    """
+    if expired:
+        return f"no result of {processor} came within {timeout_s:g} s that was new enough; {expired} were too old"
+    return (
+        f"no result of processor {processor} came within {timeout_s:g} s: does skyloop process run one of that name "
+        "for this drone?"
+    )

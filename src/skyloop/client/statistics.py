@@ -1,4 +1,4 @@
-"""Statistics of the channels, cheap to gather: rings of the newest delays, evaluated when somebody looks."""
+"""Statistics of channels: the newest delays in rings, evaluated when they are read."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ DEPTH = 1024  #: samples kept of each channel, a power of two
 
 @dataclass(frozen=True, slots=True)
 class Distribution:
-    """Of delays, in seconds."""
+    """Distribution of delays [s]."""
 
     median: float
     p99: float
@@ -24,14 +24,18 @@ class Distribution:
 
 @dataclass(frozen=True, slots=True)
 class ChannelStats:
-    """One channel since the drone was connected.
+    """Statistics of one channel since the drone was connected. None where nothing is known.
 
-    ``count``: samples received (sent, for commands); ``rate_hz``: over the last two seconds; ``lost``: missing by the
-    gaps in their numbers (for video this includes what the proxy left out); ``dropped``: pushed out by newer ones
-    before their consumer took them (commands: could not be handed to the link); ``malformed``: not to be understood.
-    ``delay_s``: from publishing (sending, for commands) to receiving, of the last 1024; ``age_s``: from the newest
-    sample's capture until now. None where nothing is known. ``uncertainty_s``: how wrong both may be because two
-    computers' clocks had to be compared; 0 on one host.
+    Attributes:
+        count: Samples received; for commands, sent.
+        rate_hz: Samples a second, over the last two seconds.
+        lost: Samples missing by the gaps in their numbers; for video including those that the proxy left out.
+        dropped: Samples that newer ones pushed out before their consumer took them; for commands, those that could not
+            be handed to the transport.
+        malformed: Samples that could not be decoded.
+        delay_s: From publishing to receiving, of the last 1024 samples; for commands, from sending to applying.
+        age_s: From the newest sample's capture until now.
+        uncertainty_s: Largest error of ``delay_s`` and ``age_s`` from comparing two hosts' clocks; 0 on one host.
     """
 
     count: int = 0
@@ -45,7 +49,11 @@ class ChannelStats:
 
 
 def distribution(delays_ns: NDArray[np.int64]) -> Distribution | None:
-    """Of delays in ns; None for none."""
+    """Return the distribution of delays; None for none.
+
+    Args:
+        delays_ns: In ns, any length.
+    """
     if not delays_ns.size:
         return None
     seconds = np.sort(delays_ns) / 1e9
@@ -60,7 +68,7 @@ def distribution(delays_ns: NDArray[np.int64]) -> Distribution | None:
 
 
 class ChannelCounter:
-    """Counts one channel. One thread adds; any thread may look."""
+    """Counts the samples of one channel. One thread adds; any thread may read."""
 
     __slots__ = ("_arrivals", "_delays", "captured_ns", "count", "dropped", "last_seq", "lost", "malformed")
 
@@ -75,7 +83,13 @@ class ChannelCounter:
         self.last_seq: int | None = None
 
     def add(self, delay_ns: int, captured_ns: int, now_ns: int) -> None:
-        """A sample arrived now that was captured at ``captured_ns`` on our clock."""
+        """Count a sample.
+
+        Args:
+            delay_ns: Its delay.
+            captured_ns: When it was captured, on this process's clock.
+            now_ns: When it arrived.
+        """
         place = self.count & (DEPTH - 1)
         self._arrivals[place] = now_ns
         self._delays[place] = delay_ns
@@ -83,14 +97,21 @@ class ChannelCounter:
         self.count += 1
 
     def follow(self, seq: int) -> None:
-        """Count what is missing between the sample before and this one."""
+        """Count the samples missing between the previous number and ``seq``."""
         last = self.last_seq
         if last is not None and seq > last + 1:
             self.lost += seq - last - 1
         self.last_seq = seq
 
     def stats(self, now_ns: int, *, dropped: int = 0, malformed: int = 0, ages: bool = True) -> ChannelStats:
-        """The figures now. ``dropped`` and ``malformed`` are added to what was counted here."""
+        """Return the statistics at ``now_ns``.
+
+        Args:
+            now_ns: On this process's clock.
+            dropped: Added to what was counted here.
+            malformed: Added to what was counted here.
+            ages: Whether ``age_s`` is meaningful for this channel.
+        """
         filled = min(self.count, DEPTH)
         arrivals = np.frombuffer(bytes(self._arrivals), np.int64)[:filled]
         delays = np.frombuffer(bytes(self._delays), np.int64)[:filled]

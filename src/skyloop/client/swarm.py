@@ -1,8 +1,9 @@
-"""Several drones flown as one: commands to all, waiting for all, and what is done when one of them fails."""
+"""Several drones commanded and waited for together, and a policy for what follows when one of them fails."""
 
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from array import array
 from collections.abc import Callable, Iterator, Mapping
@@ -14,11 +15,10 @@ from typing import Any, Final, Literal, Self, TypeVar, get_args
 import numpy as np
 
 from skyloop.client.authority import AuthorityStatus
+from skyloop.client.commands import checked, number
 from skyloop.client.drone import Drone
-from skyloop.client.flying import checked, number
-from skyloop.client.parallel import in_parallel
-from skyloop.client.reading import Wanted, as_predicate
 from skyloop.client.statistics import DEPTH, Distribution, distribution
+from skyloop.client.telemetry import Wanted, as_predicate
 from skyloop.errors import (
     AuthorityError,
     ClosedError,
@@ -42,7 +42,7 @@ _log = logging.getLogger("skyloop")
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """One beat of :meth:`Swarm.ticks`."""
+    """One iteration of :meth:`Swarm.ticks`."""
 
     number: int  #: from 0
     elapsed_s: float  #: since the first
@@ -50,21 +50,24 @@ class Tick:
 
 
 class Swarm:
-    """Drones by name, in a fixed order; made by :func:`skyloop.swarm`. A context manager; for one thread at a time.
+    """Drones by name, in a fixed order; made by :func:`skyloop.swarm`. A context manager, for one thread at a time.
 
-    ``drones["alpha"]`` is one :class:`Drone`, iterating gives all. A command goes to all that are *active*. What fails
-    at some never keeps the others from getting it; ``on_error`` says what follows:
+    ``drones["alpha"]`` is one :class:`Drone`, and iterating gives all of them. A command goes to all that are *active*.
+    The failure of some never keeps the others from getting it; ``on_error`` says what follows:
 
-    - ``"continue"``: those that failed are told to hover and are set aside, the others go on. Set aside are those in
-      :attr:`errors`; one that somebody took over comes back by itself when it is given back, the others with
-      :meth:`readmit`. :class:`SwarmError` is raised when none is left, and at the end of the block.
-    - ``"raise"``: :class:`SwarmError` is raised, the others do what they were told.
+    - ``"continue"``: those that failed hover and are set aside, the others go on. Those set aside are in
+      :attr:`errors`; one that another application took over comes back when its authority is given back, the others
+      with :meth:`readmit`. :class:`SwarmError` is raised when none is left, and at the end of the block.
+    - ``"raise"``: :class:`SwarmError` is raised, the others keep their commands.
     - ``"stop"``: the others hover, then :class:`SwarmError` is raised.
     - ``"land"``: the others land, then :class:`SwarmError` is raised.
 
-    A drone whose link is lost gets nothing, and takes part again when the link is back; with any ``on_error`` but
-    ``"continue"`` a command that could not be sent is a failure. At the end of the block all land at the same time
-    (or hover, with ``on_exit``), those set aside included, each whatever happens to the others.
+    A drone whose link is lost gets no commands and takes part again when the link is back; unless ``on_error`` is
+    ``"continue"``, a command that could not be sent is a failure. At the end of the block all drones land at the same
+    time (or hover, with ``on_exit``), including those set aside, whatever happens to any of them.
+
+    Commands return, by name, what the same command of :class:`Drone` returns. They raise :class:`SwarmError` as
+    ``on_error`` says, :class:`UsageError` for numbers that are not finite, and :class:`ClosedError`.
     """
 
     def __init__(
@@ -74,7 +77,16 @@ class Swarm:
         on_error: OnError = "continue",
         missing: Mapping[str, Exception] | None = None,
     ) -> None:
-        """``missing``: drones that were wanted and could not be connected to, and why."""
+        """Take over connected drones, which the swarm closes at its end.
+
+        Args:
+            drones: By name.
+            on_error: What follows when some fail.
+            missing: Drones that were wanted and could not be connected to, and why.
+
+        Raises:
+            UsageError: If there is no drone, or ``on_error`` is unknown.
+        """
         self.check_policy(on_error)
         if not drones:
             raise UsageError("a swarm needs at least one drone")
@@ -87,7 +99,11 @@ class Swarm:
 
     @staticmethod
     def check_policy(on_error: str) -> None:
-        """Raise :class:`UsageError` for what is no ``on_error``."""
+        """Check an ``on_error``.
+
+        Raises:
+            UsageError: If it is unknown.
+        """
         if on_error not in get_args(OnError):
             raise UsageError(f"on_error is {on_error!r} and must be one of {', '.join(map(repr, get_args(OnError)))}")
 
@@ -95,12 +111,15 @@ class Swarm:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of all drones, those set aside included."""
+        """Names of all drones, including those set aside."""
         return tuple(self._drones)
 
     @property
     def active(self) -> dict[str, Drone]:
-        """Those that commands go to, by name."""
+        """Drones that commands go to, by name.
+
+        Reading it takes back drones whose authority was given back.
+        """
         for name, error in list(self._aside.items()):
             if isinstance(error, AuthorityError) and self._drones[name].authority.state == "held":
                 del self._aside[name]
@@ -109,17 +128,24 @@ class Swarm:
 
     @property
     def errors(self) -> dict[str, Exception]:
-        """Why drones are not with the others: those set aside, and those that were never connected to, by name."""
+        """Why drones do not take part, by name: those set aside, and those that were never connected."""
         return {**self.missing, **self._aside}
 
     def readmit(self, *names: str) -> None:
-        """Take drones that were set aside back among the active ones (default: all)."""
+        """Make drones that were set aside active again.
+
+        Args:
+            *names: Which; none: all.
+
+        Raises:
+            UnknownNameError: If no drone of the swarm has one of the names.
+        """
         for name in names or list(self._aside):
             self[name]  # raises for an unknown name
             self._aside.pop(name, None)
 
     def items(self) -> list[tuple[str, Drone]]:
-        """(name, drone) of all."""
+        """Return (name, drone) of all drones, including those set aside."""
         return list(self._drones.items())
 
     def __getitem__(self, name: str) -> Drone:
@@ -144,25 +170,48 @@ class Swarm:
     # Commands --------------------------------------------------------------------------------------------------
 
     def takeoff(self, *, wait: bool = True, timeout_s: float = 15.0) -> dict[str, bool]:
-        """All take off at the same time; waits until each hovers. Results by name, as :meth:`Drone.takeoff` says."""
+        """Take off with all active drones at the same time.
+
+        Args:
+            wait: Wait until each hovers.
+            timeout_s: How long to wait [s].
+
+        Returns:
+            By name, whether the command was handed to the transport at once.
+        """
         return self.each(lambda drone: drone.takeoff(wait=wait, timeout_s=timeout_s), "takeoff")
 
     def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> dict[str, bool]:
-        """All land where they are; waits until each has landed."""
+        """Land all active drones at their present positions, at the same time.
+
+        Args:
+            wait: Wait until each has landed.
+            timeout_s: How long to wait [s].
+
+        Returns:
+            By name, whether the command was handed to the transport at once.
+        """
         return self.each(lambda drone: drone.land(wait=wait, timeout_s=timeout_s), "land")
 
     def hover(self) -> dict[str, bool]:
-        """Stop and hold the place."""
+        """Stop and hold the position, with all active drones."""
         return self.command(Hover())
 
     def idle(self) -> dict[str, bool]:
-        """Want nothing: keeps the authority and leaves the vehicles as they are."""
+        """Ask for nothing: keep the authority and leave the vehicles as they are."""
         return self.command(Idle())
 
     def velocity(
         self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, yaw_rate: float = 0.0
     ) -> dict[str, bool]:
-        """The same velocity for all, each in its own body's levelled axes [m/s], turning counter-clockwise [rad/s]."""
+        """Fly with the same velocity, each drone in its own levelled body axes.
+
+        Args:
+            forward: Along x, forward [m/s].
+            left: Along y, to the left [m/s].
+            up: Along z, up [m/s].
+            yaw_rate: Counter-clockwise seen from above [rad/s].
+        """
         return self.command(
             Velocity(number("forward", forward), number("left", left), number("up", up), number("yaw_rate", yaw_rate))
         )
@@ -170,17 +219,28 @@ class Swarm:
     def attitude(
         self, *, roll: float = 0.0, pitch: float = 0.0, climb: float = 0.0, yaw_rate: float = 0.0
     ) -> dict[str, bool]:
-        """The same attitude for all; see :meth:`Drone.attitude`."""
+        """Hold the same attitude with all active drones; see :meth:`Drone.attitude`.
+
+        Args:
+            roll: Right side down is positive [rad].
+            pitch: Nose down is positive [rad].
+            climb: Vertical velocity, up [m/s].
+            yaw_rate: Counter-clockwise seen from above [rad/s].
+        """
         return self.command(
             Attitude(number("roll", roll), number("pitch", pitch), number("climb", climb), number("yaw_rate", yaw_rate))
         )
 
     def reset_emergency(self) -> dict[str, bool]:
-        """Leave the emergency state, on the ground."""
+        """Leave the emergency state, on the ground, with all active drones."""
         return self.command(ResetEmergency())
 
     def emergency_stop(self) -> dict[str, bool]:
-        """Cut the motors of all at once, those set aside included: they fall. :class:`SwarmError` if some did not."""
+        """Cut the motors of all drones at once, including those set aside: they fall.
+
+        Raises:
+            SwarmError: If the command could not be sent to some, whatever ``on_error`` says.
+        """
         sent, errors = _try_all(self._drones, lambda drone: drone.emergency_stop())
         errors |= {name: _not_sent(self._drones[name]) for name, handed in sent.items() if not handed}
         if errors:
@@ -188,15 +248,25 @@ class Swarm:
         return sent
 
     def command(self, action: AnyAction) -> dict[str, bool]:
-        """Make any action the newest set-point of all active drones, sent at one tick."""
+        """Make ``action`` the newest set-point of all active drones; see :meth:`send`."""
         return self.send(dict.fromkeys(self.active, action))
 
     def send(self, actions: Mapping[str, AnyAction]) -> dict[str, bool]:
-        """Make each action the newest set-point of the drone of its name, all sent at one tick.
+        """Make each action the newest set-point of the drone of its name, all sent together.
 
-        A drone that is set aside is left out. Returns by name whether it was handed to the link now. How far apart the
-        first and the last one left is measured: :attr:`spread`. Raises :class:`UnknownNameError` and
-        :class:`UsageError` before anything is sent.
+        Drones that are set aside are left out. :attr:`spread` tells how far apart the first and the last command left.
+
+        Args:
+            actions: By name of the drone.
+
+        Returns:
+            By name, whether the command was handed to the transport now.
+
+        Raises:
+            UnknownNameError: If no drone of the swarm has one of the names; nothing is sent then.
+            UsageError: If an action can't be commanded or has numbers that are not finite; nothing is sent then.
+            SwarmError: As ``on_error`` says.
+            ClosedError: If the swarm was closed.
         """
         self._check_open()
         for name, action in actions.items():
@@ -222,10 +292,19 @@ class Swarm:
         return sent
 
     def each(self, function: Callable[[Drone], T], what: str = "") -> dict[str, T]:
-        """Call a function with each active drone, each on a thread of its own; what it returned, by name.
+        """Call ``function`` with each active drone, each on a thread of its own, and wait for all.
 
-        A :class:`SkyloopError` that it raises is that drone's failure, called ``what`` in the report; anything else
-        comes out here.
+        Args:
+            function: A :class:`SkyloopError` that it raises is that drone's failure; any other exception is raised
+                here.
+            what: Name of the action in the report of failures; empty: the function's.
+
+        Returns:
+            What it returned, by name.
+
+        Raises:
+            SwarmError: As ``on_error`` says.
+            ClosedError: If the swarm was closed.
         """
         self._check_open()
 
@@ -237,27 +316,55 @@ class Swarm:
         return results
 
     def request_authority(self, priority: int | None = None, **options: Any) -> dict[str, AuthorityStatus]:
-        """Ask for the right to command all; options are those of :meth:`Drone.request_authority`."""
+        """Ask for the authority over all active drones.
+
+        Args:
+            priority: 0 (highest) to 31 (lowest); None: as in the last request.
+            **options: As for :meth:`Drone.request_authority`.
+
+        Returns:
+            The status of each, by name.
+        """
         return self.each(lambda drone: drone.request_authority(priority, **options), "request_authority")
 
     def release_authority(self) -> None:
-        """Give the right to command all back."""
+        """Release the authority over all active drones."""
         self.each(lambda drone: drone.release_authority(), "release_authority")
 
     # Reading ---------------------------------------------------------------------------------------------------
 
     def feedback(self, *, max_age_s: float | None = None) -> dict[str, Feedback]:
-        """The newest feedback of each active drone. One whose feedback is older than ``max_age_s`` has failed."""
+        """Return the newest feedback of each active drone, by name.
+
+        Args:
+            max_age_s: Oldest age since capture that is accepted [s]; a drone whose feedback is older has failed.
+
+        Raises:
+            SwarmError: As ``on_error`` says.
+            ClosedError: If the swarm was closed.
+        """
         self._check_open()
         found, errors = _try_all(self.active, lambda drone: drone.feedback(max_age_s=max_age_s))
         self.fail("feedback", errors)
         return found
 
     def wait_all(self, wanted: Wanted, timeout_s: float = 10.0) -> dict[str, Feedback]:
-        """Wait until all active drones are as wanted *at the same time*: a flight state, several, or a predicate.
+        """Wait until all active drones are as wanted *at the same time*.
 
-        A drone whose link is lost is not as wanted, whatever it told last. Those that are not as wanted in time have
-        failed, and do not hold up the others longer. Returns the feedback of the others.
+        A drone whose link is lost is not as wanted, whatever its last feedback. Drones that are not as wanted in time
+        have failed.
+
+        Args:
+            wanted: A flight state or its name, several of them, or a predicate on feedback.
+            timeout_s: How long to wait [s].
+
+        Returns:
+            The feedback of those that are as wanted, by name.
+
+        Raises:
+            UnknownNameError: If there is no flight state of that name.
+            SwarmError: As ``on_error`` says.
+            ClosedError: If the swarm was closed.
         """
         self._check_open()
         predicate, what = as_predicate(wanted)
@@ -275,9 +382,16 @@ class Swarm:
         return met
 
     def ticks(self, rate_hz: float = 20.0, seconds: float | None = None) -> Iterator[Tick]:
-        """A steady beat on absolute deadlines for a loop that commands all, for ``seconds`` or until it is left.
+        """Yield at a steady rate on absolute deadlines, for a loop that commands all drones.
 
-        A loop that takes longer than a period makes the beat start anew; ``late_s`` of each tick tells.
+        Ends with the swarm. After an iteration that takes longer than a period the deadlines start anew from there.
+
+        Args:
+            rate_hz: Ticks a second, 0.1 to 200.
+            seconds: For how long [s]; None: until the loop is left.
+
+        Raises:
+            UsageError: If ``rate_hz`` is out of range, at the first iteration.
         """
         if not 0.1 <= rate_hz <= 200.0:
             raise UsageError(f"rate_hz is {rate_hz!r} and must be from 0.1 to 200 ticks a second")
@@ -293,15 +407,22 @@ class Swarm:
 
     @property
     def spread(self) -> Distribution | None:
-        """How far apart the first and the last set-point of one tick left this process [s]; None before any."""
+        """How far apart the first and the last command of one :meth:`send` left this process [s]; None before any."""
         return distribution(np.frombuffer(bytes(self._spreads_ns), np.int64))
 
     # Failures ------------------------------------------------------------------------------------------------------
 
     def fail(self, what: str, errors: Mapping[str, Exception]) -> None:
-        """Some have failed at ``what``: do to them and to the others what ``on_error`` says, and raise if it says so.
+        """Apply ``on_error`` after some drones have failed. Does nothing if ``errors`` is empty.
 
-        For whoever builds on a swarm; the swarm's own commands call it.
+        The swarm's own commands call it; programs that build on a swarm may too.
+
+        Args:
+            what: What they failed at, for the report.
+            errors: Why, by name of the drone.
+
+        Raises:
+            SwarmError: As ``on_error`` says.
         """
         if not errors:
             return
@@ -326,7 +447,13 @@ class Swarm:
     # The end ---------------------------------------------------------------------------------------------------
 
     def leave(self) -> dict[str, Exception]:
-        """What the end of the block does: land what flies, all at the same time, and close. What failed, by name."""
+        """Do what the end of the block does: land all that fly, at the same time, and close.
+
+        Idempotent.
+
+        Returns:
+            What failed, by name of the drone.
+        """
         if self._closed:
             return {}
         self._closed = True
@@ -371,7 +498,7 @@ class Swarm:
 
 
 def _try_all(items: Mapping[str, T], function: Callable[[T], R]) -> tuple[dict[str, R], dict[str, Exception]]:
-    """One after the other on this thread: what each returned, and what each raised, by name."""
+    """Call ``function`` for each item in turn: what it returned, and the :class:`SkyloopError` it raised, by name."""
     results: dict[str, R] = {}
     errors: dict[str, Exception] = {}
     for name, item in items.items():
@@ -383,7 +510,7 @@ def _try_all(items: Mapping[str, T], function: Callable[[T], R]) -> tuple[dict[s
 
 
 def _wait_open(drones: Mapping[str, Drone]) -> None:
-    """Wait, a few milliseconds at most, until each takes a new set-point at once: else some would leave later."""
+    """Wait, a few milliseconds at most, until every drone sends a new set-point at once, so that none leaves later."""
     open_ns = max((drone.open_ns for drone in drones.values()), default=0)
     time.sleep(max(0, open_ns - time.monotonic_ns()) / 1e9)
 
@@ -408,7 +535,7 @@ def _is(drone: Drone, predicate: Callable[[Feedback], bool]) -> bool:
 
 
 def _halt(drone: Drone) -> None:
-    """Hover, if it is ours and in the air; else want nothing, so that a take-off that failed is not done later."""
+    """If the authority is held, hover in the air, else idle, so that a failed take-off is not carried out later."""
     with suppress(SkyloopError):
         if drone.authority.state == "held":
             drone.hover() if drone.feedback().state.airborne else drone.idle()
@@ -421,3 +548,42 @@ def _not_sent(drone: Drone) -> LinkError:
 
 def _what(actions: Mapping[str, AnyAction]) -> str:
     return ", ".join(sorted({action.name for action in actions.values()}))
+
+
+def in_parallel(jobs: Mapping[str, Callable[[], T]]) -> tuple[dict[str, T], dict[str, Exception]]:
+    """Run all jobs at the same time, each on a thread of its own, and wait for the last.
+
+    The threads are daemons: an interrupt of the waiting leaves them to end by themselves.
+
+    Args:
+        jobs: By name.
+
+    Returns:
+        What each job returned, and the :class:`SkyloopError` that each raised, both by name. Any other exception is
+        raised here when all have ended.
+    """
+    results: dict[str, T] = {}
+    raised: dict[str, BaseException] = {}
+
+    def work(name: str, job: Callable[[], T]) -> None:
+        try:
+            results[name] = job()
+        except BaseException as error:  # noqa: BLE001  (raised below, on the caller's thread)
+            raised[name] = error
+
+    threads = [
+        threading.Thread(target=work, args=(name, job), name=f"skyloop-swarm-{name}", daemon=True)
+        for name, job in jobs.items()
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    errors: dict[str, Exception] = {}
+    for name in jobs:
+        error = raised.get(name)
+        if isinstance(error, SkyloopError):
+            errors[name] = error
+        elif error is not None:
+            raise error
+    return {name: results[name] for name in jobs if name in results}, errors

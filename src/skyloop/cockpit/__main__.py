@@ -1,4 +1,7 @@
-"""``python -m skyloop.cockpit [NAME …]``: the cockpit as a process of its own. Prints its address as the first line."""
+"""``python -m skyloop.cockpit [NAME …]``: the cockpit as a process of its own.
+
+It prints the page's address as the first line.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +11,20 @@ import sys
 import threading
 from pathlib import Path
 
-from skyloop.client.by_name import network_settings
+from skyloop.client.connect import network_settings
 from skyloop.cockpit.server import RECORDINGS, serve_cockpit
 from skyloop.errors import SkyloopError
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Exit code 0; 2 with a line of explanation when it could not start."""
+    """Run the cockpit.
+
+    Args:
+        arguments: In place of the command line's.
+
+    Returns:
+        The exit code: 0, or 2 with a line of explanation when it could not start.
+    """
     parser = argparse.ArgumentParser(prog="python -m skyloop.cockpit", description="A page to watch and fly drones.")
     parser.add_argument("names", metavar="name", nargs="*", help="of running proxies (default: all, as they come)")
     parser.add_argument("--port", type=int, default=0, help="0 takes a free one (default)")
@@ -43,7 +53,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _wait_for_end(descriptor: int, stop: threading.Event) -> None:
-    """A pipe whose writing end is gone gives the end of file, however its owner ended."""
+    """Wait for the end of file that a pipe gives when its writing end is gone, however its owner ended."""
     try:
         while os.read(descriptor, 64):
             pass

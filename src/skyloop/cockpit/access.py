@@ -14,16 +14,20 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+import ipaddress
+import logging
 import os
 import secrets
 import stat
+import struct
+import sys
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Protocol
 
-from skyloop.clock import Clock, monotonic_ns, nanoseconds
-from skyloop.cockpit.peers import Endpoint, peer_uid
+from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
 from skyloop.errors import FileFormatError, UsageError
 from skyloop.messages import Role
 
@@ -33,23 +37,87 @@ SHORTEST_TOKEN: Final = 16  #: characters; a shorter one could be guessed
 MAX_TOKEN: Final = 256
 CERTIFICATE: Final = "peer_certificate"  #: where the server puts it, in the connection's state
 
+FIRST_S: Final = 0.25  #: after the first wrong token of an address; each further one doubles it
+LONGEST_S: Final = 16.0  #: shorter than :data:`skyloop.cockpit.admission.ANSWER_S`, or nobody would get the answer
+FORGET_S: Final = 600.0  #: an address from which no wrong token came for so long begins anew
+MAX_ADDRESSES: Final = 1024  #: kept in mind; the one that has been quiet for longest is forgotten first
+FREE_IN_ALL: Final = 20  #: wrong tokens a minute from everywhere that cost nothing besides
+EACH_IN_ALL_S: Final = 0.1  #: that each further one a minute adds, whoever sends it
+MOST_IN_ALL_S: Final = 4.0
+_MINUTE_NS: Final = nanoseconds(60.0)
+
+_TABLES: Final = (Path("/proc/net/tcp"), Path("/proc/net/tcp6"))
+_WORD: Final = "<I" if sys.byteorder == "little" else ">I"
+_LOCAL, _REMOTE, _UID, _INODE = 1, 2, 7, 9  # columns of the tables
+
 Scope = Mapping[str, Any]
+Endpoint = tuple[str, int]  #: address and port
+
+_log = logging.getLogger(__name__)
+
+
+def peer_uid(client: Endpoint, server: Endpoint) -> int | None:
+    """Return the user id of the program at the client's end of a loopback connection.
+
+    It is looked up in the kernel's table of sockets, ``/proc/net/tcp`` (``tcp6``; Linux), described in proc_pid_net(5)
+    and the kernel's ``proc_net_tcp.txt``: columns of local and remote address in hexadecimal, state, …, user id and
+    inode. A socket that its program has closed already has user 0 and inode 0 there, so an entry without an inode says
+    nothing of who opened it.
+
+    Args:
+        client: The client's address and port.
+        server: This server's.
+
+    Returns:
+        None if it is not known.
+    """
+    for table in _TABLES:
+        with suppress(OSError):
+            found = uid_in(table.read_text(), client, server)
+            if found is not None:
+                return found
+    return None
+
+
+def uid_in(table: str, client: Endpoint, server: Endpoint) -> int | None:
+    """Return the owner of the socket from ``client`` to ``server`` in a table; None if it is not there, or nobody's."""
+    wanted = {(_table_entry(client, mapped), _table_entry(server, mapped)) for mapped in (False, True)}
+    for line in table.splitlines()[1:]:
+        cells = line.split()
+        if len(cells) > _INODE and (cells[_LOCAL], cells[_REMOTE]) in wanted:
+            return int(cells[_UID]) if cells[_INODE] != "0" else None
+    return None
+
+
+def _table_entry(end: Endpoint, mapped: bool) -> str:
+    """Format an address as the table does: 32-bit words in the host's order.
+
+    Args:
+        end: Address and port.
+        mapped: Whether to write an IPv4 address as one within IPv6.
+    """
+    address = ipaddress.ip_address(end[0])
+    packed = address.packed
+    if mapped and address.version == 4:
+        packed = ipaddress.IPv6Address(f"::ffff:{address}").packed
+    words = "".join(f"{word:08X}" for (word,) in struct.iter_unpack(_WORD, packed))
+    return f"{words}:{end[1]:04X}"
 
 
 @dataclass(frozen=True, slots=True)
 class Person:
-    """Who asks, as far as is known: ``name`` may be empty."""
+    """Who asks, as far as is known; ``name`` may be empty."""
 
     role: Role
     name: str = ""
 
     def may(self, role: Role) -> bool:
-        """Whether what needs this role is allowed: a pilot may also observe."""
+        """Return whether this person may do what needs a role: a pilot may also observe."""
         return self.role is Role.PILOT or role is Role.OBSERVER
 
 
 class Gate(Protocol):
-    """Says who asks."""
+    """Decides who sent a request."""
 
     #: Whether a person can be let in by telling a token.
     takes_tokens: bool
@@ -57,11 +125,16 @@ class Gate(Protocol):
     hint: str
 
     def person(self, scope: Scope) -> Person | None:
-        """Who sent this request; None if nobody whom it lets in."""
+        """Return who sent this request; None if nobody whom it lets in."""
 
 
 class OpenGate:
-    """Everybody on this machine who runs as the same user has one role."""
+    """Gives everybody on this machine who runs as the same user one role.
+
+    Args:
+        role: The role.
+        uid_of: Returns the user id of the client, by the addresses of both ends.
+    """
 
     takes_tokens = False
     hint = "this cockpit belongs to another user of this machine; with --token-file it asks for a token instead"
@@ -87,7 +160,7 @@ class Token:
 
 
 class TokenGate:
-    """Lets in by a token, once told. On the event loop."""
+    """Lets in by a token, told once for a session's cookie or with each request. On the event loop."""
 
     takes_tokens = True
     hint = "log in with a token"
@@ -95,6 +168,7 @@ class TokenGate:
     def __init__(self, tokens: Iterable[Token], cookie: str, clock: Clock = monotonic_ns) -> None:
         """``cookie`` is the name of the cookie that browsers are given."""
         self.cookie = cookie
+        self.wrong = WrongTokens(clock)
         self._tokens = tuple(tokens)
         self._clock = clock
         self._sessions: dict[bytes, tuple[Person, int]] = {}  # by the hash of the cookie, until when [ns]
@@ -110,8 +184,13 @@ class TokenGate:
         person, until_ns = self._sessions.get(_hash(given), (None, 0))
         return person if self._clock() < until_ns else None
 
+    def wrong_token_s(self, scope: Scope) -> float:
+        """Count a wrong token, and return for how long the answer to it is to wait [s]."""
+        client = scope.get("client")
+        return self.wrong.another(str(client[0]) if client else "")
+
     def known(self, token: str) -> Person | None:
-        """Whose token this is. It takes as long for one that is nearly right as for any other."""
+        """Return whose token this is, None if nobody's; a nearly right token takes as long as any other."""
         given = token.encode()[: MAX_TOKEN + 1]
         found = None
         for one in self._tokens:
@@ -120,7 +199,7 @@ class TokenGate:
         return found
 
     def begin(self, person: Person) -> str:
-        """A new session's cookie. The oldest sessions make room if there are too many."""
+        """Begin a session, and return its cookie; the oldest sessions make room if there are too many."""
         now_ns = self._clock()
         self._sessions = {key: value for key, value in self._sessions.items() if now_ns < value[1]}
         while len(self._sessions) >= MAX_SESSIONS:
@@ -130,7 +209,7 @@ class TokenGate:
         return value
 
     def end(self, scope: Scope) -> None:
-        """Log out: the cookie of this request is worth nothing from now on."""
+        """End the session of this request's cookie."""
         self._sessions.pop(_hash(_cookies(scope).get(self.cookie, "")), None)
 
 
@@ -145,8 +224,15 @@ class CertificateGate:
 
 
 def person_of(certificate: Mapping[str, Any] | None) -> Person | None:
-    """Role by the organizational unit and name by the common name of a certificate as ``SSLObject.getpeercert()``
-    tells it; None if it has no OU that is a role, or two of them."""
+    """Return role and name of a certificate.
+
+    Args:
+        certificate: As ``SSLObject.getpeercert()`` returns it.
+
+    Returns:
+        The role by the organizational unit and the name by the common name; None if there is no OU that is a role, or
+        two of them.
+    """
     if not certificate:
         return None
     fields = [pair for part in certificate.get("subject", ()) for pair in part]
@@ -159,9 +245,13 @@ def person_of(certificate: Mapping[str, Any] | None) -> Person | None:
 
 
 def read_tokens(path: Path) -> list[Token]:
-    """The file of tokens: a line for each, ``ROLE TOKEN [NAME]``; empty lines and those that begin with # are left out.
+    """Read the file of tokens.
 
-    Raises :class:`UsageError` for a file that is not there or that others may read, :class:`FileFormatError`.
+    It has a line for each, ``ROLE TOKEN [NAME]``; empty lines and those that begin with # are left out.
+
+    Raises:
+        UsageError: It can't be read, or others may read it.
+        FileFormatError: A line is not valid, or there is no token.
     """
     try:
         mode = path.stat().st_mode
@@ -195,7 +285,7 @@ def _token(line: str, where: str) -> Token:
 
 
 def _hash(value: str) -> bytes:
-    """What is looked up is a hash: how long that takes tells nothing of the cookie."""
+    """Hash a cookie: looking up a hash takes a time that tells nothing of the cookie."""
     return hashlib.sha256(value.encode()).digest()
 
 
@@ -204,7 +294,50 @@ def _header(scope: Scope, wanted: bytes) -> str | None:
     return values[0].decode("latin-1") if len(values) == 1 else None
 
 
+def tells_token(scope: Scope) -> bool:
+    """Return whether a token comes with this request."""
+    return any(name.lower() == b"authorization" for name, _ in scope["headers"])
+
+
 def _cookies(scope: Scope) -> dict[str, str]:
     header = _header(scope, b"cookie") or ""
     pairs = (part.partition("=") for part in header.split(";"))
     return {name.strip(): value.strip() for name, _, value in pairs}
+
+
+class WrongTokens:
+    """Decides how long the answer to a wrong token waits. On the event loop.
+
+    The wait is longer, the more wrong tokens there were, from the same address and in all. A right token never waits,
+    so nobody can lock out who has one, from the same address neither. What grows is the wait for *no*: a guesser who
+    reads the answers gets few of them. One who does not, and takes silence for *no*, is as fast as connections are
+    made; against that the length of tokens is what counts.
+
+    Args:
+        clock: The monotonic clock [ns].
+    """
+
+    def __init__(self, clock: Clock = monotonic_ns) -> None:
+        self.count = 0  #: since the start
+        self._clock = clock
+        self._of_address: dict[str, tuple[int, int]] = {}  # how many, and when the last one came; the quietest first
+        self._minute_ns = clock()
+        self._in_minute = 0
+
+    def another(self, address: str) -> float:
+        """Count a wrong token from an address, and return for how long its answer is to wait [s]."""
+        now_ns = self._clock()
+        before, last_ns = self._of_address.pop(address, (0, now_ns))
+        many = 1 if seconds(now_ns - last_ns) >= FORGET_S else before + 1
+        self._of_address[address] = many, now_ns
+        if len(self._of_address) > MAX_ADDRESSES:
+            del self._of_address[next(iter(self._of_address))]
+        if now_ns - self._minute_ns >= _MINUTE_NS:
+            self._minute_ns, self._in_minute = now_ns, 0
+        self._in_minute += 1
+        self.count += 1
+        if many.bit_count() == 1:  # 1, 2, 4, 8, …: a guesser must not fill the log
+            _log.warning("%d wrong tokens from %s", many, address)
+        of_address_s = min(LONGEST_S, FIRST_S * 2.0 ** min(many - 1, 16))
+        in_all_s = min(MOST_IN_ALL_S, EACH_IN_ALL_S * max(0, self._in_minute - FREE_IN_ALL))
+        return min(LONGEST_S, of_address_s + in_all_s)

@@ -1,12 +1,13 @@
-"""The cockpit's routes: one page, questions and orders in JSON, WebSockets for what moves. ``docs/cockpit.md`` has all.
+"""The cockpit's routes: one page, requests in JSON, WebSockets for what moves. ``docs/cockpit.md`` describes them all.
 
 ======================================  ==================================================================
 ``/``, ``/static/…``                    the page
 ``/api/…``                              see :mod:`skyloop.cockpit.api`
 ``/ws/overview``                        to the page: all drones, twice a second
+``/ws/control``                         from the page: commands to all drones; to the page: what became of them
 ``/ws/drones/NAME/telemetry``           to the page: ``vehicle``, then ``state`` with new events, as JSON
 ``/ws/drones/NAME/video/CAMERA``        to the page: frames (binary) and drawings (JSON); back: ``{"ack": n}``
-``/ws/drones/NAME/control``             from the page: orders; to the page: what became of them, who has control
+``/ws/drones/NAME/control``             from the page: commands; to the page: what became of them, who has control
 ======================================  ==================================================================
 """
 
@@ -28,14 +29,15 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
 from skyloop.cockpit.access import Gate
+from skyloop.cockpit.admission import Admission
 from skyloop.cockpit.api import Api
 from skyloop.cockpit.control import ControlSession
-from skyloop.cockpit.fleet import Fleet
-from skyloop.cockpit.overview import Overview
+from skyloop.cockpit.fleet import Fleet, Overview
+from skyloop.cockpit.fleet_control import FleetSession
 from skyloop.cockpit.recordings import Recordings
 from skyloop.cockpit.security import NOT_ALLOWED, Guard, Names, person_of
 from skyloop.cockpit.station import Station
-from skyloop.cockpit.stream import UNKNOWN, BeatSender, PageCounts, TelemetrySender, VideoSender
+from skyloop.cockpit.stream import UNKNOWN, BroadcastSender, PageCounts, TelemetrySender, VideoSender
 from skyloop.messages import Role
 
 STATIC = Path(__file__).with_name("static")
@@ -43,7 +45,13 @@ _THREADS: Final = 32  # for what waits: proxies that answer late, recorders that
 
 
 class Cockpit:
-    """Answers what is no question in JSON."""
+    """The page and the WebSockets.
+
+    Args:
+        fleet: The drones.
+        recordings: Of the same drones.
+        static: The folder of the page.
+    """
 
     def __init__(self, fleet: Fleet, recordings: Recordings, static: Path) -> None:
         self.counts = PageCounts()
@@ -54,25 +62,38 @@ class Cockpit:
 
     @asynccontextmanager
     async def lifespan(self, _: Starlette) -> AsyncIterator[None]:
+        """Run the fleet while the server runs."""
         asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(_THREADS, "cockpit"))
         await self._fleet.start()
         try:
             yield
         finally:
-            self._overview.beat.end()
+            self._overview.broadcast.close()
             await self._recordings.close()
             await self._fleet.close()
 
     async def page(self, _: Request) -> Response:
+        """Answer with the page."""
         if not self._page.is_file():
             return PlainTextResponse(f"The page is not built: there is no {self._page}. Run make in the sources.", 503)
         return FileResponse(self._page)
 
     async def overview(self, socket: WebSocket) -> None:
+        """Send all drones to a page."""
         await socket.accept()
-        await BeatSender(socket, self._overview.beat).run()
+        await BroadcastSender(socket, self._overview.broadcast).run()
+
+    async def all_drones(self, socket: WebSocket) -> None:
+        """Accept a pilot's commands to all drones."""
+        await socket.accept()
+        person = person_of(socket.scope)
+        if person is None or not person.may(Role.PILOT):
+            await socket.close(NOT_ALLOWED, "this needs a pilot")
+            return
+        await FleetSession(socket, self._fleet, person.name).run()
 
     async def telemetry(self, socket: WebSocket) -> None:
+        """Send one drone's telemetry to a page."""
         station = await self._accept(socket)
         if station is None:
             return
@@ -83,6 +104,7 @@ class Cockpit:
             self.counts.pages -= 1
 
     async def video(self, socket: WebSocket) -> None:
+        """Send one camera's video to a page."""
         station = await self._accept(socket)
         if station is None:
             return
@@ -90,9 +112,10 @@ class Cockpit:
         if feed is None:
             await socket.close(UNKNOWN, "no such camera")
             return
-        await VideoSender(socket, feed, station.news, self.counts).run()
+        await VideoSender(socket, feed, station.event_feed, self.counts).run()
 
     async def control(self, socket: WebSocket) -> None:
+        """Accept a pilot's commands to one drone."""
         station = await self._accept(socket)
         if station is None:
             return
@@ -103,7 +126,7 @@ class Cockpit:
         await ControlSession(socket, station, person.name).run()
 
     async def _accept(self, socket: WebSocket) -> Station | None:
-        """The drone that is asked for; None, and told, if there is none of that name."""
+        """Return the station of the drone that is asked for; None, and the socket is closed, if there is none."""
         station = self._fleet.stations.get(socket.path_params["name"])
         await socket.accept()
         if station is None:
@@ -111,18 +134,33 @@ class Cockpit:
         return station
 
 
-def create_app(fleet: Fleet, recordings: Recordings, names: Names, gate: Gate, *, static: Path = STATIC) -> Starlette:
-    """The cockpit over these drones, answering to these names only, and to whom the gate lets in.
+def create_app(
+    fleet: Fleet,
+    recordings: Recordings,
+    names: Names,
+    gate: Gate,
+    *,
+    static: Path = STATIC,
+    admission: Admission | None = None,
+) -> Starlette:
+    """Make the cockpit's application.
 
-    ``static`` is the folder of the page.
+    Args:
+        fleet: The drones.
+        recordings: Of the same drones.
+        names: The only names to which it answers.
+        gate: Decides who is let in.
+        static: The folder of the page.
+        admission: Counts the connections.
     """
     cockpit = Cockpit(fleet, recordings, static)
-    api = Api(fleet, recordings, gate, cockpit.counts, names.scheme)
+    api = Api(fleet, recordings, gate, cockpit.counts, names.scheme, admission or Admission())
     return Starlette(
         routes=[
             Route("/", cockpit.page),
             *api.routes(),
             WebSocketRoute("/ws/overview", cockpit.overview),
+            WebSocketRoute("/ws/control", cockpit.all_drones),
             WebSocketRoute("/ws/drones/{name}/telemetry", cockpit.telemetry),
             WebSocketRoute("/ws/drones/{name}/video/{camera}", cockpit.video),
             WebSocketRoute("/ws/drones/{name}/control", cockpit.control),

@@ -1,4 +1,4 @@
-"""The cockpit as a child process, for a program that wants a page beside what it does itself."""
+"""The cockpit as a child process, for a program that shows a page beside its own work."""
 
 from __future__ import annotations
 
@@ -21,12 +21,20 @@ _ASK_S = 2.0
 
 
 class CockpitProcess:
-    """Runs ``python -m skyloop.cockpit [NAME]``; the child ends with :meth:`close`, and with this process however that
-    ends. It has a session of its own: Ctrl-C in the terminal is for the parent."""
+    """Runs ``python -m skyloop.cockpit [NAME]`` as a child process.
+
+    The child ends with :meth:`close`, and with this process however that ends. It has a session of its own: Ctrl-C in
+    the terminal is for the parent.
+    """
 
     def __init__(self, name: str | None = None, port: int = 0, recordings: Path | None = None) -> None:
-        """``name`` of the proxy to show (default: all), ``port`` of loopback (0 takes a free one), ``recordings``: the
-        folder for recordings. Returns at once: see :meth:`address`."""
+        """Start the child; returns at once, see :meth:`address`.
+
+        Args:
+            name: The proxy to show (default: all).
+            port: The port on loopback; 0 takes a free one.
+            recordings: The folder for recordings.
+        """
         self._said = tempfile.TemporaryFile()  # noqa: SIM115  (closed by close())
         reading, self._alive = os.pipe()
         names = [] if name is None else [name]
@@ -53,11 +61,21 @@ class CockpitProcess:
 
     @property
     def pid(self) -> int:
-        """Of the child."""
+        """The child's process id."""
         return self._process.pid
 
     def address(self, timeout_s: float = 15.0) -> str:
-        """The page's address, once it is served. Raises :class:`LinkError` with what the child said if it is not."""
+        """Wait until the page is served.
+
+        Args:
+            timeout_s: How long to wait [s].
+
+        Returns:
+            The page's address.
+
+        Raises:
+            LinkError: It was not served in time, or the child ended; with the last line of its errors.
+        """
         assert self._process.stdout is not None
         deadline = time.monotonic() + timeout_s
         line = b""
@@ -72,7 +90,11 @@ class CockpitProcess:
         return self._address
 
     def statistics(self) -> dict[str, Any]:
-        """What its pages were sent: see ``/api/statistics``. Raises :class:`LinkError`."""
+        """Return what its pages were sent: see ``/api/statistics``.
+
+        Raises:
+            LinkError: It does not answer.
+        """
         try:
             with urllib.request.urlopen(f"{self.address()}api/statistics", timeout=_ASK_S) as answer:
                 values: dict[str, Any] = json.load(answer)
@@ -97,7 +119,7 @@ class CockpitProcess:
         self._said.close()
 
     def _complaint(self) -> str:
-        """The last line that it wrote to its standard error, if it ended."""
+        """Return the last line that the child wrote to its standard error, if it has ended."""
         try:
             code = self._process.wait(0.5)
         except subprocess.TimeoutExpired:

@@ -1,8 +1,12 @@
-"""One page's controls of one drone: from its messages to commands, and what it is told of them.
+"""One page's control of one drone: from its messages to the vehicle's commands, and the answers to them.
 
-The page is watched (*dead-man*): while it flies by sticks or to a waypoint and says nothing for :data:`SILENT_S`, the
-vehicle hovers. When its connection ends the vehicle hovers too, and the authority is given back, so that the proxy's
-failsafe ladder, or whoever waits in line, goes on from there.
+A command is carried out if it comes in time (:func:`skyloop.cockpit.commands.untimely`); else it is refused, and never
+carried out later.
+
+The page is watched (*dead-man*): while it flies by sticks or to a waypoint and sends nothing for :data:`SILENT_S`, the
+vehicle hovers. A page that has not shown for :data:`GONE_S` that it receives from the cockpit is a silent pilot:
+nothing is repeated for it any more, so that the proxy ends its lease and the failsafe ladder acts, as for every
+program. When the page's connection ends the vehicle hovers at once, and the authority is given back.
 """
 
 from __future__ import annotations
@@ -13,15 +17,13 @@ from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final
 
-from starlette.websockets import WebSocket, WebSocketDisconnect
+from starlette.websockets import WebSocket
 
-from skyloop.clock import monotonic_ns
-from skyloop.cockpit.asking import Asking, Place
-from skyloop.cockpit.feeds import call_soon
-from skyloop.cockpit.orders import (
+from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
+from skyloop.cockpit.commands import (
     Alive,
     Answer,
-    AnyOrder,
+    AnyCommand,
     Fly,
     GoTo,
     HoverHere,
@@ -32,213 +34,263 @@ from skyloop.cockpit.orders import (
     Take,
     TakeOff,
     Write,
-    decode_order,
+    decode_command,
+    late_s,
+    untimely,
 )
-from skyloop.cockpit.telemetry import encode_json
+from skyloop.cockpit.feeds import call_soon
+from skyloop.cockpit.stream import PageSocket
+from skyloop.cockpit.takeover import QueuePosition, TakeoverDialog
 from skyloop.control.waypoint import Waypoint, lacking, reached, velocity_to
 from skyloop.errors import AuthorityError, DecodeError, LinkError, RefusedError, SkyloopError
-from skyloop.messages import EventKind, FlightState, LinkState
+from skyloop.messages import EventKind, FlightState, LinkState, Refusal
 
 if TYPE_CHECKING:
-    from skyloop.cockpit.hands import Hands
+    from skyloop.cockpit.pilot_connection import PilotConnection
     from skyloop.cockpit.station import Station
     from skyloop.messages import Event
 
-SILENT_S: Final = 0.5  #: a page that flies and says nothing for so long is taken for dead
+SILENT_S: Final = 0.5  #: a page that flies and sends nothing for so long counts as dead
+GONE_S: Final = (
+    2.0  #: a page that receives nothing from the cockpit for so long flies nothing, and its control runs out
+)
 GOTO_PERIOD_S: Final = 0.05
-MAX_WAITING: Final = 256  #: answers to a page that does not read; what comes on top is not said
-_SAY_AGAIN_S: Final = 1.0  # the same refusal of sticks, which come twenty times a second
+_REFUSE_AGAIN_S: Final = 1.0  # the same refusal of sticks, which come twenty times a second
 _UP: Final = frozenset({FlightState.HOVERING, FlightState.FLYING})
 _DOWN: Final = frozenset({FlightState.LANDED})
 _SETTLED_NS: Final = 50_000_000  # feedback captured so soon after a command may still be from before it
+_TAKEOFF_NS: Final = 1_000_000_000  # a take-off is repeated for so long, in case packets are lost
+#: Refusals of one packet, not of what was asked for: the next repeat is younger, and newer.
+_OF_ONE_PACKET: Final = (Refusal.STALE, Refusal.OUT_OF_SEQUENCE)
 _numbers = itertools.count(1)
 
 Json = dict[str, Any]
 
 
 class ControlSession:
-    """Made when a page opens its control socket, gone when that closes. On the event loop."""
+    """Serves one control socket of a page, from its opening to its end. On the event loop."""
 
-    def __init__(self, socket: WebSocket, station: Station, person: str = "") -> None:
-        """``person``: the name of who flies, if it is known."""
-        self._socket = socket
+    def __init__(self, socket: WebSocket, station: Station, person: str = "", clock: Clock = monotonic_ns) -> None:
+        """Prepare the session; :meth:`run` serves it.
+
+        Args:
+            socket: Accepted already.
+            station: The drone.
+            person: The name of who flies, if it is known.
+            clock: The monotonic clock [ns].
+        """
+        self._page = PageSocket(socket)
+        self._send = self._page.send
         self._station = station
+        self._clock = clock
         #: The name under which everybody sees who flies.
         self.app = f"{person} (cockpit {next(_numbers)})" if person else f"cockpit {next(_numbers)}"
-        self._hands: Hands | None = None
-        self._outbox: asyncio.Queue[Json] = asyncio.Queue(MAX_WAITING)
+        self._pilot: PilotConnection | None = None
         self._jobs: set[asyncio.Task[None]] = set()
-        self._asking = asyncio.Lock()  # what waits for the proxy is done one after the other
+        self._turn = asyncio.Lock()  # what waits for the proxy is done one after the other
         self._goto: asyncio.Task[None] | None = None
         self._steering = False  # by sticks: the newest set-point is a velocity of this page
         self._silence: asyncio.TimerHandle | None = None
-        self._authority: tuple[str, str | None, int | None, Place | None] | None = None  # as told last
-        self._takeover = Asking(self._say)
-        self._last = ""  # what was ordered last
-        self._orders = 0  # how many there were
-        self._told_of = 0  # the order of which a refusal was told
+        #: As the page was sent it last: state, holder, its priority, position in the queue, how control was lost.
+        self._authority: tuple[str, str | None, int | None, QueuePosition | None, str | None] | None = None
+        self._was_mine = False
+        self._loss: str | None = None  # how the control that this page had was lost; None: it was not
+        self._takeover = TakeoverDialog(self._send)
+        self._last_command = ""  # what the page commanded last
+        self._commands = 0  # how many there were
+        self._refused_command = 0  # the one whose refusal was sent
         self._awaited: tuple[str, frozenset[FlightState], int] | None = None  # what is done in which states, from when
-        self._complained = ("", 0.0)  # about sticks: why, and when
-        self._do: dict[type[AnyOrder], Callable[[Any], None]] = {
-            Take: lambda order: self._begin(order.do, self._take(order.priority, order.ask)),
-            Release: lambda order: self._begin(order.do, self._release()),
-            Answer: lambda order: self._begin(order.do, self._answer(order)),
-            TakeOff: lambda order: self._command(order.do, lambda hands: hands.takeoff(wait=False), _UP),
-            HoverHere: lambda order: self._command(order.do, lambda hands: hands.hover()),
-            LandHere: lambda order: self._command(order.do, lambda hands: hands.land(wait=False), _DOWN),
-            Reset: lambda order: self._command(order.do, lambda hands: hands.reset_emergency()),
-            Stop: lambda order: self._begin(order.do, self._stop(), wait=False),
+        self._repeated = False  # for as long as a take-off may be
+        self._last_refusal = ("", -_REFUSE_AGAIN_S)  # about sticks: why, and when [s]
+        self._handlers: dict[type[AnyCommand], Callable[[Any], None]] = {
+            Take: lambda command: self._run_in_turn(command, self._take),
+            Release: lambda command: self._run_in_turn(command, self._release),
+            Answer: lambda command: self._run_in_turn(command, self._answer),
+            TakeOff: lambda command: self._send_command(command, lambda pilot: pilot.takeoff(wait=False), _UP),
+            HoverHere: lambda command: self._send_command(command, lambda pilot: pilot.hover()),
+            LandHere: lambda command: self._send_command(command, lambda pilot: pilot.land(wait=False), _DOWN),
+            Reset: lambda command: self._send_command(command, lambda pilot: pilot.reset_emergency()),
+            Stop: self._stop_motors,
             Fly: self._fly,
             GoTo: self._go_to,
-            Write: lambda order: self._begin(order.do, self._write(order)),
-            Alive: lambda order: self._say({"type": "pong", "n": order.n}),
+            Write: lambda command: self._run_in_turn(command, self._write),
         }
 
     async def run(self) -> None:
         """Serve the page until it is gone, then leave the vehicle in a safe state."""
-        look = self._look
-        writing = asyncio.create_task(self._write_out())
+        update = self._update
         self._station.pilot_came()
-        self._station.beat.join(look)
+        self._station.broadcast.subscribe(update)
         try:
-            while True:
-                message = await self._socket.receive()
-                if message["type"] == "websocket.disconnect":
-                    break
-                self._take_in(message.get("text") or message.get("bytes") or "")
-        except WebSocketDisconnect:
-            pass
+            await self._page.serve(self._on_message)
         finally:
-            self._station.beat.leave(look)
-            self._let_go()
-            writing.cancel()
-            await asyncio.shield(self._leave())
+            self._station.broadcast.unsubscribe(update)
+            self._on_page_gone()
+            await asyncio.shield(self._close())
 
-    # What the page says ----------------------------------------------------------------------------------------
+    # Messages of the page ----------------------------------------------------------------------------------------
 
-    def _take_in(self, text: str | bytes) -> None:
+    def _on_message(self, text: str | bytes) -> None:
         try:
-            order = decode_order(text)
+            command = decode_command(text)
         except DecodeError as error:
             self._refuse("", str(error))
             return
-        self._rearm()
-        if not isinstance(order, Alive | Answer):
-            self._last = order.do
-            self._orders += 1
+        now_ns = self._clock()
+        problem = untimely(command, seconds(now_ns))
+        if not problem:
+            self._restart_silence_timer()  # what is old is no sign of life
+        if isinstance(command, Alive):
+            self._on_ping(command, now_ns)
+            return
         try:
-            self._do[type(order)](order)
+            if problem:
+                raise RefusedError(problem)
+            if not isinstance(command, Answer):
+                self._last_command = command.do
+                self._commands += 1
+            self._handlers[type(command)](command)
         except SkyloopError as error:
-            self._refuse(order.do, str(error))
+            self._refuse_command(command, str(error))
 
-    def _command(self, do: str, act: Callable[[Hands], bool], until: frozenset[FlightState] = frozenset()) -> None:
-        """What is one command; it ends whatever the page flew before. Done when sent, or when the vehicle is in one of
-        the states. Raises what the drone raises."""
-        hands = self._held()
+    def _on_ping(self, ping: Alive, now_ns: int) -> None:
+        """Count the page as present, from when it last received from us, and answer."""
+        if ping.seen_s is not None and self._pilot is not None:
+            ago_s = min(
+                GONE_S, max(0.0, seconds(now_ns) - ping.seen_s)
+            )  # never more than it is, whatever the page says
+            self._pilot.present_until(now_ns + nanoseconds(GONE_S - ago_s))
+        self._send({"type": "pong", "n": ping.n, "now_s": seconds(now_ns)})
+
+    def _send_command(
+        self, command: AnyCommand, act: Callable[[PilotConnection], bool], until: frozenset[FlightState] = frozenset()
+    ) -> None:
+        """Send one command, which ends whatever the page flew before.
+
+        It is done when it was sent or, if ``until`` has states, when the vehicle is in one of them.
+
+        Args:
+            command: The page's.
+            act: Sends it; returns whether it was sent.
+            until: The states.
+
+        Raises:
+            SkyloopError: What the drone raises; :class:`LinkError` if it was not sent.
+        """
+        pilot = self._held()
         self._end_flight()
-        if not act(hands):
-            raise LinkError(f"{do} was not sent: the link to the proxy is {hands.link.application}")
+        if not act(pilot):
+            with suppress(SkyloopError):
+                pilot.idle()  # or it would be done after all when the link is back soon
+            raise LinkError(f"{command.do} was not sent: the link to the proxy is {pilot.link.application}")
+        self._acknowledge(command)
         if until:
-            self._awaited = do, until, hands.proxy_ns + _SETTLED_NS
+            self._awaited, self._repeated = (command.do, until, pilot.proxy_now_ns + _SETTLED_NS), False
         else:
-            self._say({"type": "done", "do": do})
+            self._send({"type": "done", "do": command.do})
 
-    def _fly(self, order: Fly) -> None:
-        try:
-            hands = self._held()
-            self._end_flight()
-            hands.velocity(forward=order.forward, left=order.left, up=order.up, yaw_rate=order.yaw_rate)
-        except SkyloopError as error:
-            now_s = asyncio.get_running_loop().time()
-            before, at_s = self._complained
-            if str(error) != before or now_s - at_s > _SAY_AGAIN_S:
-                self._complained = str(error), now_s
-                self._refuse(order.do, str(error))
-        else:
-            self._steering = True
-            self._rearm()
+    def _fly(self, command: Fly) -> None:
+        pilot = self._held()
+        self._end_flight()
+        pilot.velocity(forward=command.forward, left=command.left, up=command.up, yaw_rate=command.yaw_rate)
+        self._steering = True
+        self._restart_silence_timer()
 
-    def _go_to(self, order: GoTo) -> None:
-        hands = self._held()
-        problem = lacking(hands.feedback())
+    def _go_to(self, command: GoTo) -> None:
+        pilot = self._held()
+        problem = lacking(pilot.feedback())
         if problem:
             raise RefusedError(f"it can't be flown to a place: {problem}")
-        if not hands.feedback().state.airborne:
+        if not pilot.feedback().state.airborne:
             raise RefusedError("it can't be flown to a place: it is not in the air, take off first")
-        goal = Waypoint(order.x, order.y, order.z, order.yaw)
+        goal = Waypoint(command.x, command.y, command.z, command.yaw)
         self._end_flight()
         self._station.goals[self.app] = goal
-        self._goto = self._job(self._follow(hands, goal))
-        self._rearm()
+        self._goto = self._start_job(self._follow(pilot, goal))
+        self._acknowledge(command)
+        self._restart_silence_timer()
 
-    async def _stop(self) -> None:
+    def _stop_motors(self, command: Stop) -> None:
         self._end_flight()
-        try:
-            hands = self._hands or await self._station.stopper()
-        except SkyloopError as error:
-            raise LinkError(f"the emergency stop was not sent: {error}") from error
-        if not hands.emergency_stop():
-            raise LinkError(
-                f"the emergency stop was not sent: the link to the proxy is {hands.link.application}; it still is if "
-                "the link is back within half a second"
-            )
-        self._say({"type": "done", "do": "stop"})
+        self._start_job(self._cut_motors(command))
 
-    async def _take(self, priority: int, ask: bool) -> None:
-        hands = self._hands
-        if hands is None:
-            hands = self._hands = await self._station.open_hands(self.app)
+    async def _cut_motors(self, command: Stop) -> None:
+        """Cut the motors, trying for as long as the page shows the command as pending."""
+        assert command.at_s is not None  # or it would be untimely
+        until_ns = nanoseconds(command.at_s - command.unsure_s + late_s(command))
+        try:
+            await self._station.cut_motors(until_ns, self._pilot)
+        except SkyloopError as error:
+            self._refuse_command(command, str(error))
+        else:
+            self._acknowledge(command)
+            self._send({"type": "done", "do": command.do})
+
+    async def _take(self, command: Take) -> None:
+        pilot = self._pilot
+        if pilot is None:
+            pilot = self._pilot = await self._station.open_pilot(self.app)
+            pilot.set_flown_by_person()
             loop = asyncio.get_running_loop()
-            hands.on_event(lambda event: call_soon(loop, self._hear, event), inline=True)
-        self._takeover.join(ask=ask)
+            pilot.on_event(lambda event: call_soon(loop, self._on_event, event), inline=True)
+        elif not pilot.is_linked:
+            raise LinkError("the link to the proxy is lost: control can be taken when it is back")
+        pilot.present_until(monotonic_ns() + nanoseconds(GONE_S))
+        self._takeover.request(ask=command.ask)
+        self._acknowledge(command)
         try:
-            await asyncio.to_thread(hands.take, priority, ask=ask)
+            await asyncio.to_thread(pilot.acquire, command.priority, ask=command.ask)
         except SkyloopError as error:
-            if hands.authority.state == "none":
-                await self._drop_hands()
+            if pilot.authority.state == "none":
+                await self._close_pilot()
             if isinstance(error, AuthorityError) and error.code == "busy":
-                raise AuthorityError(self._busy(priority), code="busy") from error
+                raise AuthorityError(self._busy(command.priority), code="busy") from error
             raise
-        self._say({"type": "done", "do": "take"})
-        self._look()
+        self._send({"type": "done", "do": command.do})
+        self._update()
 
-    async def _answer(self, order: Answer) -> None:
-        await self._takeover.answer(order, self._held())
-        self._say({"type": "done", "do": order.do})
+    async def _answer(self, command: Answer) -> None:
+        self._acknowledge(command)
+        await self._takeover.answer(command, self._held())
+        self._send({"type": "done", "do": command.do})
 
-    async def _release(self) -> None:
+    async def _release(self, command: Release) -> None:
         self._hover()
-        await self._drop_hands()
-        self._say({"type": "done", "do": "release"})
-        self._look()
+        self._was_mine, self._loss = False, None  # on purpose
+        self._acknowledge(command)
+        await self._close_pilot()
+        self._send({"type": "done", "do": command.do})
+        self._update()
 
-    async def _drop_hands(self) -> None:
+    async def _close_pilot(self) -> None:
         """Without the authority a page needs no connection of its own."""
-        hands, self._hands = self._hands, None
-        if hands is not None:
-            await self._station.close_hands(hands)
+        pilot, self._pilot = self._pilot, None
+        if pilot is not None:
+            await self._station.close_pilot(pilot)
 
-    async def _write(self, order: Write) -> None:
-        hands = self._held()
+    async def _write(self, command: Write) -> None:
+        pilot = self._held()
+
+        self._acknowledge(command)
 
         def write() -> Any:
-            hands.config[order.name] = order.value
-            return hands.config[order.name]
+            pilot.config[command.name] = command.value
+            return pilot.config[command.name]
 
         value = await asyncio.to_thread(write)
-        self._say({"type": "done", "do": order.do, "name": order.name, "value": value})
+        self._send({"type": "done", "do": command.do, "name": command.name, "value": value})
 
-    async def _follow(self, hands: Hands, goal: Waypoint) -> None:
-        """Fly to a place. Ends there, with the first thing that goes wrong, and with the page's next order."""
+    async def _follow(self, pilot: PilotConnection, goal: Waypoint) -> None:
+        """Fly to a place. Ends there, with the first thing that goes wrong, and with the page's next command."""
         try:
-            while not reached(goal, hands.feedback(max_age_s=1.0)):
-                hands.command(velocity_to(goal, hands.feedback()))
+            while not reached(goal, pilot.feedback(max_age_s=1.0)):
+                pilot.command(velocity_to(goal, pilot.feedback()))
                 await asyncio.sleep(GOTO_PERIOD_S)
-            hands.hover()
-            self._say({"type": "done", "do": "goto"})
+            pilot.hover()
+            self._send({"type": "done", "do": "goto"})
         except SkyloopError as error:
             self._refuse("goto", str(error))
-            self._hover_if_held(hands)
+            self._hover_if_held(pilot)
         finally:
             if self._goto is asyncio.current_task():
                 self._goto = None
@@ -255,33 +307,37 @@ class ControlSession:
             "a lower number is a higher priority"
         )
 
-    def _held(self) -> Hands:
-        """The hands with the authority. Raises :class:`AuthorityError`."""
-        hands = self._hands
-        if hands is None or hands.authority.state == "none":
+    def _held(self) -> PilotConnection:
+        """Return the connection that holds the authority.
+
+        Raises:
+            AuthorityError: There is none.
+        """
+        pilot = self._pilot
+        if pilot is None or pilot.authority.state == "none":
             raise AuthorityError("take control first", code="no_authority")
-        if hands.authority.state != "held":
-            raise AuthorityError(f"{hands.authority.holder or 'another application'} has control", code="no_authority")
-        return hands
+        if pilot.authority.state != "held":
+            raise AuthorityError(f"{pilot.authority.holder or 'another application'} has control", code="no_authority")
+        return pilot
 
     # The dead-man ----------------------------------------------------------------------------------------------
 
-    def _rearm(self) -> None:
-        """The page has just been heard."""
+    def _restart_silence_timer(self) -> None:
+        """Restart the timer, as the page has just given a sign of life."""
         if self._silence is not None:
             self._silence.cancel()
             self._silence = None
         if self._steering or self._goto is not None:
-            self._silence = asyncio.get_running_loop().call_later(SILENT_S, self._silent)
+            self._silence = asyncio.get_running_loop().call_later(SILENT_S, self._on_silence)
 
-    def _silent(self) -> None:
+    def _on_silence(self) -> None:
         self._silence = None
         if self._steering or self._goto is not None:
             self._hover()
-            self._refuse(self._last, f"the page was silent for {SILENT_S:g} s: the vehicle hovers")
+            self._refuse(self._last_command, f"the page was silent for {SILENT_S:g} s: the vehicle hovers")
 
     def _end_flight(self) -> None:
-        """What the page flew before is over."""
+        """End what the page flew before."""
         self._steering = False
         self._awaited = None
         if self._goto is not None:
@@ -290,116 +346,157 @@ class ControlSession:
         self._station.goals.pop(self.app, None)
 
     def _hover(self) -> None:
-        """Hover if this page has the vehicle under way. A take-off or landing under way ends safely by itself."""
+        """Hover if this page has the vehicle under way; a take-off or landing under way ends safely by itself."""
         flies = self._steering or self._goto is not None
         self._end_flight()
-        hands = self._hands
-        if hands is not None and (flies or hands.flies):
-            self._hover_if_held(hands)
+        pilot = self._pilot
+        if pilot is not None and (flies or pilot.is_flying):
+            self._hover_if_held(pilot)
 
-    def _hover_if_held(self, hands: Hands) -> None:
+    def _hover_if_held(self, pilot: PilotConnection) -> None:
         try:
-            if hands.authority.state == "held":
-                hands.hover()
+            if pilot.authority.state == "held":
+                pilot.hover()
         except SkyloopError:
             pass  # somebody else has it, or the link is lost: then the proxy sees to it
 
     # The end ---------------------------------------------------------------------------------------------------
 
-    def _let_go(self) -> None:
-        """The page is gone: hover at once."""
+    def _on_page_gone(self) -> None:
+        """Hover at once, as the page is gone."""
         if self._silence is not None:
             self._silence.cancel()
             self._silence = None
         self._hover()
 
-    async def _leave(self) -> None:
+    async def _close(self) -> None:
         """Wait for what is under way, and give the authority back."""
         await asyncio.gather(*self._jobs, return_exceptions=True)
         self._hover()  # what was taken, or begun, only just now
-        await self._drop_hands()
+        await self._close_pilot()
         await self._station.pilot_went()
 
-    # What the page is told -------------------------------------------------------------------------------------
+    # Messages to the page -------------------------------------------------------------------------------------
 
-    def _look(self) -> None:
-        """Tell who has the authority, what this page is asked, and what is done, if that is news."""
-        self._tell_authority()
-        hands = self._hands
-        if self._awaited is not None and hands is not None:
+    def _update(self) -> None:
+        """Send the authority, the page's open questions, and commands that are done, where that has changed."""
+        self._send_authority()
+        pilot = self._pilot
+        if self._awaited is not None and pilot is not None:
             do, states, from_ns = self._awaited
+            if do == TakeOff().do and pilot.proxy_now_ns - from_ns > _TAKEOFF_NS and not self._repeated:
+                self._repeated = True
+                with suppress(SkyloopError):
+                    pilot.idle()  # what has begun goes on; what has not must not begin when a slow link is back
             with suppress(LinkError):
-                feedback = hands.feedback()
+                feedback = pilot.feedback()
                 if feedback.captured_ns >= from_ns and feedback.state in states:
                     self._awaited = None
-                    self._say({"type": "done", "do": do})
+                    self._send({"type": "done", "do": do})
 
-    def _tell_authority(self) -> None:
-        hands, drone = self._hands, self._station.drone
-        state = "none" if hands is None else hands.authority.state
+    def _send_authority(self) -> None:
+        pilot, drone = self._pilot, self._station.drone
+        state = "none" if pilot is None else pilot.authority.state
         try:
             feedback = drone.feedback()
-            holder, priority = feedback.owner, feedback.owner_priority
+            holder, priority = self._station.view.holder(feedback), feedback.owner_priority
         except LinkError:
             holder, priority = None, None
         mine = state == "held"
         lost = drone.link.application in (LinkState.LOST, LinkState.CLOSED)
         if lost or (holder == self.app and not mine):  # from before
-            holder, priority = None, None
-        if mine and hands is not None:  # known here first
-            holder, priority = self.app, hands.authority.priority
-        place = self._takeover.look(hands)
-        if (state, holder, priority, place) != self._authority:
-            self._authority = state, holder, priority, place
+            holder = None
+        if holder is None:
+            priority = None
+        if mine and pilot is not None:  # known here first
+            holder, priority = self.app, pilot.authority.priority
+        if mine or (self._was_mine and pilot is not None):
+            self._loss = None if mine or pilot is None else _end_of_control(pilot)
+        self._was_mine = mine
+        why = None if self._loss is None else self._why(self._loss, holder, lost)
+        place = self._takeover.update(pilot)
+        if (state, holder, priority, place, why) != self._authority:
+            self._authority = state, holder, priority, place, why
             if not mine:
                 self._end_flight()
-            told = {"type": "authority", "state": state, "holder": holder, "priority": priority, "mine": mine}
-            self._say(told | {"line": None if place is None else place.told(monotonic_ns())})
+            message = {
+                "type": "authority",
+                "state": state,
+                "holder": holder,
+                "priority": priority,
+                "mine": mine,
+                "why": why,
+            }
+            self._send(message | {"line": None if place is None else place.to_json(monotonic_ns())})
 
-    def _hear(self, event: Event) -> None:
-        """The proxy refused what this page commanded, or somebody asks for control or answers."""
-        hands = self._hands
-        if hands is None:
+    def _why(self, ended: str, holder: str | None, lost: bool) -> str:
+        """Return what became of the control that this page had, in words that are true now."""
+        name = self._station.found.name
+        now = f"{holder} has control" if holder else "nobody has control"
+        if ended == "link" and lost:
+            return f"the link to the proxy of {name} is down: nobody has control, and what {name} does is not known"
+        if ended == "link":
+            return f"the link to the proxy of {name} was lost: {now}, and what {name} flew meanwhile is not known"
+        if ended == "silent":
+            return f"the cockpit did not hear this page for {GONE_S:g} s, so its control ran out: {now}"
+        return f"{now} now"
+
+    def _on_event(self, event: Event) -> None:
+        """Handle the proxy's refusal of a command of this page, and takeovers by asking."""
+        pilot = self._pilot
+        if pilot is None:
             return
-        self._takeover.hear(event, hands)
+        self._takeover.on_event(event, pilot)
         ours = event.kind is EventKind.COMMAND_REFUSED and event.app == self.app
-        if not ours or self._told_of == self._orders:
+        if not ours or self._refused_command == self._commands or event.data.get("reason") in _OF_ONE_PACKET:
             return  # its repeats are refused too, which is no news
-        self._told_of = self._orders
+        self._refused_command = self._commands
         self._awaited = None
-        self._refuse(self._last, event.text)
-        if self._last == TakeOff().do:
+        self._refuse(self._last_command, event.text)
+        if self._last_command == TakeOff().do:
             with suppress(SkyloopError):
-                hands.idle()  # or it would take off, to everybody's surprise, once it can
+                pilot.idle()  # or it would take off, to everybody's surprise, once it can
 
     def _refuse(self, do: str, why: str) -> None:
-        self._say({"type": "refused", "do": do, "why": why})
+        self._send({"type": "refused", "do": do, "n": 0, "why": why})
 
-    def _begin(self, do: str, work: Coroutine[Any, Any, None], *, wait: bool = True) -> None:
-        """Do what takes a moment; one after the other, unless it can't ``wait``."""
-        self._job(self._work(do, work, wait))
+    def _refuse_command(self, command: AnyCommand, why: str) -> None:
+        if isinstance(command, Fly):  # comes twenty times a second
+            now_s = seconds(self._clock())
+            before, at_s = self._last_refusal
+            if why == before and now_s - at_s <= _REFUSE_AGAIN_S:
+                return
+            self._last_refusal = why, now_s
+        self._send({"type": "refused", "do": command.do, "n": command.n, "why": why})
 
-    def _job(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+    def _acknowledge(self, command: AnyCommand) -> None:
+        self._send({"type": "sent", "do": command.do, "n": command.n})
+
+    def _run_in_turn(self, command: AnyCommand, work: Callable[[Any], Coroutine[Any, Any, None]]) -> None:
+        """Start work that takes a moment, after what was started before."""
+        self._start_job(self._run(command, work))
+
+    def _start_job(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         job = asyncio.create_task(work)
         self._jobs.add(job)
         job.add_done_callback(self._jobs.discard)
         return job
 
-    async def _work(self, do: str, work: Coroutine[Any, Any, None], wait: bool) -> None:
+    async def _run(self, command: AnyCommand, work: Callable[[Any], Coroutine[Any, Any, None]]) -> None:
         try:
-            if wait:
-                async with self._asking:
-                    await work
-            else:
-                await work
+            async with self._turn:
+                problem = untimely(command, seconds(self._clock()))
+                if problem:  # what was before it took too long
+                    raise RefusedError(problem)
+                await work(command)
         except SkyloopError as error:
-            self._refuse(do, str(error))
+            self._refuse_command(command, str(error))
 
-    def _say(self, message: Json) -> None:
-        with suppress(asyncio.QueueFull):
-            self._outbox.put_nowait(message)
 
-    async def _write_out(self) -> None:
-        with suppress(WebSocketDisconnect):  # the receiving side sees it too
-            while True:
-                await self._socket.send_text(encode_json(await self._outbox.get()).decode())
+def _end_of_control(pilot: PilotConnection) -> str:
+    """Return how a page lost the control that it had: ``taken``, ``link``, ``silent`` or ``over``."""
+    if pilot.authority.state != "none":
+        return "taken"
+    if not pilot.is_linked:
+        return "link"
+    return "silent" if pilot.is_silent else "over"

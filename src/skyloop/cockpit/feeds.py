@@ -1,7 +1,7 @@
-"""From the client's threads to the event loop: the newest frame, the newest drawing of each source, the last events,
-what applications log and what is commanded.
+"""From the client's threads to the event loop: what a drone sends, and what pages get of it at a steady rate.
 
-Everything here but the callbacks given to the drone runs on the event loop.
+That is the newest frame, the newest drawing of each source, the last events, what applications log, and what is
+commanded. Everything here but the callbacks given to the drone runs on the event loop.
 """
 
 from __future__ import annotations
@@ -11,10 +11,12 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+
+import msgspec
 
 from skyloop.clock import Clock, monotonic_ns, seconds
-from skyloop.messages import Annotation, Applied, Event, LogEntry
+from skyloop.messages import Annotation, Applied, Event, LogEntry, Points, Polyline, Text
 from skyloop.messages.log import MOCAP as SERIES
 
 if TYPE_CHECKING:
@@ -22,33 +24,83 @@ if TYPE_CHECKING:
 
 JPEG_QUALITY = 80
 KEPT_EVENTS = 256
+KEPT_S = 10.0  #: what was drawn or logged longer ago is no longer shown
 MAX_SERIES = 256  #: logged numbers that are shown of one drone
+MAX_SOURCES = 64  #: sources of drawings that are shown of one drone; all of its cameras together
+MAX_WAYPOINTS = 256  #: of one path that are shown
 WAYPOINTS = "waypoints"  #: name under which a controller logs where it flies to
 MOCAP_S = 0.5  #: a pose of motion capture that is older is not shown
 
+_KEPT_NS = round(KEPT_S * 1e9)
+
 Wake = Callable[[], None]
+_encode = msgspec.json.Encoder().encode
 
 
 class _Cancellable(Protocol):
-    """What registering with a drone gives back."""
+    """What registering a callback with a drone returns."""
 
     def cancel(self) -> None: ...
 
 
+K = TypeVar("K")
+V = TypeVar("V")
+
+
+class Newest(Generic[K, V]):
+    """The newest value of each of at most ``most`` keys, forgotten after :data:`KEPT_S`.
+
+    A key that is there keeps its place as long as it is renewed, however many others ask for one. One thread calls
+    :meth:`put`, others read.
+    """
+
+    def __init__(self, most: int, clock: Clock) -> None:
+        self.refused = 0  #: values that found no place
+        self._most = most
+        self._clock = clock
+        self._values: dict[K, tuple[int, V]] = {}  # with when it came; what was renewed last is last
+
+    def put(self, key: K, value: V) -> None:
+        """Set a key's value; it is refused, and counted, if there is no place for a new key."""
+        now_ns = self._clock()
+        if self._values.pop(key, None) is None and len(self._values) >= self._most:
+            oldest = next(iter(self._values))
+            if now_ns - self._values[oldest][0] < _KEPT_NS:
+                self.refused += 1
+                return
+            del self._values[oldest]
+        self._values[key] = now_ns, value
+
+    def items(self) -> list[tuple[K, V]]:
+        """Return the values that were set within :data:`KEPT_S`, with their keys."""
+        oldest_ns = self._clock() - _KEPT_NS
+        return [(key, value) for key, (at_ns, value) in list(self._values.items()) if at_ns > oldest_ns]
+
+    def clear(self) -> None:
+        """Forget all values."""
+        self._values = {}
+
+
 @dataclass(frozen=True, slots=True)
-class Picture:
-    """One frame on its way to pages. ``serial`` counts what this process saw, across restarts of the proxy."""
+class NumberedFrame:
+    """One frame on its way to pages; ``serial`` counts the frames of this process, across restarts of the proxy."""
 
     serial: int
     frame: Frame
 
 
 class CameraFeed:
-    """The newest frame of one camera, encoded at most once for all pages, and only while a page wants it."""
+    """The newest frame of one camera, encoded at most once for all pages, and only while a page wants it.
+
+    Args:
+        drone: The drone.
+        camera: The camera's name.
+        clock: The monotonic clock [ns].
+    """
 
     def __init__(self, drone: Drone, camera: str, clock: Clock = monotonic_ns) -> None:
         self.camera = camera
-        self.newest: Picture | None = None
+        self.newest: NumberedFrame | None = None
         self.encoded = 0  #: frames that were made a JPEG
         self._drone = drone
         self._clock = clock
@@ -65,8 +117,8 @@ class CameraFeed:
         """Whether a page watches it."""
         return bool(self._wakes)
 
-    def join(self, wake: Wake) -> None:
-        """A page wants frames: ``wake`` is called on the loop when there is a newer one."""
+    def subscribe(self, wake: Wake) -> None:
+        """Call ``wake`` on the loop for each newer frame; the first subscriber subscribes to the camera."""
         self._wakes.add(wake)
         if self._processor is None:
             loop = asyncio.get_running_loop()
@@ -77,8 +129,8 @@ class CameraFeed:
         elif self.newest is not None:
             wake()
 
-    def leave(self, wake: Wake) -> None:
-        """A page went away; after the last one the camera is no longer subscribed."""
+    def unsubscribe(self, wake: Wake) -> None:
+        """Call ``wake`` no longer; after the last one the camera is no longer subscribed to."""
         self._wakes.discard(wake)
         if not self._wakes and self._processor is not None:
             self._processor.cancel()
@@ -86,13 +138,13 @@ class CameraFeed:
 
     @property
     def age_s(self) -> float | None:
-        """Age of the newest frame, or how long one was waited for in vain; None while no page wants any [s]."""
+        """Age of the newest frame [s], or how long one was waited for in vain; None while no page wants any."""
         if self._processor is None:
             return None
         return seconds(self._clock() - self._since_ns) if self.newest is None else self.newest.frame.age_s
 
-    async def jpeg(self, picture: Picture) -> bytes:
-        """The picture as a JPEG file; the same work is done once for all pages."""
+    async def jpeg(self, picture: NumberedFrame) -> bytes:
+        """Return the picture as a JPEG file; it is encoded once for all pages, on a thread."""
         if self._jpeg is None or self._jpeg[0] != picture.serial:
             loop = asyncio.get_running_loop()
             self._jpeg = picture.serial, loop.run_in_executor(self._pool, to_jpeg, picture.frame)
@@ -100,6 +152,7 @@ class CameraFeed:
         return await asyncio.shield(self._jpeg[1])
 
     def close(self) -> None:
+        """Unsubscribe from the camera, and end the thread."""
         if self._processor is not None:
             self._processor.cancel()
             self._processor = None
@@ -109,42 +162,96 @@ class CameraFeed:
         if self._processor is None:  # cancelled while this was on its way
             return
         self._serial += 1
-        self.newest = Picture(self._serial, frame)
+        self.newest = NumberedFrame(self._serial, frame)
         for wake in self._wakes:
             wake()
 
 
-class NewsFeed:
-    """The drone's annotations and events. Events are numbered here, as those that the client makes have no number."""
+class Drawing:
+    """A drawing on its way to pages; encoded once for all of them."""
 
-    def __init__(self, drone: Drone) -> None:
-        self.drawings: dict[tuple[str, str], Annotation] = {}  #: newest, by camera and source
+    __slots__ = ("_text", "annotation")
+
+    def __init__(self, annotation: Annotation) -> None:
+        self.annotation = annotation
+        self._text: str | None = None
+
+    @property
+    def text(self) -> str:
+        """The message to pages, in JSON."""
+        if self._text is None:
+            self._text = _encode(drawing_values(self.annotation)).decode()
+        return self._text
+
+
+def drawing_values(annotation: Annotation) -> dict[str, Any]:
+    """Return an annotation as JSON values for a page."""
+    return {
+        "type": "drawing",
+        "source": annotation.source,
+        "captured_ns": str(annotation.captured_ns),  # too large for JavaScript's numbers
+        "width": annotation.width,
+        "height": annotation.height,
+        "shapes": [_shape(shape) for shape in annotation.shapes],
+    }
+
+
+def _shape(shape: Polyline | Points | Text) -> dict[str, Any]:
+    if isinstance(shape, Text):
+        return {"kind": "text", "text": shape.text, "at": shape.at, "colour": shape.colour}
+    if isinstance(shape, Points):
+        return {"kind": "points", "points": shape.points, "colour": shape.colour}
+    return {"kind": "line", "points": shape.points, "closed": shape.closed, "colour": shape.colour}
+
+
+class EventFeed:
+    """The drone's annotations and events.
+
+    Events are numbered here, as those that the client makes have no number.
+
+    Args:
+        drone: The drone.
+        clock: The monotonic clock [ns].
+    """
+
+    def __init__(self, drone: Drone, clock: Clock = monotonic_ns) -> None:
+        self.drawings: Newest[tuple[str, str], Drawing] = Newest(MAX_SOURCES, clock)  #: by camera and source
         self.events: deque[tuple[int, Event]] = deque(enumerate(drone.recent_events(), 1), maxlen=KEPT_EVENTS)
         self._next = len(self.events) + 1
         self._wakes: set[Wake] = set()
-        loop = asyncio.get_running_loop()
+        self._loop = loop = asyncio.get_running_loop()
+        self._waking = False  # pages are about to be woken
         self._listeners: list[_Cancellable] = [
-            drone.on_annotation(lambda annotation: call_soon(loop, self._draw, annotation)),
+            drone.on_annotation(self._draw),
             drone.on_event(lambda event: call_soon(loop, self._tell, event)),
         ]
 
-    def join(self, wake: Wake) -> None:
-        """``wake`` is called on the loop when there is a newer drawing."""
+    def subscribe(self, wake: Wake) -> None:
+        """Call ``wake`` on the loop when there is a newer drawing."""
         self._wakes.add(wake)
 
-    def leave(self, wake: Wake) -> None:
+    def unsubscribe(self, wake: Wake) -> None:
+        """Call ``wake`` no longer."""
         self._wakes.discard(wake)
 
     def events_after(self, number: int) -> list[tuple[int, Event]]:
-        """Events with greater numbers, oldest first, with their numbers."""
+        """Return the events with greater numbers and those numbers, the oldest first."""
         return [(n, event) for n, event in self.events if n > number]
 
     def close(self) -> None:
+        """Unregister from the drone."""
         for listener in self._listeners:
             listener.cancel()
 
     def _draw(self, annotation: Annotation) -> None:
-        self.drawings[annotation.camera, annotation.source] = annotation
+        """Keep a drawing. On the client's thread: however many come, they put one call on the loop."""
+        self.drawings.put((annotation.camera, annotation.source), Drawing(annotation))
+        if not self._waking:
+            self._waking = True
+            call_soon(self._loop, self._wake_pages)
+
+    def _wake_pages(self) -> None:
+        self._waking = False
         for wake in self._wakes:
             wake()
 
@@ -153,24 +260,28 @@ class NewsFeed:
         self._next += 1
 
 
-class Listening:
-    """What applications log and what was applied last; heard only while somebody wants it, as it costs the proxy
-    something. The values are replaced as a whole, by the receiving thread."""
+class LogFeed:
+    """What applications log, and which command was applied last.
 
-    #: A number that was logged longer ago is no longer shown.
-    KEPT_S = 10.0
+    It is subscribed to only while somebody wants it, as it costs the proxy something. The client's receiving thread
+    replaces the values as a whole.
+
+    Args:
+        drone: The drone.
+        clock: The monotonic clock [ns].
+    """
 
     def __init__(self, drone: Drone, clock: Clock = monotonic_ns) -> None:
         self.applied: Applied | None = None
         self._drone = drone
         self._clock = clock
-        self._numbers: dict[str, tuple[int, float]] = {}  # when it came, and the value
+        self._numbers: Newest[str, float] = Newest(MAX_SERIES, clock)
         self._waypoints: tuple[int, tuple[tuple[float, ...], ...]] | None = None
         self._mocap: tuple[int, tuple[float, ...]] | None = None
         self._listeners: list[_Cancellable] = []
 
     def want(self, wanted: bool) -> None:
-        """Begin to listen, or end it."""
+        """Subscribe, or unsubscribe and forget the values."""
         if wanted and not self._listeners:
             self._listeners = [
                 self._drone.on_command(self._command, inline=True),
@@ -180,20 +291,33 @@ class Listening:
             for listener in self._listeners:
                 listener.cancel()
             self._listeners = []
-            self._numbers, self._waypoints, self._mocap, self.applied = {}, None, None, None
+            self._numbers.clear()
+            self._waypoints, self._mocap, self.applied = None, None, None
 
     def numbers(self) -> dict[str, float]:
-        """The newest value of each series that was logged lately."""
-        oldest_ns = self._clock() - round(self.KEPT_S * 1e9)
-        return {name: value for name, (at_ns, value) in list(self._numbers.items()) if at_ns >= oldest_ns}
+        """Return the newest value of each series that was logged within :data:`KEPT_S`."""
+        return dict(self._numbers.items())
+
+    @property
+    def refused(self) -> int:
+        """Logged numbers for which there was no place."""
+        return self._numbers.refused
 
     def waypoints(self) -> tuple[tuple[float, ...], ...]:
-        """What was logged lately as an array named ``waypoints``: a row each of x, y, z [m] and perhaps yaw [rad]."""
+        """Return the array named ``waypoints`` that was logged last, if within :data:`KEPT_S`.
+
+        Returns:
+            A row each of x, y, z [m] and perhaps yaw [rad], in world axes; empty if there is none.
+        """
         told = self._waypoints
-        return told[1] if told is not None and seconds(self._clock() - told[0]) <= self.KEPT_S else ()
+        return told[1] if told is not None and seconds(self._clock() - told[0]) <= KEPT_S else ()
 
     def mocap(self) -> tuple[float, ...] | None:
-        """Where motion capture sees it now: x, y, z [m], quaternion x, y, z, w; None if it does not."""
+        """Return the pose that motion capture has given last.
+
+        Returns:
+            x, y, z [m], quaternion x, y, z, w; None if it is older than :data:`MOCAP_S`.
+        """
         told = self._mocap
         return told[1] if told is not None and seconds(self._clock() - told[0]) <= MOCAP_S else None
 
@@ -202,8 +326,7 @@ class Listening:
 
     def _log(self, entry: LogEntry) -> None:
         if entry.number is not None:
-            if entry.name in self._numbers or len(self._numbers) < MAX_SERIES:
-                self._numbers[entry.name] = self._clock(), entry.number
+            self._numbers.put(entry.name, entry.number)
         elif entry.values is not None and entry.name == SERIES and len(entry.values) >= 7:
             self._mocap = self._clock(), entry.values
         elif (
@@ -211,12 +334,16 @@ class Listening:
         ):
             rows, columns = entry.shape
             values = entry.values
-            places = tuple(values[row * columns : (row + 1) * columns] for row in range(rows))
+            places = tuple(values[row * columns : (row + 1) * columns] for row in range(min(rows, MAX_WAYPOINTS)))
             self._waypoints = self._clock(), places
 
 
 def to_jpeg(frame: Frame) -> bytes:
-    """A frame (BGR) as a JPEG file."""
+    """Encode a frame (BGR) as a JPEG file.
+
+    Raises:
+        ValueError: OpenCV could not.
+    """
     import cv2
 
     done, data = cv2.imencode(".jpg", frame.image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
@@ -226,6 +353,73 @@ def to_jpeg(frame: Frame) -> bytes:
 
 
 def call_soon(loop: asyncio.AbstractEventLoop, function: Callable[..., None], *arguments: Any) -> None:
-    """From any thread. A loop that has just been closed has no pages left to tell."""
+    """Call a function on the loop, from any thread; does nothing if the loop is closed, as it has no pages left."""
     if not loop.is_closed():
         loop.call_soon_threadsafe(function, *arguments)
+
+
+class PeriodicBroadcast:
+    """Makes a message at a steady rate while there are subscribers, once for all of them. On the event loop."""
+
+    def __init__(self, period_s: float, make: Callable[[], bytes], on_change: Callable[[bool], None]) -> None:
+        """Prepare it; the first subscriber starts it.
+
+        Args:
+            period_s: Between two messages [s].
+            make: Makes a message.
+            on_change: Called with True before the first subscriber, with False after the last one.
+        """
+        self.message = b""  #: the newest
+        self.closed = False  #: no more messages will come
+        self._period_s = period_s
+        self._make = make
+        self._on_change = on_change
+        self._wakes: set[Wake] = set()
+        self._task: asyncio.Task[None] | None = None
+
+    @property
+    def wanted(self) -> bool:
+        """Whether there are subscribers."""
+        return bool(self._wakes)
+
+    def subscribe(self, wake: Wake) -> None:
+        """Call ``wake`` for each new message, and now: the message is fresh, unless this is closed."""
+        if self.closed:
+            wake()
+            return
+        if not self._wakes:
+            self._on_change(True)
+            self.message = self._make()
+            self._task = asyncio.create_task(self._run())
+        self._wakes.add(wake)
+        wake()
+
+    def unsubscribe(self, wake: Wake) -> None:
+        """Call ``wake`` no longer; does nothing for one that has not subscribed."""
+        if wake in self._wakes:
+            self._wakes.discard(wake)
+            if not self._wakes:
+                self._stop()
+                self._on_change(False)
+
+    def close(self) -> None:
+        """End it for good, and wake all subscribers."""
+        self.closed = True
+        self._stop()
+        for wake in list(self._wakes):
+            wake()
+
+    def _stop(self) -> None:
+        if self._task is not None:
+            self._task.cancel()
+            self._task = None
+
+    async def _run(self) -> None:
+        loop = asyncio.get_running_loop()
+        due = loop.time()
+        while True:
+            due = max(due + self._period_s, loop.time())  # a late one is not made up for
+            await asyncio.sleep(due - loop.time())
+            self.message = self._make()
+            for wake in list(self._wakes):
+                wake()

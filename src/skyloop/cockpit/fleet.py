@@ -1,29 +1,33 @@
 """All drones that the cockpit knows: found, connected to as an observer, shown as lost, and forgotten.
 
-One connection a drone, for all pages. A drone that vanishes is looked for by its own link and comes back by itself;
-only when it was gone for long, and no page shows it, it is let go of. All of this is on the event loop; connecting and
-closing, which may wait, are on threads.
+There is one connection per drone, for all pages. A drone that vanishes is searched for by its own connection, and comes
+back by itself; only when it was gone for long, and no page shows it, it is removed. All of this is on the event loop;
+connecting and closing, which may wait, are on threads.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Collection
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable, Collection, Coroutine
+from typing import TYPE_CHECKING, Any, Final
 
-from skyloop.clock import Clock, monotonic_ns, nanoseconds
-from skyloop.cockpit.finder import Finder, Found
+from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
+from skyloop.cockpit.discovery import Finder, Found
+from skyloop.cockpit.feeds import PeriodicBroadcast
 from skyloop.cockpit.station import Station
+from skyloop.cockpit.telemetry import encode_json
 from skyloop.errors import SkyloopError
 from skyloop.messages import LinkState
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
+    from skyloop.cockpit.recordings import Recordings
 
 LOOK_S: Final = 0.5
 FORGET_S: Final = 60.0  #: gone for so long, a drone is no longer shown as lost
 CONNECT_S: Final = 3.0
+OVERVIEW_S: Final = 0.5  #: period of what pages are sent of all drones
 FIRST_LOOK_S: Final = 2.0  #: how long the first pages wait for those that are slow to answer
 
 Connect = Callable[[Found], "Drone"]
@@ -31,14 +35,26 @@ _log = logging.getLogger(__name__)
 
 
 def observe(found: Found) -> Drone:
-    """Connect as an observer. Raises :class:`SkyloopError`."""
+    """Connect to a proxy as an observer.
+
+    Raises:
+        SkyloopError: It can't be connected to within :data:`CONNECT_S`.
+    """
     from skyloop.client import Drone
 
     return Drone(found.dial, app="cockpit", access="observe").open(timeout_s=CONNECT_S)
 
 
 class Fleet:
-    """Stations by name. ``kept`` names are shown for ever once they were there."""
+    """The stations, by name.
+
+    Args:
+        finder: Finds proxies.
+        connect: Connects to one; called on threads.
+        kept: Names that are shown for ever once they were there.
+        clock: The monotonic clock [ns].
+        look_s: Time between two searches [s].
+    """
 
     def __init__(
         self,
@@ -60,9 +76,10 @@ class Fleet:
         self._connecting: dict[str, asyncio.Task[None]] = {}
         self._closing: set[asyncio.Task[None]] = set()
         self._watching: asyncio.Task[None] | None = None
+        self._begun: set[asyncio.Task[None]] = set()
 
     async def start(self) -> None:
-        """Look for the first time, wait for who answers soon, and go on looking."""
+        """Search for the first time, wait up to :data:`FIRST_LOOK_S` for the proxies found, and go on searching."""
         await self.look()
         if self._connecting:
             await asyncio.wait(list(self._connecting.values()), timeout=FIRST_LOOK_S)
@@ -73,13 +90,26 @@ class Fleet:
         waiting = [self._watching, *self._connecting.values()]
         if self._watching is not None:
             self._watching.cancel()
-        await asyncio.gather(*(task for task in waiting if task is not None), return_exceptions=True)
+        for task in self._begun:
+            task.cancel()
+        await asyncio.gather(*(task for task in waiting if task is not None), *self._begun, return_exceptions=True)
         for name in list(self.stations):
             self.let_go(name)
         await asyncio.gather(*self._closing, return_exceptions=True)
 
+    def begin(self, work: Coroutine[Any, Any, None]) -> None:
+        """Start work that goes on when the page that wanted it is gone."""
+        task = asyncio.create_task(work)
+        self._begun.add(task)
+        task.add_done_callback(self._begun.discard)
+
     async def look(self) -> None:
-        """Look once who is there: connect to new ones, let go of those that are gone for good."""
+        """Search once: begin to connect to new proxies, and remove those that are gone for good.
+
+        Raises:
+            SkyloopError: The search is not possible now.
+            OSError: The same.
+        """
         found = {one.name: one for one in await asyncio.to_thread(self.finder)}
         now_ns = self._clock()
         for name, one in found.items():
@@ -95,11 +125,11 @@ class Fleet:
                 self.let_go(name)
 
     def want(self, name: str) -> None:
-        """Show this one too, though others only were asked for."""
-        self.finder.also(name)
+        """Show this drone too, where only certain names are shown."""
+        self.finder.add_name(name)
 
     def let_go(self, name: str) -> None:
-        """Show it no longer; found again, it comes back. Does nothing for what is not there."""
+        """Remove a drone; found again, it comes back. Does nothing for an unknown name."""
         if name in self.stations:
             task = asyncio.create_task(self.stations.pop(name).close())
             self._closing.add(task)
@@ -127,3 +157,53 @@ class Fleet:
             self.stations[found.name] = Station(found, drone)
         finally:
             del self._connecting[found.name]
+
+
+class Overview:
+    """All drones in one message, made twice a second for all pages.
+
+    Args:
+        fleet: The drones.
+        recordings: Of the same drones.
+        period_s: Between two messages [s].
+    """
+
+    def __init__(self, fleet: Fleet, recordings: Recordings, period_s: float = OVERVIEW_S) -> None:
+        self._fleet = fleet
+        self._recordings = recordings
+        self.broadcast = PeriodicBroadcast(period_s, self._make, lambda _: None)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Return a row for each drone, by name, also for those that were found and did not answer."""
+        recorded = self._recordings.drones()
+        rows = []
+        for name, station in self._fleet.stations.items():
+            replay = name in self._recordings.replays
+            rows.append({**station.view.overview(), "recording": name in recorded, "replay": replay})
+        for name, problem in self._fleet.problems.items():
+            rows.append(_silent(name, problem))
+        return sorted(rows, key=lambda row: str(row["name"]))
+
+    def _make(self) -> bytes:
+        return encode_json({"type": "overview", "now_s": seconds(monotonic_ns()), "drones": self.rows()})
+
+
+def _silent(name: str, problem: str) -> dict[str, Any]:
+    unknown = ("battery", "position", "altitude", "yaw", "owner")
+    return {
+        "name": name,
+        "uri": "",
+        "vehicle": "",
+        "transport": "",
+        "state": "unknown",
+        "airborne": False,
+        "can_fly": False,
+        "why_not": problem,
+        "cameras": [],
+        "me": False,
+        "links": {"application": "lost", "vehicle": "connecting", "reason": problem, "remedy": ""},
+        "alarms": [problem],
+        "recording": False,
+        "replay": False,
+        **dict.fromkeys(unknown),
+    }

@@ -1,15 +1,14 @@
 """Recordings from the page: started, stopped, listed, reported on and played again.
 
 Each is done by a process of its own, and nothing of it on the event loop: the recorder is a child that the flight does
-not feel, a report is made by ``skyloop log report``, and what is played again is a private proxy.
+not feel, so is the process that makes a report, and a replay is a private proxy. All of them end with this process,
+however that ends; the number of each is bounded, and they are started one by one.
 """
 
 from __future__ import annotations
 
 import asyncio
 import itertools
-import sys
-import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -17,8 +16,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Protocol
 from urllib.parse import quote
 
-from skyloop.clock import NS_PER_S
-from skyloop.errors import LinkError, SkyloopError, UnknownNameError, UsageError
+import msgspec
+
+from skyloop.cockpit.reports import Reports
+from skyloop.errors import RefusedError, UnknownNameError, UsageError
+from skyloop.logfile.listing import ENDING, Described, describe
+from skyloop.messages import Refusal
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
@@ -26,10 +29,9 @@ if TYPE_CHECKING:
 
 Json = dict[str, Any]
 
-REPORT_S: Final = 300.0
 REPLAY_S: Final = 20.0
+MAX_CHILDREN: Final = 8  #: recordings at one time, and as many replays: each is a process
 MOST_LISTED: Final = 500
-_ENDING: Final = ".mcap"
 
 
 class Recorder(Protocol):
@@ -49,21 +51,35 @@ class Running:
 
 
 def start_recorder(drones: Sequence[str], folder: Path) -> Recorder:
-    """Record these proxies to a new file of the folder. Raises :class:`SkyloopError`."""
+    """Record proxies to a new file of a folder.
+
+    Raises:
+        SkyloopError: It can't start.
+    """
     from skyloop.recording import record
 
     return record(drones, folder)
 
 
 def start_replay(path: Path) -> Drone:
-    """A private proxy that plays a file, connected to. Raises :class:`SkyloopError`."""
+    """Start a private proxy that plays a file, and connect to it.
+
+    Raises:
+        SkyloopError: It can't start.
+    """
     from skyloop.client import connect
 
     return connect(f"replay://{quote(str(path))}", access="observe", name="cockpit", timeout_s=REPLAY_S)
 
 
 class Recordings:
-    """Those of one folder. On the event loop."""
+    """The recordings of one folder. On the event loop.
+
+    Args:
+        folder: Made when it is needed.
+        record: Starts a recorder; called on a thread.
+        replay: Starts a replay; called on a thread.
+    """
 
     def __init__(
         self,
@@ -75,16 +91,31 @@ class Recordings:
         self.replays: dict[str, Drone] = {}  #: by the name of the proxy
         self._record = record
         self._replay = replay
+        self._reports = Reports()
+        self._starting = asyncio.Lock()
+        self._looking = asyncio.Lock()
         self._running: dict[str, Running] = {}
         self._numbers = itertools.count(1)
-        self._known: dict[tuple[str, int, int], Json] = {}  # what is in a file, by its name, size and time
+        self._known: dict[tuple[str, int, int], Described] = {}  # what is in a file, by its name, size and time
 
     def drones(self) -> set[str]:
-        """Those that are being recorded."""
+        """Return the names of the drones that are being recorded."""
         return {name for running in self._running.values() for name in running.drones}
 
     async def start(self, drones: Sequence[str]) -> Json:
-        """Raises what the recorder raises when it can't start."""
+        """Start a recording.
+
+        Args:
+            drones: The names of the drones.
+
+        Returns:
+            The recording, as JSON values.
+
+        Raises:
+            UsageError: No drone is named, or the folder can't be made.
+            RefusedError: :data:`MAX_CHILDREN` recordings run already.
+            SkyloopError: The recorder can't start.
+        """
         if not drones:
             raise UsageError("no drone to record: name one at least")
 
@@ -92,13 +123,25 @@ class Recordings:
             self._make_folder()
             return self._record(drones, self.folder)
 
-        recorder = await asyncio.to_thread(start)
-        number = str(next(self._numbers))
-        self._running[number] = Running(tuple(drones), recorder)
-        return self._told(number)
+        async with self._starting:
+            _check_number("recordings run", "stop", len(self._running))
+            recorder = await asyncio.to_thread(start)
+            number = str(next(self._numbers))
+            self._running[number] = Running(tuple(drones), recorder)
+            return self._told(number)
 
     async def stop(self, number: str) -> Json:
-        """Raises :class:`UnknownNameError`."""
+        """Stop a recording, and wait until its file is closed.
+
+        Args:
+            number: The recording's ``id``.
+
+        Returns:
+            The recording, as JSON values.
+
+        Raises:
+            UnknownNameError: No such recording runs.
+        """
         if number not in self._running:
             raise UnknownNameError("running recording", number, self._running)
         told = self._told(number)
@@ -107,46 +150,50 @@ class Recordings:
         return {**told, **_progress(running.recorder.status)}
 
     async def listing(self) -> Json:
-        """Running ones, and those in the folder, the newest first."""
+        """Return the running recordings, and those in the folder, the newest first."""
         running = [self._told(number) for number in self._running]
-        return {"folder": str(self.folder), "running": running, "past": await asyncio.to_thread(self._past)}
+        async with self._looking:  # many who ask at one time cost as much as one
+            past = await asyncio.to_thread(self._past)
+        return {"folder": str(self.folder), "running": running, "past": past}
 
     async def report(self, name: str, drone: str | None = None) -> str:
-        """The page that ``skyloop log report`` makes. Raises :class:`UnknownNameError`, :class:`UsageError` with what
-        that says, :class:`LinkError` if it takes too long."""
-        path = self._path(name)
-        with tempfile.TemporaryDirectory(prefix="skyloop-report-") as folder:
-            target = Path(folder) / "report.html"
-            words = [sys.executable, "-m", "skyloop", "log", "report", str(path.absolute()), "-o", str(target)]
-            child = await asyncio.create_subprocess_exec(
-                *words,
-                *(["--drone", drone] if drone else []),
-                stdin=asyncio.subprocess.DEVNULL,
-                stdout=asyncio.subprocess.DEVNULL,
-                stderr=asyncio.subprocess.PIPE,
-            )
-            try:
-                _, said = await asyncio.wait_for(child.communicate(), REPORT_S)
-            except TimeoutError:
-                raise LinkError(f"the report of {name} was not made within {REPORT_S:g} s") from None
-            finally:
-                if child.returncode is None:
-                    child.kill()
-                    await child.wait()
-            if child.returncode or not target.exists():
-                lines = said.decode(errors="replace").strip().splitlines()
-                raise UsageError(lines[-1] if lines else f"no report of {name} could be made")
-            return target.read_text(encoding="utf-8")
+        """Return the page that ``skyloop log report`` makes.
+
+        Args:
+            name: The file's, in the folder.
+            drone: Which of the recorded ones; None for the only one.
+
+        Raises:
+            UnknownNameError: There is no such file.
+            SkyloopError: What :meth:`skyloop.cockpit.reports.Reports.make` raises.
+        """
+        path = await asyncio.to_thread(self._path, name)
+        return await self._reports.make(path, drone)
 
     async def replay(self, name: str) -> str:
-        """Play it again; the name of the proxy. Raises :class:`UnknownNameError`, and what connecting raises."""
-        path = self._path(name).absolute()
-        drone = await asyncio.to_thread(self._replay, path)
-        self.replays[drone.name] = drone
-        return drone.name
+        """Play a recording again.
+
+        Returns:
+            The name of the proxy.
+
+        Raises:
+            UnknownNameError: There is no such file.
+            RefusedError: :data:`MAX_CHILDREN` replays run already.
+            SkyloopError: The replay can't start.
+        """
+        path = (await asyncio.to_thread(self._path, name)).absolute()
+        async with self._starting:
+            _check_number("replays run", "end", len(self.replays))
+            drone = await asyncio.to_thread(self._replay, path)
+            self.replays[drone.name] = drone
+            return drone.name
 
     async def end_replay(self, name: str) -> None:
-        """Raises :class:`UnknownNameError`."""
+        """End a replay.
+
+        Raises:
+            UnknownNameError: No such replay runs.
+        """
         if name not in self.replays:
             raise UnknownNameError("replay", name, self.replays)
         await asyncio.to_thread(self.replays.pop(name).close)
@@ -171,10 +218,12 @@ class Recordings:
         return known[name]
 
     def _files(self) -> list[Path]:
-        """Those in the folder that nobody here is writing."""
-        written = {Path(file).name for running in self._running.values() for file in running.recorder.status.files}
+        """Return the recordings in the folder that nobody here is writing."""
+        written = {
+            Path(file).name for running in list(self._running.values()) for file in running.recorder.status.files
+        }
         with suppress(FileNotFoundError, NotADirectoryError):
-            return [path for path in self.folder.iterdir() if path.suffix == _ENDING and path.name not in written]
+            return [path for path in self.folder.iterdir() if path.suffix == ENDING and path.name not in written]
         return []
 
     def _past(self) -> list[Json]:
@@ -186,7 +235,8 @@ class Recordings:
         newest = sorted(found, reverse=True)[:MOST_LISTED]
         known = {(path.name, size, at_ns): path for at_ns, path, size in newest}
         self._known = {key: self._known.get(key) or describe(path) for key, path in known.items()}
-        return [{"name": name, "size": size, **told} for (name, size, _), told in self._known.items()]
+        rows = self._known.items()
+        return [{"name": name, "size": size, **msgspec.structs.asdict(told)} for (name, size, _), told in rows]
 
     def _make_folder(self) -> None:
         try:
@@ -195,20 +245,9 @@ class Recordings:
             raise UsageError(f"the folder of recordings {self.folder} can't be made: {error.strerror}") from None
 
 
-def describe(path: Path) -> Json:
-    """What is in a file: when it was started (Unix time [s]), which drones, for how long; or why it can't be told."""
-    try:
-        from skyloop.logfile.reader import Recording
-
-        recording = Recording.open(path)
-    except SkyloopError as error:
-        return {"started": None, "drones": [], "seconds": None, "problem": str(error)}
-    return {
-        "started": recording.start.started_unix_ns / NS_PER_S,
-        "drones": [drone.name for drone in recording.drones],
-        "seconds": round(recording.seconds, 3),
-        "problem": recording.cut,
-    }
+def _check_number(what: str, end: str, running: int) -> None:
+    if running >= MAX_CHILDREN:
+        raise RefusedError(f"{running} {what}, which is all that may at one time: {end} one first", code=Refusal.BUSY)
 
 
 def _progress(status: Status) -> Json:

@@ -2,15 +2,17 @@
 
 A page from elsewhere can make a browser send requests here. Three things stop it: the ``Host`` header must be this
 server's own (or a foreign name was made to point at it: DNS rebinding); the ``Origin``, which browsers add to every
-WebSocket and to every request that changes something, and which pages can't forge, must be this page's; and the
+WebSocket and to every request that changes something, and which pages can't forge, must be this page's (for a link,
+which has none, ``Sec-Fetch-Site`` tells where it stood: it may lead to the page, and to nothing else); and the
 page may load nothing but its own files and can't be framed (Content-Security-Policy).
 
-Then the person's role decides (:mod:`skyloop.cockpit.access`). What a route needs is decided here for all of them: one
-that nobody thought of needs at least an observer, and one that changes something needs a pilot.
+Then the person's role decides (:mod:`skyloop.cockpit.access`). What a route needs is decided here for all of them: by
+default a route needs an observer, and one that changes something a pilot.
 """
 
 from __future__ import annotations
 
+import asyncio
 import ipaddress
 import re
 from collections.abc import Iterable
@@ -19,24 +21,31 @@ from typing import Final
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from skyloop.cockpit.access import Gate, Person
+from skyloop.cockpit.access import Gate, Person, TokenGate, tells_token
 from skyloop.errors import UsageError
 from skyloop.messages import Role
 
 LOG_IN: Final = 4401  #: close code of a WebSocket: nobody known, log in
 NOT_ALLOWED: Final = 4403  #: close code: this needs a pilot
+ADMIT: Final = "admit"  #: in the connection's state: asked with the person, it tells why there is no place; or nothing
 _FOREIGN: Final = 1008  # close code: another page
+_LATER: Final = 1013  # close code: no place now
 
 #: Answered without a role: the page itself, and what is needed to get one.
 _PUBLIC: Final = re.compile(r"/|/static/.*|/favicon\.ico|/api/session|/api/login|/api/logout")
-_CONTROL: Final = re.compile(r"/ws/drones/[^/]+/control")
+_CONTROL: Final = re.compile(r"/ws/(drones/[^/]+/)?control")
 _READING: Final = ("GET", "HEAD")
 _ADDRESS: Final = re.compile(r"(\[[0-9a-f:.]+\]|[0-9.]+)(?::(\d{1,5}))?")
+_OWN_SITE: Final = {"same-origin", "none"}  # none: the person typed it, or it is a bookmark
 _USUAL_PORT: Final = {"http": 80, "https": 443}
 
 
 def bind_address(host: str) -> tuple[str, bool]:
-    """The address to bind to, and whether it is of this machine's loopback. Raises :class:`UsageError`."""
+    """Return the address to bind to, and whether it is of this machine's loopback.
+
+    Raises:
+        UsageError: It is not an address.
+    """
     if host == "localhost":
         return "127.0.0.1", True
     try:
@@ -63,7 +72,7 @@ class Names:
     any_address: bool = False
 
     def own(self, host: str) -> bool:
-        """Whether a value of ``Host``, in lower case, is this server's."""
+        """Return whether a value of ``Host``, in lower case, is this server's."""
         if host in self.exact:
             return True
         found = _ADDRESS.fullmatch(host) if self.any_address else None
@@ -77,7 +86,14 @@ class Names:
 
 
 def own_names(address: str, port: int, more: Iterable[str] = (), scheme: str = "http") -> Names:
-    """The names of a server that listens on an address; ``more``: host names by which browsers reach it."""
+    """Return the names of a server.
+
+    Args:
+        address: Where it listens.
+        port: The same.
+        more: Host names by which browsers reach it.
+        scheme: ``http`` or ``https``.
+    """
     known = ipaddress.ip_address(address)
     bare = {name.lower() for name in more}
     if known.is_loopback:
@@ -88,14 +104,24 @@ def own_names(address: str, port: int, more: Iterable[str] = (), scheme: str = "
     return Names(frozenset(exact), scheme, port, known.is_unspecified)
 
 
-def foreign(kind: str, method: str, headers: Iterable[tuple[bytes, bytes]], names: Names) -> str:
-    """Why a request is of no page of ours; empty if it may be. ``kind`` is ``http`` or ``websocket``."""
-    given: dict[str, list[str]] = {"host": [], "origin": []}
+def foreign(kind: str, method: str, headers: Iterable[tuple[bytes, bytes]], names: Names, path: str = "") -> str:
+    """Return why a request does not come from our page; empty if it may.
+
+    Args:
+        kind: ``http`` or ``websocket``.
+        method: Of HTTP.
+        headers: Names and values.
+        names: This server's.
+        path: The request's.
+    """
+    given: dict[str, list[str]] = {"host": [], "origin": [], "sec-fetch-site": []}
     for name, value in headers:
         if (key := name.decode("latin-1").lower()) in given:
             given[key].append(value.decode("latin-1").lower())
     if len(given["host"]) != 1 or not names.own(given["host"][0]):
         return "this server answers to its own address only"
+    if not {*given["sec-fetch-site"]} <= _OWN_SITE and not (method in _READING and path == "/"):
+        return "what another page links to, or loads, is refused: open the cockpit's own page"
     if not given["origin"]:
         must = kind == "websocket" or method not in _READING
         return "a WebSocket, and a request that changes something, must tell its origin" if must else ""
@@ -105,7 +131,7 @@ def foreign(kind: str, method: str, headers: Iterable[tuple[bytes, bytes]], name
 
 
 def needed(kind: str, method: str, path: str) -> Role | None:
-    """The role that a request needs; None if everybody may."""
+    """Return the role that a request needs; None if everybody may send it."""
     if kind == "websocket":
         return Role.PILOT if _CONTROL.fullmatch(path) else Role.OBSERVER
     if _PUBLIC.fullmatch(path):
@@ -114,8 +140,16 @@ def needed(kind: str, method: str, path: str) -> Role | None:
 
 
 class Guard:
-    """ASGI middleware: refuses what :func:`foreign` and :func:`needed` say, tells the others in ``scope["person"]`` who
-    asks (None: not known), and puts the protecting headers on every answer."""
+    """ASGI middleware: decides which requests are answered, and puts the protecting headers on every answer.
+
+    It refuses what :func:`foreign` and :func:`needed` say; the others find in ``scope["person"]`` who asks (None: not
+    known).
+
+    Args:
+        app: The application.
+        names: This server's.
+        gate: Decides who asks.
+    """
 
     def __init__(self, app: ASGIApp, names: Names, gate: Gate) -> None:
         self._app = app
@@ -130,12 +164,20 @@ class Guard:
         method = scope.get("method", "")
         if kind == "http":
             send = _protected(send, self._policy(scope))
-        if reason := foreign(kind, method, scope["headers"], self._names):
+        admit = scope.get("state", {}).get(ADMIT, _everybody)
+        if reason := foreign(kind, method, scope["headers"], self._names, scope["path"]):
+            admit(None)
             await _refuse(kind, receive, send, 403, _FOREIGN, reason)
             return
         role = needed(kind, method, scope["path"])
         person = self._gate.person(scope)
-        if role is not None and person is None:
+        reason = admit(person)
+        if person is None and isinstance(self._gate, TokenGate) and tells_token(scope):
+            if not await gone_within(receive, self._gate.wrong_token_s(scope)):
+                await _refuse(kind, _connected, send, 401, LOG_IN, "this token is not known here")
+        elif reason:
+            await _refuse(kind, receive, send, 503, _LATER, reason)
+        elif role is not None and person is None:
             await _refuse(kind, receive, send, 401, LOG_IN, self._gate.hint)
         elif role is not None and person is not None and not person.may(role):
             await _refuse(kind, receive, send, 403, NOT_ALLOWED, "this needs a pilot, and you are an observer")
@@ -156,9 +198,38 @@ class Guard:
 
 
 def person_of(scope: Scope) -> Person | None:
-    """Who sent this request, as the guard has found."""
+    """Return who sent this request, as the guard has found."""
     person: Person | None = scope["person"]
     return person
+
+
+async def gone_within(receive: Receive, within_s: float) -> bool:
+    """Wait until who asked is gone.
+
+    Args:
+        receive: Of the request; other messages are dropped.
+        within_s: How long to wait [s].
+
+    Returns:
+        Whether that happened in time.
+    """
+    try:
+        async with asyncio.timeout(within_s):
+            while not (await receive())["type"].endswith(".disconnect"):
+                pass
+    except TimeoutError:
+        return False
+    return True
+
+
+async def _connected() -> Message:
+    """Return the first message of a WebSocket anew, as it was received already."""
+    return {"type": "websocket.connect"}
+
+
+def _everybody(_: Person | None) -> str:
+    """Admit everybody, where nobody counts connections."""
+    return ""
 
 
 async def _refuse(kind: str, receive: Receive, send: Send, status: int, code: int, reason: str) -> None:

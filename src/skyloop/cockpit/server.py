@@ -1,4 +1,4 @@
-"""Runs the cockpit: binds, finds drones, serves until told to stop."""
+"""Runs the cockpit: binds its address, finds drones, serves until it is to stop."""
 
 from __future__ import annotations
 
@@ -15,6 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from skyloop.clock import Clock, monotonic_ns
+from skyloop.cockpit.admission import Admission, Connection
+from skyloop.cockpit.listening import Listener, ProtocolFactory, limit_messages, places_here
 from skyloop.errors import MissingExtraError, UnknownNameError, UsageError
 from skyloop.messages import Role
 
@@ -23,10 +26,10 @@ if TYPE_CHECKING:
     from starlette.applications import Starlette
 
     from skyloop.cockpit.access import Gate
-    from skyloop.cockpit.finder import Finder
+    from skyloop.cockpit.discovery import Finder
     from skyloop.transport.fabric import FabricSettings
 
-NICENESS = 10  #: of the serving thread and of those that it starts: whoever flies comes first
+NICENESS = 10  #: of the serving thread and of those that it starts: programs that fly come first
 RECORDINGS = Path("recordings")  #: where recordings go if nothing else is said
 _LARGEST_MESSAGE = 4096  # bytes from a page
 _LOOK_S = 0.05  # how often it is asked whether to end
@@ -42,6 +45,9 @@ class Access:
     certificate and key, for TLS. ``client_ca``: PEM file of the authority that signed the certificates of those who
     may come in; their OU is the role. ``role``: of everybody, where neither tokens nor certificates tell it.
     ``hostnames``: names by which browsers reach this machine, where they don't use its address.
+
+    Raises:
+        UsageError: The options contradict one another.
     """
 
     host: str = "127.0.0.1"
@@ -62,6 +68,7 @@ class Access:
 
     @property
     def scheme(self) -> str:
+        """``http``, or ``https`` with TLS."""
         return "http" if self.tls_cert is None else "https"
 
 
@@ -75,14 +82,23 @@ def serve_cockpit(
     stop: threading.Event | None = None,
     network: FabricSettings | None = None,
 ) -> None:
-    """Serve the page until ``stop`` is set or a signal (Ctrl-C, SIGTERM) comes; the calling thread becomes nicer.
+    """Serve the page until ``stop`` is set or a signal (Ctrl-C, SIGTERM) comes.
 
-    ``names`` of the drones to show; none: all that there are, as they come and go. ``port`` 0 takes a free one.
-    ``recordings``: the folder for recordings, made when it is needed. ``on_ready`` is called once on this thread with
-    the page's address (default: it is printed). ``network``: show drones that can be reached over it too.
+    The calling thread becomes nicer by :data:`NICENESS`, for good.
 
-    Raises :class:`UsageError` for an address, port, or file that can't be used, :class:`UnknownNameError` if there is
-    no proxy of a name given, :class:`MissingExtraError` if the cockpit's parts are missing.
+    Args:
+        names: The drones to show; none: all that there are, as they come and go.
+        port: The TCP port; 0 takes a free one.
+        access: Who may come in, and from where; by default this user, on this machine, as a pilot.
+        recordings: The folder for recordings, made when it is needed.
+        on_ready: Called once on this thread with the page's address (default: it is printed).
+        stop: Ends the server when it is set, from any thread.
+        network: Shows drones that can be reached over it, too.
+
+    Raises:
+        UsageError: An address, port or file can't be used.
+        UnknownNameError: There is no proxy of a name in ``names``.
+        MissingExtraError: The extra ``cockpit`` is not installed.
     """
     try:
         import cv2  # noqa: F401
@@ -115,8 +131,7 @@ def serve_cockpit(
 
 
 def _finder(names: Sequence[str], network: FabricSettings | None) -> Finder:
-    from skyloop.cockpit.far import NetworkFinder
-    from skyloop.cockpit.finder import LocalFinder
+    from skyloop.cockpit.discovery import LocalFinder, NetworkFinder
 
     near = LocalFinder(names)
     return near if network is None else NetworkFinder(near, network, frozenset(names))
@@ -143,7 +158,11 @@ def _gate(access: Access, port: int) -> Gate:
 
 
 def _tls(access: Access) -> ssl.SSLContext:
-    """Raises :class:`UsageError` for files that can't be used."""
+    """Make the server's TLS context.
+
+    Raises:
+        UsageError: A file can't be used.
+    """
     assert access.tls_cert is not None
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
@@ -191,42 +210,75 @@ def _serve(
     address, port = listening.getsockname()[:2]
     own_name = () if bind_address(address)[1] else (socket.gethostname(),)
     hosts = own_names(address, port, (*access.hostnames, *own_name), access.scheme)
-    app = create_app(Fleet(finder, kept=names), Recordings(recordings), hosts, gate)
-    server = quiet_server(app, tls)
+    admission = Admission(places_here())
+    app = create_app(Fleet(finder, kept=names), Recordings(recordings), hosts, gate, admission=admission)
+    server = quiet_server(app)
     page = f"{access.scheme}://{f'[{address}]' if ':' in address else address}:{port}/"
     os.nice(NICENESS)
-    asyncio.run(_run(server, listening, lambda: on_ready(page), stop))
+    listener = Listener(listening, admission, http_protocol(server, admission), tls)
+    asyncio.run(_run(server, listener, lambda: on_ready(page), stop))
 
 
-def quiet_server(app: Starlette, tls: ssl.SSLContext | None = None) -> uvicorn.Server:
-    """A server for the cockpit that leaves signals alone: uvicorn raises them anew at its end, which would cut short
-    our own."""
-    import uvicorn
+def http_protocol(server: uvicorn.Server, admission: Admission, clock: Clock = monotonic_ns) -> ProtocolFactory:
+    """Return what makes the HTTP protocol of a connection, for a server that has been started.
+
+    Args:
+        server: The server.
+        admission: Is told how far each connection has come.
+        clock: The monotonic clock [ns].
+    """
     from uvicorn.protocols.http.h11_impl import H11Protocol
 
     from skyloop.cockpit.access import CERTIFICATE
+    from skyloop.cockpit.security import ADMIT
 
     class Protocol(H11Protocol):
-        """Tells the application the certificate of the other end, which uvicorn keeps to itself."""
+        """uvicorn's protocol, which also reports to the application and to the admission.
+
+        The application is told the certificate of the other end, which uvicorn keeps to itself; the admission how far a
+        connection has come.
+        """
+
+        def __init__(self, connection: Connection) -> None:
+            super().__init__(server.config, server.server_state, server.lifespan.state)
+            self._connection = connection
 
         def connection_made(self, transport: Any) -> None:
             super().connection_made(transport)
-            connection = transport.get_extra_info("ssl_object")
-            certificate = None if connection is None else connection.getpeercert()
-            self.app_state = {**self.app_state, CERTIFICATE: certificate}
+            self._connection.end = transport.abort
+            tls = transport.get_extra_info("ssl_object")
+            self.app_state = {
+                **self.app_state,
+                CERTIFICATE: None if tls is None else tls.getpeercert(),
+                ADMIT: lambda person: admission.requested(self._connection, person, clock()),
+            }
+
+        def on_response_complete(self) -> None:
+            admission.answered(self._connection, clock())
+            super().on_response_complete()
+
+    return Protocol
+
+
+def quiet_server(app: Starlette) -> uvicorn.Server:
+    """Make a server for the cockpit that neither listens itself nor handles signals.
+
+    uvicorn would raise the signals again at its end, which would cut short our own.
+    """
+    import uvicorn
 
     class QuietServer(uvicorn.Server):
         @contextmanager
         def capture_signals(self) -> Iterator[None]:
             yield
 
+    limit_messages()
     config = uvicorn.Config(
         app,
-        http=Protocol,
         log_level="warning",
         access_log=False,
         server_header=False,
-        proxy_headers=False,  # who is at the other end is asked of the kernel, not of a header
+        proxy_headers=False,  # the client's address comes from the kernel, not from a header
         ws_max_size=_LARGEST_MESSAGE,
         ws_ping_interval=_PING_S,
         ws_ping_timeout=_PING_S,
@@ -235,28 +287,32 @@ def quiet_server(app: Starlette, tls: ssl.SSLContext | None = None) -> uvicorn.S
         # What a page that stopped reading leaves in buffers must not hold up the end.
         timeout_graceful_shutdown=2,
     )
-    config.load()
-    config.ssl = tls
     return QuietServer(config)
 
 
 async def _run(
-    server: uvicorn.Server, listening: socket.socket, on_ready: Callable[[], None], stop: threading.Event | None
+    server: uvicorn.Server, listener: Listener, on_ready: Callable[[], None], stop: threading.Event | None
 ) -> None:
     ending = asyncio.Event()
     if threading.current_thread() is threading.main_thread():
         for number in (signal.SIGINT, signal.SIGTERM):
             asyncio.get_running_loop().add_signal_handler(number, ending.set)
-    serving = asyncio.create_task(server.serve(sockets=[listening]))
+    serving = asyncio.create_task(server.serve(sockets=[]))
     while not server.started and not serving.done():
         await asyncio.sleep(_LOOK_S / 10)
+    listening = asyncio.create_task(listener.run())
+    await asyncio.sleep(0)  # it listens from its first step on
     if not serving.done():
         on_ready()
     while not serving.done():
         await asyncio.wait([serving], timeout=_LOOK_S)
-        if ending.is_set() or (stop is not None and stop.is_set()):
+        if ending.is_set() or listening.done() or (stop is not None and stop.is_set()):
+            listening.cancel()
             server.should_exit = True
+    await asyncio.gather(listening, return_exceptions=True)
     await serving
+    if not listening.cancelled():
+        await listening  # what ended it
 
 
 def _tell(page: str) -> None:

@@ -3,107 +3,163 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
-from skyloop.cockpit.beat import Beat
-from skyloop.cockpit.feeds import CameraFeed, Listening, NewsFeed
-from skyloop.cockpit.finder import Found
+from skyloop.clock import monotonic_ns, seconds
+from skyloop.cockpit.discovery import Found
+from skyloop.cockpit.feeds import CameraFeed, EventFeed, LogFeed, PeriodicBroadcast
 from skyloop.cockpit.telemetry import TelemetryView
 from skyloop.control.waypoint import Waypoint
+from skyloop.errors import LinkError, SkyloopError
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
-    from skyloop.cockpit.hands import Hands
+    from skyloop.cockpit.pilot_connection import PilotConnection
 
 TELEMETRY_HZ: Final = 18.0
-HANDS_S: Final = 2.0  #: for a pilot's connection to be made
+PILOT_S: Final = 2.0  #: for a pilot's connection to be made
+RECORDINGS: Final = ("replay:", "video:")  #: how addresses of what was recorded begin
+RETRY_S: Final = 0.05  #: between two tries to send an emergency stop
 
 
 class Station:
-    """Made and closed on the event loop."""
+    """One drone, with what all its pages share. Made and closed on the event loop.
+
+    Args:
+        found: Where the proxy is.
+        drone: Connected as an observer; closed by :meth:`close`.
+    """
 
     def __init__(self, found: Found, drone: Drone) -> None:
         self.found = found
         self.drone = drone
-        self.news = NewsFeed(drone)
-        self.listening = Listening(drone)
+        self.event_feed = EventFeed(drone)
+        self.log_feed = LogFeed(drone)
         self.cameras: dict[str, CameraFeed] = {}
         self.goals: dict[str, Waypoint] = {}  #: where pages fly it to, by the name of the application that does
-        self.hands: set[Hands] = set()  #: pilots' connections of pages
+        self.pilots: set[PilotConnection] = set()  #: pilots' connections of pages
         self.view = TelemetryView(self)
-        self.beat = Beat(1.0 / TELEMETRY_HZ, self.view.state, self.listening.want)
-        self._stopper: asyncio.Task[Hands] | None = None
+        self.broadcast = PeriodicBroadcast(1.0 / TELEMETRY_HZ, self.view.state, self.log_feed.want)
+        self._stopper: asyncio.Task[PilotConnection] | None = None
         self._may_stop = 0
+
+    @property
+    def flies(self) -> bool:
+        """Whether there is anything to fly: a recording is none, and takes every command without effect."""
+        return bool(self.drone.capabilities.actions) and not self.drone.uri.startswith(RECORDINGS)
 
     @property
     def in_use(self) -> bool:
         """Whether a page shows it."""
-        return self.beat.wanted or any(feed.wanted for feed in self.cameras.values())
+        return self.broadcast.wanted or any(feed.wanted for feed in self.cameras.values())
 
     def camera(self, name: str) -> CameraFeed | None:
-        """The camera of that name; None if the vehicle has none."""
+        """Return the feed of a camera; None if the vehicle has none of that name."""
         if name not in self.cameras and any(info.name == name for info in self.drone.capabilities.cameras):
             self.cameras[name] = CameraFeed(self.drone, name)
         return self.cameras.get(name)
 
     # Pilots ----------------------------------------------------------------------------------------------------
 
-    async def open_hands(self, app: str) -> Hands:
-        """A pilot's connection that holds nothing yet. Raises :class:`SkyloopError`."""
-        from skyloop.cockpit.hands import Hands
+    async def open_pilot(self, app: str) -> PilotConnection:
+        """Open a pilot's connection that holds nothing yet.
 
-        def connect() -> Hands:
-            hands = Hands(self.found.dial, app=app, on_exit="hover")
-            hands.open(timeout_s=HANDS_S)
-            return hands
+        Args:
+            app: The name under which it connects.
 
-        hands = await asyncio.to_thread(connect)
-        self.hands.add(hands)
-        return hands
+        Raises:
+            SkyloopError: It can't be opened within :data:`PILOT_S`.
+        """
+        from skyloop.cockpit.pilot_connection import PilotConnection
 
-    async def close_hands(self, hands: Hands) -> None:
-        """Give back what it holds."""
-        await asyncio.to_thread(hands.close)
-        self.hands.discard(hands)
+        def connect() -> PilotConnection:
+            pilot = PilotConnection(self.found.dial, app=app, on_exit="hover")
+            pilot.open(timeout_s=PILOT_S)
+            return pilot
+
+        pilot = await asyncio.to_thread(connect)
+        self.pilots.add(pilot)
+        return pilot
+
+    async def close_pilot(self, pilot: PilotConnection) -> None:
+        """Close a pilot's connection, and give back what it holds."""
+        await asyncio.to_thread(pilot.close)
+        self.pilots.discard(pilot)
 
     def pilot_came(self) -> None:
-        """A page that may stop the motors is there: what it needs for that is made ready."""
+        """Prepare the connection for emergency stops, as a page that may stop the motors is there."""
         self._may_stop += 1
         if self._stopper is None:
-            self._stopper = asyncio.create_task(self.open_hands("cockpit stop"))
-            self._stopper.add_done_callback(_look)
+            self._stopper = asyncio.create_task(self.open_pilot("cockpit stop"))
+            self._stopper.add_done_callback(_ignore_error)
 
     async def pilot_went(self) -> None:
+        """Close the connection for emergency stops, if no page is there any more that may use it."""
         self._may_stop -= 1
         if not self._may_stop and self._stopper is not None:
             stopper, self._stopper = self._stopper, None
             await self._end(stopper)
 
-    async def stopper(self) -> Hands:
-        """A pilot's connection that never holds the authority, for emergency stops. Raises :class:`SkyloopError`."""
+    async def stopper(self) -> PilotConnection:
+        """Return the pilot's connection for emergency stops, which never holds the authority.
+
+        Raises:
+            SkyloopError: It can't be opened.
+        """
         if self._stopper is None or (self._stopper.done() and self._stopper.exception() is not None):
-            self._stopper = asyncio.create_task(self.open_hands("cockpit stop"))
+            self._stopper = asyncio.create_task(self.open_pilot("cockpit stop"))
         return await asyncio.shield(self._stopper)
 
+    async def cut_motors(self, until_ns: int, pilot: PilotConnection | None = None) -> None:
+        """Send an emergency stop, trying until a time.
+
+        Args:
+            until_ns: The time, on this process's monotonic clock.
+            pilot: The connection to send it by; None for the one that is kept for it.
+
+        Raises:
+            LinkError: It was not sent, and never will be.
+            UnsupportedError: The vehicle has no emergency stop.
+        """
+        why = "the proxy does not answer"
+        while (left_s := seconds(until_ns - monotonic_ns())) > 0:
+            try:
+                using = pilot if pilot is not None else await asyncio.wait_for(self.stopper(), left_s)
+                if monotonic_ns() > until_ns:
+                    break
+                if using.emergency_stop():
+                    return
+                why = f"the link to the proxy is {using.link.application}"
+                with suppress(SkyloopError):
+                    using.idle()  # or it would be sent whenever the link is back: it is tried again here instead
+            except LinkError as error:
+                why = str(error)
+            except TimeoutError:
+                break
+            await asyncio.sleep(RETRY_S)
+        raise LinkError(f"the emergency stop was not sent: {why}")
+
     async def close(self) -> None:
-        self.beat.end()
-        self.listening.want(False)
-        self.news.close()
+        """Close all connections to the drone."""
+        self.broadcast.close()
+        self.log_feed.want(False)
+        self.event_feed.close()
         for feed in self.cameras.values():
             feed.close()
         if self._stopper is not None:
             await self._end(self._stopper)
-        for hands in list(self.hands):
-            await self.close_hands(hands)
+        for pilot in list(self.pilots):
+            await self.close_pilot(pilot)
         await asyncio.to_thread(self.drone.close)
 
-    async def _end(self, stopper: asyncio.Task[Hands]) -> None:
+    async def _end(self, stopper: asyncio.Task[PilotConnection]) -> None:
         await asyncio.gather(stopper, return_exceptions=True)
         if not stopper.cancelled() and stopper.exception() is None:
-            await self.close_hands(stopper.result())
+            await self.close_pilot(stopper.result())
 
 
-def _look(task: asyncio.Task[Hands]) -> None:
-    """An error is told when somebody wants to stop, which tries again."""
+def _ignore_error(task: asyncio.Task[PilotConnection]) -> None:
+    """Its error is raised when somebody wants to stop, which tries again."""
     if not task.cancelled():
         task.exception()

@@ -1,4 +1,4 @@
-"""The senders: one object per open page and stream. A page that does not keep up gets less, never anything older.
+"""What is sent to pages: one object per open socket. A page that does not keep up gets less, never anything older.
 
 Video: one frame is on its way at a time; the page acknowledges it when it has drawn it, and only then gets the newest.
 Telemetry: the newest state about twenty times a second, as far as the socket takes it; made once for all pages.
@@ -9,17 +9,21 @@ from __future__ import annotations
 import asyncio
 import json
 import struct
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from skyloop.cockpit.beat import Beat
-from skyloop.cockpit.feeds import CameraFeed, NewsFeed
+from skyloop.cockpit.feeds import CameraFeed, EventFeed, PeriodicBroadcast
 from skyloop.cockpit.station import Station
 from skyloop.cockpit.telemetry import encode_json
-from skyloop.messages import Annotation, Points, Polyline, Text
+
+DRAWN_BYTES = 65_536  #: of drawings that are sent to a page with one frame: about what the frame itself has
+MAX_WAITING: Final = 256  #: answers to a page that does not read; what comes on top is not sent
+MAX_COUNTED = 256  #: sources of drawings that are named in the counts
 
 _LENGTH = struct.Struct(">I")
 _BAD_MESSAGE = 1008
@@ -38,49 +42,36 @@ class PageCounts:
 
 
 def pack_frame(head: dict[str, Any], jpeg: bytes) -> bytes:
-    """A binary message: length of the head (4 bytes, big-endian), the head as JSON, the JPEG file."""
+    """Return a binary message: length of the head (4 bytes, big-endian), the head as JSON, the JPEG file."""
     text = json.dumps(head, separators=(",", ":")).encode()
     return _LENGTH.pack(len(text)) + text + jpeg
 
 
-def drawing_values(annotation: Annotation) -> dict[str, Any]:
-    """An annotation as JSON values for a page."""
-    return {
-        "type": "drawing",
-        "source": annotation.source,
-        "captured_ns": str(annotation.captured_ns),  # too large for JavaScript's numbers
-        "width": annotation.width,
-        "height": annotation.height,
-        "shapes": [_shape(shape) for shape in annotation.shapes],
-    }
-
-
-def _shape(shape: Polyline | Points | Text) -> dict[str, Any]:
-    if isinstance(shape, Text):
-        return {"kind": "text", "text": shape.text, "at": shape.at, "colour": shape.colour}
-    if isinstance(shape, Points):
-        return {"kind": "points", "points": shape.points, "colour": shape.colour}
-    return {"kind": "line", "points": shape.points, "closed": shape.closed, "colour": shape.colour}
-
-
 class VideoSender:
-    """Sends one camera to one page until the page goes away."""
+    """Sends one camera to one page until the page goes away.
 
-    def __init__(self, socket: WebSocket, feed: CameraFeed, news: NewsFeed, counts: PageCounts) -> None:
+    Args:
+        socket: Accepted already.
+        feed: The camera.
+        event_feed: The drone's, for drawings.
+        counts: Of all pages.
+    """
+
+    def __init__(self, socket: WebSocket, feed: CameraFeed, event_feed: EventFeed, counts: PageCounts) -> None:
         self._socket = socket
         self._feed = feed
-        self._news = news
+        self._event_feed = event_feed
         self._counts = counts
         self._wake = asyncio.Event()
         self._sent = 0  # serial of the last frame sent; not the frame, which would keep its memory from the proxy
         self._sent_ns = 0  # and its capture
         self._waiting = False  # for its acknowledgement
-        self._drawn: dict[str, int] = {}  # capture of the newest drawing sent, by source
+        self._drawn: dict[str, int] = {}  # capture of the newest drawing sent, by source; what was sent last is last
 
     async def run(self) -> None:
-        """Returns when the page is gone."""
-        self._feed.join(self._wake.set)
-        self._news.join(self._wake.set)
+        """Send until the page is gone."""
+        self._feed.subscribe(self._wake.set)
+        self._event_feed.subscribe(self._wake.set)
         receiver = asyncio.create_task(self._receive())
         receiver.add_done_callback(lambda _: self._wake.set())
         try:
@@ -94,13 +85,13 @@ class VideoSender:
         except WebSocketDisconnect:
             pass  # while sending: the page went away
         finally:
-            self._feed.leave(self._wake.set)
-            self._news.leave(self._wake.set)
+            self._feed.unsubscribe(self._wake.set)
+            self._event_feed.unsubscribe(self._wake.set)
             receiver.cancel()
             await asyncio.gather(receiver, return_exceptions=True)
 
     async def _receive(self) -> bool:
-        """Takes acknowledgements until the page is gone (True) or sends something else (False)."""
+        """Receive acknowledgements until the page is gone (True) or sends something else (False)."""
         while True:
             message = await self._socket.receive()
             if message["type"] == "websocket.disconnect":
@@ -135,36 +126,56 @@ class VideoSender:
         self._counts.frames_skipped += skipped
 
     async def _send_drawings(self) -> None:
-        """Drawings of the frame sent last, or older ones: so there are never more of them than of frames."""
-        for (camera, source), annotation in list(self._news.drawings.items()):
-            captured = annotation.captured_ns
-            if camera != self._feed.camera or captured > self._sent_ns:
+        """Send drawings of the frame sent last, or older ones, so that there are never more of them than of frames.
+
+        At most :data:`DRAWN_BYTES` are sent for each frame, in pieces, first those that were sent longest ago: what
+        many sources draw keeps neither this page's pictures nor anybody else waiting.
+        """
+        newest = self._event_feed.drawings.items()
+        drawings = {source: one for (camera, source), one in newest if camera == self._feed.camera}
+        self._drawn = {source: captured for source, captured in self._drawn.items() if source in drawings}
+        fresh = [source for source in drawings if source not in self._drawn]
+        left = DRAWN_BYTES
+        for source in [*fresh, *self._drawn]:
+            captured = drawings[source].annotation.captured_ns
+            if captured > self._sent_ns or self._drawn.get(source) == captured:
                 continue
-            if self._drawn.get(source) != captured:
-                self._drawn[source] = captured
+            text = drawings[source].text
+            left -= len(text)
+            if left < 0 and left + len(text) < DRAWN_BYTES:
+                break  # with the next frame; one that is larger than all that is sent alone
+            self._drawn.pop(source, None)
+            self._drawn[source] = captured
+            if len(self._counts.sources) < MAX_COUNTED:
                 self._counts.sources.add(source)
-                await self._socket.send_text(json.dumps(drawing_values(annotation), separators=(",", ":")))
+            await self._socket.send_text(text)
+            await asyncio.sleep(0)
 
 
-class BeatSender:
-    """Sends what a beat makes to one page until the page goes away."""
+class BroadcastSender:
+    """Sends the messages of a broadcast to one page until the page goes away.
 
-    def __init__(self, socket: WebSocket, beat: Beat) -> None:
+    Args:
+        socket: Accepted already.
+        broadcast: Makes the messages.
+    """
+
+    def __init__(self, socket: WebSocket, broadcast: PeriodicBroadcast) -> None:
         self._socket = socket
-        self._beat = beat
+        self._broadcast = broadcast
         self._wake = asyncio.Event()
 
     async def run(self) -> None:
-        """Returns when the page is gone."""
+        """Send until the page is gone."""
         gone = asyncio.create_task(self._until_gone())
         gone.add_done_callback(lambda _: self._wake.set())
-        wake = self._wake.set  # the same object to join and to leave with
-        self._beat.join(wake)
+        wake = self._wake.set  # the same object to subscribe and to unsubscribe with
+        self._broadcast.subscribe(wake)
         try:
-            while not gone.done() and not self._beat.ended:
+            while not gone.done() and not self._broadcast.closed:
                 await self._wake.wait()
                 self._wake.clear()
-                if not gone.done() and not self._beat.ended:
+                if not gone.done() and not self._broadcast.closed:
                     await self._send()
             if not gone.done():
                 await self._socket.close(UNKNOWN, "it is not here any more")
@@ -173,23 +184,28 @@ class BeatSender:
         except WebSocketDisconnect:
             pass  # while sending: the page went away
         finally:
-            self._beat.leave(wake)
+            self._broadcast.unsubscribe(wake)
             gone.cancel()
             await asyncio.gather(gone, return_exceptions=True)
 
     async def _send(self) -> None:
-        await self._socket.send_text(self._beat.made.decode())
+        await self._socket.send_text(self._broadcast.message.decode())
 
     async def _until_gone(self) -> str:
-        """Nothing is expected from the page here: returns the type of whatever comes."""
+        """Return the type of whatever comes: nothing is expected from the page here."""
         return str((await self._socket.receive())["type"])
 
 
-class TelemetrySender(BeatSender):
-    """Sends a drone's state and events; before them the vehicle, whenever it is another one."""
+class TelemetrySender(BroadcastSender):
+    """Sends a drone's state and events; before them the vehicle, whenever it is another one.
+
+    Args:
+        socket: Accepted already.
+        station: The drone.
+    """
 
     def __init__(self, socket: WebSocket, station: Station) -> None:
-        super().__init__(socket, station.beat)
+        super().__init__(socket, station.broadcast)
         self._station = station
         self._vehicle: dict[str, Any] | None = None
         self._told = 0  # number of the last event
@@ -200,10 +216,46 @@ class TelemetrySender(BeatSender):
         if vehicle != self._vehicle:
             self._vehicle = vehicle
             await self._socket.send_text(encode_json(vehicle).decode())
-        fresh = self._station.news.events_after(self._told)
+        fresh = self._station.event_feed.events_after(self._told)
         self._told = fresh[-1][0] if fresh else self._told
         events = encode_json(view.events(fresh))
-        await self._socket.send_text((self._beat.made + b',"events":' + events + b"}").decode())
+        await self._socket.send_text((self._broadcast.message + b',"events":' + events + b"}").decode())
+
+
+class PageSocket:
+    """Sends messages to one page, and passes on the commands that it sends. On the event loop.
+
+    Args:
+        socket: Accepted already.
+    """
+
+    def __init__(self, socket: WebSocket) -> None:
+        self._socket = socket
+        self._outbox: asyncio.Queue[dict[str, Any]] = asyncio.Queue(MAX_WAITING)
+
+    def send(self, message: dict[str, Any]) -> None:
+        """Queue a message; it is dropped if the page has not read the :data:`MAX_WAITING` before."""
+        with suppress(asyncio.QueueFull):
+            self._outbox.put_nowait(message)
+
+    async def serve(self, handle: Callable[[str | bytes], None]) -> None:
+        """Call ``handle`` with each message of the page until it is gone."""
+        writing = asyncio.create_task(self._write())
+        try:
+            while True:
+                message = await self._socket.receive()
+                if message["type"] == "websocket.disconnect":
+                    break
+                handle(message.get("text") or message.get("bytes") or "")
+        except WebSocketDisconnect:
+            pass
+        finally:
+            writing.cancel()
+
+    async def _write(self) -> None:
+        with suppress(WebSocketDisconnect):  # the receiving side notices it too
+            while True:
+                await self._socket.send_text(encode_json(await self._outbox.get()).decode())
 
 
 class _Ack(msgspec.Struct):
@@ -213,7 +265,7 @@ class _Ack(msgspec.Struct):
 
 
 def _acknowledged(text: str) -> int | None:
-    """The number acknowledged; None if it is something else."""
+    """Return the number acknowledged; None if it is something else."""
     try:
         return msgspec.json.decode(text, type=_Ack).ack
     except msgspec.DecodeError:

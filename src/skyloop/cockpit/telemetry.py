@@ -1,4 +1,4 @@
-"""The view model: what pages are told of a drone, made once for all of them. SI units and radians; pages convert."""
+"""The view model: what pages are sent of a drone, made once for all of them. SI units and radians; pages convert."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from skyloop.clock import Clock, monotonic_ns, seconds
-from skyloop.cockpit.alarms import alarms
 from skyloop.cockpit.values import (
     Json,
+    alarms,
     channel_values,
     event_values,
     feedback_values,
@@ -25,28 +25,34 @@ from skyloop.cockpit.values import (
     vector,
 )
 from skyloop.errors import LinkError
-from skyloop.messages import HIGHEST_PRIORITY, LOWEST_PRIORITY, Event, Feedback
+from skyloop.messages import HIGHEST_PRIORITY, LOWEST_PRIORITY, Event, Feedback, LinkState
 
 if TYPE_CHECKING:
     from skyloop.cockpit.station import Station
 
+_BROKEN = (str(LinkState.LOST), str(LinkState.CLOSED))
 _CHANNELS_S = 0.5  # statistics cost sorting, and nobody reads faster
 
 encode_json = msgspec.json.Encoder().encode
 
 
 class TelemetryView:
-    """Looks at one drone for all pages. Used on the event loop."""
+    """One drone as pages see it. Used on the event loop.
+
+    Args:
+        station: The drone.
+        clock: The monotonic clock [ns].
+    """
 
     def __init__(self, station: Station, clock: Clock = monotonic_ns) -> None:
         self._station = station
         self._clock = clock
         self._channels: dict[str, Json] = {}
-        self._looked_ns: int | None = None
-        self._looking: asyncio.Task[None] | None = None
+        self._channels_ns: int | None = None
+        self._channels_task: asyncio.Task[None] | None = None
 
     def vehicle(self) -> Json:
-        """What changes only when the vehicle is another one."""
+        """Return what changes only when the vehicle is another one."""
         station, capabilities = self._station, self._station.drone.capabilities
         return {
             "type": "vehicle",
@@ -62,12 +68,12 @@ class TelemetryView:
         }
 
     def state(self) -> bytes:
-        """The newest of everything that moves, as a JSON object without its last brace."""
+        """Return the newest of everything that moves, as a JSON object without its last brace."""
         self._refresh_channels()
-        return encode_json(self._look(self._clock()))[:-1]
+        return encode_json(self._values(self._clock()))[:-1]
 
     def overview(self) -> Json:
-        """The drone in one row."""
+        """Return the drone in one row."""
         feedback = self._feedback()
         vehicle = self.vehicle()
         motion = motion_values(feedback)
@@ -76,50 +82,67 @@ class TelemetryView:
             **{key: motion[key] for key in ("airborne", "battery", "position", "altitude")},
             "state": motion["flight"],
             "yaw": None if feedback is None else number(feedback.yaw),
-            "owner": None if feedback is None else feedback.owner,
+            "owner": self.holder(feedback),
             "me": self.is_mine(feedback),
             "links": self._links(),
             "alarms": self.alarms(feedback),
         }
 
     def events(self, events: Sequence[tuple[int, Event]]) -> list[Json]:
-        """Events with their numbers, for a page."""
+        """Return events with their numbers, for a page."""
         now_ns = self._clock() + self._station.drone.clock_offset_ns
         return [event_values(number_, event, now_ns) for number_, event in events]
 
     def alarms(self, feedback: Feedback | None) -> list[str]:
-        """What a person must know at once."""
+        """Return what a person must know at once."""
         drone = self._station.drone
         age_s = None if feedback is None else self._age_s(feedback.captured_ns)
         ages = {name: feed.age_s for name, feed in self._station.cameras.items()}
         return alarms(drone.link, feedback, age_s, {name: age for name, age in ages.items() if age is not None})
 
+    def holder(self, feedback: Feedback | None) -> str | None:
+        """Return who has the authority.
+
+        That is nobody if the lease ended by silence, though feedback keeps the name, and if there is no proxy that
+        could give one.
+        """
+        broken = self._links()["application"] in _BROKEN
+        return None if feedback is None or broken or not feedback.lease else feedback.owner
+
     def is_mine(self, feedback: Feedback | None) -> bool:
-        """Whether a page of this cockpit holds the authority."""
-        return feedback is not None and any(hands.app_id == feedback.owner_id for hands in self._station.hands)
+        """Return whether a page of this cockpit holds the authority."""
+        return (
+            feedback is not None
+            and feedback.lease > 0
+            and any(pilot.app_id == feedback.owner_id for pilot in self._station.pilots)
+        )
 
     # Inside ----------------------------------------------------------------------------------------------------
 
-    def _look(self, now_ns: int) -> Json:
-        station, listening, feedback = self._station, self._station.listening, self._feedback()
-        links, applied = self._links(), listening.applied
+    def _values(self, now_ns: int) -> Json:
+        station, log_feed, feedback = self._station, self._station.log_feed, self._feedback()
+        links = self._links()
+        if links["application"] in _BROKEN:
+            log_feed.applied = None  # nobody knows what is applied now, and after its return it is not what was
+        applied = log_feed.applied
         native = None if feedback is None else feedback.native
         proxy_ns = now_ns + station.drone.clock_offset_ns
         return {
             "type": "state",
+            "now_s": seconds(now_ns),
             "link": links,
             "links": links,
             "feedback": None if feedback is None else feedback_values(feedback, proxy_ns),
             **motion_values(feedback),
-            "owner": None if feedback is None else feedback.owner,
+            "owner": self.holder(feedback),
             "authority": self._authority(feedback),
             "channels": self._channels,
             "alarms": self.alarms(feedback),
-            "values": flat_values(feedback, listening.numbers(), None if applied is None else applied.applied),
+            "values": flat_values(feedback, log_feed.numbers(), None if applied is None else applied.applied),
             "set_points": None
             if applied is None
             else set_point_values(applied.applied, self._age_s(applied.applied_ns)),
-            "truth": mocap_values(listening.mocap()) or truth_values(native),
+            "truth": mocap_values(log_feed.mocap()) or truth_values(native),
             "targets": target_values(native),
             "waypoints": self._waypoints(),
         }
@@ -132,42 +155,48 @@ class TelemetryView:
 
     def _links(self) -> Json:
         link = self._station.drone.link
-        return {"application": str(link.application), "vehicle": str(link.vehicle), "reason": link.reason}
+        return {
+            "application": str(link.application),
+            "vehicle": str(link.vehicle),
+            "reason": link.reason,
+            "remedy": link.remedy,
+        }
 
     def _authority(self, feedback: Feedback | None) -> Json:
-        if feedback is None or not feedback.owner_id:
+        if feedback is None or self.holder(feedback) is None:
             return {"holder": None, "priority": None, "lease": 0, "me": False}
         return {
-            "holder": feedback.owner,
+            "holder": self.holder(feedback),
             "priority": feedback.owner_priority,
             "lease": feedback.lease,
             "me": self.is_mine(feedback),
         }
 
     def _waypoints(self) -> list[Json]:
-        """Where pages fly it to, then what controllers have logged."""
+        """Return where pages fly it to, then what controllers have logged."""
         goals = [
             {"position": vector(goal.position), "yaw": number(goal.yaw), "app": app}
             for app, goal in self._station.goals.items()
         ]
         logged = [
             {"position": vector(row[:3]), "yaw": number(row[3]) if len(row) > 3 else None, "app": None}
-            for row in self._station.listening.waypoints()
+            for row in self._station.log_feed.waypoints()
         ]
         return goals + logged
 
     def _age_s(self, captured_ns: int) -> float:
-        """Of what is stamped on the proxy's clock."""
+        """Return the age of what is stamped on the proxy's clock [s]."""
         return seconds(self._clock() + self._station.drone.clock_offset_ns - captured_ns)
 
     def _refresh_channels(self) -> None:
-        """Have the statistics looked up anew if they are old; waits for nothing."""
+        """Start to read the statistics anew if they are old, without waiting."""
         now_ns = self._clock()
-        if self._looking is None and (self._looked_ns is None or seconds(now_ns - self._looked_ns) >= _CHANNELS_S):
-            self._looked_ns = now_ns
-            self._looking = asyncio.create_task(self._look_up_channels())
+        old = self._channels_ns is None or seconds(now_ns - self._channels_ns) >= _CHANNELS_S
+        if self._channels_task is None and old:
+            self._channels_ns = now_ns
+            self._channels_task = asyncio.create_task(self._read_channels())
 
-    async def _look_up_channels(self) -> None:
+    async def _read_channels(self) -> None:
         # On another thread: for the command delay the drone asks the proxy, and waits for its answer.
         try:
             stats = await asyncio.to_thread(lambda: self._station.drone.stats)
@@ -175,4 +204,4 @@ class TelemetryView:
         except LinkError:
             pass  # closed meanwhile
         finally:
-            self._looking = None
+            self._channels_task = None

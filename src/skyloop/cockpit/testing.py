@@ -7,7 +7,7 @@
     print(pages.frames, pages.newest_age_s)
 
 Each opens the telemetry and the video of one drone and acknowledges every frame, as a browser's page does once it has
-drawn it. Nothing is decoded: what drawing costs is a browser's own affair.
+drawn it. Nothing is decoded: drawing costs only the browser.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ STARTS_WITHIN_S: Final = 10.0
 
 
 class PageClient:
-    """One page that shows one drone. Used on one event loop; the counts may be read from anywhere."""
+    """One page that shows one drone. Used on one event loop; the counts may be read from any thread."""
 
     def __init__(
         self,
@@ -46,8 +46,16 @@ class PageClient:
         tls: ssl.SSLContext | None = None,
         draw_s: float = 0.0,
     ) -> None:
-        """``address`` of the cockpit, as it prints it. ``cameras`` to watch (default: the first). ``token``: where one
-        is asked for; ``tls``: for an ``https`` address. ``draw_s``: how long a frame takes to be drawn."""
+        """Prepare a page; nothing is opened yet.
+
+        Args:
+            address: Of the cockpit, as it prints it.
+            drone: The drone's name.
+            cameras: The cameras to watch (default: the first).
+            token: Where the cockpit asks for one.
+            tls: For an ``https`` address.
+            draw_s: How long a frame takes to be drawn [s].
+        """
         self.drone = drone
         self.states = 0  #: telemetry messages
         self.frames = 0
@@ -62,7 +70,7 @@ class PageClient:
         self._draw_s = draw_s
 
     def open(self, path: str) -> connect:
-        """One of the cockpit's WebSockets as this page opens it: ``async with page.open("/ws/overview") as socket``."""
+        """Open one of the cockpit's WebSockets: ``async with page.open("/ws/overview") as socket``."""
         return connect(
             f"ws{self._origin.removeprefix('http')}{path}",
             origin=Origin(self._origin),
@@ -73,7 +81,11 @@ class PageClient:
         )
 
     async def run(self) -> None:
-        """Watch until cancelled. Raises :class:`LinkError` when the cockpit ends it, or does not let it in."""
+        """Watch until cancelled.
+
+        Raises:
+            LinkError: The cockpit ends it, or does not let the page in.
+        """
         base = f"/ws/drones/{self.drone}"
         try:
             async with self.open(f"{base}/telemetry") as socket:
@@ -112,17 +124,28 @@ class PageClient:
 
 
 def unpack_head(message: bytes) -> dict[str, Any]:
-    """What stands before the JPEG file in a binary message."""
+    """Return the head of a binary message, which stands before the JPEG file."""
     (length,) = _LENGTH.unpack_from(message)
     head: dict[str, Any] = json.loads(message[_LENGTH.size : _LENGTH.size + length])
     return head
 
 
 class Pages:
-    """Several pages on a thread of their own; a context manager for programs that are not asynchronous."""
+    """Several pages on a thread of their own; a context manager for programs that are not asynchronous.
+
+    Entering it returns when each page has its first state, and raises :class:`LinkError` if they don't within
+    :data:`STARTS_WITHIN_S`.
+    """
 
     def __init__(self, address: str, drone: str, count: int = 1, **options: Any) -> None:
-        """``options`` are those of :class:`PageClient`."""
+        """Prepare the pages.
+
+        Args:
+            address: Of the cockpit, as it prints it.
+            drone: The drone's name.
+            count: How many pages.
+            **options: As of :class:`PageClient`.
+        """
         self.clients = [PageClient(address, drone, **options) for _ in range(count)]
         self.problem: BaseException | None = None  #: why they ended, if they did
         self._loop: asyncio.AbstractEventLoop | None = None
@@ -132,18 +155,22 @@ class Pages:
 
     @property
     def frames(self) -> int:
-        """Of all pages."""
+        """Frames of all pages."""
         return sum(client.frames for client in self.clients)
 
     @property
     def newest_age_s(self) -> float | None:
-        """The oldest of the newest frames of each page; None if a page had none."""
+        """The largest age that the newest frame of a page had [s]; None if a page had no frame."""
         ages = [client.newest_age_s for client in self.clients]
         known = [age for age in ages if age is not None]
         return max(known) if known and len(known) == len(ages) else None
 
     def __enter__(self) -> Self:
-        """Returns when each has its first state. Raises :class:`LinkError`."""
+        """Open the pages, and return when each has its first state.
+
+        Raises:
+            LinkError: They don't within :data:`STARTS_WITHIN_S`.
+        """
         self._thread.start()
         self._changed.wait(STARTS_WITHIN_S)
         if self.problem is not None or not all(client.states for client in self.clients):
@@ -152,7 +179,7 @@ class Pages:
         return self
 
     def close(self) -> None:
-        """Close all. Idempotent."""
+        """Close all pages. Idempotent."""
         if self._loop is not None and self._stop is not None and not self._loop.is_closed():
             with suppress(RuntimeError):  # closed in this very moment
                 self._loop.call_soon_threadsafe(self._stop.set)

@@ -1,18 +1,27 @@
-"""Feedback, commands and statistics as plain JSON values. Pure. SI units and radians; what is not known is null."""
+"""Feedback, commands, statistics and alarms as plain JSON values, in SI units and radians.
+
+What is not known is null.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from skyloop.clock import seconds
-from skyloop.messages import ACTION_NAMES, AnyAction, Event, Feedback, Value
+from skyloop.messages import ACTION_NAMES, AnyAction, Event, Failsafe, Feedback, FlightState, LinkState, Value
 
 if TYPE_CHECKING:
+    from skyloop.client import LinkStatus
     from skyloop.client.statistics import ChannelStats
 
 Json = dict[str, Any]
+
+BATTERY_LOW: Final = 0.2  #: as ``battery.warn`` of a proxy, unless that was written
+STALE_VIDEO_S: Final = 1.0
+STALE_FEEDBACK_S: Final = 1.0
+MAX_TEXT = 1000  #: characters of an event that pages get: there may be hundreds for a new one
 
 #: Names of a vector's parts: body axes (x forward, y left, z up), or world axes.
 _PARTS = {
@@ -23,18 +32,21 @@ _PARTS = {
 }
 _NUMBERS = ("battery", "battery_v", "roll", "pitch", "yaw", "altitude")
 
+_BROKEN: Final = (LinkState.LOST, LinkState.CLOSED)
+
 
 def number(value: float | None) -> float | None:
-    """A number for JSON, to seven digits; None for what is not known or not finite."""
+    """Return a number for JSON, to seven digits; None for what is not known or not finite."""
     return None if value is None or not math.isfinite(value) else float(f"{value:.7g}")
 
 
 def vector(values: tuple[float, ...] | None) -> list[float | None] | None:
+    """Return a vector for JSON; None if it is not known."""
     return None if values is None else [number(value) for value in values]
 
 
 def feedback_values(feedback: Feedback, now_ns: int) -> Json:
-    """A feedback as JSON values."""
+    """Return feedback as JSON values; ``now_ns`` is the proxy's clock."""
     return {
         "age_s": number(seconds(now_ns - feedback.captured_ns)),
         "captured_ns": str(feedback.captured_ns),  # too large for JavaScript's numbers
@@ -50,7 +62,7 @@ def feedback_values(feedback: Feedback, now_ns: int) -> Json:
 
 
 def motion_values(feedback: Feedback | None) -> Json:
-    """What instruments show, each known by itself."""
+    """Return what instruments show, each value known by itself."""
     if feedback is None:
         names = ("attitude", "angular_velocity", "altitude", "velocity", "speed", "position", "battery")
         return {**dict.fromkeys(names), "flight": "unknown", "airborne": False}
@@ -71,8 +83,15 @@ def motion_values(feedback: Feedback | None) -> Json:
 def flat_values(
     feedback: Feedback | None, logged: Mapping[str, float], set_point: AnyAction | None
 ) -> dict[str, float | None]:
-    """Everything that is a number under a name of its own, for plots: ``yaw``, ``velocity.forward``, ``native.…``,
-    ``log.…`` and ``set_point.…``. What is not known is left out."""
+    """Return everything that is a number under a name of its own, for plots.
+
+    Names are ``yaw``, ``velocity.forward``, ``native.…``, ``log.…`` and ``set_point.…``. What is not known is left out.
+
+    Args:
+        feedback: The newest, None for none.
+        logged: The newest number of each series.
+        set_point: The command that is applied, None for none.
+    """
     found: dict[str, float | None] = {}
     if feedback is not None:
         found |= {name: number(getattr(feedback, name)) for name in _NUMBERS if getattr(feedback, name) is not None}
@@ -89,7 +108,7 @@ def flat_values(
 
 
 def set_point_values(action: AnyAction, age_s: float) -> Json:
-    """A command as it was applied."""
+    """Return a command as it was applied, as JSON values."""
     return {
         "action": ACTION_NAMES[type(action)],
         "values": {name: number(value) for name, value in _fields(action)},
@@ -98,7 +117,11 @@ def set_point_values(action: AnyAction, age_s: float) -> Json:
 
 
 def mocap_values(pose: tuple[float, ...] | None) -> Json | None:
-    """Where motion capture sees it: from position and quaternion x, y, z, w."""
+    """Return the pose that motion capture gives, as JSON values.
+
+    Args:
+        pose: Position [m] and quaternion x, y, z, w; None if it is not known.
+    """
     if pose is None:
         return None
     x, y, z, w = pose[3:7]
@@ -106,12 +129,12 @@ def mocap_values(pose: tuple[float, ...] | None) -> Json | None:
 
 
 def truth_values(native: Mapping[str, Value] | None) -> Json | None:
-    """Where a simulated vehicle really is: ``native``'s ``truth.x``, ``.y``, ``.z`` [m] and ``.yaw`` [rad]."""
+    """Return where a simulated vehicle really is: ``native``'s ``truth.x``, ``.y``, ``.z`` [m] and ``.yaw`` [rad]."""
     return None if native is None else _place(native, "truth")
 
 
 def target_values(native: Mapping[str, Value] | None) -> list[Json]:
-    """The moving targets of a simulated world: ``truth.target``, ``truth.target2``, …"""
+    """Return the moving targets of a simulated world: ``truth.target``, ``truth.target2``, …, as JSON values."""
     if native is None:
         return []
     names = sorted({key.rpartition(".")[0] for key in native if key.startswith("truth.target")})
@@ -120,12 +143,18 @@ def target_values(native: Mapping[str, Value] | None) -> list[Json]:
 
 
 def event_values(number_: int, event: Event, now_ns: int) -> Json:
-    """An event with the number that the cockpit gave it."""
+    """Return an event as JSON values.
+
+    Args:
+        number_: The number that the cockpit gave it.
+        event: The event.
+        now_ns: The proxy's clock.
+    """
     return {
         "n": number_,
         "kind": str(event.kind),
         "severity": str(event.severity),
-        "text": event.text,
+        "text": event.text[:MAX_TEXT],
         "app": event.app,
         "age_s": number(seconds(now_ns - event.at_ns)),
         "at_ns": str(event.at_ns),
@@ -133,7 +162,7 @@ def event_values(number_: int, event: Event, now_ns: int) -> Json:
 
 
 def channel_values(stats: ChannelStats) -> Json:
-    """One channel's figures; delays in seconds."""
+    """Return one channel's figures as JSON values; delays in seconds."""
     delay = stats.delay_s
     return {
         "count": stats.count,
@@ -166,3 +195,51 @@ def _numbers(name: str, value: Value) -> dict[str, float | None]:
 def _fields(action: AnyAction) -> Iterator[tuple[str, float]]:
     for name in action.__struct_fields__:
         yield name, getattr(action, name)
+
+
+def alarms(
+    link: LinkStatus,
+    feedback: Feedback | None,
+    feedback_age_s: float | None,
+    video_age_s: Mapping[str, float],
+    battery_low: float = BATTERY_LOW,
+) -> list[str]:
+    """Return what a person must know at once, in words; the worst first.
+
+    Args:
+        link: The state of both hops.
+        feedback: The newest, None for none.
+        feedback_age_s: Its age [s].
+        video_age_s: Age of what is shown [s], by camera that somebody watches.
+        battery_low: Charge below which the battery is low, 0 to 1.
+    """
+    if link.application in _BROKEN:
+        # Nothing else is known any more: what came before is no news.
+        return [_because("link to the proxy lost", link.reason)]
+    if link.vehicle is LinkState.CLOSED:
+        return []  # a recording that is over, as every recording is some time: nothing is wrong
+    found = []
+    if feedback is not None and feedback.state is FlightState.EMERGENCY:
+        found.append("emergency: the motors are off")
+    if link.vehicle is LinkState.LOST:
+        found.append(_because("link to the vehicle lost", link.reason, link.remedy))
+    elif link.vehicle is LinkState.CONNECTING:
+        found.append(_because("no vehicle yet", link.reason, link.remedy))
+    if feedback is not None and feedback.failsafe is not Failsafe.NONE:
+        done = "landing" if feedback.failsafe is Failsafe.LAND else "hovering"
+        found.append(f"failsafe: {done} by itself")
+    if feedback is not None and feedback.battery is not None and feedback.battery < battery_low:
+        found.append(f"battery low: {feedback.battery:.0%}")
+    for hop, state in (("proxy", link.application), ("vehicle", link.vehicle)):
+        if state is LinkState.DEGRADED:
+            found.append(_because(f"link to the {hop} degraded", link.reason))
+    if feedback_age_s is not None and feedback_age_s > STALE_FEEDBACK_S:
+        found.append(f"feedback is {feedback_age_s:.1f} s old")
+    for camera, age_s in video_age_s.items():
+        if age_s > STALE_VIDEO_S:
+            found.append(f"video of {camera} is {age_s:.1f} s old")
+    return found
+
+
+def _because(what: str, *more: str) -> str:
+    return ": ".join((what, *filter(None, more)))

@@ -1,4 +1,4 @@
-"""Controllers: an application's own control loop as a class; what they are made of, and ready ones."""
+"""Controllers: the base class for an application's control loop, ready-made behaviours, and their building blocks."""
 
 from skyloop.control.approach import ApproachMarker, OrbitMarker, OrbitPlace
 from skyloop.control.avoid import SeeAndAvoid

@@ -1,4 +1,4 @@
-"""Fly up to a marker and stop before it; swing round a marker; circle round a place."""
+"""Fly up to a marker and stop before it; swing round a marker; circle round a position."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ _LONGEST_STEP_S = 0.2
 
 
 class ApproachMarker(FollowMarker):
-    """Finds a marker, flies to the place straight before its face, and hovers there; then :meth:`run` returns.
+    """Finds a marker, flies straight before its face, and hovers there; then :meth:`run` returns.
 
-    The place counts as reached when distance, height and the angle to the marker's face were within ``near_m`` and
-    ``near_rad`` for ``hold_s``.
+    The goal counts as reached when distance and height were within ``near_m``, and the angle to the marker's face
+    within ``near_rad``, for ``hold_s``.
     """
 
     name = "approach"
@@ -46,8 +46,25 @@ class ApproachMarker(FollowMarker):
         camera: str | None = None,
         settings: FollowSettings | None = None,
     ) -> None:
-        """``distance_m`` goes before that of ``settings``; the others as those of :class:`FollowMarker`. Raises
-        :class:`UsageError` for numbers that make no sense."""
+        """Initialise the behaviour.
+
+        Args:
+            drone: The drone to fly; it must be airborne when :meth:`run` is called.
+            marker_id: Which marker.
+            distance_m: Where to stop before it; replaces that of ``settings``.
+            near_m: Acceptance radius of distance and height together.
+            near_rad: Acceptance angle to each side of straight before the face.
+            hold_s: How long the vehicle must stay within both.
+            size_m: Edge of the marker's black square.
+            dictionary: The marker's dictionary.
+            camera: Whose frames to use; None is the vehicle's first camera.
+            settings: Of the law; None are the defaults, with ``aside_rad`` 0.
+
+        Raises:
+            UsageError: A number is not finite and above 0.
+            UnknownNameError: There is no such camera or dictionary.
+            MissingExtraError: OpenCV is not installed.
+        """
         _require_above_0(distance_m=distance_m, near_m=near_m, near_rad=near_rad, hold_s=hold_s)
         wanted = replace(settings or FollowSettings(aside_rad=0.0), distance_m=distance_m)
         super().__init__(drone, marker_id, size_m=size_m, dictionary=dictionary, camera=camera, settings=wanted)
@@ -55,7 +72,7 @@ class ApproachMarker(FollowMarker):
         self._there_ns: int | None = None
 
     def on_frame(self, frame: Frame) -> None:
-        """As :class:`FollowMarker`, and see whether it is there."""
+        """Follow the marker, and finish once the vehicle has stayed at the goal for ``hold_s``."""
         super().on_frame(frame)
         law = self._follow_law
         there = (
@@ -74,9 +91,12 @@ class ApproachMarker(FollowMarker):
 
 
 class OrbitMarker(FollowMarker):
-    """Swings to and fro round a marker, looking at it: a flat marker can't be seen from behind.
+    """Swings to and fro round a marker on an arc, looking at it: a flat marker can't be seen from behind.
 
-    Begins where it sees the marker from; ``turns`` counts how often it came to the end of the arc.
+    Starts on the side from which it sees the marker, and runs until it is stopped.
+
+    Attributes:
+        turns: How often the end of the arc was reached.
     """
 
     name = "orbit"
@@ -94,8 +114,24 @@ class OrbitMarker(FollowMarker):
         camera: str | None = None,
         settings: FollowSettings | None = None,
     ) -> None:
-        """``radius_m`` goes before the distance of ``settings``; ``reach_rad``: how far to each side of straight before
-        the marker's face, at most 1.1; ``rate_rad_s``: how fast. Raises :class:`UsageError`."""
+        """Initialise the behaviour.
+
+        Args:
+            drone: The drone to fly; it must be airborne when :meth:`run` is called.
+            marker_id: Which marker.
+            radius_m: Distance from it; replaces that of ``settings``.
+            reach_rad: How far to each side of straight before the marker's face, at most 1.1.
+            rate_rad_s: Angular rate round the marker.
+            size_m: Edge of the marker's black square.
+            dictionary: The marker's dictionary.
+            camera: Whose frames to use; None is the vehicle's first camera.
+            settings: Of the law; None are the defaults, with ``aside_rad`` 0.05.
+
+        Raises:
+            UsageError: A number is out of its range.
+            UnknownNameError: There is no such camera or dictionary.
+            MissingExtraError: OpenCV is not installed.
+        """
         _require_above_0(radius_m=radius_m, reach_rad=reach_rad, rate_rad_s=rate_rad_s)
         if reach_rad > 1.1:
             raise UsageError(f"reach_rad is {reach_rad!r}: from farther aside than 1.1 the marker is not seen any more")
@@ -106,7 +142,7 @@ class OrbitMarker(FollowMarker):
         self._last_ns: int | None = None
 
     def on_frame(self, frame: Frame) -> None:
-        """Move the station on while the marker is seen, then as :class:`FollowMarker`."""
+        """Move the station along the arc while the marker is seen, and follow the marker."""
         law = self._follow_law
         dt_s = 0.0 if self._last_ns is None else min(_LONGEST_STEP_S, seconds(frame.captured_ns - self._last_ns))
         self._last_ns = frame.captured_ns
@@ -122,9 +158,9 @@ class OrbitMarker(FollowMarker):
 
 
 class OrbitPlace(FollowPath):
-    """Flies round a place on a circle, looking at it or away from it; then hovers, and :meth:`run` returns.
+    """Flies round a position on a circle, facing it or away from it; then hovers, and :meth:`run` returns.
 
-    Needs to know where it is: see :class:`FollowPath`.
+    Needs the vehicle's position: see :class:`FollowPath`.
     """
 
     def __init__(
@@ -139,8 +175,21 @@ class OrbitPlace(FollowPath):
         settings: PathSettings | None = None,
         source: PositionSource | None = None,
     ) -> None:
-        """``centre``: x, y and the height to fly at [m], world axes; ``look``: where the front goes. Raises
-        :class:`UsageError`."""
+        """Initialise the controller.
+
+        Args:
+            drone: The drone to fly; it must be airborne when :meth:`run` is called.
+            centre: x, y and the height to fly at [m], world axes.
+            radius_m: Of the circle.
+            look: Whether the front points ``"in"`` to the centre or ``"out"``.
+            speed_m_s: Along the circle.
+            laps: How often round; counter-clockwise.
+            settings: Of the path law; None are the defaults.
+            source: Of positions; None is the vehicle's own feedback.
+
+        Raises:
+            UsageError: An argument is out of its range.
+        """
         if look not in ("in", "out"):
             raise UsageError(f"look is {look!r} and must be 'in' or 'out'")
         circle = Circle(centre, radius_m, laps=laps, speed_m_s=speed_m_s)

@@ -1,8 +1,8 @@
-"""See and avoid: fly ahead, and past what is in the way, by a colour and fuzzy rules.
+"""See and avoid: fly ahead, and past obstacles of a known colour, by fuzzy rules.
 
-What is in the way is tracked by its colour, and kept out of the middle of the picture by a fuzzy controller, as in
+An obstacle is detected by its colour, and kept out of the middle of the image by a fuzzy controller, as in
 Olivares-Mendez, Campoy, Mellado-Bataller and Mejias, "See-and-avoid quadcopter using fuzzy control optimized by
-cross-entropy", FUZZ-IEEE 2012. Here the rules are over where it is and how wide it looks, and say how fast to go aside.
+cross-entropy", FUZZ-IEEE 2012. Here the rules take its bearing and apparent width, and give the sideways speed.
 """
 
 from __future__ import annotations
@@ -33,7 +33,11 @@ _NEAR: Colour = (255, 120, 60)
 
 
 def avoidance() -> FuzzyController:
-    """Sideways speed, 1 to the left to -1 to the right, by ``bearing`` [rad, left positive] and ``width`` [rad]."""
+    """Return the rules for the sideways speed.
+
+    Their inputs are ``bearing`` [rad, left positive] and apparent ``width`` [rad] of an obstacle; the output is from 1
+    (to the left) to -1 (to the right).
+    """
     variables = {
         "bearing": triangles({"right": -0.5, "ahead right": -0.2, "ahead": 0.0, "ahead left": 0.2, "left": 0.5}),
         "width": triangles({"far": 0.08, "near": 0.25, "close": 0.5}),
@@ -49,6 +53,8 @@ def avoidance() -> FuzzyController:
 
 
 class AvoidPhase(StrEnum):
+    """What :class:`AvoidLaw` is doing."""
+
     CLEAR = "nothing in the way"
     AVOIDING = "going past something"
     ARRIVED = "arrived"
@@ -56,22 +62,33 @@ class AvoidPhase(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class AvoidSettings:
-    """How it flies."""
+    """Speeds and distances of :class:`AvoidLaw`."""
 
     speed_m_s: float = 0.6  #: ahead
     aside_m_s: float = 0.7  #: at most
-    close_rad: float = 0.9  #: so wide it looks when there is no going ahead any more
-    back_share: float = 0.25  #: of the speed, where there is no way on
-    avoiding_rad: float = 0.15  #: narrower ones are far
-    passing_s: float = 2.5  #: for so long after it left the picture at one side it is not flown to that side
+    close_rad: float = 0.9  #: apparent width of an obstacle at which the speed ahead is 0
+    back_share: float = 0.25  #: share of the speed at which it backs off where there is no way on
+    avoiding_rad: float = 0.15  #: apparent width above which an obstacle is avoided
+    passing_s: float = 2.5  #: for so long after an obstacle left the image at one side, that side is blocked
     yaw_gain: float = 1.5  #: [1/s]
     acceleration_m_s2: float = 2.0
 
 
 class AvoidLaw:
-    """What is in the way in, velocities out. Pure: times are on the proxy's clock [ns]."""
+    """Computes velocities from sightings of obstacles. Pure: times are on the proxy's clock [ns].
+
+    Attributes:
+        phase: As of the last step.
+        ahead_m: Distance flown ahead, along the yaw at the start.
+    """
 
     def __init__(self, distance_m: float, settings: AvoidSettings | None = None) -> None:
+        """Initialise the law.
+
+        Args:
+            distance_m: How far to fly ahead.
+            settings: None are the defaults.
+        """
         self.settings = s = settings or AvoidSettings()
         self.phase = AvoidPhase.CLEAR
         self.ahead_m = 0.0  #: how far it has come
@@ -86,18 +103,23 @@ class AvoidLaw:
         self._last_ns: int | None = None
 
     def feedback(self, feedback: Feedback) -> None:
-        """Take the vehicle's newest state."""
+        """Update with the vehicle's newest state."""
         self._odometry.add(feedback)
 
     def see(self, seen: list[BlobSighting], captured_ns: int) -> None:
-        """Take what is before the vehicle, the widest first."""
+        """Update with the obstacles that are in a frame.
+
+        Args:
+            seen: The widest first; empty if there are none.
+            captured_ns: Capture of the frame.
+        """
         self._seen = seen
         for one in seen:
             if one.width_rad > self.settings.avoiding_rad and abs(one.bearing_rad) > 0.25:
                 self._beside[math.copysign(1.0, one.bearing_rad)] = captured_ns
 
     def step(self, now_ns: int) -> Velocity:
-        """What to ask the vehicle for now."""
+        """Compute the set-point for now. All zero until the vehicle's motion is known, and at the end."""
         s, motion = self.settings, self._odometry.at(now_ns)
         if motion is None:
             return Velocity()
@@ -113,7 +135,7 @@ class AvoidLaw:
         self.phase = AvoidPhase.AVOIDING if near else AvoidPhase.CLEAR
         aside, share = self._aside(now_ns), self._share()
         if share < 0.05 and abs(aside) < 0.05:
-            share = -s.back_share  # there is no way on from here: back to where it came from
+            share = -s.back_share  # blocked ahead and to both sides: back off
         wanted = np.array([s.speed_m_s * share, s.aside_m_s * aside])
         turn = clamped(s.yaw_gain * wrap_angle(self._yaw - motion.yaw), 1.0)
         dt_s = 0.0 if self._last_ns is None else seconds(now_ns - self._last_ns)
@@ -121,12 +143,12 @@ class AvoidLaw:
         return self._limiter.step(np.array([*wanted, -0.8 * way[2], turn]), dt_s)
 
     def _share(self) -> float:
-        """Of the speed ahead: the less, the wider something looks that is in the way."""
+        """Return the share of the speed ahead: the wider an obstacle ahead looks, the less."""
         in_the_way = (one.width_rad for one in self._seen if abs(one.bearing_rad) < one.width_rad / 2 + 0.2)
         return max(0.0, 1.0 - max(in_the_way, default=0.0) / self.settings.close_rad)
 
     def _aside(self, now_ns: int) -> float:
-        """The rules' answers to all that is seen, together, unless something is there beside the vehicle."""
+        """Return the sum of the rules' outputs for all obstacles, or 0 if an unseen one blocks that side."""
         aside = clamped(sum(self._rules.step(bearing=one.bearing_rad, width=one.width_rad) for one in self._seen), 1.0)
         side = math.copysign(1.0, aside)
         seen_ns = self._beside.get(side)
@@ -136,7 +158,7 @@ class AvoidLaw:
 
 
 class SeeAndAvoid(Behaviour):
-    """Flies ahead for a distance, keeps its height and yaw, and goes past whatever has the colour; then hovers."""
+    """Flies ahead for a distance at one height and yaw, past whatever has the colour; then hovers."""
 
     name = "see and avoid"
 
@@ -149,8 +171,20 @@ class SeeAndAvoid(Behaviour):
         camera: str | None = None,
         settings: AvoidSettings | None = None,
     ) -> None:
-        """``distance_m``: how far ahead; ``colour``: red, green, blue of what to avoid. Raises :class:`UsageError`,
-        :class:`UnknownNameError` for a camera that is not there, :class:`MissingExtraError` without OpenCV."""
+        """Initialise the behaviour.
+
+        Args:
+            drone: The drone to fly; it must be airborne when :meth:`run` is called.
+            distance_m: How far to fly ahead.
+            colour: Red, green, blue of the obstacles, 0 to 255.
+            camera: Whose frames to use; None is the vehicle's first camera.
+            settings: Of the law; None are the defaults.
+
+        Raises:
+            UsageError: The distance is not a finite number above 0, or the colour has no hue.
+            UnknownNameError: The vehicle has no such camera.
+            MissingExtraError: OpenCV is not installed.
+        """
         if not 0.0 < distance_m < math.inf:
             raise UsageError(f"distance_m is {distance_m!r} and must be a finite number above 0")
         self._avoid_law = AvoidLaw(distance_m, settings)
@@ -159,16 +193,16 @@ class SeeAndAvoid(Behaviour):
 
     @property
     def phase(self) -> AvoidPhase:
-        """What it is doing."""
+        """What the behaviour is doing."""
         return self._avoid_law.phase
 
     @property
     def ahead_m(self) -> float:
-        """How far it has come."""
+        """Distance flown ahead [m]."""
         return self._avoid_law.ahead_m
 
     def look(self, frame: Frame) -> list[Shape]:
-        """Find what has the colour."""
+        """Detect obstacles by their colour."""
         if self.phase is AvoidPhase.ARRIVED:
             self.finish(f"{self.ahead_m:.1f} m ahead")
             return []

@@ -1,48 +1,66 @@
-"""The base of ready behaviours: a law that is told feedback and what was seen, and steers by velocity or attitude."""
+"""The base of ready-made behaviours: detection in images, a control law, and its velocity or attitude set-points."""
 
 from __future__ import annotations
 
+from contextlib import suppress
 from enum import StrEnum
 from typing import TYPE_CHECKING, Protocol
 
 from skyloop.clock import nanoseconds
 from skyloop.control.controller import Controller
-from skyloop.errors import UnknownNameError
+from skyloop.errors import UnknownNameError, UsageError
 from skyloop.messages import Attitude, CameraInfo, EventKind, Feedback, Severity, Velocity
 from skyloop.messages.annotation import Shape
 
 if TYPE_CHECKING:
     from skyloop.client import Drone, Frame
 
-BLIND_S = 0.5  #: with no picture for so long, it holds its place rather than turn or fly on
+BLIND_S = 0.5  #: without a frame for longer than this, the vehicle hovers
 
 
 class Law(Protocol):
-    """What a behaviour is around. Pure; times are on the proxy's clock [ns]."""
+    """The control law of a behaviour. Pure: no clock and no thread; times are on the proxy's clock [ns]."""
 
     def feedback(self, feedback: Feedback) -> None:
-        """Take the vehicle's newest state."""
+        """Update the law with the vehicle's newest state."""
 
     def step(self, now_ns: int) -> Velocity | Attitude:
-        """What to ask the vehicle for now."""
+        """Compute the set-point for this time."""
 
 
 class Behaviour(Controller):
-    """Sees, decides, steers, draws; says by events what it is doing. The vehicle must be airborne when :meth:`run` is
-    called. When pictures stop coming it hovers.
+    """A controller that detects something in the camera's frames and flies by it.
 
-    To be written: :meth:`look`, :attr:`phase`, and which phases are :attr:`losses`.
+    Each frame is searched (:meth:`look`), the law computes a set-point, :meth:`steer` sends it, and what was found is
+    drawn as annotations. Changes of :attr:`phase` are published as events. The vehicle must be airborne when
+    :meth:`run` is called; when frames stop for more than :data:`BLIND_S` it hovers.
+
+    Subclasses define :meth:`look`, :attr:`phase`, and in :attr:`losses` the phases without sight of the target.
+
+    Attributes:
+        name: Source of the annotations, and prefix of the events' text.
+        done: Whether the behaviour reached its end.
+        blind: Whether no frames arrive, and the vehicle hovers for that reason.
     """
 
-    name = "behaviour"  #: its annotations' source, and how its events begin
-    losses: frozenset[StrEnum] = frozenset()  #: phases in which it does not see what it flies by
+    name = "behaviour"  #: source of its annotations, and prefix of its events' text
+    losses: frozenset[StrEnum] = frozenset()  #: phases in which the target is not seen; entering one is a warning
 
     def __init__(self, drone: Drone, law: Law, camera: str | None = None) -> None:
-        """``camera``: the vehicle's first if not given. Raises :class:`UnknownNameError` for one that it has not."""
+        """Initialise the behaviour.
+
+        Args:
+            drone: The drone to fly.
+            law: Computes the set-points.
+            camera: Whose frames to use; None is the vehicle's first camera.
+
+        Raises:
+            UnknownNameError: The vehicle has no such camera.
+        """
         super().__init__(drone)
         self.camera = camera
-        self.done = False  #: it came to its end
-        self.blind = False  #: no pictures come, and it hovers
+        self.done = False  #: the behaviour reached its end
+        self.blind = False  #: no frames arrive, and the vehicle hovers
         self._law = law
         self._mounting = camera_info(drone, camera)
         self._frame_ns: int | None = None  # capture of the newest frame
@@ -50,15 +68,19 @@ class Behaviour(Controller):
 
     @property
     def phase(self) -> StrEnum:
-        """What it is doing."""
+        """The present phase."""
         raise NotImplementedError
 
     def look(self, frame: Frame) -> list[Shape]:
-        """Tell the law what is in a picture; returns what to draw on it."""
+        """Find the target in a frame and update the law.
+
+        Returns:
+            The shapes to draw on the frame.
+        """
         raise NotImplementedError
 
     def on_feedback(self, feedback: Feedback) -> None:
-        """Keep track of the vehicle's own motion; hold the place when pictures stop coming."""
+        """Update the law; hover when frames stop arriving."""
         self._law.feedback(feedback)
         if self._frame_ns is None or self.done:
             return
@@ -69,7 +91,7 @@ class Behaviour(Controller):
             self.drone.hover()
 
     def on_frame(self, frame: Frame) -> None:
-        """Look, decide, command, and draw what was seen."""
+        """Search the frame, send the law's set-point, and draw what was found."""
         if self.done:
             return
         self._frame_ns = frame.captured_ns
@@ -81,24 +103,38 @@ class Behaviour(Controller):
         self._tell_phase()
         if not self.done:
             self.steer(wanted)
-        self.drone.annotate(frame, shapes, source=self.name)
+        with suppress(UsageError):  # a shape that can't be drawn must not end the flight
+            self.drone.annotate(frame, shapes, source=self.name)
 
     def steer(self, wanted: Velocity | Attitude) -> None:
-        """Ask the vehicle for this."""
+        """Send a set-point to the vehicle.
+
+        Args:
+            wanted: A velocity in the body's levelled axes, or an attitude.
+        """
         if isinstance(wanted, Attitude):
             self.drone.command(wanted)
         else:
             self.drone.velocity(forward=wanted.forward, left=wanted.left, up=wanted.up, yaw_rate=wanted.yaw_rate)
 
     def finish(self, text: str) -> None:
-        """It is over: the vehicle hovers, and :meth:`run` returns."""
+        """End the behaviour: publish an event, hover, and let :meth:`run` return.
+
+        Args:
+            text: What was achieved; the event's text after the name.
+        """
         self.done = True
         self.tell(text)
         self.drone.hover()
         self.stop()
 
     def tell(self, text: str, severity: Severity = Severity.INFO) -> None:
-        """Say something to this application's listeners of events."""
+        """Emit an event to this application's event subscribers.
+
+        Args:
+            text: Follows the behaviour's name and a colon.
+            severity: How important it is.
+        """
         self.drone.tell(EventKind.VEHICLE_MESSAGE, f"{self.name}: {text}", severity)
 
     def _tell_phase(self) -> None:
@@ -110,7 +146,15 @@ class Behaviour(Controller):
 
 
 def camera_info(drone: Drone, camera: str | None) -> CameraInfo:
-    """How a camera is mounted, the vehicle's first for None. Raises :class:`UnknownNameError`."""
+    """Return a camera of the vehicle's capabilities.
+
+    Args:
+        drone: The drone that is asked for its capabilities.
+        camera: The camera's name; None is the vehicle's first.
+
+    Raises:
+        UnknownNameError: The vehicle has no such camera, or none at all.
+    """
     cameras = {info.name: info for info in drone.capabilities.cameras}
     if camera is None and cameras:
         return next(iter(cameras.values()))

@@ -1,4 +1,4 @@
-"""The base class of controllers, and the loop that runs one."""
+"""The base class of controllers, and the loop that calls its callbacks."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ from skyloop.messages import LinkState
 
 if TYPE_CHECKING:
     from skyloop.client import AuthorityStatus, Drone, Frame
-    from skyloop.client.inbox import Inbox
     from skyloop.client.results import Result
+    from skyloop.client.telemetry import Mailboxes
     from skyloop.messages import Feedback
 
 Reason = Literal["time", "until", "stopped", "closed"]
-_LOOK_S = 0.1  #: how often ``until`` is asked while nothing comes
+_LOOK_S = 0.1  #: how often ``until`` is evaluated while no sample arrives
 
 
 @dataclass(frozen=True, slots=True)
 class RunSummary:
-    """How a run went."""
+    """What :meth:`Controller.run` counted, and why it ended."""
 
     frames: int  #: calls of ``on_frame``
     feedback: int  #: calls of ``on_feedback``
     frames_dropped: int  #: frames that newer ones replaced while a callback was running
     feedback_dropped: int
-    overruns: int  #: callbacks that took so long that something was dropped meanwhile
+    overruns: int  #: callbacks during which at least one sample was dropped
     seconds: float
-    reason: Reason  #: why it ended
+    reason: Reason  #: why the run ended
     results: int = 0  #: calls of ``on_result``
     results_dropped: int = 0  #: results that newer ones replaced
-    results_expired: int = 0  #: results that were older than ``result_max_age_s`` when their turn came
+    results_expired: int = 0  #: results that were older than ``result_max_age_s`` when they were taken from the queue
 
     def __str__(self) -> str:
         return (
@@ -51,11 +51,17 @@ class RunSummary:
 
 
 class Controller:
-    """Write ``on_feedback``, ``on_frame`` or ``on_result``, or several, and call :meth:`run`.
+    """The base class of an application's control loop.
 
-    Each is called with the newest sample, one call at a time, on the thread that called :meth:`run`; what comes while
-    a call is running is replaced by what is newer. ``camera`` names whose frames come; None: the vehicle's first.
-    ``processors`` names whose results come, None: everybody's; older ones than ``result_max_age_s`` are left out.
+    Override one or several of :meth:`on_feedback`, :meth:`on_frame` and :meth:`on_result`, then call :meth:`run`. Each
+    callback gets the newest sample, one call at a time, on the thread that called :meth:`run`; samples that arrive
+    while a callback runs replace the older ones that are waiting.
+
+    Attributes:
+        camera: Whose frames :meth:`on_frame` gets; None is the vehicle's first camera.
+        processors: Whose results :meth:`on_result` gets; None is all processors.
+        result_max_age_s: Results older than this are left out; None leaves out none.
+        drone: The drone that is flown.
     """
 
     camera: str | None = None
@@ -63,43 +69,72 @@ class Controller:
     result_max_age_s: float | None = 1.0
 
     def __init__(self, drone: Drone) -> None:
+        """Store the drone; no callback is called before :meth:`run`."""
         self.drone = drone
         self._stopped = threading.Event()
-        self._inbox: Inbox | None = None
+        self._inbox: Mailboxes | None = None
 
-    # To be written by the user ---------------------------------------------------------------------------------
+    # To be overridden ------------------------------------------------------------------------------------------
 
     def on_feedback(self, feedback: Feedback) -> None:
-        """Called with the newest feedback."""
+        """Handle the newest feedback."""
 
     def on_frame(self, frame: Frame) -> None:
-        """Called with the newest frame: BGR, shape (height, width, 3), uint8, read-only."""
+        """Handle the newest frame.
+
+        Args:
+            frame: BGR image, shape (height, width, 3), uint8, read-only.
+        """
 
     def on_result(self, result: Result) -> None:
-        """Called with the newest result of each processor; ``result.age_s`` is the time since its frame's capture."""
+        """Handle the newest result of a processor.
+
+        Args:
+            result: ``result.age_s`` is the time since the capture of the frame that it was computed from.
+        """
 
     def on_authority(self, status: AuthorityStatus) -> None:
-        """Called once when a command failed because somebody else took over, and once when it is given back."""
+        """Handle the loss or the return of authority.
+
+        Called once when a command fails because another client took over, and once, before the next callback, when
+        authority is held again.
+        """
 
     def on_reload(self, before: Controller) -> None:
-        """Called once before the first sample, when this one takes the place of ``before`` in flight because its file
-        was saved (``skyloop fly --reload``): take over here what the older one knows, ``self.target = before.target``.
+        """Take over the state of the controller that this one replaces in flight.
+
+        Called once before the first sample, when ``skyloop fly --reload`` loads a saved file again. Copy here what the
+        older controller knows, for example ``self.target = before.target``.
+
+        Args:
+            before: The controller that ran until now.
         """
 
     # To be called ----------------------------------------------------------------------------------------------
 
     def stop(self) -> None:
-        """End :meth:`run` after the call that is under way. Any thread."""
+        """End :meth:`run` after the callback that is running. May be called from any thread."""
         self._stopped.set()
         inbox = self._inbox
         if inbox is not None:
-            inbox.bell.ring()
+            inbox.notifier.notify()
 
     def run(self, seconds: float | None = None, until: Callable[[], bool] | None = None) -> RunSummary:
-        """Call the callbacks for ``seconds``, or until ``until()`` is true, :meth:`stop` or the drone's end.
+        """Call the callbacks until the time is over, ``until()`` is true, :meth:`stop` is called or the drone closes.
 
-        An exception in a callback makes an airborne vehicle hover and comes out here. Only an
-        :class:`AuthorityError` because somebody else took over does not: :meth:`on_authority` is told, and it goes on.
+        An exception in a callback makes an airborne vehicle hover, if this client holds authority, and is raised from
+        here. An :class:`AuthorityError` because another client took over does not end the run: :meth:`on_authority` is
+        called instead.
+
+        Args:
+            seconds: How long to run, 0 or more; None sets no limit.
+            until: Evaluated before each round of callbacks, and every 0.1 s while no sample arrives.
+
+        Returns:
+            What was called and dropped, and why the run ended.
+
+        Raises:
+            UsageError: ``seconds`` is negative or NaN.
         """
         if seconds is not None and not seconds >= 0.0:
             raise UsageError(f"seconds is {seconds!r} and must be 0 or more")
@@ -127,7 +162,7 @@ class Controller:
 class _Run:
     """One run of a controller."""
 
-    def __init__(self, controller: Controller, inbox: Inbox, stopped: threading.Event) -> None:
+    def __init__(self, controller: Controller, inbox: Mailboxes, stopped: threading.Event) -> None:
         self._controller = controller
         self._drone = controller.drone
         self._inbox = inbox
@@ -136,7 +171,7 @@ class _Run:
         self._feedback = 0
         self._results = 0
         self._overruns = 0
-        self._lost = False  # somebody took over, and the controller was told
+        self._lost = False  # another client took over, and on_authority was called
 
     def go(self, seconds: float | None, until: Callable[[], bool] | None) -> RunSummary:
         started_ns = self._inbox.clock()
@@ -148,19 +183,19 @@ class _Run:
             left_s = _LOOK_S
             if deadline_ns is not None:
                 left_s = min(left_s, (deadline_ns - self._inbox.clock()) / NS_PER_S)
-            self._inbox.bell.wait_for(lambda: self._inbox.waiting or self._stopped.is_set(), max(0.0, left_s))
+            self._inbox.notifier.wait_for(lambda: self._inbox.waiting or self._stopped.is_set(), max(0.0, left_s))
             self._serve()
         return RunSummary(
             self._frames,
             self._feedback,
-            self._inbox.frames_dropped,
-            self._inbox.feedback_dropped,
+            self._inbox.frames.dropped,
+            self._inbox.feedback.dropped,
             self._overruns,
             (self._inbox.clock() - started_ns) / NS_PER_S,
             reason,
             self._results,
-            self._inbox.results_dropped,
-            self._inbox.results_expired,
+            self._inbox.results.pushed_out,
+            self._inbox.results.expired,
         )
 
     def _over(self, deadline_ns: int | None, until: Callable[[], bool] | None) -> Reason | None:
@@ -173,12 +208,12 @@ class _Run:
         return "until" if until is not None and until() else None
 
     def _ended(self) -> bool:
-        """Whether the vehicle ended on purpose, as a recording does, and all that came before that was served."""
+        """Whether the vehicle closed its link on purpose, as a replay does, and all samples were handled."""
         return self._drone.link.vehicle is LinkState.CLOSED and not self._inbox.waiting
 
     def _serve(self) -> None:
-        """One call for each kind of sample that came; feedback first, so that frames meet the newer state."""
-        feedback = self._inbox.feedback()
+        """Call one callback per kind of sample that waits; feedback first, so that frames meet the newer state."""
+        feedback = self._inbox.feedback.take()
         if feedback is not None:
             self._feedback += 1
             self._call(self._controller.on_feedback, feedback)
@@ -186,7 +221,7 @@ class _Run:
         if frame is not None:
             self._frames += 1
             self._call(self._controller.on_frame, frame)
-        result = None if self._stopped.is_set() else self._inbox.result()
+        result = None if self._stopped.is_set() else self._inbox.results.take()
         if result is not None:
             self._results += 1
             self._call(self._controller.on_result, result)
@@ -205,7 +240,7 @@ class _Run:
             self._overruns += 1
 
     def _dropped(self) -> int:
-        return self._inbox.frames_dropped + self._inbox.feedback_dropped + self._inbox.results_dropped
+        return self._inbox.frames.dropped + self._inbox.feedback.dropped + self._inbox.results.pushed_out
 
     def _guarded(self, callback: Callable[[Any], None], sample: Any) -> None:
         try:
@@ -213,13 +248,13 @@ class _Run:
         except AuthorityError:
             status = self._drone.authority
             if status.state == "none":
-                raise  # nobody took over: it was never asked for, or given back by this application
+                raise  # nobody took over: this application never acquired authority, or released it
             if not self._lost and status.state != "held":
                 self._lost = True
                 self._controller.on_authority(status)
 
     def _hover(self) -> None:
-        """Leave the vehicle in a safe state if it is in our hands and in the air."""
+        """Make the vehicle hover if this client holds authority and it is airborne."""
         with contextlib.suppress(SkyloopError):
             if self._drone.authority.state == "held" and self._drone.feedback().state.airborne:
                 self._drone.hover()

@@ -1,4 +1,4 @@
-"""Hold the place by the ground's picture alone, by attitude: for a vehicle that knows neither place nor velocity."""
+"""Hold the position by the optical flow of the ground, by attitude: for a vehicle without position and velocity."""
 
 from __future__ import annotations
 
@@ -30,6 +30,8 @@ _LOST: Colour = (255, 180, 60)
 
 
 class FlowPhase(StrEnum):
+    """What :class:`FlowLaw` is doing."""
+
     WAITING = "waiting for the first pictures of the ground"
     HOLDING = "holding the place by the ground's picture"
     LOST = "lost the ground: level"
@@ -37,7 +39,11 @@ class FlowPhase(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class FlowSettings:
-    """How hard it holds. Raises :class:`UsageError` for numbers that make no sense."""
+    """Gains and limits of :class:`FlowLaw`.
+
+    Raises:
+        UsageError: A number is negative or not finite.
+    """
 
     gain: float = 2.5  #: acceleration by distance [1/s²]
     damping: float = 2.6  #: acceleration by velocity [1/s]
@@ -45,8 +51,8 @@ class FlowSettings:
     tilt_rad: float = 0.2
     height_gain: float = 1.0  #: [1/s]
     yaw_gain: float = 1.5  #: [1/s]
-    lead_s: float = 0.12  #: from a picture's capture until what was asked for by it takes hold, less its age
-    fresh_s: float = 0.3  #: older than this, what is known of the place is not flown by
+    lead_s: float = 0.12  #: from a set-point's decision until it takes effect
+    fresh_s: float = 0.3  #: greatest age of the last sighting of the ground that is still flown by
 
     def __post_init__(self) -> None:
         for name in self.__dataclass_fields__:
@@ -57,7 +63,7 @@ class FlowSettings:
 
 @dataclass(slots=True)
 class _Kept:
-    """What it came with."""
+    """What to hold: yaw [rad], altitude [m], and position (2,) [m] in the tracker's axes."""
 
     yaw: float
     altitude: float
@@ -65,16 +71,21 @@ class _Kept:
 
 
 class FlowLaw:
-    """Places in, attitudes out. Pure: times are on the proxy's clock [ns].
+    """Computes attitudes from horizontal positions. Pure: times are on the proxy's clock [ns].
 
-    Acceleration by place, velocity and the integral of the place, as a PID of each axis; the velocity comes from a
-    constant-velocity filter of the places, not from the vehicle.
+    A PID of each axis: acceleration by position, velocity and the integral of the position. The velocity comes from a
+    constant-velocity filter of the positions, not from the vehicle.
+
+    Attributes:
+        phase: As of the last step.
+        off_m: Estimated distance from the position to hold; None while it is not known.
     """
 
     def __init__(self, settings: FlowSettings | None = None) -> None:
+        """Initialise the law."""
         self.settings = settings or FlowSettings()
         self.phase = FlowPhase.WAITING
-        self.off_m: float | None = None  #: from where it is to hold, as it believes; None while it does not know
+        self.off_m: float | None = None  #: estimated distance from the position to hold; None while it is not known
         self._filter = ConstantVelocityFilter(2, intensity_m2_s3=0.5, speed_m_s=0.5, gate=math.inf)
         self._integral = np.zeros(2)
         self._kept: _Kept | None = None
@@ -83,11 +94,16 @@ class FlowLaw:
         self._last_ns: int | None = None
 
     def feedback(self, feedback: Feedback) -> None:
-        """Take attitude and height; velocity and position are not looked at."""
+        """Update attitude and height; velocity and position are not used."""
         self._newest = feedback
 
     def see(self, place: Array, captured_ns: int) -> None:
-        """Take where the vehicle was, (2,) [m] along yaw 0 and to its left."""
+        """Update with a position; the first one, and the first after a second without, becomes the one to hold.
+
+        Args:
+            place: Where the vehicle was at the capture, (2,) [m], along yaw 0 and to its left.
+            captured_ns: Capture of the frame.
+        """
         newest = self._newest
         if newest is None or newest.yaw is None or newest.altitude is None:
             return
@@ -99,7 +115,7 @@ class FlowLaw:
         self._seen_ns = captured_ns
 
     def step(self, now_ns: int) -> Attitude:
-        """What to ask the vehicle for now: level while it does not know where it is."""
+        """Compute the set-point for now: level while the position is not known."""
         s, newest = self.settings, self._newest
         dt_s = 0.0 if self._last_ns is None else min(0.2, seconds(now_ns - self._last_ns))
         self._last_ns = now_ns
@@ -125,18 +141,29 @@ class FlowLaw:
 
 
 class FlowHover(Behaviour):
-    """Holds the place, height and yaw at which it first saw the ground, by the camera that looks down.
+    """Holds the position, height and yaw at which it first saw the ground, by the camera that looks down.
 
-    Needs attitude and height from the vehicle, takes nothing else from it, and steers by attitude. Without the ground
-    it goes level, which lets the vehicle drift, says so, and holds wherever it finds the ground again.
+    Needs attitude and height from the vehicle, uses nothing else of its feedback, and flies by attitude. Without sight
+    of the ground it goes level, which lets the vehicle drift, emits a warning, and holds wherever it sees the ground
+    again.
     """
 
     name = "flow hover"
     losses = frozenset({FlowPhase.LOST})
 
     def __init__(self, drone: Drone, *, camera: str = "bottom", settings: FlowSettings | None = None) -> None:
-        """Raises :class:`UnknownNameError` for a camera that is not there, :class:`UsageError` for a vehicle that takes
-        no attitude, :class:`MissingExtraError` without OpenCV."""
+        """Initialise the behaviour.
+
+        Args:
+            drone: The drone to fly; it must be airborne when :meth:`run` is called.
+            camera: One that looks down.
+            settings: Of the law; None are the defaults.
+
+        Raises:
+            UnknownNameError: The vehicle has no such camera.
+            UsageError: The vehicle does not accept attitude set-points.
+            MissingExtraError: OpenCV is not installed.
+        """
         if "attitude" not in drone.capabilities.actions:
             raise UsageError("this vehicle does not fly by attitude")
         self._flow_law = FlowLaw(settings)
@@ -145,12 +172,12 @@ class FlowHover(Behaviour):
 
     @property
     def phase(self) -> FlowPhase:
-        """What it is doing."""
+        """What the behaviour is doing."""
         return self._flow_law.phase
 
     @property
     def off_m(self) -> float | None:
-        """From where it is to hold, as it believes [m]; None while it does not know."""
+        """Estimated distance from the position to hold [m]; None while it is not known."""
         return self._flow_law.off_m
 
     def look(self, frame: Frame) -> list[Shape]:

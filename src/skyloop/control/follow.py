@@ -1,4 +1,4 @@
-"""Follow a marker by the camera, keeping a distance and staying before its face; search for it when it is not seen."""
+"""Follow a marker by the camera at a distance and straight before its face; search for it when it is not seen."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _OTHER: Colour = (150, 150, 150)
 
 @dataclass(slots=True)
 class FollowScore:
-    """How well it went, counted from the first sighting on. Ranges are the estimate's, from the vehicle's centre."""
+    """How well it went, counted from the first sighting on. Ranges are estimates, from the vehicle's centre."""
 
     frames: int = 0  #: since the first sighting, that one included
     in_view: int = 0  #: of those, how many showed the marker
@@ -36,16 +36,21 @@ class FollowScore:
 
     @property
     def share_in_view(self) -> float | None:
-        """0 to 1; None if the marker was never seen."""
+        """Share of the frames that showed the marker, 0 to 1; None if it was never seen."""
         return self.in_view / self.frames if self.frames else None
 
     def range_errors_m(self, after_s: float = 0.0) -> list[float]:
-        """Distance minus the wanted one, of the sightings later than ``after_s`` from the first."""
+        """Return estimated minus wanted distance of each sighting from ``after_s`` after the first one on."""
         begin = (self.first_seen_ns or 0) + nanoseconds(after_s)
         return [error for at_ns, error in self.ranges if at_ns >= begin]
 
     def count(self, captured_ns: int, range_error_m: float | None) -> None:
-        """One more frame; ``None``: the marker was not in it."""
+        """Count a frame.
+
+        Args:
+            captured_ns: Its capture.
+            range_error_m: Estimated minus wanted distance; None if the marker was not in the frame.
+        """
         if range_error_m is not None:
             if self.first_seen_ns is None:
                 self.first_seen_ns = captured_ns
@@ -60,7 +65,11 @@ class FollowScore:
 class FollowMarker(Behaviour):
     """Finds a marker and follows it. The vehicle must be airborne when :meth:`run` is called.
 
-    ``mode`` tells what it is doing, ``score`` how well it went; every frame is annotated with what was seen.
+    Every frame is annotated with what was seen.
+
+    Attributes:
+        marker_id: Which marker is followed.
+        score: How well it went.
     """
 
     name = "follow"
@@ -76,10 +85,19 @@ class FollowMarker(Behaviour):
         camera: str | None = None,
         settings: FollowSettings | None = None,
     ) -> None:
-        """``size_m`` is the edge of the marker's black square; ``camera`` the vehicle's first if not given.
+        """Initialise the behaviour.
 
-        Raises :class:`UnknownNameError` for a camera or dictionary that is not there, :class:`MissingExtraError`
-        without OpenCV.
+        Args:
+            drone: The drone to fly.
+            marker_id: Which marker.
+            size_m: Edge of the marker's black square.
+            dictionary: The marker's dictionary.
+            camera: Whose frames to use; None is the vehicle's first camera.
+            settings: Of the law; None are the defaults.
+
+        Raises:
+            UnknownNameError: There is no such camera or dictionary.
+            MissingExtraError: OpenCV is not installed.
         """
         self.marker_id = marker_id
         self.score = FollowScore()
@@ -89,7 +107,7 @@ class FollowMarker(Behaviour):
 
     @property
     def mode(self) -> Mode:
-        """What it is doing: searching, following or recovering."""
+        """What the behaviour is doing: searching, following or recovering."""
         return self._follow_law.mode
 
     @property
@@ -99,18 +117,18 @@ class FollowMarker(Behaviour):
 
     @property
     def distance_m(self) -> float:
-        """How far from the marker it wants to be."""
+        """The wanted distance from the marker [m]."""
         return self._follow_law.settings.distance_m
 
     def look(self, frame: Frame) -> list[Shape]:
-        """Take the marker if it is there, and count."""
+        """Detect the marker, update the law, and count the frame."""
         seen = self._detector.detect(frame)
         mine = next((one for one in seen if one.id == self.marker_id), None)
         self.score.count(frame.captured_ns, None if mine is None else self._use(mine, frame))
         return self._drawing(frame, seen, mine)
 
     def _use(self, sighting: MarkerSighting, frame: Frame) -> float:
-        """Tell the law; returns how much too far the marker is [m]."""
+        """Update the law; return estimated minus wanted distance [m]."""
         place = sighting.position_in_body(self._mounting)
         if frame.feedback is not None:
             normal = sighting.normal_in_body(self._mounting)

@@ -1,9 +1,9 @@
-"""The law that follows a marker by the camera: sightings and feedback in, velocities out. Pure: no clock, no thread.
+"""The law that follows a marker: sightings and feedback in, velocities out. Pure: no clock, no thread.
 
 Position-based visual servoing (Chaumette and Hutchinson, "Visual servo control, part I", IEEE RAM 13(4), 2006): the
-marker's pose is levelled by the attitude at the picture's capture and placed where the vehicle was then; a filter
-tells where it is now and will be when the command takes hold; the vehicle keeps its distance along the line of sight,
-its height, and comes round when the marker is seen too much from the side.
+marker's pose is levelled by the attitude at the image's capture and placed where the vehicle was then; a filter
+predicts where it is when the command takes effect. The vehicle keeps its distance along the line of sight and its
+height, and comes round when the marker is seen too much from the side.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ Array = NDArray[np.float64]
 
 
 class Mode(StrEnum):
+    """What :class:`FollowLaw` is doing."""
+
     SEARCHING = "searching"  #: turning on the spot, at one height after the other
     FOLLOWING = "following"  #: seen a moment ago
     RECOVERING = "recovering"  #: lost: turning to where it must be now
@@ -33,7 +35,7 @@ class Mode(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class FollowSettings:
-    """What the law aims at and how hard. The defaults suit a small indoor vehicle with velocity control."""
+    """Goal, gains and limits of :class:`FollowLaw`. The defaults suit a small indoor vehicle with velocity control."""
 
     distance_m: float = 1.5
     lead_s: float = 0.12  #: from a command's decision to its taking hold
@@ -57,12 +59,21 @@ class FollowSettings:
 
 
 class FollowLaw:
-    """Tell it every feedback and every sighting; ask it for the velocity. Times are on the proxy's clock [ns]."""
+    """Computes velocities from feedback and sightings. Times are on the proxy's clock [ns].
+
+    Attributes:
+        mode: As of the last step.
+        station_rad: Where to be around the marker: angle from straight before its face, counter-clockwise from above.
+        station_rate_rad_s: How fast that changes.
+        off_m: Error of distance and height together, as of the last step; None while searching.
+        aside_rad: Where the vehicle is, as ``station_rad``; None while the marker's face is not known.
+    """
 
     def __init__(self, settings: FollowSettings | None = None) -> None:
+        """Initialise the law."""
         self.settings = settings or FollowSettings()
         self.mode = Mode.SEARCHING
-        #: Where to be around the marker: how far counter-clockwise, seen from above, of straight before its face [rad];
+        #: Where to be around the marker: angle from straight before its face, counter-clockwise from above [rad];
         #: and how fast that changes [rad/s].
         self.station_rad = 0.0
         self.station_rate_rad_s = 0.0
@@ -76,18 +87,22 @@ class FollowLaw:
         s = self.settings
         self._search = TurningSearch(s.search_rad_s, s.search_heights_m, s.lowest_m, s.highest_m)
         self._limiter = SetpointLimiter(SetpointLimits(speed_m_s=s.speed_m_s, acceleration_m_s2=s.acceleration_m_s2))
-        self._last_ns: int | None = None  # when something was asked for last
+        self._last_ns: int | None = None  # time of the last step
 
     def feedback(self, feedback: Feedback) -> None:
-        """Take the vehicle's newest state."""
+        """Update with the vehicle's newest state."""
         self._odometry.add(feedback)
         self._altitude = feedback.altitude
 
     def see(self, position: Array, normal: Array, at_capture: Feedback, captured_ns: int, trust: float = 1.0) -> None:
-        """Take a sighting: the marker's position [m] and face normal, both (3,) in body axes at the capture.
+        """Update with a sighting. Ignored while the vehicle's attitude or motion is not known.
 
-        ``at_capture`` gives the attitude then; ``trust`` (0 to 1) is how sure the normal is. Ignored while the
-        vehicle's attitude or motion is not known.
+        Args:
+            position: The marker's centre in body axes at the capture, (3,) [m].
+            normal: Normal of its face in the same axes, (3,).
+            at_capture: Feedback with the attitude at the capture.
+            captured_ns: Capture of the frame.
+            trust: How sure the normal is, 0 to 1.
         """
         motion = self._odometry.at(captured_ns)
         if motion is None or at_capture.roll is None or at_capture.pitch is None or at_capture.yaw is None:
@@ -102,7 +117,7 @@ class FollowLaw:
         self._seen_ns = captured_ns
 
     def step(self, now_ns: int) -> Velocity:
-        """What to ask the vehicle for now. All zero until the vehicle's motion is known."""
+        """Compute the set-point for now. All zero until the vehicle's motion is known."""
         motion = self._odometry.at(now_ns)
         if motion is None:
             return Velocity()
@@ -118,9 +133,9 @@ class FollowLaw:
         return self._smooth(wanted, now_ns)
 
     def _follow(self, own: Motion, unseen_s: float) -> Array:
-        """Wanted forward, left, up [m/s] and yaw rate [rad/s] while the target is known."""
+        """Return wanted forward, left, up [m/s] and yaw rate [rad/s] while the target is known."""
         s = self.settings
-        # What is not seen is not flown to: translation fades out within a second of the loss, turning goes on.
+        # Translation fades out within a second after the marker is lost; turning goes on.
         fade = max(0.0, min(1.0, 1.0 - (unseen_s - s.following_s)))
         place, speed = self._target.at(own.at_ns)
         speed = speed * fade
@@ -141,7 +156,7 @@ class FollowLaw:
         return np.array([*own.to_body(velocity[:2]), up, clamped(turn, s.turn_rad_s)])
 
     def _come_round(self, sight: Array, across: float) -> float:
-        """Speed to the left of the line of sight [m/s] that brings the vehicle to its station around the marker."""
+        """Return the speed to the left of the line of sight [m/s] that brings the vehicle to its station."""
         s = self.settings
         if self._face is None or float(np.hypot(*self._face)) < 0.3:  # looks up or down, or every way in turn
             self.aside_rad = None
@@ -161,7 +176,7 @@ class FollowLaw:
         return clamped(up, s.climb_m_s)
 
     def _smooth(self, wanted: Array, now_ns: int) -> Velocity:
-        """Limits how fast the set-point changes."""
+        """Limit how fast the set-point changes."""
         dt_s = 0.0 if self._last_ns is None else seconds(now_ns - self._last_ns)
         self._last_ns = now_ns
         return self._limiter.step(wanted, dt_s)

@@ -1,28 +1,35 @@
-"""Shapes for several drones, who flies to which place, and whether their ways keep apart. Pure.
+"""Shapes for several drones, the assignment of drones to positions, and whether their flights keep apart. Pure.
 
-A shape is an array of places, shape (n, 3), float64, in metres: x ahead, y left, z up, centred on its own middle. With
-:func:`placed` it stands in world axes (ROS REP 103).
+A shape is an array of positions, shape (n, 3), float64, in metres: x ahead, y left, z up, centred on its own middle.
+:func:`placed` puts it into world axes (ROS REP 103).
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from skyloop.errors import UsageError
+from skyloop.errors import MissingExtraError, UsageError
 from skyloop.messages.geometry import rotation_from_euler
 
-#: Of n drones, shape (n, 3), float64.
+#: Positions of n drones, shape (n, 3), float64 [m].
 Places = NDArray[np.float64]
 
-MOST: Final = 200  #: drones that :func:`assign` takes
+MOST: Final = 200  #: greatest number of places for :func:`assign`
 
 
 class Approach(NamedTuple):
-    """How near two of several drones come to each other."""
+    """The closest approach of several drones.
+
+    Attributes:
+        distance_m: Between the two that come closest; infinite for fewer than two drones.
+        first: Index of one of them.
+        second: Index of the other.
+    """
 
     distance_m: float  #: infinite for less than two drones
     first: int
@@ -30,19 +37,43 @@ class Approach(NamedTuple):
 
 
 def line(n: int, spacing_m: float) -> Places:
-    """Side by side, the first at the left end."""
+    """Return a line abreast, the first drone at the left end.
+
+    Args:
+        n: How many drones.
+        spacing_m: Between neighbours.
+
+    Raises:
+        UsageError: ``n`` is less than 1, or the spacing is not a finite number above 0.
+    """
     _check(n, spacing_m=spacing_m)
     return _centred([(0.0, -spacing_m * k, 0.0) for k in range(n)])
 
 
 def column(n: int, spacing_m: float) -> Places:
-    """One behind the other, the first ahead."""
+    """Return a column, one drone behind the other, the first ahead.
+
+    Args:
+        n: How many drones.
+        spacing_m: Between neighbours.
+
+    Raises:
+        UsageError: ``n`` is less than 1, or the spacing is not a finite number above 0.
+    """
     _check(n, spacing_m=spacing_m)
     return _centred([(-spacing_m * k, 0.0, 0.0) for k in range(n)])
 
 
 def circle(n: int, spacing_m: float) -> Places:
-    """On a circle, neighbours so far apart, the first ahead and the others counter-clockwise after it."""
+    """Return a circle, the first drone ahead and the others counter-clockwise after it.
+
+    Args:
+        n: How many drones.
+        spacing_m: Between neighbours, along the chord.
+
+    Raises:
+        UsageError: ``n`` is less than 1, or the spacing is not a finite number above 0.
+    """
     _check(n, spacing_m=spacing_m)
     radius = spacing_m / (2 * math.sin(math.pi / n)) if n > 1 else 0.0
     turns = [2 * math.pi * k / n for k in range(n)]
@@ -50,9 +81,15 @@ def circle(n: int, spacing_m: float) -> Places:
 
 
 def vee(n: int, spacing_m: float, angle: float = math.pi / 2) -> Places:
-    """Like geese: the first ahead, the others behind it by turns left and right, on legs that open by ``angle`` [rad].
+    """Return a V like that of geese: the first drone ahead, the others behind it, alternately left and right.
 
-    An angle of less than π/3 would bring the two legs closer than the spacing.
+    Args:
+        n: How many drones.
+        spacing_m: Between neighbours on one leg.
+        angle: Between the legs [rad], π/3 to π; less would bring the legs closer than the spacing.
+
+    Raises:
+        UsageError: An argument is out of its range.
     """
     _check(n, spacing_m=spacing_m)
     if not math.pi / 3 - 1e-9 <= angle <= math.pi:
@@ -63,7 +100,16 @@ def vee(n: int, spacing_m: float, angle: float = math.pi / 2) -> Places:
 
 
 def grid(n: int, spacing_m: float, columns: int | None = None) -> Places:
-    """In rows of ``columns`` (default: as square as it gets), the first ahead and left."""
+    """Return a grid of rows, the first drone ahead and left.
+
+    Args:
+        n: How many drones.
+        spacing_m: Between neighbours in a row and between rows.
+        columns: Drones in a row; None makes the grid as square as possible.
+
+    Raises:
+        UsageError: An argument is out of its range.
+    """
     _check(n, spacing_m=spacing_m)
     wide = math.ceil(math.sqrt(n)) if columns is None else columns
     if wide < 1:
@@ -72,7 +118,16 @@ def grid(n: int, spacing_m: float, columns: int | None = None) -> Places:
 
 
 def placed(shape: ArrayLike, at: ArrayLike, yaw: float = 0.0) -> Places:
-    """The shape turned by ``yaw`` [rad] counter-clockwise about z, its middle at ``at`` in world axes [m]."""
+    """Turn a shape and move it into world axes.
+
+    Args:
+        shape: Shape (n, 3) [m].
+        at: Where its middle is to be, (3,) in world axes [m].
+        yaw: Counter-clockwise about z [rad].
+
+    Raises:
+        UsageError: The shape, the place or the yaw is not finite, or of another shape.
+    """
     middle = np.asarray(at, dtype=np.float64)
     if middle.shape != (3,) or not np.isfinite(middle).all() or not math.isfinite(yaw):
         raise UsageError(f"a formation is placed at three finite coordinates with a finite yaw, not {at!r}, {yaw!r}")
@@ -81,7 +136,11 @@ def placed(shape: ArrayLike, at: ArrayLike, yaw: float = 0.0) -> Places:
 
 
 def places(values: ArrayLike) -> Places:
-    """An array of places. Raises :class:`UsageError` for what is not finite or not of shape (n, 3)."""
+    """Convert to an array of positions.
+
+    Raises:
+        UsageError: A coordinate is not finite, or the shape is not (n, 3).
+    """
     try:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
@@ -92,12 +151,19 @@ def places(values: ArrayLike) -> Places:
 
 
 def assign(starts: ArrayLike, slots: ArrayLike) -> list[int]:
-    """For each start the number of its slot, so that the sum of the squared distances is the least.
+    """Return for each start the index of its slot, so that the sum of the squared distances is least.
 
-    With that sum the straight ways of drones that leave and arrive together do not cross, and keep apart by 1/√2 of the
-    least distance among starts and among slots, each start being that far from other starts and each slot from other
-    slots (Turpin, Michael and Kumar, "CAPT", International Journal of Robotics Research 33, 2014). There may be
-    more slots than starts. Raises :class:`UsageError`.
+    With that sum, the straight paths of drones that leave and arrive together do not cross. They keep apart by 1/√2 of
+    the least distance of starts from one another and of slots from one another (Turpin, Michael and Kumar, "CAPT",
+    International Journal of Robotics Research 33, 2014).
+
+    Args:
+        starts: Shape (n, 3) [m].
+        slots: Shape (m, 3) [m], with m from n to :data:`MOST`.
+
+    Raises:
+        UsageError: There are fewer slots than starts, too many slots, or coordinates that are not finite.
+        MissingExtraError: SciPy is not installed (extra ``control``).
     """
     a, b = places(starts), places(slots)
     if len(a) > len(b):
@@ -105,11 +171,20 @@ def assign(starts: ArrayLike, slots: ArrayLike) -> list[int]:
     if len(b) > MOST:
         raise UsageError(f"{len(b)} places are more than the {MOST} that can be assigned")
     costs = ((a[:, None, :] - b[None, :, :]) ** 2).sum(axis=2)
-    return _least_cost(costs)
+    _, columns = solver()(costs)
+    return [int(column) for column in columns]
 
 
 def closest_approach(starts: ArrayLike, goals: ArrayLike) -> Approach:
-    """How near two drones come when each flies straight from its start to its goal, all in the same time."""
+    """Return how close two drones come when each flies straight from its start to its goal, all in the same time.
+
+    Args:
+        starts: Shape (n, 3) [m].
+        goals: Shape (n, 3) [m].
+
+    Raises:
+        UsageError: A coordinate is not finite, or the shape is not (n, 3).
+    """
     a, b = places(starts), places(goals)
     nearest = Approach(math.inf, 0, 0)
     for i in range(len(a)):
@@ -124,10 +199,22 @@ def closest_approach(starts: ArrayLike, goals: ArrayLike) -> Approach:
 
 
 def kept_apart(velocities: ArrayLike, positions: ArrayLike, apart_m: float, gain: float = 1.0) -> Places:
-    """World velocities [m/s], changed where two drones are closer than ``apart_m``, so that these part.
+    """Change velocities so that drones closer than ``apart_m`` part.
 
-    Their velocities along the line between them become such that the distance grows by ``gain`` [1/s] times what is
-    missing; both give way by half. What they do across that line stays.
+    Along the line between two of them the velocities become such that the distance grows by ``gain`` times what is
+    missing; both give way by half. The components across that line stay.
+
+    Args:
+        velocities: Shape (n, 3), world axes [m/s].
+        positions: Shape (n, 3), world axes [m].
+        apart_m: The least distance.
+        gain: [1/s]
+
+    Returns:
+        The changed velocities, shape (n, 3).
+
+    Raises:
+        UsageError: A number is not finite, or the shape is not (n, 3).
     """
     changed, at = places(velocities).copy(), places(positions)
     for i in range(len(at)):
@@ -157,35 +244,15 @@ def _check(n: int, *, spacing_m: float) -> None:
         raise UsageError(f"spacing_m is {spacing_m!r} and must be more than 0 m")
 
 
-def _least_cost(costs: NDArray[np.float64]) -> list[int]:
-    """The column of each row with the least sum; not more rows than columns.
+def solver() -> Callable[[NDArray[np.float64]], tuple[NDArray[np.intp], NDArray[np.intp]]]:
+    """Return SciPy's solver of the assignment problem.
 
-    By successive shortest augmenting paths with potentials (Kuhn 1955; Jonker and Volgenant 1987): rows join one after
-    the other, each by the cheapest chain of changes among those that are there.
+    Raises:
+        MissingExtraError: SciPy is not installed.
     """
-    rows, columns = costs.shape
-    row_price, column_price = np.zeros(rows), np.zeros(columns)
-    row_of = np.full(columns, -1)
-    for new in range(rows):
-        least = np.full(columns, math.inf)  # of the reduced cost at which a column is reached
-        before = np.full(columns, -1)  # the column from whose row it is reached
-        done = np.zeros(columns, dtype=bool)
-        row, column, so_far = new, -1, 0.0
-        while row >= 0:
-            reduced = so_far + costs[row] - row_price[row] - column_price
-            better = ~done & (reduced < least)
-            least[better], before[better] = reduced[better], column
-            column = int(np.argmin(np.where(done, math.inf, least)))
-            so_far = float(least[column])
-            done[column] = True
-            row = int(row_of[column])
-        reached = np.flatnonzero(done & (row_of >= 0))
-        row_price[row_of[reached]] += so_far - least[reached]
-        row_price[new] += so_far
-        column_price[done] -= so_far - least[done]
-        while column >= 0:
-            previous = int(before[column])
-            row_of[column] = row_of[previous] if previous >= 0 else new
-            column = previous
-    slot_of = {int(row): column for column, row in enumerate(row_of) if row >= 0}
-    return [slot_of[row] for row in range(rows)]
+    try:
+        from scipy.optimize import linear_sum_assignment
+    except ImportError as error:
+        raise MissingExtraError("formations", "control", cause=str(error)) from error
+    found: Callable[[NDArray[np.float64]], tuple[NDArray[np.intp], NDArray[np.intp]]] = linear_sum_assignment
+    return found

@@ -1,4 +1,4 @@
-"""Flying a swarm in formation, by the positions that the drones tell in world axes."""
+"""Fly a swarm in formation, by the positions that the drones report in world axes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from skyloop.control.formation import Places, assign, closest_approach, kept_apart, places
+from skyloop.control.formation import Places, assign, closest_approach, kept_apart, places, solver
 from skyloop.control.waypoint import Waypoint, WaypointSettings, lacking, reached, velocity_to
 from skyloop.errors import NoAnswerError, UnknownNameError, UsageError
 from skyloop.messages import AnyAction, Feedback, Vector, Velocity
@@ -20,35 +20,52 @@ if TYPE_CHECKING:
     from skyloop.client import Swarm
     from skyloop.client.swarm import Tick
 
-MAX_AGE_S: Final = 1.0  #: of the feedback that is flown by
-SLACK_S: Final = 10.0  #: how much longer than planned a flight may take
-_PEAK: Final = 1.875  # of a minimum-jerk way's speed over its mean
+MAX_AGE_S: Final = 1.0  #: greatest age of the feedback that is flown by
+SLACK_S: Final = 10.0  #: how much longer than planned a flight may take by default
+_PEAK: Final = 1.875  # peak speed over mean speed of a minimum-jerk trajectory
 
 
 @dataclass(frozen=True, slots=True)
 class FormationReport:
-    """How a flight went."""
+    """How a flight in formation went."""
 
     seconds: float
-    slots: dict[str, Vector]  #: where each was to be at the end, in world axes [m]
-    errors_m: dict[str, float]  #: and how far from there each was
-    closest_m: float  #: the least distance that any two were seen at; infinite for one drone
-    spread_s: float | None  #: how far apart the set-points of one tick left, at most
+    slots: dict[str, Vector]  #: where each drone was to be at the end, in world axes [m]
+    errors_m: dict[str, float]  #: how far from its slot each drone was
+    closest_m: float  #: least distance between any two drones; infinite for one drone
+    spread_s: float | None  #: greatest time between the first and the last set-point of one tick
 
 
 class Formation:
-    """Flies the active drones of a swarm, on the thread that calls. Each must be in the air and tell position and yaw.
+    """Flies the active drones of a swarm in formation, on the calling thread.
 
-    ``apart_m``: ways that would bring two closer are refused, and drones that come closer are steered apart.
-    ``settings``: how hard they fly. Raises :class:`UsageError` for drones that can't, and as ``on_error`` of the swarm
-    says for drones that fail on the way.
+    Each drone must be airborne and report position and yaw. Drones that fail on the way are handled as ``on_error`` of
+    the swarm says.
+
+    Attributes:
+        drones: The swarm.
+        apart_m: The least distance between two drones.
     """
 
     def __init__(
         self, drones: Swarm, *, rate_hz: float = 20.0, apart_m: float = 0.7, settings: WaypointSettings | None = None
     ) -> None:
+        """Initialise the formation.
+
+        Args:
+            drones: The swarm to fly.
+            rate_hz: Rate of the set-points.
+            apart_m: Flights that would bring two drones closer are refused, and drones that come closer are steered
+                apart.
+            settings: Gains, limits and acceptance radii; None are the defaults.
+
+        Raises:
+            UsageError: ``apart_m`` is negative or not finite.
+            MissingExtraError: SciPy is not installed.
+        """
         if not (math.isfinite(apart_m) and apart_m >= 0.0):
             raise UsageError(f"apart_m is {apart_m!r} and must be 0 m or more")
+        solver()  # loaded, or refused, here and not while the drones fly to their places
         self.drones = drones
         self.apart_m = apart_m
         self._rate_hz = rate_hz
@@ -58,11 +75,20 @@ class Formation:
     def fly_to(
         self, slots: ArrayLike, *, speed_m_s: float = 0.6, yaw: float | None = None, timeout_s: float | None = None
     ) -> FormationReport:
-        """Assign the places, shape (n, 3) in world axes [m], and fly there straight, all leaving and arriving together.
+        """Assign drones to slots and fly there straight, all leaving and arriving together; they hover at the end.
 
-        ``speed_m_s``: of who has the longest way, at most. ``yaw`` [rad]: of all; None: as each is. There may be more
-        places than drones. Those that are not there ``timeout_s`` after the start have failed (default: ten seconds
-        more than planned). They hover at the end.
+        Args:
+            slots: Shape (n, 3), world axes [m]; at least as many as there are drones.
+            speed_m_s: Greatest speed of the drone with the longest path.
+            yaw: Of all drones [rad]; None leaves it free.
+            timeout_s: Drones that are not at their slot by then have failed; None is ten seconds more than planned.
+
+        Returns:
+            Where each drone is at the end, and how close they came to each other.
+
+        Raises:
+            UsageError: A drone can't be flown by its position, or two would come closer than ``apart_m``.
+            SwarmError: A drone failed, and the swarm's ``on_error`` does not say to continue.
         """
         if not (math.isfinite(speed_m_s) and speed_m_s > 0.0):
             raise UsageError(f"speed_m_s is {speed_m_s!r} and must be more than 0 m/s")
@@ -89,7 +115,15 @@ class Formation:
         return self._arrived({name: way[1] for name, way in ways.items()}, yaw, elapsed_s)
 
     def hold(self, seconds: float) -> FormationReport:
-        """Keep the places where they are."""
+        """Keep each drone at its present position.
+
+        Args:
+            seconds: How long.
+
+        Raises:
+            UsageError: A drone can't be flown by its position.
+            SwarmError: A drone failed, and the swarm's ``on_error`` does not say to continue.
+        """
         here = {name: np.array(sample.position) for name, sample in self._ready().items()}
         still = np.zeros(3)
         for _ in self.drones.ticks(self._rate_hz, seconds):
@@ -106,12 +140,22 @@ class Formation:
         lead: Callable[[Tick], AnyAction] | None = None,
         turn: bool = True,
     ) -> FormationReport:
-        """Keep each follower at its offset from the leader for so long, its velocity fed forward.
+        """Keep followers at offsets from a leader, whose velocity is fed forward; the drones hover at the end.
 
-        ``offsets``: by name, three coordinates [m]: ahead, left and up of the leader, or with ``turn=False`` east,
-        north and up of it. ``lead``: what the leader is told at each tick, sent together with the followers'
-        set-points; None: somebody else flies it. A leader that fails lets the followers hover: :class:`SwarmError` or,
-        with ``on_error="continue"``, the end of this call.
+        Args:
+            leader: The leader's name.
+            offsets: Of each follower by name, (3,) [m]: ahead, left and up of the leader, or with ``turn=False`` east,
+                north and up of it.
+            seconds: How long.
+            lead: Returns the leader's action at each tick, which is sent together with the followers' set-points; None:
+                another client flies the leader.
+            turn: Whether offsets and yaw turn with the leader.
+
+        Raises:
+            UnknownNameError: The swarm has no drone of such a name.
+            UsageError: The leader is among the followers, or a drone can't be flown by its position.
+            SwarmError: A drone failed. If the leader failed and the swarm's ``on_error`` is ``"continue"``, the
+                followers hover and this call returns.
         """
         wanted = {name: _offset(offset) for name, offset in offsets.items()}
         for name in (leader, *wanted):
@@ -142,7 +186,7 @@ class Formation:
         return self.drones.feedback(max_age_s=MAX_AGE_S)
 
     def _ready(self) -> dict[str, Feedback]:
-        """The newest of each. Raises :class:`UsageError` naming those that can't be flown by their position."""
+        """Return the newest feedback of each drone; raise UsageError naming those that can't be flown by position."""
         self._closest_m = math.inf
         found = self._look()
         problems = [f"{name}: {lacking(sample)}" for name, sample in found.items() if lacking(sample)]
@@ -172,7 +216,7 @@ class Formation:
         fixed: Mapping[str, Feedback] | None = None,
         also: Mapping[str, AnyAction] | None = None,
     ) -> None:
-        """Send each towards its goal, which moves by ``drift`` [m/s]; ``fixed``: others that they keep away from."""
+        """Send each drone towards its goal, which moves by ``drift`` [m/s]; ``fixed``: others to keep away from."""
         towards = {name: velocity_to(goals[name], now[name], self._settings) for name in now}
         others = fixed or {}
         positions = _positions({**now, **others})
@@ -199,7 +243,7 @@ class Formation:
 
     @property
     def _loose(self) -> WaypointSettings:
-        """What counts as there a moment later, when they hover."""
+        """Acceptance radii for a moment after the arrival, when the drones hover."""
         return replace(self._settings, near_m=3 * self._settings.near_m, near_rad=math.pi, slow_m_s=math.inf)
 
     def _report(self, goals: Mapping[str, NDArray[np.float64]], seconds: float) -> FormationReport:
@@ -211,8 +255,19 @@ class Formation:
 
 
 def station(leader: Feedback, offset: ArrayLike, *, turn: bool = True) -> NDArray[np.float64]:
-    """The place at an offset from a leader in world axes [m], shape (3,): ahead, left and up of it, or with
-    ``turn=False`` east, north and up. Raises :class:`UsageError` while the leader's position or yaw are not known."""
+    """Return the position at an offset from a leader.
+
+    Args:
+        leader: The leader's newest feedback.
+        offset: (3,) [m]: ahead, left and up of the leader, or with ``turn=False`` east, north and up.
+        turn: Whether the offset turns with the leader's yaw.
+
+    Returns:
+        World axes [m], shape (3,).
+
+    Raises:
+        UsageError: The leader's position or yaw are not known.
+    """
     problem = lacking(leader)
     if problem or leader.position is None or leader.yaw is None:
         raise UsageError(f"nobody can keep a place beside it: {problem}")
@@ -222,7 +277,7 @@ def station(leader: Feedback, offset: ArrayLike, *, turn: bool = True) -> NDArra
 
 
 def _minimum_jerk(share: float) -> tuple[float, float]:
-    """Way and speed along a way of length 1 in time 1: at rest at both ends (Flash and Hogan 1985)."""
+    """Return distance and speed on a path of length 1 flown in time 1, at rest at both ends (Flash and Hogan 1985)."""
     t = min(1.0, max(0.0, share))
     return t**3 * (10.0 - 15.0 * t + 6.0 * t * t), 30.0 * t * t * (1.0 - t) ** 2
 
@@ -247,13 +302,13 @@ def _vector(place: NDArray[np.float64]) -> Vector:
 
 
 def _turned(velocity: Velocity, sample: Feedback, way: float) -> NDArray[np.float64]:
-    """From the body's levelled axes to the world's, or back with ``way`` -1."""
+    """Turn a velocity from the body's levelled axes into the world's, or back with ``way`` -1."""
     rotation = rotation_from_euler(0.0, 0.0, way * (sample.yaw or 0.0))
     return np.asarray(rotation @ (velocity.forward, velocity.left, velocity.up), dtype=np.float64)
 
 
 def _world_velocity(sample: Feedback) -> NDArray[np.float64]:
-    """As told; nothing for one that does not tell."""
+    """Return the reported velocity in world axes; zero for a drone that does not report it."""
     return _turned(Velocity(*(sample.velocity or (0.0, 0.0, 0.0))), sample, 1.0)
 
 

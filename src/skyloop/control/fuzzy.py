@@ -1,4 +1,4 @@
-"""Fuzzy inference: rules in words over numbers. Pure.
+"""Fuzzy inference: linguistic rules over numbers. Pure.
 
 Zero-order Takagi-Sugeno: each rule concludes a number, and the output is the mean of these, weighted by how true the
 rules are; the truth of a rule is the product of its conditions' (Takagi and Sugeno, "Fuzzy identification of systems
@@ -17,10 +17,12 @@ from skyloop.errors import UnknownNameError, UsageError
 
 @dataclass(frozen=True, slots=True)
 class Trapezoid:
-    """How true a term is of a number: 0 up to ``a``, rising to 1 at ``b``, 1 up to ``c``, falling to 0 at ``d``.
+    """Membership function: 0 up to ``a``, rising to 1 at ``b``, 1 up to ``c``, falling to 0 at ``d``.
 
-    Infinite ``a`` and ``b``, or ``c`` and ``d``, leave that side at 1. Raises :class:`UsageError` unless
-    ``a`` ≤ ``b`` ≤ ``c`` ≤ ``d``.
+    Infinite ``a`` and ``b``, or ``c`` and ``d``, leave that side at 1.
+
+    Raises:
+        UsageError: The corners do not satisfy ``a`` ≤ ``b`` ≤ ``c`` ≤ ``d``.
     """
 
     a: float
@@ -33,6 +35,7 @@ class Trapezoid:
             raise UsageError(f"a trapezoid's corners must rise: {self.a}, {self.b}, {self.c}, {self.d}")
 
     def __call__(self, value: float) -> float:
+        """Return the membership of a value, 0 to 1."""
         if self.b <= value <= self.c:
             return 1.0
         if value < self.b:
@@ -41,8 +44,16 @@ class Trapezoid:
 
 
 def triangles(peaks: Mapping[str, float]) -> dict[str, Trapezoid]:
-    """Terms of one variable that each are wholly true at their peak and not at all at the next ones', so that all
-    together are 1 everywhere; the outermost ones go on for ever. Raises :class:`UsageError` unless the peaks rise."""
+    """Return triangular terms of one variable, each 1 at its peak and 0 at the next ones.
+
+    All together add up to 1 everywhere; the outermost ones stay at 1 beyond their peaks.
+
+    Args:
+        peaks: Where each term is 1, by its name; at least two, in rising order.
+
+    Raises:
+        UsageError: There are fewer than two peaks, or they do not rise.
+    """
     names, at = list(peaks), list(peaks.values())
     if len(at) < 2 or any(not low < high for low, high in itertools.pairwise(at)):
         raise UsageError(f"two peaks or more, each above the one before, not {dict(peaks)}")
@@ -55,16 +66,26 @@ def triangles(peaks: Mapping[str, float]) -> dict[str, Trapezoid]:
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """If every variable is what ``when`` says, then this number."""
+    """If every variable is what ``when`` says, the output is ``then``."""
 
-    when: Mapping[str, str]  #: variable: term; one that is not named may be anything
+    when: Mapping[str, str]  #: term by variable; a variable that is not named may have any value
     then: float
 
 
 class FuzzyController:
-    """Variables, their terms, and rules. Raises :class:`UnknownNameError` for a rule about what does not exist."""
+    """Rules over variables with linguistic terms."""
 
     def __init__(self, variables: Mapping[str, Mapping[str, Trapezoid]], rules: Sequence[Rule]) -> None:
+        """Check and store the rules.
+
+        Args:
+            variables: Membership functions by variable and term.
+            rules: At least one.
+
+        Raises:
+            UsageError: There is no rule.
+            UnknownNameError: A rule names a variable or term that does not exist.
+        """
         if not rules:
             raise UsageError("there is no rule")
         for rule in rules:
@@ -77,9 +98,16 @@ class FuzzyController:
         self._rules = tuple(rules)
 
     def step(self, **values: float) -> float:
-        """The output for these values; 0 where no rule says anything.
+        """Compute the output.
 
-        Raises :class:`UsageError` for a variable without a value, or one that is NaN.
+        Args:
+            **values: One for each variable.
+
+        Returns:
+            The weighted mean of the rules' conclusions; 0 where no rule applies.
+
+        Raises:
+            UsageError: A variable has no value, or it is NaN.
         """
         missing = [name for name in self._variables if math.isnan(values.get(name, math.nan))]
         if missing:

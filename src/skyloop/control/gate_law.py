@@ -1,9 +1,9 @@
 """The law that flies through a gate: sightings and feedback in, velocities out. Pure: no clock, no thread.
 
 Position-based visual servoing (Chaumette and Hutchinson, "Visual servo control, part I", IEEE RAM 13(4), 2006). The
-gate's place and the way through it are kept in odometry axes, where they stand still but for the odometry's drift. The
-vehicle is brought onto the axis of the gate while it looks at the opening, comes nearer the better it is aligned, and
-flies through, the last metre and a half by odometry, because there the frame is larger than the picture.
+gate's position and its axis are kept in odometry axes, where they stand still but for the odometry's drift. The
+vehicle is brought onto the gate's axis while it faces the opening, comes nearer the better it is aligned, and flies
+through. The last metre and a half is flown by odometry, because there the gate is larger than the image.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ Array = NDArray[np.float64]
 
 
 class GatePhase(StrEnum):
+    """What :class:`GateLaw` is doing."""
+
     SEARCHING = "searching the gate"  #: turning on the spot, at one height after the other
     ALIGNING = "going to the gate's axis"  #: seen a moment ago
     RECOVERING = "lost the gate: holding the place, turning to where it must be"
@@ -37,7 +39,10 @@ class GatePhase(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class GateSettings:
-    """How it flies. The defaults suit a small indoor vehicle and openings of about a metre."""
+    """Gains, limits and distances of :class:`GateLaw`.
+
+    The defaults suit a small indoor vehicle and openings of about a metre.
+    """
 
     lead_s: float = 0.12  #: from a command's decision to its taking hold
     #: Share of the velocity's error that is asked for on top: gusts push a vehicle with a soft velocity loop less far.
@@ -50,11 +55,11 @@ class GateSettings:
     aside_gain: float = 1.3  #: [1/s]
     height_gain: float = 1.3  #: [1/s]
     yaw_gain: float = 1.8  #: [1/s]
-    stand_m: float = 1.7  #: before the gate, where it must be aligned
+    stand_m: float = 1.7  #: distance before the gate where the vehicle must be aligned
     aligned_m: float = 0.15  #: off the axis, across and in height
     aligned_rad: float = 0.25  #: off its heading
     cone: float = 0.3  #: how much farther off the axis it may be for each metre before that
-    beyond_m: float = 0.7  #: so far behind the gate it is through
+    beyond_m: float = 0.7  #: distance behind the gate at which it counts as passed
     fresh_s: float = 0.4  #: since last seen: it flies on
     recovering_s: float = 3.0
     search_rad_s: float = 0.7
@@ -64,17 +69,23 @@ class GateSettings:
 
 
 class Axis(NamedTuple):
-    """Where the vehicle is, seen from the gate."""
+    """Where the vehicle is in the gate's axes."""
 
-    along_m: float  #: the way through; negative before it
+    along_m: float  #: in the direction of flight; negative before the gate
     aside_m: float  #: to the left of the axis
     above_m: float
 
 
 class GateLaw:
-    """Tell it every feedback and every sighting; ask it for the velocity. Times are on the proxy's clock [ns]."""
+    """Computes velocities from feedback and sightings. Times are on the proxy's clock [ns].
+
+    Attributes:
+        phase: As of the last step.
+        axis: Where the vehicle is, as of the last step; None while the gate is not known.
+    """
 
     def __init__(self, settings: GateSettings | None = None) -> None:
+        """Initialise the law."""
         self.settings = s = settings or GateSettings()
         self.phase = GatePhase.SEARCHING
         self.axis: Axis | None = None  #: as of the last step
@@ -88,21 +99,32 @@ class GateLaw:
         self._seen_ns: int | None = None
 
     def next_gate(self, *, turning: float = 0.0) -> None:
-        """Another gate from here on; ``turning``: which way to search for it first, counter-clockwise positive."""
+        """Forget the gate and search for another.
+
+        Args:
+            turning: Which way to search first; positive is counter-clockwise.
+        """
         self.phase, self.axis = GatePhase.SEARCHING, None
         self._gate, self._way, self._seen_ns = _new_filter(), None, None
         self._search.restart(turning=turning)
 
     def feedback(self, feedback: Feedback) -> None:
-        """Take the vehicle's newest state."""
+        """Update with the vehicle's newest state."""
         self._odometry.add(feedback)
         self._altitude = feedback.altitude
 
     def see(self, position: Array, normal: Array, at_capture: Feedback, captured_ns: int, trust: float = 1.0) -> None:
-        """Take a sighting: the opening's centre [m] and the normal of the side seen, both (3,) in body axes.
+        """Update with a sighting.
 
-        ``at_capture`` gives the attitude then; ``trust`` (0 to 1) is how sure the normal is. Ignored while the
-        vehicle's attitude or motion is not known, and where it is far from where the gate was seen before.
+        Ignored while the vehicle's attitude or motion is not known, and where it is far from where the gate was seen
+        before.
+
+        Args:
+            position: The opening's centre in body axes, (3,) [m].
+            normal: Normal of the side that is seen, in body axes, (3,).
+            at_capture: Feedback with the attitude at the capture.
+            captured_ns: Capture of the frame.
+            trust: How sure the normal is, 0 to 1.
         """
         motion = self._odometry.at(captured_ns)
         if motion is None or at_capture.roll is None or at_capture.pitch is None or at_capture.yaw is None:
@@ -117,7 +139,7 @@ class GateLaw:
         self._seen_ns = captured_ns
 
     def step(self, now_ns: int) -> Velocity:
-        """What to ask the vehicle for now. All zero until the vehicle's motion is known."""
+        """Compute the set-point for now. All zero until the vehicle's motion is known."""
         motion = self._odometry.at(now_ns)
         if motion is None:
             return Velocity()
@@ -128,7 +150,7 @@ class GateLaw:
         return self._limiter.step(wanted, dt_s)
 
     def _wanted(self, own: Motion, now_ns: int) -> Array:
-        """Forward, left, up [m/s] and yaw rate [rad/s]; decides the phase."""
+        """Return forward, left, up [m/s] and yaw rate [rad/s]; sets the phase."""
         s = self.settings
         if self._seen_ns is None or self._way is None:
             return self._search.step(own.yaw, self._altitude)
@@ -176,7 +198,7 @@ class GateLaw:
         return GatePhase.PASSING if near and aligned else GatePhase.ALIGNING
 
     def _approach(self, axis: Axis) -> float:
-        """Speed along the axis while aligning [m/s]: to the place before the gate, and only within the cone."""
+        """Return the speed along the axis while aligning [m/s]: to the place before the gate, within the cone only."""
         s = self.settings
         left_m = -s.stand_m - axis.along_m
         if left_m < 0.0:
@@ -190,5 +212,5 @@ class GateLaw:
 
 
 def _new_filter() -> ConstantVelocityFilter:
-    """Of a thing that stands still, in axes that drift by some centimetres a second."""
+    """Create a filter for a thing that stands still, in axes that drift by some centimetres a second."""
     return ConstantVelocityFilter(3, intensity_m2_s3=0.002, speed_m_s=0.03, gate=6.0)

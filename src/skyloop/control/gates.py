@@ -44,10 +44,13 @@ FIVE_GATES = (
 
 
 class FlyThroughGates(Behaviour):
-    """Searches each gate by its colour, goes onto its axis, flies through, and on to the next; hovers behind the last.
+    """Flies through gates of known colours, one after the other, and hovers behind the last.
 
-    ``passed`` is how many it flew through. A gate that is lost on the way makes it hold its place and turn to where the
-    gate must be, then search for it again.
+    Each gate is searched by its colour. A gate that is lost on the way makes the vehicle hold its position and turn to
+    where the gate must be, then search for it again. The vehicle must be airborne when :meth:`run` is called.
+
+    Attributes:
+        passed: How many gates were flown through.
     """
 
     name = "gates"
@@ -61,8 +64,19 @@ class FlyThroughGates(Behaviour):
         camera: str | None = None,
         settings: GateSettings | None = None,
     ) -> None:
-        """Raises :class:`UsageError` without gates and for a colour without a hue, :class:`UnknownNameError` for a
-        camera that is not there, :class:`MissingExtraError` without OpenCV."""
+        """Initialise the behaviour.
+
+        Args:
+            drone: The drone to fly.
+            gates: The course, in order.
+            camera: Whose frames to use; None is the vehicle's first camera.
+            settings: Of the law; None are the defaults.
+
+        Raises:
+            UsageError: There is no gate, or a colour has no hue.
+            UnknownNameError: The vehicle has no such camera.
+            MissingExtraError: OpenCV is not installed.
+        """
         if not gates:
             raise UsageError("there is no gate to fly through")
         self._gates = tuple(gates)
@@ -74,16 +88,16 @@ class FlyThroughGates(Behaviour):
 
     @property
     def phase(self) -> GatePhase:
-        """What it is doing."""
+        """What the behaviour is doing."""
         return self._gate_law.phase
 
     @property
     def gate(self) -> GateKind | None:
-        """The one that it flies to; None when all are passed."""
+        """The gate that is next; None when all are passed."""
         return self._gates[self.passed] if self.passed < len(self._gates) else None
 
     def look(self, frame: Frame) -> list[Shape]:
-        """Take the nearest gate of the colour that is next."""
+        """Detect the nearest gate of the colour that is next, and update the law."""
         if self.phase is GatePhase.PASSED:
             self._next()
         gate = self.gate

@@ -1,7 +1,7 @@
-"""Where to look while flying: yaw modes. Pure.
+"""Yaw modes: where the front points while flying. Pure.
 
-A mode is called with the place and the velocity that the path wants, both (3,) in world axes, and returns the yaw
-[rad], or None where it does not care.
+A mode is called with the position and the velocity that the path wants, both (3,) in world axes, and returns the yaw
+[rad], or None to keep the present one.
 """
 
 from __future__ import annotations
@@ -16,19 +16,23 @@ from numpy.typing import NDArray
 from skyloop.errors import UsageError
 
 Array = NDArray[np.float64]
-_ALONG_M_S = 0.05  # slower than this a velocity has no direction worth turning to
-_NEAR_M = 0.3  # a point nearer than this, seen from above, is nothing to look at
+_ALONG_M_S = 0.05  # slower velocities have no direction worth turning to
+_NEAR_M = 0.3  # a point nearer than this, seen from above, has no reliable bearing
 
 
 class YawMode(Protocol):
-    """One way to choose the yaw."""
+    """Chooses the yaw by the path's position and velocity."""
 
     def __call__(self, position: Array, velocity: Array) -> float | None: ...
 
 
 @dataclass(frozen=True, slots=True)
 class FixedYaw:
-    """Always this yaw [rad]."""
+    """Always the same yaw [rad].
+
+    Raises:
+        UsageError: The yaw is not finite.
+    """
 
     yaw: float
 
@@ -37,16 +41,18 @@ class FixedYaw:
             raise UsageError(f"yaw is {self.yaw} and must be finite")
 
     def __call__(self, position: Array, velocity: Array) -> float | None:  # noqa: ARG002
+        """Return the yaw."""
         return self.yaw
 
 
 @dataclass(frozen=True, slots=True)
 class AlongPath:
-    """The way it flies, plus ``offset`` [rad]; while it stands or only climbs, as before."""
+    """The direction of flight plus ``offset`` [rad]; the yaw stays while the vehicle hovers or only climbs."""
 
     offset: float = 0.0
 
     def __call__(self, position: Array, velocity: Array) -> float | None:  # noqa: ARG002
+        """Return the yaw, or None while the horizontal speed is less than 0.05 m/s."""
         if math.hypot(velocity[0], velocity[1]) < _ALONG_M_S:
             return None
         return math.atan2(velocity[1], velocity[0]) + self.offset
@@ -54,11 +60,12 @@ class AlongPath:
 
 @dataclass(frozen=True, slots=True)
 class LookAt:
-    """At a point [m]; while it is above or below it, as before."""
+    """Faces a point, x and y in world axes [m]; the yaw stays while the vehicle is above or below it."""
 
     x: float
     y: float
 
     def __call__(self, position: Array, velocity: Array) -> float | None:  # noqa: ARG002
+        """Return the yaw, or None within 0.3 m of the point, seen from above."""
         east, north = self.x - position[0], self.y - position[1]
         return math.atan2(north, east) if math.hypot(east, north) >= _NEAR_M else None

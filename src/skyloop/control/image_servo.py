@@ -1,4 +1,4 @@
-"""Hold a place before a marker by its picture alone: image-based visual servoing."""
+"""Hold a position before a marker by its image alone: image-based visual servoing."""
 
 from __future__ import annotations
 
@@ -33,6 +33,8 @@ _LOOKING: Colour = (120, 190, 255)
 
 
 class ServoPhase(StrEnum):
+    """What :class:`ImageServoLaw` is doing."""
+
     SEARCHING = "searching the marker"
     SERVOING = "servoing"
     HOLDING = "lost the marker: holding the place"
@@ -40,7 +42,11 @@ class ServoPhase(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class ServoSettings:
-    """How it flies. Raises :class:`UsageError` for numbers that make no sense."""
+    """Gain and limits of :class:`ImageServoLaw`.
+
+    Raises:
+        UsageError: A number is not finite and above 0.
+    """
 
     gain: float = 0.8  #: [1/s]
     #: Share of the velocity's error, where the velocity is known, that is asked for on top, against gusts.
@@ -61,13 +67,24 @@ class ServoSettings:
 
 
 class ImageServoLaw:
-    """Points in, velocities out. Pure: times are on the proxy's clock [ns]."""
+    """Computes velocities from points in the image. Pure: times are on the proxy's clock [ns].
+
+    Attributes:
+        phase: As of the last step.
+        error: Root mean square of the points' distances from where they are wanted, in the plane at z = 1.
+    """
 
     def __init__(
         self, camera: CameraInfo, wanted: Array, depth_m: float, settings: ServoSettings | None = None
     ) -> None:
-        """``wanted`` (n, 2): where the level camera is to see the points, in the plane at z = 1; ``depth_m``: how far
-        they are from it then."""
+        """Initialise the law.
+
+        Args:
+            camera: How the camera is mounted.
+            wanted: Where the level camera is to see the points, (n, 2) in the plane at z = 1.
+            depth_m: How far the points are from the camera then.
+            settings: None are the defaults.
+        """
         s = self.settings = settings or ServoSettings()
         self.phase = ServoPhase.SEARCHING
         self.error = math.inf  #: root mean square of the points' distances from where they are wanted, plane at z = 1
@@ -86,14 +103,22 @@ class ImageServoLaw:
         )
 
     def feedback(self, feedback: Feedback) -> None:
-        """Take the vehicle's newest state."""
+        """Update with the vehicle's newest state."""
         self._yaw, self._altitude = feedback.yaw, feedback.altitude
         self._flown = None if feedback.velocity is None else np.asarray(feedback.velocity)
 
     def see(self, points: Array, at_capture: Feedback, captured_ns: int) -> None:
-        """Take the points (n, 2) as the camera saw them, in the plane at z = 1, with the attitude then.
+        """Update with the points of a frame. Ignored while the attitude is not known.
 
-        Ignored while the attitude is not known. The depth of all is guessed from how large they look.
+        The depth of all points is estimated from how large they look.
+
+        Args:
+            points: As the camera saw them, (n, 2) in the plane at z = 1.
+            at_capture: Feedback with the attitude at the capture.
+            captured_ns: Capture of the frame.
+
+        Raises:
+            UsageError: The vehicle is tilted so far that a level camera would not see the points.
         """
         if at_capture.roll is None or at_capture.pitch is None:
             return
@@ -106,7 +131,7 @@ class ImageServoLaw:
         self._seen_ns = captured_ns
 
     def step(self, now_ns: int) -> Velocity:
-        """What to ask the vehicle for now."""
+        """Compute the set-point for now."""
         s = self.settings
         unseen_s = math.inf if self._seen_ns is None else seconds(now_ns - self._seen_ns)
         wanted = np.zeros(4)
@@ -127,10 +152,9 @@ class ImageServoLaw:
 
 
 class ImageServo(Behaviour):
-    """Flies to where a marker looks as it would from ``distance_m`` straight before it, and holds that place.
+    """Flies to where a marker looks as it would from ``distance_m`` straight before it, and holds that position.
 
-    Nothing is measured in metres on the way but the marker's size, which gives the wanted picture. ``error_px`` tells
-    how far its corners are from there.
+    Works in the image alone; of the marker only its size is used, for the wanted image. Runs until it is stopped.
     """
 
     name = "servo"
@@ -147,8 +171,22 @@ class ImageServo(Behaviour):
         camera: str | None = None,
         settings: ServoSettings | None = None,
     ) -> None:
-        """``camera``: one that looks forward, the vehicle's first if not given. Raises :class:`UsageError` for a
-        distance that is not above 0, :class:`UnknownNameError`, :class:`MissingExtraError` without OpenCV."""
+        """Initialise the behaviour.
+
+        Args:
+            drone: The drone to fly; it must be airborne when :meth:`run` is called.
+            marker_id: Which marker.
+            distance_m: Wanted distance, straight before the marker.
+            size_m: Edge of the marker's black square.
+            dictionary: The marker's dictionary.
+            camera: One that looks forward; None is the vehicle's first camera.
+            settings: Of the law; None are the defaults.
+
+        Raises:
+            UsageError: The distance is not a finite number above 0, or the camera does not look forward.
+            UnknownNameError: There is no such camera or dictionary.
+            MissingExtraError: OpenCV is not installed.
+        """
         if not 0.0 < distance_m < math.inf:
             raise UsageError(f"distance_m is {distance_m!r} and must be a finite number above 0")
         info = camera_info(drone, camera)
@@ -163,7 +201,7 @@ class ImageServo(Behaviour):
 
     @property
     def phase(self) -> ServoPhase:
-        """What it is doing."""
+        """What the behaviour is doing."""
         return self._servo_law.phase
 
     @property
@@ -172,7 +210,7 @@ class ImageServo(Behaviour):
         return self._servo_law.error * self._focal_px if self._focal_px else math.inf
 
     def look(self, frame: Frame) -> list[Shape]:
-        """Take the marker's corners if they are there."""
+        """Detect the marker's corners and update the law."""
         intrinsics = frame.intrinsics
         mine = next((one for one in self._detector.detect(frame) if one.id == self.marker_id), None)
         if mine is None or intrinsics is None:

@@ -23,10 +23,17 @@ Array = NDArray[np.float64]
 
 
 def interaction_matrix(points: Array, depths_m: Array) -> Array:
-    """How points (n, 2) at these depths (n,) move in the picture with the camera's twist: (2n, 6), equation 11.
+    """Return how points move in the image with the camera's twist: (2n, 6), equation 11.
 
     The twist is velocity [m/s] and angular velocity [rad/s] of the camera along and about its own axes, (6,); the rows
-    are x and y of each point in turn. Raises :class:`UsageError` for other shapes, and depths that are not above 0.
+    are x and y of each point in turn.
+
+    Args:
+        points: Shape (n, 2).
+        depths_m: Shape (n,), above 0.
+
+    Raises:
+        UsageError: The shapes are others, or a number is out of its range.
     """
     points, depths = np.asarray(points, np.float64), np.asarray(depths_m, np.float64)
     if points.ndim != 2 or points.shape[1] != 2 or depths.shape != (len(points),):
@@ -40,10 +47,13 @@ def interaction_matrix(points: Array, depths_m: Array) -> Array:
 
 
 def camera_twist(camera: CameraInfo) -> Array:
-    """The twist of a level camera, (6, 4), by what the levelled vehicle does: forward, left, up [m/s], yaw [rad/s].
+    """Return the twist of a level camera by the levelled vehicle's motion, (6, 4).
 
-    The camera's place in the body matters: what is mounted before the centre swings when the vehicle turns. Raises
-    :class:`UsageError` if the camera does not say how it is mounted.
+    The columns are forward, left, up [m/s] and yaw rate [rad/s]. The camera's place in the body matters: one that is
+    mounted before the centre swings when the vehicle turns.
+
+    Raises:
+        UsageError: The camera does not say how it is mounted.
     """
     to_camera = mounting_rotation(camera).T
     place = np.zeros(3) if camera.position is None else np.asarray(camera.position)
@@ -56,9 +66,16 @@ def camera_twist(camera: CameraInfo) -> Array:
 
 
 def levelled(points: Array, camera: CameraInfo, roll: float, pitch: float) -> Array:
-    """Where the points (n, 2) would be for the level camera, (n, 2), while the vehicle has this attitude [rad].
+    """Return where the level camera would see points, (n, 2).
 
-    Raises :class:`UsageError` for points that a level camera does not have before it.
+    Args:
+        points: As the camera sees them, (n, 2).
+        camera: How it is mounted.
+        roll: Of the vehicle [rad].
+        pitch: Of the vehicle [rad].
+
+    Raises:
+        UsageError: A point would not be in front of a level camera.
     """
     mounting = mounting_rotation(camera)
     turn = mounting.T @ rotation_from_euler(roll, pitch, 0.0) @ mounting
@@ -69,10 +86,22 @@ def levelled(points: Array, camera: CameraInfo, roll: float, pitch: float) -> Ar
 
 
 def servo(points: Array, wanted: Array, depths_m: Array, camera: CameraInfo, gain: float) -> Array:
-    """Forward, left, up [m/s] and yaw rate [rad/s], (4,), that bring the level camera's points (n, 2) to where they are
-    wanted, exponentially: ``-gain · (L·T)⁺ · e`` (equation 5, with T of :func:`camera_twist`), ``gain`` in 1/s.
+    """Compute the motion that brings the level camera's points to where they are wanted, exponentially.
 
-    At least two points. Raises :class:`UsageError` for shapes that do not fit.
+    ``-gain · (L·T)⁺ · e`` (equation 5, with T of :func:`camera_twist`).
+
+    Args:
+        points: Where the level camera sees them, (n, 2), two or more.
+        wanted: Where they are wanted, (n, 2).
+        depths_m: Shape (n,), above 0.
+        camera: How it is mounted.
+        gain: [1/s]
+
+    Returns:
+        Forward, left, up [m/s] and yaw rate [rad/s], (4,).
+
+    Raises:
+        UsageError: The shapes do not fit, or there are fewer than two points.
     """
     if np.shape(points) != np.shape(wanted) or len(points) < 2:
         raise UsageError(f"two points or more, and as many wanted ones, not {np.shape(points)} and {np.shape(wanted)}")

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
-    """Where a point is believed to be at one time, and how sure that is."""
+    """Position and velocity of a point at one time, and their covariance."""
 
     at_ns: int
     position: Array  #: (n,) [m]
@@ -37,7 +37,11 @@ class Estimate:
 
 
 class ConstantVelocityFilter:
-    """A point that goes on as it went, up to accelerations by chance. Times are integer nanoseconds on one clock."""
+    """A Kalman filter of a point with constant velocity and random accelerations. Times are nanoseconds on one clock.
+
+    Attributes:
+        refused: Measurements outside of the gate since the last one within it.
+    """
 
     def __init__(
         self,
@@ -47,11 +51,17 @@ class ConstantVelocityFilter:
         speed_m_s: float = 0.7,
         gate: float = 5.0,
     ) -> None:
-        """``intensity_m2_s3``: of the acceleration's white noise: the velocity wanders by the root of it within a
-        second; ``speed_m_s``: standard deviation of each component of the velocity at first; ``gate``: a measurement
-        farther off than so many standard deviations (Mahalanobis distance) is refused, ``math.inf``: none is.
+        """Initialise the filter.
 
-        Raises :class:`UsageError` for what is out of range.
+        Args:
+            dimensions: Of the position; 1 or more.
+            intensity_m2_s3: Of the acceleration's white noise: within a second the velocity wanders by the root of it.
+            speed_m_s: Standard deviation of each component of the velocity at first.
+            gate: Measurements farther off than so many standard deviations (Mahalanobis distance) are refused;
+                ``math.inf`` refuses none.
+
+        Raises:
+            UsageError: An argument is out of its range.
         """
         if isinstance(dimensions, bool) or not isinstance(dimensions, int) or dimensions < 1:
             raise UsageError(f"dimensions is {dimensions!r} and must be a whole number of at least 1")
@@ -69,11 +79,20 @@ class ConstantVelocityFilter:
 
     @property
     def newest(self) -> Estimate | None:
-        """As of the last measurement; None before the first."""
+        """The estimate as of the last measurement; None before the first."""
         return self._estimate
 
     def start(self, position: Array, deviation_m: float | Array, at_ns: int) -> Estimate:
-        """Begin anew at a measured position, at rest as far as is known; see :meth:`update`."""
+        """Start anew at a measured position, with velocity 0.
+
+        Args:
+            position: As in :meth:`update`.
+            deviation_m: As in :meth:`update`.
+            at_ns: When it was measured.
+
+        Raises:
+            UsageError: A shape is wrong, or a number is not finite.
+        """
         measured, noise = self._checked(position, deviation_m)
         n = self._n
         covariance = np.zeros((2 * n, 2 * n))
@@ -84,10 +103,18 @@ class ConstantVelocityFilter:
         return self._estimate
 
     def update(self, position: Array, deviation_m: float | Array, at_ns: int) -> bool:
-        """Take a measured position (n,) [m] with its standard deviation, one for all axes, or its covariance (n, n)
-        [m²]. False if it was not used: outside of the gate (counted in :attr:`refused`), or older than the last.
+        """Update with a measured position.
 
-        Raises :class:`UsageError` for other shapes and for what is not finite.
+        Args:
+            position: Shape (n,) [m].
+            deviation_m: Its standard deviation [m], one for all axes, or its covariance (n, n) [m²].
+            at_ns: When it was measured.
+
+        Returns:
+            Whether it was used; False outside of the gate (counted in :attr:`refused`), or if older than the last one.
+
+        Raises:
+            UsageError: A shape is wrong, a number is not finite, or both estimate and measurement are exact.
         """
         if self._estimate is None:
             self.start(position, deviation_m, at_ns)
@@ -117,8 +144,15 @@ class ConstantVelocityFilter:
         return True
 
     def at(self, at_ns: int, *, longest_s: float = math.inf) -> Estimate:
-        """The prediction for a time, later than the last measurement by ``longest_s`` at most; for an earlier time
-        the estimate as of the last measurement. Raises :class:`UsageError` before the first one."""
+        """Predict the estimate for a time; before the last measurement it is the estimate as of that measurement.
+
+        Args:
+            at_ns: The time to predict for.
+            longest_s: How far the last measurement is extrapolated at most.
+
+        Raises:
+            UsageError: There was no measurement.
+        """
         last = self._estimate
         if last is None:
             raise UsageError("the target was never seen")
@@ -133,7 +167,7 @@ class ConstantVelocityFilter:
         return Estimate(last.at_ns + round(dt * 1e9), last.position + last.velocity * dt, last.velocity, covariance)
 
     def _checked(self, position: Array, deviation: float | Array) -> tuple[Array, Array]:
-        """Position (n,) and covariance (n, n) of a measurement."""
+        """Return position (n,) and covariance (n, n) of a measurement."""
         n = self._n
         measured = np.asarray(position, dtype=np.float64)
         noise = np.asarray(deviation, dtype=np.float64)

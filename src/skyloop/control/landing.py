@@ -1,4 +1,4 @@
-"""Land on a marker that the camera below sees, also when it moves."""
+"""Land on a marker that the downward camera sees, also when the marker moves."""
 
 from __future__ import annotations
 
@@ -20,10 +20,14 @@ _SEEN: Colour = (64, 220, 100)
 
 
 class LandOnMarker(Behaviour):
-    """Searches the marker on a spiral, goes over it, goes down with it, and stops the motors when it stands.
+    """Searches the marker on a spiral, flies over it, descends with it, and stops the motors when it has landed.
 
-    ``landed`` tells whether it did. A marker that is lost on the way makes it climb where it must be, then search.
-    Low over the marker, where that no longer fits into the picture, it comes down by the marker's last known motion.
+    A marker that is lost on the way makes the vehicle climb where the marker must be, then search. Low over the marker,
+    where it no longer fits into the image, the vehicle descends by the marker's last known motion. The vehicle must be
+    airborne when :meth:`run` is called.
+
+    Attributes:
+        marker_id: Which marker.
     """
 
     name = "landing"
@@ -39,9 +43,21 @@ class LandOnMarker(Behaviour):
         camera: str = "bottom",
         settings: LandingSettings | None = None,
     ) -> None:
-        """``size_m`` is the edge of the marker's black square. Raises :class:`UnknownNameError` for a camera or
-        dictionary that is not there, :class:`UsageError` for a vehicle that can't land by itself,
-        :class:`MissingExtraError` without OpenCV."""
+        """Initialise the behaviour.
+
+        Args:
+            drone: The drone to fly.
+            marker_id: Which marker.
+            size_m: Edge of the marker's black square.
+            dictionary: The marker's dictionary.
+            camera: One that looks down.
+            settings: Of the law; None are the defaults.
+
+        Raises:
+            UnknownNameError: There is no such camera or dictionary.
+            UsageError: The vehicle can't land by itself.
+            MissingExtraError: OpenCV is not installed.
+        """
         if "land" not in drone.capabilities.actions:
             raise UsageError("this vehicle can't land by itself")
         self._landing_law = LandingLaw(settings)
@@ -51,16 +67,16 @@ class LandOnMarker(Behaviour):
 
     @property
     def phase(self) -> LandingPhase:
-        """What it is doing."""
+        """What the behaviour is doing."""
         return self._landing_law.phase
 
     @property
     def landed(self) -> bool:
-        """Whether it stands."""
+        """Whether the vehicle stands on the marker."""
         return self.done
 
     def on_feedback(self, feedback: Feedback) -> None:
-        """As every behaviour, until it is down: then wait until the vehicle stands."""
+        """Update the law; once it is down, wait until the vehicle reports that it has landed."""
         if self.phase is not LandingPhase.DOWN:
             super().on_feedback(feedback)
         elif feedback.state is FlightState.LANDED and not self.done:
@@ -69,7 +85,7 @@ class LandOnMarker(Behaviour):
             self.stop()
 
     def look(self, frame: Frame) -> list[Shape]:
-        """Take the marker if it is there."""
+        """Detect the marker and update the law."""
         law = self._landing_law
         mine = next((one for one in self._detector.detect(frame) if one.id == self.marker_id), None)
         if mine is None:
@@ -85,7 +101,7 @@ class LandOnMarker(Behaviour):
         return shapes
 
     def steer(self, wanted: Velocity | Attitude) -> None:
-        """By velocity until it is down; then the vehicle's own landing stops the motors."""
+        """Send velocities until the law is down; then let the vehicle's own landing stop the motors."""
         if self.phase is LandingPhase.DOWN:
             self.drone.land(wait=False)
         else:

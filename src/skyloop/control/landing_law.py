@@ -1,10 +1,10 @@
 """The law that lands on a marker that may move: sightings and feedback in, velocities out. Pure: no clock, no thread.
 
-The marker's place and velocity come from a constant-velocity filter in odometry axes (see :mod:`.kalman`); the vehicle
-takes up that velocity, and goes down while it is within a cone over the marker, as in Saripalli, Montgomery and
+The marker's position and velocity come from a constant-velocity filter in odometry axes (see :mod:`.kalman`). The
+vehicle takes up that velocity, and descends while it is within a cone over the marker, as in Saripalli, Montgomery and
 Sukhatme, "Visually Guided Landing of an Unmanned Aerial Vehicle", IEEE T-RA 19(3), 2003: outside of the cone it keeps
-its height and closes up first. The last part, where the marker no longer fits into the picture, is flown by what the
-filter knows; when the feet touch, or must have touched, the motors are to stop.
+its height and closes up first. The last part, where the marker no longer fits into the image, is flown by the filter's
+prediction; when the feet touch, or must have touched, the motors are to stop.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ Array = NDArray[np.float64]
 
 
 class LandingPhase(StrEnum):
+    """What :class:`LandingLaw` is doing."""
+
     SEARCHING = "searching the marker"  #: on a square spiral, at the search height
     CHASING = "going over the marker"
     DESCENDING = "going down over the marker"
@@ -38,7 +40,7 @@ class LandingPhase(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class LandingSettings:
-    """How it lands. Heights are of the vehicle's feet over the marker unless they say otherwise."""
+    """Gains, limits and heights of :class:`LandingLaw`. Heights are of the feet over the marker by default."""
 
     lead_s: float = 0.12  #: from a command's decision to its taking hold
     #: Share of the velocity's error that is asked for on top: gusts push a vehicle with a soft velocity loop less far.
@@ -49,8 +51,8 @@ class LandingSettings:
     descent_m_s: float = 0.35
     cone_m: float = 0.06  #: radius of the cone at the marker
     cone: float = 0.2  #: how much wider it is for each metre of height
-    #: Below this it goes down by the filter, whether it sees the marker or not, if it is near the marker's centre, and
-    #: the marker's velocity has not changed of late: what turns just now is waited for.
+    #: Below this it descends by the filter, whether it sees the marker or not, if it is near the marker's centre and
+    #: the marker's velocity is steady: it waits for a marker that is turning.
     commit_m: float = 0.55
     commit_off_m: float = 0.07
     steady_m_s: float = 0.06  #: between the marker's velocity and that velocity through a low pass of ``steady_s``
@@ -70,10 +72,18 @@ class LandingSettings:
 
 
 class LandingLaw:
-    """Tell it every feedback and every sighting; ask it for the velocity, and stop the motors at :attr:`phase` DOWN.
-    Times are on the proxy's clock [ns]."""
+    """Computes velocities from feedback and sightings; the motors are to stop at :attr:`phase` DOWN.
+
+    Times are on the proxy's clock [ns].
+
+    Attributes:
+        phase: As of the last step.
+        height_m: Of the feet over the marker, as of the last step; None while searching.
+        off_m: Horizontal distance from the marker's centre, as of the last step; None while searching.
+    """
 
     def __init__(self, settings: LandingSettings | None = None) -> None:
+        """Initialise the law."""
         self.settings = s = settings or LandingSettings()
         self.phase = LandingPhase.SEARCHING
         self.height_m: float | None = None  #: of the feet over the marker, as of the last step
@@ -92,19 +102,22 @@ class LandingLaw:
 
     @property
     def target_speed_m_s(self) -> float | None:
-        """How fast the marker moves, horizontally; None before it was seen."""
+        """Horizontal speed of the marker; None before it was seen."""
         newest = self._target.newest
         return None if newest is None else float(np.hypot(*newest.velocity[:2]))
 
     def feedback(self, feedback: Feedback) -> None:
-        """Take the vehicle's newest state."""
+        """Update with the vehicle's newest state."""
         self._odometry.add(feedback)
         self._altitude = feedback.altitude
 
     def see(self, position: Array, at_capture: Feedback, captured_ns: int) -> None:
-        """Take a sighting: the marker's position (3,) [m] in body axes. ``at_capture`` gives the attitude then.
+        """Update with a sighting. Ignored while the vehicle's attitude or motion is not known.
 
-        Ignored while the vehicle's attitude or motion is not known.
+        Args:
+            position: The marker's centre in body axes, (3,) [m].
+            at_capture: Feedback with the attitude at the capture.
+            captured_ns: Capture of the frame.
         """
         motion = self._odometry.at(captured_ns)
         if motion is None or at_capture.roll is None or at_capture.pitch is None or at_capture.yaw is None:
@@ -121,7 +134,7 @@ class LandingLaw:
             self._target.start(place, deviation, captured_ns)
 
     def step(self, now_ns: int) -> Velocity:
-        """What to ask the vehicle for now. All zero until the vehicle's motion is known, and when it is down."""
+        """Compute the set-point for now. All zero until the vehicle's motion is known, and when it is down."""
         motion = self._odometry.at(now_ns)
         if motion is None or self.phase is LandingPhase.DOWN:
             return Velocity()
@@ -132,7 +145,7 @@ class LandingLaw:
         return self._limiter.step(wanted, dt_s)
 
     def _wanted(self, now: Motion, ahead: Motion, now_ns: int) -> Array:
-        """Forward, left, up [m/s] and yaw rate [rad/s]; decides the phase."""
+        """Return forward, left, up [m/s] and yaw rate [rad/s]; sets the phase."""
         s = self.settings
         unseen_s = math.inf if self._seen_ns is None else seconds(now_ns - self._seen_ns)
         if self._seen_ns is None or (unseen_s > s.recovering_s and self._committed_ns is None):
@@ -165,14 +178,14 @@ class LandingLaw:
 
     @property
     def _steady(self) -> bool:
-        """Whether the marker has not changed its velocity of late."""
+        """Whether the marker has kept its velocity lately."""
         newest, late = self._target.newest, self._of_late.value
         if newest is None or late is None:
             return False
         return float(np.hypot(*(newest.velocity - late)[:2])) < self.settings.steady_m_s
 
     def _climb(self, off: float, height: float) -> float:
-        """Relative to the marker [m/s]."""
+        """Return the vertical speed relative to the marker [m/s]."""
         s = self.settings
         if self.phase is LandingPhase.COMMITTED:
             return -s.final_descent_m_s
@@ -195,5 +208,5 @@ class LandingLaw:
 
 
 def _new_filter() -> ConstantVelocityFilter:
-    """Of a thing that goes about on a floor and seldom changes its speed."""
+    """Create a filter for a thing that moves on a floor and seldom changes its velocity."""
     return ConstantVelocityFilter(3, intensity_m2_s3=0.03, speed_m_s=0.4, gate=6.0)

@@ -1,4 +1,4 @@
-"""Limits of numbers, vectors and set-points: how large they may be, and how fast they may change. Pure."""
+"""Limits of numbers, vectors and set-points: of their size, and of how fast they change. Pure."""
 
 from __future__ import annotations
 
@@ -16,21 +16,22 @@ _LONGEST_STEP_S = 0.2  # a longer pause gives no right to a larger step
 
 
 def clamped(value: float, longest: float) -> float:
-    """The nearest value within ±``longest``."""
+    """Return the nearest value within ±``longest``."""
     return max(-longest, min(longest, value))
 
 
 def shortened(vector: Array, longest: float) -> Array:
-    """A vector (n,) of the same direction that is at most so long."""
+    """Return a vector (n,) of the same direction whose length is at most ``longest``."""
     length = math.sqrt(float(vector @ vector))
     return vector if length <= longest else vector * (longest / length)
 
 
 @dataclass(frozen=True, slots=True)
 class SetpointLimits:
-    """How large set-points of a vehicle may be and how fast they may change; infinite: as they come.
+    """Limits of velocity set-points and of their rates of change; infinite means no limit.
 
-    Raises :class:`UsageError` for what is not above 0.
+    Raises:
+        UsageError: A limit is not above 0.
     """
 
     speed_m_s: float = math.inf  #: horizontally
@@ -48,14 +49,19 @@ class SetpointLimits:
 
 
 class SetpointLimiter:
-    """Velocity set-points within their limits, each near enough to the one before. The first one may be anything."""
+    """Limits velocity set-points, and the change from each to the next. The first one may differ by any amount."""
 
     def __init__(self, limits: SetpointLimits) -> None:
         self.limits = limits
         self._last: Array | None = None
 
     def step(self, wanted: Array, dt_s: float) -> Velocity:
-        """``wanted``: forward, left, up [m/s] and yaw rate [rad/s], shape (4,); ``dt_s`` since the last call."""
+        """Limit the next set-point.
+
+        Args:
+            wanted: Forward, left, up [m/s] and yaw rate [rad/s], shape (4,).
+            dt_s: Time since the last call; counts as 0.2 s at most, so that a pause does not allow a larger step.
+        """
         limits, dt = self.limits, max(0.0, min(_LONGEST_STEP_S, dt_s))
         result = np.asarray(wanted, dtype=np.float64).copy()
         result[:2] = shortened(result[:2], limits.speed_m_s)
@@ -72,7 +78,7 @@ class SetpointLimiter:
         return Velocity(forward=forward, left=left, up=up, yaw_rate=yaw_rate)
 
     def reset(self, last: Velocity | None = None) -> None:
-        """Begin anew, from a set-point or from whatever comes."""
+        """Start anew from a set-point; None lets the next one be anything."""
         self._last = None if last is None else np.array([last.forward, last.left, last.up, last.yaw_rate])
 
 

@@ -1,4 +1,4 @@
-"""Loads the user's controller from a file, with errors that say where and what."""
+"""Load the user's controller from a Python file, with errors that give the line and the reason."""
 
 from __future__ import annotations
 
@@ -14,11 +14,19 @@ from skyloop.errors import FileFormatError, UnknownNameError, UsageError
 
 
 def load_controller(path: str | Path, class_name: str | None = None) -> type[Controller]:
-    """The controller class in a Python file, which is run; it may import its neighbours, as a script may.
+    """Return the controller class in a Python file.
 
-    Classes that the file only imports count if it has none of its own. With several, ``class_name`` says which. Raises
-    :class:`FileFormatError` for a file that can't be read or run (with the line), or that has no controller;
-    :class:`UnknownNameError` for a class that it lacks; :class:`UsageError` for a missing file or several classes.
+    The file is executed, and may import modules beside it, as a script may. Imported classes count only if the file
+    defines none of its own.
+
+    Args:
+        path: The Python file.
+        class_name: Which class, where the file has several.
+
+    Raises:
+        FileFormatError: The file can't be read or executed (with the line), or has no controller.
+        UnknownNameError: The file has no class of that name.
+        UsageError: The file does not exist, or it has several classes and no name was given.
     """
     file = Path(path)
     module = load_module(file, "a class derived from skyloop.Controller")
@@ -32,7 +40,7 @@ def load_controller(path: str | Path, class_name: str | None = None) -> type[Con
 
 
 class _FreshLoader(SourceFileLoader):
-    """Compiles what the file holds now: Python's cache takes a file of the same second and size for the same one."""
+    """Always compiles the source: Python's cache takes a file of the same second and size for unchanged."""
 
     def get_code(self, fullname: str) -> CodeType:
         path = self.get_filename(fullname)
@@ -82,7 +90,7 @@ def _choose(
 
 
 def _line_of(error: BaseException, file: Path) -> str:
-    """Where in the user's file it went wrong, if it did there."""
+    """Return where in the user's file an exception was raised, or an empty string if it was elsewhere."""
     traceback = error.__traceback__
     line = None
     while traceback is not None:
@@ -97,9 +105,15 @@ def _is(name: str | None, file: Path) -> bool:
 
 
 def load_module(file: Path, what: str) -> ModuleType:
-    """A Python file, run as a module of its own. ``what``: it should hold, for people.
+    """Execute a Python file as a module of its own.
 
-    Raises :class:`FileFormatError` for one that can't be read or run (with the line), :class:`UsageError` for none.
+    Args:
+        file: The Python file.
+        what: What it should hold; a noun phrase for the error message.
+
+    Raises:
+        FileFormatError: The file can't be read or executed (with the line).
+        UsageError: The file does not exist, or is a directory.
     """
     if file.is_dir():
         raise UsageError(f"{file} is a directory: give a Python file in it")

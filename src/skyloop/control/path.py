@@ -1,13 +1,14 @@
-"""Paths: where to be at which time, and how fast to be then. World axes x east, y north, z up [m]. Pure.
+"""Paths: position and velocity by time. World axes x east, y north, z up [m]. Pure.
 
-Anything with :class:`Path`'s attributes is one. Those made here begin and end at rest.
+Every object with :class:`Path`'s attributes is a path. Those of this module, but for a :class:`FunctionPath`, start and
+end at rest.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,22 +19,30 @@ from skyloop.errors import MissingExtraError, UsageError
 Array = NDArray[np.float64]
 _DIFFERENCE_S = 0.01
 
+#: Lengths, speeds, accelerations and times in this range can be divided by one another without under- or overflow.
+_LEAST: Final = 1e-6
+_MOST: Final = 1e6
+
 
 class Path(Protocol):
-    """A place and a velocity at each time from 0 to ``duration_s``; before and after, it stands still at its ends."""
+    """Position and velocity at each time from 0 to ``duration_s``; before and after, it stands still at its ends."""
 
     @property
     def duration_s(self) -> float: ...
 
     def position(self, t_s: float) -> Array:
-        """Shape (3,) [m]."""
+        """Return the position at a time [s], shape (3,) [m]."""
 
     def velocity(self, t_s: float) -> Array:
-        """Shape (3,) [m/s]."""
+        """Return the velocity at a time [s], shape (3,) [m/s]."""
 
 
 class FunctionPath:
-    """A path by a function of the time."""
+    """A path given by functions of the time.
+
+    Attributes:
+        duration_s: How long it takes.
+    """
 
     def __init__(
         self,
@@ -41,18 +50,34 @@ class FunctionPath:
         duration_s: float,
         velocity: Callable[[float], ArrayLike] | None = None,
     ) -> None:
-        """``position(t)`` and ``velocity(t)`` return three numbers; without ``velocity`` it is the difference quotient.
+        """Initialise the path.
 
-        Raises :class:`UsageError` for a duration that is not above 0.
+        Args:
+            position: Returns x, y, z [m] at a time from 0 to ``duration_s``.
+            duration_s: How long it takes.
+            velocity: Returns x, y, z [m/s] at a time; None differentiates ``position`` numerically.
+
+        Raises:
+            UsageError: The duration is not from 1e-6 to 1e6 s.
         """
         self.duration_s = _positive("duration_s", duration_s)
         self._position = position
         self._velocity = velocity
 
     def position(self, t_s: float) -> Array:
+        """Return the position at a time [s], shape (3,) [m].
+
+        Raises:
+            UsageError: The function does not return three finite numbers.
+        """
         return _point(self._position(self._within(t_s)))
 
     def velocity(self, t_s: float) -> Array:
+        """Return the velocity at a time [s], shape (3,) [m/s]; 0 before the start and from the end on.
+
+        Raises:
+            UsageError: A function does not return three finite numbers.
+        """
         if not 0.0 <= t_s < self.duration_s:
             return np.zeros(3)
         if self._velocity is not None:
@@ -65,7 +90,7 @@ class FunctionPath:
 
 
 class Polyline:
-    """Straight legs between points at one speed, with a stop at each corner, or with the corners cut by arcs."""
+    """Straight legs between points at one speed, with a stop at each corner, or with corners rounded by arcs."""
 
     def __init__(
         self,
@@ -75,10 +100,17 @@ class Polyline:
         acceleration_m_s2: float = 0.8,
         corner_m: float = 0.0,
     ) -> None:
-        """``corner_m``: how long before a corner the arc begins, at most half of a leg; on it the vehicle is no
-        faster than its acceleration allows. 0: it stops at the corners.
+        """Compute the legs and arcs.
 
-        Raises :class:`UsageError` for fewer than two points that differ, or numbers that make no sense.
+        Args:
+            points: At least two that differ, each (3,) [m].
+            speed_m_s: Along the legs.
+            acceleration_m_s2: At start and end, at stops, and across the arcs.
+            corner_m: How far before a corner the arc starts, at most half of a leg; on it the vehicle is no faster than
+                its acceleration allows. 0 stops at each corner.
+
+        Raises:
+            UsageError: Fewer than two points differ, or a number is out of its range.
         """
         speed, acceleration = _speeds(speed_m_s, acceleration_m_s2)
         if not 0.0 <= corner_m < math.inf:
@@ -106,13 +138,16 @@ class Polyline:
 
     @property
     def duration_s(self) -> float:
+        """How long the path takes [s]."""
         return self._profile.duration_s
 
     def position(self, t_s: float) -> Array:
+        """Return the position at a time [s], shape (3,) [m]."""
         piece, way, _ = self._at(t_s)
         return piece.point(way)
 
     def velocity(self, t_s: float) -> Array:
+        """Return the velocity at a time [s], shape (3,) [m/s]."""
         piece, way, speed = self._at(t_s)
         return piece.direction(way) * speed
 
@@ -124,7 +159,7 @@ class Polyline:
 
 
 class Circle:
-    """Round a centre at one height and speed, from rest to rest."""
+    """A circle about a centre at one height and speed, from rest to rest."""
 
     def __init__(
         self,
@@ -137,7 +172,20 @@ class Circle:
         clockwise: bool = False,
         acceleration_m_s2: float = 0.8,
     ) -> None:
-        """``begin_rad``: where on the circle it begins, counter-clockwise from east. Raises :class:`UsageError`."""
+        """Initialise the path.
+
+        Args:
+            centre: x, y, z [m].
+            radius_m: Of the circle.
+            speed_m_s: Along the circle.
+            laps: How often round.
+            begin_rad: Where on the circle it starts, counter-clockwise from east.
+            clockwise: The sense, seen from above.
+            acceleration_m_s2: At start and end.
+
+        Raises:
+            UsageError: A number is out of its range.
+        """
         self._centre = _point(centre)
         self._radius = _positive("radius_m", radius_m)
         self._begin = begin_rad
@@ -148,13 +196,16 @@ class Circle:
 
     @property
     def duration_s(self) -> float:
+        """How long the path takes [s]."""
         return self._profile.duration_s
 
     def position(self, t_s: float) -> Array:
+        """Return the position at a time [s], shape (3,) [m]."""
         angle, _ = self._angle(t_s)
         return self._centre + self._radius * np.array([math.cos(angle), math.sin(angle), 0.0])
 
     def velocity(self, t_s: float) -> Array:
+        """Return the velocity at a time [s], shape (3,) [m/s]."""
         angle, speed = self._angle(t_s)
         return self._sense * speed * np.array([-math.sin(angle), math.cos(angle), 0.0])
 
@@ -164,7 +215,7 @@ class Circle:
 
 
 class Lemniscate:
-    """A lying eight at one height, Gerono's: ``x = a·sin u``, ``y = a·sin u·cos u``, turned by ``yaw_rad``."""
+    """A horizontal figure of eight, Gerono's: ``x = a·sin u``, ``y = a·sin u·cos u``, turned by ``yaw_rad``."""
 
     def __init__(
         self,
@@ -176,7 +227,19 @@ class Lemniscate:
         yaw_rad: float = 0.0,
         acceleration_m_s2: float = 0.8,
     ) -> None:
-        """It begins in the centre; ``speed_m_s`` is the greatest, which it has there. Raises :class:`UsageError`."""
+        """Initialise the path, which starts in the centre.
+
+        Args:
+            centre: x, y, z [m].
+            half_width_m: ``a``: from the centre to each end.
+            speed_m_s: Greatest speed, which it has in the centre.
+            laps: How often round.
+            yaw_rad: Turns the figure counter-clockwise.
+            acceleration_m_s2: At start and end.
+
+        Raises:
+            UsageError: A number is out of its range.
+        """
         self._centre = _point(centre)
         self._a = _positive("half_width_m", half_width_m)
         c, s = math.cos(yaw_rad), math.sin(yaw_rad)
@@ -188,33 +251,46 @@ class Lemniscate:
 
     @property
     def duration_s(self) -> float:
+        """How long the path takes [s]."""
         return self._profile.duration_s
 
     def position(self, t_s: float) -> Array:
+        """Return the position at a time [s], shape (3,) [m]."""
         u, _ = self._profile.at(t_s)
         return self._centre + self._turn @ (self._a * np.array([math.sin(u), math.sin(u) * math.cos(u), 0.0]))
 
     def velocity(self, t_s: float) -> Array:
+        """Return the velocity at a time [s], shape (3,) [m/s]."""
         u, rate = self._profile.at(t_s)
         along: Array = self._turn @ (self._a * rate * np.array([math.cos(u), math.cos(2 * u), 0.0]))
         return along
 
 
 class Spline:
-    """A smooth curve through points at given times, at rest at both ends: SciPy's clamped cubic spline."""
+    """A smooth curve through points at given times, at rest at both ends: SciPy's clamped cubic spline.
+
+    Attributes:
+        duration_s: How long it takes.
+    """
 
     def __init__(self, points: Sequence[ArrayLike], times_s: Sequence[float]) -> None:
-        """``times_s``: one a point, from 0 and growing.
+        """Compute the curve.
 
-        Raises :class:`UsageError` for other times, :class:`MissingExtraError` without SciPy.
+        Args:
+            points: At least two, each (3,) [m].
+            times_s: One for each point, starting at 0 and growing.
+
+        Raises:
+            UsageError: The times do not fit the points, do not start at 0, or do not grow.
+            MissingExtraError: SciPy is not installed.
         """
         places, times = np.array([_point(point) for point in points]), np.asarray(times_s, dtype=np.float64)
         if len(places) < 2 or times.shape != (len(places),):
             raise UsageError(
                 f"a spline needs two points or more and a time for each, not {len(places)} and {times.size}"
             )
-        if times[0] != 0.0 or not np.isfinite(times).all() or not (np.diff(times) > 0.0).all():
-            raise UsageError("the times of a spline begin at 0 and grow")
+        if times[0] != 0.0 or not np.isfinite(times).all() or not (np.diff(times) >= _LEAST).all():
+            raise UsageError(f"the times of a spline begin at 0 and grow, by {_LEAST:g} s at least")
         try:
             from scipy.interpolate import CubicSpline
         except ImportError as error:
@@ -224,9 +300,11 @@ class Spline:
         self.duration_s = float(times[-1])
 
     def position(self, t_s: float) -> Array:
+        """Return the position at a time [s], shape (3,) [m]."""
         return np.asarray(self._curve(max(0.0, min(self.duration_s, t_s))), dtype=np.float64)
 
     def velocity(self, t_s: float) -> Array:
+        """Return the velocity at a time [s], shape (3,) [m/s]."""
         return np.asarray(self._slope(t_s), dtype=np.float64) if 0.0 <= t_s <= self.duration_s else np.zeros(3)
 
 
@@ -249,7 +327,7 @@ class _Arc:
     """A piece of a circle that leaves one leg and joins the next."""
 
     def __init__(self, corner: Array, before: Array, after: Array, reach: float, turn: float) -> None:
-        """``before``, ``after``: directions of the legs; ``reach`` from the corner to either end; ``turn`` [rad]."""
+        """Compute the arc from the directions of the legs, the distance ``reach`` to its ends, and the angle [rad]."""
         self.begin, self.end = corner - before * reach, corner + after * reach
         self.radius = reach / math.tan(turn / 2)
         self.length = self.radius * turn
@@ -268,7 +346,7 @@ class _Arc:
 
 
 def _arc(before: Array, corner: Array, after: Array, reach: float) -> _Arc | None:
-    """None where there is no corner to cut, or where it turns back on itself."""
+    """Return None where there is no corner to round, or where the path turns back on itself."""
     come, go = corner - before, after - corner
     reach = min(reach, float(np.linalg.norm(come)) / 2, float(np.linalg.norm(go)) / 2)
     come, go = come / np.linalg.norm(come), go / np.linalg.norm(go)
@@ -286,14 +364,14 @@ def _distinct(points: list[Array]) -> list[Array]:
 
 def _point(value: ArrayLike) -> Array:
     point = np.asarray(value, dtype=np.float64)
-    if point.shape != (3,) or not np.isfinite(point).all():
-        raise UsageError(f"a place is three finite numbers, x, y, z in metres, not {value!r:.80}")
+    if point.shape != (3,) or not (np.abs(point) <= _MOST).all():
+        raise UsageError(f"a place is three numbers, x, y, z in metres, of at most {_MOST:g}, not {value!r:.80}")
     return point
 
 
 def _positive(name: str, value: float) -> float:
-    if not 0.0 < value < math.inf:
-        raise UsageError(f"{name} is {value!r} and must be a finite number above 0")
+    if not _LEAST <= value <= _MOST:
+        raise UsageError(f"{name} is {value!r} and must be from {_LEAST:g} to {_MOST:g}")
     return float(value)
 
 

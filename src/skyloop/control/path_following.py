@@ -23,12 +23,12 @@ from skyloop.messages import EventKind, Feedback, Severity, Vector
 if TYPE_CHECKING:
     from skyloop.client import Drone
 
-APPROACH_M_S: Final = 0.5  #: to the begin of a path
+APPROACH_M_S: Final = 0.5  #: speed to the start of a path
 
 
 @dataclass(slots=True)
 class TrackingError:
-    """How far off the path it was, summed up."""
+    """Statistics of the distance from where the vehicle should have been."""
 
     samples: int = 0
     largest_m: float = 0.0
@@ -40,14 +40,14 @@ class TrackingError:
         return math.sqrt(self._squares / self.samples) if self.samples else 0.0
 
     def add(self, error_m: float) -> None:
-        """One more distance from where it should have been."""
+        """Add a distance [m]."""
         self.samples += 1
         self._squares += error_m**2
         self.largest_m = max(self.largest_m, error_m)
 
 
 class _PathFlyer(Controller):
-    """What both controllers have in common: a law, a source of positions, and what to do when that falls silent."""
+    """What both controllers have in common: a law, a position source, and hovering while the source has no position."""
 
     def __init__(
         self,
@@ -62,7 +62,7 @@ class _PathFlyer(Controller):
             raise UsageError(f"max_age_s is {max_age_s!r} and must be a number of seconds above 0")
         self.settings = settings or PathSettings()
         self.error = TrackingError()  #: distance from where it should have been, as the position source has it
-        self.done = False  #: all was flown
+        self.done = False  #: the whole path was flown
         self.lost = False  #: the position is not known now, and the vehicle hovers
         self._yaw = yaw
         self._source = source
@@ -71,13 +71,17 @@ class _PathFlyer(Controller):
 
     @property
     def target(self) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-        """Where it should be now, and how fast: (3,) [m] and (3,) [m/s], world axes; None before the first fix."""
+        """Where the vehicle should be now, and how fast.
+
+        Position (3,) [m] and velocity (3,) [m/s], world axes; None before the first fix.
+        """
         return None if self._law is None else self._law.target
 
     def on_feedback(self, feedback: Feedback) -> None:
-        """Fly on; hover while the position is not known, and while it is older than the time allowed.
+        """Send the next set-point; hover while the position is not known, or older than ``max_age_s``.
 
-        Raises :class:`UsageError` if there is no other source and the vehicle does not tell its position at first.
+        Raises:
+            UsageError: There is no other source, and the vehicle does not report its position at first.
         """
         if self.done:
             return
@@ -98,11 +102,11 @@ class _PathFlyer(Controller):
             self.drone.velocity(forward=wanted.forward, left=wanted.left, up=wanted.up, yaw_rate=wanted.yaw_rate)
 
     def _begin(self, fix: Fix) -> PathLaw:
-        """The law for where it is at first."""
+        """Return the law for the first fix."""
         raise NotImplementedError
 
     def _look(self, law: PathLaw, fix: Fix) -> None:
-        """After each step: what comes next."""
+        """Decide after each step what comes next."""
         raise NotImplementedError
 
     def _finish(self) -> None:
@@ -120,9 +124,16 @@ class _PathFlyer(Controller):
 
 
 class FollowPath(_PathFlyer):
-    """Flies to a path's begin, along it, and hovers at its end; then :meth:`run` returns.
+    """Flies to a path's start, along it, and hovers at its end; then :meth:`run` returns.
 
-    The vehicle must be airborne when that is called. ``error`` counts from the path's begin to its end.
+    The vehicle must be airborne when :meth:`run` is called.
+
+    Attributes:
+        path: The path.
+        on_path: Whether the start was reached.
+        error: Tracking error from the path's start to its end.
+        done: Whether the whole path was flown.
+        lost: Whether the position is not known now, and the vehicle hovers.
     """
 
     def __init__(
@@ -135,11 +146,22 @@ class FollowPath(_PathFlyer):
         source: PositionSource | None = None,
         max_age_s: float = 0.5,
     ) -> None:
-        """``yaw``: one of :mod:`skyloop.control.heading`, None keeps the present one; ``source``: what knows where the
-        vehicle is, None: its own feedback; ``max_age_s``: with an older position it hovers."""
+        """Initialise the controller.
+
+        Args:
+            drone: The drone to fly.
+            path: In world axes.
+            yaw: One of :mod:`skyloop.control.heading`; None keeps the present yaw.
+            settings: Of the law; None are the defaults.
+            source: Of positions; None is the vehicle's own feedback.
+            max_age_s: With an older position the vehicle hovers.
+
+        Raises:
+            UsageError: ``max_age_s`` is not a finite number above 0.
+        """
         super().__init__(drone, settings, yaw, source, max_age_s)
         self.path = path
-        self.on_path = False  #: the begin was reached
+        self.on_path = False  #: the start was reached
 
     def _begin(self, fix: Fix) -> PathLaw:
         return PathLaw(_way(fix.position, _vector(self.path.position(0.0)), APPROACH_M_S), self.settings, self._yaw)
@@ -157,10 +179,16 @@ class FollowPath(_PathFlyer):
 
 
 class Waypoints(_PathFlyer):
-    """Flies straight from one waypoint to the next and stays at each as long as wanted; then :meth:`run` returns.
+    """Flies straight from one waypoint to the next and stays at each; then hovers, and :meth:`run` returns.
 
-    The vehicle must be airborne when that is called. ``reached`` is how many were; ``error`` counts all the way, as the
-    distance from where it should have been at each time.
+    The vehicle must be airborne when :meth:`run` is called.
+
+    Attributes:
+        waypoints: Where to fly.
+        reached: How many waypoints were reached.
+        error: Distance from where the vehicle should have been, during the whole flight.
+        done: Whether the last waypoint was reached.
+        lost: Whether the position is not known now, and the vehicle hovers.
     """
 
     def __init__(
@@ -176,8 +204,22 @@ class Waypoints(_PathFlyer):
         source: PositionSource | None = None,
         max_age_s: float = 0.5,
     ) -> None:
-        """``waypoints``: :class:`Waypoint` or (x, y, z) [m]; a waypoint's own yaw goes before ``yaw``. ``hold_s``: how
-        long to stay at each. The others as those of :class:`FollowPath`. Raises :class:`UsageError`."""
+        """Initialise the controller.
+
+        Args:
+            drone: The drone to fly.
+            waypoints: :class:`Waypoint` or (x, y, z) [m], world axes.
+            speed_m_s: Greatest speed between waypoints.
+            acceleration_m_s2: At the start and end of each leg.
+            hold_s: How long to stay at each waypoint.
+            yaw: One of :mod:`skyloop.control.heading`, for waypoints without a yaw; None keeps the present yaw.
+            settings: Of the law; None are the defaults.
+            source: Of positions; None is the vehicle's own feedback.
+            max_age_s: With an older position the vehicle hovers.
+
+        Raises:
+            UsageError: There is no waypoint, or a number is out of its range.
+        """
         super().__init__(drone, settings, yaw, source, max_age_s)
         self.waypoints = tuple(one if isinstance(one, Waypoint) else Waypoint(*one) for one in waypoints)
         if not self.waypoints:
@@ -187,8 +229,8 @@ class Waypoints(_PathFlyer):
         self.reached = 0
         self._speed = (speed_m_s, acceleration_m_s2)
         self._hold_ns = nanoseconds(hold_s)
-        self._there_ns: int | None = None  # since when it is at the next waypoint
-        _way((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), *self._speed)  # says now what is wrong with them
+        self._there_ns: int | None = None  # arrival at the next waypoint
+        _way((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), *self._speed)  # raises now if speed or acceleration are out of range
 
     def _begin(self, fix: Fix) -> PathLaw:
         goal = self.waypoints[0]
@@ -213,7 +255,7 @@ class Waypoints(_PathFlyer):
 
 
 class _Stay:
-    """A path of one place."""
+    """A path that stays at one position."""
 
     duration_s = 0.0
 
@@ -228,7 +270,7 @@ class _Stay:
 
 
 def _way(begin: Vector, end: Vector, speed_m_s: float, acceleration_m_s2: float = 0.8) -> Path:
-    """Straight from one place to the other; where both are the same, that place."""
+    """Return a straight path, or one that stays where both ends are the same."""
     if math.dist(begin, end) < 1e-6:
         return _Stay(end)
     return Polyline([begin, end], speed_m_s=speed_m_s, acceleration_m_s2=acceleration_m_s2)

@@ -1,8 +1,8 @@
-"""The law that keeps a vehicle on a path: where it is in, velocities out. Pure: no clock, no thread.
+"""The law that keeps a vehicle on a path: position in, velocities out. Pure: no clock, no thread.
 
-The path's own velocity is fed forward, ahead by what the vehicle needs to take it up, and PI loops on the position take
-out what is left: the integral is for wind and for a velocity that the vehicle measures wrong (Åström and Hägglund,
-"Advanced PID Control", ISA 2006, chapter 5). A measured place is compared with the path at the time of the
+The path's own velocity is fed forward, ahead by what the vehicle needs to take it up, and PI loops on the position
+remove the rest: the integral is for wind and for a velocity that the vehicle measures wrong (Åström and Hägglund,
+"Advanced PID Control", ISA 2006, chapter 5). A measured position is compared with the path at the time of the
 measurement, so that its delay is no error.
 """
 
@@ -27,14 +27,15 @@ from skyloop.messages.geometry import wrap_angle
 Array = NDArray[np.float64]
 _LONGEST_STEP_S = 0.5  # a longer gap between two fixes does not move the path on by more
 _MAY_BE_ZERO = ("velocity_gain", "yaw_gain", "lead_s")
-_AHEAD_S = 0.1  # over which the turn of the wanted yaw is looked up
+_AHEAD_S = 0.1  # interval over which the rate of the wanted yaw is computed
 
 
 @dataclass(frozen=True, slots=True)
 class PathSettings:
-    """How closely it keeps to the path, and what counts as there. The defaults suit a small indoor vehicle.
+    """Gains, limits and acceptance radii of :class:`PathLaw`. The defaults suit a small indoor vehicle.
 
-    Raises :class:`UsageError` for numbers that make no sense.
+    Raises:
+        UsageError: A number is out of its range.
     """
 
     gains: Gains = field(default_factory=lambda: Gains(p=1.6, i=0.15))  #: by position error [1/s, 1/s²]
@@ -49,8 +50,8 @@ class PathSettings:
         )
     )
     leash_m: float = 0.5  #: farther from the path than this, the path waits
-    near_m: float = 0.15  #: so close to a place is there (acceptance radius)
-    near_rad: float = 0.15  #: the same for the yaw
+    near_m: float = 0.15  #: acceptance radius
+    near_rad: float = 0.15  #: greatest yaw error that is accepted
 
     def __post_init__(self) -> None:
         for name in ("velocity_gain", "yaw_gain", "lead_s", "leash_m", "near_m", "near_rad"):
@@ -60,10 +61,21 @@ class PathSettings:
 
 
 class PathLaw:
-    """Tell it where the vehicle is, and it says how to fly. The path's time begins with the first fix."""
+    """Computes velocities from fixes. The path's time starts with the first fix.
+
+    Attributes:
+        time_s: On the path.
+        off_m: Distance from where the vehicle should have been, as of the last fix.
+    """
 
     def __init__(self, path: Path, settings: PathSettings | None = None, yaw: YawMode | None = None) -> None:
-        """``yaw`` None: the yaw that it has at first is kept."""
+        """Initialise the law.
+
+        Args:
+            path: In world axes.
+            settings: None are the defaults.
+            yaw: Chooses the yaw; None keeps the yaw of the first fix.
+        """
         self.settings = settings or PathSettings()
         self.time_s = 0.0  #: on the path
         self.off_m = 0.0  #: distance from where it should have been, as of the last fix
@@ -77,32 +89,37 @@ class PathLaw:
 
     @property
     def over(self) -> bool:
-        """Whether the path has been flown to its end, as far as its time goes."""
+        """Whether the path's time is at its end."""
         return self.time_s >= self._path.duration_s
 
     @property
     def target(self) -> tuple[Array, Array]:
-        """Where it should be now, and how fast: position (3,) [m] and velocity (3,) [m/s]."""
+        """Where the vehicle should be now, and how fast: position (3,) [m] and velocity (3,) [m/s]."""
         return self._path.position(self.time_s), self._path.velocity(self.time_s)
 
     def follow(self, path: Path, yaw: YawMode | None = None) -> None:
-        """Go on with another path, from its begin, keeping what the integrals have learnt; ``yaw`` None: as before."""
+        """Continue with another path from its start, keeping the integrals.
+
+        Args:
+            path: In world axes.
+            yaw: Chooses the yaw; None keeps the present mode.
+        """
         self._path, self.time_s = path, 0.0
         if yaw is not None:
             self._yaw = yaw
 
     def pause(self) -> None:
-        """The vehicle was made to hover meanwhile: set-points begin at rest again."""
+        """Restart set-points from rest, because the vehicle was made to hover meanwhile."""
         self._limiter.reset(Velocity())
 
     def there(self, fix: Fix) -> bool:
-        """Whether the path is over and the vehicle within the acceptance radius of its end, looking the right way."""
+        """Whether the path is over and the vehicle within the acceptance radius of its end, at the wanted yaw."""
         s = self.settings
         turned = 0.0 if self._wanted_yaw is None else wrap_angle(self._wanted_yaw - fix.yaw)
         return self.over and self._off(fix) <= s.near_m and abs(turned) <= s.near_rad
 
     def step(self, fix: Fix) -> Velocity:
-        """What to ask for now. A fix that is not newer than the last moves nothing on."""
+        """Compute the set-point for a fix. One that is not newer than the last does not advance the path."""
         dt_s = 0.0 if self._last is None else max(0.0, seconds(fix.at_ns - self._last.at_ns))
         self._last = fix
         self._go_on(min(dt_s, _LONGEST_STEP_S), self._off(fix))
@@ -131,12 +148,12 @@ class PathLaw:
         return float(np.linalg.norm(self._path.position(self.time_s) - fix.position))
 
     def _go_on(self, dt_s: float, off_m: float) -> None:
-        """The path's time goes on, slower beyond the leash, and stands still at twice its length."""
+        """Advance the path's time, slower beyond the leash, and not at all from twice the leash on."""
         share = max(0.0, min(1.0, 2.0 - off_m / self.settings.leash_m))
         self.time_s = min(self._path.duration_s, self.time_s + share * dt_s)
 
     def _turn(self, fix: Fix) -> float:
-        """The yaw rate to ask for [rad/s]."""
+        """Return the wanted yaw rate [rad/s]."""
         position, velocity = self.target
         if self._yaw is not None:
             later = self.time_s + _AHEAD_S

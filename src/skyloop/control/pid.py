@@ -18,7 +18,11 @@ from skyloop.messages.geometry import wrap_angle
 
 @dataclass(frozen=True, slots=True)
 class Gains:
-    """Of error, its integral and its derivative, and how they are limited. Raises :class:`UsageError`."""
+    """Gains of the error, its integral and its derivative, with their time constants.
+
+    Raises:
+        UsageError: A number is negative or not finite.
+    """
 
     p: float = 1.0  #: output per error
     i: float = 0.0  #: output per error and second
@@ -35,15 +39,18 @@ class Gains:
 
     @property
     def tracking_time_s(self) -> float:
-        """The time constant in force."""
+        """The time constant of back-calculation in force [s]."""
         if self.tracking_s is not None:
             return self.tracking_s
         return self.p / self.i if self.i > 0.0 else 0.0
 
 
 class Pid:
-    """One loop. :attr:`gains` may be replaced in flight; the output does not jump then while there is an integral gain
-    to take the difference out again, and else no faster than the rate limit lets it."""
+    """A PID loop of one number.
+
+    :attr:`gains` may be replaced in flight. With an integral gain the output does not jump then, because the integral
+    term takes up the difference; without one it changes no faster than the rate limit allows.
+    """
 
     def __init__(
         self,
@@ -54,10 +61,17 @@ class Pid:
         rate: float = math.inf,
         angle: bool = False,
     ) -> None:
-        """``low``, ``high``: of the output; ``rate``: how much it may change a second; ``angle``: set-point and
-        measurement are angles [rad], and the way between them is the short one.
+        """Initialise the loop.
 
-        Raises :class:`UsageError` unless ``low`` < ``high`` and ``rate`` > 0.
+        Args:
+            gains: The gains to begin with.
+            low: Least output.
+            high: Greatest output.
+            rate: Greatest change of the output per second.
+            angle: Whether set-point and measurement are angles [rad], whose difference is taken the short way round.
+
+        Raises:
+            UsageError: ``low`` is not below ``high``, or ``rate`` is not above 0.
         """
         if not low < high:
             raise UsageError(f"low is {low!r} and must be below high, which is {high!r}")
@@ -96,7 +110,17 @@ class Pid:
         return self._integral
 
     def step(self, set_point: float, measured: float, dt_s: float, feed_forward: float = 0.0) -> float:
-        """The output for a measurement that was taken ``dt_s`` after the last; ``feed_forward`` is added to it."""
+        """Compute the output for a new measurement.
+
+        Args:
+            set_point: Where the measured value is to be.
+            measured: The measured value, in the same unit.
+            dt_s: Time since the last measurement [s].
+            feed_forward: Is added to the output before the limits.
+
+        Returns:
+            The output, within ``low`` and ``high`` and the rate limit.
+        """
         g = self._gains
         error = self._difference(set_point, measured)
         if self._measured is not None and dt_s > 0.0:
@@ -113,17 +137,27 @@ class Pid:
         return limited
 
     def applied(self, output: float) -> None:
-        """What was really done with the last output, where a limit outside of this loop took something off: the
-        integral term follows it. :meth:`step` calls this with its own output."""
+        """Report what was really applied of the last output, where a limit outside of this loop reduced it.
+
+        The integral term follows it (back-calculation). :meth:`step` calls this with its own output.
+
+        Args:
+            output: What was applied.
+        """
         if self._gains.i > 0.0:
             self._integral += gain(self._gains.tracking_time_s, self._dt_s) * (output - self._unlimited)
             self._unlimited = output
         self._output = output
 
     def reset(self, output: float = 0.0, *, set_point: float = 0.0, measured: float | None = None) -> None:
-        """Begin anew with the integral term that makes ``output`` the next one, so that taking over is no jump.
+        """Start anew with the integral term for which ``output`` is the next output, so that taking over is no jump.
 
-        Without an integral gain the next output is what error and derivative say.
+        Without an integral gain the next output is what error and derivative give.
+
+        Args:
+            output: What was applied until now.
+            set_point: The set-point now.
+            measured: The measured value now; None counts the error as 0.
         """
         self._error = 0.0 if measured is None else self._difference(set_point, measured)
         self._integral = output - self._gains.p * self._error if self._gains.i > 0.0 else 0.0

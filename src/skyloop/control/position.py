@@ -1,4 +1,4 @@
-"""Where the vehicle is, from whatever knows it: its own feedback, motion capture, its velocity summed up."""
+"""Sources of positions: the vehicle's own feedback, motion capture, or its integrated velocity."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class Fix(NamedTuple):
-    """A place in world axes (x east, y north, z up) at one time."""
+    """A position in world axes (x east, y north, z up) at one time."""
 
     at_ns: int  #: on the proxy's clock
     position: Vector  #: [m]
@@ -22,36 +22,46 @@ class Fix(NamedTuple):
     velocity: Vector | None = None  #: in world axes [m/s], if it is known
 
 
-#: Gives the newest known place, None while it is not known; must return at once.
+#: Returns the newest known position, None while it is not known; must not block.
 PositionSource = Callable[[], Fix | None]
 
 
 def fix_of(feedback: Feedback) -> Fix | None:
-    """The place that the vehicle itself tells; None while it does not know its position or yaw."""
+    """Return the position that the vehicle itself reports.
+
+    Returns:
+        The fix at the feedback's capture; None while position or yaw are not known.
+    """
     if feedback.position is None or feedback.yaw is None:
         return None
     return Fix(feedback.captured_ns, feedback.position, feedback.yaw, _world_velocity(feedback.velocity, feedback.yaw))
 
 
 class DeadReckoning:
-    """A source of positions for a vehicle that tells its velocity only: summed up from where it was when this was made.
+    """A position source for a vehicle that reports its velocity but no position: integrates it from where it is now.
 
-    It drifts by what the velocity is wrong. The height is the vehicle's altitude, where it tells one.
+    The position drifts by the velocity's error. The height is the vehicle's altitude, where it reports one. Feedback is
+    handled on the thread that receives it.
     """
 
     def __init__(self, drone: Drone, begin: tuple[float, float] = (0.0, 0.0)) -> None:
-        """``begin``: where it is now, x and y [m]."""
+        """Subscribe to the drone's feedback.
+
+        Args:
+            drone: The drone.
+            begin: Where it is now, x and y [m].
+        """
         self._begin = begin
         self._odometry = Odometry()
         self._newest: Fix | None = None
         self._listener = drone.on_feedback(self._take, inline=True)
 
     def __call__(self) -> Fix | None:
-        """The newest place; None before velocity and yaw were told."""
+        """Return the newest position; None before velocity and yaw were received."""
         return self._newest
 
     def close(self) -> None:
-        """Listen no longer."""
+        """Cancel the subscription."""
         self._listener.cancel()
 
     def _take(self, feedback: Feedback) -> None:

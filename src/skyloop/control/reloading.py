@@ -1,4 +1,4 @@
-"""Loads the user's file again when it, or a neighbour that it imports, was saved, while something else goes on."""
+"""Reload the user's file when it, or a module beside it that it imports, was saved, without interrupting the flight."""
 
 from __future__ import annotations
 
@@ -14,18 +14,24 @@ from skyloop.control.controller import Controller
 from skyloop.control.loading import load_controller
 from skyloop.errors import SkyloopError
 
-LOOK_S: Final = 0.1  #: how often the files are looked at
+LOOK_S: Final = 0.1  #: how often the files are polled
 Stamp = tuple[int, int, int]  #: what changes when a file is saved: time [ns], size, inode
 
 
 class Reloader:
-    """Watches a controller's file, and loads it on a thread of its own when it was saved. A context manager.
+    """Watches a controller's file, and loads it on its own thread when it was saved. A context manager.
 
-    A file counts as saved when it looks the same twice, ``look_s`` apart, so that one that is half written is not
-    loaded.
+    A file counts as saved once it is unchanged for ``look_s / 2``, so that a file that is being written is not loaded.
     """
 
     def __init__(self, path: str | Path, class_name: str | None = None, *, look_s: float = LOOK_S) -> None:
+        """Record the state of the files; the thread starts with the context.
+
+        Args:
+            path: The controller's file.
+            class_name: Which class, where the file has several.
+            look_s: How often the files are polled [s].
+        """
         self._path = Path(path)
         self._folder = self._path.resolve().parent
         self._class_name = class_name
@@ -48,32 +54,32 @@ class Reloader:
 
     @property
     def waiting(self) -> bool:
-        """Whether :meth:`take` has something."""
+        """Whether :meth:`take` has something to return."""
         return bool(self._news)
 
     @property
     def age_s(self) -> float:
-        """How long ago the change was seen that was loaded last [s]."""
+        """Time since the last change was detected [s]."""
         return time.monotonic() - self._saved_at
 
     def take(self) -> type[Controller] | SkyloopError | None:
-        """The new class, or why the file that was saved can't be loaded; None if nothing was saved since."""
+        """Return the new class, or the error why the saved file can't be loaded; None if nothing was saved since."""
         return self._news.popleft() if self._news else None
 
     def look(self) -> None:
-        """Look at the files once, and load what was saved."""
+        """Poll the files once, and load them if they changed."""
         found = self._stamps()
         if found == self._seen:
             return
         self._saved_at = time.monotonic()
-        while (again := self._settled()) != found:  # somebody is still writing
+        while (again := self._settled()) != found:  # the file is still being written
             found = again
         self._seen = found
         try:
             self._news.append(self._load())
         except SkyloopError as error:
             self._news.append(error)
-        self._seen = {**self._stamps(), **found}  # what the new one imports is watched too
+        self._seen = {**self._stamps(), **found}  # modules that the new version imports are watched too
 
     def _settled(self) -> dict[Path, Stamp]:
         self._ended.wait(self._look_s / 2)
@@ -84,7 +90,7 @@ class Reloader:
             self.look()
 
     def _load(self) -> type[Controller]:
-        """With the neighbours that were loaded taken anew; what was loaded before is put back if that fails."""
+        """Load the file and its neighbours anew; restore the modules that were loaded before if that fails."""
         before = self._neighbours()
         for name in before:
             sys.modules.pop(name, None)
@@ -95,7 +101,7 @@ class Reloader:
             raise
 
     def _neighbours(self) -> dict[str, ModuleType]:
-        """Modules that were loaded from the folder of the user's file: that one, and what it imports beside it."""
+        """Return the loaded modules from the folder of the user's file: that file, and those beside it."""
         loaded = dict(sys.modules)
         tops = {name for name in loaded if "." not in name and self._lies_here(name, loaded[name])}
         return {name: module for name, module in loaded.items() if name.partition(".")[0] in tops and _file(module)}
@@ -117,7 +123,7 @@ def _file(module: ModuleType) -> Path | None:
 
 
 def _stamp(file: Path) -> Stamp | None:
-    """None for a file that is not there, as it is for a moment when an editor replaces it."""
+    """Return what changes when a file is saved; None while it is missing, as when an editor replaces it."""
     try:
         found = file.stat()
     except OSError:

@@ -1,4 +1,4 @@
-"""Looking for something with a camera that looks forward: turning on the spot, at one height after the other. Pure."""
+"""Search with a camera that looks forward: turn on the spot, at one height after the other. Pure."""
 
 from __future__ import annotations
 
@@ -23,8 +23,14 @@ class TurningSearch:
         lowest_m: float = 0.6,
         highest_m: float = 2.2,
     ) -> None:
-        """``turn_rad_s``: how fast; ``heights_m``: above the one that it began at, one a full turn, kept between
-        ``lowest_m`` and ``highest_m`` above the ground."""
+        """Initialise the search.
+
+        Args:
+            turn_rad_s: Yaw rate.
+            heights_m: One for each full turn, above the height at the start.
+            lowest_m: Least height above the ground.
+            highest_m: Greatest height above the ground.
+        """
         self._rate = turn_rad_s
         self._heights = heights_m
         self._lowest, self._highest = lowest_m, highest_m
@@ -34,13 +40,25 @@ class TurningSearch:
         self._base: float | None = None
 
     def restart(self, *, turning: float) -> None:
-        """The next search begins the way the vehicle is turning now [rad/s], counter-clockwise positive."""
+        """Start the next search in the direction in which the vehicle is turning.
+
+        Args:
+            turning: Yaw rate [rad/s], counter-clockwise positive; below 0.05 the direction stays.
+        """
         if abs(turning) > 0.05:
             self._direction = math.copysign(1.0, turning)
         self._turned, self._yaw, self._base = 0.0, None, None
 
     def step(self, yaw: float, altitude: float | None) -> Array:
-        """Wanted forward, left, up [m/s] and yaw rate [rad/s]; without an altitude [m] it keeps its height."""
+        """Compute the set-point.
+
+        Args:
+            yaw: Of the vehicle [rad].
+            altitude: Above the ground [m]; None keeps the height.
+
+        Returns:
+            Forward, left, up [m/s] and yaw rate [rad/s], (4,).
+        """
         if self._yaw is not None:
             self._turned += abs(wrap_angle(yaw - self._yaw))
         self._yaw = yaw

@@ -1,4 +1,4 @@
-"""Looking for something below with a camera that looks down: a square spiral outwards. Pure.
+"""Search with a camera that looks down: a square spiral outwards. Pure.
 
 The expanding square of search and rescue: International Aeronautical and Maritime Search and Rescue Manual, volume II,
 section 5.5 (legs of 1, 1, 2, 2, 3, 3 … lanes, each a quarter turn from the one before).
@@ -17,11 +17,19 @@ Array = NDArray[np.float64]
 
 
 class SpiralSearch:
-    """Flies an expanding square around the place where it began; when that is as large as allowed it goes back there
-    and begins anew."""
+    """Flies an expanding square around its start; at its greatest size it returns to the start and begins anew."""
 
     def __init__(self, lane_m: float = 1.1, speed_m_s: float = 0.7, largest_m: float = 4.4) -> None:
-        """``lane_m``: between lanes; ``largest_m``: of the longest leg. Raises :class:`UsageError` unless above 0."""
+        """Initialise the search.
+
+        Args:
+            lane_m: Distance between lanes.
+            speed_m_s: Greatest speed.
+            largest_m: Length of the longest leg.
+
+        Raises:
+            UsageError: A number is not finite and above 0.
+        """
         for name, value in (("lane_m", lane_m), ("speed_m_s", speed_m_s), ("largest_m", largest_m)):
             if not 0.0 < value < math.inf:
                 raise UsageError(f"{name} is {value!r} and must be a finite number above 0")
@@ -32,11 +40,11 @@ class SpiralSearch:
         self._begin: Array | None = None
 
     def restart(self) -> None:
-        """The next search begins around the place where it begins."""
+        """Start the next search around the position at its first step."""
         self._leg, self._goal = 0, None
 
     def step(self, position: Array) -> Array:
-        """The velocity (2,) [m/s] wanted at a place (2,) [m], in the same axes."""
+        """Return the wanted velocity (2,) [m/s] at a position (2,) [m], in the same axes."""
         if self._goal is None:
             self._begin = self._goal = position.copy()
         way = self._goal - position
@@ -48,7 +56,7 @@ class SpiralSearch:
         return way * (min(self._speed, 1.5 * distance) / max(distance, 1e-9))
 
     def _next(self, corner: Array) -> Array:
-        """Where the next leg ends."""
+        """Return where the next leg ends."""
         if self._leg >= self._legs and self._begin is not None:
             self._leg = 0
             return self._begin

@@ -1,8 +1,8 @@
-"""Where the vehicle went and where a target goes, from what a vehicle without a map knows. Pure.
+"""Motion of the vehicle and of a target, for a vehicle that does not know its position. Pure.
 
-Both live in *odometry axes*: levelled, x along yaw 0, z up, the origin wherever the vehicle was first heard. The
-origin drifts with the vehicle's own velocity error, which does not matter here: only differences over about a second
-are ever taken.
+Both are in *odometry axes*: levelled, x along yaw 0, z up, origin where the vehicle was at its first sample. The origin
+drifts with the error of the vehicle's velocity. That does no harm here, because only differences over about a second
+are used.
 """
 
 from __future__ import annotations
@@ -22,13 +22,21 @@ from skyloop.messages.geometry import rotation_from_euler, wrap_angle
 Array = NDArray[np.float64]
 
 _HISTORY_S = 3.0
-_LONGEST_STEP_S = 0.5  # a longer silence is not integrated over: the vehicle may have done anything
+_LONGEST_STEP_S = 0.5  # longer gaps are not integrated over: the vehicle may have done anything
 _EXTRAPOLATE_S = 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """The vehicle at one time, in odometry axes: position and velocity (3,) [m, m/s], yaw and its rate [rad, rad/s]."""
+    """The vehicle's motion at one time, in odometry axes.
+
+    Attributes:
+        at_ns: On the proxy's clock.
+        position: Shape (3,) [m].
+        velocity: Shape (3,) [m/s].
+        yaw: [rad]
+        yaw_rate: [rad/s]
+    """
 
     at_ns: int
     position: Array
@@ -37,29 +45,34 @@ class Motion:
     yaw_rate: float
 
     def moved_to(self, at_ns: int) -> Motion:
-        """The same motion carried on (or back) to another time, by at most 0.3 s."""
+        """Return the motion extrapolated to another time, by at most 0.3 s forward or back."""
         dt = max(-_EXTRAPOLATE_S, min(_EXTRAPOLATE_S, seconds(at_ns - self.at_ns)))
         yaw = wrap_angle(self.yaw + self.yaw_rate * dt)
         return Motion(at_ns, self.position + self.velocity * dt, self.velocity, yaw, self.yaw_rate)
 
     def to_body(self, horizontal: Array) -> tuple[float, float]:
-        """Forward and left, along the levelled body, of a horizontal vector (2,) in odometry axes."""
+        """Turn a horizontal vector (2,) from odometry axes into forward and left of the levelled body."""
         c, s = math.cos(self.yaw), math.sin(self.yaw)
         return float(c * horizontal[0] + s * horizontal[1]), float(c * horizontal[1] - s * horizontal[0])
 
     def stiffened(self, wanted: Array, share: float) -> Array:
-        """A wanted velocity (3,) in odometry axes, and this share of what the present one lacks of it on top."""
+        """Add a share of the present velocity error to a wanted velocity.
+
+        Args:
+            wanted: Shape (3,) in odometry axes [m/s].
+            share: Of the difference between wanted and present velocity; 0 or more.
+        """
         return wanted + share * (wanted - self.velocity)
 
 
 class Odometry:
-    """Integrates feedback's velocity and keeps the last three seconds, so that a picture's capture can be placed."""
+    """Integrates feedback's velocity and keeps the last three seconds, so that frames can be placed at capture."""
 
     def __init__(self) -> None:
         self._history: deque[Motion] = deque()
 
     def add(self, feedback: Feedback) -> None:
-        """Take the next sample. Those without velocity or yaw, and those not newer than the last, are passed over."""
+        """Integrate the next sample. Samples without velocity or yaw, or not newer than the last, are ignored."""
         if feedback.velocity is None or feedback.yaw is None:
             return
         last = self._history[-1] if self._history else None
@@ -77,11 +90,11 @@ class Odometry:
 
     @property
     def newest(self) -> Motion | None:
-        """As of the last sample; None before the first."""
+        """The motion as of the last sample; None before the first."""
         return self._history[-1] if self._history else None
 
     def at(self, at_ns: int) -> Motion | None:
-        """The vehicle's motion at a time, from the nearest sample; None before the first sample."""
+        """Return the motion at a time [ns], extrapolated from the nearest sample; None before the first."""
         if not self._history:
             return None
         nearest = self._history[-1]
@@ -93,15 +106,21 @@ class Odometry:
 
 
 class TargetFilter:
-    """A point that is carried about and seen now and then: a constant-velocity filter that begins anew after a jump."""
+    """Position and velocity of a point that is seen now and then: a filter that restarts after a jump."""
 
     def __init__(self) -> None:
         self._filter = ConstantVelocityFilter(3, intensity_m2_s3=0.1, speed_m_s=0.7, gate=math.inf)
 
     def see(self, position: Array, deviation_m: float, at_ns: int) -> None:
-        """Take a measured position (3,) with its standard deviation. One older than the last is passed over.
+        """Update with a measured position. One that is older than the last is ignored.
 
-        After two seconds unseen, or when the target is more than a metre (and five deviations) off, it starts anew.
+        After two seconds unseen, or when the target is more than a metre (and five deviations) off, the filter
+        restarts.
+
+        Args:
+            position: Shape (3,) [m].
+            deviation_m: Standard deviation of each component.
+            at_ns: When it was measured.
         """
         newest = self._filter.newest
         if newest is None or self._jumped(position, deviation_m, at_ns):
@@ -110,7 +129,18 @@ class TargetFilter:
             self._filter.update(position, deviation_m, at_ns)
 
     def at(self, at_ns: int, *, longest_s: float = 1.0) -> tuple[Array, Array]:
-        """Predicted position (3,) [m] and velocity (3,) [m/s]; the motion is carried on for ``longest_s`` at most."""
+        """Predict the target's motion.
+
+        Args:
+            at_ns: The time to predict for.
+            longest_s: How far the last estimate is extrapolated at most.
+
+        Returns:
+            Position (3,) [m] and velocity (3,) [m/s].
+
+        Raises:
+            UsageError: The target was never seen.
+        """
         estimate = self._filter.at(at_ns, longest_s=longest_s)
         return estimate.position, estimate.velocity
 

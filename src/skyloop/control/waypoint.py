@@ -1,7 +1,7 @@
-"""Fly to a place: position and yaw in, velocity out. Pure: no clock, no thread.
+"""Fly to a position: position and yaw in, velocity out. Pure: no clock, no thread.
 
-A proportional law whose speed is limited and, near the place, by what a given deceleration brings to rest there; the
-error is turned into the body's levelled axes by the yaw alone, as set-points are given in them (ROS REP 103).
+A proportional law. The speed is limited, and near the goal it is at most what a given deceleration brings to rest
+there. The error is turned by the yaw alone into the body's levelled axes, in which set-points are given (ROS REP 103).
 """
 
 from __future__ import annotations
@@ -16,9 +16,16 @@ from skyloop.messages.geometry import wrap_angle
 
 @dataclass(frozen=True, slots=True)
 class Waypoint:
-    """A place in world axes: x east, y north, z up [m]; ``yaw`` counter-clockwise from x [rad], None: any.
+    """A position in world axes, and optionally a yaw.
 
-    Raises :class:`UsageError` for what is not finite.
+    Attributes:
+        x: East [m].
+        y: North [m].
+        z: Up [m].
+        yaw: Counter-clockwise from x [rad]; None leaves it free.
+
+    Raises:
+        UsageError: A number is not finite.
     """
 
     x: float
@@ -34,33 +41,46 @@ class Waypoint:
 
     @property
     def position(self) -> Vector:
+        """Return (x, y, z) [m], world axes."""
         return self.x, self.y, self.z
 
 
 @dataclass(frozen=True, slots=True)
 class WaypointSettings:
-    """How hard it flies, and what counts as there. The defaults suit a small indoor vehicle with velocity control."""
+    """Gains, limits and acceptance radii. The defaults suit a small indoor vehicle with velocity control."""
 
     gain: float = 1.2  #: speed by distance [1/s]
     yaw_gain: float = 1.5  #: [1/s]
     speed_m_s: float = 1.0  #: greatest, horizontally
     climb_m_s: float = 0.6  #: greatest, up or down
     turn_rad_s: float = 1.2  #: greatest
-    slow_down_m_s2: float = 0.6  #: deceleration towards the place
-    near_m: float = 0.15  #: so close to the place is there
+    slow_down_m_s2: float = 0.6  #: deceleration towards the goal
+    near_m: float = 0.15  #: acceptance radius
     near_rad: float = 0.1
-    slow_m_s: float = 0.2  #: and no faster than this, where the velocity is known
+    slow_m_s: float = 0.2  #: greatest speed at which the goal counts as reached, where the velocity is known
 
 
 def lacking(feedback: Feedback) -> str:
-    """Why it can't be flown to a place, in words; empty if it can."""
+    """Return why a vehicle can't be flown to a position, or an empty string if it can."""
     if feedback.position is None:
         return "the vehicle does not tell its position"
     return "the vehicle does not tell its yaw" if feedback.yaw is None else ""
 
 
 def velocity_to(goal: Waypoint, feedback: Feedback, settings: WaypointSettings | None = None) -> Velocity:
-    """The velocity to ask for now. Raises :class:`UsageError` while position or yaw are not known."""
+    """Compute the velocity that brings a vehicle to a waypoint.
+
+    Args:
+        goal: Where to fly.
+        feedback: The vehicle's newest feedback, with position and yaw.
+        settings: Gains and limits; None are the defaults.
+
+    Returns:
+        Set-point in the body's levelled axes [m/s, rad/s].
+
+    Raises:
+        UsageError: Position or yaw are not known.
+    """
     s = settings or WaypointSettings()
     east, north, up, yaw = _errors(goal, feedback)
     away = math.hypot(east, north)
@@ -77,7 +97,16 @@ def velocity_to(goal: Waypoint, feedback: Feedback, settings: WaypointSettings |
 
 
 def reached(goal: Waypoint, feedback: Feedback, settings: WaypointSettings | None = None) -> bool:
-    """Whether it is there, and nearly at rest. Raises :class:`UsageError` while position or yaw are not known."""
+    """Whether the vehicle is within the acceptance radius and nearly at rest.
+
+    Args:
+        goal: Where it is to be.
+        feedback: The vehicle's newest feedback; without a velocity it counts as at rest.
+        settings: Acceptance radii; None are the defaults.
+
+    Raises:
+        UsageError: Position or yaw are not known.
+    """
     s = settings or WaypointSettings()
     east, north, up, yaw = _errors(goal, feedback)
     velocity = feedback.velocity
@@ -86,7 +115,7 @@ def reached(goal: Waypoint, feedback: Feedback, settings: WaypointSettings | Non
 
 
 def _errors(goal: Waypoint, feedback: Feedback) -> tuple[float, float, float, float]:
-    """East, north, up [m] and yaw [rad] from where it is to where it shall be."""
+    """Return east, north, up [m] and yaw [rad] from where the vehicle is to the goal."""
     problem = lacking(feedback)
     if problem or feedback.position is None or feedback.yaw is None:
         raise UsageError(f"it can't fly to a waypoint: {problem}")
@@ -96,5 +125,5 @@ def _errors(goal: Waypoint, feedback: Feedback) -> tuple[float, float, float, fl
 
 
 def _approach(away: float, limit: float, s: WaypointSettings) -> float:
-    """Speed at this distance: by the gain, within the limit, and slow enough to come to rest at the place."""
+    """Return the speed at a distance: by the gain, within the limit, and slow enough to come to rest at the goal."""
     return min(s.gain * away, limit, math.sqrt(2.0 * s.slow_down_m_s2 * away))

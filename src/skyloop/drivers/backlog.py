@@ -1,4 +1,4 @@
-"""Frames that came and are not decoded yet: what is decoded, what is shown and what is left out. Pure."""
+"""Frames that arrived and are not decoded yet: which are decoded, shown and left out. Pure."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ MAX_FRAMES: Final = 120  #: 4 s; key frames of the vehicles are half a second or
 
 @dataclass(frozen=True, slots=True)
 class Coded:
-    """A frame as it came."""
+    """An encoded frame as it arrived."""
 
     data: object  #: what the vehicle's decoder takes
     is_key: bool  #: whether decoding can begin here
@@ -22,14 +22,14 @@ class Coded:
 
 
 class Backlog:
-    """Frames in the order of their coming, at most :data:`MAX_FRAMES`. The newest wins.
+    """Frames in the order of arrival, at most :data:`MAX_FRAMES`. The newest wins.
 
-    While pictures are wanted and decoding keeps up, every frame is decoded and shown. When it is late, what stands
-    before the newest key frame is left out, and of the rest, which must all be decoded as each builds on the one
-    before, only the newest is shown. While no picture is wanted the frames since the newest key frame are kept, so
-    that a picture can be shown at once when one is.
+    While frames are wanted and decoding keeps up, every frame is decoded and shown. When decoding is late, what stands
+    before the newest key frame is left out; the rest must all be decoded, as each builds on the one before, but only
+    the newest is shown. While no frame is wanted, those since the newest key frame are kept, so that one can be shown
+    at once when somebody wants it.
 
-    ``skipped`` counts the frames that were wanted and not shown because newer ones were there.
+    ``skipped`` counts the frames that were wanted and not shown because newer ones had arrived.
     """
 
     def __init__(self) -> None:
@@ -40,7 +40,12 @@ class Backlog:
         return len(self._frames)
 
     def put(self, frame: Coded, *, wanted: bool) -> None:
-        """A frame came."""
+        """Add a frame that arrived.
+
+        Args:
+            frame: The newest.
+            wanted: Whether anybody wants frames now.
+        """
         if frame.is_key and not wanted:
             self._drop(len(self._frames))
         elif len(self._frames) == MAX_FRAMES:
@@ -48,7 +53,17 @@ class Backlog:
         self._frames.append((frame, wanted))
 
     def take(self, now_ns: int) -> tuple[Coded, bool]:
-        """The frame to decode next, and whether to show it. Raises IndexError if there is none."""
+        """Remove the frame to decode next.
+
+        Args:
+            now_ns: On the clock of ``arrived_ns``.
+
+        Returns:
+            The frame, and whether to show it.
+
+        Raises:
+            IndexError: There is none.
+        """
         if self._late(now_ns):
             keys = [n for n, (frame, _) in enumerate(self._frames) if frame.is_key]
             self._drop(keys[-1] if keys else 0)

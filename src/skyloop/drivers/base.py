@@ -1,8 +1,8 @@
 """The contract between the proxy and a vehicle's driver. ``docs/drivers.md`` shows how to write one.
 
 A driver speaks one vehicle family's native protocol and knows nothing of the network, of applications or of
-authority. It converts units and axes at its edge. Its class is registered under the entry-point group
-``skyloop.drivers`` with its URI scheme as the name.
+authority. It converts units and axes at its edge: above it are SI units and body axes x forward, y left, z up. Its
+class is registered under the entry-point group ``skyloop.drivers`` with its URI scheme as the name.
 """
 
 from __future__ import annotations
@@ -35,10 +35,19 @@ from skyloop.messages import (
 
 
 class Sink(Protocol):
-    """Where a driver puts what it hears. All methods may be called from any thread, return quickly, never raise."""
+    """Receives a driver's feedback, frames, link states and events.
+
+    All methods may be called from any thread, return quickly and never raise. Every ``captured_ns`` is
+    ``time.monotonic_ns`` of this host.
+    """
 
     def feedback(self, feedback: Feedback) -> None:
-        """The vehicle's newest state. Fill the vehicle's block of :class:`Feedback`; leave the proxy's fields alone."""
+        """Publish the vehicle's newest state.
+
+        Args:
+            feedback: With the vehicle's block filled in. The proxy's fields (``seq``, ``published_ns``, ``lease``,
+                ``owner`` and the like) keep their defaults. A number that is not known is None, never NaN.
+        """
 
     def frame(
         self,
@@ -51,13 +60,21 @@ class Sink(Protocol):
         encoding: Encoding = Encoding.BGR8,
         intrinsics: Intrinsics | None = None,
     ) -> None:
-        """A whole frame. ``pixels`` is C-contiguous uint8 and may be reused when the call returns.
+        """Publish a whole frame.
 
-        Raw encodings have exactly ``height * width * channels`` bytes; JPEG is one file.
+        Args:
+            camera: A name that :meth:`Driver.capabilities` lists.
+            pixels: C-contiguous uint8. Raw encodings have exactly ``height * width * channels`` bytes; JPEG is one
+                file. May be reused when the call returns.
+            captured_ns: When the frame was captured, on this host's monotonic clock.
+            width: [px]
+            height: [px]
+            encoding: Of ``pixels``.
+            intrinsics: For this size, None if they are not known.
         """
 
     def wants(self, camera: str) -> bool:
-        """Whether anybody looks at this camera now: if not, a driver may save itself the work of decoding."""
+        """Return whether anybody uses this camera's frames now. If not, a driver may save itself the decoding."""
 
     def stream(
         self,
@@ -70,32 +87,63 @@ class Sink(Protocol):
         key: bool,
         intrinsics: Intrinsics | None = None,
     ) -> None:
-        """A picture as the vehicle encoded it, of a camera whose ``CameraInfo`` announces ``stream="h264"``.
+        """Publish a picture as the vehicle encoded it, of a camera whose ``CameraInfo`` announces ``stream="h264"``.
 
-        ``data``: one access unit of H.264 in Annex B form, undamaged, with SPS and PPS if it is a key picture, and of
-        a stream without B pictures. One that is no ``key`` follows the picture that was given last: after a gap, and
-        after a while in which nobody wanted any, begin with a key. Size, intrinsics and time are those of the decoded
-        frame, which is given to :meth:`frame` all the same while somebody wants that.
+        Size, time and intrinsics are those of the decoded frame, which goes to :meth:`frame` as well while somebody
+        wants that.
+
+        Args:
+            camera: A name that :meth:`Driver.capabilities` lists.
+            data: One access unit of H.264 in Annex B form, undamaged, with SPS and PPS if it is a key picture, of a
+                stream without B pictures. One that is no key picture follows the picture that was given last: begin
+                with a key picture after a gap, and after a while in which nobody wanted any.
+            captured_ns: When the picture was captured, on this host's monotonic clock.
+            width: [px]
+            height: [px]
+            key: Whether decoding can begin with this picture.
+            intrinsics: For this size, None if they are not known.
         """
 
     def wants_stream(self, camera: str) -> bool:
-        """Whether anybody takes this camera's pictures as they come."""
+        """Return whether anybody receives this camera's encoded pictures now."""
 
-    def link(self, state: LinkState, reason: str = "") -> None:
-        """The hop to the vehicle changed. Call it with UP once the vehicle answers."""
+    def link(self, state: LinkState, reason: str = "", remedy: str = "") -> None:
+        """Report a new state of the vehicle link, or a new reason for the present one.
+
+        Args:
+            state: UP once the vehicle answers.
+            reason: What is waited for, and what failed last. Shown to everybody.
+            remedy: What a person can do about it, as an instruction ("join its Wi-Fi network"). Shown to everybody.
+        """
 
     def event(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: Value) -> None:
-        """Something happened that a person or a program may want to know."""
+        """Emit an event that a person or a program may want to know about.
+
+        Args:
+            kind: Of the event.
+            text: For people.
+            severity: For people and for filters.
+            **data: For programs.
+        """
 
 
 class Driver(ABC):
-    """Base class of drivers: owns the life cycle; a driver writes ``_open``, ``_close`` and ``_apply``.
+    """Base class of drivers: owns the life cycle; a subclass writes ``_open``, ``_close`` and ``_apply``.
 
     No I/O happens before :meth:`open`. Times given to the sink are ``time.monotonic_ns`` of this host.
+
+    Args:
+        uri: The vehicle's address with its options.
+
+    Raises:
+        UsageError: A subclass raises it for an option that it does not know; see :func:`reject_unknown_options`.
     """
 
+    #: Whether somebody else may fly the vehicle too. If so, a vehicle found in the air is theirs and is left alone.
+    shared = True
+
     def __init__(self, uri: VehicleUri) -> None:
-        """Reads the address and options from the URI. Raises :class:`UsageError` for options it does not know."""
+        """Store the address. A subclass reads its options here, and does no I/O."""
         self.uri = uri
         self._lock = threading.Lock()
         self._sink: Sink | None = None
@@ -104,27 +152,45 @@ class Driver(ABC):
 
     @abstractmethod
     def capabilities(self) -> Capabilities:
-        """What the vehicle can do, told before it is opened. Actions not named are done in software if possible."""
+        """Return what the vehicle can do.
+
+        May be called before :meth:`open`. The proxy emulates actions that are not named in software where it can.
+        """
 
     def parameters(self) -> list[Parameter]:
-        """The vehicle's own parameters with their present values. Names are dotted and lower-case."""
+        """Return the vehicle's own parameters with their present values. Names are dotted and lower-case."""
         return []
 
     def set_parameter(self, name: str, value: Value) -> Value:  # noqa: ARG002
         """Write one parameter and return the value that is now in force.
 
-        The type and range were checked against :meth:`parameters`. Called on the proxy's thread of requests, may take
-        up to a second. Raises :class:`ParameterError` with the vehicle's own reason if it refuses.
+        Called on the proxy's request thread; may take up to a second.
+
+        Args:
+            name: A name that :meth:`parameters` lists.
+            value: Type and range were checked against :meth:`parameters`.
+
+        Returns:
+            The value in force, which a vehicle may have rounded.
+
+        Raises:
+            ParameterError: The vehicle refuses it; with the vehicle's own reason.
         """
         raise ParameterError(f"{name} cannot be written", code=Refusal.READ_ONLY)
 
     # Life cycle ------------------------------------------------------------------------------------------------
 
     def open(self, sink: Sink) -> None:
-        """Start to talk to the vehicle; returns at once, the link's state goes to the sink.
+        """Start to talk to the vehicle. Returns at once; the state of the link goes to the sink.
 
-        A vehicle that is not there is no error: the driver goes on trying. Raises :class:`UsageError` or
-        :class:`skyloop.errors.MissingExtraError` only for what trying again can't mend.
+        A vehicle that does not answer is no error: the driver keeps trying.
+
+        Args:
+            sink: Receives everything that the vehicle reports, until :meth:`close` returns.
+
+        Raises:
+            UsageError: The driver is open already, or for something else that trying again can't mend.
+            MissingExtraError: A package that this vehicle needs is not installed.
         """
         with self._lock:
             if self._sink is not None:
@@ -137,7 +203,10 @@ class Driver(ABC):
             raise
 
     def close(self) -> None:
-        """Stop threads and give resources back. Idempotent. Does not land: the proxy does that before."""
+        """Stop threads and release resources. Idempotent.
+
+        Does not land the vehicle: the proxy does that before. The sink is not called after it returns.
+        """
         with self._lock:
             was_open, self._sink = self._sink is not None, None
         if was_open:
@@ -145,18 +214,47 @@ class Driver(ABC):
 
     # Flying ----------------------------------------------------------------------------------------------------
 
-    def apply(self, action: AnyAction) -> AnyAction:
-        """Make the vehicle do it, until the next call; returns what was really applied (after the vehicle's limits).
+    def apply(self, action: AnyAction, *, new: bool = True) -> AnyAction:
+        """Make the vehicle perform an action until the next call.
 
-        Only actions named in :meth:`capabilities` come here, with finite numbers; one call at a time; must not block
-        longer than a few milliseconds. May raise :class:`skyloop.errors.DriverError`.
+        Must not block longer than a few milliseconds. The proxy makes one call at a time, with actions that
+        :meth:`capabilities` names and with finite numbers.
+
+        Args:
+            action: A set-point or a one-time action.
+            new: Whether an application newly asked for it. If not, it is the library's repeat of an earlier request, or
+                what became of one, and keeps in force what is in force: it never takes the vehicle back from somebody
+                else.
+
+        Returns:
+            What was applied, after the vehicle's limits.
+
+        Raises:
+            DriverError: The vehicle can't do it; the text is shown to people.
         """
-        return self._apply(action)
+        return self._apply(action) if new else self._repeat(action)
+
+    def left_to(self) -> str:
+        """Return what others made of the vehicle since it was last commanded from here, such as ``RTL``.
+
+        For vehicles that report it. The proxy asks several times a second and leaves alone what others fly; a new
+        action takes the vehicle over and ends this. May be called from any thread; returns at once.
+
+        Returns:
+            The driver's word for it, empty if nothing was changed.
+        """
+        return ""
 
     def failsafe(self, action: Hover | Land) -> bool:
-        """Do this with nobody at the controls. Never raises: a failure is told as an event, and the proxy tries again.
+        """Apply an action while nobody is in command. Never raises.
 
-        Returns whether the driver took it.
+        A failure is emitted as an event, and the proxy tries again.
+
+        Args:
+            action: Hover or land.
+
+        Returns:
+            Whether the driver accepted it.
         """
         sink = self._sink
         try:
@@ -170,15 +268,24 @@ class Driver(ABC):
     # What some vehicles can do besides ---------------------------------------------------------------------------
 
     def external_pose(self, pose: ExternalPose) -> None:  # noqa: ARG002
-        """Tell the vehicle where motion capture saw it, for flight without GPS. Any thread; returns at once.
+        """Send the vehicle its pose as motion capture measured it, for flight without GPS.
 
-        Raises :class:`UnsupportedError` for a vehicle that takes none, :class:`skyloop.errors.DriverError` while it
-        can't be told.
+        May be called from any thread; returns at once.
+
+        Args:
+            pose: Position and orientation in world axes.
+
+        Raises:
+            UnsupportedError: The vehicle accepts no poses from outside.
+            DriverError: The pose can't be sent now.
         """
         raise UnsupportedError(f"{self.uri.scheme}:// takes no poses from outside")
 
     def checkup(self) -> list[Remark]:
-        """What of the vehicle's settings wants attention before flying, for ``skyloop doctor ADDRESS``. While open."""
+        """Return which of the vehicle's settings need attention before flying, for ``skyloop doctor ADDRESS``.
+
+        Called while the driver is open.
+        """
         return []
 
     # To be written by a driver ---------------------------------------------------------------------------------
@@ -192,9 +299,21 @@ class Driver(ABC):
     def _apply(self, action: AnyAction) -> AnyAction:
         raise UsageError(f"{self.uri.scheme} takes no {action.name}")
 
+    def _repeat(self, action: AnyAction) -> AnyAction:
+        """Apply a repeat; see :meth:`apply`. Override it where somebody else may fly the vehicle too."""
+        return self._apply(action)
+
 
 def reject_unknown_options(uri: VehicleUri, known: set[str]) -> None:
-    """Raise :class:`UnknownNameError` for an option of the URI that is not in ``known``."""
+    """Raise an error for an option of the URI that the driver does not know.
+
+    Args:
+        uri: The vehicle's address.
+        known: Every option that the driver reads.
+
+    Raises:
+        UnknownNameError: For the first option that is not in ``known``.
+    """
     for name in uri.options:
         if name not in known:
             raise UnknownNameError(f"option of {uri.scheme}://", name, known)

@@ -1,5 +1,8 @@
-"""A camera's intrinsics as options of a vehicle's address: ``calibration``, the file of one, or ``fx``, ``fy``, ``cx``,
-``cy`` [px] and ``distortion``."""
+"""A camera's intrinsics as options of a vehicle's address.
+
+``calibration`` names the file of a calibration; or ``fx``, ``fy``, ``cx``, ``cy`` [px] and ``distortion``
+(k1, k2, p1, p2[, k3[, k4, k5, k6]]) give the numbers.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,11 @@ INTRINSICS_OPTIONS: Final = frozenset({"calibration", "fx", "fy", "cx", "cy", "d
 
 
 def check_intrinsics(uri: VehicleUri) -> None:
-    """Raises :class:`UsageError` for intrinsics that make no sense."""
+    """Check the intrinsics of an address.
+
+    Raises:
+        UsageError: An option makes no sense, options don't go together, or the calibration can't be read.
+    """
     if "calibration" in uri.options:
         _calibration(uri)
     else:
@@ -22,8 +29,19 @@ def check_intrinsics(uri: VehicleUri) -> None:
 
 
 def intrinsics_of(uri: VehicleUri, width: int, height: int) -> Intrinsics | None:
-    """Those of the address for pictures of this size; None unless it gives the focal length, or a calibration of
-    pictures of this shape."""
+    """Return the intrinsics of an address for frames of a size.
+
+    Args:
+        uri: The vehicle's address.
+        width: [px]
+        height: [px]
+
+    Returns:
+        None unless the address gives the focal length, or a calibration made with frames of this shape.
+
+    Raises:
+        UsageError: An option makes no sense, options don't go together, or the calibration can't be read.
+    """
     if "calibration" in uri.options:
         calibration = _calibration(uri)
         return calibration.intrinsics_for(width, height) if calibration.fits(width, height) else None

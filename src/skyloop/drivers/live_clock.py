@@ -1,4 +1,4 @@
-"""Stamps of a live stream's own clock, mapped to this host's clock. Pure."""
+"""Maps the stamps of a live stream's own clock to this host's clock. Pure."""
 
 from __future__ import annotations
 
@@ -6,10 +6,13 @@ from skyloop.clock import nanoseconds
 
 
 class LiveClock:
-    """Maps a live stream's stamps to this host's clock: the smallest delay seen lately is taken for no delay.
+    """Maps a live stream's stamps to this host's clock, taking the smallest delay seen lately for no delay.
 
-    A stream whose clock runs a little slower is followed through two windows of ``window_s``, one of which is always
-    complete. Times run neither backwards nor ahead.
+    A stream whose clock runs a little slower is followed through two windows, one of which is always complete. Times
+    run neither backwards nor ahead.
+
+    Args:
+        window_s: Length of a window [s].
     """
 
     def __init__(self, window_s: float = 5.0) -> None:
@@ -20,7 +23,12 @@ class LiveClock:
         self._begun_ns = 0
 
     def captured_ns(self, stamp_s: float, arrived_ns: int) -> int:
-        """When the picture of this stamp, which came at ``arrived_ns``, was taken; never later than that."""
+        """Return when a picture was captured, never later than it arrived.
+
+        Args:
+            stamp_s: On the stream's clock [s]. A step back voids what was learned.
+            arrived_ns: On this host's monotonic clock.
+        """
         stamp_ns = nanoseconds(stamp_s)
         if stamp_ns < self._stamp_ns:  # the stream's clock was set back: what was learned is void
             self._before_ns = self._smallest_ns = None

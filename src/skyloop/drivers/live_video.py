@@ -1,7 +1,7 @@
 """Receives a vehicle's live video, decodes it, and shows the newest picture.
 
-Two threads: one takes frames off the socket at once, so that no picture grows old in a buffer of the kernel, and makes
-the connection anew for ever when it is lost; the other decodes what is wanted. Between them stands the
+Two threads: one reads frames from the socket at once, so that no picture grows old in a buffer of the kernel, and
+reconnects for ever; the other decodes what is wanted. Between them stands the
 :class:`~skyloop.drivers.backlog.Backlog`, which decides what is left out when decoding is late.
 """
 
@@ -23,16 +23,16 @@ from skyloop.errors import UnsupportedError, UsageError
 from skyloop.messages import EventKind, Intrinsics, Severity, Value
 
 RETRY_S: Final = (0.25, 0.5, 1.0, 2.0)  #: waits between attempts to connect; the last one is repeated
-REFUSALS: Final = 3  #: frames in a row of a codec that is not decoded, before it is told; one may be a flipped bit
+REFUSALS: Final = 3  #: frames in a row of an unsupported codec before it is reported; one may be a flipped bit
 _CLOSE_S: Final = 2.0
 
 
 class Decoded(NamedTuple):
-    """A picture that a decoder gave."""
+    """A picture that a decoder made."""
 
     number: int  #: counts the vehicle's pictures
     pixels: NDArray[np.uint8]  #: BGR, (height, width, 3), C-contiguous
-    captured_ns: int | None = None  #: None: when the frame was that was decoded last
+    captured_ns: int | None = None  #: None: as the frame that was decoded last
 
 
 class Stream(Protocol):
@@ -40,16 +40,19 @@ class Stream(Protocol):
 
     @property
     def broken(self) -> int:
-        """Frames that were begun and broken off, or stale."""
+        """Frames that were begun and not finished, or stale."""
 
     @property
     def lost_bytes(self) -> int:
         """Bytes that belong to no whole frame."""
 
     def read(self) -> list[Coded]:
-        """The frames that came, after a tenth of a second at most if it can: :meth:`LiveVideo.stop` waits for it.
+        """Return the frames that arrived.
 
-        Raises OSError once the connection is lost.
+        Returns after a tenth of a second at most if it can: :meth:`LiveVideo.stop` waits for it.
+
+        Raises:
+            OSError: The connection is lost.
         """
 
     def close(self) -> None: ...
@@ -60,19 +63,27 @@ class Decoder(Protocol):
 
     @property
     def waited(self) -> int:
-        """Frames left out because what they build on was never seen, or because a newer one was shown before."""
+        """Frames left out because what they build on was never received, or because a newer one was shown before."""
 
     @property
     def damaged(self) -> int:
         """Frames that could not be decoded."""
 
     def restart(self) -> None:
-        """What comes next does not continue what came before."""
+        """Forget the stream so far: the next frame does not continue it."""
 
     def decode(self, coded: Coded, *, show: bool) -> Decoded | None:
-        """The picture of this frame; None if there is none, or it is not to be shown.
+        """Decode a frame. Raises nothing else, whatever a frame holds.
 
-        Raises :class:`UnsupportedError` for what is not decoded here, and nothing else for what a frame holds.
+        Args:
+            coded: The frame.
+            show: Whether its picture is wanted.
+
+        Returns:
+            The picture; None if there is none, or it is not wanted.
+
+        Raises:
+            UnsupportedError: The codec is not supported.
         """
 
 
@@ -87,20 +98,32 @@ class Picture:
     number: int  #: counts the vehicle's pictures, 32 bits
 
     def show(self, sink: Sink, camera: str, intrinsics: Intrinsics | None) -> None:
-        """Give it to the proxy."""
+        """Publish it as a frame of a camera.
+
+        Args:
+            sink: The proxy's.
+            camera: Its name.
+            intrinsics: For this size, None if they are not known.
+        """
         sink.frame(camera, self.pixels, self.captured_ns, width=self.width, height=self.height, intrinsics=intrinsics)
 
 
 class Notice(Enum):
-    """What a receiver tells beside pictures."""
+    """What a receiver reports besides pictures."""
 
     STREAMING = "streaming"  #: frames come
-    LOST = "lost"  #: no connection, or no more; told once for each reason, tried again for ever
-    UNSUPPORTED = "unsupported"  #: frames come in another codec, or are noise; told once a row of them
-    FAULT = "fault"  #: an error of this program, told once; it goes on
+    LOST = "lost"  #: no connection, or no more; reported once for each reason, tried again for ever
+    UNSUPPORTED = "unsupported"  #: frames come in another codec, or are noise; reported once for each row of them
+    FAULT = "fault"  #: an error of this program, reported once; the video goes on
 
     def tell(self, sink: Sink, where: str, text: str) -> None:
-        """An event, of the video or the camera."""
+        """Emit it as an event.
+
+        Args:
+            sink: The proxy's.
+            where: What it is about, such as the video or a camera.
+            text: For people.
+        """
         kind, severity = _EVENTS[self]
         sink.event(kind, f"{where} {self.value}: {text}", severity, where=where)
 
@@ -127,15 +150,30 @@ class VideoCounters:
     reconnects: int = 0  #: connections on which frames came, after the first such
 
     def telemetry(self, of: str) -> dict[str, Value]:
-        """For feedback's ``native``: each counter under its name behind ``of`` and a point."""
+        """Return the counters for feedback's ``native``.
+
+        Args:
+            of: Prefix of their names, before a dot.
+        """
         return {f"{of}.{name}": getattr(self, name) for name in self.__dataclass_fields__}
 
 
 class LiveVideo:
-    """The video of one vehicle. ``show`` and ``told`` are called from its threads, and must return quickly.
+    """The video of one vehicle.
 
-    ``wants`` says whether anybody looks. While nobody does nothing is decoded, but the stream is read on and the frames
-    since its newest key frame are kept, so that a picture is there with the first frame after somebody looks.
+    While nobody wants pictures nothing is decoded, but the stream is read and the frames since its newest key frame are
+    kept, so that a picture is there with the first frame after somebody does. No I/O happens before :meth:`start`.
+
+    Args:
+        place: Where the video comes from, for people.
+        connect: Opens the connection of this number, counted from 0; raises OSError if it can't. On the reading thread.
+        make_decoder: Makes the decoder; raises MissingExtraError if none is installed. On the thread of :meth:`start`.
+        show: Called with each picture on the decoding thread; must return quickly.
+        told: Called with each notice and its text on either thread; must return quickly.
+        wants: Whether anybody wants pictures. Called on the reading thread.
+        came: Called with every whole frame as it arrived, on the reading thread.
+        clock: Monotonic, ns.
+        name: Of the reading thread, and the beginning of the decoding one's.
     """
 
     def __init__(
@@ -151,11 +189,7 @@ class LiveVideo:
         clock: Clock = monotonic_ns,
         name: str = "video",
     ) -> None:
-        """No I/O. ``place`` is for people.
-
-        ``connect`` makes the connection of this number, and raises OSError if it can't. ``came`` gets every whole frame
-        as it came, on the reading thread.
-        """
+        """Store the arguments. No I/O."""
         self._place = place
         self._connect = connect
         self._make_decoder = make_decoder
@@ -176,7 +210,12 @@ class LiveVideo:
         self._threads: list[threading.Thread] = []
 
     def start(self) -> None:
-        """Returns at once. Raises :class:`skyloop.errors.MissingExtraError` if no decoder is installed."""
+        """Start both threads. Returns at once.
+
+        Raises:
+            UsageError: It was started before.
+            MissingExtraError: No decoder is installed.
+        """
         if self._threads:
             raise UsageError("this receiver was started before")
         self._decoder = self._make_decoder()
@@ -188,9 +227,9 @@ class LiveVideo:
             thread.start()
 
     def stop(self) -> None:
-        """Ends both threads. Idempotent; after it neither callback is called, unless it is called from one.
+        """Stop both threads. Idempotent; no callback is called after it, unless it is called from one.
 
-        Takes up to 4 s; a connection that is being made or read for longer is left to end by itself, unseen.
+        Takes up to 4 s; a connection that takes longer to open or read is left to end by itself, unseen.
         """
         self._stop.set()
         with self._came:
@@ -201,7 +240,7 @@ class LiveVideo:
 
     @property
     def counters(self) -> VideoCounters:
-        """So far; from any thread."""
+        """The counters so far; from any thread."""
         with self._came:
             stream, decoder = self._stream, self._decoder
             return VideoCounters(
@@ -239,7 +278,11 @@ class LiveVideo:
             failures += 1
 
     def _follow(self) -> None:
-        """One connection, from beginning to end. Raises OSError when it ends otherwise than by :meth:`stop`."""
+        """Serve one connection from beginning to end.
+
+        Raises:
+            OSError: It ended otherwise than by :meth:`stop`.
+        """
         stream = self._connect(self._connections)
         with self._came:
             self._stream = stream
@@ -303,7 +346,7 @@ class LiveVideo:
                     self._tell(Notice.FAULT, said)
 
     def _next(self) -> tuple[Coded, bool] | None:
-        """Waits for a frame while pictures are wanted; the frame, and whether to show it. None after :meth:`stop`."""
+        """Wait for a frame while pictures are wanted. Return it and whether to show it; None after :meth:`stop`."""
         with self._came:
             self._came.wait_for(lambda: self._stop.is_set() or (self._wanted and len(self._backlog)))
             return None if self._stop.is_set() else self._backlog.take(self._clock())

@@ -1,4 +1,4 @@
-"""Something for the sink's ``event``."""
+"""Events that a session has for the sink."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from skyloop.messages import EventKind, Severity, Value
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """What is told, to whom it may concern."""
+    """An event, with the arguments of :meth:`skyloop.drivers.base.Sink.event`."""
 
     kind: EventKind
     text: str
@@ -18,5 +18,12 @@ class Notice:
 
 
 def message(text: str, reason: str, severity: Severity = Severity.INFO, **data: Value) -> Notice:
-    """Of the vehicle itself, with a word for programs."""
+    """Return a message of the vehicle itself.
+
+    Args:
+        text: For people.
+        reason: One word for programs, in the event's data.
+        severity: For people and for filters.
+        **data: More for programs.
+    """
     return Notice(EventKind.VEHICLE_MESSAGE, text, severity, {"reason": reason, **data})

@@ -1,4 +1,4 @@
-"""A sink that keeps what a driver tells and checks each piece as it comes."""
+"""A sink for tests that keeps what a driver reports and checks each piece as it comes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,19 @@ _CHANNELS = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
 
 @dataclass(frozen=True, slots=True)
 class SeenFrame:
-    """A frame as it was handed over; ``pixels`` is a copy, shape (h, w, 3), (h, w) or (bytes,) for JPEG."""
+    """A frame as the driver handed it over.
+
+    Args:
+        camera: Its name.
+        pixels: A copy, uint8, shape (height, width, 3), (height, width), or (bytes,) for JPEG; empty if it was
+            malformed or pixels are not kept.
+        captured_ns: As the driver gave it.
+        arrived_ns: When the call came. Both on this host's monotonic clock.
+        width: [px]
+        height: [px]
+        encoding: Of the pixels.
+        intrinsics: As the driver gave them.
+    """
 
     camera: str
     pixels: NDArray[np.uint8]
@@ -34,7 +46,7 @@ class SeenFrame:
 
 @dataclass(frozen=True, slots=True)
 class SeenPicture:
-    """A picture as the vehicle encoded it."""
+    """A picture as the vehicle encoded it, with the arguments of :meth:`skyloop.drivers.base.Sink.stream`."""
 
     camera: str
     data: bytes
@@ -47,6 +59,8 @@ class SeenPicture:
 
 @dataclass(frozen=True, slots=True)
 class SeenEvent:
+    """An event, with the arguments of :meth:`skyloop.drivers.base.Sink.event`."""
+
     kind: EventKind
     text: str
     severity: Severity
@@ -54,10 +68,15 @@ class SeenEvent:
 
 
 class RecordingSink:
-    """Keeps the newest ``keep`` feedback samples and frames, every link state and event, and counts all.
+    """A :class:`skyloop.drivers.base.Sink` that keeps recent samples and frames and every link state, and counts all.
 
-    ``problems`` holds, in words, whatever broke the contract of :class:`skyloop.drivers.base.Sink`. Looks at every
-    camera unless ``watch`` names the ones to look at; takes pictures as they come while ``record`` is set.
+    ``problems`` holds, in words, whatever broke the contract of :class:`skyloop.drivers.base.Sink`. Thread-safe.
+
+    Args:
+        watch: Names of the cameras whose frames are wanted; None: all.
+        keep: How many feedback samples, frames, pictures and events are kept; of frames with pixels at most 64.
+        keep_pixels: Whether frames keep a copy of their pixels.
+        record: Whether encoded pictures are wanted, of every camera.
     """
 
     def __init__(
@@ -69,6 +88,7 @@ class RecordingSink:
         self.feedbacks: deque[Feedback] = deque(maxlen=keep)
         self.frames: deque[SeenFrame] = deque(maxlen=keep if not keep_pixels else min(keep, 64))
         self.links: list[tuple[LinkState, str]] = []
+        self.remedy = ""  #: of the newest link state
         self.events: deque[SeenEvent] = deque(maxlen=keep)
         self.problems: list[str] = []
         self.calls = 0
@@ -81,6 +101,7 @@ class RecordingSink:
     # What a driver calls ---------------------------------------------------------------------------------------
 
     def feedback(self, feedback: Feedback) -> None:
+        """Keep a sample, and note a problem if its time is in the future or runs backwards."""
         now_ns = monotonic_ns()
         with self._changed:
             self._check_time("feedback", feedback.captured_ns, now_ns)
@@ -99,6 +120,7 @@ class RecordingSink:
         encoding: Encoding = Encoding.BGR8,
         intrinsics: Intrinsics | None = None,
     ) -> None:
+        """Keep a frame, and note a problem if its time or its pixels break the contract."""
         now_ns = monotonic_ns()
         with self._changed:
             self._check_time(f"frame of {camera}", captured_ns, now_ns)
@@ -109,6 +131,7 @@ class RecordingSink:
             self._tell()
 
     def wants(self, camera: str) -> bool:
+        """Return whether the camera is in ``watch``, or True if that is None."""
         return self.watch is None or camera in self.watch
 
     def stream(
@@ -122,6 +145,7 @@ class RecordingSink:
         key: bool,
         intrinsics: Intrinsics | None = None,
     ) -> None:
+        """Keep an encoded picture, and note a problem if the first one is no key picture or it is no Annex B."""
         now_ns = monotonic_ns()
         with self._changed:
             self._check_time(f"picture of {camera}", captured_ns, now_ns)
@@ -133,14 +157,18 @@ class RecordingSink:
             self._tell()
 
     def wants_stream(self, camera: str) -> bool:  # noqa: ARG002  (of all cameras or of none)
+        """Return ``record``."""
         return self.record
 
-    def link(self, state: LinkState, reason: str = "") -> None:
+    def link(self, state: LinkState, reason: str = "", remedy: str = "") -> None:
+        """Keep a link state with its reason."""
         with self._changed:
             self.links.append((LinkState(state), reason))
+            self.remedy = remedy
             self._tell()
 
     def event(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: Value) -> None:
+        """Keep an event."""
         with self._changed:
             self.events.append(SeenEvent(EventKind(kind), text, Severity(severity), data))
             self._tell()
@@ -149,16 +177,24 @@ class RecordingSink:
 
     @property
     def newest(self) -> Feedback | None:
-        """The newest feedback."""
+        """The newest feedback, None while there was none."""
         return self.feedbacks[-1] if self.feedbacks else None
 
     @property
     def link_state(self) -> LinkState | None:
-        """The newest state of the link, None while nothing was told."""
+        """The newest state of the link, None while none was reported."""
         return self.links[-1][0] if self.links else None
 
     def wait(self, condition: Callable[[], bool], timeout_s: float) -> bool:
-        """Wait until the condition holds; looked at whenever the driver told something. False on time-out."""
+        """Wait until a condition holds.
+
+        Args:
+            condition: Called after each of the driver's calls, with the sink's lock held.
+            timeout_s: [s]
+
+        Returns:
+            Whether it held; False after the time-out.
+        """
         end = time.monotonic() + timeout_s
         with self._changed:
             while not condition():
@@ -202,7 +238,7 @@ class RecordingSink:
         return pixels.reshape((height, width, 3) if channels == 3 else (height, width)).copy()
 
 
-#: What a number of feedback may be at most, in its unit: beyond it, it is most likely in another unit.
+#: Plausible range of each number of feedback, in its unit: outside of it, it is most likely in another unit.
 PLAUSIBLE: dict[str, tuple[float, float]] = {
     "battery": (0.0, 1.0),
     "battery_v": (0.0, 60.0),
@@ -218,7 +254,14 @@ PLAUSIBLE: dict[str, tuple[float, float]] = {
 
 
 def implausible(feedback: Feedback) -> list[str]:
-    """What is not finite, or so large that it must be in another unit, in words."""
+    """Check a sample for numbers that are not finite or so large that they must be in another unit.
+
+    Args:
+        feedback: The sample.
+
+    Returns:
+        The problems in words, empty if there are none.
+    """
     problems = []
     for name, (low, high) in PLAUSIBLE.items():
         value = getattr(feedback, name)

@@ -1,6 +1,6 @@
 """Finds drivers by the entry-point group ``skyloop.drivers``: the entry point's name is the URI scheme.
 
-A driver's module is imported when a vehicle of its scheme is asked for, and not before.
+A driver's module is imported only when a vehicle of its scheme is asked for.
 """
 
 from __future__ import annotations
@@ -17,15 +17,20 @@ GROUP: Final = "skyloop.drivers"
 
 
 def known_schemes() -> list[str]:
-    """The schemes that an installed package claims, sorted. Imports no driver."""
+    """Return the schemes that installed packages claim, sorted. Imports no driver."""
     return sorted(_claims())
 
 
 def driver_class(scheme: str) -> type[Driver]:
-    """The class of driver for a scheme, imported now.
+    """Import and return the driver class for a scheme.
 
-    Raises :class:`UnknownNameError` for a scheme that nobody claims and :class:`DriverError` for one that two
-    packages claim or whose class cannot be had; both name the packages.
+    Args:
+        scheme: Such as ``ardrone``.
+
+    Raises:
+        UnknownNameError: No installed package claims the scheme.
+        DriverError: Two packages claim it, or the class can't be loaded; the text names the packages.
+        MissingExtraError: A package that the driver needs is not installed.
     """
     claims = _claims()
     if scheme not in claims:
@@ -38,9 +43,16 @@ def driver_class(scheme: str) -> type[Driver]:
 
 
 def make_driver(uri: str | VehicleUri) -> Driver:
-    """A driver for a vehicle's address, not yet opened.
+    """Return a driver for a vehicle's address, not opened.
 
-    Raises :class:`UsageError` for an address or option that makes no sense, and what :func:`driver_class` raises.
+    Args:
+        uri: The address, as text or parsed.
+
+    Raises:
+        UsageError: The address or one of its options makes no sense.
+        UnknownNameError: No installed package claims the scheme.
+        DriverError: Two packages claim the scheme, or the class can't be loaded.
+        MissingExtraError: A package that the driver needs is not installed.
     """
     parsed = parse_uri(uri) if isinstance(uri, str) else uri
     return driver_class(parsed.scheme)(parsed)
@@ -49,7 +61,7 @@ def make_driver(uri: str | VehicleUri) -> Driver:
 def _claims() -> dict[str, list[EntryPoint]]:
     claims: dict[str, dict[tuple[str, str], EntryPoint]] = defaultdict(dict)
     for entry in entry_points(group=GROUP):
-        # One package may be found twice, through two folders of the path; that is no second claim.
+        # One package may be found twice, in two folders of sys.path; that is no second claim.
         claims[entry.name][entry.value, _package(entry)] = entry
     return {scheme: list(found.values()) for scheme, found in claims.items()}
 
@@ -57,7 +69,7 @@ def _claims() -> dict[str, list[EntryPoint]]:
 def _load(entry: EntryPoint) -> type[Driver]:
     try:
         loaded = entry.load()
-    except SkyloopError:  # says already what is missing and how to install it
+    except SkyloopError:  # its text names what is missing and how to install it
         raise
     except Exception as error:
         raise DriverError(f"the driver for {entry.name}:// of {_owner(entry)} cannot be loaded: {error!r}") from error

@@ -1,4 +1,4 @@
-"""What some drivers can do besides flying: take poses from outside, and say what of their vehicle wants attention."""
+"""What some drivers can do besides flying: accept poses from outside, and check their vehicle's settings."""
 
 from __future__ import annotations
 
@@ -13,11 +13,15 @@ from skyloop.messages import Vector
 class ExternalPose:
     """Where something outside of the vehicle, such as motion capture, saw it.
 
-    ``position``: of the body's origin in world axes, x east, y north, z up [m]. ``quaternion``: w, x, y, z, from body
-    axes (forward, left, up) to world axes. ``captured_ns``: when it was so, on this host's monotonic clock.
-    ``position_std_m`` and ``attitude_std_rad``: standard deviations, None where they are not known.
+    Args:
+        position: Of the body's origin in world axes, x east, y north, z up [m].
+        quaternion: (w, x, y, z), rotates body axes (x forward, y left, z up) to world axes.
+        captured_ns: When it was measured, on this host's monotonic clock.
+        position_std_m: Standard deviation of the position [m], None if it is not known.
+        attitude_std_rad: Standard deviation of the orientation [rad], None if it is not known.
 
-    Raises :class:`UsageError` for a number that is not finite and for a quaternion that is no rotation.
+    Raises:
+        UsageError: A number is not finite, or the quaternion's length differs from 1 by more than 0.001.
     """
 
     position: Vector
@@ -36,7 +40,14 @@ class ExternalPose:
 
 @dataclass(frozen=True, slots=True)
 class Remark:
-    """Something about a vehicle's settings that a person may want to know before flying. ``advice``: what to do."""
+    """Something about a vehicle's settings that a person may want to know before flying.
+
+    Args:
+        what: What was examined.
+        good: Whether it is as it should be.
+        detail: What was found.
+        advice: What to do about it, empty if nothing.
+    """
 
     what: str
     good: bool

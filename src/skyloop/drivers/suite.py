@@ -7,7 +7,7 @@
     class TestMyDriver(DriverSuite):
         uri = "mydrone://127.0.0.1?port=5556"
 
-The vehicle of that address must be there and, if it can fly, stand on the ground with room around it: the suite takes
+The vehicle at that address must answer and, if it can fly, stand on the ground with room around it: the suite takes
 off, moves about a metre along each axis, turns, and lands. **Never run it against a real vehicle that is not tied
 down or netted in.** A vehicle that can't fly is not asked to.
 
@@ -59,7 +59,11 @@ _PARAMETER_NAME: Final = re.compile(r"[a-z0-9_]+(\.[a-z0-9_]+)*\Z")
 
 
 class DriverSuite:
-    """Base class of a driver's tests. Set :attr:`uri`, or write :meth:`make`; the rest has sensible defaults."""
+    """Base class of a driver's tests. Set :attr:`uri`, or override :meth:`make`; everything else has a default.
+
+    Override the class attributes below for a vehicle that is slower or moves less, and :meth:`vehicle_disappears` and
+    :meth:`vehicle_appears` to have the loss of the link tested.
+    """
 
     #: The address of the vehicle to test with.
     uri: ClassVar[str] = ""
@@ -75,7 +79,8 @@ class DriverSuite:
     lost_timeout_s: ClassVar[float] = 5.0
     close_grace_s: ClassVar[float] = 2.0  #: for threads that were joined to vanish from the system's tables
 
-    #: What the flight test asks for: speeds [m/s], tilt [rad], turn [rad/s]; how far the vehicle must go [m], [rad].
+    #: What the flight test commands: speed and climb [m/s], tilt [rad], yaw rate [rad/s]; how far the vehicle must go
+    #: (distance [m]) and turn [rad].
     speed: ClassVar[float] = 0.4
     climb: ClassVar[float] = 0.4
     tilt: ClassVar[float] = 0.08
@@ -83,7 +88,7 @@ class DriverSuite:
     distance: ClassVar[float] = 0.15
     turn: ClassVar[float] = 0.2
 
-    #: A sample or frame may be this old when it comes [s].
+    #: How old a sample or frame may be when it arrives [s].
     feedback_age_s: ClassVar[float] = 0.5
     frame_age_s: ClassVar[float] = 1.0
 
@@ -93,25 +98,50 @@ class DriverSuite:
     # To be written or overridden by whoever tests a driver ---------------------------------------------------------
 
     def make(self, uri: VehicleUri) -> Driver:
-        """A new driver, not opened. The default finds it by its entry point."""
+        """Return a new driver, not opened. The default finds its class by the entry point of the URI's scheme.
+
+        Args:
+            uri: The address of the vehicle to test with, or one with an option that must be refused.
+        """
         return make_driver(uri)
 
     def vehicle_disappears(self) -> None:
-        """Take the vehicle away from the driver that is open (switch off its radio, kill its emulator)."""
+        """Take the vehicle away from the open driver: switch off its radio, or stop its emulator.
+
+        Raises:
+            unittest.SkipTest: Unless overridden.
+        """
         raise unittest.SkipTest("this suite does not know how to make the vehicle disappear")
 
     def vehicle_appears(self) -> None:
-        """Bring it back."""
+        """Bring the vehicle back.
+
+        Raises:
+            unittest.SkipTest: Unless overridden.
+        """
         raise unittest.SkipTest("this suite does not know how to make the vehicle appear")
 
     # Helpers -------------------------------------------------------------------------------------------------------
 
     def new_driver(self) -> Driver:
+        """Return a new driver for :attr:`uri`, not opened."""
         return self.make(parse_uri(self.uri))
 
     @contextmanager
     def opened(self, *, watch: set[str] | None = None, record: bool = False) -> Iterator[tuple[Driver, RecordingSink]]:
-        """A driver whose link is up and its sink; closed at the end, and its sink's complaints raised."""
+        """Open a driver with a checking sink, wait until its link is up, and close it at the end.
+
+        Args:
+            watch: Names of the cameras whose frames are wanted; None: all.
+            record: Whether encoded pictures are wanted.
+
+        Yields:
+            The open driver and its sink.
+
+        Raises:
+            AssertionError: The link was not reported UP within :attr:`connect_timeout_s`, or, at the end, the driver
+                broke the contract of :class:`skyloop.drivers.base.Sink`.
+        """
         driver, sink = self.new_driver(), RecordingSink(watch=watch, record=record)
         driver.open(sink)
         try:
@@ -125,6 +155,7 @@ class DriverSuite:
     # Before it is opened -------------------------------------------------------------------------------------------
 
     def test_constructor_does_no_io(self) -> None:
+        """A constructor starts no thread and opens no descriptor, and closing what was never opened does nothing."""
         self.new_driver()  # imports and caches of the first time are no resource of the driver
         before = _resources()
         drivers = [self.new_driver() for _ in range(3)]
@@ -133,6 +164,7 @@ class DriverSuite:
             driver.close()  # closing what was never opened does nothing
 
     def test_capabilities_before_open(self) -> None:
+        """Capabilities are known before the driver is opened and make sense."""
         capabilities = self.new_driver().capabilities()
         assert capabilities.vehicle, "capabilities need the vehicle's family name"
         unknown = capabilities.actions - set(ACTION_NAMES.values())
@@ -149,6 +181,7 @@ class DriverSuite:
                 _check_rotation(camera.name, camera.rotation)
 
     def test_unknown_option_is_refused(self) -> None:
+        """The constructor refuses an option that the driver does not know, and names it."""
         good = parse_uri(self.uri)
         options = {**good.options, "no_such_option_at_all": "1"}
         try:
@@ -162,6 +195,7 @@ class DriverSuite:
     # Life cycle ----------------------------------------------------------------------------------------------------
 
     def test_close_is_idempotent_and_final(self) -> None:
+        """A second close does nothing, and the sink is not called after the first."""
         with self.opened() as (driver, sink):
             sink.wait(lambda: sink.feedback_count > 0, self.feedback_timeout_s)
             driver.close()
@@ -171,6 +205,7 @@ class DriverSuite:
             assert sink.calls == calls, "the driver called its sink after close()"
 
     def test_open_twice_is_refused(self) -> None:
+        """Opening an open driver raises UsageError."""
         with self.opened() as (driver, _):
             try:
                 driver.open(RecordingSink())
@@ -179,6 +214,7 @@ class DriverSuite:
             raise AssertionError("opening a driver that is open must raise UsageError")
 
     def test_can_be_opened_again(self) -> None:
+        """A driver that was closed can be opened again with another sink."""
         driver = self.new_driver()
         for _ in range(2):
             sink = RecordingSink()
@@ -188,6 +224,7 @@ class DriverSuite:
             assert up, f"the link was not told UP; told: {sink.links}"
 
     def test_gives_threads_and_descriptors_back(self) -> None:
+        """Opening and closing leaves no threads or descriptors behind."""
         with self.opened() as (_, sink):  # what libraries keep for themselves is kept from here on
             self.hear(sink)
         gc.collect()
@@ -201,9 +238,10 @@ class DriverSuite:
             time.sleep(0.02)
         assert not _exceeds(_resources(), before), f"threads and descriptors: {before} before, {_resources()} after"
 
-    # What it tells -------------------------------------------------------------------------------------------------
+    # What it reports -----------------------------------------------------------------------------------------------
 
     def test_feedback(self) -> None:
+        """Feedback comes, is recent, plausible in SI units, and leaves the proxy's fields alone."""
         with self.opened() as (_, sink):
             arrived = sink.wait(lambda: sink.feedback_count >= 10, self.feedback_timeout_s + 5.0)
             assert arrived, f"{sink.feedback_count} samples of feedback in {self.feedback_timeout_s + 5.0} s"
@@ -219,6 +257,7 @@ class DriverSuite:
         assert age_s <= self.feedback_age_s + 1.0, f"the newest feedback is {age_s:.2f} s old"
 
     def test_frames(self) -> None:
+        """Frames come, are recent, and have the announced cameras' names and sizes."""
         cameras = {camera.name: camera for camera in self.new_driver().capabilities().cameras}
         if not cameras:
             raise unittest.SkipTest("the vehicle has no camera")
@@ -238,6 +277,7 @@ class DriverSuite:
         assert statistics.median(ages_s) <= self.frame_age_s, f"frames are {statistics.median(ages_s):.2f} s old"
 
     def test_pictures_as_they_come(self) -> None:
+        """Encoded pictures come and have the announced cameras' names and sizes."""
         cameras = {camera.name: camera for camera in self.new_driver().capabilities().cameras if camera.stream}
         if not cameras:
             raise unittest.SkipTest("the vehicle has no camera whose pictures can be had as they come")
@@ -253,6 +293,7 @@ class DriverSuite:
             )
 
     def test_link_lost_and_found(self) -> None:
+        """The link is reported LOST with a reason when the vehicle disappears, and UP when it is back."""
         with self.opened() as (_, sink):
             self.hear(sink)
             self.vehicle_disappears()
@@ -265,10 +306,13 @@ class DriverSuite:
             found = sink.wait(lambda: sink.link_state is LinkState.UP, self.connect_timeout_s)
             assert found, f"the link was not told UP again; told: {sink.links}"
 
-    # What it is told -----------------------------------------------------------------------------------------------
+    # What it is commanded -----------------------------------------------------------------------------------------
 
     def test_apply_returns_what_was_applied_at_once(self) -> None:
-        """On the ground, with actions that do not take off; a flight follows in its own test."""
+        """``apply`` returns a finite action within :data:`APPLY_S`.
+
+        On the ground, with actions that do not take off; the flight has its own test.
+        """
         with self.opened() as (driver, sink):
             self.hear(sink)
             actions = driver.capabilities().actions
@@ -288,7 +332,20 @@ class DriverSuite:
                 middle_s = statistics.median(times_s)
                 assert middle_s <= APPLY_S, f"apply({action.name}) took {middle_s * 1e3:.0f} ms"
 
+    def test_a_repeat_keeps_what_is_in_force(self) -> None:
+        """A repeated action applies what a new one does while nobody else commands the vehicle. On the ground."""
+        with self.opened() as (driver, sink):
+            self.hear(sink)
+            assert driver.left_to() == "", f"on the ground it is left to {driver.left_to()!r}"
+            announced = [action for action in (Land(), Hover()) if action.name in driver.capabilities().actions]
+            if not announced:
+                raise unittest.SkipTest("the vehicle neither hovers nor lands by itself")
+            for action in announced:
+                assert driver.apply(action, new=False) == driver.apply(action), f"a repeated {action.name} differs"
+            assert driver.left_to() == ""
+
     def test_failsafe_never_raises(self) -> None:
+        """``failsafe`` returns a bool before ``open``, while open, and after ``close``."""
         driver = self.new_driver()
         assert isinstance(driver.failsafe(Hover()), bool), "failsafe before open() must return a bool"
         with self.opened() as (driver, sink):
@@ -300,6 +357,7 @@ class DriverSuite:
     # Parameters ----------------------------------------------------------------------------------------------------
 
     def test_parameters_are_well_formed(self) -> None:
+        """Parameters have unique dotted lower-case names, and values and defaults that fit their own description."""
         with self.opened() as (driver, sink):
             self.hear(sink)
             parameters = driver.parameters()
@@ -314,6 +372,7 @@ class DriverSuite:
                     assert not problem, f"{parameter.name}: its {what} {value!r} {problem}"
 
     def test_parameters_round_trip(self) -> None:
+        """What is written to a parameter is in force and listed. Writes the old value back."""
         with self.opened() as (driver, sink):
             self.hear(sink)
             writable = [p for p in driver.parameters() if not p.read_only and p.name not in self.untouched_parameters]
@@ -330,6 +389,7 @@ class DriverSuite:
                     driver.set_parameter(parameter.name, parameter.value)
 
     def test_bad_parameters_are_refused(self) -> None:
+        """Writing an unknown or read-only parameter raises ParameterError or UnknownNameError."""
         with self.opened() as (driver, sink):
             self.hear(sink)
             read_only = [parameter for parameter in driver.parameters() if parameter.read_only]
@@ -344,7 +404,7 @@ class DriverSuite:
     # Flight --------------------------------------------------------------------------------------------------------
 
     def test_flight(self) -> None:
-        """Take-off, each axis with its sign, landing."""
+        """The vehicle takes off, moves both ways along each axis with the right sign, and lands."""
         with self.opened(watch=set()) as (driver, sink):
             flight = Flight(self, driver, sink)
             flight.take_off()
@@ -357,7 +417,7 @@ class DriverSuite:
                 flight.land()
 
     def test_emergency_stop_and_reset(self) -> None:
-        """On the ground: the state is told, and left only by the reset."""
+        """An emergency stop is reported and ends only with the reset. On the ground."""
         with self.opened(watch=set()) as (driver, sink):
             actions = driver.capabilities().actions
             if not {"emergency_stop", "reset_emergency"} <= actions:
@@ -373,7 +433,14 @@ class DriverSuite:
             flight.until(lambda f: f.state is FlightState.LANDED, self.emergency_timeout_s, "landed after the reset")
 
     def hear(self, sink: RecordingSink) -> None:
-        """Wait for the first feedback."""
+        """Wait for the first feedback.
+
+        Args:
+            sink: Of the open driver.
+
+        Raises:
+            AssertionError: None came within :attr:`feedback_timeout_s`.
+        """
         heard = sink.wait(lambda: sink.feedback_count > 0, self.feedback_timeout_s)
         assert heard, f"no feedback within {self.feedback_timeout_s} s of the link being up"
 

@@ -1,4 +1,4 @@
-"""The driver suite's flight: take-off, both ways along each axis, landing; judged by what the vehicle tells."""
+"""The driver suite's flight: take-off, both ways along each axis, landing, judged by the vehicle's feedback."""
 
 from __future__ import annotations
 
@@ -15,12 +15,22 @@ from skyloop.messages.geometry import wrap_angle
 if TYPE_CHECKING:
     from skyloop.drivers.suite import DriverSuite
 
-#: How far the vehicle went from one sample to another, with sign; None if it does not tell.
+#: How far the vehicle went from the first sample to the second, with sign; None if it does not report it.
 Measure = Callable[[Feedback, Feedback], float | None]
 
 
 class Flight:
-    """One flight of the suite, on native actions where the vehicle has them and on set-points where it has not."""
+    """One flight of the suite, with native take-off and landing where the vehicle has them, else with set-points.
+
+    Args:
+        suite: Gives speeds, distances and time-outs.
+        driver: Open, with its link up.
+        sink: Of the driver.
+
+    Raises:
+        unittest.SkipTest: The vehicle takes neither velocity nor attitude set-points.
+        AssertionError: No feedback comes.
+    """
 
     def __init__(self, suite: DriverSuite, driver: Driver, sink: RecordingSink) -> None:
         self.suite = suite
@@ -32,6 +42,19 @@ class Flight:
         suite.hear(sink)
 
     def until(self, condition: Callable[[Feedback], bool], timeout_s: float, what: str) -> Feedback:
+        """Wait until the newest feedback meets a condition.
+
+        Args:
+            condition: Called with the newest feedback after each of the driver's calls.
+            timeout_s: [s]
+            what: Completes "not ... within" in the error.
+
+        Returns:
+            The newest feedback.
+
+        Raises:
+            AssertionError: The condition was not met in time.
+        """
         sink = self.sink
 
         def holds() -> bool:
@@ -42,6 +65,11 @@ class Flight:
         return sink.newest
 
     def take_off(self) -> None:
+        """Take off and wait until the vehicle hovers or flies; without a native take-off, climb to 0.6 m.
+
+        Raises:
+            AssertionError: It was not up within the suite's ``takeoff_timeout_s``.
+        """
         if "takeoff" in self.actions:
             self.driver.apply(Takeoff())
             settled = (FlightState.HOVERING, FlightState.FLYING)
@@ -52,6 +80,11 @@ class Flight:
         self.set_point()
 
     def land(self) -> None:
+        """Land and wait for it; without a native landing, descend until the vehicle is landed or below 0.1 m.
+
+        Raises:
+            AssertionError: It was not down within the suite's ``land_timeout_s``.
+        """
         if "land" in self.actions:
             self.driver.apply(Land())
             self.until(lambda f: f.state is FlightState.LANDED, self.suite.land_timeout_s, "landed")
@@ -63,7 +96,16 @@ class Flight:
         )
 
     def set_point(self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, turn: float = 0.0) -> None:
-        """Velocity if the vehicle takes it; else the attitude that accelerates that way. One call: it must last."""
+        """Apply a velocity if the vehicle takes it, else the attitude that accelerates that way.
+
+        Called once: the driver must keep it in force.
+
+        Args:
+            forward: [m/s], body axes; for an attitude only the sign counts, and the suite's ``tilt`` is the angle.
+            left: As ``forward``.
+            up: [m/s]
+            turn: [rad/s], positive counter-clockwise seen from above.
+        """
         if "velocity" in self.actions:
             self.driver.apply(Velocity(forward=forward, left=left, up=up, yaw_rate=turn))
             return
@@ -72,7 +114,11 @@ class Flight:
         self.driver.apply(Attitude(roll=roll, pitch=pitch, climb=up, yaw_rate=turn))
 
     def moves_along_axes(self) -> None:
-        """Both ways along each axis: the sign is right only if both are."""
+        """Move both ways along each axis: the sign is right only if both are.
+
+        Raises:
+            AssertionError: The vehicle did not go the suite's ``distance`` or ``turn`` within ``motion_timeout_s``.
+        """
         suite = self.suite
         for sign in (1.0, -1.0):
             self._goes("up", _height, sign * suite.distance, up=sign * suite.climb)
@@ -85,7 +131,7 @@ class Flight:
         start = self.sink.newest
         assert start is not None
         if measure(start, start) is None:
-            return  # the vehicle does not tell what this axis would be judged by
+            return  # the vehicle does not report what this axis would be judged by
         self.set_point(**set_point)
 
         def far_enough(feedback: Feedback) -> bool:
@@ -97,7 +143,7 @@ class Flight:
         self._settle()
 
     def _settle(self) -> None:
-        """Until it is slow again, where it tells its speed; a drone that takes only attitudes coasts."""
+        """Wait until the vehicle is slow again, where it reports its speed. One that takes only attitudes coasts."""
         brake = "hover" in self.actions
         if brake:
             self.driver.apply(Hover())
@@ -125,7 +171,7 @@ def _aside(start: Feedback, now: Feedback) -> float | None:
 
 
 def _along(start: Feedback, now: Feedback, axis: int) -> float | None:
-    """How far it went along the heading (axis 0) or to the left of it (1), or its speed there if that is all."""
+    """Return the way along the heading (axis 0) or to its left (1) [m]; the speed there if no position is known."""
     if start.position is None or now.position is None or start.yaw is None:
         return _speed_sign(now, axis)
     east, north = now.position[0] - start.position[0], now.position[1] - start.position[1]

@@ -1,4 +1,4 @@
-"""What the driver suite knows of parameters: whether a value fits its description, and another value that does."""
+"""The driver suite's checks of parameters: whether a value fits its description, and another value that does."""
 
 from __future__ import annotations
 
@@ -17,7 +17,15 @@ _TYPES: Final[dict[ParameterType, tuple[type, ...]]] = {
 
 
 def mismatch(parameter: Parameter, value: Value) -> str:
-    """Why a value does not fit its own description, empty if it does."""
+    """Say why a value does not fit a parameter's description.
+
+    Args:
+        parameter: The description: type, choices, range.
+        value: To be checked.
+
+    Returns:
+        The end of a sentence about the value, empty if it fits.
+    """
     expected = _TYPES[parameter.type]
     if not isinstance(value, expected) or (isinstance(value, bool) and bool not in expected):
         return f"is not of type {parameter.type}"
@@ -37,7 +45,7 @@ def mismatch(parameter: Parameter, value: Value) -> str:
 
 
 def another_value(parameter: Parameter) -> Value:
-    """A legal value other than the present one, where there is one."""
+    """Return a legal value other than the present one, or the present one if there is none."""
     value = parameter.value
     if parameter.choices:
         return next((choice for choice in parameter.choices if choice != value), value)
@@ -54,13 +62,16 @@ def another_value(parameter: Parameter) -> Value:
 def _another_number(value: float, parameter: Parameter) -> float:
     low, high = parameter.minimum, parameter.maximum
     if low is not None and high is not None:
-        return math.floor((low + high) / 2) if parameter.type is ParameterType.INT else (value + low + high) / 3
+        if parameter.type is ParameterType.INT:  # the next one: a vehicle may accept only some values of a wide range
+            return value + 1 if value < high else value - 1
+        return (value + low + high) / 3
     if high is not None:
         return min(high, value - 1)
     return value + 1
 
 
 def same(one: Value, other: Value) -> bool:
+    """Return whether two values are equal, numbers within a relative 1e-5 or an absolute 1e-6."""
     if isinstance(one, tuple) and isinstance(other, tuple):
         return len(one) == len(other) and all(same(a, b) for a, b in zip(one, other, strict=True))
     if isinstance(one, (int, float)) and isinstance(other, (int, float)):

@@ -14,7 +14,14 @@ _SCHEME = re.compile(r"[a-z][a-z0-9+.-]*\Z")
 
 @dataclass(frozen=True, slots=True)
 class VehicleUri:
-    """A parsed address. ``place`` is what stands between ``://`` and ``?``: a host, a path, or nothing."""
+    """A parsed vehicle address.
+
+    Args:
+        scheme: The driver's name.
+        place: What stands between ``://`` and ``?``, percent-decoded: a host, a path, or nothing.
+        options: Names and values as they were given, percent-decoded.
+        text: The address as it was given; empty for one that was made in code.
+    """
 
     scheme: str
     place: str = ""
@@ -25,7 +32,17 @@ class VehicleUri:
         return self.text or f"{self.scheme}://{self.place}"
 
     def number(self, option: str, default: float, *, minimum: float = -math.inf, maximum: float = math.inf) -> float:
-        """An option as a finite number within a range. Raises :class:`UsageError`."""
+        """Return an option as a finite number within a range.
+
+        Args:
+            option: Its name.
+            default: Returned if the option is not given; not checked against the range.
+            minimum: Smallest allowed value.
+            maximum: Largest allowed value.
+
+        Raises:
+            UsageError: It is not a finite number within the range.
+        """
         given = self.options.get(option)
         if given is None:
             return default
@@ -40,14 +57,32 @@ class VehicleUri:
         return value
 
     def whole(self, option: str, default: int, *, minimum: int = 0, maximum: int = 2**31 - 1) -> int:
-        """An option as a whole number within a range. Raises :class:`UsageError`."""
+        """Return an option as a whole number within a range.
+
+        Args:
+            option: Its name.
+            default: Returned if the option is not given.
+            minimum: Smallest allowed value.
+            maximum: Largest allowed value.
+
+        Raises:
+            UsageError: It is not a whole number within the range.
+        """
         value = self.number(option, default, minimum=minimum, maximum=maximum)
         if value != int(value):
             raise UsageError(f"{self}: option {option} is {value:g} and must be a whole number")
         return int(value)
 
     def flag(self, option: str, default: bool = False) -> bool:
-        """An option as yes or no. Raises :class:`UsageError`."""
+        """Return an option as a bool: ``1``, ``true``, ``yes`` or nothing after the name; ``0``, ``false``, ``no``.
+
+        Args:
+            option: Its name.
+            default: Returned if the option is not given.
+
+        Raises:
+            UsageError: It is another word.
+        """
         given = self.options.get(option)
         if given is None:
             return default
@@ -58,7 +93,14 @@ class VehicleUri:
 
 
 def parse_uri(text: str) -> VehicleUri:
-    """Parse a vehicle's address. Raises :class:`UsageError`."""
+    """Parse a vehicle's address.
+
+    Args:
+        text: Such as ``ardrone://192.168.1.1?camera=front``. Place and options may be percent-encoded.
+
+    Raises:
+        UsageError: It has no scheme with ``://``, or gives an option twice.
+    """
     scheme, separator, rest = text.partition("://")
     if not separator or not _SCHEME.match(scheme):
         raise UsageError(f"{text!r} is not a vehicle's address: it looks like sim:// or ardrone://192.168.1.1")

@@ -1,4 +1,7 @@
-"""The thread that serves a vehicle's session: it waits for sockets, is woken by others, and outlives its own errors."""
+"""The link of every vehicle that is heard through sockets: its thread, and sockets renewed while nothing is heard.
+
+What the link carries is decided by the session: see :mod:`skyloop.drivers.vehicle_session`.
+"""
 
 from __future__ import annotations
 
@@ -9,32 +12,54 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
-from typing import Final, Generic, TypeVar
+from typing import Final, Generic, Protocol, TypeVar
 
-from skyloop.clock import Clock, monotonic_ns, seconds
+from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
 from skyloop.drivers.base import Sink
-from skyloop.drivers.vehicle_session import Telling, VehicleSession
+from skyloop.drivers.name_lookup import NameLookup
+from skyloop.drivers.vehicle_session import SinkCallback, VehicleSession
 from skyloop.messages import AnyAction, EventKind, Severity
 
 PAUSE_S: Final = 0.03  #: after an error
+RENEW_NS: Final = nanoseconds(2.0)  #: between new sockets while nothing is heard: this host's address may have changed
+MAX_DATAGRAM: Final = 65_536
+BURST: Final = 32  #: datagrams that are read before commands get their turn
 
 S = TypeVar("S", bound=VehicleSession)
 
 
-class VehicleLink(ABC, Generic[S]):
-    """Serves a session from :meth:`start` to :meth:`stop`. ``deliver`` gets its tellings, on the link's thread.
+class Readable(Protocol):
+    """Anything with a file descriptor that the link can wait for, such as a socket."""
 
-    All decisions are the session's, made with ``lock`` held; what it tells is delivered with the lock free. A kind of
-    vehicle keeps its sockets in ``_selector``.
+    def fileno(self) -> int: ...
+
+    def close(self) -> None: ...
+
+
+class VehicleLink(ABC, Generic[S]):
+    """Serves a session on a thread of its own from :meth:`start` to :meth:`stop`.
+
+    All decisions are the session's, made with ``lock`` held; its callbacks are delivered with the lock free. A kind of
+    vehicle writes :meth:`_open_sockets`, :meth:`_close_sockets` and :meth:`_send_due`, and gives each socket that it
+    opens to :meth:`_watch`.
+
+    Args:
+        name: Of the thread.
+        session: The vehicle's protocol.
+        deliver: Called on the link's thread with what the session has for the sink.
+        clock: Monotonic, ns.
+        family: Of the addresses that the host's name is looked up for.
+        close_s: How long :meth:`stop` waits for the thread.
     """
 
     def __init__(
         self,
         name: str,
         session: S,
-        deliver: Callable[[list[Telling]], None],
+        deliver: Callable[[list[SinkCallback]], None],
         clock: Clock = monotonic_ns,
         *,
+        family: socket.AddressFamily = socket.AF_INET,
         close_s: float = 2.0,
     ) -> None:
         self.session = session
@@ -44,18 +69,20 @@ class VehicleLink(ABC, Generic[S]):
         self._stopping = threading.Event()
         self._selector = selectors.DefaultSelector()
         self._awake, self._waker = socket.socketpair()
+        self._lookup = NameLookup(family)
+        self._opened_ns: int | None = None  # when sockets were opened last, or tried to
         self._close_s = close_s
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
     def start(self) -> None:
-        """Begin."""
+        """Start the thread."""
         self._awake.setblocking(False)
         self._waker.setblocking(False)
-        self._selector.register(self._awake, selectors.EVENT_READ)
+        self._watch(self._awake, self._drain_wakeups)
         self._thread.start()
 
     def stop(self) -> None:
-        """End, and give everything back. Who waits for an answer gets none."""
+        """Stop the thread, close the sockets and end the session: every caller that waits for an answer gets none."""
         self._stopping.set()
         self._wake()
         if self._thread is not threading.current_thread():
@@ -63,24 +90,40 @@ class VehicleLink(ABC, Generic[S]):
         with self.lock:
             self.session.close()
 
+    def command(self, action: AnyAction) -> AnyAction:
+        """Have the session accept an action, and send it at once if its pace allows. Any thread.
+
+        Returns:
+            What is applied, after the vehicle's limits.
+
+        Raises:
+            DriverError: It can't be done.
+        """
+        return self._decide(partial(self.session.command, action))
+
     # For a kind's methods that the proxy's threads call ----------------------------------------------------------
 
-    def _decided(self, decide: Callable[[int], AnyAction]) -> AnyAction:
-        """What is really applied, decided now, and said at once if the session's pace lets it."""
+    def _decide(self, decide: Callable[[int], AnyAction]) -> AnyAction:
         with self.lock:
             now_ns = self._clock()
             applied = decide(now_ns)
             due_ns = self.session.due_ns
             if due_ns <= now_ns:
-                self._say(now_ns)
+                self._send_due(now_ns)
         if now_ns < due_ns:
             self._wake()
         return applied
 
-    def _answer(
+    def _wait_for_answer(
         self, ask: Callable[[Callable[[str | None], None]], None], within_s: float, otherwise: str | None
     ) -> str | None:
-        """Have something asked with the lock held, and wait for what the function that it is given gets."""
+        """Ask the vehicle and wait for its answer. Any thread but the link's.
+
+        Args:
+            ask: Called with the lock held, with the function that takes the answer.
+            within_s: How long to wait [s].
+            otherwise: Returned if no answer comes in time.
+        """
         done = threading.Event()
         answers: list[str | None] = []
 
@@ -97,64 +140,116 @@ class VehicleLink(ABC, Generic[S]):
     # On the link's thread ----------------------------------------------------------------------------------------
 
     @abstractmethod
-    def _renew(self) -> None:
-        """Make sockets, or make them anew, where it is time to. With the lock free."""
+    def _open_sockets(self) -> None:
+        """Replace the sockets by new ones. On the link's thread, with the lock free.
+
+        Raises:
+            OSError: They can't be opened; tried again.
+        """
 
     @abstractmethod
-    def _receive(self, ready: object, /) -> None:
-        """Read what came at this socket. With the lock free."""
+    def _close_sockets(self) -> None:
+        """Close what :meth:`_open_sockets` opened. With the lock held."""
 
     @abstractmethod
-    def _say(self, now_ns: int) -> None:
+    def _send_due(self, now_ns: int) -> None:
         """Send what is due. With the lock held, on any thread."""
 
-    def _look(self, now_ns: int) -> None:
-        """Do what goes by other paces than the session's. With the lock held."""
+    def _renewal_ns(self) -> int | None:
+        """Return how long after they were opened last the sockets are opened anew; None: not as things stand.
 
-    @abstractmethod
-    def _release(self) -> None:
-        """Close what the link opened."""
+        By default what suits UDP: while nothing is heard. Called with the lock held.
+        """
+        return None if self.session.is_heard else RENEW_NS
+
+    def _poll(self, now_ns: int) -> None:
+        """Do what follows another pace than the session's. With the lock held, on the link's thread."""
+
+    def _watch(self, source: Readable, ready: Callable[[], None]) -> None:
+        """Have a function called on the link's thread, with the lock free, whenever a source has something to read."""
+        self._selector.register(source, selectors.EVENT_READ, ready)
+
+    def _forget(self, source: Readable) -> None:
+        """Stop watching a source and close it."""
+        with suppress(KeyError, ValueError):
+            self._selector.unregister(source)
+        source.close()
+
+    def _read_datagrams(
+        self, port: socket.socket, handle: Callable[[bytes, int], None], sender: str | None = None
+    ) -> None:
+        """Handle at most :data:`BURST` datagrams that arrived; with a ``sender``, only those from that address."""
+        for _ in range(BURST):
+            try:
+                datagram, source = port.recvfrom(MAX_DATAGRAM)
+            except BlockingIOError:
+                return
+            except OSError as error:
+                with self.lock:
+                    self.session.failed(error)
+                return
+            if sender is None or source[0] == sender:
+                with self.lock:
+                    handle(datagram, self._clock())
+
+    def _send_datagram(self, port: socket.socket, datagram: bytes) -> None:
+        """Send a datagram, noting a failure in the session. With the lock held."""
+        try:
+            port.send(datagram)
+        except BlockingIOError:
+            pass  # lost, as any datagram may be
+        except OSError as error:
+            self.session.failed(error)
+
+    def _renew(self) -> None:
+        now_ns = self._clock()
+        with self.lock:
+            pace_ns = self._renewal_ns()
+        if pace_ns is None or (self._opened_ns is not None and now_ns - self._opened_ns < pace_ns):
+            return
+        self._opened_ns = now_ns
+        try:
+            self._open_sockets()
+        except OSError as error:
+            with self.lock:
+                self.session.failed(error)
 
     def _step(self) -> None:
+        self._renew()  # before the wait, so that no socket is closed between being ready and being read
         with self.lock:
             wait_ns = self.session.due_ns - self._clock()
-        ready = self._selector.select(max(0.0, seconds(wait_ns)))
-        self._renew()
-        for key, _ in ready:
-            if key.fileobj is self._awake:
-                self._slept()
-            else:
-                self._receive(key.fileobj)
+        for key, _ in self._selector.select(max(0.0, seconds(wait_ns))):
+            key.data()
         with self.lock:
             now_ns = self._clock()
             if now_ns >= self.session.due_ns:
-                self._say(now_ns)
-            self._look(now_ns)
-            tellings = self.session.tellings()
+                self._send_due(now_ns)
+            self._poll(now_ns)
+            pending = self.session.drain()
         if not self._stopping.is_set():
-            self._deliver(tellings)
+            self._deliver(pending)
 
     def _run(self) -> None:
         try:
             while not self._stopping.is_set():
                 try:
                     self._step()
-                except Exception as error:  # noqa: BLE001  whatever happens, the vehicle must be told what to do
+                except Exception as error:  # noqa: BLE001  whatever happens, the vehicle must keep getting commands
                     self._deliver([partial(_tell_failure, error)])
                     self._stopping.wait(PAUSE_S)
         finally:
-            self._release()
+            with self.lock:
+                self._close_sockets()
             self._selector.close()
             self._awake.close()
             self._waker.close()
 
     def _wake(self) -> None:
-        """Have the thread look at once. From any thread."""
+        """End the wait of the link's thread. From any thread."""
         with suppress(OSError):  # it is awake, or it ended
             self._waker.send(b"\0")
 
-    def _slept(self) -> None:
-        """It was woken: nothing of that is left."""
+    def _drain_wakeups(self) -> None:
         with suppress(OSError):
             while self._awake.recv(4096):
                 pass

@@ -1,53 +1,55 @@
-"""How the link to a vehicle stands, and what its session has to tell: what the sessions of all vehicles share. Pure."""
+"""State of the vehicle link and pending events: what the sessions of all vehicles share. Pure."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import ClassVar, Protocol, TypeAlias
+from typing import ClassVar, Final, TypeAlias
 
-from skyloop.clock import seconds
+from skyloop.clock import nanoseconds, seconds
 from skyloop.drivers.base import Sink
+from skyloop.drivers.link_trouble import LinkTrouble, trouble_of
 from skyloop.drivers.notices import Notice
-from skyloop.messages import LinkState
+from skyloop.messages import AnyAction, LinkState
 
-Telling: TypeAlias = Callable[[Sink], None]
+RETELL_NS: Final = nanoseconds(2.0)  #: least time between two reasons that are reported while nothing is heard
 
-
-class Noticing(Protocol):
-    """What flies the vehicle, and has something to say of it now and then."""
-
-    def notices(self) -> Iterable[Notice]: ...
+SinkCallback: TypeAlias = Callable[[Sink], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Patience:
-    """With a vehicle that is silent, ns."""
+class LinkTimeouts:
+    """How long a vehicle may be silent [ns] before the link is degraded or lost."""
 
     degraded_ns: int
     lost_ns: int
-    first_word_ns: int  #: who was never heard by then is told as lost
+    first_word_ns: int  #: since opening; a vehicle that was never heard by then is reported as lost
 
 
 class VehicleSession(ABC):
-    """The vehicle of one opened driver, from its first word on. Not thread-safe.
+    """The protocol of one opened driver with its vehicle. Not thread-safe.
 
-    The time comes as an argument; bytes go in and out. What is for the proxy's sink is collected as *tellings*, for the
-    caller to deliver when it holds no lock. A kind of vehicle sets ``_heard_ns`` with whatever it understood, and calls
-    :meth:`_look_at_silence` with each tick.
+    Time comes as an argument; bytes go in and out. What the proxy's sink is to be told is collected as callbacks, for
+    the caller to run when it holds no lock. A kind of vehicle sets ``_heard_ns`` with whatever it understood, and calls
+    :meth:`_check_silence` with each poll.
+
+    Args:
+        now_ns: The time of opening, on the link's clock.
     """
 
-    PATIENCE: ClassVar[Patience]
-    pilot: Noticing | None
+    TIMEOUTS: ClassVar[LinkTimeouts]
 
     def __init__(self, now_ns: int) -> None:
-        self.due_ns = now_ns  #: when there is something to be said next
-        self.link_state: LinkState | None = None  #: as told
-        self._tellings: list[Telling] = []
+        self.due_ns = now_ns  #: when there is something to be sent next
+        self.link_state: LinkState | None = None  #: as last reported
+        self._pending: list[SinkCallback] = []
         self._opened_ns = now_ns
         self._heard_ns: int | None = None  # None: not since it was opened or lost
         self._unreachable = ""
+        self._remedy = ""  # of what is unreachable
+        self._told_why = ""
+        self._told_ns = now_ns
 
     @property
     def is_heard(self) -> bool:
@@ -55,50 +57,98 @@ class VehicleSession(ABC):
         return self._heard_ns is not None
 
     @abstractmethod
-    def close(self) -> None:
-        """Nothing more will come: whoever waits for an answer is told."""
+    def command(self, action: AnyAction, now_ns: int) -> AnyAction:
+        """Accept an action.
 
-    def unreachable(self, reason: str) -> None:
-        """The host said that nobody listens, or this host has no way to it, or the connection failed."""
-        self._unreachable = reason
+        Args:
+            action: One that the driver's capabilities name.
+            now_ns: The present time.
 
-    def tellings(self) -> list[Telling]:
-        """What is to be told to the sink since the last call, in order."""
-        if self.pilot is not None:
-            for notice in self.pilot.notices():
-                self._notice(notice)
-        tellings, self._tellings = self._tellings, []
-        return tellings
+        Returns:
+            What is applied, after the vehicle's limits.
+
+        Raises:
+            DriverError: It can't be done.
+        """
 
     @abstractmethod
-    def _silence(self, since: str, why: str) -> str:
-        """That nothing comes, for people: with how long, and with what the host says of it, each empty or a phrase that
-        begins with a blank."""
+    def close(self) -> None:
+        """End the session: every caller that waits for an answer is told that it failed."""
+
+    def unreachable(self, reason: str) -> None:
+        """Note why the vehicle can't be reached: nobody listens, there is no route to it, or the connection failed.
+
+        Args:
+            reason: Completes what is reported of the silence.
+        """
+        self._unreachable, self._remedy = reason, ""
+
+    def failed(self, error: OSError) -> None:
+        """Note an error of a socket or port, with what a person can do about it."""
+        trouble = self._trouble(error)
+        self._unreachable, self._remedy = trouble.reason, trouble.remedy
+
+    def drain(self) -> list[SinkCallback]:
+        """Return the callbacks for the sink that are pending since the last call, in order."""
+        for notice in self._new_notices():
+            self._notice(notice)
+        pending, self._pending = self._pending, []
+        return pending
+
+    def _new_notices(self) -> Iterable[Notice]:
+        """Return the events of this kind of vehicle since the last call."""
+        return ()
+
+    @abstractmethod
+    def _describe_silence(self, since: str, why: str) -> str:
+        """Say to people that nothing is heard.
+
+        Args:
+            since: How long, empty or a phrase that begins with a blank.
+            why: What the host says of it, empty or a phrase that begins with a blank.
+        """
+
+    def _advice(self) -> str:
+        """Return what a person can do where nothing is heard and nothing has failed, as an instruction."""
+        return "check the vehicle's power, and host and port in the address"
+
+    def _trouble(self, error: OSError) -> LinkTrouble:
+        return trouble_of(error, self._advice())
 
     @abstractmethod
     def _lose(self, reason: str, now_ns: int, /) -> None:
-        """It is lost: from here on everything begins anew with its next word."""
+        """Drop all state of the lost vehicle: everything begins anew with its next packet."""
 
-    def _look_at_silence(self, now_ns: int) -> None:
-        patience = self.PATIENCE
+    def _check_silence(self, now_ns: int) -> None:
+        patience = self.TIMEOUTS
         if self._heard_ns is None:
             if self.link_state is LinkState.CONNECTING and now_ns - self._opened_ns >= patience.first_word_ns:
-                self._tell_link(LinkState.LOST, self._told_silence())
+                self._told_ns = now_ns
+                self._set_link_state(LinkState.LOST, self._silence_text())
+            elif self._unreachable != self._told_why and now_ns - self._told_ns >= RETELL_NS:
+                self._told_ns = now_ns
+                self._tell(LinkState.LOST, self._silence_text())
             return
         silent_ns = now_ns - self._heard_ns
         if silent_ns >= patience.lost_ns:
-            self._lose(self._told_silence(silent_ns), now_ns)
+            self._lose(self._silence_text(silent_ns), now_ns)
         elif silent_ns >= patience.degraded_ns and self.link_state is LinkState.UP:
-            self._tell_link(LinkState.DEGRADED, self._told_silence(silent_ns))
+            self._set_link_state(LinkState.DEGRADED, self._silence_text(silent_ns))
 
-    def _told_silence(self, silent_ns: int | None = None) -> str:
+    def _silence_text(self, silent_ns: int | None = None) -> str:
         since = f" for {seconds(silent_ns):.2g} s" if silent_ns is not None else ""
-        return self._silence(since, f" ({self._unreachable})" if self._unreachable else "")
+        return self._describe_silence(since, f" ({self._unreachable})" if self._unreachable else "")
 
-    def _tell_link(self, state: LinkState, reason: str = "") -> None:
+    def _set_link_state(self, state: LinkState, reason: str = "") -> None:
         if state is not self.link_state:
-            self.link_state = state
-            self._tellings.append(lambda sink: sink.link(state, reason))
+            self._tell(state, reason)
+
+    def _tell(self, state: LinkState, reason: str) -> None:
+        self.link_state, self._told_why = state, self._unreachable
+        remedy = ""
+        if state in (LinkState.CONNECTING, LinkState.LOST):
+            remedy = (self._remedy if self._unreachable else "") or self._advice()
+        self._pending.append(lambda sink: sink.link(state, reason, remedy))
 
     def _notice(self, notice: Notice) -> None:
-        self._tellings.append(lambda sink: sink.event(notice.kind, notice.text, notice.severity, **notice.data))
+        self._pending.append(lambda sink: sink.event(notice.kind, notice.text, notice.severity, **notice.data))

@@ -45,9 +45,13 @@ class Arena:
         self.simulation.put(drone, (middle_x + x, middle_y + y, z), yaw)
 
     def state(self) -> tuple[Floats, Floats, Floats]:
-        """Places in the cells, shape (n, 3) [m]; velocities in the body's levelled axes, shape (n, 3) [m/s]; roll,
-        pitch and yaw, shape (n, 3) [rad]. Places and angles are true ones, as motion capture would tell; velocities are
-        what the drones believe."""
+        """Return where the drones are in their cells, how fast and at which angles.
+
+        Returns:
+            Positions, shape (n, 3) [m]; velocities in the body's levelled axes, shape (n, 3) [m/s]; roll, pitch and
+            yaw, shape (n, 3) [rad]. Positions and angles are the true ones, as motion capture would measure them;
+            velocities are what the drones estimate.
+        """
         places = np.empty((self.count, 3))
         velocities, angles = np.empty((self.count, 3)), np.empty((self.count, 3))
         for drone in range(self.count):

@@ -101,6 +101,11 @@ class Reaching:
         return self.arena
 
 
+def _told(distances: Floats) -> dict[str, NDArray[Any]]:
+    """What a step's ``info`` tells of each drone."""
+    return {"distance_m": distances, "is_success": distances < NEAR_M}
+
+
 class ReachEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     """One drone. ``skyloop.gym.register()`` makes it known as ``skyloop/Reach-v0``.
 
@@ -134,7 +139,7 @@ class ReachEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         rewards, failed, over, distances = self._task.step(np.asarray(action, dtype=float).reshape(1, 4))
-        told = {"distance_m": float(distances[0]), "is_success": bool(distances[0] < NEAR_M)}
+        told = {name: values[0].item() for name, values in _told(distances).items()}
         return self._task.observe()[0], float(rewards[0]), bool(failed[0]), bool(over[0] and not failed[0]), told
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -148,8 +153,11 @@ class ReachEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
 
 class ReachVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
-    """Many drones in one simulation, which is many times faster than as many simulations. As :class:`ReachEnv`, with
-    a leading axis; an episode that ended begins anew with the step after (``AutoresetMode.NEXT_STEP``)."""
+    """Many drones in one simulation, which is many times faster than as many simulations.
+
+    As :class:`ReachEnv`, with a leading axis; an episode that ended begins anew with the step after
+    (``AutoresetMode.NEXT_STEP``).
+    """
 
     metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
 
@@ -184,4 +192,4 @@ class ReachVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         rewards[again], failed[again], over[again] = 0.0, False, False
         over &= ~failed
         self._ended = failed | over
-        return self._task.observe(), rewards, failed, over, {"distance_m": distances}
+        return self._task.observe(), rewards, failed, over, _told(distances)

@@ -1,8 +1,8 @@
 """Certificates (X.509) of a lab's authority and of its identities: made, read, checked. Times are arguments, in UTC.
 
-An identity's common name is its name, by which Zenoh's access control knows it. What it may do stands in a URI among
-its alternative names, ``urn:skyloop:ROLE:DRONES``. Only proxies and routers may use theirs to be connected to (extended
-key usage), so that with the key of a pilot or an observer nobody can stand in for a proxy.
+An identity's common name is its name, by which Zenoh's access control knows it. Its role and drones are a URI among its
+alternative names, ``urn:skyloop:ROLE:DRONES``. Only the certificates of proxies and routers may be used to be connected
+to (extended key usage), so that with the key of a pilot or an observer nobody can stand in for a proxy.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Final
 
-from skyloop.errors import FileFormatError, MissingExtraError, UsageError
+from skyloop.errors import DecodeError, FileFormatError, MissingExtraError, UsageError
 from skyloop.keys.identity import Identity, KeyRole, make_identity
 
 try:
@@ -26,6 +26,7 @@ except ImportError as error:  # pragma: no cover  it is installed where tests ru
     raise MissingExtraError("keys", "network", cause=str(error)) from None
 
 PrivateKey = ec.EllipticCurvePrivateKey
+Certificate = x509.Certificate
 
 #: Certificates count from a day ago, for machines whose clocks are behind.
 BACKDATED: Final = timedelta(days=1)
@@ -36,52 +37,55 @@ _SIGNED: Final = ec.ECDSA(hashes.SHA256())
 
 @dataclass(frozen=True, slots=True)
 class Authority:
-    """A lab's authority. ``key`` is there only where identities are issued."""
+    """A lab's authority; ``key`` is there only where identities are issued."""
 
     certificate: x509.Certificate
     key: PrivateKey | None = None
 
     @property
     def name(self) -> str:
+        """Its name, for people."""
         return common_name(self.certificate)
 
     @property
     def expires(self) -> datetime:
+        """When its certificate expires, in UTC."""
         return self.certificate.not_valid_after_utc
 
     def sign(self, content: bytes) -> bytes:
-        """A signature of something that is no certificate."""
+        """Return a signature of content that is no certificate; needs the key."""
         assert self.key is not None
         return self.key.sign(content, _SIGNED)
 
     def signed(self, content: bytes, signature: bytes) -> bool:
-        """Whether the signature is this authority's."""
-        try:
-            _public(self.certificate).verify(signature, content, _SIGNED)
-        except InvalidSignature:
-            return False
-        return True
+        """Return whether a signature of content is this authority's."""
+        return signed_by(self.certificate, content, signature)
 
 
 def new_key() -> PrivateKey:
-    """A new private key."""
+    """Make a new private key, on the curve P-256."""
     return ec.generate_private_key(_CURVE)
 
 
 def key_pem(key: PrivateKey) -> bytes:
-    """A private key as it is kept in a file."""
+    """Encode a private key for a file: PKCS #8 as PEM, not encrypted."""
     return key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
 
 
 def certificate_pem(certificate: x509.Certificate) -> bytes:
-    """A certificate as it is kept in a file."""
+    """Encode a certificate for a file, as PEM."""
     return certificate.public_bytes(serialization.Encoding.PEM)
 
 
 def make_authority(days: int, now: datetime) -> Authority:
-    """A new lab's authority, valid for so many days. Its name ends in random digits, so that labs can be told apart."""
+    """Make a new lab's authority. Its name ends in random digits, so that labs can be told apart.
+
+    Args:
+        days: How long it is valid.
+        now: The time in UTC.
+    """
     key = new_key()
     name = _name(f"Skyloop lab {secrets.token_hex(4)}")
     certificate = (
@@ -96,7 +100,15 @@ def make_authority(days: int, now: datetime) -> Authority:
 def issue(
     authority: Authority, identity: Identity, key: PrivateKey, until: datetime, now: datetime
 ) -> x509.Certificate:
-    """A certificate for an identity. It never lasts longer than the authority's own."""
+    """Make a certificate for an identity.
+
+    Args:
+        authority: Signs it; needs its key.
+        identity: The holder.
+        key: The holder's key.
+        until: When it expires, in UTC; no later than the authority's certificate does.
+        now: The time in UTC.
+    """
     assert authority.key is not None
     purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
     if identity.role in (KeyRole.PROXY, KeyRole.ROUTER):
@@ -116,15 +128,65 @@ def issue(
 
 
 def read_certificate(content: bytes, path: Path) -> x509.Certificate:
-    """Raises :class:`FileFormatError`; ``path`` is named in it."""
+    """Decode a certificate from a file.
+
+    Args:
+        content: PEM.
+        path: The file, for errors.
+
+    Raises:
+        FileFormatError: It is not a certificate.
+    """
     try:
         return x509.load_pem_x509_certificate(content)
     except ValueError:
         raise FileFormatError(f"{path} is no certificate in PEM form, or it is damaged") from None
 
 
+def read_der(content: bytes) -> x509.Certificate:
+    """Decode a certificate that came over the network.
+
+    Raises:
+        DecodeError: It is not a certificate in DER.
+    """
+    try:
+        return x509.load_der_x509_certificate(content)
+    except ValueError as error:
+        raise DecodeError(f"{len(content)} bytes that are no certificate: {error}") from None
+
+
+def der(certificate: x509.Certificate) -> bytes:
+    """Encode a certificate for the network, as DER."""
+    return certificate.public_bytes(serialization.Encoding.DER)
+
+
+def sign(key: PrivateKey, content: bytes) -> bytes:
+    """Return a signature by the key of an identity: ECDSA with SHA-256, in DER."""
+    return key.sign(content, _SIGNED)
+
+
+def signed_by(certificate: x509.Certificate, content: bytes, signature: bytes) -> bool:
+    """Return whether the holder of a certificate signed this content."""
+    public = certificate.public_key()
+    if not isinstance(public, ec.EllipticCurvePublicKey):
+        return False
+    try:
+        public.verify(signature, content, _SIGNED)
+    except InvalidSignature:
+        return False
+    return True
+
+
 def read_key(content: bytes, path: Path) -> PrivateKey:
-    """Raises :class:`FileFormatError`."""
+    """Decode a private key from a file.
+
+    Args:
+        content: PEM, not encrypted.
+        path: The file, for errors.
+
+    Raises:
+        FileFormatError: It is not such a key, or not one on a curve.
+    """
     try:
         key = serialization.load_pem_private_key(content, password=None)
     except (ValueError, TypeError):  # TypeError: it is encrypted
@@ -135,7 +197,17 @@ def read_key(content: bytes, path: Path) -> PrivateKey:
 
 
 def read_authority(certificate: x509.Certificate, key: PrivateKey | None, path: Path) -> Authority:
-    """Raises :class:`FileFormatError` for what is no authority that skyloop keys made."""
+    """Check that a certificate is an authority's.
+
+    Args:
+        certificate: The authority's.
+        key: Its key, None where nothing is issued.
+        path: The certificate's file, for errors.
+
+    Raises:
+        FileFormatError: It is not an authority's certificate.
+        UsageError: The key does not belong to it.
+    """
     try:
         constraints = certificate.extensions.get_extension_for_class(x509.BasicConstraints).value
     except x509.ExtensionNotFound:
@@ -148,7 +220,15 @@ def read_authority(certificate: x509.Certificate, key: PrivateKey | None, path: 
 
 
 def identity_of(certificate: x509.Certificate, path: Path) -> Identity:
-    """Who a certificate says its holder is. Raises :class:`FileFormatError`."""
+    """Return the identity that a certificate names.
+
+    Args:
+        certificate: The holder's.
+        path: Its file, for errors.
+
+    Raises:
+        FileFormatError: It names no role and drones.
+    """
     try:
         names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
         (urn,) = (uri for uri in names.get_values_for_type(x509.UniformResourceIdentifier) if uri.startswith(_URN))
@@ -161,18 +241,27 @@ def identity_of(certificate: x509.Certificate, path: Path) -> Identity:
 
 
 def common_name(certificate: x509.Certificate) -> str:
-    """The name that access control goes by; empty if there is none, or several."""
+    """Return the name that access control goes by; empty if the certificate has none or several."""
     names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     return str(names[0].value) if len(names) == 1 else ""
 
 
 def matches(key: PrivateKey, certificate: x509.Certificate) -> bool:
-    """Whether the certificate is about this key."""
+    """Return whether a certificate is for this key."""
     return key.public_key() == certificate.public_key()
 
 
 def check_issued(certificate: x509.Certificate, authority: Authority, path: Path) -> None:
-    """Raise :class:`UsageError` for a certificate that another authority issued."""
+    """Check that an authority issued a certificate.
+
+    Args:
+        certificate: To check.
+        authority: The lab's.
+        path: The certificate's file, for errors.
+
+    Raises:
+        UsageError: Another authority issued it.
+    """
     try:
         certificate.verify_directly_issued_by(authority.certificate)
     except (ValueError, TypeError, InvalidSignature):
@@ -182,7 +271,16 @@ def check_issued(certificate: x509.Certificate, authority: Authority, path: Path
 
 
 def check_time(certificate: x509.Certificate, what: str, now: datetime) -> None:
-    """Raise :class:`UsageError` for a certificate that is not valid yet, or no longer."""
+    """Check that a certificate is valid now.
+
+    Args:
+        certificate: To check.
+        what: What it belongs to, for errors.
+        now: The time in UTC.
+
+    Raises:
+        UsageError: It is not valid yet, or has expired.
+    """
     if now >= certificate.not_valid_after_utc:
         raise UsageError(f"{what} expired on {certificate.not_valid_after_utc:%Y-%m-%d %H:%M} UTC: issue a new one")
     if now < certificate.not_valid_before_utc:

@@ -10,16 +10,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Final
 
 from skyloop.errors import UsageError
+from skyloop.files import expand
 from skyloop.keys import files
 from skyloop.keys import roster as rosters
 from skyloop.keys.certificates import (
     Authority,
+    Certificate,
+    PrivateKey,
     check_issued,
     check_time,
     identity_of,
@@ -35,7 +38,7 @@ AUTHORITY_FILE: Final = "ca.pem"
 CERTIFICATE_FILE: Final = "identity.pem"
 KEY_FILE: Final = "identity.key"
 ROSTER_FILE: Final = "roster.json"
-NOTICE: Final = timedelta(days=7)  #: how long before its end an expiry is told
+NOTICE: Final = timedelta(days=7)  #: how long before its end an expiry is announced
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,51 +50,75 @@ class Credentials:
     authority: Authority
     roster: Roster
     directory: Path
+    certificate: Certificate = field(repr=False)
+    key: PrivateKey = field(repr=False)
 
     @property
     def name(self) -> str:
+        """The identity's name."""
         return self.identity.name
 
     @property
     def role(self) -> KeyRole:
+        """The identity's role."""
         return self.identity.role
 
     @property
     def authority_file(self) -> Path:
+        """The certificate of the lab's authority."""
         return self.directory / AUTHORITY_FILE
 
     @property
     def certificate_file(self) -> Path:
+        """The identity's certificate."""
         return self.directory / CERTIFICATE_FILE
 
     @property
     def key_file(self) -> Path:
+        """The identity's private key."""
         return self.directory / KEY_FILE
 
     @property
     def roster_file(self) -> Path:
+        """The roster."""
         return self.directory / ROSTER_FILE
 
     def ends(self, now: datetime | None = None) -> dict[str, str]:
-        """What ends within a week, this key and the lab's authority, with a sentence for people each."""
+        """Return what expires within a week or has expired: this key, and the lab's authority.
+
+        Args:
+            now: The time in UTC; by default of this machine.
+
+        Returns:
+            A sentence for people for each, by what it is about.
+        """
         now = now or datetime.now(UTC)
         dates = {f"the key of {self.name}": self.expires, "the lab's authority": self.authority.expires}
         return {what: text for what, end in dates.items() if (text := expiry_notice(what, end, now))}
 
     def renewed(self) -> Credentials | None:
-        """These with a newer roster, if one lies in the folder by now; None if not.
+        """Return these credentials with a newer roster, if the folder has one by now; None if not.
 
-        Raises :class:`UsageError` for one that can't be read or is not signed by this lab's authority.
+        Raises:
+            UsageError: The roster can't be read, or this lab's authority did not sign it.
         """
         roster = _read_roster(self.directory, self.authority)
         return replace(self, roster=roster) if roster.number > self.roster.number else None
 
 
 def load(directory: Path | str, now: datetime | None = None) -> Credentials:
-    """Read an identity's folder and check all that can be checked. Raises :class:`UsageError`, also its branch
-    :class:`skyloop.errors.FileFormatError`, with what is wrong and what would be right."""
+    """Read an identity's folder and check all that can be checked.
+
+    Args:
+        directory: The folder.
+        now: The time in UTC; by default of this machine.
+
+    Raises:
+        UsageError: Something is wrong with the folder; :class:`skyloop.errors.FileFormatError` for a file that is
+            damaged or of another kind. The message says what would be right.
+    """
     now = now or datetime.now(UTC)
-    path = Path(directory).expanduser().resolve()
+    path = expand(directory).resolve()
     _check_folder(path)
     certificate_path, key_path = path / CERTIFICATE_FILE, path / KEY_FILE
     key = read_key(files.read_private(key_path, "the private key"), key_path)
@@ -105,11 +132,15 @@ def load(directory: Path | str, now: datetime | None = None) -> Credentials:
     identity = identity_of(certificate, certificate_path)
     roster = _read_roster(path, authority)
     _check_listed(identity, roster, path)
-    return Credentials(identity, certificate.not_valid_after_utc, authority, roster, path)
+    return Credentials(identity, certificate.not_valid_after_utc, authority, roster, path, certificate, key)
 
 
 def read_public(directory: Path) -> tuple[Authority, Roster]:
-    """What everybody may know, from the folder of a lab or of an identity. Raises :class:`UsageError`."""
+    """Read the certificate and roster in the folder of a lab or of an identity, which everybody may know.
+
+    Raises:
+        UsageError: There is no such folder, or a file in it is missing or not valid.
+    """
     if not directory.is_dir():
         raise UsageError(f"there is no folder {directory}: make a lab's with skyloop keys init")
     authority = _read_authority(directory)
@@ -117,7 +148,13 @@ def read_public(directory: Path) -> tuple[Authority, Roster]:
 
 
 def expiry_notice(what: str, end: datetime, now: datetime) -> str:
-    """A sentence for people if the end is less than a week away, or past; empty if not."""
+    """Return a sentence for people if the end is less than a week away, or past; empty if not.
+
+    Args:
+        what: What ends.
+        end: When, in UTC.
+        now: The time in UTC.
+    """
     left = end - now
     if left > NOTICE:
         return ""

@@ -11,12 +11,18 @@ from pathlib import Path
 from typing import Final
 
 from skyloop.errors import UsageError
+from skyloop.files import read_bytes
 
+MAX_BYTES: Final = 16 << 20  #: of a file; a roster of 10 000 identities takes 3 MB
 _OTHERS: Final = stat.S_IRWXG | stat.S_IRWXO
 
 
 def make_directory(path: Path) -> None:
-    """Make a directory that only its owner can enter, or see that it is one. Raises :class:`UsageError`."""
+    """Make a directory that only its owner can enter, or check that it is one.
+
+    Raises:
+        UsageError: It can't be made, or is open to others.
+    """
     try:
         path.mkdir(mode=0o700, parents=True, exist_ok=True)
         mode = path.stat().st_mode
@@ -27,7 +33,16 @@ def make_directory(path: Path) -> None:
 
 
 def write(path: Path, content: bytes, *, private: bool = False) -> None:
-    """Replace a file in one step; a private one can be read by its owner only, from its first byte on."""
+    """Replace a file in one step.
+
+    Args:
+        path: The file.
+        content: All of it.
+        private: Whether only its owner may read it, from its first byte on.
+
+    Raises:
+        UsageError: It can't be written.
+    """
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600 if private else 0o644)
@@ -42,15 +57,28 @@ def write(path: Path, content: bytes, *, private: bool = False) -> None:
 
 
 def read(path: Path, what: str) -> bytes:
-    """The content of a file. ``what`` says for people what is in it. Raises :class:`UsageError`."""
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise UsageError(f"{what} {path} can't be read: {error.strerror}") from None
+    """Read a file of at most :data:`MAX_BYTES`.
+
+    Args:
+        path: The file.
+        what: What it holds, for errors.
+
+    Raises:
+        UsageError: It can't be read, or is too large.
+    """
+    return read_bytes(path, what, MAX_BYTES)
 
 
 def read_private(path: Path, what: str) -> bytes:
-    """The same of a file that must not be open to others: somebody else may have the key already."""
+    """Read a file that must not be open to others, as somebody else may have the key then.
+
+    Args:
+        path: The file.
+        what: What it holds, for errors.
+
+    Raises:
+        UsageError: It can't be read, is too large, or is open to others.
+    """
     content = read(path, what)
     mode = path.stat().st_mode
     if mode & _OTHERS:
@@ -63,7 +91,10 @@ def read_private(path: Path, what: str) -> bytes:
 
 @contextmanager
 def locked(directory: Path) -> Iterator[None]:
-    """Hold a directory against other processes that change it; the kernel lets go of it with this process."""
+    """Lock a directory against other processes that change it, and wait until they have finished.
+
+    The kernel releases the lock with the process.
+    """
     descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)

@@ -1,4 +1,4 @@
-"""Who somebody is on the network, and which drones that is about. Pure."""
+"""Identities on the network: a name, a role, and the drones that it is about."""
 
 from __future__ import annotations
 
@@ -18,44 +18,64 @@ _PATTERN: Final = re.compile(r"[a-z0-9_.*-]{1,48}")
 
 
 class KeyRole(StrEnum):
-    """What a key lets its holder be. ``drones`` are the names that it is about."""
+    """What a key lets its holder be, with respect to the drones that the identity names."""
 
     PILOT = "pilot"  #: sees every drone, and may fly those that are named
     OBSERVER = "observer"  #: sees those that are named, and flies nothing
     PROXY = "proxy"  #: serves drones of these names
-    ROUTER = "router"  #: carries everybody's traffic between networks, and is trusted with all of it
+    ROUTER = "router"  #: carries everybody's traffic between networks, which is sealed: it can lose it, not read it
 
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """A name with what it may do. ``drones`` are patterns in which ``*`` stands for any characters."""
+    """A name with what it may do; ``drones`` are patterns in which ``*`` stands for any characters."""
 
     name: str
     role: KeyRole
     drones: tuple[str, ...] = ALL_DRONES
 
     def covers(self, drone: str) -> bool:
-        """Whether a drone of this name is among those that this identity is for."""
+        """Return whether a drone of this name is among those that this identity is for."""
         return any(fnmatchcase(drone, pattern) for pattern in self.drones)
 
     def may_fly(self, drone: str) -> bool:
-        """Whether this is a pilot of a drone of this name."""
+        """Return whether this is a pilot of a drone of this name."""
         return self.role is KeyRole.PILOT and self.covers(drone)
 
+    def may_see(self, drone: str) -> bool:
+        """Return whether an application with these keys may see a drone of this name: a pilot sees all."""
+        return self.role is KeyRole.PILOT or (self.role is KeyRole.OBSERVER and self.covers(drone))
+
+    def may_serve(self, drone: str) -> bool:
+        """Return whether this is a proxy that may serve this name."""
+        return self.role is KeyRole.PROXY and self.covers(drone)
+
     def require_proxy(self, drone: str) -> None:
-        """Raise :class:`UsageError` unless this is a proxy that may serve this name."""
+        """Check that this is a proxy that may serve a name.
+
+        Raises:
+            UsageError: It is not.
+        """
         if self.role is not KeyRole.PROXY:
             raise UsageError(f"these are the keys of {self}: a proxy needs some of --role proxy")
         if not self.covers(drone):
             raise UsageError(f"these are the keys of {self}: they are not for the name {drone!r}")
 
     def require_router(self) -> None:
-        """Raise :class:`UsageError` unless this is a router."""
+        """Check that this is a router.
+
+        Raises:
+            UsageError: It is not.
+        """
         if self.role is not KeyRole.ROUTER:
             raise UsageError(f"these are the keys of {self}: a router needs some of --role router")
 
     def require_application(self) -> None:
-        """Raise :class:`UsageError` unless this is a pilot or an observer."""
+        """Check that this is a pilot or an observer.
+
+        Raises:
+            UsageError: It is not.
+        """
         if self.role not in (KeyRole.PILOT, KeyRole.OBSERVER):
             raise UsageError(f"these are the keys of {self}: an application needs a pilot's or an observer's")
 
@@ -64,7 +84,16 @@ class Identity:
 
 
 def make_identity(name: str, role: str, drones: str = "*") -> Identity:
-    """Check what a person typed. Raises :class:`UsageError`."""
+    """Make an identity from what a person typed.
+
+    Args:
+        name: 1 to 48 lower-case letters, digits, ``_``, ``-`` and ``.``; not ``anyone``.
+        role: One of :class:`KeyRole`.
+        drones: Names or patterns, separated by commas; ``*`` for a router.
+
+    Raises:
+        UsageError: One of them is not valid.
+    """
     if not _NAME.fullmatch(name):
         raise UsageError(
             f"{name!r} cannot be the name of a key: 1 to 48 lower-case letters, digits, '_', '-' and '.', "
@@ -81,7 +110,11 @@ def make_identity(name: str, role: str, drones: str = "*") -> Identity:
 
 
 def parse_drones(text: str) -> tuple[str, ...]:
-    """Names of drones or patterns of them, separated by commas: ``alpha,bravo*``. Raises :class:`UsageError`."""
+    """Parse names of drones or patterns of them, separated by commas: ``alpha,bravo*``.
+
+    Raises:
+        UsageError: A pattern is not valid, or there are more than :data:`MAX_PATTERNS`.
+    """
     patterns = tuple(dict.fromkeys(re.sub(r"\*+", "*", part.strip()) for part in text.split(",")))
     for pattern in patterns:
         if not _PATTERN.fullmatch(pattern) or not (_NAME.fullmatch(pattern) or "*" in pattern):

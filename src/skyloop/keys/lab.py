@@ -33,7 +33,10 @@ _ISSUED: Final = "issued"
 
 
 class Lab:
-    """An authority that can issue. Each change is made under a lock on the folder, so two processes don't lose one."""
+    """An authority that can issue identities; :meth:`make` makes one, :meth:`open` opens one.
+
+    Each change is made under a lock on the folder, so that two processes don't lose one.
+    """
 
     def __init__(self, directory: Path, authority: Authority) -> None:
         self.directory = directory
@@ -41,7 +44,16 @@ class Lab:
 
     @classmethod
     def make(cls, directory: Path, days: int = AUTHORITY_DAYS, now: datetime | None = None) -> Lab:
-        """A new authority in a folder of its own. Raises :class:`UsageError`, also where there is one already."""
+        """Make a new authority in a folder of its own.
+
+        Args:
+            directory: The folder, made if it is missing.
+            days: How long the authority is valid, 1 to 36500.
+            now: The time in UTC; by default of this machine.
+
+        Raises:
+            UsageError: The folder has an authority already or can't be used, or ``days`` is out of range.
+        """
         if not 1 <= days <= 36500:
             raise UsageError(f"an authority is valid for 1 to 36500 days, not {days}")
         files.make_directory(directory)
@@ -58,7 +70,11 @@ class Lab:
 
     @classmethod
     def open(cls, directory: Path) -> Lab:
-        """The authority in a folder. Raises :class:`UsageError`."""
+        """Open the authority in a folder.
+
+        Raises:
+            UsageError: There is none, or a file is damaged.
+        """
         key_path, certificate_path = directory / _AUTHORITY_KEY, directory / AUTHORITY_FILE
         if not key_path.exists():
             raise UsageError(f"there is no authority in {directory}: make one with skyloop keys init")
@@ -69,18 +85,32 @@ class Lab:
 
     @property
     def roster(self) -> Roster:
-        """The roster as it lies in the folder now."""
+        """The roster as it is in the folder now.
+
+        Reading it raises :class:`UsageError` if it can't be read or was changed.
+        """
         path = self.directory / ROSTER_FILE
         return rosters.decode(files.read(path, "the roster"), self.authority, path)
 
     def folder(self, name: str) -> Path:
-        """Where an identity's folder is."""
+        """Return the path of an identity's folder."""
         return self.directory / _ISSUED / name
 
     def issue(self, identity: Identity, days: float = IDENTITY_DAYS, now: datetime | None = None) -> Entry:
-        """A new key and certificate for an identity, which may be a renewal; returns its entry in the roster.
+        """Make a new key and certificate for an identity, also to renew them.
 
-        ``days`` is shortened to what is left of the authority's. Raises :class:`UsageError`.
+        Args:
+            identity: The holder.
+            days: How long the key is valid, more than 0 and at most :data:`MAX_IDENTITY_DAYS`; shortened to what is
+                left of the authority's time.
+            now: The time in UTC; by default of this machine.
+
+        Returns:
+            The identity's entry in the roster.
+
+        Raises:
+            UsageError: ``days`` is out of range, the authority has expired, the name was revoked and its lost key is
+                still valid, or a file can't be written.
         """
         now = _now(now)
         if not (math.isfinite(days) and 0 < days <= MAX_IDENTITY_DAYS):
@@ -105,9 +135,16 @@ class Lab:
         return entry
 
     def revoke(self, name: str) -> Entry:
-        """Take an identity off the list of those who may join, and delete its folder here; returns its entry.
+        """Revoke an identity, and delete its folder's files here.
 
-        It counts wherever the new roster has arrived. Raises :class:`UsageError`.
+        It takes effect wherever the new roster has arrived.
+
+        Returns:
+            The identity's entry in the roster.
+
+        Raises:
+            UnknownNameError: The roster has no such name.
+            UsageError: It was revoked already.
         """
         with files.locked(self.directory):
             roster = self.roster
@@ -123,7 +160,10 @@ class Lab:
         return revoked
 
     def _write_roster(self, roster: Roster) -> None:
-        """To the folder and to those of all identities, so that each one that is copied from now on has the newest."""
+        """Write the roster to the lab's folder and to those of all identities.
+
+        So each folder that is copied from now on has the newest.
+        """
         content = rosters.encode(roster, self.authority)
         files.write(self.directory / ROSTER_FILE, content)
         for entry in roster.entries:

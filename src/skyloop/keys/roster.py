@@ -2,7 +2,7 @@
 
 Zenoh's access control knows subjects by their common names, so whoever enforces it must know all names beforehand. The
 roster is a file of two parts: the list itself, and the signature of exactly those bytes. Its number grows with each
-change, and the highest one is right.
+change, and the highest one is in force.
 """
 
 from __future__ import annotations
@@ -36,14 +36,17 @@ class Entry(msgspec.Struct, frozen=True):
 
     @property
     def identity(self) -> Identity:
+        """The identity itself."""
         return Identity(self.name, self.role, self.drones)
 
     @property
     def expires_at(self) -> datetime:
+        """When its newest certificate expires, in UTC."""
         return datetime.fromtimestamp(self.expires, UTC)
 
     @property
     def last_at(self) -> datetime:
+        """When the last of all certificates under this name expires, in UTC."""
         return datetime.fromtimestamp(self.last, UTC)
 
 
@@ -56,16 +59,19 @@ class Roster(msgspec.Struct, frozen=True):
     format: int = FORMAT
 
     def find(self, name: str) -> Entry | None:
-        """The entry of a name."""
+        """Return the entry of a name, None if there is none."""
         return next((entry for entry in self.entries if entry.name == name), None)
 
     @property
     def identities(self) -> list[Identity]:
-        """Who may join: all that were not revoked. That the others' certificates are valid is for the handshake."""
+        """The identities that may join: all that were not revoked.
+
+        The handshake checks that their certificates are valid.
+        """
         return [entry.identity for entry in self.entries if not entry.revoked]
 
     def put(self, entry: Entry) -> Roster:
-        """The next roster, with this entry in the place of the one of its name."""
+        """Return the next roster, with this entry in the place of the one of its name."""
         others = [other for other in self.entries if other.name != entry.name]
         entries = tuple(sorted([*others, entry], key=lambda each: each.name))
         return Roster(self.number + 1, self.lab, entries)
@@ -77,18 +83,28 @@ class _File(msgspec.Struct):
 
 
 def encode(roster: Roster, authority: Authority) -> bytes:
-    """The file, signed."""
+    """Return the roster's file, signed."""
     body = msgspec.json.format(msgspec.json.encode(roster), indent=1)
     signature = base64.b64encode(authority.sign(_PURPOSE + body)).decode()
     return msgspec.json.encode(_File(msgspec.Raw(body), signature)) + b"\n"
 
 
 def decode(content: bytes, authority: Authority, path: Path) -> Roster:
-    """Check the signature, then read. Raises :class:`FileFormatError` and :class:`UsageError`."""
+    """Check the signature of a roster's file, then decode it.
+
+    Args:
+        content: The file.
+        authority: The lab's.
+        path: The file, for errors.
+
+    Raises:
+        FileFormatError: It is not a roster, is damaged, or has another format.
+        UsageError: It was changed, or another authority signed it.
+    """
     try:
         file = msgspec.json.decode(content, type=_File)
         signature = base64.b64decode(file.signature, validate=True)
-    except (msgspec.MsgspecError, UnicodeDecodeError, binascii.Error) as error:
+    except (msgspec.MsgspecError, UnicodeDecodeError, binascii.Error, RecursionError) as error:
         raise FileFormatError(f"{path} is no roster, or it is damaged: {error}") from None
     body = bytes(file.roster)
     if not authority.signed(_PURPOSE + body, signature):

@@ -1,23 +1,22 @@
-"""Pictures of H.264 that build on one another, decoded when somebody looks: PyAV is imported then."""
+"""H.264 frames that build on one another, decoded on demand: PyAV is imported then."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from skyloop.errors import FileFormatError, MissingExtraError
+from skyloop.errors import FileFormatError
 from skyloop.messages.encoded import Chain
-
-_MAX_PIXELS: Final = 7680 * 4320
+from skyloop.pyav import new_decoder
 
 if TYPE_CHECKING:
     from av.video.codeccontext import VideoCodecContext
 
 
 class Group:
-    """A key picture and those that follow it, in the order of their capture. Decoding goes on where it stood before."""
+    """A key frame and the frames that follow it, in order of capture. Decoding continues where it stopped before."""
 
     def __init__(self) -> None:
         self._units: list[bytes] = []
@@ -26,16 +25,30 @@ class Group:
         self._image: Any = None  # the picture of the last of them
 
     def __len__(self) -> int:
+        """Return the number of frames."""
         return len(self._units)
 
     def add(self, unit: bytes) -> None:
+        """Append a frame's access unit."""
         self._units.append(unit)
 
     def pixels(self, index: int, what: str) -> NDArray[np.uint8]:
-        """One picture: BGR, shape (height, width, 3). Raises :class:`FileFormatError`, :class:`MissingExtraError`."""
+        """Decode one frame.
+
+        Args:
+            index: Of the frame in the group.
+            what: The frame, for error messages.
+
+        Returns:
+            BGR, shape (height, width, 3), uint8.
+
+        Raises:
+            FileFormatError: The frame is damaged, or no H.264.
+            MissingExtraError: PyAV is not installed.
+        """
         if self._context is None or index < self._done - 1:
             self._context, self._done = _decoder(), 0
-        while self._done <= index and (self._done == 0 or self._image is not None):  # what builds on damage is damaged
+        while self._done <= index and (self._done == 0 or self._image is not None):  # so are those after damage
             self._image = _decode(self._context, self._units[self._done])
             self._done += 1
         if self._image is None:
@@ -44,14 +57,23 @@ class Group:
 
 
 class Groups:
-    """Sorts the pictures of one camera, in their order, into groups."""
+    """Sorts the frames of one camera, in their order, into groups."""
 
     def __init__(self) -> None:
         self._chain = Chain()
         self._group = Group()
 
     def add(self, number: int, unit: bytes, *, key: bool) -> tuple[Group, int] | None:
-        """A picture's group, and its place there; None for one that can't be decoded, as one before it is missing."""
+        """Add a frame.
+
+        Args:
+            number: Of the frame.
+            unit: Its access unit.
+            key: Whether it is a key frame.
+
+        Returns:
+            The group and the index in it; None for a frame that can't be decoded, because one before it is missing.
+        """
         if not self._chain.follows(number, key=key):
             return None
         if key:
@@ -61,20 +83,11 @@ class Groups:
 
 
 def _decoder() -> VideoCodecContext:
-    try:
-        import av
-    except ImportError as error:
-        raise MissingExtraError("decoding recorded H.264", "video", cause=str(error)) from None
-    context = av.CodecContext.create("h264", "r")
-    # A picture with errors is refused instead of patched up; a damaged header must not ask for gigabytes.
-    context.options = {"err_detect": "explode+aggressive", "max_pixels": str(_MAX_PIXELS)}
-    context.flags |= av.codec.context.Flags.low_delay
-    context.thread_count = 1  # frame threads would hold pictures back
-    return context
+    return new_decoder("h264", "decoding recorded H.264")
 
 
 def _decode(context: VideoCodecContext, unit: bytes) -> Any:
-    """The picture of one access unit, or None."""
+    """Decode one access unit; None if it is damaged."""
     import av
 
     try:

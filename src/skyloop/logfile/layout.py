@@ -1,7 +1,7 @@
-"""What a recording looks like: topics, schemas and times, and the way there and back. The page is docs/recording.md.
+"""The layout of a recording: topics, schemas and times, encoding and decoding. The page is docs/recording.md.
 
-Pure, and without the MCAP library. Our own samples are JSON objects, made by :func:`encode` and read by :func:`decode`;
-messages for viewers are in :mod:`skyloop.recording.foxglove`.
+Pure, and without the MCAP library. Skyloop's own samples are JSON objects, encoded by :func:`encode` and decoded by
+:func:`decode`; messages for viewers are in :mod:`skyloop.recording.foxglove`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import msgspec
 from msgspec import inspect
 
 from skyloop.errors import FileFormatError
-from skyloop.logfile.plain import decode, encode, from_plain, schema, schema_name, to_plain
+from skyloop.logfile.plain import decode, encode, from_json, from_plain, limited, schema, schema_name, to_plain
 from skyloop.messages import (
     Annotation,
     Applied,
@@ -64,8 +64,8 @@ T = TypeVar("T")
 
 PROFILE: Final = "skyloop"  #: of the MCAP header
 VERSION: Final = 1  #: of this layout
-JSON: Final = "json"  #: message encoding of our own samples
-JSON_SCHEMA: Final = "jsonschema"  #: schema encoding of our own samples
+JSON: Final = "json"  #: message encoding of Skyloop's own samples
+JSON_SCHEMA: Final = "jsonschema"  #: schema encoding of Skyloop's own samples
 PROTOBUF: Final = "protobuf"  #: both encodings of messages for viewers
 
 # Names of the metadata records. All their values are texts; see :class:`ClockPair` and :class:`Start`.
@@ -81,11 +81,14 @@ WORLD: Final = "world"  #: the fixed frame: x east, y north, z up [m]
 # Times ---------------------------------------------------------------------------------------------------------
 
 
+_LAST_UNIX_NS: Final = 2**63 - 1  #: in the year 2262
+
+
 class ClockPair(msgspec.Struct, frozen=True):
     """Metadata ``skyloop.clock``: one moment on the recorder's two clocks.
 
-    ``log_time`` of a message is when it was received, ``publish_time`` when it was captured (sent, told), both as Unix
-    time [ns] by this pair. Times *within* our samples are on the proxy's monotonic clock, untouched.
+    ``log_time`` of a message is when it was received, ``publish_time`` when it was captured (sent, published), both as
+    Unix time [ns] by this pair. Times *within* Skyloop's samples are on the proxy's monotonic clock, unchanged.
     """
 
     monotonic_ns: int
@@ -95,16 +98,24 @@ class ClockPair(msgspec.Struct, frozen=True):
 
     @classmethod
     def now(cls) -> ClockPair:
+        """Read both clocks."""
         before = time.monotonic_ns()
         unix = time.time_ns()
         return cls((before + time.monotonic_ns()) // 2, unix, os.getpid(), _boot_id())
 
     def unix(self, monotonic_ns: int, offset_ns: int = 0) -> int:
-        """Unix time [ns] of a monotonic one; ``offset_ns``: the clock that it is on less the recorder's."""
-        return max(0, monotonic_ns - offset_ns - self.monotonic_ns + self.unix_ns)
+        """Convert a monotonic time to Unix time [ns].
+
+        The result is limited to what a file can hold, so that a sample with an absurd time breaks no file.
+
+        Args:
+            monotonic_ns: The time.
+            offset_ns: Its clock minus the recorder's.
+        """
+        return min(max(0, monotonic_ns - offset_ns - self.monotonic_ns + self.unix_ns), _LAST_UNIX_NS)
 
     def monotonic(self, unix_ns: int, offset_ns: int = 0) -> int:
-        """The way back from :meth:`unix`."""
+        """Convert Unix time [ns] to a monotonic time; the inverse of :meth:`unix`."""
         return unix_ns - self.unix_ns + self.monotonic_ns + offset_ns
 
 
@@ -123,12 +134,16 @@ class DroneRecord(msgspec.Struct, frozen=True):
 
     name: str
     uri: str = ""
-    capabilities: dict[str, Any] = {}  #: as :func:`to_plain` makes them of :class:`Capabilities`
-    clock_offset_ns: int = 0  #: the proxy's clock less the recorder's, as known at the start
+    capabilities: dict[str, Any] = {}  #: :class:`Capabilities`, converted by :func:`to_plain`
+    clock_offset_ns: int = 0  #: the proxy's clock minus the recorder's, as known at the start
 
     @property
     def described(self) -> Capabilities:
-        """What the vehicle can do."""
+        """The drone's capabilities.
+
+        Raises:
+            FileFormatError: They can't be decoded.
+        """
         return from_plain(self.capabilities, Capabilities)
 
 
@@ -154,7 +169,7 @@ class End(msgspec.Struct, frozen=True):
 
 
 def to_metadata(record: msgspec.Struct) -> dict[str, str]:
-    """A metadata record's texts: a text as it is, all else as JSON."""
+    """Convert a metadata record to strings: a string as it is, all else as JSON."""
     fields = msgspec.to_builtins(record)
     return {
         key: value if isinstance(value, str) else msgspec.json.encode(value).decode() for key, value in fields.items()
@@ -162,27 +177,31 @@ def to_metadata(record: msgspec.Struct) -> dict[str, str]:
 
 
 def from_metadata(texts: Mapping[str, str], kind: type[T]) -> T:
-    """The way back. Raises :class:`FileFormatError`."""
+    """Convert strings back to a metadata record.
+
+    Raises:
+        FileFormatError: They do not fit the record.
+    """
     info = inspect.type_info(kind)
     assert isinstance(info, inspect.StructType)
     try:
         fields = {
             field.name: texts[field.name]
             if isinstance(field.type, inspect.StrType)
-            else msgspec.json.decode(texts[field.name])
+            else limited(from_json(texts[field.name]))
             for field in info.fields
             if field.name in texts
         }
         return msgspec.convert(fields, kind)
-    except (msgspec.DecodeError, msgspec.ValidationError) as error:
+    except (msgspec.ValidationError, FileFormatError, ValueError) as error:
         raise FileFormatError(f"metadata that can't be understood as {kind.__name__}: {error}") from None
 
 
-# Our own samples -----------------------------------------------------------------------------------------------
+# Skyloop's own samples -----------------------------------------------------------------------------------------
 
 
 class Channel(StrEnum):
-    """Our own channels; topics are ``/NAME/CHANNEL``, for frames ``/NAME/frames/CAMERA``."""
+    """Skyloop's own channels; topics are ``/NAME/CHANNEL``, for frames ``/NAME/frames/CAMERA``."""
 
     FEEDBACK = "feedback"
     COMMANDS = "commands"
@@ -196,17 +215,19 @@ class Channel(StrEnum):
 
 
 class FrameRecord(msgspec.Struct, frozen=True):
-    """A recorded frame. Its picture is the message on :func:`image_topic`, or of H.264 on :func:`video_topic`, of the
-    same ``sequence`` and times."""
+    """A recorded frame; its image is a message of its own, with the same sequence and times.
 
-    header: FrameHeader  #: as it came
+    That is on :func:`image_topic`, or for H.264 on :func:`video_topic`.
+    """
+
+    header: FrameHeader  #: as received
     received_ns: int  #: on the recorder's monotonic clock
-    format: str  #: of the picture in the file: ``jpeg``, ``png``, ``h264``
-    key: bool = True  #: it can be decoded without those before it, as all but some of ``h264`` can
+    format: str  #: of the image in the file: ``jpeg``, ``png``, ``h264``
+    key: bool = True  #: whether it can be decoded alone, as all but some of ``h264`` can
 
 
 class ResultRecord(msgspec.Struct, frozen=True):
-    """What a processor made of a frame: a ``ProcessorResult`` with its value in JSON, NumPy's arrays as lists."""
+    """A processor's result for a frame: a ``ProcessorResult`` with its value in JSON, NumPy's arrays as lists."""
 
     processor: str
     worker: int
@@ -214,20 +235,20 @@ class ResultRecord(msgspec.Struct, frozen=True):
     camera: str
     seq: int  #: of the frame
     captured_ns: int  #: of the frame
-    made_ns: int  #: when the result was there, on the proxy's clock
+    made_ns: int  #: when the result was ready, on the proxy's clock
     took_ns: int
     value: Any = None
 
 
 class Drops(msgspec.Struct, frozen=True):
-    """Totals since the recording started, written when one has changed; by channel: ``feedback``, ``video.front`` …"""
+    """Totals by channel (``feedback``, ``video.front``) since the recording started, written when one has changed."""
 
     at_ns: int  #: on the recorder's monotonic clock
     dropped: dict[str, int]  #: received, and left out because the disk or the encoder was slower
-    missed: dict[str, int]  #: never received: left out by the proxy for a slow recorder, or lost on the way
+    missed: dict[str, int]  #: never received: dropped by the proxy for a slow recorder, or lost in transport
 
 
-#: What the messages of our own channels are.
+#: Types of the messages of Skyloop's own channels.
 TYPES: Final[dict[Channel, type[msgspec.Struct]]] = {
     Channel.FEEDBACK: Feedback,
     Channel.COMMANDS: Applied,
@@ -243,18 +264,19 @@ TYPES: Final[dict[Channel, type[msgspec.Struct]]] = {
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """Our own topic, taken apart."""
+    """One of Skyloop's own topics, in its parts."""
 
     drone: str
     channel: Channel
     camera: str = ""
 
     def __str__(self) -> str:
+        """Return the topic as a string."""
         return "/" + "/".join(map(_quoted, (self.drone, self.channel.value, *([self.camera] if self.camera else []))))
 
 
 def parse_topic(topic: str) -> Topic | None:
-    """The parts of one of our own topics; None for any other."""
+    """Parse one of Skyloop's own topics; return None for any other."""
     parts = [_unquoted(part) for part in topic.split("/")]
     if len(parts) not in (3, 4) or parts[0] or parts[2] not in set(Channel):
         return None
@@ -265,42 +287,42 @@ def parse_topic(topic: str) -> Topic | None:
 
 
 def image_topic(drone: str, camera: str) -> str:
-    """foxglove.CompressedImage."""
+    """Return the topic of a camera's images, foxglove.CompressedImage."""
     return f"/{_quoted(drone)}/camera/{_quoted(camera)}/image"
 
 
 def video_topic(drone: str, camera: str) -> str:
-    """foxglove.CompressedVideo: pictures that are kept as they came."""
+    """Return the topic of a camera's H.264 as the vehicle sent it, foxglove.CompressedVideo."""
     return f"/{_quoted(drone)}/camera/{_quoted(camera)}/video"
 
 
 def calibration_topic(drone: str, camera: str) -> str:
-    """foxglove.CameraCalibration."""
+    """Return the topic of a camera's intrinsics, foxglove.CameraCalibration."""
     return f"/{_quoted(drone)}/camera/{_quoted(camera)}/calibration"
 
 
 def drawing_topic(drone: str, camera: str) -> str:
-    """foxglove.ImageAnnotations."""
+    """Return the topic of the annotations on a camera's frames, foxglove.ImageAnnotations."""
     return f"/{_quoted(drone)}/camera/{_quoted(camera)}/annotations"
 
 
 def pose_topic(drone: str) -> str:
-    """foxglove.PoseInFrame."""
+    """Return the topic of the drone's pose, foxglove.PoseInFrame."""
     return f"/{_quoted(drone)}/pose"
 
 
 def mocap_topic(drone: str) -> str:
-    """foxglove.PoseInFrame, as motion capture sees it."""
+    """Return the topic of the drone's pose by motion capture, foxglove.PoseInFrame."""
     return f"/{_quoted(drone)}/mocap"
 
 
 def path_topic(drone: str) -> str:
-    """foxglove.PosesInFrame: where it has been since the recording started."""
+    """Return the topic of where the drone has been since the recording started, foxglove.PosesInFrame."""
     return f"/{_quoted(drone)}/path"
 
 
 def optical_frame(drone: str, camera: str) -> str:
-    """Name of a camera's frame: x right, y down, z forward."""
+    """Return the name of a camera's frame of reference: x right, y down, z forward."""
     return f"{drone}/{camera}"
 
 

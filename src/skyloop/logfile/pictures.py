@@ -1,8 +1,9 @@
 """A recorded frame, and its pixels.
 
-The picture is the field ``data`` of a foxglove.CompressedImage, or where the vehicle's H.264 was kept of a
-foxglove.CompressedVideo, taken out of its Protocol Buffers encoding (https://protobuf.dev/programming-guides/encoding/,
-https://docs.foxglove.dev/docs/sdk/schemas/compressed-image, …/compressed-video).
+The image is the field ``data`` of a foxglove.CompressedImage, or where the vehicle's H.264 was kept of a
+foxglove.CompressedVideo, extracted from its Protocol Buffers encoding
+(https://protobuf.dev/programming-guides/encoding/, https://docs.foxglove.dev/docs/sdk/schemas/compressed-image,
+…/compressed-video).
 """
 
 from __future__ import annotations
@@ -18,8 +19,9 @@ from skyloop.logfile.h264 import Group
 from skyloop.logfile.layout import FrameRecord
 from skyloop.messages import Encoding, FrameHeader
 from skyloop.messages.encoded import H264
+from skyloop.messages.image_header import why_not_decoded
 
-_DATA: Final = 2  #: number of the field with the compressed picture,
+_DATA: Final = 2  #: number of the field with the compressed image,
 _VIDEO_DATA: Final = 3  #: and of the one with H.264
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  #: kinds of field
 _FIXED_SIZE: Final = {_FIXED64: 8, _FIXED32: 4}
@@ -34,23 +36,38 @@ class Picture:
     log_ns: int  #: when it was received, Unix time [ns]
     publish_ns: int  #: when it was captured, Unix time [ns]
     message: bytes  #: foxglove.CompressedImage or CompressedVideo
-    group: tuple[Group, int] | None = None  #: of H.264 that can be decoded: where, and its place there
+    group: tuple[Group, int] | None = None  #: for H.264 that can be decoded: its group, and its index in it
 
     @property
     def header(self) -> FrameHeader:
+        """The frame's header, as received."""
         return self.record.header
 
     @property
     def compressed(self) -> bytes:
-        """The picture's file, or access unit, in ``record.format``. Raises :class:`FileFormatError`."""
+        """The image file, or access unit, in ``record.format``.
+
+        Raises:
+            FileFormatError: The message is damaged.
+        """
         return compressed(self.message, self.record)
 
     def pixels(self) -> NDArray[np.uint8]:
-        """BGR, shape (height, width, 3), uint8. Raises :class:`FileFormatError` for what can't be decoded."""
+        """Decode the frame: BGR, shape (height, width, 3), uint8.
+
+        Raises:
+            FileFormatError: It can't be decoded.
+            MissingExtraError: OpenCV, or for H.264 PyAV, is not installed.
+        """
         return self._decoded(grey=False)
 
     def as_recorded(self) -> tuple[NDArray[np.uint8], Encoding]:
-        """The pixels in the encoding in which the vehicle gave them if that was raw, else BGR."""
+        """Decode the frame in the encoding in which the vehicle sent it if that was raw, else as BGR.
+
+        Raises:
+            FileFormatError: It can't be decoded.
+            MissingExtraError: OpenCV, or for H.264 PyAV, is not installed.
+        """
         grey = self.header.encoding is Encoding.MONO8
         image = self._decoded(grey=grey)
         if self.header.encoding is Encoding.RGB8:
@@ -68,27 +85,47 @@ class Picture:
 
 
 def compressed(message: bytes, record: FrameRecord) -> bytes:
-    """A picture's file, or access unit, out of its message. Raises :class:`FileFormatError`."""
+    """Extract an image file, or access unit, from its message.
+
+    Raises:
+        FileFormatError: The message is damaged.
+    """
     return _field(message, _VIDEO_DATA if record.format == H264 else _DATA)
 
 
 def decode_image(data: bytes, what: str, *, grey: bool) -> NDArray[np.uint8]:
-    """JPEG or PNG to BGR, shape (h, w, 3), or with ``grey`` (h, w)."""
+    """Decode JPEG or PNG.
+
+    Args:
+        data: The image file.
+        what: The frame, for error messages.
+        grey: Whether to return grey and not BGR.
+
+    Returns:
+        BGR, shape (h, w, 3), or grey (h, w), uint8.
+
+    Raises:
+        FileFormatError: It can't be decoded.
+        MissingExtraError: OpenCV is not installed.
+    """
     try:
         import cv2
     except ImportError as error:
         raise MissingExtraError("decoding recorded frames", "vision", cause=str(error)) from None
-    image: Any = None
-    if data:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR)
+    if reason := why_not_decoded(data):
+        raise FileFormatError(f"{what} can't be decoded: {reason}")
+    try:
+        image: Any = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR)
+    except cv2.error:
+        image = None
     if image is None:
-        raise FileFormatError(f"{what} can't be decoded: it is neither JPEG nor PNG, or it is damaged")
+        raise FileFormatError(f"{what} can't be decoded: it is damaged")
     result: NDArray[np.uint8] = image
     return result
 
 
 def _field(message: bytes, number: int) -> bytes:
-    """A field of bytes of an encoded message; empty if it is not there."""
+    """Return a field of bytes of an encoded message; empty if it is not there."""
     at = 0
     while at < len(message):
         key, at = _varint(message, at)
@@ -108,7 +145,7 @@ def _field(message: bytes, number: int) -> bytes:
 
 
 def _varint(message: bytes, at: int) -> tuple[int, int]:
-    """A number of seven bits a byte, and where it ends."""
+    """Decode a number of seven bits per byte; return it and where it ends."""
     number = shift = 0
     while at < len(message) and shift < 64:
         byte = message[at]

@@ -1,7 +1,7 @@
-"""Our own samples as JSON objects with a schema, and the way back. Pure, and without the MCAP library.
+"""Skyloop's own samples as JSON objects with a schema, and back. Pure, and without the MCAP library.
 
 The keys are the fields of a sample's class. What is not known is absent; a number that is not finite is null; the
-members of a union are told apart by a key of their own (``action``, ``shape``).
+members of a union are distinguished by a key of their own (``action``, ``shape``).
 """
 
 from __future__ import annotations
@@ -19,22 +19,38 @@ from skyloop.messages import ACTION_NAMES, Points, Polyline, Text
 
 T = TypeVar("T")
 
+MAX_DEPTH: Final = 64  #: of lists and objects in a sample; a processor's results have a handful
+MIN_INT: Final = -(1 << 63)
+MAX_INT: Final = (1 << 63) - 1
+
 
 def encode(sample: msgspec.Struct) -> bytes:
-    """A sample as JSON."""
+    """Encode a sample as JSON."""
     return msgspec.json.encode(to_plain(sample))
 
 
 def decode(data: bytes | memoryview, kind: type[T]) -> T:
-    """The way back. Raises :class:`FileFormatError` for anything else."""
+    """Decode a sample from JSON.
+
+    Raises:
+        FileFormatError: The data are no sample of that kind.
+    """
+    return from_plain(from_json(data), kind)
+
+
+def from_json(data: bytes | memoryview | str) -> Any:
+    """Decode any JSON.
+
+    Raises:
+        FileFormatError: The data are no JSON, or nested too deeply.
+    """
     try:
-        plain = msgspec.json.decode(data)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        return msgspec.json.decode(data)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise FileFormatError(f"a message that is not JSON: {error}") from None
-    return from_plain(plain, kind)
 
 
-#: How the members of a union are told apart in JSON: key and value.
+#: How the members of a union are distinguished in JSON: key and value.
 _TAGS: Final[dict[type, tuple[str, str]]] = {
     **{action: ("action", name) for action, name in ACTION_NAMES.items()},
     Polyline: ("shape", "polyline"),
@@ -44,7 +60,7 @@ _TAGS: Final[dict[type, tuple[str, str]]] = {
 
 
 def to_plain(value: Any) -> Any:
-    """A sample as dict, list, text, number and bool."""
+    """Convert a sample to dict, list, str, numbers and bool."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, msgspec.Struct):
@@ -65,12 +81,37 @@ def to_plain(value: Any) -> Any:
 
 
 def from_plain(plain: Any, kind: type[T]) -> T:
-    """The way back. Raises :class:`FileFormatError`."""
+    """Convert plain values back to a sample.
+
+    Raises:
+        FileFormatError: The values are no sample of that kind.
+    """
     restore = _restorer(kind)  # type: ignore[arg-type]
     try:
         return msgspec.convert(restore(plain), kind)
-    except (msgspec.ValidationError, TypeError, ValueError, LookupError, AttributeError) as error:
-        raise FileFormatError(f"a message that can't be understood as {kind.__name__}: {error!r}") from None
+    except (msgspec.ValidationError, TypeError, ValueError, LookupError, AttributeError, RecursionError) as error:
+        raise FileFormatError(f"a message that can't be understood as {kind.__name__}: {error!r:.300}") from None
+
+
+def limited(value: Any, depth: int = MAX_DEPTH) -> Any:
+    """Return a JSON value unchanged if others can work with it.
+
+    Args:
+        value: The decoded JSON.
+        depth: How deeply it may be nested.
+
+    Raises:
+        ValueError: A whole number has more than 64 bits, which neither NumPy nor a packet can hold, or the value is
+            nested too deeply.
+    """
+    if isinstance(value, dict | list):
+        if depth <= 0:
+            raise ValueError(f"it is nested more than {MAX_DEPTH} deep")
+        for one in value.values() if isinstance(value, dict) else value:
+            limited(one, depth - 1)
+    elif type(value) is int and not MIN_INT <= value <= MAX_INT:
+        raise ValueError("a whole number of more than 64 bits")
+    return value
 
 
 _Restore = Callable[[Any], Any]
@@ -78,7 +119,7 @@ _Restore = Callable[[Any], Any]
 
 @cache
 def _restorer(kind: Any) -> _Restore:
-    """From a JSON value to what ``msgspec.convert`` takes for this type."""
+    """Return a function from a JSON value to what ``msgspec.convert`` takes for this type."""
     return _restore_type(inspect.type_info(kind))
 
 
@@ -87,6 +128,8 @@ def _restore_type(info: inspect.Type) -> _Restore:
         return _restore_type(info.type)
     if isinstance(info, inspect.FloatType):
         return lambda value: math.nan if value is None else value
+    if isinstance(info, inspect.IntType | inspect.AnyType):
+        return limited
     if isinstance(info, inspect.StructType):
         return _restore_struct(info)
     if isinstance(info, inspect.UnionType):
@@ -146,8 +189,13 @@ def _restore_union(info: inspect.UnionType) -> _Restore:
             key = next(iter(structs.values()))[0]
             return structs[value[key]][1](value)
         if only is not None:
-            return only(value)
-        return [math.nan if one is None else one for one in value] if isinstance(value, list) else value
+            restored = only(value)
+            # A vector that is not known in one part is not known; our own samples hold no numbers that are not finite.
+            unknown = nothing is None and isinstance(restored, list) and any(one != one for one in restored)
+            return None if unknown else restored
+        return (
+            [math.nan if one is None else limited(one) for one in value] if isinstance(value, list) else limited(value)
+        )
 
     return restore
 
@@ -156,15 +204,17 @@ def _restore_union(info: inspect.UnionType) -> _Restore:
 
 
 def schema_name(kind: type[msgspec.Struct]) -> str:
+    """Return the name of a sample's schema."""
     return f"skyloop.{kind.__name__}"
 
 
 @cache
 def schema(kind: type[msgspec.Struct]) -> bytes:
-    """The JSON schema of a sample, in the few words that viewers understand: no references, no choice of types.
+    """Return the JSON schema of a sample, in the subset that viewers understand: no references, no choice of types.
 
     (Foxglove's and Lichtblick's readers want "type": "object" at the root and one type for each property and item.)
     A property that may be of several types, such as a parameter's value, is therefore not listed: others are allowed.
+    The description is the first line of the class's docstring.
     """
     info = inspect.type_info(kind)
     described = {"title": schema_name(kind), "description": (kind.__doc__ or "").partition("\n")[0], **_schema_of(info)}
@@ -181,7 +231,7 @@ _SIMPLE: Final = (
 
 
 def _schema_of(info: inspect.Type) -> dict[str, Any]:
-    """Empty for what can't be said."""
+    """Return the schema of a type; empty for one that can't be described."""
     if isinstance(info, inspect.Metadata):
         return _schema_of(info.type)
     for kind, name in _SIMPLE:

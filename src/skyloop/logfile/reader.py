@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import zip_longest
+from operator import attrgetter
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeGuard
 
 from skyloop.clock import NS_PER_S
 from skyloop.errors import FileFormatError, UnknownNameError
@@ -31,16 +34,16 @@ from skyloop.logfile.layout import (
     video_topic,
 )
 from skyloop.logfile.pictures import Picture, compressed
-from skyloop.logfile.scan import Message, Piece, Scan, note, open_file, records, scan
+from skyloop.logfile.scan import MAX_TIME_NS, Message, Piece, Scan, find_channels, note, open_file, records, scan
 from skyloop.messages.encoded import H264
 
-#: Told how much of a file has been read, from 0 to 1.
+#: Called with the share of a file that has been read, from 0 to 1.
 Progress = Callable[[float], object]
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One message as it lies in the file; times are Unix time [ns]."""
+    """One message of the file; times are Unix time [ns]."""
 
     topic: str
     log_ns: int  #: when it was received
@@ -65,12 +68,12 @@ class Series:
 
     topic: str
     schema: str
-    own: Topic | None  #: None: for viewers, or somebody else's
+    own: Topic | None  #: None for viewers' topics and for foreign ones
 
 
 @dataclass(slots=True)
 class Recording:
-    """An MCAP file that Skyloop recorded. Opening looks through it once; each iteration reads it anew.
+    """An MCAP file that Skyloop recorded. Opening scans it once; each iteration reads it anew.
 
     A file that was cut off is read as far as it goes, and ``cut`` says where it ends. What can't be read in its middle
     is left out, and ``damaged`` says where.
@@ -82,11 +85,19 @@ class Recording:
     end: End | None  #: None for a file that was not closed
     found: Scan
     _bad: Counter[str] = field(default_factory=Counter)
+    _complete: bool = False  # whether all channels are known
 
     @classmethod
     def open(cls, path: str | Path) -> Recording:
-        """Raises :class:`UsageError` for a file that is not there, and :class:`FileFormatError` for one that is no MCAP
-        file or that something else wrote."""
+        """Open a recording.
+
+        Args:
+            path: The file.
+
+        Raises:
+            UsageError: The file does not exist or can't be read.
+            FileFormatError: It is no MCAP file, or was not recorded by Skyloop.
+        """
         found = scan(path)
         texts = {record.name: record.metadata for record in found.metadata}
         if META_RECORDING not in texts or META_CLOCK not in texts:
@@ -102,7 +113,7 @@ class Recording:
 
     @property
     def cut(self) -> str:
-        """Why it is no whole file, in words; empty for a whole one."""
+        """Why the file is incomplete, in words; empty for a complete one."""
         return self.found.cut
 
     @property
@@ -112,10 +123,16 @@ class Recording:
 
     @property
     def drones(self) -> tuple[DroneRecord, ...]:
+        """The drones of the recording."""
         return self.start.drones
 
     def drone(self, name: str | None = None) -> DroneRecord:
-        """The drone of that name, or the first. Raises :class:`UnknownNameError`."""
+        """Return the drone of that name, or the first.
+
+        Raises:
+            UnknownNameError: The recording has no such drone.
+            FileFormatError: The recording has no drone at all.
+        """
         if not self.drones:
             raise FileFormatError(f"{self.path} names no drone")
         if name is None:
@@ -127,7 +144,10 @@ class Recording:
 
     @property
     def series(self) -> list[Series]:
-        """The channels in the file, sorted by topic."""
+        """The channels in the file, sorted by topic. For a file that was cut off, the first access reads all of it."""
+        if self.found.cut and not self._complete:
+            find_channels(self.found)
+        self._complete = True
         schemas = self.found.schemas
         return sorted(
             (
@@ -142,7 +162,11 @@ class Recording:
         )
 
     def cameras(self, drone: str) -> list[str]:
-        """The cameras of which there are frames, in the vehicle's order."""
+        """Return the cameras that have frames, in the vehicle's order.
+
+        Raises:
+            UnknownNameError: The recording has no such drone.
+        """
         own = (series.own for series in self.series)
         found = {topic.camera for topic in own if topic and topic.drone == drone and topic.camera}
         order = [camera.name for camera in self.drone(drone).described.cameras]
@@ -154,11 +178,11 @@ class Recording:
         times = [(piece.start_ns, piece.end_ns) for piece in self.found.pieces if piece.end_ns]
         if not times:
             return 0, 0
-        return min(time[0] for time in times if time[0]), max(time[1] for time in times)
+        return min(time[0] for time in times), max(time[1] for time in times)
 
     @property
     def seconds(self) -> float:
-        """From the first message to the last [s]."""
+        """Time from the first message to the last."""
         first, last = self.span_ns
         return (last - first) / NS_PER_S
 
@@ -167,17 +191,30 @@ class Recording:
     def entries(
         self, topics: Collection[str] | None = None, *, from_ns: int = 0, progress: Progress | None = None
     ) -> Iterator[Entry]:
-        """Messages in the order of their log time, of some topics or of all, from a log time on (Unix time [ns])."""
+        """Yield messages in the order of their log time.
+
+        Args:
+            topics: Which ones; None yields all.
+            from_ns: Log time to start from, Unix time [ns].
+            progress: Called with the share that was read, 0 to 1.
+
+        Raises:
+            UsageError: The file can't be read any more.
+        """
         wanted = None if topics is None else set(topics)
         total = sum(piece.size for piece in self.found.pieces) or 1
         read = 0
         with open_file(self.path) as file:
-            for piece in self.found.pieces:
+            # Several threads feed a recorder: a message may come a little before an older one, also of the next piece.
+            held: list[Entry] = []
+            for piece, after in zip_longest(self.found.pieces, self.found.pieces[1:]):
                 read += piece.size
                 if not piece.end_ns or piece.end_ns >= from_ns:
-                    found = [entry for entry in self._piece(file, piece, wanted) if entry.log_ns >= from_ns]
-                    # Several threads feed a recorder: a message may stand a little before an older one.
-                    yield from sorted(found, key=lambda entry: entry.log_ns)
+                    held += (entry for entry in self._piece(file, piece, wanted) if entry.log_ns >= from_ns)
+                    held.sort(key=attrgetter("log_ns"))
+                    until = bisect_left(held, after.start_ns, key=attrgetter("log_ns")) if _has_start(after) else None
+                    yield from held[:until]
+                    held = [] if until is None else held[until:]
                 if progress is not None:
                     progress(read / total)
 
@@ -189,7 +226,14 @@ class Recording:
         from_ns: int = 0,
         progress: Progress | None = None,
     ) -> Iterator[Item]:
-        """Our own samples of a drone, of some channels or of all. What can't be understood is left out, and counted."""
+        """Yield Skyloop's own samples of a drone. What can't be decoded is left out, and counted in :attr:`damaged`.
+
+        Args:
+            drone: The drone's name.
+            channels: Which ones.
+            from_ns: Log time to start from, Unix time [ns].
+            progress: Called with the share that was read, 0 to 1.
+        """
         topics = self._topics(drone, channels)
         for entry in self.entries(topics, from_ns=from_ns, progress=progress):
             topic = topics[entry.topic]
@@ -203,11 +247,21 @@ class Recording:
         channels: Collection[Channel],
         progress: Progress | None = None,
     ) -> Iterator[Item | Picture]:
-        """The same, with each frame as a :class:`Picture`, which is a :class:`FrameRecord` with what it shows."""
+        """Return samples as :meth:`items` does, with each frame as a :class:`Picture`: its record with its image.
+
+        Args:
+            drone: The drone's name.
+            channels: Which ones.
+            progress: Called with the share that was read, 0 to 1.
+        """
         return self._paired(self._topics(drone, channels), _image_topics(drone, self.cameras(drone)), progress)
 
     def pictures(self, drone: str, camera: str, progress: Progress | None = None) -> Iterator[Picture]:
-        """The frames of one camera."""
+        """Return the frames of one camera.
+
+        Raises:
+            UnknownNameError: The recording has no such drone or camera.
+        """
         known = self.cameras(drone)
         if camera not in known:
             raise UnknownNameError(f"camera of {drone} in {self.path}", camera, known)
@@ -216,7 +270,7 @@ class Recording:
         return (picture for picture in found if isinstance(picture, Picture))
 
     def decoded(self, entry: Entry, channel: Channel) -> Any:
-        """A message of one of our own channels; None, and counted, if it can't be understood."""
+        """Decode a message of one of Skyloop's own channels; None, and counted in :attr:`damaged`, if that fails."""
         try:
             return decode(entry.data, TYPES[channel])
         except FileFormatError as error:
@@ -226,20 +280,22 @@ class Recording:
     # Inside ----------------------------------------------------------------------------------------------------
 
     def _piece(self, file: IO[bytes], piece: Piece, wanted: Collection[str] | None) -> Iterator[Entry]:
-        """Messages of a part of the file, as they lie there."""
+        """Yield the messages of a part of the file, in the file's order."""
         channels = self.found.channels
         for record in records(file, piece, self.found.damage):
             if not isinstance(record, Message):
                 note(self.found, record)
                 continue
             channel = channels.get(record.channel_id)
-            if channel is not None and (wanted is None or channel.topic in wanted):
+            if max(record.log_time, record.publish_time) > MAX_TIME_NS:
+                self._bad["a message of a time after the year 2262"] += 1
+            elif channel is not None and (wanted is None or channel.topic in wanted):
                 yield Entry(channel.topic, record.log_time, record.publish_time, record.sequence, record.data)
 
     def _paired(
         self, topics: dict[str, Topic], images: dict[str, _Kind], progress: Progress | None
     ) -> Iterator[Item | Picture]:
-        """Samples of some topics, with the pictures of others instead of their records."""
+        """Yield samples of some topics, with frames as pictures in place of their records."""
         pairs = _Pairs()
         for entry in self.entries([*topics, *images], progress=progress):
             topic = topics.get(entry.topic)
@@ -267,14 +323,19 @@ class Recording:
 _Kind = tuple[str, bool]  # camera, and whether it is H.264 as the vehicle sent it
 
 
+def _has_start(piece: Piece | None) -> TypeGuard[Piece]:
+    """Whether the time of a piece's first message is known."""
+    return piece is not None and piece.start_ns > 0
+
+
 def _image_topics(drone: str, cameras: Collection[str]) -> dict[str, _Kind]:
-    """Where pictures are."""
+    """Return the topics with images."""
     found: dict[str, _Kind] = {image_topic(drone, camera): (camera, False) for camera in cameras}
     return found | {video_topic(drone, camera): (camera, True) for camera in cameras}
 
 
 class _Pairs:
-    """Brings together each frame's record and its image, whichever comes first: both have the same sequence."""
+    """Combines each frame's record with its image, whichever comes first: both have the same sequence."""
 
     def __init__(self) -> None:
         self._records: dict[_Kind, tuple[Entry, FrameRecord]] = {}
@@ -299,7 +360,7 @@ class _Pairs:
         group = None
         if encoded:
             groups = self._groups.setdefault(camera, Groups())
-            with suppress(FileFormatError):  # it has no group then, and says so when it is looked at
+            with suppress(FileFormatError):  # without a group, decoding it raises
                 group = groups.add(record.header.seq, compressed(image.data, record), key=record.key)
         return Picture(camera, record, entry.log_ns, entry.publish_ns, image.data, group)
 

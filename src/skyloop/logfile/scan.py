@@ -1,12 +1,13 @@
-"""Where everything lies in an MCAP file, found without its index: one that was cut off reads like a whole one.
+"""The structure of an MCAP file, found without its index, so that one that was cut off reads like a complete one.
 
 The format is that of https://mcap.dev/spec: records of an opcode, a length and that many bytes, most of them chunks,
-which hold messages. A record that the file ends within is where reading stops; of a chunk that was cut, what is there
-is read.
+which hold messages. Reading stops at a record within which the file ends; of a chunk that was cut off, the part that is
+there is read.
 """
 
 from __future__ import annotations
 
+import itertools
 import struct
 import zlib
 from collections.abc import Callable, Iterator
@@ -16,6 +17,20 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 from skyloop.errors import FileFormatError, MissingExtraError, UsageError
+
+# Limits: a few kilobytes of a file could otherwise fill the memory or keep a core busy for minutes.
+#: Bytes of a chunk, packed and unpacked, and of a message outside of one. Recorders close a chunk after 1 to 4 MB; it
+#: is larger only by one message, of which an uncompressed 4K picture is the largest.
+MAX_CHUNK: Final = 64 << 20
+#: How many times as large a chunk may be unpacked. LZ4 can't do more than 255; what hardly changes gets to 150.
+MAX_RATIO: Final = 512
+MAX_RECORD: Final = 8 << 20  #: bytes of a metadata record, a schema or a channel; Skyloop's take some kilobytes
+#: Bytes of metadata, schemas and channels of a file: they are kept in memory. A recording of 100 drones has about 1 MB.
+MAX_HEAD: Final = 32 << 20
+MAX_PIECES: Final = 500_000  #: chunks of a file; a recorder that closes one every second gets there after five days
+MAX_RECORDS: Final = 5_000_000  #: records of a file outside of chunks, where Skyloop's recordings have some hundreds
+MAX_TIME_NS: Final = (1 << 63) - 1  #: Unix time, in the year 2262; later times can't be converted to a date
+_RUN: Final = 4 << 20  #: bytes of messages outside of chunks that are read at once
 
 try:
     from mcap.data_stream import ReadDataStream
@@ -31,21 +46,33 @@ _CHUNK: Final = struct.Struct(
     "<QQQII"
 )  #: first and last time, size and CRC when unpacked, length of compression's name
 _MESSAGE: Final = struct.Struct("<HIQQ")  #: channel, sequence, log time, publish time
-MAX_RECORD: Final = 1 << 32  #: a longer one is damage
-MAX_CHUNK: Final = 1 << 30  #: unpacked
+_LONGEST: Final = 1 << 32  #: a longer record is damage
 MAX_NAME: Final = 16
 
 #: What reading a damaged record may raise.
-Damage: Final = (McapError, struct.error, ValueError, EOFError, MemoryError, OverflowError)
+Damage: Final = (McapError, struct.error, ValueError, EOFError, MemoryError, OverflowError, RecursionError)
 
 Record = Schema | Channel | Message
 
-__all__ = ["Channel", "Message", "Piece", "Record", "Scan", "Schema", "note", "open_file", "records", "scan"]
+__all__ = [
+    "Channel",
+    "Message",
+    "Piece",
+    "Record",
+    "Scan",
+    "Schema",
+    "attachments",
+    "find_channels",
+    "note",
+    "open_file",
+    "records",
+    "scan",
+]
 
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """A chunk, or a run of messages that lie outside of chunks."""
+    """A chunk, or a run of messages outside of chunks."""
 
     offset: int  #: of the chunk's data, or of the run's first record
     size: int  #: in the file
@@ -53,12 +80,13 @@ class Piece:
     end_ns: int = 0
     compression: str | None = None  #: of a chunk, ``""`` for none; None: a run of messages
     crc: int = 0
+    unpacked: int = 0  #: bytes of a chunk's records, as it announces
     cut: bool = False  #: the file ends within it
 
 
 @dataclass(slots=True)
 class Scan:
-    """What a file consists of."""
+    """The structure of a file."""
 
     path: Path
     size: int
@@ -66,33 +94,57 @@ class Scan:
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     metadata: list[Metadata] = field(default_factory=list)
-    attachments: list[Attachment] = field(default_factory=list)
-    cut: str = ""  #: why it is no whole file, in words; empty for one with index and end
+    attachments: list[tuple[int, int]] = field(default_factory=list)  #: where they lie: offset and length
+    cut: str = ""  #: why the file is incomplete, in words; empty for one with index and end
     damaged: list[str] = field(default_factory=list)  #: what can't be read, in words
+    head: int = 0  #: bytes of metadata, schemas and channels that are kept
 
     def damage(self, what: str) -> None:
-        """Remember what can't be read, once."""
+        """Add a description of what can't be read, once."""
         if what not in self.damaged:
             self.damaged.append(what)
 
 
 def scan(path: str | Path) -> Scan:
-    """Look through a file once. Raises :class:`UsageError` for one that is not there, :class:`FileFormatError` for one
-    that is no MCAP file."""
+    """Scan a file once.
+
+    Raises:
+        UsageError: The file does not exist or can't be read.
+        FileFormatError: It is no MCAP file.
+    """
     file_path = Path(path)
     with open_file(file_path) as file:
         found = Scan(file_path, file_path.stat().st_size)
         _check_magic(found, file.read(len(MAGIC)))
         _Scanner(found, file).run()
-        if found.cut:  # channels are repeated at the end of a whole file only
-            for piece in found.pieces:
-                for record in records(file, piece, found.damage):
-                    note(found, record)
     return found
 
 
+def find_channels(found: Scan) -> None:
+    """Read all of a file that was cut off to find its channels: only a complete one repeats them at the end."""
+    with open_file(found.path) as file:
+        for piece in found.pieces:
+            for record in records(file, piece, found.damage):
+                note(found, record)
+
+
+def attachments(found: Scan) -> Iterator[Attachment]:
+    """Yield the attachments; one that can't be read is left out, and noted as damage."""
+    with open_file(found.path) as file:
+        for offset, length in found.attachments:
+            file.seek(offset)
+            try:
+                yield Attachment.read(ReadDataStream(BytesIO(file.read(length))))
+            except Damage as error:
+                found.damage(f"at byte {offset}: {error or type(error).__name__}")
+
+
 def open_file(path: Path) -> IO[bytes]:
-    """Raises :class:`UsageError` that says why it can't be read."""
+    """Open a file for reading.
+
+    Raises:
+        UsageError: It can't be read, with the reason.
+    """
     try:
         return path.open("rb")
     except OSError as error:
@@ -100,21 +152,39 @@ def open_file(path: Path) -> IO[bytes]:
 
 
 def note(found: Scan, record: Record) -> None:
-    """Remember a schema or channel."""
+    """Store a schema or channel, unless there are too many already."""
     if isinstance(record, Channel):
-        found.channels[record.id] = record
-    elif isinstance(record, Schema):
+        if record.id in found.channels or _room(found, len(record.topic) + len(str(record.metadata))):
+            found.channels[record.id] = record
+    elif isinstance(record, Schema) and (record.id in found.schemas or _room(found, len(record.data))):
         found.schemas[record.id] = record
 
 
+def _room(found: Scan, size: int) -> bool:
+    """Whether so much more can be kept in memory; if not, that is noted as damage."""
+    found.head += size
+    if found.head > MAX_HEAD:
+        found.damage(f"more than {MAX_HEAD} bytes of metadata, schemas and channels: the others are left out")
+    return found.head <= MAX_HEAD
+
+
 def records(file: IO[bytes], piece: Piece, damaged: Callable[[str], object] | None = None) -> Iterator[Record]:
-    """Schemas, channels and messages of one piece, in the file's order. ``damaged`` is told of what can't be read."""
-    file.seek(piece.offset)
-    data = file.read(piece.size)
+    """Yield schemas, channels and messages of one piece, in the file's order.
+
+    Args:
+        file: The open file.
+        piece: Which part.
+        damaged: Called with a description of what can't be read.
+    """
     try:
+        if piece.size > MAX_CHUNK:
+            raise ValueError(f"a part of {piece.size} bytes, and at most {MAX_CHUNK} are read at once")
+        file.seek(piece.offset)
+        data = file.read(piece.size)
+        most = len(data)  # records: each takes a byte at least, however well it is packed
         if piece.compression is not None:
             data = _unpack(piece, data)
-        yield from _parse(data)
+        yield from _parse(data, most)
     except Damage as error:
         if damaged is not None and not piece.cut:
             damaged(f"at byte {piece.offset}: {error or type(error).__name__}")
@@ -139,17 +209,20 @@ class _Scanner:
 
     def run(self) -> None:
         found, file = self._found, self._file
-        while True:
+        for number in itertools.count():
+            if number >= MAX_RECORDS or len(found.pieces) >= MAX_PIECES:
+                found.cut = f"it is read up to byte {self._offset} only: it has too many records"
+                break
             frame = file.read(_FRAME.size)
             if len(frame) < _FRAME.size:
                 found.cut = "it has no end: whoever wrote it was stopped" if not frame else "it ends within a record"
                 break
             opcode, length = _FRAME.unpack(frame)
-            if length > MAX_RECORD or opcode == 0:
+            if length > _LONGEST or opcode == 0:
                 found.cut = f"what stands at byte {self._offset} is no record: the file is damaged from there on"
                 break
             end = self._offset + _FRAME.size + length
-            if opcode != Opcode.MESSAGE:
+            if opcode != Opcode.MESSAGE or self._run_size() + length > _RUN:
                 self._end_run()
             if end > found.size:
                 found.cut = f"it ends within a record, {end - found.size} bytes short"
@@ -169,31 +242,39 @@ class _Scanner:
         elif opcode == Opcode.MESSAGE:
             if self._run_start is None:
                 self._run_start = self._offset
+        elif opcode == Opcode.ATTACHMENT:
+            self._found.attachments.append((self._offset + _FRAME.size, length))
         elif opcode in _KEPT:
             try:
-                self._keep(_KEPT[opcode](ReadDataStream(BytesIO(self._file.read(length)))))
+                self._keep(_KEPT[opcode], length)
             except Damage as error:
                 self._found.damage(f"at byte {self._offset}: {error or type(error).__name__}")
 
-    def _keep(self, record: Any) -> None:
-        if isinstance(record, Metadata):
-            self._found.metadata.append(record)
-        elif isinstance(record, Attachment):
-            self._found.attachments.append(record)
-        else:
+    def _keep(self, read: Callable[[ReadDataStream], Any], length: int) -> None:
+        if length > MAX_RECORD:
+            raise ValueError(f"a record of {length} bytes, and at most {MAX_RECORD} are read")
+        record = read(ReadDataStream(BytesIO(self._file.read(length))))
+        if not isinstance(record, Metadata):
             note(self._found, record)
+        elif _room(self._found, length):
+            self._found.metadata.append(record)
 
     def _chunk(self, length: int, *, cut: bool) -> None:
         head = self._file.read(_CHUNK.size)
         if len(head) < _CHUNK.size:
             return
-        start_ns, end_ns, _, crc, name_length = _CHUNK.unpack(head)
+        start_ns, end_ns, unpacked, crc, name_length = _CHUNK.unpack(head)
+        if not start_ns <= end_ns <= MAX_TIME_NS:
+            start_ns = end_ns = 0
         name = self._file.read(min(name_length, MAX_NAME))
         offset = self._offset + _FRAME.size + _CHUNK.size + name_length + 8
         size = length - _CHUNK.size - name_length - 8
         if size > 0:
             compression = name.decode("ascii", "replace")
-            self._found.pieces.append(Piece(offset, size, start_ns, end_ns, compression, crc, cut))
+            self._found.pieces.append(Piece(offset, size, start_ns, end_ns, compression, crc, unpacked, cut))
+
+    def _run_size(self) -> int:
+        return 0 if self._run_start is None else self._offset - self._run_start
 
     def _end_run(self) -> None:
         if self._run_start is not None:
@@ -205,44 +286,65 @@ _KEPT: Final[dict[int, Callable[[ReadDataStream], Any]]] = {
     Opcode.SCHEMA: Schema.read,
     Opcode.CHANNEL: Channel.read,
     Opcode.METADATA: Metadata.read,
-    Opcode.ATTACHMENT: Attachment.read,
 }
 
 
 def _unpack(piece: Piece, data: bytes) -> bytes:
-    """A chunk's records. What is left of a chunk that was cut, if its compression allows that."""
+    """Return a chunk's records, or what is left of a chunk that was cut off, if its compression allows that.
+
+    No more is unpacked than the chunk announces, and nothing if it announces too much.
+    """
+    size = piece.unpacked
+    if size > min(MAX_CHUNK, MAX_RATIO * len(data)) and not piece.cut:
+        raise ValueError(
+            f"{len(data)} bytes that announce {size} unpacked, and at most {MAX_RATIO} times as many, {MAX_CHUNK} in "
+            "all, are unpacked"
+        )
+    size = min(size, MAX_CHUNK, MAX_RATIO * len(data))
     if piece.compression == "":
         unpacked = data
     elif piece.compression == "zstd":
         import zstandard
 
         try:
-            unpacked = zstandard.ZstdDecompressor().stream_reader(data).read(MAX_CHUNK)
+            unpacked = zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK).stream_reader(data).read(size + 1)
         except zstandard.ZstdError as error:
             raise ValueError(str(error)) from None
     elif piece.compression == "lz4":
         import lz4.frame
 
         try:
-            unpacked = lz4.frame.LZ4FrameDecompressor().decompress(data, MAX_CHUNK)
+            unpacked = lz4.frame.LZ4FrameDecompressor().decompress(data, size + 1)
         except RuntimeError as error:
             raise ValueError(str(error)) from None
     else:
         raise ValueError(f"its compression {piece.compression!r} is neither zstd nor lz4")
+    if len(unpacked) > size and not piece.cut:
+        raise ValueError(f"it holds more than the {size} bytes that it announces")
     if piece.crc and not piece.cut and zlib.crc32(unpacked) != piece.crc:
         raise ValueError("its checksum is wrong")
     return unpacked
 
 
-def _parse(data: bytes) -> Iterator[Record]:
-    """Records until the data end; one that is cut there is left out."""
+def _parse(data: bytes, most: int) -> Iterator[Record]:
+    """Yield records until the data end; one that is cut off there is left out.
+
+    Raises:
+        ValueError: There are more than ``most`` records.
+    """
     at, size = 0, len(data)
-    while at + _FRAME.size <= size:
+    for number in itertools.count():
+        if at + _FRAME.size > size:
+            return
+        if number >= most:
+            raise ValueError(f"more than {most} records packed into as many bytes: the others are left out")
         opcode, length = _FRAME.unpack_from(data, at)
         begin = at + _FRAME.size
         at = begin + length
         if at > size:
             return
+        if opcode != Opcode.MESSAGE and length > MAX_RECORD:
+            raise ValueError(f"a record of {length} bytes, and at most {MAX_RECORD} are read")
         if opcode == Opcode.MESSAGE:
             channel_id, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(data, begin)
             yield Message(channel_id, log_ns, data[begin + _MESSAGE.size : at], publish_ns, sequence)

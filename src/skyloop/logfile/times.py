@@ -1,7 +1,7 @@
-"""When a recorded sample was known to the proxy, on the proxy's own clock: the time along which flights are looked at.
+"""When a recorded sample was known to the proxy, on the proxy's own clock: the time axis of a flight.
 
-Those times stand in the samples themselves. The times of the file are the recorder's, and those of one that wrote down
-a replay in step with its application say nothing about the flight.
+Those times are in the samples themselves. The times of the file are the recorder's, and those of a file that recorded a
+replay in step with its application are unrelated to the flight.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from typing import Any, Final
 from skyloop.clock import NS_PER_S
 from skyloop.messages import Annotation, Applied, Event, Feedback, LogEntry
 
-_BACK_NS: Final = 10 * NS_PER_S  #: a sample's time is not believed if it lies farther before the newest one than this
+_BACK_NS: Final = 10 * NS_PER_S  #: a sample's time is ignored if it is farther before the newest one than this,
 _AHEAD_NS: Final = 3600 * NS_PER_S  #: or farther ahead of it
 
 
 def told_ns(value: Any) -> int | None:
-    """When the proxy knew of a sample, told, or published it; None for one that does not say."""
+    """Return when the proxy received or published a sample; None for one without a time."""
     if isinstance(value, Feedback):
         return value.published_ns or value.captured_ns
     if isinstance(value, Applied):
@@ -33,15 +33,21 @@ def told_ns(value: Any) -> int | None:
 
 
 class Course:
-    """The time along a recording, sample by sample: never backwards, and not led astray by a single wrong time."""
+    """The time along a recording, sample by sample: it never runs backwards, and ignores a single wrong time.
+
+    Attributes:
+        first_ns: Time of the first sample that has one.
+        newest_ns: Time of the newest sample.
+    """
 
     def __init__(self) -> None:
+        """Start before the first sample."""
         self.first_ns: int | None = None
         self.newest_ns = 0
-        self._doubted_ns: int | None = None  # far ahead: believed if the next such one agrees, as after a long pause
+        self._doubted_ns: int | None = None  # far ahead: accepted if the next such one agrees, as after a long pause
 
     def follow(self, value: Any) -> int:
-        """The time of the next sample, in the order of the file."""
+        """Return the time of the next sample, in the order of the file."""
         own_ns = told_ns(value)
         if own_ns is None:
             return self.newest_ns

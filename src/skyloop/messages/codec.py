@@ -1,4 +1,4 @@
-"""Samples to bytes and back. Pure; the byte tables are in ``docs/wire-format.md``.
+"""Samples to bytes and back, as pure functions; the byte tables are in ``docs/wire-format.md``.
 
 A packet is a 12-byte header (signature, version, kind, reserved, length of the body) and a body: the sample's fields
 in order as one MessagePack array. msgspec encodes, decodes and checks types, lengths and ranges in C; fields added
@@ -49,7 +49,7 @@ Sample = (
 
 
 class Kind(IntEnum):
-    """The kinds of packet. 0x40 and above belong to the transports and never reach this codec."""
+    """The kinds of packets. 0x40 and above belong to the transports and never reach this codec."""
 
     COMMAND = 1
     FEEDBACK = 2
@@ -95,9 +95,10 @@ _BY_PREFIX: Final = {
 
 
 def encode(sample: Sample) -> bytes:
-    """The packet of a sample.
+    """Encode a sample to a packet.
 
-    Raises ``ValueError`` if it is larger than :data:`MAX_BODY`, which only free text or native telemetry can cause.
+    Raises:
+        ValueError: It is larger than :data:`MAX_BODY`, which only free text or native telemetry can cause.
     """
     body = _encode_body(sample)
     if len(body) > MAX_BODY:
@@ -106,7 +107,17 @@ def encode(sample: Sample) -> bytes:
 
 
 def decode(packet: bytes | memoryview) -> Sample:
-    """The sample in a packet. Raises :class:`DecodeError` for anything else, in bounded time and memory."""
+    """Decode a packet, in bounded time and memory.
+
+    Args:
+        packet: Any bytes.
+
+    Returns:
+        The sample, with its types, lengths and ranges checked.
+
+    Raises:
+        DecodeError: It is not the packet of a sample.
+    """
     # One look-up settles signature, version, kind and reserved bytes; why a packet is refused is found out later.
     decoder = _BY_PREFIX.get(bytes(packet[:_PREFIX_SIZE]))
     size = len(packet) - HEADER_SIZE
@@ -115,13 +126,17 @@ def decode(packet: bytes | memoryview) -> Sample:
         raise DecodeError(f"unknown kind {kind}: known are {', '.join(f'{k.value} {k.name}' for k in Kind)}")
     try:
         sample: Sample = decoder(memoryview(packet)[HEADER_SIZE:])
-    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError, OverflowError) as error:
         raise DecodeError(f"bad {Kind(packet[5]).name.lower()} packet: {error}") from None
     return sample
 
 
 def packet_kind(packet: bytes | memoryview) -> int:
-    """The kind of a packet after checking its header against its length. Raises :class:`DecodeError`."""
+    """Return the kind of a packet, after checking its header against its length.
+
+    Raises:
+        DecodeError: The header is not one of this version, or does not fit the packet.
+    """
     if len(packet) < HEADER_SIZE:
         raise DecodeError(f"{len(packet)} bytes are less than the header of {HEADER_SIZE}")
     signature, version, kind, reserved, length = _unpack_header(packet)

@@ -6,11 +6,10 @@ Axes are the body's (ROS REP 103): x forward, y left, z up; yaw is counter-clock
 from __future__ import annotations
 
 import math
-from typing import Annotated
 
 import msgspec
 
-Count = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+from skyloop.messages.numbers import Count, TimeNs
 
 
 class Action(msgspec.Struct, frozen=True, array_like=True):
@@ -65,6 +64,7 @@ class Attitude(Action, frozen=True, array_like=True, tag=6):
 
     @property
     def finite(self) -> bool:
+        """Whether all numbers of the action are finite."""
         return math.isfinite(self.roll + self.pitch + self.climb + self.yaw_rate)
 
 
@@ -78,6 +78,7 @@ class Velocity(Action, frozen=True, array_like=True, tag=7):
 
     @property
     def finite(self) -> bool:
+        """Whether all numbers of the action are finite."""
         return math.isfinite(self.forward + self.left + self.up + self.yaw_rate)
 
 
@@ -101,7 +102,9 @@ class Command(msgspec.Struct, frozen=True, array_like=True):
     seq: Count  #: grows with every packet of a connection
     lease: Count  #: number of the lease that it is sent under; 0 for none (emergency stop only)
     intent: Count  #: grows when the *application* asks for something; repeats by the library keep it
-    sent_ns: int  #: when it was sent, on the proxy's clock
+    sent_ns: (
+        int  #: when it was sent, on the proxy's clock; not bounded, as an emergency stop counts whatever its time is
+    )
     action: AnyAction
 
 
@@ -111,7 +114,7 @@ class Applied(msgspec.Struct, frozen=True, array_like=True):
     seq: Count
     lease: Count
     app_id: Count  #: 0: the proxy itself (failsafe, autopilot)
-    sent_ns: int
-    applied_ns: int
+    sent_ns: TimeNs
+    applied_ns: TimeNs
     asked: AnyAction
     applied: AnyAction  #: after limits, and as the driver really applied it

@@ -6,10 +6,10 @@ from typing import Annotated
 
 import msgspec
 
-from skyloop.messages.command import Count
 from skyloop.messages.feedback import Value
 from skyloop.messages.frame import CameraInfo, Name
 from skyloop.messages.kinds import Refusal, Role, Takeover
+from skyloop.messages.numbers import Count, TimeNs
 from skyloop.messages.parameter import Parameter, ParameterName
 from skyloop.messages.result import MAX_CODE, ProcessorName
 
@@ -17,6 +17,7 @@ Priority = Annotated[int, msgspec.Meta(ge=0, le=31)]
 LONGEST_TERM_S = 86_400.0
 Term = Annotated[float, msgspec.Meta(gt=0, le=LONGEST_TERM_S)]
 MAX_REASON = 200  #: characters of why a holder declines
+ClockName = Annotated[str, msgspec.Meta(max_length=64)]
 Reason = Annotated[str, msgspec.Meta(max_length=MAX_REASON)]
 
 HIGHEST_PRIORITY = 0
@@ -45,8 +46,10 @@ class Hello(msgspec.Struct, frozen=True, array_like=True, tag=1):
 
 
 class RequestAuthority(msgspec.Struct, frozen=True, array_like=True, tag=2):
+    """Asks for the authority."""
+
     priority: Priority = DEFAULT_PRIORITY
-    queue: bool = True  #: wait in line when somebody else holds it; else be refused at once
+    queue: bool = True  #: wait in the queue when another application holds it; else be refused at once
     for_s: Term | None = None  #: for how long it is wanted, from the grant on; nil: until it is given back
     takeover: Takeover = Takeover.NOW
 
@@ -56,10 +59,14 @@ class ReleaseAuthority(msgspec.Struct, frozen=True, array_like=True, tag=3):
 
 
 class GetParameter(msgspec.Struct, frozen=True, array_like=True, tag=4):
+    """Asks for a parameter."""
+
     name: ParameterName
 
 
 class SetParameter(msgspec.Struct, frozen=True, array_like=True, tag=5):
+    """Writes a parameter."""
+
     name: ParameterName
     value: Value
     lease: Count  #: writing needs the authority
@@ -74,7 +81,7 @@ class ListParameters(msgspec.Struct, frozen=True, array_like=True, tag=6):
 class Ping(msgspec.Struct, frozen=True, array_like=True, tag=7):
     """Asks for the proxy's time, to estimate the offset between the clocks and to see that it lives."""
 
-    sent_ns: int  #: on the asker's clock
+    sent_ns: TimeNs  #: on the asker's clock
 
 
 class GetStatistics(msgspec.Struct, frozen=True, array_like=True, tag=8):
@@ -118,6 +125,8 @@ AnyRequest = (
 
 
 class Request(msgspec.Struct, frozen=True, array_like=True):
+    """One request, with the number by which its reply is recognised."""
+
     id: Count  #: chosen by the asker; comes back in the answer
     body: AnyRequest
 
@@ -133,13 +142,16 @@ class Welcome(msgspec.Struct, frozen=True, array_like=True, tag=1):
     run_id: Count  #: random; another number means that the proxy was restarted
     pid: Count
     uri: str  #: of the vehicle
-    now_ns: int  #: the proxy's clock
+    now_ns: TimeNs  #: the proxy's clock
     capabilities: Capabilities
+    clock: ClockName = ""  #: which monotonic clock it reads, on its host; empty: not told
 
 
 class AuthorityGranted(msgspec.Struct, frozen=True, array_like=True, tag=2):
+    """The application holds the authority now."""
+
     lease: Count
-    until_ns: int = 0  #: when the time is over for which it was wanted, on the proxy's clock; 0: it is not limited
+    until_ns: TimeNs = 0  #: when the time is over for which it was wanted, on the proxy's clock; 0: it is not limited
 
 
 class AuthorityQueued(msgspec.Struct, frozen=True, array_like=True, tag=3):
@@ -147,24 +159,30 @@ class AuthorityQueued(msgspec.Struct, frozen=True, array_like=True, tag=3):
 
     position: Count  #: 1 is next
     holder: str
-    holder_priority: int
+    holder_priority: Priority
     wait_s: float | None = None  #: expected, by what the others said for how long they want it; nil: not known
     asked: bool = False  #: the holder is being asked to hand it over
 
 
 class ParameterValue(msgspec.Struct, frozen=True, array_like=True, tag=4):
+    """A parameter, as it was read or is after it was written."""
+
     parameter: Parameter
 
 
 class ParameterPage(msgspec.Struct, frozen=True, array_like=True, tag=5):
+    """A page of the parameters; ``total`` counts all of them, ``first`` is the index of the first one here."""
+
     total: Count
     first: Count
     parameters: tuple[Parameter, ...]
 
 
 class Pong(msgspec.Struct, frozen=True, array_like=True, tag=6):
-    sent_ns: int
-    now_ns: int
+    """Answer to Ping, with its ``sent_ns``; ``now_ns`` is the proxy's clock."""
+
+    sent_ns: TimeNs
+    now_ns: TimeNs
 
 
 class Done(msgspec.Struct, frozen=True, array_like=True, tag=7):
@@ -172,6 +190,8 @@ class Done(msgspec.Struct, frozen=True, array_like=True, tag=7):
 
 
 class Refused(msgspec.Struct, frozen=True, array_like=True, tag=8):
+    """The request was refused; ``message`` says why, for people."""
+
     code: Refusal
     message: str
 
@@ -188,5 +208,7 @@ AnyReply = (
 
 
 class Reply(msgspec.Struct, frozen=True, array_like=True):
+    """The answer to one request."""
+
     id: Count
     body: AnyReply

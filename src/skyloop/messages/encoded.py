@@ -6,8 +6,8 @@ from typing import Annotated, Final
 
 import msgspec
 
-from skyloop.messages.command import Count
 from skyloop.messages.frame import Intrinsics, Name, Pixels
+from skyloop.messages.numbers import Count, TimeNs
 
 H264: Final = "h264"  #: the one codec that is recorded as it comes
 #: Bytes of a picture that fit a packet, with all that is told beside it.
@@ -24,8 +24,8 @@ class EncodedFrame(msgspec.Struct, frozen=True, array_like=True):
 
     camera: Name
     seq: Count  #: grows by one with each picture of the stream, those too large for a packet included
-    captured_ns: int  #: as of the decoded frame
-    published_ns: int  #: when the proxy had it
+    captured_ns: TimeNs  #: as of the decoded frame
+    published_ns: TimeNs  #: when the proxy had it
     width: Pixels  #: of the picture when decoded
     height: Pixels
     codec: Annotated[str, msgspec.Meta(max_length=16)]  #: ``h264``
@@ -35,13 +35,18 @@ class EncodedFrame(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Chain:
-    """Which pictures of a stream can be decoded: a key, and each that follows it without a gap in the numbers."""
+    """Tells which pictures of a stream can be decoded: a key, and each that follows it without a gap in the numbers."""
 
     def __init__(self) -> None:
         self._last: int | None = None  # None: wait for a key
 
     def follows(self, number: int, *, key: bool) -> bool:
-        """Whether this one, the next that came, can be decoded. One that came a second time is not wanted again."""
+        """Return whether a picture, the next that came, can be decoded; False for one that came a second time.
+
+        Args:
+            number: The picture's ``seq``.
+            key: Whether it is a key picture.
+        """
         if number == self._last and not key:
             return False
         whole = key or (self._last is not None and number == self._last + 1)
@@ -49,5 +54,5 @@ class Chain:
         return whole
 
     def restart(self) -> None:
-        """What comes next does not continue what came before."""
+        """Begin anew: the next picture does not continue what came before."""
         self._last = None

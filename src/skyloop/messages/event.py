@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import msgspec
 
-from skyloop.messages.command import Count
 from skyloop.messages.feedback import Value
 from skyloop.messages.kinds import EventKind, Severity
+from skyloop.messages.numbers import Count, TimeNs
 
 
 class Event(msgspec.Struct, frozen=True, array_like=True):
@@ -14,7 +14,7 @@ class Event(msgspec.Struct, frozen=True, array_like=True):
 
     kind: EventKind
     text: str
-    at_ns: int  #: on the proxy's clock
+    at_ns: TimeNs  #: on the proxy's clock
     severity: Severity = Severity.INFO
     seq: Count = 0  #: grows by one per proxy's run; 0 for events made by the client itself
     app: str | None = None  #: the application it concerns

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 
-from skyloop.messages.command import Count
 from skyloop.messages.kinds import Failsafe, FlightState, LinkState
+from skyloop.messages.numbers import Count, Finite, TimeNs
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-Vector = tuple[float, float, float]
+Vector = tuple[Finite, Finite, Finite]
+
+MAX_LINK_TEXT = 300  #: characters of a text about the link to the vehicle
+LinkText = Annotated[str, msgspec.Meta(max_length=MAX_LINK_TEXT)]
 
 #: A value of a vehicle's native telemetry, of a parameter or of an event's particulars.
 Value = bool | int | float | str | tuple[float, ...]
@@ -27,14 +30,14 @@ class Feedback(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
     yaw counter-clockwise from x (ROS REP 103).
     """
 
-    captured_ns: int  #: when the vehicle was in this state, on the proxy's clock
+    captured_ns: TimeNs  #: when the vehicle was in this state, on the proxy's clock
     state: FlightState = FlightState.UNKNOWN
-    battery: float | None = None  #: charge left, 0 to 1
-    battery_v: float | None = None  #: voltage [V]
-    roll: float | None = None  #: [rad]
-    pitch: float | None = None  #: [rad]
-    yaw: float | None = None  #: [rad]
-    altitude: float | None = None  #: height above the ground below [m]
+    battery: Finite | None = None  #: charge left, 0 to 1
+    battery_v: Finite | None = None  #: voltage [V]
+    roll: Finite | None = None  #: [rad]
+    pitch: Finite | None = None  #: [rad]
+    yaw: Finite | None = None  #: [rad]
+    altitude: Finite | None = None  #: height above the ground below [m]
     velocity: Vector | None = None  #: body's levelled axes: forward, left, up [m/s]
     angular_velocity: Vector | None = None  #: about the body's axes [rad/s]
     acceleration: Vector | None = None  #: specific force along the body's axes, gravity included [m/s²]
@@ -42,19 +45,22 @@ class Feedback(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
     native: dict[str, Value] | None = None  #: the vehicle's own telemetry, by its own names and in its own units
 
     seq: Count = 0  #: grows by one with each sample of a proxy's run
-    published_ns: int = 0  #: when the proxy published it
+    published_ns: TimeNs = 0  #: when the proxy published it
     vehicle_link: LinkState = LinkState.CONNECTING  #: the hop proxy–vehicle
     owner: str | None = None  #: name of the application that holds the authority
     owner_id: Count = 0  #: its number in this run of the proxy; 0 for nobody
-    owner_priority: int | None = None  #: 0 is the highest
+    owner_priority: Annotated[int, msgspec.Meta(ge=0, le=31)] | None = None  #: 0 is the highest
     lease: Count = 0  #: number of the lease in force; 0 for none
     failsafe: Failsafe = Failsafe.NONE
+    link_reason: LinkText = ""  #: why the hop proxy–vehicle is as it is; empty while it is up
+    link_remedy: LinkText = ""  #: what a person can do about it
+    others: LinkText | None = None  #: why the proxy leaves the vehicle alone: another controller flies it
 
     @property
     def rotation(self) -> NDArray[np.float64]:
         """Rotation from body to world axes, shape (3, 3), float64: Rz(yaw) · Ry(pitch) · Rx(roll).
 
-        Raises ``ValueError`` while the attitude is not known.
+        Reading it raises ``ValueError`` while the attitude is not known.
         """
         from skyloop.messages.geometry import rotation_from_euler
 

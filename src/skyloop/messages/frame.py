@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 
-from skyloop.messages.command import Count
 from skyloop.messages.kinds import Encoding
+from skyloop.messages.numbers import Count, Finite, TimeNs
 
 if TYPE_CHECKING:
     import numpy as np
@@ -20,11 +20,12 @@ Pixels = Annotated[int, msgspec.Meta(ge=1, le=16384)]
 class Intrinsics(msgspec.Struct, frozen=True, array_like=True):
     """A camera's intrinsics in OpenCV's convention, in pixels of the frame that they come with."""
 
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    distortion: tuple[float, ...] = ()  #: k1, k2, p1, p2[, k3, …] (pinhole) or k1 … k4 (fisheye)
+    fx: Finite
+    fy: Finite
+    cx: Finite
+    cy: Finite
+    #: k1, k2, p1, p2[, k3, …] (pinhole) or k1 … k4 (fisheye)
+    distortion: Annotated[tuple[Finite, ...], msgspec.Meta(max_length=14)] = ()
     model: str = "pinhole"  #: ``pinhole`` or ``fisheye``
 
     @property
@@ -40,8 +41,8 @@ class FrameHeader(msgspec.Struct, frozen=True, array_like=True):
 
     camera: Name
     seq: Count  #: grows by one with each frame that this camera gave, dropped ones included
-    captured_ns: int  #: middle of the exposure as near as the vehicle tells it, on the proxy's clock
-    published_ns: int  #: when the proxy had it
+    captured_ns: TimeNs  #: middle of the exposure as near as the vehicle tells it, on the proxy's clock
+    published_ns: TimeNs  #: when the proxy had it
     width: Pixels
     height: Pixels
     encoding: Encoding
@@ -55,10 +56,10 @@ class CameraInfo(msgspec.Struct, frozen=True, array_like=True):
     name: Name
     width: Pixels
     height: Pixels
-    fps: float  #: nominal
+    fps: Finite  #: nominal
     encoding: Encoding = Encoding.BGR8
     intrinsics: Intrinsics | None = None
     #: rotation from the camera's optical axes (x right, y down, z forward) to the body's axes, row by row
-    rotation: tuple[float, float, float, float, float, float, float, float, float] | None = None
-    position: tuple[float, float, float] | None = None  #: of the optical centre in body axes [m]
+    rotation: tuple[Finite, Finite, Finite, Finite, Finite, Finite, Finite, Finite, Finite] | None = None
+    position: tuple[Finite, Finite, Finite] | None = None  #: of the optical centre in body axes [m]
     stream: str = ""  #: codec in which its pictures can be had as they come, ``h264``; empty: as frames only

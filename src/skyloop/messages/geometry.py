@@ -1,4 +1,4 @@
-"""The few rotations that everybody needs, as NumPy matrices. ROS REP 103 axes and signs."""
+"""Rotations as NumPy matrices and quaternions, with the axes and signs of ROS REP 103."""
 
 from __future__ import annotations
 
@@ -9,7 +9,16 @@ from numpy.typing import NDArray
 
 
 def rotation_from_euler(roll: float, pitch: float, yaw: float) -> NDArray[np.float64]:
-    """Body-to-world rotation, shape (3, 3): ``Rz(yaw) @ Ry(pitch) @ Rx(roll)``, angles in rad."""
+    """Return the rotation from body to world axes: ``Rz(yaw) @ Ry(pitch) @ Rx(roll)``.
+
+    Args:
+        roll: About x, right side down positive [rad].
+        pitch: About y, nose down positive [rad].
+        yaw: About z, counter-clockwise seen from above positive [rad].
+
+    Returns:
+        Shape (3, 3), float64.
+    """
     cr, sr = math.cos(roll), math.sin(roll)
     cp, sp = math.cos(pitch), math.sin(pitch)
     cy, sy = math.cos(yaw), math.sin(yaw)
@@ -23,7 +32,13 @@ def rotation_from_euler(roll: float, pitch: float, yaw: float) -> NDArray[np.flo
 
 
 def quaternion_from_euler(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
-    """Body-to-world as a unit quaternion (w, x, y, z): the rotation of :func:`rotation_from_euler`."""
+    """Return the rotation of :func:`rotation_from_euler` as a unit quaternion (w, x, y, z).
+
+    Args:
+        roll: About x, right side down positive [rad].
+        pitch: About y, nose down positive [rad].
+        yaw: About z, counter-clockwise seen from above positive [rad].
+    """
     cr, sr = math.cos(roll / 2), math.sin(roll / 2)
     cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
     cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
@@ -36,7 +51,14 @@ def quaternion_from_euler(roll: float, pitch: float, yaw: float) -> tuple[float,
 
 
 def euler_from_rotation(rotation: NDArray[np.float64]) -> tuple[float, float, float]:
-    """(roll, pitch, yaw) in rad of a body-to-world rotation, shape (3, 3); pitch within ±π/2."""
+    """Return the angles of a rotation from body to world axes.
+
+    Args:
+        rotation: Shape (3, 3).
+
+    Returns:
+        Roll, pitch and yaw [rad]; pitch is within ±π/2.
+    """
     pitch = math.asin(max(-1.0, min(1.0, -float(rotation[2, 0]))))
     roll = math.atan2(float(rotation[2, 1]), float(rotation[2, 2]))
     yaw = math.atan2(float(rotation[1, 0]), float(rotation[0, 0]))
@@ -44,5 +66,5 @@ def euler_from_rotation(rotation: NDArray[np.float64]) -> tuple[float, float, fl
 
 
 def wrap_angle(angle: float) -> float:
-    """The same angle within [-π, π)."""
+    """Return the same angle within [-π, π) [rad]."""
     return (angle + math.pi) % (2 * math.pi) - math.pi

@@ -8,7 +8,7 @@ from enum import StrEnum
 class FlightState(StrEnum):
     """What the vehicle is doing, as the vehicle (or the software autopilot for it) says."""
 
-    UNKNOWN = "unknown"  #: nothing heard yet
+    UNKNOWN = "unknown"  #: nothing received yet
     LANDED = "landed"
     TAKING_OFF = "taking_off"
     HOVERING = "hovering"  #: airborne, holding its place by itself
@@ -28,10 +28,10 @@ _AIRBORNE = frozenset({FlightState.TAKING_OFF, FlightState.HOVERING, FlightState
 class LinkState(StrEnum):
     """State of one hop (application–proxy, or proxy–vehicle)."""
 
-    CONNECTING = "connecting"  #: first attempt under way, nothing heard yet
+    CONNECTING = "connecting"  #: first attempt under way, nothing received yet
     UP = "up"
     DEGRADED = "degraded"  #: up, but samples are missing, late or malformed
-    LOST = "lost"  #: nothing heard past the threshold; recovery goes on by itself
+    LOST = "lost"  #: nothing received past the threshold; recovery goes on by itself
     CLOSED = "closed"  #: ended on purpose; nothing more will come
 
 
@@ -67,6 +67,8 @@ class Takeover(StrEnum):
 
 
 class Severity(StrEnum):
+    """How serious an event is."""
+
     INFO = "info"
     WARNING = "warning"
     ERROR = "error"
@@ -76,7 +78,7 @@ class EventKind(StrEnum):
     """What an event tells. ``Event.data`` holds the particulars named here."""
 
     APPLICATION_LINK = "application_link"  #: hop application–proxy changed; data: state, reason
-    VEHICLE_LINK = "vehicle_link"  #: hop proxy–vehicle changed; data: state, reason
+    VEHICLE_LINK = "vehicle_link"  #: hop proxy–vehicle changed, or why it is so; data: state, reason, remedy
     AUTHORITY_GRANTED = "authority_granted"  #: data: app_id, priority, lease, identity; until_ns if for a time
     AUTHORITY_QUEUED = "authority_queued"  #: waits, or has moved up; data: app_id, priority, position; wait_s if known
     AUTHORITY_LOST = "authority_lost"  #: data: app_id, lease, reason (released, silent, gone, expired), by (app name)
@@ -123,6 +125,6 @@ class Refusal(StrEnum):
     OUT_OF_RANGE = "out_of_range"
     READ_ONLY = "read_only"
     DRIVER_FAILED = "driver_failed"
-    BUSY = "busy"  #: somebody of at least the same priority holds the authority
+    BUSY = "busy"  #: an application of at least the same priority holds the authority
     NAME_TAKEN = "name_taken"  #: other code, or another way to share, goes by that name
     PROTOCOL = "protocol"  #: a request out of place, or of another protocol version

@@ -13,6 +13,8 @@ ParameterName = Annotated[str, msgspec.Meta(min_length=1, max_length=128)]
 
 
 class ParameterType(StrEnum):
+    """The type of a parameter's value."""
+
     BOOL = "bool"
     INT = "int"
     FLOAT = "float"

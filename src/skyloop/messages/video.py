@@ -1,4 +1,4 @@
-"""What a consumer of video asks for: a camera, and how its frames are to come. Pure."""
+"""What a consumer of video asks for: a camera, and in which form its frames are to come."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from typing import Final, Literal
 from urllib.parse import parse_qsl, quote, unquote
 
 from skyloop.errors import UsageError
+from skyloop.messages.result import MAX_PARTS
 
 VideoEncoding = Literal["raw", "jpeg"]
 DEFAULT_QUALITY: Final = 80
-MAX_PARTS: Final = 1024
+MIN_FPS: Final = 0.001  #: a frame in a quarter of an hour; the time between two of much less has no end
 _PREFIX: Final = "video/"
 _TOLERANCE: Final = 0.1  # of a period: a frame that comes so much too early is in time
 _FIELDS: Final = ("encoding", "max_fps", "part", "quality", "scale")
@@ -19,9 +20,12 @@ _FIELDS: Final = ("encoding", "max_fps", "part", "quality", "scale")
 
 @dataclass(frozen=True, slots=True)
 class VideoRequest:
-    """Frames of one camera, as one consumer wants them. Raises :class:`UsageError` for values that make no sense.
+    """Frames of one camera, as one consumer wants them.
 
     Two requests that give the same frames are equal and have the same :attr:`topic`.
+
+    Raises:
+        UsageError: A value is not valid.
     """
 
     camera: str
@@ -38,8 +42,10 @@ class VideoRequest:
             raise UsageError(f'encoding is {self.encoding!r} and must be "raw" or "jpeg"')
         if not _is_whole(self.quality) or not 1 <= self.quality <= 100:
             raise UsageError(f"quality is {self.quality!r} and must be a whole number from 1 to 100")
-        if self.max_fps is not None and not (_is_number(self.max_fps) and 0.0 < self.max_fps < math.inf):
-            raise UsageError(f"max_fps is {self.max_fps!r} and must be a number of frames a second above 0")
+        if self.max_fps is not None and not (_is_number(self.max_fps) and MIN_FPS <= self.max_fps < math.inf):
+            raise UsageError(
+                f"max_fps is {self.max_fps!r} and must be a finite number of frames a second, from {MIN_FPS}"
+            )
         if not _is_number(self.scale) or not 0.0 < self.scale <= 1.0:
             raise UsageError(f"scale is {self.scale!r} and must be above 0 and at most 1")
         if self.part is not None and not _is_part(self.part):
@@ -69,12 +75,16 @@ class VideoRequest:
 
     @property
     def plain(self) -> VideoRequest:
-        """All frames of the same camera, as they are."""
+        """The request for all frames of the same camera, as they are."""
         return VideoRequest(self.camera)
 
     @classmethod
     def parse(cls, topic: str) -> VideoRequest:
-        """The request of a topic. Raises :class:`UsageError` for one that is none."""
+        """Parse the request of a topic.
+
+        Raises:
+            UsageError: It is not a topic of a camera's frames.
+        """
         camera, _, variant = topic.removeprefix(_PREFIX).partition("?")
         if not topic.startswith(_PREFIX) or not camera:
             raise UsageError(f"{topic[:100]!r} is no topic of a camera's frames: it looks like video/front")
@@ -88,7 +98,13 @@ class VideoRequest:
 
 
 class FrameFilter:
-    """Which frames of a camera a request is about, by their numbers and times of capture. One a stream of frames."""
+    """Selects the frames of one camera that a request is for, by their numbers and times of capture.
+
+    It keeps state, so each stream of frames needs its own.
+
+    Args:
+        request: Its ``part`` and ``max_fps`` count.
+    """
 
     def __init__(self, request: VideoRequest) -> None:
         self._part = request.part
@@ -96,7 +112,12 @@ class FrameFilter:
         self._due_ns: int | None = None
 
     def wants(self, seq: int, captured_ns: int) -> bool:
-        """Whether the frame with this number, captured at this time, is wanted."""
+        """Return whether a frame is wanted. Call it once for each frame, in order.
+
+        Args:
+            seq: The frame's number.
+            captured_ns: When it was captured, on any one clock [ns].
+        """
         if self._part is not None and seq % self._part[1] != self._part[0]:
             return False
         return not self._period_ns or self._in_time(captured_ns)

@@ -1,16 +1,17 @@
-"""Motion capture: Vicon, OptiTrack, Qualisys and VRPN by the ``motioncapture`` package, and the simulator's truth."""
+"""Motion capture: Vicon, OptiTrack and Qualisys by the ``motioncapture`` package, VRPN, and the simulator's truth."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 
-from skyloop.motion_capture.address import SIM, System, parse_system
+from skyloop.motion_capture.address import SIM, VRPN, System, parse_system
 from skyloop.motion_capture.calibration import Calibration, calibrate
 from skyloop.motion_capture.capture import MotionCapture, Source, TrackEvent
 from skyloop.motion_capture.pose import BodyPose
 from skyloop.motion_capture.source import ChildSource
 from skyloop.motion_capture.tracking import TrackState
 from skyloop.motion_capture.truth import TruthSource
+from skyloop.motion_capture.vrpn import VrpnSource
 from skyloop.motion_capture.worker import RawFrame
 
 __all__ = [
@@ -27,14 +28,23 @@ __all__ = [
 
 
 def mocap(address: str, bodies: Mapping[str, str], *, timeout_s: float = 10.0) -> MotionCapture:
-    """Connect to a motion capture system; returns with its first frame.
+    """Connect to a motion capture system, and wait for its first frame.
 
-    ``address``: ``vicon://HOST``, ``optitrack://HOST``, ``qualisys://HOST``, ``vrpn://HOST`` (extra ``[mocap]``), or
-    ``sim://`` for the true poses of simulated drones. ``bodies``: names of drones to the names that the system gives
-    their bodies, ``{"alpha": "alpha_body"}``. Positions in metres, world axes with z up.
+    Positions are in metres, in world axes with z up.
 
-    Raises :class:`UsageError`, :class:`UnknownNameError`, :class:`LinkError` if no frame comes within ``timeout_s``,
-    and :class:`MissingExtraError`.
+    Args:
+        address: ``vicon://HOST``, ``optitrack://HOST`` or ``qualisys://HOST`` (extra ``[mocap]``), ``vrpn://HOST``, or
+            ``sim://`` for the true poses of simulated drones.
+        bodies: Names of drones to the names that the system gives their bodies, ``{"alpha": "alpha_body"}``. With
+            VRPN those are trackers, ``"Rig"``, or one sensor of a tracker, ``"Rig:2"``.
+        timeout_s: How long to wait for the first frame [s].
+
+    Raises:
+        UsageError: An argument is wrong, or a VRPN tracker has several sensors and none was named.
+        UnknownNameError: There is no such system or option.
+        LinkError: No frame comes within ``timeout_s``.
+        MissingExtraError: The extra ``[mocap]`` is not installed.
+        UnsupportedError: A simulated drone does not report its true pose.
     """
     system = parse_system(address)
     return MotionCapture(system, bodies, _source).open(timeout_s)
@@ -43,4 +53,8 @@ def mocap(address: str, bodies: Mapping[str, str], *, timeout_s: float = 10.0) -
 def _source(
     system: System, names: Iterable[str], take: Callable[[RawFrame], None], trouble: Callable[[str], None]
 ) -> Source:
-    return TruthSource(names, take) if system.kind == SIM else ChildSource(system, take, trouble)
+    if system.kind == SIM:
+        return TruthSource(names, take)
+    if system.kind == VRPN:
+        return VrpnSource(system, names, take, trouble)
+    return ChildSource(system, take, trouble)

@@ -1,8 +1,8 @@
-"""How a body's axes, as a motion capture system defines them, lie to the drone's. Pure.
+"""Rotation between a tracked body's axes, as a motion capture system defines them, and the drone's. Pure.
 
 As MAVwork did it: the drone stands still for two seconds, the poses are averaged, and the calibration is refused when
 they are spread too much. At rest the drone's own roll and pitch tell how it stands; its heading is taken from the way
-that it is put down: nose along the world's x axis, or as ``heading`` says.
+it is put down: nose along the world's x axis, or as ``heading`` says.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ MIN_POSES: Final = 20
 class Calibration:
     """Turns the poses of a tracked body into those of the drone."""
 
-    turn: Quaternion = (0.0, 0.0, 0.0, 1.0)  #: drone's axes to the tracked body's axes
+    turn: Quaternion = (0.0, 0.0, 0.0, 1.0)  #: from the drone's axes to the tracked body's; x, y, z, w
     spread_m: float = 0.0  #: root mean square distance of the poses from their mean
     spread_rad: float = 0.0  #: root mean square angle between the poses and their mean
     poses: int = 0  #: how many were averaged
-    yaw_offset: float | None = None  #: the drone's own yaw less its heading in the world [rad], if it tells its yaw
+    yaw_offset: float | None = None  #: the drone's own yaw minus its heading in the world [rad], if it reports its yaw
 
     def apply(self, pose: BodyPose) -> BodyPose:
-        """The drone's pose."""
+        """Return the drone's pose for one of the tracked body."""
         return replace(pose, quaternion=multiply(pose.quaternion, self.turn))
 
 
@@ -49,11 +49,20 @@ def calibrate(
     max_spread_m: float = MAX_SPREAD_M,
     max_spread_rad: float = MAX_SPREAD_RAD,
 ) -> Calibration:
-    """From poses at rest. ``roll``, ``pitch``, ``yaw`` [rad]: as the drone tells them, averaged over the same time
-    (roll: right side down, pitch: nose down); ``heading``: of its nose in the world [rad], counter-clockwise from x.
+    """Compute the calibration from poses at rest.
 
-    Raises :class:`UsageError` for too few poses, or poses that are spread more than the limits: it moved, or the
-    tracking is poor.
+    Args:
+        poses: At least 20.
+        roll: As the drone reports it, averaged over the same time [rad]; right side down is positive.
+        pitch: As the drone reports it [rad]; nose down is positive.
+        yaw: As the drone reports it [rad]; None if it does not.
+        heading: Of its nose in the world [rad], counter-clockwise from x.
+        max_spread_m: Greatest root mean square distance of the poses from their mean.
+        max_spread_rad: Greatest root mean square angle between the poses and their mean.
+
+    Raises:
+        UsageError: There are too few poses, or they are spread more than the limits: the drone moved, or the tracking
+            is poor.
     """
     if len(poses) < MIN_POSES:
         raise UsageError(
@@ -74,7 +83,16 @@ def calibrate(
 
 
 def quaternion_of(roll: float, pitch: float, yaw: float) -> Quaternion:
-    """Turns about the body's x, then y, then z axis (ROS REP 103; pitch positive with the nose down)."""
+    """Return the rotation about the body's x, then y, then z axis (ROS REP 103; pitch positive with the nose down).
+
+    Args:
+        roll: [rad]
+        pitch: [rad]
+        yaw: [rad]
+
+    Returns:
+        x, y, z, w.
+    """
     x: Quaternion = (math.sin(roll / 2), 0.0, 0.0, math.cos(roll / 2))
     y: Quaternion = (0.0, math.sin(pitch / 2), 0.0, math.cos(pitch / 2))
     z: Quaternion = (0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
@@ -82,14 +100,16 @@ def quaternion_of(roll: float, pitch: float, yaw: float) -> Quaternion:
 
 
 def conjugate(quaternion: Quaternion) -> Quaternion:
-    """The opposite turn."""
+    """Return the inverse rotation of a unit quaternion."""
     x, y, z, w = quaternion
     return -x, -y, -z, w
 
 
 def mean_quaternion(quaternions: Sequence[Quaternion]) -> Quaternion:
-    """The turn nearest to all of them: largest eigenvector of their outer products (Markley et al., "Averaging
-    Quaternions", 2007), which does not care for their signs."""
+    """Return the mean rotation, whatever the signs of the quaternions.
+
+    It is the largest eigenvector of the sum of their outer products (Markley et al., "Averaging Quaternions", 2007).
+    """
     parts = np.array(quaternions)
     _, vectors = np.linalg.eigh(parts.T @ parts)
     x, y, z, w = vectors[:, -1].tolist()

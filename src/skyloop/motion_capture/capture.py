@@ -1,39 +1,40 @@
-"""Motion capture as an application sees it: where each body is, now and as it moves."""
+"""Motion capture for applications: the newest pose of each body, callbacks, and calibration."""
 
 from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from types import TracebackType
 from typing import TYPE_CHECKING, Final, Protocol, Self, TypeVar
 
 from skyloop.clock import monotonic_ns, nanoseconds
+from skyloop.control.position import Fix
 from skyloop.errors import ClosedError, NoAnswerError, UnknownNameError, UsageError
+from skyloop.messages import Severity
+from skyloop.messages.log import MOCAP
 from skyloop.motion_capture.address import System
 from skyloop.motion_capture.calibration import REST_S, Calibration, calibrate
-from skyloop.motion_capture.linking import Linked, fixes
 from skyloop.motion_capture.pose import BodyPose, plausible, z_up
 from skyloop.motion_capture.tracking import Track, TrackState
 from skyloop.motion_capture.worker import RawFrame
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
-    from skyloop.control.position import Fix
 
-LOOK_S: Final = 0.05  #: how often it is judged whether a body is lost
+LOOK_S: Final = 0.05  #: period of the check whether a body is lost
+MAX_UNKNOWN: Final = 1000  #: limit of the names of unrequested bodies that are remembered
 T = TypeVar("T")
 _log = logging.getLogger("skyloop")
 
 
 @dataclass(frozen=True, slots=True)
 class TrackEvent:
-    """The tracking of a body changed, or the system has something to tell."""
+    """A change of a body's tracking, or trouble with the system."""
 
     at_ns: int  #: on this host's monotonic clock
-    body: str  #: empty where it is about the system
+    body: str  #: empty where the event is about the system
     state: TrackState
     text: str
 
@@ -49,18 +50,54 @@ class Source(Protocol):
     def close(self) -> None: ...
 
 
-#: Makes a source for a system and the names of bodies in it; it hands each frame on, and tells in words of trouble.
+#: Creates a source from a system, the bodies' names in it, and callbacks for frames and for troubles (in words).
 MakeSource = Callable[[System, Iterable[str], Callable[[RawFrame], None], Callable[[str], None]], Source]
 
 
-class MotionCapture:
-    """Poses of the bodies that a motion capture system tracks; made by :func:`skyloop.mocap`. A context manager.
+class Registration:
+    """A callback's registration, until :meth:`close`. A context manager."""
 
-    Every method may be called from any thread; listeners are called on the receiving thread and must be quick.
+    def __init__(self, end: Callable[[], None]) -> None:
+        """Store what removes the callback."""
+        self._end = end
+
+    def close(self) -> None:
+        """Remove the callback. Idempotent."""
+        self._end()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class MotionCapture:
+    """Poses of the bodies that a motion capture system tracks. A context manager; created by :func:`skyloop.mocap`.
+
+    Every method may be called from any thread. Callbacks run on the receiving thread (events also on a thread that
+    checks for lost bodies) and must be quick; one that raises is logged and does not affect the others.
+
+    Attributes:
+        system: The system.
+        bodies: Names of drones to the system's names of their bodies.
+        latency_ns: Age of a pose on arrival, as the address says.
+        unknown: Bodies that the system sees but ``bodies`` does not name.
     """
 
     def __init__(self, system: System, bodies: Mapping[str, str], make: MakeSource) -> None:
-        """``bodies``: our names, those of the drones, to the names that the system knows them by."""
+        """Initialise without connecting; :func:`skyloop.mocap` also opens it.
+
+        Args:
+            system: The system.
+            bodies: Names of drones to the system's names of their bodies.
+            make: Creates the source of frames.
+
+        Raises:
+            UsageError: ``bodies`` is empty or maps two names to one body.
+        """
         if not bodies or not all(isinstance(one, str) and one for pair in bodies.items() for one in pair):
             raise UsageError(f'bodies is {bodies!r} and must map names, as {{"alpha": "alpha_body"}}')
         if len(set(bodies.values())) < len(bodies):
@@ -68,7 +105,7 @@ class MotionCapture:
         self.system = system
         self.bodies = dict(bodies)
         self.latency_ns = nanoseconds(system.latency_s)
-        self.unknown: set[str] = set()  #: bodies that the system sees and nobody asked for
+        self.unknown: set[str] = set()  #: bodies that the system sees but ``bodies`` does not name
         self._names = {theirs: ours for ours, theirs in bodies.items()}
         self._tracks = {name: Track(name, may_freeze=system.kind == "sim") for name in bodies}
         self._told = dict.fromkeys(bodies, TrackState.WAITING)
@@ -83,13 +120,23 @@ class MotionCapture:
     # Life cycle ------------------------------------------------------------------------------------------------
 
     def open(self, timeout_s: float = 5.0) -> Self:
-        """Connect; returns with the first frame. Raises :class:`LinkError` and :class:`MissingExtraError`."""
+        """Connect, and wait for the first frame.
+
+        Args:
+            timeout_s: How long to wait.
+
+        Raises:
+            LinkError: No frame came within that time.
+            MissingExtraError: The extra ``[mocap]`` is not installed.
+            UsageError: A VRPN tracker has several sensors and none was named.
+            UnsupportedError: A simulated drone does not report its true pose.
+        """
         self._source.start(timeout_s)
         self._watch.start()
         return self
 
     def close(self) -> None:
-        """End it. Idempotent."""
+        """Disconnect and end the threads. Idempotent."""
         if self._ended.is_set():
             return
         self._ended.set()
@@ -112,18 +159,36 @@ class MotionCapture:
     # Reading ---------------------------------------------------------------------------------------------------
 
     def pose(self, name: str) -> BodyPose | None:
-        """The newest pose of a body while it is tracked; None while it is not. Never an old one."""
+        """Return the newest pose of a body while it is tracked; None while it is not, never an old one.
+
+        Raises:
+            UnknownNameError: ``bodies`` has no such name.
+        """
         track = self._track(name)
         with self._changed:
-            track.look(monotonic_ns())  # the thread that looks on may be late
+            track.look(monotonic_ns())  # the watching thread may be late
             return track.pose
 
     def state(self, name: str) -> TrackState:
-        """Whether a body is tracked."""
+        """Return whether a body is tracked.
+
+        Raises:
+            UnknownNameError: ``bodies`` has no such name.
+        """
         return self._track(name).state
 
     def wait(self, name: str, timeout_s: float = 5.0) -> BodyPose:
-        """The pose of a body, once it is tracked. Raises :class:`NoAnswerError` with what the system sees instead."""
+        """Wait until a body is tracked, and return its pose.
+
+        Args:
+            name: One of ``bodies``.
+            timeout_s: How long to wait.
+
+        Raises:
+            NoAnswerError: It is not tracked within that time; the text lists what the system sees instead.
+            ClosedError: This motion capture was closed.
+            UnknownNameError: ``bodies`` has no such name.
+        """
         track = self._track(name)
         with self._changed:
             self._changed.wait_for(lambda: track.pose is not None or self._ended.is_set(), timeout_s)
@@ -135,26 +200,42 @@ class MotionCapture:
             f"{self.system.address} does not track {self.bodies[name]!r} (for {name}) within {timeout_s:g} s{others}"
         )
 
-    @contextmanager
-    def on_pose(self, function: OnPose) -> Iterator[None]:
-        """While in this block, call a function with each pose of each body, on the receiving thread."""
-        self.listen(pose=function)
-        try:
-            yield
-        finally:
-            self.listen_no_more(pose=function)
+    def on_pose(self, function: OnPose) -> Registration:
+        """Call a function with each pose of each body, on the receiving thread.
 
-    @contextmanager
-    def on_event(self, function: OnEvent) -> Iterator[None]:
-        """While in this block, call a function whenever a body is found or lost, or the system has trouble."""
+        Args:
+            function: Must return quickly.
+
+        Returns:
+            Closing it, or the end of its ``with`` block, removes the callback.
+
+        Raises:
+            UsageError: The function can't be called.
+        """
+        self.listen(pose=function)
+        return Registration(lambda: self.listen_no_more(pose=function))
+
+    def on_event(self, function: OnEvent) -> Registration:
+        """Call a function whenever a body is found or lost, or the system has trouble.
+
+        Args:
+            function: Must return quickly.
+
+        Returns:
+            Closing it, or the end of its ``with`` block, removes the callback.
+
+        Raises:
+            UsageError: The function can't be called.
+        """
         self.listen(event=function)
-        try:
-            yield
-        finally:
-            self.listen_no_more(event=function)
+        return Registration(lambda: self.listen_no_more(event=function))
 
     def listen(self, pose: OnPose | None = None, event: OnEvent | None = None) -> None:
-        """As :meth:`on_pose` and :meth:`on_event`, until :meth:`listen_no_more`."""
+        """Add callbacks as :meth:`on_pose` and :meth:`on_event` do, until :meth:`listen_no_more`.
+
+        Raises:
+            UsageError: A function can't be called.
+        """
         for function in (pose, event):
             if function is not None and not callable(function):
                 raise UsageError(f"{function!r:.80} can't be called: a function with one argument is needed")
@@ -164,33 +245,58 @@ class MotionCapture:
             self._event_listeners.append(event)
 
     def listen_no_more(self, pose: OnPose | None = None, event: OnEvent | None = None) -> None:
-        """Idempotent."""
+        """Remove callbacks. Idempotent."""
         if pose in self._pose_listeners:
             self._pose_listeners.remove(pose)
         if event in self._event_listeners:
             self._event_listeners.remove(event)
 
-    # For others ------------------------------------------------------------------------------------------------
+    # For drones and controllers ---------------------------------------------------------------------------------
 
     def link(self, drone: Drone, *, max_hz: float = 100.0, to_vehicle: bool = False) -> Linked:
-        """While in the block of what this returns, tell a drone's poses with the drone: recorders write them, and the
-        cockpit shows them. Lost tracking is told too. A drone is known by its proxy's name.
+        """Log a drone's poses with the drone, so that recorders write them and the cockpit shows them.
 
-        ``to_vehicle``: tell them the vehicle itself besides (:meth:`Drone.tell_pose`), which may fly by them."""
+        Loss of tracking is logged too.
+
+        Args:
+            drone: Its proxy's name must be one of ``bodies``.
+            max_hz: Greatest rate of the logged poses, 1 to 1000.
+            to_vehicle: Whether to send the poses to the vehicle too (:meth:`Drone.tell_pose`), which may fly by them.
+
+        Returns:
+            A context manager; poses are logged within its block.
+
+        Raises:
+            UnknownNameError: ``bodies`` has no such name.
+            UsageError: ``max_hz`` is out of its range.
+        """
         self._track(drone.name)
         return Linked(self, drone, max_hz, to_vehicle)
 
     def source(self, drone: Drone) -> Callable[[], Fix | None]:
-        """What path controllers take as ``source``: ``FollowPath(drone, path, source=capture.source(drone))``."""
+        """Return a position source for controllers: ``FollowPath(drone, path, source=capture.source(drone))``.
+
+        Raises:
+            UnknownNameError: ``bodies`` has no such name.
+        """
         return fixes(self, drone)
 
     # Calibration -----------------------------------------------------------------------------------------------
 
     def calibrate(self, drone: Drone, *, heading: float = 0.0, seconds: float = REST_S) -> Calibration:
-        """Find how the tracked body's axes lie to the drone's, while it stands on the ground at rest, nose to
-        ``heading`` [rad] in the world. Poses of that body are the drone's from then on.
+        """Measure the rotation between the tracked body's axes and the drone's, while it stands at rest on the ground.
 
-        Raises :class:`UsageError` if it flies or moves, :class:`NoAnswerError` if it is not tracked.
+        From then on the poses of that body are the drone's.
+
+        Args:
+            drone: Its proxy's name must be one of ``bodies``.
+            heading: Of its nose in the world [rad], counter-clockwise from x.
+            seconds: How long to collect poses.
+
+        Raises:
+            UsageError: The drone flies or moves, or there are too few poses.
+            NoAnswerError: It is not tracked.
+            ClosedError: This motion capture was closed.
         """
         name = drone.name
         self.wait(name)
@@ -211,12 +317,13 @@ class MotionCapture:
     # What the source calls -------------------------------------------------------------------------------------
 
     def take(self, frame: RawFrame) -> None:
-        """A frame of the system."""
+        """Handle a frame of the system."""
         captured_ns = frame.received_ns - self.latency_ns
         for theirs, (position, quaternion) in frame.bodies.items():
             name = self._names.get(theirs)
             if name is None:
-                self.unknown.add(theirs)
+                if len(self.unknown) < MAX_UNKNOWN:
+                    self.unknown.add(theirs)
             elif plausible(position, quaternion):
                 if self.system.up == "y":
                     position, quaternion = z_up(position, quaternion)
@@ -243,7 +350,7 @@ class MotionCapture:
                 self._report(track)
 
     def _report(self, track: Track) -> None:
-        """Tell once of each change of a body's state."""
+        """Emit an event once for each change of a body's state."""
         with self._changed:
             before, state = self._told[track.body], track.state
             self._told[track.body] = state
@@ -268,9 +375,75 @@ class MotionCapture:
 
 
 def _call(listeners: list[Callable[[T], object]], sample: T) -> None:
-    """A listener that raises costs only itself, and is told of in the log."""
+    """Call all callbacks; log the exceptions that they raise."""
     for function in list(listeners):
         try:
             function(sample)
         except Exception:  # noqa: BLE001  the user's code may raise anything
             _log.exception("a motion capture listener failed")
+
+
+class Linked:
+    """Logs each pose of a drone with the drone, until closed. See :meth:`MotionCapture.link`."""
+
+    def __init__(self, capture: MotionCapture, drone: Drone, max_hz: float, to_vehicle: bool = False) -> None:
+        """Initialise; the ``with`` block starts the logging.
+
+        Raises:
+            UsageError: ``max_hz`` is not from 1 to 1000.
+        """
+        if not 1.0 <= max_hz <= 1000.0:
+            raise UsageError(f"max_hz is {max_hz!r} and must be from 1 to 1000")
+        self._capture = capture
+        self._drone = drone
+        self._period_ns = nanoseconds(1.0 / max_hz)
+        self._to_vehicle = to_vehicle
+        self._due_ns = 0
+
+    def __enter__(self) -> Self:
+        self._capture.listen(self._pose, self._event)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop logging. Idempotent."""
+        self._capture.listen_no_more(self._pose, self._event)
+
+    def _pose(self, pose: BodyPose) -> None:
+        if pose.body != self._drone.name or pose.captured_ns < self._due_ns:
+            return
+        # Accept poses a quarter of a period early: else a rate near the system's own would be halved.
+        self._due_ns = pose.captured_ns + self._period_ns * 3 // 4
+        values = (*pose.position, *pose.quaternion, *(pose.velocity or ()))
+        at_ns = pose.captured_ns + self._drone.clock_offset_ns
+        if self._to_vehicle:  # first, as the vehicle flies by it
+            self._drone.tell_pose(pose.position, pose.quaternion, at_ns=at_ns)
+        self._drone.log.array(MOCAP, values, at_ns=at_ns)
+
+    def _event(self, event: TrackEvent) -> None:
+        if event.body in ("", self._drone.name):
+            lost = event.state is TrackState.LOST
+            severity = Severity.WARNING if lost else Severity.INFO
+            self._drone.log.text(event.text, name=MOCAP, severity=severity)
+
+
+def fixes(capture: MotionCapture, drone: Drone) -> Callable[[], Fix | None]:
+    """Return a position source for controllers: the newest pose of a drone, with its time on the proxy's clock.
+
+    Raises:
+        UnknownNameError: The capture has no body of the drone's name.
+    """
+    name = drone.name
+    capture.state(name)  # raises now for an unknown name
+
+    def newest() -> Fix | None:
+        pose = capture.pose(name)
+        if pose is None:
+            return None
+        return Fix(pose.captured_ns + drone.clock_offset_ns, pose.position, pose.yaw, pose.velocity)
+
+    return newest

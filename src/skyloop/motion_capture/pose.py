@@ -1,4 +1,4 @@
-"""A body as a motion capture system sees it, in Skyloop's axes."""
+"""Poses of bodies from a motion capture system, in Skyloop's axes."""
 
 from __future__ import annotations
 
@@ -20,8 +20,11 @@ Quaternion = tuple[float, float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class BodyPose:
-    """Where a body is. World axes of the capture volume: z up; body axes as the system defines them, or after a
-    calibration those of the drone: x forward, y left, z up (ROS REP 103)."""
+    """The pose of a body.
+
+    World axes are those of the capture volume, with z up. Body axes are as the system defines them, or after a
+    calibration those of the drone: x forward, y left, z up (ROS REP 103).
+    """
 
     body: str
     captured_ns: int  #: on this host's monotonic clock
@@ -37,19 +40,27 @@ class BodyPose:
 
     @property
     def rotation(self) -> Rotation:
-        """Body axes to world axes. Raises :class:`MissingExtraError` without SciPy."""
+        """Rotation from body axes to world axes.
+
+        Raises:
+            MissingExtraError: SciPy is not installed, or too old.
+        """
         found: Rotation = scipy_types().Rotation.from_quat(self.quaternion)
         return found
 
     @property
     def transform(self) -> RigidTransform:
-        """The pose of the body in the world."""
+        """The body's pose in the world.
+
+        Raises:
+            MissingExtraError: SciPy is not installed, or too old.
+        """
         found: RigidTransform = scipy_types().RigidTransform.from_components(self.position, self.rotation)
         return found
 
 
 def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
-    """Hamilton product: first ``b``, then ``a``; x, y, z, w."""
+    """Return the Hamilton product of quaternions (x, y, z, w): the rotation ``b``, then ``a``."""
     ax, ay, az, aw = a
     bx, by, bz, bw = b
     return (
@@ -61,22 +72,28 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
 
 
 def z_up(position: Vector, quaternion: Quaternion) -> tuple[Vector, Quaternion]:
-    """From axes with y up (x right, y up, z backward, as Motive streams by default) to such with z up: a quarter turn
-    about x, of the world and of the body alike, so that a body that stands upright keeps standing."""
+    """Convert from axes with y up (x right, y up, z backward, as Motive streams by default) to axes with z up.
+
+    This is a quarter turn about x, of the world and of the body alike, so that an upright body stays upright.
+
+    Args:
+        position: [m]
+        quaternion: x, y, z, w.
+    """
     x, y, z = position
     qx, qy, qz, qw = quaternion
     return (x, -z, y), (qx, -qz, qy, qw)
 
 
 def plausible(position: Vector, quaternion: Quaternion) -> bool:
-    """Whether this can be a pose: finite, and a quaternion of length 1 within 1 %."""
+    """Whether this can be a pose: finite, with a quaternion whose length is 1 within 1 %."""
     if not all(map(math.isfinite, (*position, *quaternion))):
         return False
     return abs(math.sqrt(sum(part * part for part in quaternion)) - 1.0) < 0.01
 
 
 def matrix(quaternion: Quaternion) -> NDArray[np.float64]:
-    """The rotation matrix of a quaternion, shape (3, 3), float64."""
+    """Return the rotation matrix of a quaternion (x, y, z, w), shape (3, 3), float64."""
     x, y, z, w = quaternion
     return np.array(
         [
@@ -88,7 +105,11 @@ def matrix(quaternion: Quaternion) -> NDArray[np.float64]:
 
 
 def scipy_types() -> Any:
-    """SciPy's module of rotations and transforms. Raises :class:`MissingExtraError` without it, or for an old one."""
+    """Import SciPy's module of rotations and transforms.
+
+    Raises:
+        MissingExtraError: SciPy is not installed, or older than 1.16.
+    """
     try:
         from scipy.spatial import transform
 

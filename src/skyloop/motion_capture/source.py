@@ -1,4 +1,4 @@
-"""Where frames of a motion capture system come from: a child process that listens to it, started anew when it dies."""
+"""Frames of a motion capture system from a child process, which is restarted when it dies."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from skyloop.errors import LinkError, MissingExtraError
 from skyloop.motion_capture.address import System
 from skyloop.motion_capture.worker import MISSING, RawFrame, read
 
-AGAIN_S: Final = 0.5  #: pause before a child that ended is started anew
-SILENT_S: Final = 3.0  #: a child that says nothing for so long is ended: its system may have been restarted
-FIRST_S: Final = 10.0  #: and one that has not said anything yet
-_TAIL: Final = 2000  #: bytes of what a child said that an error shows
+AGAIN_S: Final = 0.5  #: pause before a child that ended is restarted
+SILENT_S: Final = 3.0  #: a child that sends nothing for so long is killed: its system may have been restarted
+FIRST_S: Final = 10.0  #: the same before its first frame
+_TAIL: Final = 2000  #: bytes of a child's standard error that an error shows
 
 
 class ChildSource:
-    """Runs :mod:`skyloop.motion_capture.worker` for a system and hands on each frame, on a thread of its own.
+    """Runs :mod:`skyloop.motion_capture.worker` for a system and passes each frame on, on its own thread.
 
-    A child that ends, or falls silent, is replaced for as long as :meth:`close` was not called.
+    A child that ends or falls silent is replaced until :meth:`close`.
     """
 
     def __init__(
@@ -36,6 +36,14 @@ class ChildSource:
         *,
         command: tuple[str, ...] = (sys.executable, "-m", "skyloop.motion_capture.worker"),
     ) -> None:
+        """Initialise without starting the child.
+
+        Args:
+            system: The system to connect to.
+            take: Called with each frame, on the reading thread.
+            trouble: Called with a description when the child fails, on the reading thread.
+            command: The child's command line, before kind and settings.
+        """
         self._system = system
         self._take = take
         self._trouble = trouble
@@ -45,18 +53,25 @@ class ChildSource:
         self._ended = threading.Event()
         self._first = threading.Event()
         self._failed: Exception | None = None
-        self._said = ""  # what the last child complained of
+        self._said = ""  # the end of the last child's standard error
         self._reader = threading.Thread(target=self._run, name="skyloop-mocap", daemon=True)
         self._guard = threading.Thread(target=self._watch, name="skyloop-mocap-guard", daemon=True)
 
     @property
     def pid(self) -> int | None:
-        """Of the child."""
+        """Process id of the child; None before the first."""
         return None if self._child is None else self._child.pid
 
     def start(self, timeout_s: float) -> None:
-        """Listen, and wait for the first frame. Raises :class:`LinkError` if none comes, or
-        :class:`MissingExtraError`."""
+        """Start the child, and wait for the first frame.
+
+        Args:
+            timeout_s: How long to wait.
+
+        Raises:
+            LinkError: No frame came within that time.
+            MissingExtraError: The ``motioncapture`` package is not installed.
+        """
         self._reader.start()
         self._guard.start()
         if not self._first.wait(timeout_s) or self._failed is not None:
@@ -89,7 +104,7 @@ class ChildSource:
             self._ended.wait(AGAIN_S)
 
     def _listen(self, messages: IO[bytes]) -> int:
-        """One child from its start to its end; its exit code."""
+        """Run one child from its start to its end; return its exit code."""
         settings = msgspec.json.encode(self._system.configuration).decode()
         self._heard_s = time.monotonic() + FIRST_S - SILENT_S
         child = subprocess.Popen(
@@ -116,7 +131,7 @@ class ChildSource:
         return child.wait()
 
     def _watch(self) -> None:
-        """End a child that has fallen silent: the native code waits for ever."""
+        """Kill a child that has fallen silent: the native code would wait for ever."""
         while not self._ended.wait(AGAIN_S):
             if time.monotonic() - self._heard_s > SILENT_S:
                 self._kill()

@@ -12,9 +12,9 @@ import numpy as np
 from skyloop.clock import NS_PER_S, nanoseconds
 from skyloop.motion_capture.pose import BodyPose, Quaternion, Vector
 
-LOST_AFTER_S: Final = 0.2  #: without a pose for so long a body is lost: ten poses at 50 Hz
-FROZEN_AFTER_S: Final = 0.5  #: the same pose to the last bit for so long is no measurement
-WINDOW_S: Final = 0.1  #: of the velocity's straight line
+LOST_AFTER_S: Final = 0.2  #: a body without a pose for so long is lost: ten poses at 50 Hz
+FROZEN_AFTER_S: Final = 0.5  #: a pose that stays the same to the last bit for so long is no measurement
+WINDOW_S: Final = 0.1  #: of the poses from which the velocity is computed
 MIN_POSES: Final = 4  #: for a velocity
 
 
@@ -23,16 +23,29 @@ class TrackState(StrEnum):
 
     WAITING = "waiting"  #: not seen yet
     TRACKED = "tracked"
-    LOST = "lost"  #: seen before, and no new pose comes: there is no pose to be had
-    ENDED = "ended"  #: nothing listens any more
+    LOST = "lost"  #: seen before, but no new pose arrives
+    ENDED = "ended"  #: the motion capture was closed
 
 
 class Track:
-    """Poses of one body. The velocity is the slope of a straight line through those of the last :data:`WINDOW_S`
-    (least squares), which lags by half of the window and halves the noise of a difference many times over."""
+    """Poses of one body.
+
+    The velocity is the slope of a straight line (least squares) through the poses of the last :data:`WINDOW_S`. It lags
+    by half of the window, and has far less noise than a difference of two poses.
+
+    Attributes:
+        body: The body's name.
+        state: Whether it is tracked.
+        pose: The newest one while it is tracked, else None.
+    """
 
     def __init__(self, body: str, *, may_freeze: bool = False) -> None:
-        """``may_freeze``: whether the same pose for long is possible, as from a simulator without noise."""
+        """Initialise a body that was not seen yet.
+
+        Args:
+            body: Its name.
+            may_freeze: Whether the same pose for long is possible, as from a simulator without noise.
+        """
         self.body = body
         self.state = TrackState.WAITING
         self.pose: BodyPose | None = None  #: the newest one while it is tracked, else None
@@ -43,7 +56,16 @@ class Track:
         self._last: tuple[Vector, Quaternion] | None = None
 
     def add(self, captured_ns: int, position: Vector, quaternion: Quaternion) -> BodyPose | None:
-        """A new pose; None for one that is older than what is known, or frozen."""
+        """Update with a new pose.
+
+        Args:
+            captured_ns: When it was captured.
+            position: [m]
+            quaternion: x, y, z, w.
+
+        Returns:
+            The pose with its velocity; None if it is not newer than the last, or frozen.
+        """
         if captured_ns <= self._seen_ns:
             return None
         self._seen_ns = captured_ns
@@ -61,14 +83,14 @@ class Track:
         return self.pose
 
     def look(self, now_ns: int) -> bool:
-        """Whether it has been lost since the last look."""
+        """Update the state for a time [ns]; return whether the body has become lost."""
         if self.pose is None or now_ns - self.pose.captured_ns < nanoseconds(LOST_AFTER_S):
             return False
         self.state, self.pose = TrackState.LOST, None
         return True
 
     def end(self) -> None:
-        """Nothing will come any more."""
+        """End the track: no pose will come any more."""
         self.state, self.pose = TrackState.ENDED, None
 
     def _velocity(self) -> Vector | None:

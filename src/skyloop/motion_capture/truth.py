@@ -1,4 +1,4 @@
-"""The simulator as a motion capture system: the true poses that its drones tell with ``sim://?truth=1``."""
+"""The simulator as a motion capture system: the true poses that its drones report with ``sim://?truth=1``."""
 
 from __future__ import annotations
 
@@ -18,16 +18,29 @@ if TYPE_CHECKING:
 
 
 class TruthSource:
-    """Observes the proxies of simulated drones, and takes the truth out of their native telemetry."""
+    """Observes the proxies of simulated drones, and reads the true poses from their native telemetry."""
 
     def __init__(self, proxies: Iterable[str], take: Callable[[RawFrame], None]) -> None:
+        """Initialise without connecting.
+
+        Args:
+            proxies: Names of the drones' proxies.
+            take: Called with each frame, on the thread that receives feedback.
+        """
         self._proxies = tuple(proxies)
         self._take = take
         self._open = ExitStack()
 
     def start(self, timeout_s: float) -> None:
-        """Connect to all. Raises what :func:`skyloop.connect` raises, and :class:`UnsupportedError` for a vehicle that
-        does not tell the truth."""
+        """Connect to all proxies.
+
+        Args:
+            timeout_s: How long to wait for each.
+
+        Raises:
+            UnsupportedError: A vehicle does not report its true pose.
+            SkyloopError: As of :func:`skyloop.connect`.
+        """
         from skyloop.client import connect
 
         with ExitStack() as opening:
@@ -41,7 +54,7 @@ class TruthSource:
             self._open = opening.pop_all()
 
     def close(self) -> None:
-        """Idempotent."""
+        """Disconnect from all. Idempotent."""
         self._open.close()
 
     def _taking(self, name: str, drone: Drone) -> Callable[[Feedback], None]:
@@ -56,7 +69,7 @@ class TruthSource:
 def true_pose(
     feedback: Feedback,
 ) -> tuple[tuple[float, float, float], tuple[float, float, float, float]] | None:
-    """Position [m] and quaternion (x, y, z, w) in native telemetry of the simulator; None if it is not there."""
+    """Return position [m] and quaternion (x, y, z, w) from the simulator's native telemetry; None without them."""
     native = feedback.native or {}
     try:
         x, y, z, roll, pitch, yaw = (

@@ -1,8 +1,8 @@
-"""The process that listens to a motion capture system: ``python -m skyloop.motion_capture.worker KIND SETTINGS``.
+"""The process that receives from a motion capture system: ``python -m skyloop.motion_capture.worker KIND SETTINGS``.
 
-The ``motioncapture`` package waits in native code, without a time-out and partly with the interpreter locked: in a
-process of its own it can hold up nobody, and be ended whatever it waits for. Each frame goes to standard output as one
-msgpack array with its length before it: when it came, and of each body that is seen its position and quaternion.
+The ``motioncapture`` package waits in native code, without a timeout and partly with the interpreter locked. In its own
+process it can block nobody, and can be killed whatever it waits for. Each frame is written to standard output as a
+msgpack array, preceded by its length: when it was received, and position and quaternion of each body that is seen.
 """
 
 from __future__ import annotations
@@ -30,7 +30,14 @@ class RawFrame(msgspec.Struct, frozen=True, array_like=True):
 
 
 def read(stream: BinaryIO) -> RawFrame | None:
-    """The next frame; None at the end. Raises ``msgspec.DecodeError`` for what is none."""
+    """Read the next frame.
+
+    Returns:
+        The frame; None at the end of the stream.
+
+    Raises:
+        msgspec.DecodeError: The data are no frame.
+    """
     head = stream.read(LENGTH.size)
     if len(head) < LENGTH.size:
         return None
@@ -42,13 +49,14 @@ def read(stream: BinaryIO) -> RawFrame | None:
 
 
 def write(stream: BinaryIO, frame: RawFrame) -> None:
+    """Write a frame and flush."""
     data = msgspec.msgpack.encode(frame)
     stream.write(LENGTH.pack(len(data)) + data)
     stream.flush()
 
 
 def seen(bodies: Any) -> dict[str, Seen]:
-    """What the package gives of the bodies, as plain numbers."""
+    """Convert the package's bodies to plain numbers."""
     found: dict[str, Seen] = {}
     for name, body in bodies.items():
         x, y, z = (float(value) for value in body.position)
@@ -58,13 +66,22 @@ def seen(bodies: Any) -> dict[str, Seen]:
 
 
 def open_output() -> BinaryIO:
-    """Standard output, for frames alone: what the native code prints goes to standard error."""
+    """Return standard output for frames alone, and redirect what native code prints to standard error."""
     output = os.fdopen(os.dup(1), "wb", buffering=0)
     os.dup2(2, 1)
     return output
 
 
 def main(kind: str, settings: str) -> int:
+    """Connect and write frames until the reader is gone.
+
+    Args:
+        kind: The system's name in the ``motioncapture`` package.
+        settings: JSON object of strings, for its ``connect``.
+
+    Returns:
+        The exit code: 0 when the reader is gone, :data:`MISSING` without the package, 1 for any other error.
+    """
     try:
         import motioncapture
     except ImportError as error:
@@ -77,7 +94,7 @@ def main(kind: str, settings: str) -> int:
             system.waitForNextFrame()
             write(output, RawFrame(time.monotonic_ns(), seen(system.rigidBodies)))
     except BrokenPipeError:
-        return 0  # whoever listened is gone
+        return 0  # the reader is gone
     except Exception as error:  # noqa: BLE001  whatever the native code throws
         print(error, file=sys.stderr)
         return 1

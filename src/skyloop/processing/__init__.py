@@ -1,4 +1,4 @@
-"""Processors: classes that look at frames on any host and publish what they find. docs/processors.md is the page."""
+"""Processors: classes that process frames on any host and publish what they find. See docs/processors.md."""
 
 from skyloop.processing.loading import Code, load_processor
 from skyloop.processing.output import Output

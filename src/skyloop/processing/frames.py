@@ -1,4 +1,4 @@
-"""The frames of a worker: its share of a camera's, the newest first."""
+"""Frames of a worker: its share of a camera's, the newest first."""
 
 from __future__ import annotations
 
@@ -8,29 +8,37 @@ from types import TracebackType
 from typing import Any, Self
 
 from skyloop.client import Drone, Frame
+from skyloop.client.channels import VideoChannel
 from skyloop.client.frame import Arrival
-from skyloop.client.membership import Membership
-from skyloop.client.reception import VideoChannel
-from skyloop.client.slots import Buffer
+from skyloop.client.mailbox import Mailbox
+from skyloop.client.worker import Membership
 from skyloop.messages import ProcessorShare
 
 
 class Frames:
-    """The newest frame of a worker's part that it did not take yet. A context manager: subscribed while open.
+    """The newest frame of a worker's share that it has not taken yet. A context manager: subscribed while open.
 
-    Only the frames of its part are asked for, anew whenever that changes, so that over a network no others travel.
+    Only frames of the share are requested, anew whenever it changes, so that no others travel over a network.
     """
 
     def __init__(
         self, drone: Drone, membership: Membership, came: Callable[[], None], *, max_fps: float | None = None
     ) -> None:
+        """Prepare to subscribe.
+
+        Args:
+            drone: Where the frames come from.
+            membership: Knows the share.
+            came: Called with each frame of the share, on the receiving thread.
+            max_fps: Most frames a second; None: all.
+        """
         self._drone = drone
         self._membership = membership
         self._came = came
         self._how: dict[str, Any] = {} if max_fps is None else {"max_fps": max_fps}
         self._usual = drone.channel(membership.camera)
-        self._channel: VideoChannel | None = None  # whose frames come now
-        self._buffer: Buffer[Arrival] = Buffer()
+        self._channel: VideoChannel | None = None  # subscribed now
+        self._buffer: Mailbox[Arrival] = Mailbox()
         self._sink = self._arrived
         self._lock = threading.Lock()  # guards the change from one channel to another
 
@@ -48,18 +56,18 @@ class Frames:
 
     @property
     def dropped(self) -> int:
-        """Frames of its part that newer ones replaced."""
+        """Frames of the share that newer ones replaced."""
         return self._buffer.dropped
 
     def wait(self, timeout_s: float) -> Arrival | None:
-        """The newest, waited for."""
+        """Take the newest frame; None if none comes within ``timeout_s`` [s]."""
         return self._buffer.wait(timeout_s)
 
     def picture(self, arrival: Arrival) -> Frame | None:
-        """The frame; None, and counted by its channel, if it can't be understood."""
+        """Decode the frame; None, and counted by its channel, if it can't be decoded."""
         return (self._channel or self._usual).picture(arrival)
 
-    # On the receiving thread, but for the first time -----------------------------------------------------------
+    # On the receiving thread, except on entering --------------------------------------------------------------
 
     def _follow(self, share: ProcessorShare) -> None:
         part = (share.part, share.parts)
@@ -72,12 +80,12 @@ class Frames:
                 return
             if channel is not None:
                 already = self._buffer.dropped
-                channel.topic.add(self._sink, lambda: self._buffer.dropped - already)
+                channel.add(self._sink, lambda: self._buffer.dropped - already)
             if before is not None:
-                before.topic.remove(self._sink)
+                before.remove(self._sink)
 
     def _arrived(self, arrival: Arrival) -> None:
-        share = self._membership.share  # a frame may have been on its way when that changed
+        share = self._membership.share  # the frame may be of an earlier share
         if share is not None and share.parts and arrival.header.seq % share.parts == share.part:
             self._came()
             self._buffer.put(arrival)

@@ -1,4 +1,4 @@
-"""Several workers on this host, each a process of its own; one that dies is started anew."""
+"""Several workers on this host, each a process of its own; one that dies is restarted."""
 
 from __future__ import annotations
 
@@ -16,38 +16,44 @@ import msgspec
 
 from skyloop.processing.status import Status, together
 
-_PAUSE_S: Final = 1.0  #: before a worker that died is started anew
-_GRACE_S: Final = 4.0  #: to end by itself, before it is told to
-USAGE_ERROR: Final = 2  #: exit code of a child that can't work at all, as it then says itself
+_PAUSE_S: Final = 1.0  #: time before a worker that died is restarted
+_GRACE_S: Final = 4.0  #: time for a child to end by itself, before a signal
+USAGE_ERROR: Final = 2  #: exit code of a child that can't work at all; it prints why
 
 
 class Child:
-    """One worker's process. It ends when its standard input does, and so never outlives this process."""
+    """The process of one worker. It ends when its standard input does, and so never outlives this process."""
 
     def __init__(self, command: Sequence[str]) -> None:
+        """Start the process.
+
+        Args:
+            command: Its command line; it prints a :class:`Status` as JSON on a line of standard output now and then.
+        """
         self.status: Status | None = None
-        # A session of its own: Ctrl-C in the terminal is for the parent, which then ends the children.
+        # A session of its own: Ctrl-C in the terminal reaches only the parent, which then ends the children.
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True)
         self._thread = threading.Thread(target=self._listen, name="skyloop-worker", daemon=True)
         self._thread.start()
 
     @property
     def pid(self) -> int:
+        """Process id."""
         return self._process.pid
 
     @property
     def code(self) -> int | None:
-        """How it ended; None while it runs."""
+        """Exit code, negative for a signal; None while it runs."""
         return self._process.poll()
 
     def part(self) -> None:
-        """Let it end, without waiting."""
+        """Ask it to end, by closing its standard input. Does not wait."""
         assert self._process.stdin is not None
         with contextlib.suppress(OSError):
             self._process.stdin.close()
 
     def end(self) -> None:
-        """Wait for its end, and force it if need be."""
+        """End it and wait; after 4 s it is terminated, after another 4 s killed."""
         self.part()
         for harder in (self._process.terminate, self._process.kill):
             try:
@@ -61,16 +67,24 @@ class Child:
         assert self._process.stdout is not None
         with self._process.stdout as lines:
             for text in lines:
-                with contextlib.suppress(msgspec.DecodeError):  # what the user's code prints goes there too
+                with contextlib.suppress(msgspec.DecodeError):  # the user's code may print there too
                     self.status = msgspec.json.decode(text, type=Status)
 
 
 class Group:
-    """``count`` children that run the same command. A context manager that ends them. ``tell`` is told of deaths."""
+    """Several children that run the same command. A context manager that ends them."""
 
     def __init__(
         self, command: Sequence[str], count: int, tell: Callable[[str], None], *, pause_s: float = _PAUSE_S
     ) -> None:
+        """Start the children.
+
+        Args:
+            command: Command line of each.
+            count: How many.
+            tell: Called with a text for people when a child dies, on the thread that calls :meth:`look`.
+            pause_s: Time before a child that died is restarted [s].
+        """
         self._command = tuple(command)
         self._tell = tell
         self._pause_s = pause_s
@@ -79,16 +93,20 @@ class Group:
 
     @property
     def status(self) -> Status | None:
-        """All of them together; None until one has told something."""
+        """Statistics of all children together; None until one has reported."""
         return together(child.status for child in self._children if child is not None and child.status is not None)
 
     @property
     def pids(self) -> list[int]:
-        """Of those that run."""
+        """Process ids of the children that run."""
         return [child.pid for child in self._children if child is not None]
 
     def look(self) -> int | None:
-        """Start anew who died; the exit code once all have ended by themselves, or one said that it can't work."""
+        """Restart children that died. To be called again and again.
+
+        Returns:
+            The exit code once all have ended by themselves, or one has reported that it can't work; None before.
+        """
         for number, child in enumerate(self._children):
             if child is None:
                 self._restart(number)
@@ -126,7 +144,10 @@ class Group:
 
 
 def end_with_parent(stop: Callable[[], None]) -> None:
-    """In a child: call ``stop`` when standard input ends, and leave all the same if it does not end then."""
+    """Call ``stop`` in this child process when its standard input ends, and exit if it is still running 2 s later.
+
+    ``stop`` runs on a thread of its own.
+    """
 
     def watch() -> None:
         with contextlib.suppress(OSError):
@@ -134,11 +155,11 @@ def end_with_parent(stop: Callable[[], None]) -> None:
                 pass
         stop()
         time.sleep(_GRACE_S / 2)
-        os._exit(1)  # the user's code hangs, and nobody is there any more to end this process
+        os._exit(1)  # the user's code hangs, and the parent can't end this process any more
 
     threading.Thread(target=watch, name="skyloop-parent", daemon=True).start()
 
 
 def child_command(arguments: Sequence[str]) -> list[str]:
-    """The command line of this program with these arguments."""
+    """Return the command line that runs this program with these arguments."""
     return [sys.executable, "-m", "skyloop", *arguments]

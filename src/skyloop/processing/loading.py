@@ -1,4 +1,4 @@
-"""Loads the user's processor from a module or a file, with errors that say where and what."""
+"""Loads the user's processor from a module or a file, with errors that say where and what is wrong."""
 
 from __future__ import annotations
 
@@ -20,25 +20,33 @@ _DIGITS: Final = 16  #: of the hash of the code
 
 @dataclass(frozen=True, slots=True)
 class Code:
-    """A processor's class, and what tells it from others of the same name."""
+    """The class of a processor, and a mark that tells it from other code of the same name."""
 
     kind: type[Any]
-    mark: str  #: name of the class and a hash of the file that it stands in
+    mark: str  #: name of the class and a hash of the file that defines it
 
     @classmethod
     def of(cls, kind: type[Any]) -> Code:
-        """Raises :class:`UsageError` for a class that has no ``process(self, frame)``."""
+        """Return the code of a class.
+
+        Raises:
+            UsageError: If it has no plain method ``process(self, frame)``.
+        """
         _check(kind)
         digits = hashlib.sha256(_source(kind)).hexdigest()[:_DIGITS]
         return cls(kind, f"{kind.__qualname__[:100]} {digits}")
 
     @property
     def name(self) -> str:
-        """What results go by if nothing else is said."""
+        """Default name of the processor: the class's in lower case."""
         return self.kind.__name__.lower()[:64]
 
     def make(self) -> Any:
-        """One of it. Raises :class:`UsageError` where it needs arguments."""
+        """Return an instance.
+
+        Raises:
+            UsageError: If the class needs arguments.
+        """
         try:
             inspect.signature(self.kind).bind()
         except TypeError as error:
@@ -48,10 +56,16 @@ class Code:
 
 
 def load_processor(target: str) -> Code:
-    """The class in ``module:Class``, ``file.py:Class``, or in ``file.py`` if it is the only one there.
+    """Load a processor's class.
 
-    Modules are looked for in the current directory too. Raises :class:`UsageError`, :class:`UnknownNameError` (no such
-    module or class), :class:`FileFormatError` (what fails when it is loaded).
+    Args:
+        target: ``module:Class``, ``file.py:Class``, or ``file.py`` if that has only one processor. Modules are searched
+            in the current directory too.
+
+    Raises:
+        UsageError: If ``target`` names no processor, there is no such module, or the class is none.
+        UnknownNameError: If there is no such class.
+        FileFormatError: If loading it fails, or the file has no processor.
     """
     place, colon, class_name = target.rpartition(":")
     if not colon:
@@ -81,7 +95,7 @@ def _import(name: str) -> ModuleType:
 
 
 def _choose(module: ModuleType, class_name: str, place: str) -> type[Any]:
-    """The class of that name, else the only one that processes."""
+    """The class of that name, else the only class with a method ``process``."""
     found = {
         name: value
         for name, value in vars(module).items()
@@ -113,7 +127,7 @@ def _check(kind: type[Any]) -> None:
 
 
 def _source(kind: type[Any]) -> bytes:
-    """The file that the class stands in; where there is none, as in a notebook, what was compiled."""
+    """Contents of the file that defines the class; where there is none, as in a notebook, the compiled code."""
     try:
         return Path(inspect.getsourcefile(kind) or "").read_bytes()
     except (TypeError, OSError):

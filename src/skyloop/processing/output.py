@@ -1,4 +1,4 @@
-"""What a processor may return beside a plain value."""
+"""What a processor may return besides a plain value."""
 
 from __future__ import annotations
 
@@ -9,13 +9,16 @@ from skyloop.messages.annotation import Shape
 
 
 class Output:
-    """A value, and what is to be drawn over the frame for people: ``return Output(boxes, [Polyline(…)])``.
-
-    ``shapes`` are in the frame's pixels. A value of None publishes no result.
-    """
+    """A value, and shapes to draw over the frame for people: ``return Output(boxes, [Polyline(…)])``."""
 
     __slots__ = ("shapes", "value")
 
     def __init__(self, value: Any, shapes: Iterable[Shape] = ()) -> None:
+        """Combine a value with shapes.
+
+        Args:
+            value: The result; None publishes none.
+            shapes: In the frame's pixels.
+        """
         self.value = value
         self.shapes = tuple(shapes)

@@ -1,4 +1,4 @@
-"""How a worker does: counts since it began, and what the last second was like."""
+"""Statistics of a worker: counts since it started, and rates and ages of the last second."""
 
 from __future__ import annotations
 
@@ -11,19 +11,22 @@ import msgspec
 from skyloop.clock import NS_PER_S, Clock
 from skyloop.messages import ProcessorShare
 
-_KEPT: Final = 1024  #: results of which the age is known
-#: What several workers have together is the sum of what each has.
+_KEPT: Final = 1024  #: newest results and frames that are kept for rates and ages
+#: Summed over several workers.
 _SUMS: Final = ("frames", "results", "dropped", "stale", "errors", "refused", "unsent", "frames_hz", "results_hz")
 
 
 class Status(msgspec.Struct, frozen=True, kw_only=True):
-    """One worker, or several of one processor together. Counts are since they began; rates, ages of the last second."""
+    """Statistics of one worker, or of several of one processor together.
+
+    Counts are since the start; rates and ages are of the last second.
+    """
 
     processor: str
     camera: str
-    processes: int = 1  #: that this is about
-    part: int = 0  #: which part of the frames it takes; of several: 0
-    parts: int = 0  #: of how many, 0: none now; of several: how many of them take a part
+    processes: int = 1  #: workers that these statistics cover
+    part: int = 0  #: which part of the frames it takes; 0 for several workers
+    parts: int = 0  #: of how many parts, 0: none now; for several workers: how many of them take a part
     workers: int = 0  #: of this processor and camera that the proxy knows
     frames: int = 0  #: frames of its part
     results: int = 0
@@ -31,12 +34,12 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     stale: int = 0  #: frames that were too old when their turn came
     errors: int = 0  #: calls of ``process`` that raised
     refused: int = 0  #: results that can't be sent
-    unsent: int = 0  #: results that could not be handed over
+    unsent: int = 0  #: results that could not be handed to the transport
     frames_hz: float = 0.0
     results_hz: float = 0.0
-    age_s: float | None = None  #: median, from a frame's capture to its result
+    age_s: float | None = None  #: median time from a frame's capture to its result
     age_max_s: float | None = None
-    took_s: float | None = None  #: median, of ``process``
+    took_s: float | None = None  #: median duration of ``process``
 
     def __str__(self) -> str:
         share = f"part {self.part + 1} of {self.parts}" if self.parts else "no part now"
@@ -59,7 +62,10 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def together(found: Iterable[Status]) -> Status | None:
-    """Several workers of one processor as one; None for none. The age is the worst median."""
+    """Combine the statistics of several workers of one processor; None for none.
+
+    Counts and rates are summed. Ages are the worst of all.
+    """
     each = list(found)
     if len(each) < 2:
         return each[0] if each else None
@@ -79,7 +85,7 @@ def together(found: Iterable[Status]) -> Status | None:
 
 
 class Tally:
-    """Counts of one worker. One thread counts; any may look."""
+    """Counts what one worker does. One thread counts frames, one results; any may read."""
 
     def __init__(self, clock: Clock) -> None:
         self.frames = self.results = self.stale = self.errors = self.refused = self.unsent = 0
@@ -88,17 +94,29 @@ class Tally:
         self._made: deque[tuple[int, float, float]] = deque(maxlen=_KEPT)  # when, age [s], took [s]
 
     def came(self) -> None:
-        """A frame of its part came. On the receiving thread."""
+        """Count a frame of its part; on the receiving thread."""
         self.frames += 1
         self._came.append(self._clock())
 
     def made(self, age_s: float, took_s: float) -> None:
-        """A result was sent."""
+        """Count a result that was published.
+
+        Args:
+            age_s: From the frame's capture until now [s].
+            took_s: Duration of ``process`` [s].
+        """
         self.results += 1
         self._made.append((self._clock(), age_s, took_s))
 
     def status(self, processor: str, camera: str, share: ProcessorShare | None, dropped: int) -> Status:
-        """How it does now."""
+        """Return the present statistics.
+
+        Args:
+            processor: Name of the processor.
+            camera: Name of the camera.
+            share: Share of the frames; None while it is not known.
+            dropped: Frames that newer ones replaced.
+        """
         since_ns = self._clock() - NS_PER_S
         made = [one for one in self._made.copy() if one[0] > since_ns]
         ages, took = sorted(age for _, age, _ in made), sorted(took for _, _, took in made)

@@ -1,4 +1,4 @@
-"""One worker of a processor: takes its share of the frames, calls the user's class, publishes what that returns."""
+"""One worker of a processor: takes its share of the frames, calls the user's class, and publishes what that returns."""
 
 from __future__ import annotations
 
@@ -20,20 +20,24 @@ from skyloop.processing.frames import Frames
 from skyloop.processing.output import Output
 from skyloop.processing.status import Status, Tally
 
-_LOOK_S: Final = 0.1  #: how often it is looked whether to end while no frame comes
-_TELL_EVERY_S: Final = 1.0  #: how often an exception of the user's code is told
+_LOOK_S: Final = 0.1  #: how often run() checks whether to end while no frame comes
+_TELL_EVERY_S: Final = 1.0  #: exceptions of the user's code are reported at most this often
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """How a processor is run. Raises :class:`UsageError` for what makes no sense."""
+    """How a processor is run.
 
-    name: str  #: of the processor; its results go by it
-    code: str  #: what tells it from other code of that name; of all its workers the same
-    camera: str | None = None  #: None: the vehicle's first
-    shared: bool = True  #: each frame to one worker; else all get all
-    max_age_s: float | None = 1.0  #: frames that are older when their turn comes are left out
-    max_fps: float | None = None  #: frames a second that this worker takes at most
+    Raises:
+        UsageError: If a name, an age or a limit is out of range.
+    """
+
+    name: str  #: name of the processor and of its results
+    code: str  #: identifies the code that runs, the same for all workers
+    camera: str | None = None  #: name of the camera; None: the vehicle's first
+    shared: bool = True  #: each frame goes to one worker; if False, each worker gets all
+    max_age_s: float | None = 1.0  #: older frames are left out when their turn comes; None: none are
+    max_fps: float | None = None  #: most frames a second for this worker; None: all
     stuck_s: float = 2.0  #: a call of ``process`` that takes longer gives this worker's share to the others
 
     def __post_init__(self) -> None:
@@ -47,13 +51,25 @@ class Settings:
 class Worker:
     """Runs a processor on a drone's frames: ``Worker(drone, Detector(), settings).run()``.
 
-    What ``process`` raises, and results that can't be sent, are told on ``drone.log`` and by ``tell``, counted, and
-    work goes on with the next frame.
+    Exceptions of ``process`` and results that can't be sent are counted and reported through ``drone.log`` and
+    ``tell``; the worker goes on with the next frame.
     """
 
     def __init__(
         self, drone: Drone, processor: Any, settings: Settings, tell: Callable[[str], None] = lambda _: None
     ) -> None:
+        """Join the processor's workers; no frame is taken before :meth:`run`.
+
+        Args:
+            drone: Where frames come from and results go to.
+            processor: Has a method ``process(frame)``, called on the thread of :meth:`run`.
+            settings: How it is run.
+            tell: Called with each report, a text for people, on the thread of :meth:`run`.
+
+        Raises:
+            NameTakenError: If another application runs other code under this name.
+            SkyloopError: Whatever else :meth:`skyloop.client.Drone.join_processor` raises.
+        """
         self.settings = settings
         self._drone = drone
         self._process = processor.process
@@ -71,9 +87,14 @@ class Worker:
         self._frames = Frames(drone, self.membership, self._tally.came, max_fps=settings.max_fps)
 
     def run(self, seconds: float | None = None) -> None:
-        """Work for ``seconds``, or until :meth:`stop` or the drone's end.
+        """Process frames until :meth:`stop` or the drone's end, then leave the processor's workers.
 
-        Raises :class:`NameTakenError` if meanwhile other code took over the name, as it can while the proxy is away.
+        Args:
+            seconds: For how long at most [s]; None: no limit.
+
+        Raises:
+            NameTakenError: If other code took over the name meanwhile, as it can while the proxy is away.
+            RefusedError: If the proxy refuses this worker for another reason.
         """
         end_s = math.inf if seconds is None else time.monotonic() + seconds
         try:
@@ -82,7 +103,7 @@ class Worker:
                     arrival = frames.wait(_LOOK_S)
                     if arrival is not None:
                         self._work(arrival)
-                    del arrival  # else its memory stayed on loan while this waits for the next one
+                    del arrival  # returns its memory to the proxy while this waits for the next one
         finally:
             self.membership.close()
 
@@ -92,7 +113,7 @@ class Worker:
 
     @property
     def status(self) -> Status:
-        """How it does. Any thread."""
+        """Present statistics. Any thread."""
         membership = self.membership
         return self._tally.status(membership.processor, membership.camera, membership.share, self._frames.dropped)
 
@@ -120,11 +141,11 @@ class Worker:
             stuck = not self._ready()
             self._busy_since_s = None
             if stuck:
-                self.membership.renew()  # its share comes back
+                self.membership.renew()  # the proxy gives its share back
         self._publish(frame, found, time.monotonic() - began_s)
 
     def _ready(self) -> bool:
-        """Whether it can take frames: not while a call of ``process`` takes too long."""
+        """Whether it can take frames: not while a call of ``process`` takes longer than ``stuck_s``."""
         since_s = self._busy_since_s
         return since_s is None or time.monotonic() - since_s < self.settings.stuck_s
 
@@ -146,7 +167,7 @@ class Worker:
 
     def _refused(self, error: UsageError) -> None:
         self._tally.refused += 1
-        if not self._told_refused:  # what it returns is the same kind of thing each time
+        if not self._told_refused:  # further results are most likely of the same type
             self._told_refused = True
             self._say(f"{self.settings.name}: {error}. Further ones are counted and not told.")
 

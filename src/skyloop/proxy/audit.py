@@ -120,7 +120,7 @@ def read(path: Path) -> tuple[list[Entry], int]:
     for line in lines:
         try:
             entries.append(msgspec.json.decode(line, type=Entry))
-        except msgspec.DecodeError:
+        except (msgspec.DecodeError, RecursionError):
             bad += 1
     return entries, bad
 

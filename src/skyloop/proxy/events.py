@@ -1,71 +1,47 @@
-"""Events: numbered, published, and not repeated without end."""
+"""What the proxy reports about itself: numbered events for everybody, and counters for whoever asks."""
 
 from __future__ import annotations
 
 import logging
 import threading
+from collections import defaultdict, deque
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass, field
 from typing import Final
 
 from skyloop.clock import NS_PER_S, Clock
 from skyloop.messages import Event, EventKind, Severity, Value, encode
-from skyloop.proxy.statistics import Counters
+from skyloop.proxy.core.events import EventDraft, RepeatedEvents
 from skyloop.transport.base import EVENTS
 
+#: Command delays that the distribution is taken over: about a minute of one pilot at 32 Hz.
+WINDOW: Final = 2000
 MAX_TEXT: Final = 1000  #: characters of an event's text
-REPEAT_NS: Final = NS_PER_S  #: how often something that goes on is told again
 
 _log = logging.getLogger(__name__)
 
 
-@dataclass(slots=True)
-class Notice:
-    """Something that may happen many times a second. Told at once the first time, then in sums."""
-
-    kind: EventKind
-    text: str
-    severity: Severity = Severity.WARNING
-    app: str | None = None
-    data: dict[str, Value] = field(default_factory=dict)
-
-
-class Repeats:
-    """Which repeated things are due to be told: the first at once, the others once a second with their count. Pure."""
+class Counters:
+    """Counts and the recent command delays. Each name is counted under one lock only, or by one thread."""
 
     def __init__(self) -> None:
-        self._told: dict[Hashable, tuple[int, Notice]] = {}
-        self._counts: dict[Hashable, int] = {}
+        self.counts: defaultdict[str, int] = defaultdict(int)
+        self.delays_ns: deque[int] = deque(maxlen=WINDOW)  #: sent to applied, of accepted commands
 
-    def first(self, key: Hashable) -> bool:
-        """Count one more; returns whether it is the first, which is to be given to :meth:`begin` and told now."""
-        count = self._counts.get(key)
-        if count is None:
-            return True
-        self._counts[key] = count + 1
-        return False
-
-    def begin(self, key: Hashable, notice: Notice, now_ns: int) -> None:
-        """The first of its key was told."""
-        self._told[key] = (now_ns, notice)
-        self._counts[key] = 0
-
-    def due(self, now_ns: int) -> list[tuple[Notice, int]]:
-        """What went on for a second since it was last told, with how often. What did not is forgotten."""
-        due: list[tuple[Notice, int]] = []
-        for key, (told_ns, notice) in list(self._told.items()):
-            if now_ns - told_ns < REPEAT_NS:
-                continue
-            count = self._counts[key]
-            if count:
-                due.append((notice, count))
-                self.begin(key, notice, now_ns)
-            else:
-                del self._told[key], self._counts[key]
-        return due
+    def snapshot(self, **now: float) -> dict[str, float]:
+        """All counters, the distribution of the command delay [s], and what the caller adds."""
+        values: dict[str, float] = {name: float(count) for name, count in self.counts.copy().items()}
+        values.update(now)
+        delays = sorted(self.delays_ns.copy())
+        if delays:
+            values["commands.delay.median_s"] = delays[len(delays) // 2] / NS_PER_S
+            values["commands.delay.p99_s"] = delays[int(0.99 * (len(delays) - 1))] / NS_PER_S
+            values["commands.delay.max_s"] = delays[-1] / NS_PER_S
+            values["commands.delay.mean_s"] = sum(delays) / len(delays) / NS_PER_S
+            values["commands.delay.count"] = float(len(delays))
+        return dict(sorted(values.items()))
 
 
-class EventLog:
+class EventPublisher:
     """Numbers and publishes the events of one run. Any thread; never raises."""
 
     def __init__(self, publish: Callable[[str, bytes], int], clock: Clock, counters: Counters) -> None:
@@ -74,11 +50,11 @@ class EventLog:
         self._counts = counters.counts
         self._lock = threading.Lock()  # keeps the order of publishing that of the numbers
         self._seq = 0
-        self._repeats = Repeats()
+        self._repeats = RepeatedEvents()
         self._missed = 0
         self.listener: Callable[[Event], None] | None = None  #: called with each event; must be quick and never raise
 
-    def tell(
+    def publish(
         self,
         kind: EventKind,
         text: str,
@@ -89,29 +65,34 @@ class EventLog:
     ) -> None:
         """Publish one event now."""
         with self._lock:
-            self._tell(kind, text, severity, app, data or {})
+            self._number(kind, text, severity, app, data or {})
 
-    def repeated(self, key: Hashable, make: Callable[[], Notice]) -> None:
-        """Tell something that may come many times a second; ``make`` is called only when it is told."""
+    def publish_draft(self, draft: EventDraft) -> None:
+        """Publish one event now."""
         with self._lock:
-            if self._repeats.first(key):
-                notice = make()
-                self._repeats.begin(key, notice, self._clock())
-                self._tell(notice.kind, notice.text, notice.severity, notice.app, {**notice.data, "count": 1})
+            self._number(draft.kind, draft.text, draft.severity, draft.app, draft.data)
+
+    def publish_repeated(self, key: Hashable, make: Callable[[], EventDraft]) -> None:
+        """Publish an event that may come many times a second; ``make`` is called only when it is published."""
+        with self._lock:
+            if self._repeats.first(key, make):
+                draft = make()
+                self._repeats.begin(key, make, self._clock())
+                self._number(draft.kind, draft.text, draft.severity, draft.app, {**draft.data, "count": 1})
 
     def tick(self, now_ns: int) -> None:
-        """Tell what went on repeatedly, and what could not be handed over. Call some times a second."""
+        """Publish sums of repeated events, and of those that could not be handed over. Call some times a second."""
         with self._lock:
-            for notice, count in self._repeats.due(now_ns):
-                text = f"{notice.text} (and {count} more like it within the last second)"
-                self._tell(notice.kind, text, notice.severity, notice.app, {**notice.data, "count": count})
+            for draft, count in self._repeats.due(now_ns):
+                text = f"{draft.text} (and {count} more like it within the last second)"
+                self._number(draft.kind, text, draft.severity, draft.app, {**draft.data, "count": count})
             if self._missed:
                 missed, self._missed = self._missed, 0
                 text = f"{missed} events could not be handed over to applications that are too slow"
-                self._tell(EventKind.SAMPLES_LOST, text, Severity.WARNING, None, {"count": missed})
+                self._number(EventKind.SAMPLES_LOST, text, Severity.WARNING, None, {"count": missed})
                 self._missed = 0  # that this one was not handed over either is no news
 
-    def _tell(self, kind: EventKind, text: str, severity: Severity, app: str | None, data: dict[str, Value]) -> None:
+    def _number(self, kind: EventKind, text: str, severity: Severity, app: str | None, data: dict[str, Value]) -> None:
         self._seq += 1
         event = Event(kind, text[:MAX_TEXT], self._clock(), severity, self._seq, app, data)
         try:

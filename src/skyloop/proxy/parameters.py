@@ -9,14 +9,19 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import Final
 
 import msgspec
 
+from skyloop.clock import nanoseconds
 from skyloop.errors import ParameterError, UnknownNameError
 from skyloop.messages import Parameter, ParameterPage, ParameterType, Refusal, Value
 from skyloop.messages.codec import MAX_BODY
-from skyloop.proxy.zones import BOX, FAR_M, ZONES, check_written
+from skyloop.proxy.core.autopilot import AutopilotSettings
+from skyloop.proxy.core.failsafe import FailsafeSettings
+from skyloop.proxy.core.limits import Limits
+from skyloop.proxy.core.zones import BOX, FAR_M, ZONES, Safety, check_written, safety_of
 
 MAX_TEXT: Final = 1024  #: characters of a text value
 MAX_PARAMETER: Final = 8192  #: bytes of one encoded parameter: a driver's larger one is left out
@@ -135,6 +140,19 @@ def _check_number(parameter: Parameter, number: float) -> None:
         raise ParameterError(f"{parameter.name} must be {allowed}, not {number!r}", code=Refusal.OUT_OF_RANGE)
 
 
+@dataclass(frozen=True, slots=True)
+class FlightSettings:
+    """What the parameters ask of the flight."""
+
+    limits: Limits
+    safety: Safety | None  #: the safety box and zones; None: there are none
+    failsafe: FailsafeSettings
+    autopilot: AutopilotSettings
+    max_age_ns: int  #: of a command
+    authority_timeout_ns: int
+    authority_ask_ns: int
+
+
 class Parameters:
     """The store. Any thread; driver calls happen on the caller's thread, outside of the store's lock."""
 
@@ -180,6 +198,41 @@ class Parameters:
         value = self._own[name].value
         assert isinstance(value, str)
         return value
+
+    def flight_settings(self) -> FlightSettings:
+        """Return what the values in force ask of the flight."""
+        number = self.number
+        limits = Limits(
+            tilt=number("limits.tilt"),
+            climb=number("limits.climb"),
+            yaw_rate=number("limits.yaw_rate"),
+            speed=number("limits.speed"),
+            altitude=number("limits.altitude"),
+        )
+        failsafe = FailsafeSettings(
+            hover_after_s=number("failsafe.hover_after_s"),
+            land_after_s=number("failsafe.land_after_s"),
+            retry_s=number("failsafe.retry_s"),
+            battery_warn=number("battery.warn"),
+            battery_land=number("battery.land"),
+        )
+        autopilot = AutopilotSettings(
+            takeoff_altitude=min(number("autopilot.takeoff_altitude"), limits.altitude),
+            climb=min(number("autopilot.climb"), limits.climb),
+            descent=min(number("autopilot.descent"), limits.climb),
+            velocity_p=number("autopilot.velocity_p"),
+            velocity_i=number("autopilot.velocity_i"),
+            tilt=limits.tilt,
+        )
+        return FlightSettings(
+            limits,
+            safety_of(number, self.text(ZONES)),
+            failsafe,
+            autopilot,
+            max_age_ns=nanoseconds(number("command.max_age_s")),
+            authority_timeout_ns=nanoseconds(number("authority.timeout_s")),
+            authority_ask_ns=nanoseconds(number("authority.ask_s")),
+        )
 
     def set(self, name: str, value: Value) -> Parameter:
         """Write one parameter and return it as it is now.

@@ -1,7 +1,7 @@
 """The proxy: one vehicle's driver made a node that any number of applications see and one at a time flies.
 
-Threads: the transport's receiving thread applies commands, the driver's threads publish what they heard, a ticker at
-50 Hz looks after authority, failsafe and software autopilot, and a worker answers the requests that may ask the driver.
+Threads: the transport's receiving thread carries commands out, the driver's threads publish what they receive, a ticker
+at 50 Hz updates authority, failsafe and software autopilot, and one thread answers requests that may ask the driver.
 """
 
 from __future__ import annotations
@@ -11,46 +11,61 @@ import os
 import secrets
 import threading
 import time
+from functools import partial
 from typing import Final
 
-from skyloop.clock import Clock, monotonic_ns, nanoseconds
+import msgspec
+
+from skyloop.clock import Clock, clock_identity, monotonic_ns, nanoseconds, seconds
 from skyloop.drivers.base import Driver
 from skyloop.errors import DecodeError, UsageError
 from skyloop.messages import (
     Annotation,
+    AnswerTakeover,
+    AnyReply,
     Command,
     EventKind,
+    FlightState,
+    GetParameter,
+    GetStatistics,
+    Hello,
+    JoinProcessor,
     LinkState,
+    ListParameters,
     LogEntry,
+    Ping,
+    Pong,
     ProcessorResult,
     Refusal,
+    Refused,
+    ReleaseAuthority,
     Request,
+    RequestAuthority,
+    Role,
+    SetParameter,
     Severity,
+    Statistics,
     Value,
     VehiclePose,
     Welcome,
     decode,
 )
 from skyloop.proxy.audit import AuditTrail
-from skyloop.proxy.autopilot import PERIOD_S, AutopilotSettings
-from skyloop.proxy.events import EventLog, Notice
-from skyloop.proxy.failsafe import LadderSettings
-from skyloop.proxy.flight import Flight
-from skyloop.proxy.helm import Helm
-from skyloop.proxy.limits import Limits
+from skyloop.proxy.core.autopilot import PERIOD_S, Autopilot, software_actions
+from skyloop.proxy.core.events import EventDraft
+from skyloop.proxy.events import Counters, EventPublisher
+from skyloop.proxy.executor import ActionExecutor
+from skyloop.proxy.flight_record import FlightRecord
+from skyloop.proxy.handler import CommandHandler
 from skyloop.proxy.parameters import Parameters
-from skyloop.proxy.poses import Poses
-from skyloop.proxy.processors import Processors
-from skyloop.proxy.requests import Requests
-from skyloop.proxy.sessions import MAX_MALFORMED, Session
-from skyloop.proxy.statistics import Counters
-from skyloop.proxy.vehicle import Vehicle
-from skyloop.proxy.watch import Watch
-from skyloop.proxy.zones import ZONES, safety_of
-from skyloop.transport.base import ANNOTATIONS, LOGS, Peer, ServerEnd
+from skyloop.proxy.publisher import VehiclePublisher, topic_problem
+from skyloop.proxy.relay import Relay
+from skyloop.proxy.requests import ParameterRequests, RequestDispatcher
+from skyloop.proxy.sessions import HELLO_NS, MAX_MALFORMED, Session
+from skyloop.proxy.workers import ProcessorWorkers
+from skyloop.transport.base import Peer, ServerEnd
 
 MAX_NAME: Final = 64  #: characters of a proxy's name
-MAX_ANNOTATION: Final = 32_768  #: bytes of an annotation's packet
 
 _log = logging.getLogger(__name__)
 
@@ -58,8 +73,15 @@ _log = logging.getLogger(__name__)
 class Proxy:
     """Owns a driver and a transport's server end, from :meth:`start` to :meth:`stop`; also a context manager.
 
-    ``clock`` is the clock of all its samples. ``ticker`` False leaves :meth:`tick` to the caller, for tests and for
-    time that stands still. Raises :class:`UsageError` for a name that is empty or longer than 64 characters.
+    Args:
+        driver: the vehicle's driver, not yet open.
+        server_end: where applications connect, not yet started.
+        name: what applications connect to, 1 to 64 characters.
+        clock: the clock of all its samples [ns].
+        ticker: False leaves :meth:`tick` to the caller, for tests and for time that stands still.
+
+    Raises:
+        UsageError: for a name that is empty or too long.
     """
 
     def __init__(
@@ -73,62 +95,85 @@ class Proxy:
         self.clock = clock
         self.run_id = secrets.randbits(63)  #: another number in each run
         self.capabilities = driver.capabilities()
+        uri = str(driver.uri)
+        self._welcome = Welcome(0, name, self.run_id, os.getpid(), uri, 0, self.capabilities, clock_identity())
         self._sessions: dict[int, Session] = {}
         self._counters = Counters()
         self._counts = self._counters.counts
-        self.events = EventLog(server_end.publish, clock, self._counters)
-        self.vehicle = Vehicle(server_end, self.events, self._counters, clock, self.capabilities)
-        self.helm = Helm(driver, self.capabilities, self.vehicle)
-        self.watch = Watch(self.helm, self.vehicle, self.events, server_end, clock, self._sessions)
-        self.flight = Flight(self.watch, self.helm, self.vehicle, self.events, self._counters, server_end, clock)
+        self.events = EventPublisher(server_end.publish, clock, self._counters)
+        software = software_actions(self.capabilities.actions)
+        autopilot = Autopilot(self.capabilities.actions) if software else None
+        self.publisher = VehiclePublisher(
+            server=server_end,
+            events=self.events,
+            counters=self._counters,
+            clock=clock,
+            capabilities=self.capabilities,
+            state_of=_as_reported if autopilot is None else autopilot.state,
+            on_link_up=self._refresh_parameters,
+        )
+        self.handler = CommandHandler(
+            executor=ActionExecutor(driver, self.capabilities, autopilot, self.publisher),
+            publisher=self.publisher,
+            events=self.events,
+            counters=self._counters,
+            server=server_end,
+            sessions=self._sessions,
+            clock=clock,
+            shared=driver.shared,
+        )
         self.parameters = Parameters(driver.parameters, driver.set_parameter)
-        self.processors = Processors(server_end, self.events, self._counters)
-        self.poses = Poses(driver, self.events, self._counters)
-        self.requests = self._make_requests()
-        self.vehicle.on_link_up = self.requests.refresh_parameters
+        self.workers = ProcessorWorkers(server_end, self.events, self._counters, self.publisher.cameras)
+        self._relay = Relay(driver, server_end, self.publisher, self.events, self._counters)
+        self._parameter_requests = ParameterRequests(self.parameters, self.handler, self.publisher, self.events)
+        self._requests = RequestDispatcher(
+            server_end,
+            self._counters,
+            immediate={
+                Hello: self._greet,
+                Ping: self._answer_ping,
+                RequestAuthority: self.handler.request_authority,
+                AnswerTakeover: self.handler.answer_takeover,
+                ReleaseAuthority: self.handler.release_authority,
+                JoinProcessor: self.workers.join,
+            },
+            deferred={
+                GetParameter: self._parameter_requests.get,
+                ListParameters: self._parameter_requests.page,
+                SetParameter: self._parameter_requests.set,
+                GetStatistics: self._answer_statistics,
+            },
+            on_failure=self.publisher.driver_failed,
+        )
         self._ticker = threading.Thread(target=self._run, name="skyloop-ticker", daemon=True) if ticker else None
         self._stopping = threading.Event()
         self._life_lock = threading.Lock()
         self._started = self._stopped = False
         self._trail: AuditTrail | None = None
+        self._record: FlightRecord | None = None
         self._decode = decode
-        self._command = self.flight.command
-
-    def _make_requests(self) -> Requests:
-        uri = str(self.driver.uri)
-        welcome = Welcome(0, self.name, self.run_id, os.getpid(), uri, 0, self.capabilities)
-        return Requests(
-            self.server,
-            self.watch,
-            self.parameters,
-            self.vehicle,
-            self.events,
-            self._counters,
-            self.clock,
-            welcome,
-            self._configure,
-            self._applications,
-            self.processors,
-        )
-
-    def _applications(self) -> int:
-        return sum(session.role is not None for session in list(self._sessions.values()))
+        self._command = self.handler.command
 
     def keep_trail(self, trail: AuditTrail) -> None:
-        """Write who flies when to this trail, which ends with the proxy. To be called before :meth:`start`."""
+        """Write who flies when to this trail and close it with the proxy. Call before :meth:`start`."""
         self._trail = trail
         self.events.listener = trail.note
+
+    def keep_record(self, record: FlightRecord) -> None:
+        """Note in this file which flight is the proxy's, and end the one noted there. Call before :meth:`start`."""
+        self._record = record
+        self.handler.on_ownership = record.set
 
     # Life cycle ------------------------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Serve. Raises what the server end and the driver raise when they cannot be opened, and is stopped then."""
+        """Start to serve. Raises what server end and driver raise when they cannot be opened; it is stopped then."""
         with self._life_lock:
             if self._started:
                 raise UsageError(f"proxy {self.name} was started before: make another one")
             self._started = True
-        self.requests.read_driver()
-        self.watch.begin(self.clock())
+        self._parameter_requests.read_driver()
+        self.handler.begin(self.clock())
         try:
             self.server.start(self)
         except BaseException:
@@ -138,9 +183,13 @@ class Proxy:
             raise
         if self._trail is not None:
             self._trail.begin(str(self.driver.uri))
-        self.requests.start()
+        if self._record is not None:  # now that the name is ours
+            if self._record.believed():
+                self.handler.ownership.began_before()
+            self._record.start()
+        self._requests.start()
         try:
-            self.driver.open(self.vehicle)
+            self.driver.open(self.publisher)
         except BaseException:
             self.stop()
             raise
@@ -148,16 +197,22 @@ class Proxy:
             self._ticker.start()
 
     def land(self, timeout_s: float) -> bool:
-        """Land what flies because the proxy is about to end, and wait for it; whether nothing flies any more.
+        """Land what flies because the proxy is about to end, and wait for it.
 
         From the first call on the proxy takes no set-points, only landing and emergency stop.
+
+        Args:
+            timeout_s: how long to wait [s].
+
+        Returns:
+            Whether nothing of the proxy's flies any more.
         """
-        if not self.watch.order_landing(self.clock()):
+        if not self.handler.order_landing(self.clock()):
             return True
-        return self.vehicle.wait_for(lambda _: not self.watch.airborne, timeout_s)
+        return self.publisher.wait_for(lambda _: not self.handler.airborne, timeout_s)
 
     def stop(self, *, reason: str = "the proxy was stopped") -> None:
-        """Tell everybody and give every resource back. Idempotent.
+        """Publish that the proxy ends and give every resource back. Idempotent.
 
         It does not land: what flies is left hovering, as far as the vehicle can by itself. See :meth:`land`.
         """
@@ -165,18 +220,19 @@ class Proxy:
             if self._stopped or not self._started:
                 return
             self._stopped = True
-        self.events.tell(EventKind.PROXY_CLOSING, f"proxy {self.name} ends: {reason}", Severity.WARNING)
+        self.events.publish(EventKind.PROXY_CLOSING, f"proxy {self.name} ends: {reason}", Severity.WARNING)
         self._stopping.set()
         if self._ticker is not None and self._ticker.is_alive():
             self._ticker.join()
-        self.watch.leave_hovering(self.clock())
-        self.requests.stop()
+        self.handler.leave_hovering(self.clock())
+        self._requests.stop()
         try:
             self.driver.close()
         finally:
             self.server.stop()
-            if self._trail is not None:
-                self._trail.close()
+            for kept in (self._trail, self._record):
+                if kept is not None:
+                    kept.close()
 
     def __enter__(self) -> Proxy:
         self.start()
@@ -188,11 +244,11 @@ class Proxy:
     # From the transport ----------------------------------------------------------------------------------------
 
     def peer_joined(self, peer: Peer) -> None:
-        """An application connected; it is nobody until its Hello."""
-        self._sessions[peer.id] = Session(peer)
+        """An application connected; it has no name and no role until its Hello."""
+        self._sessions[peer.id] = Session(peer, self.clock())
 
     def packet(self, peer: Peer, packet: bytes) -> None:
-        """A packet of an application, on the receiving thread."""
+        """Handle a packet of an application, on the receiving thread."""
         now_ns = self.clock()
         session = self._sessions.get(peer.id)
         if session is None or session.ended:
@@ -206,33 +262,43 @@ class Proxy:
         if kind is Command:
             self._command(session, sample, now_ns)  # type: ignore[arg-type]
         elif isinstance(sample, Request):
-            self.requests.take(session, sample, now_ns)
-        elif kind is Annotation:
-            self._relay_annotation(session, packet, now_ns)
-        elif kind is LogEntry:
-            self._relay(session, packet, now_ns, LOGS)
+            self._requests.handle(session, sample, now_ns)
+        elif isinstance(sample, Annotation):
+            self._refuse_malformed(session, self._relay.annotation(session, sample, packet), now_ns)
+        elif isinstance(sample, LogEntry):
+            self._refuse_malformed(session, self._relay.log(session, packet), now_ns)
         elif isinstance(sample, ProcessorResult):
-            self._relay_result(session, sample, now_ns)
+            self._refuse_malformed(session, self.workers.relay(session, sample, now_ns), now_ns)
         elif isinstance(sample, VehiclePose):
-            self.poses.take(session, sample)
+            self._relay.pose(session, sample)
         else:
             self._malformed(session, f"{kind.__name__} is for the proxy to send", now_ns)
 
     def refused(self, peer: Peer, reason: str) -> None:
-        """Somebody sent what its keys give it no right to, or what nobody that is connected may send."""
+        """Count and publish a packet that the sender's keys do not allow, or whose sender is not connected."""
         session = self._sessions.get(peer.id)
         name = None if session is None else session.name
         code = Refusal.PROTOCOL if session is None else Refusal.OBSERVER
         self._counts["packets.refused"] += 1
-        self.events.repeated(
+        self.events.publish_repeated(
             (peer.id, "refused"),
-            lambda: Notice(
+            lambda: EventDraft(
                 EventKind.COMMAND_REFUSED,
                 reason if name is None else f"{name}: {reason}",
                 app=name,
                 data={"reason": code.value, "app_id": peer.id},
             ),
         )
+
+    def topic_problem(self, topic: str) -> str:
+        """Return why nobody can subscribe to a topic; empty if it exists."""
+        return topic_problem(topic, self.publisher.cameras)
+
+    def malformed(self, peer: Peer, reason: str) -> None:
+        """Count what an application asked of the transport in vain as malformed."""
+        session = self._sessions.get(peer.id)
+        if session is not None and not session.ended:
+            self._malformed(session, reason, self.clock())
 
     def peer_left(self, peer: Peer, reason: str) -> None:
         """An application's connection ended."""
@@ -242,38 +308,22 @@ class Proxy:
         if session.role is not None:
             text = f"the connection of {session.name} ended: {reason}"
             data: dict[str, Value] = {"state": LinkState.LOST.value, "reason": reason, "app_id": session.app_id}
-            self.events.tell(EventKind.APPLICATION_LINK, text, Severity.WARNING, app=session.name, data=data)
+            self.events.publish(EventKind.APPLICATION_LINK, text, Severity.WARNING, app=session.name, data=data)
         if not self._stopping.is_set():  # else everybody leaves, and the driver may be closed already
-            self.watch.gone(session, self.clock())
-        self.processors.gone(session)
+            self.handler.application_left(session, self.clock())
+        self.workers.application_left(session)
         del self._sessions[peer.id]
 
-    def _relay_annotation(self, session: Session, packet: bytes, now_ns: int) -> None:
-        if len(packet) > MAX_ANNOTATION:
-            why = f"an annotation has {len(packet)} bytes, at most {MAX_ANNOTATION} are relayed"
-            self._malformed(session, why, now_ns)
-        else:
-            self._relay(session, packet, now_ns, ANNOTATIONS)
-
-    def _relay(self, session: Session, packet: bytes, now_ns: int, topic: str) -> None:
-        """Hand what an application tells the others to whoever subscribed to it."""
-        if session.role is None:
-            self._malformed(session, f"a packet for {topic} came before Hello", now_ns)
-        else:
-            self._counts[f"{topic}.relayed"] += 1
-            self.server.publish(topic, packet)
-
-    def _relay_result(self, session: Session, result: ProcessorResult, now_ns: int) -> None:
-        if session.role is None:
-            self._malformed(session, "a result came before Hello", now_ns)
-        else:
-            self.processors.relay(session, result)
+    def _refuse_malformed(self, session: Session, reason: str, now_ns: int) -> None:
+        """Count a sample as malformed if there is a reason to."""
+        if reason:
+            self._malformed(session, reason, now_ns)
 
     def _malformed(self, session: Session, reason: str, now_ns: int) -> None:
         self._counts["packets.malformed"] += 1
-        self.events.repeated(
+        self.events.publish_repeated(
             (session.app_id, "malformed"),
-            lambda: Notice(
+            lambda: EventDraft(
                 EventKind.PACKET_MALFORMED,
                 f"malformed packet of {session.name}: {reason}",
                 app=session.name,
@@ -288,11 +338,22 @@ class Proxy:
     # Time ------------------------------------------------------------------------------------------------------
 
     def tick(self, now_ns: int) -> None:
-        """What goes by time: authority, failsafe, software autopilot, feedback of a silent vehicle, sums of events."""
-        self.watch.tick(now_ns)
-        self.vehicle.keep_alive(now_ns)
-        self.processors.tick(now_ns)
+        """Update what goes by time: authority, failsafe, software autopilot, feedback of a silent vehicle, events."""
+        self.handler.tick(now_ns)
+        self._end_silent(now_ns)
+        self.publisher.keep_alive(now_ns)
+        self.workers.tick(now_ns)
         self.events.tick(now_ns)
+
+    def _end_silent(self, now_ns: int) -> None:
+        """End connections without a Hello: they take places from others."""
+        for session in list(self._sessions.values()):
+            if session.role is None and not session.ended and now_ns - session.joined_ns > HELLO_NS:
+                session.ended = True
+                self._counts["connections.silent"] += 1
+                why = f"no Hello came within {seconds(HELLO_NS):g} s"
+                self.events.publish_repeated(("silent",), partial(_silent, session, why))
+                self.server.disconnect(session.peer, f"{why}: connect anew")
 
     def _run(self) -> None:
         period_ns = nanoseconds(PERIOD_S)
@@ -300,44 +361,41 @@ class Proxy:
         while not self._stopping.wait(max(0, due_ns - time.monotonic_ns()) / 1e9):
             try:
                 self.tick(self.clock())
-            except Exception:  # noqa: BLE001  the vehicle needs its ladder whatever is wrong here
+            except Exception:  # noqa: BLE001  the vehicle needs its failsafe whatever is wrong here
                 _log.exception("a step of the ticker failed")
             due_ns = max(due_ns + period_ns, time.monotonic_ns())  # late ones are not made up for
 
-    # Parameters ------------------------------------------------------------------------------------------------
+    # Requests that the proxy itself answers --------------------------------------------------------------------
 
-    def _configure(self) -> None:
-        """Let the parameters' values take effect."""
-        number = self.parameters.number
-        limits = Limits(
-            tilt=number("limits.tilt"),
-            climb=number("limits.climb"),
-            yaw_rate=number("limits.yaw_rate"),
-            speed=number("limits.speed"),
-            altitude=number("limits.altitude"),
-        )
-        ladder = LadderSettings(
-            hover_after_s=number("failsafe.hover_after_s"),
-            land_after_s=number("failsafe.land_after_s"),
-            retry_s=number("failsafe.retry_s"),
-            battery_warn=number("battery.warn"),
-            battery_land=number("battery.land"),
-        )
-        autopilot = AutopilotSettings(
-            takeoff_altitude=min(number("autopilot.takeoff_altitude"), limits.altitude),
-            climb=min(number("autopilot.climb"), limits.climb),
-            descent=min(number("autopilot.descent"), limits.climb),
-            velocity_p=number("autopilot.velocity_p"),
-            velocity_i=number("autopilot.velocity_i"),
-            tilt=limits.tilt,
-        )
-        safety = safety_of(number, self.parameters.text(ZONES))
-        with self.watch.lock:
-            self.flight.limits = limits
-            self.flight.safety = safety
-            self.flight.max_age_ns = nanoseconds(number("command.max_age_s"))
-            self.watch.authority.timeout_ns = nanoseconds(number("authority.timeout_s"))
-            self.watch.authority.ask_ns = nanoseconds(number("authority.ask_s"))
-            self.watch.ladder.settings = ladder
-            if self.helm.autopilot is not None:
-                self.helm.autopilot.settings = autopilot
+    def _greet(self, session: Session, hello: Hello, now_ns: int) -> AnyReply:
+        if session.role is not None:
+            return Refused(Refusal.PROTOCOL, "Hello came before on this connection")
+        full = self.server.admit(session.peer, pilot=hello.role is Role.PILOT)
+        if full:
+            return Refused(Refusal.BUSY, full)
+        session.name, session.role = hello.name, hello.role
+        text = f"{hello.name} connected as {hello.role.value} from {session.peer.address}"
+        data: dict[str, Value] = {"state": LinkState.UP.value, "reason": "", "app_id": session.app_id}
+        self.events.publish(EventKind.APPLICATION_LINK, text, app=hello.name, data=data)
+        return msgspec.structs.replace(self._welcome, app_id=session.app_id, now_ns=now_ns)
+
+    def _answer_ping(self, _session: Session, ping: Ping, _now_ns: int) -> AnyReply:
+        return Pong(ping.sent_ns, self.clock())
+
+    def _answer_statistics(self, _session: Session, _request: GetStatistics, _now_ns: int) -> AnyReply:
+        applications = sum(session.role is not None for session in list(self._sessions.values()))
+        return Statistics(self._counters.snapshot(applications=applications, **self.server.counters))
+
+    def _refresh_parameters(self) -> None:
+        """Read the driver's parameters anew, now that its vehicle has come. On the driver's thread."""
+        self._requests.call_later(self._parameter_requests.read_driver)
+
+
+def _as_reported(state: FlightState) -> FlightState:
+    return state
+
+
+def _silent(session: Session, why: str) -> EventDraft:
+    text = f"a connection of {session.peer.address} was ended: {why}"
+    data: dict[str, Value] = {"state": LinkState.LOST.value, "reason": why, "app_id": session.app_id}
+    return EventDraft(EventKind.APPLICATION_LINK, text, data=data)

@@ -14,34 +14,70 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
+from skyloop.clock import monotonic_ns, nanoseconds
 from skyloop.drivers.registry import make_driver
 from skyloop.errors import UsageError
-from skyloop.messages import EventKind, Severity
+from skyloop.messages import EventKind, LinkState, Severity
 from skyloop.proxy.audit import AuditTrail, audit_path
+from skyloop.proxy.flight_record import FlightRecord, record_path
 from skyloop.proxy.proxy import Proxy
 from skyloop.transport.base import ServerEnd
 
 LAND_WITHIN_S: Final = 20.0  #: how long a signalled proxy waits for its vehicle to land
 _POLL_S: Final = 0.2
+GRACE_NS: Final = nanoseconds(1.0)  #: most vehicles answer within this; until then nothing is said about waiting
+_THERE: Final = (LinkState.UP, LinkState.DEGRADED)
 _log = logging.getLogger(__name__)
 
 #: Says what is new about the keys of the network, a sentence each.
 Look = Callable[[], Sequence[str]]
 
 
-class _End:
-    """Why the process is to end, and how fast."""
+class LinkLines:
+    """Lines about one proxy's vehicle link for whoever started it: one when the link, or the reason, has changed."""
+
+    def __init__(self, name: str, where: str, now_ns: int) -> None:
+        """``where``: what is served and at which address."""
+        self._name = name
+        self._where = where
+        self._began_ns = now_ns
+        self._written: tuple[LinkState, str, str] | None = None
+        self._was_there = False
+
+    def first(self, state: LinkState) -> str:
+        """Return the first line, that applications can connect: ``ready`` only if there is a vehicle as well."""
+        self._was_there = state in _THERE
+        if self._was_there:
+            self._written = state, "", ""
+        return f"{'ready' if self._was_there else 'serving'} {self._name}: {self._where}"
+
+    def changed(self, state: LinkState, reason: str, remedy: str, now_ns: int) -> str:
+        """Return what is new; empty if nothing is."""
+        now = state, reason, remedy
+        if now == self._written or (state is LinkState.CONNECTING and now_ns - self._began_ns < GRACE_NS):
+            return ""
+        self._written = now
+        if state in _THERE and not self._was_there:
+            self._was_there = True
+            return f"ready {self._name}: {self._where}"
+        why = f": {reason}" if reason else ""
+        what = f"\n  → {remedy}" if remedy else ""
+        return f"vehicle of {self._name}: {state.value}{why}{what}"
+
+
+class _Shutdown:
+    """Why the process must end, and how fast."""
 
     def __init__(self) -> None:
-        self.asked = threading.Event()
+        self.requested = threading.Event()
         self.hurry = threading.Event()  #: do not land first
         self.reason = ""
 
-    def ask(self, reason: str, *, hurry: bool) -> None:
-        if hurry or self.asked.is_set():  # a second signal means now
+    def request(self, reason: str, *, hurry: bool) -> None:
+        if hurry or self.requested.is_set():  # a second signal means now
             self.hurry.set()
         self.reason = self.reason or reason
-        self.asked.set()
+        self.requested.set()
 
 
 def serve(
@@ -59,7 +95,9 @@ def serve(
 
     ``make_end`` makes another server end, of the name and the vehicle's address: one of the network, or several.
 
-    Writes one line that begins with ``ready`` to standard output when applications can connect. Ends on SIGINT or
+    Writes to standard output a line that begins with ``ready`` when applications can connect and the vehicle is there;
+    ``serving`` while it is not, and then, whenever that changes, what is waited for, why it failed last and what to do
+    (not with ``parent_fd``). Ends on SIGINT or
     SIGTERM, landing first for at most ``land_within_s`` [s] if the vehicle flies; a second signal ends at once. With
     ``parent_fd``, the reading end of a pipe: ends at once when that reads end of file, which the death of the parent
     causes, and leaves SIGINT to the parent, as a terminal sends it to both. ``look`` is called some times a second:
@@ -93,34 +131,40 @@ def run(
 ) -> None:
     """Serve several vehicles from one process, as :func:`serve` does one: several drones of one simulated world.
 
-    The proxies are started here and stopped at the end; one line that begins with ``ready`` is written for each when
-    all of them serve. ``audit``: the file of the audit trail; by default each proxy has one in the user's directory of
-    state, and a private one (with ``parent_fd``) none.
+    The proxies are started here and stopped at the end; lines are written of each, as :func:`serve` does. ``audit``:
+    the file of the audit trail; by default each proxy has one in the user's directory of state, and a private one (with
+    ``parent_fd``) none.
     """
-    end = _End()
+    shutdown = _Shutdown()
     if audit is not None or parent_fd is None:
         for proxy in proxies:
             _keep_trail(proxy, audit)
-    with _signals(end, ignore_interrupt=parent_fd is not None), ExitStack() as started:
+    if parent_fd is None:  # a private proxy is not started again under its name
         for proxy in proxies:
-            started.push(partial(_stop, proxy, end))
+            proxy.keep_record(FlightRecord(record_path(proxy.name), str(proxy.driver.uri)))
+    with _signals(shutdown, ignore_interrupt=parent_fd is not None), ExitStack() as started:
+        for proxy in proxies:
+            started.push(partial(_stop, proxy, shutdown))
         for proxy in proxies:
             proxy.start()
         if parent_fd is not None:
-            threading.Thread(target=_await_parent, args=(parent_fd, end), name="skyloop-parent", daemon=True).start()
-        for proxy in proxies:
-            _announce(f"ready {proxy.name}: {proxy.driver.uri} at {proxy.server.address}, process {os.getpid()}")
+            watching = partial(_await_parent, parent_fd, shutdown)
+            threading.Thread(target=watching, name="skyloop-parent", daemon=True).start()
+        lines = [_announced(proxy) for proxy in proxies]
         # Looks up now and then: the kernel may hand a signal to any thread, and that does not wake this one.
-        while not end.asked.wait(_POLL_S):
-            for news in look() if look is not None else ():
-                _tell_keys(proxies, news)
-        _land(proxies, end, land_within_s)
+        while not shutdown.requested.wait(_POLL_S):
+            for change in look() if look is not None else ():
+                _publish_keys(proxies, change)
+            if parent_fd is None:  # a parent is told by the proxy's events, and may not read what is written here
+                for proxy, link in zip(proxies, lines, strict=True):
+                    _announce_link(proxy, link)
+        _land(proxies, shutdown, land_within_s)
 
 
-def _tell_keys(proxies: Sequence[Proxy], news: str) -> None:
-    _log.warning("%s", news)
+def _publish_keys(proxies: Sequence[Proxy], change: str) -> None:
+    _log.warning("%s", change)
     for proxy in proxies:
-        proxy.events.tell(EventKind.KEYS, news, Severity.WARNING)
+        proxy.events.publish(EventKind.KEYS, change, Severity.WARNING)
 
 
 def _keep_trail(proxy: Proxy, path: Path | None) -> None:
@@ -134,21 +178,21 @@ def _keep_trail(proxy: Proxy, path: Path | None) -> None:
         _log.warning("there is no audit trail, because %s can't be written: %s", chosen, error)
 
 
-def _stop(proxy: Proxy, end: _End, *_: object) -> None:
-    proxy.stop(reason=end.reason or "it failed")
+def _stop(proxy: Proxy, shutdown: _Shutdown, *_: object) -> None:
+    proxy.stop(reason=shutdown.reason or "it failed")
 
 
-def _land(proxies: Sequence[Proxy], end: _End, within_s: float) -> None:
+def _land(proxies: Sequence[Proxy], shutdown: _Shutdown, within_s: float) -> None:
     deadline = time.monotonic() + within_s
     flying = list(proxies)
-    while flying and not end.hurry.is_set() and time.monotonic() < deadline:
+    while flying and not shutdown.hurry.is_set() and time.monotonic() < deadline:
         flying = [proxy for proxy in flying if not proxy.land(_POLL_S)]
 
 
 @contextmanager
-def _signals(end: _End, *, ignore_interrupt: bool) -> Iterator[None]:
+def _signals(shutdown: _Shutdown, *, ignore_interrupt: bool) -> Iterator[None]:
     def asked(number: int, _: FrameType | None) -> None:
-        end.ask(f"{signal.Signals(number).name} received", hurry=False)
+        shutdown.request(f"{signal.Signals(number).name} received", hurry=False)
 
     before = {
         signal.SIGINT: signal.signal(signal.SIGINT, signal.SIG_IGN if ignore_interrupt else asked),
@@ -168,13 +212,27 @@ def _check_descriptor(descriptor: int) -> None:
         raise UsageError(f"file descriptor {descriptor} is not open: give the reading end of a pipe") from None
 
 
-def _await_parent(descriptor: int, end: _End) -> None:
+def _await_parent(descriptor: int, shutdown: _Shutdown) -> None:
     try:
         while os.read(descriptor, 64):
             pass
     except OSError:  # closed under us: as good as gone
         pass
-    end.ask("its parent process ended", hurry=True)
+    shutdown.request("its parent process ended", hurry=True)
+
+
+def _announced(proxy: Proxy) -> LinkLines:
+    where = f"{proxy.driver.uri} at {proxy.server.address}, process {os.getpid()}"
+    lines = LinkLines(proxy.name, where, monotonic_ns())
+    _announce(lines.first(proxy.publisher.link_state))
+    return lines
+
+
+def _announce_link(proxy: Proxy, lines: LinkLines) -> None:
+    vehicle = proxy.publisher
+    line = lines.changed(vehicle.link_state, vehicle.link_reason, vehicle.link_remedy, monotonic_ns())
+    if line:
+        _announce(line)
 
 
 def _announce(line: str) -> None:

@@ -7,32 +7,46 @@ from typing import Final
 
 from skyloop.clock import NS_PER_S
 from skyloop.messages import Role
-from skyloop.proxy.gate import Track
-from skyloop.proxy.limits import Episodes
+from skyloop.proxy.core.command_checks import CommandSequence
+from skyloop.proxy.core.limits import Episodes
 from skyloop.transport.base import Peer
 
 #: More malformed packets than this within a second restart the channel: its two ends no longer speak the same.
 MAX_MALFORMED: Final = 50
+#: How long a connection may be there without its Hello, which a client sends at once.
+HELLO_NS: Final = 5 * NS_PER_S
 
 
 class Session:
-    """One connection, from joining to leaving. ``role`` is None until its Hello."""
+    """One application's connection, from joining to leaving. ``role`` is None until its Hello."""
 
-    __slots__ = ("_malformed_ns", "app_id", "ended", "episodes", "name", "peer", "pending", "role", "track")
+    __slots__ = (
+        "_malformed_ns",
+        "app_id",
+        "ended",
+        "episodes",
+        "joined_ns",
+        "name",
+        "peer",
+        "pending",
+        "role",
+        "sequence",
+    )
 
-    def __init__(self, peer: Peer) -> None:
+    def __init__(self, peer: Peer, joined_ns: int) -> None:
         self.peer = peer
+        self.joined_ns = joined_ns
         self.app_id = peer.id
         self.name = f"application {peer.id}"  #: until Hello tells it
         self.role: Role | None = None
-        self.track = Track()
+        self.sequence = CommandSequence()
         self.episodes = Episodes()
         self.pending = 0  #: requests that wait for the worker
         self.ended = False  #: disconnected by the proxy: nothing more is taken from it
         self._malformed_ns: deque[int] = deque(maxlen=MAX_MALFORMED)
 
     def malformed(self, now_ns: int) -> bool:
-        """A malformed packet came; returns whether that is one too many within a second."""
+        """Count a malformed packet; returns whether that is one too many within a second."""
         recent = self._malformed_ns
         too_many = len(recent) == MAX_MALFORMED and now_ns - recent[0] < NS_PER_S
         recent.append(now_ns)

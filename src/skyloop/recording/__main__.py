@@ -1,4 +1,4 @@
-"""``python -m skyloop.recording ORDER``: a recorder as a process of its own; see :mod:`skyloop.recording.child`."""
+"""``python -m skyloop.recording ORDER``: a recorder in its own process; see :mod:`skyloop.recording.child`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What was received and is not written yet: bounded, and when it is full, frames go first, then feedback."""
+"""Received samples that are not written yet: bounded; when it is full, frames are dropped first, then feedback."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ RESERVE: Final = 64 * MB  #: bytes, beyond the limit, for what must not be dropp
 
 
 class Rank(IntEnum):
-    """What is dropped first has the highest."""
+    """What is dropped first has the highest rank."""
 
     KEPT = 0  #: commands, events, parameters, logs: dropped only when the reserve is full as well
     STATE = 1  #: feedback, annotations
@@ -24,14 +24,14 @@ class Rank(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """Something to write: a sample of :mod:`skyloop.messages` or of the layout, or an encoded picture."""
+    """A sample to write: of :mod:`skyloop.messages` or of the layout, or an encoded frame."""
 
-    drone: int  #: which one of the recording's
-    channel: str  #: as the counts name it: ``feedback``, ``video.front`` …
+    drone: int  #: its index in the recording
+    channel: str  #: its name in the counts: ``feedback``, ``video.front`` …
     rank: Rank
     received_ns: int  #: on this process's monotonic clock
     sample: Any
-    size: int  #: bytes, roughly
+    size: int  #: bytes, approximately
 
 
 #: Counts by drone and channel.
@@ -39,9 +39,19 @@ Counts = Counter[tuple[int, str]]
 
 
 class Backlog:
-    """Keeps the order of arrival. Any number of threads put, one takes."""
+    """A bounded queue in order of arrival, for any number of producers and one consumer.
+
+    Attributes:
+        dropped: How many items were dropped.
+    """
 
     def __init__(self, limit: int, reserve: int = RESERVE) -> None:
+        """Initialise an empty backlog.
+
+        Args:
+            limit: Bytes, beyond which frames and feedback are dropped.
+            reserve: Bytes beyond the limit for items that are dropped last.
+        """
         self.dropped: Counts = Counter()
         self._limit = limit
         self._ceiling = limit + reserve
@@ -56,7 +66,7 @@ class Backlog:
         return self._size
 
     def put(self, item: Item) -> None:
-        """Take it, or drop others or this one, and count that."""
+        """Append an item; if the backlog is full, drop and count the oldest of the highest rank."""
         with self._lock:
             self._number += 1
             self._queues[item.rank].append((self._number, item))
@@ -65,7 +75,7 @@ class Backlog:
                 self._make_room()
 
     def put_back(self, items: Iterable[Item]) -> None:
-        """What was taken last and could not be written, in its order; it comes first again."""
+        """Put items that were taken last, and could not be written, back to the front, in their order."""
         with self._lock:
             first = self._first()
             for number, item in enumerate(reversed(list(items)), 1):
@@ -74,7 +84,7 @@ class Backlog:
             self._make_room()
 
     def take(self, size: int) -> list[Item]:
-        """The oldest, until they make up this size, in the order of their arrival. Does not wait."""
+        """Remove the oldest items, until they make up this size [bytes], in order of arrival. Does not wait."""
         taken: list[Item] = []
         with self._lock:
             while size > 0:
@@ -88,7 +98,7 @@ class Backlog:
         return taken
 
     def count(self, item: Item) -> None:
-        """Count one that was dropped elsewhere."""
+        """Count an item that was dropped elsewhere."""
         with self._lock:
             self.dropped[item.drone, item.channel] += 1
 
@@ -99,6 +109,6 @@ class Backlog:
         kept, state, frames = self._queues
         for queue, limit in ((frames, self._limit), (state, self._limit), (kept, self._ceiling)):
             while self._size > limit and queue:
-                _, item = queue.popleft()  # the oldest: what comes after it belongs together
+                _, item = queue.popleft()  # the oldest, so that the newer ones stay without a gap
                 self._size -= item.size
                 self.dropped[item.drone, item.channel] += 1

@@ -1,8 +1,9 @@
-"""The recorder as a process of its own, which the flight does not feel: both of its ends."""
+"""The recorder as a separate process, so that recording does not slow down the flight: child and parent."""
 
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import signal
 import subprocess
@@ -17,7 +18,7 @@ from typing import IO, Final
 import msgspec
 
 from skyloop.client import connect
-from skyloop.client.slots import Bell
+from skyloop.client.mailbox import Notifier
 from skyloop.errors import LinkError, MissingExtraError, NoAnswerError, SkyloopError, UsageError
 from skyloop.messages import Severity
 from skyloop.recording.engine import Engine
@@ -25,41 +26,49 @@ from skyloop.recording.options import Options
 from skyloop.recording.status import News, RecorderState, Status
 
 START_S: Final = 20.0
-_END_S: Final = 15.0  # to write what has come, before it is told to end
+_END_S: Final = 15.0  # to write what was received, before the child is terminated
 _HARDER_S: Final = 3.0
 _TELL_S: Final = 0.25
 _NICE: Final = 5  # the flight comes first
 _TAIL: Final = 2000
+_log = logging.getLogger(__name__)
 
 
 class Order(msgspec.Struct, frozen=True):
     """What a child is to record."""
 
-    targets: tuple[str, ...]  #: what each drone is connected to by
+    targets: tuple[str, ...]  #: the address or name by which each drone is connected
     path: str
     options: Options
 
 
 class Line(msgspec.Struct, frozen=True, omit_defaults=True):
-    """What a child says: one JSON object a line."""
+    """A child's message to its parent: one JSON object per line."""
 
     status: Status | None = None
     news: News | None = None
     trouble: str = ""  #: why it could not start
-    usage: bool = False  #: that was the caller's fault
+    usage: bool = False  #: whether that was a UsageError
 
 
 # The child -----------------------------------------------------------------------------------------------------
 
 
 def run_child(order: Order) -> int:
-    """Record until standard input ends or SIGTERM comes; exit code 0, or 2 if it could not start."""
+    """Record until standard input ends or SIGTERM arrives.
+
+    Args:
+        order: What to record.
+
+    Returns:
+        The exit code: 0, or 2 if the recording could not start.
+    """
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     threading.Thread(target=_watch_parent, args=(stop,), name="parent", daemon=True).start()
     if hasattr(os, "nice"):
         os.nice(_NICE)
-    news: deque[News] = deque()  # told by this thread, so that a parent that does not read never holds up the writing
+    news: deque[News] = deque()  # sent by this thread, so that a parent that does not read never blocks the writing
     with contextlib.ExitStack() as stack:
         try:
             drones = [stack.enter_context(connect(t, access="observe", name="recorder")) for t in order.targets]
@@ -78,7 +87,7 @@ def run_child(order: Order) -> int:
 
 
 def _watch_parent(stop: threading.Event) -> None:
-    """Standard input is a pipe whose writing end the parent has: it ends with the parent, however that ends."""
+    """Set ``stop`` when standard input ends: the parent holds its other end, so it ends with the parent."""
     with contextlib.suppress(OSError):
         while os.read(0, 64):
             pass
@@ -92,7 +101,7 @@ def _report(engine: Engine, news: deque[News]) -> None:
 
 
 def _say(line: Line) -> None:
-    with contextlib.suppress(OSError):  # nobody listens any more
+    with contextlib.suppress(OSError):  # the parent is gone
         sys.stdout.buffer.write(msgspec.json.encode(line) + b"\n")
         sys.stdout.buffer.flush()
 
@@ -101,17 +110,27 @@ def _say(line: Line) -> None:
 
 
 class RecorderProcess:
-    """A child that records; it ends with :meth:`stop`, and with this process however that ends.
+    """A child process that records; it ends with :meth:`stop`, and with this process, however that ends.
 
-    It has a session of its own: Ctrl-C in the terminal is for the application. ``hear`` gets its news, on a thread of
-    its own. Raises what the child says when it can't record.
+    It has its own session, so that Ctrl-C in the terminal reaches only the application.
     """
 
     def __init__(self, order: Order, hear: Callable[[News], None] = lambda _: None) -> None:
+        """Start the child, and wait until it records.
+
+        Args:
+            order: What to record.
+            hear: Called with the child's news, on a thread that reads them.
+
+        Raises:
+            UsageError: The child can't record because of a wrong argument.
+            LinkError: The child can't record for another reason, or has ended.
+            NoAnswerError: The child does not start in time.
+        """
         self._hear = hear
         self._status = Status(path=order.path)
         self._trouble: Line | None = None
-        self._bell = Bell()
+        self._bell = Notifier()
         self._ended = False
         self._complaints: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115  (closed by stop())
         try:
@@ -135,17 +154,22 @@ class RecorderProcess:
 
     @property
     def pid(self) -> int:
+        """Process id of the child."""
         return self._process.pid
 
     @property
     def status(self) -> Status:
+        """The newest status that the child reported."""
         return self._status
 
     def start(self) -> None:
-        """It has begun already."""
+        """Do nothing: the child was started by the constructor."""
 
     def stop(self) -> None:
-        """Let it write what has come and close its file, and wait for that. Idempotent."""
+        """Let the child write what was received and close its file, and wait for its end. Idempotent.
+
+        A child that does not end in time is terminated, then killed.
+        """
         process = self._process
         if process.stdin is not None and not process.stdin.closed:
             with contextlib.suppress(OSError):
@@ -176,15 +200,19 @@ class RecorderProcess:
         assert self._process.stdout is not None
         with self._process.stdout as lines:
             for text in lines:
-                self._take(msgspec.json.decode(text, type=Line))
-                self._bell.ring()
+                try:
+                    self._take(msgspec.json.decode(text, type=Line))
+                except Exception as error:  # noqa: BLE001  (a library may print anything, a callback raise anything)
+                    _log.warning("the recorder's process: %r: %r", text[:200], error)
+                self._bell.notify()
         self._process.wait()
         self._ended = True
         if self._trouble is None and self._status.state not in (RecorderState.CLOSED, RecorderState.FAILED):
             reason = f"the recorder's process {self._how_it_ended()}"
             self._status = msgspec.structs.replace(self._status, state=RecorderState.FAILED, reason=reason)
-            self._hear(News(f"{reason}; what it wrote is in {self._status.path}", Severity.ERROR))
-        self._bell.ring()
+            with contextlib.suppress(Exception):
+                self._hear(News(f"{reason}; what it wrote is in {self._status.path}", Severity.ERROR))
+        self._bell.notify()
 
     def _take(self, line: Line) -> None:
         if line.status is not None:
@@ -204,7 +232,11 @@ class RecorderProcess:
 
 
 def check_installed() -> None:
-    """Raise :class:`MissingExtraError` here, where it is asked for, and not in a child."""
+    """Check that the extra is installed, so that the error is raised here and not in a child.
+
+    Raises:
+        MissingExtraError: The extra ``[record]`` is not installed.
+    """
     from importlib.util import find_spec
 
     missing = [name for name in ("mcap", "foxglove_schemas_protobuf", "cv2") if find_spec(name) is None]

@@ -1,11 +1,11 @@
-"""The recorder within a process: taps on drones, a backlog, and the thread that writes it."""
+"""The recorder within a process: subscriptions to drones, a backlog, and the thread that writes it."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from skyloop.client import Drone
 from skyloop.errors import UsageError
@@ -18,9 +18,11 @@ from skyloop.recording.taps import Tap
 from skyloop.recording.translation import Translator
 from skyloop.recording.writer import FileWriter
 
+_TOO_SLOW: Final = "the disk or the encoder is too slow"
+
 
 class Engine:
-    """Records these drones from :meth:`start` to :meth:`stop`. ``hear`` gets the news, on the writing thread."""
+    """Records drones from :meth:`start` to :meth:`stop`."""
 
     def __init__(
         self,
@@ -30,7 +32,19 @@ class Engine:
         hear: Callable[[News], None] = lambda _: None,
         **writing: Any,
     ) -> None:
-        """``writing`` replaces the disk, for tests. Raises :class:`UsageError`."""
+        """Initialise the recorder without opening a file.
+
+        Args:
+            drones: Connected ones, with different names.
+            path: The first file.
+            options: What to record and how.
+            hear: Called with news, on the writing thread.
+            **writing: Replaces the disk, for tests.
+
+        Raises:
+            UsageError: Two drones have the same name.
+            UnknownNameError: No drone has a camera that the options name.
+        """
         names = [drone.name for drone in drones]
         if len(set(names)) < len(names):
             raise UsageError(f"the drones of one recording need different names, not {', '.join(names)}")
@@ -52,16 +66,25 @@ class Engine:
         self._writer.dropped = lambda: self._counts(Tap.dropped)
         self._writer.missed = lambda: self._counts(Tap.missed)
         self._writer.each_second = self._tell_drops
+        self._told_unwritable = 0
         self._told: dict[Tap, tuple[dict[str, int], dict[str, int]]] = {tap: ({}, {}) for tap in self._taps}
 
     def start(self) -> None:
-        """Open the file and begin. Raises :class:`UsageError`."""
+        """Open the file, and start recording.
+
+        Raises:
+            UsageError: The file can't be written.
+        """
         self._writer.start()
         for tap in self._taps:
             tap.start()
 
     def stop(self, timeout_s: float = 10.0) -> None:
-        """Write what has come, and close the file. Idempotent."""
+        """Write what was received, and close the file. Idempotent.
+
+        Args:
+            timeout_s: How long to wait for the disk.
+        """
         if self._ended_ns is not None:
             return
         self._ended_ns = time.monotonic_ns()
@@ -71,7 +94,7 @@ class Engine:
 
     @property
     def status(self) -> Status:
-        """How it goes now. Any thread."""
+        """The present status. May be read from any thread."""
         writer = self._writer
         return Status(
             writer.state,
@@ -97,11 +120,14 @@ class Engine:
         self._hear(News(text, severity))
 
     def _tell_one(self, tap: Tap, text: str, severity: Severity) -> None:
-        """Into the file, and to everybody who listens to what is logged."""
+        """Write an event to the file, and log it with the drone."""
         tap.put_event(text, severity, {"state": self._writer.state.value, "path": str(self._writer.path)})
         tap.drone.log.text(text, name="recording", severity=severity)
 
     def _tell_drops(self) -> None:
+        writer = self._writer
+        unwritable = writer.unwritable > self._told_unwritable
+        self._told_unwritable = writer.unwritable
         for tap in self._taps:
             tap.look()
             now = (tap.dropped(), tap.missed())
@@ -112,6 +138,7 @@ class Engine:
             if now[0] != before[0]:
                 more = {channel: count - before[0].get(channel, 0) for channel, count in now[0].items()}
                 words = ", ".join(f"{count} of {channel}" for channel, count in more.items() if count)
-                text = f"{tap.drone.name}: the recording leaves out {words}: the disk or the encoder is too slow"
+                why = f"can't be written ({writer.unwritable_why})" if unwritable else _TOO_SLOW
+                text = f"{tap.drone.name}: the recording leaves out {words}: {why}"
                 self._tell_one(tap, text, Severity.WARNING)
                 self._hear(News(text, Severity.WARNING))

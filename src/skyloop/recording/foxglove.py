@@ -1,4 +1,4 @@
-"""Messages for viewers, in Foxglove's public protobuf schemas: pictures, calibration, poses, drawings, texts.
+"""Messages for viewers, in Foxglove's public protobuf schemas: images, calibrations, poses, drawings, texts.
 
 Pure. Needs the extra ``record``. Times are Unix ns; frames are named as in :mod:`skyloop.logfile.layout`.
 """
@@ -57,7 +57,7 @@ Vector = tuple[float, float, float]
 
 
 def schema(message: type[Message]) -> bytes:
-    """The file descriptor set of a message with all that it needs, as MCAP wants it."""
+    """Return the file descriptor set of a message with all its dependencies, as MCAP requires it."""
     found = FileDescriptorSet()
     seen: set[str] = set()
 
@@ -73,15 +73,24 @@ def schema(message: type[Message]) -> bytes:
 
 
 def timestamp(unix_ns: int) -> Timestamp:
+    """Convert Unix time [ns] to a protobuf timestamp."""
     seconds, nanos = divmod(unix_ns, 1_000_000_000)
     return Timestamp(seconds=seconds, nanos=nanos)
 
 
-# Pictures ------------------------------------------------------------------------------------------------------
+# Images --------------------------------------------------------------------------------------------------------
 
 
 def image(drone: str, camera: str, captured_ns: int, data: bytes, format_: str) -> bytes:
-    """A picture as a file of the format named (``jpeg``, ``png``)."""
+    """Encode an image.
+
+    Args:
+        drone: The drone's name.
+        camera: The camera's name.
+        captured_ns: Unix time.
+        data: A file of that format.
+        format_: ``jpeg`` or ``png``.
+    """
     message = CompressedImage(
         timestamp=timestamp(captured_ns), frame_id=optical_frame(drone, camera), data=data, format=format_
     )
@@ -89,7 +98,14 @@ def image(drone: str, camera: str, captured_ns: int, data: bytes, format_: str) 
 
 
 def video(drone: str, camera: str, captured_ns: int, data: bytes) -> bytes:
-    """One picture of H.264: an access unit in Annex B form, with SPS and PPS if it is a key picture."""
+    """Encode one frame of H.264.
+
+    Args:
+        drone: The drone's name.
+        camera: The camera's name.
+        captured_ns: Unix time.
+        data: An access unit in Annex B form, with SPS and PPS if it is a key frame.
+    """
     message = CompressedVideo(
         timestamp=timestamp(captured_ns), frame_id=optical_frame(drone, camera), data=data, format=H264
     )
@@ -97,7 +113,16 @@ def video(drone: str, camera: str, captured_ns: int, data: bytes) -> bytes:
 
 
 def calibration(drone: str, camera: str, at_ns: int, width: int, height: int, intrinsics: Intrinsics) -> bytes:
-    """Intrinsics of pictures of this size."""
+    """Encode a camera's intrinsics.
+
+    Args:
+        drone: The drone's name.
+        camera: The camera's name.
+        at_ns: Unix time.
+        width: Of the images to which they apply [px].
+        height: Of the images to which they apply [px].
+        intrinsics: Of the camera.
+    """
     fx, fy, cx, cy = intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy
     message = CameraCalibration(
         timestamp=timestamp(at_ns),
@@ -114,19 +139,19 @@ def calibration(drone: str, camera: str, at_ns: int, width: int, height: int, in
 
 
 def _coefficients(intrinsics: Intrinsics) -> Sequence[float]:
-    """As many as the viewers' model has: 4 for a fisheye, 5 for a pinhole."""
+    """Return as many coefficients as the viewers' model has: 4 for a fisheye, 5 for a pinhole."""
     wanted = 4 if intrinsics.model == "fisheye" else 5
     given = intrinsics.distortion
     return given if len(given) > wanted else (*given, *[0.0] * (wanted - len(given)))
 
 
-# Places --------------------------------------------------------------------------------------------------------
+# Poses ---------------------------------------------------------------------------------------------------------
 
 
 def pose(feedback: Feedback) -> Pose | None:
-    """Where it is in world axes; None while the attitude is not known.
+    """Return the vehicle's pose in world axes; None while the attitude is not known.
 
-    Without a position it stands above the origin, at its altitude: attitude and height can be seen all the same.
+    Without a position it is above the origin at its altitude, so that attitude and height can still be seen.
     """
     if feedback.roll is None or feedback.pitch is None or feedback.yaw is None:
         return None
@@ -135,7 +160,7 @@ def pose(feedback: Feedback) -> Pose | None:
 
 
 def quaternion(roll: float, pitch: float, yaw: float) -> Quaternion:
-    """Of the rotation Rz(yaw) · Ry(pitch) · Rx(roll), angles in rad."""
+    """Return the quaternion of the rotation Rz(yaw) · Ry(pitch) · Rx(roll), angles in rad."""
     cr, sr = math.cos(roll / 2), math.sin(roll / 2)
     cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
     cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
@@ -148,25 +173,28 @@ def quaternion(roll: float, pitch: float, yaw: float) -> Quaternion:
 
 
 def pose_of(values: Sequence[float]) -> Pose:
-    """From position and quaternion x, y, z, w."""
+    """Return the pose of a position [m] and a quaternion: x, y, z, then qx, qy, qz, qw."""
     x, y, z, qx, qy, qz, qw = values[:7]
     return Pose(position=Vector3(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
 
 
 def pose_in_world(at_ns: int, place: Pose) -> bytes:
+    """Encode a pose in world axes."""
     return PoseInFrame(timestamp=timestamp(at_ns), frame_id=WORLD, pose=place).SerializeToString()
 
 
 def path_in_world(at_ns: int, places: Iterable[Pose]) -> bytes:
+    """Encode a path in world axes."""
     return PosesInFrame(timestamp=timestamp(at_ns), frame_id=WORLD, poses=places).SerializeToString()
 
 
 def world_to_drone(drone: str, at_ns: int, place: Pose) -> bytes:
+    """Encode the transform from the world to a drone."""
     return _transform(WORLD, drone, at_ns, place.position, place.orientation)
 
 
 def drone_to_camera(drone: str, camera: CameraInfo, at_ns: int) -> bytes | None:
-    """Where a camera is mounted; None if that is not known."""
+    """Encode where a camera is mounted; None if that is not known."""
     if camera.rotation is None:
         return None
     import numpy as np
@@ -192,7 +220,7 @@ def _transform(parent: str, child: str, at_ns: int, translation: Vector3, rotati
 
 
 def drawing(annotation: Annotation, captured_ns: int) -> bytes:
-    """What was drawn on a frame captured at this Unix time."""
+    """Encode what was drawn on a frame captured at this Unix time."""
     message = ImageAnnotations()
     at = timestamp(captured_ns)
     for shape in annotation.shapes:
@@ -230,22 +258,30 @@ def _colour(colour: Colour) -> Color:
 
 
 def log(drone: str, at_ns: int, severity: Severity, text: str, source: str) -> bytes:
-    """A line for people; ``source`` is what says it."""
+    """Encode a line of text.
+
+    Args:
+        drone: The drone's name.
+        at_ns: Unix time.
+        severity: Becomes the level.
+        text: The line.
+        source: Who wrote it.
+    """
     message = Log(timestamp=timestamp(at_ns), level=_LEVELS[severity], message=text, name=drone, file=source)
     return message.SerializeToString()
 
 
-# The way back --------------------------------------------------------------------------------------------------
+# Decoding ------------------------------------------------------------------------------------------------------
 
 
 def read_image(data: bytes | memoryview) -> tuple[bytes, str]:
-    """A picture's bytes and their format, from the message on its topic."""
+    """Decode an image: its bytes and their format."""
     message = CompressedImage.FromString(bytes(data))
     return message.data, message.format
 
 
 def read_pose(data: bytes) -> tuple[Vector, tuple[float, float, float, float]]:
-    """Position [m] and quaternion (x, y, z, w) of a pose in the world."""
+    """Decode a pose in the world: position [m] and quaternion (x, y, z, w)."""
     place: Any = PoseInFrame.FromString(data).pose
     at, turned = place.position, place.orientation
     return (at.x, at.y, at.z), (turned.x, turned.y, turned.z, turned.w)

@@ -1,4 +1,4 @@
-"""What to record and how, checked before anything is opened; and which file comes next."""
+"""What to record and how, validated before anything is opened; and the name of the next file."""
 
 from __future__ import annotations
 
@@ -24,7 +24,11 @@ CHOICES: Final = (*(one.value for one in Channel if one not in (Channel.FRAMES, 
 
 
 class Options(msgspec.Struct, frozen=True):
-    """How to record; see :func:`skyloop.record` for what each means. Raises :class:`UsageError`."""
+    """How to record; see :func:`skyloop.record` for each of them.
+
+    Raises:
+        UsageError: A value is out of its range.
+    """
 
     channels: tuple[str, ...] = CHOICES
     encoding: VideoEncoding = "auto"
@@ -50,21 +54,30 @@ class Options(msgspec.Struct, frozen=True):
 
     @property
     def rotates(self) -> bool:
+        """Whether the recording is split into several files."""
         return self.rotate_mb is not None or self.rotate_s is not None
 
     def wants(self, channel: Channel) -> bool:
-        """Whether one of the channels that have no camera is recorded."""
+        """Whether a channel without a camera is recorded."""
         return channel.value in self.channels
 
     def wants_camera(self, camera: str) -> bool:
+        """Whether a camera's frames are recorded."""
         return VIDEO in self.channels or f"{VIDEO}.{camera}" in self.channels
 
     def keeps_stream(self, camera: CameraInfo) -> bool:
-        """Whether a camera's pictures are recorded as the vehicle encodes them."""
+        """Whether a camera's frames are recorded as the vehicle encodes them."""
         return self.encoding == "auto" and camera.stream == H264
 
     def check_cameras(self, known: Iterable[str]) -> None:
-        """Raises :class:`UnknownNameError` for a camera that no drone has."""
+        """Check the cameras that were chosen.
+
+        Args:
+            known: The cameras of all drones.
+
+        Raises:
+            UnknownNameError: No drone has a camera of that name.
+        """
         cameras = set(known)
         for name in self.channels:
             kind, dot, camera = name.partition(".")
@@ -73,9 +86,14 @@ class Options(msgspec.Struct, frozen=True):
 
 
 def channels_of(names: Iterable[str] | None) -> tuple[str, ...]:
-    """Channels as the caller named them, as :data:`CHOICES`; ``command`` means ``commands``. None: all.
+    """Convert the caller's choice of channels to names of :data:`CHOICES`.
 
-    Raises :class:`UnknownNameError`, :class:`UsageError` for none at all.
+    Args:
+        names: One or several; ``command`` means ``commands``. None chooses all.
+
+    Raises:
+        UnknownNameError: There is no such channel.
+        UsageError: No channel was named.
     """
     if names is None:
         return CHOICES
@@ -96,12 +114,21 @@ def channels_of(names: Iterable[str] | None) -> tuple[str, ...]:
 
 
 def numbered(path: Path, number: int) -> Path:
-    """The file with this number of a recording: ``flight-0002.mcap``."""
+    """Return the file with this number of a recording: ``flight-0002.mcap``."""
     return path.with_name(f"{path.stem}-{number:04d}{path.suffix}")
 
 
 def first_path(path: Path, drones: list[str], options: Options) -> Path:
-    """Where to record to; in a folder, a file named by drones and time. Raises :class:`UsageError`."""
+    """Return the path to record to; in a folder, a file named by drones and time.
+
+    Args:
+        path: A file, or an existing folder; a file without a suffix gets ``.mcap``.
+        drones: Their names.
+        options: Whether the recording is split, and may overwrite.
+
+    Raises:
+        UsageError: The file exists already, or its folder does not.
+    """
     if path.is_dir():
         path = path / f"{'-'.join(drones)[:64].replace('/', '_')}-{time.strftime('%Y%m%d-%H%M%S')}.mcap"
     if not path.suffix:

@@ -1,4 +1,4 @@
-"""One MCAP file of a recording. What was committed stays readable, whatever happens to what comes after it."""
+"""One MCAP file of a recording. What was committed stays readable, whatever happens later."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from skyloop.recording.options import MB
 if TYPE_CHECKING:
     from google.protobuf.message import Message as Protobuf
 
-CHUNK: Final = MB  #: bytes after which a chunk is closed, if it is not by :meth:`RecordingFile.commit`
+CHUNK: Final = MB  #: bytes after which a chunk is closed, unless :meth:`RecordingFile.commit` does so before
 
 
 class Target(Protocol):
-    """An unbuffered file opened for writing."""
+    """An unbuffered file that is open for writing."""
 
     def write(self, data: Any, /) -> int | None: ...
     def truncate(self, size: int | None = None, /) -> int: ...
@@ -35,16 +35,24 @@ Opener = Callable[[Path, bool], Target]
 
 
 def open_target(path: Path, overwrite: bool) -> Target:
-    """Raises ``OSError``."""
+    """Open a file without a buffer.
+
+    Args:
+        path: The file.
+        overwrite: Whether an existing file is replaced.
+
+    Raises:
+        OSError: It exists, or can't be written.
+    """
     return cast(Target, path.open("wb" if overwrite else "xb", buffering=0))
 
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """One message of the file. ``kind`` is the class of one of our samples, or a protobuf class."""
+    """One message of the file. ``kind`` is the class of one of Skyloop's samples, or a protobuf class."""
 
     topic: str
-    kind: type[msgspec.Struct] | type[Protobuf]
+    kind: type[msgspec.Struct | Protobuf]
     data: bytes
     log_ns: int  #: Unix time
     publish_ns: int
@@ -52,24 +60,30 @@ class Message:
 
 
 class Output:
-    """What the MCAP writer writes to: nothing reaches the file before :meth:`flush`, and then all of it or nothing."""
+    """The stream of the MCAP writer: nothing reaches the file before :meth:`flush`, and then all of it or nothing."""
 
     def __init__(self, target: Target) -> None:
-        self.committed = 0  #: bytes that are in the file, up to the end of a record
-        self.waiting = 0  #: bytes that are not
+        self.committed = 0  #: bytes in the file, up to the end of a record
+        self.waiting = 0  #: bytes that are not in the file yet
         self._target = target
         self._pieces: list[bytes] = []
 
     def write(self, data: bytes) -> int:
+        """Append to what waits; return the number of bytes."""
         self._pieces.append(data)
         self.waiting += len(data)
         return len(data)
 
     def tell(self) -> int:
+        """Return the size of the file with what waits [bytes]."""
         return self.committed + self.waiting
 
     def flush(self) -> None:
-        """Raises ``OSError``; the file then ends where it ended before."""
+        """Write what waits to the file.
+
+        Raises:
+            OSError: The disk fails; the file then ends where it ended before.
+        """
         try:
             for piece in self._pieces:
                 rest = memoryview(piece)
@@ -86,14 +100,32 @@ class Output:
 
 
 class RecordingFile:
-    """What is written is in the file after :meth:`commit`.
+    """An MCAP file that is written; messages are in the file after :meth:`commit`.
 
-    Every method raises ``OSError`` when the disk does; then only :meth:`abandon` is of use.
+    Every method raises ``OSError`` when the disk fails; then only :meth:`abandon` may be called.
+
+    Attributes:
+        path: The file.
+        written: Messages by topic.
+        count: All messages.
     """
 
     def __init__(
         self, path: Path, start: Start, clock: ClockPair, *, overwrite: bool = False, opener: Opener = open_target
     ) -> None:
+        """Create the file and write its metadata.
+
+        Args:
+            path: The file.
+            start: Metadata of the recording.
+            clock: Relates monotonic and Unix time.
+            overwrite: Whether an existing file is replaced.
+            opener: Opens the file.
+
+        Raises:
+            OSError: The file can't be created or written.
+            MissingExtraError: The extra ``[record]`` is not installed.
+        """
         try:
             from mcap.writer import CompressionType, Writer
         except ImportError as error:
@@ -117,18 +149,19 @@ class RecordingFile:
 
     @property
     def size(self) -> int:
-        """Bytes, those that are on the way included."""
+        """Bytes, including those that wait."""
         return self._output.tell()
 
     @property
     def lost(self) -> bool:
-        """Whether it was deleted: what is written goes nowhere. (One that was moved is still written.)"""
+        """Whether the file was deleted. One that was moved is still written."""
         try:
             return os.fstat(self._target.fileno()).st_nlink == 0
         except OSError:
             return True
 
     def write(self, message: Message) -> None:
+        """Append a message."""
         channel = self._channels.get(message.topic)
         if channel is None:
             channel = self._add_channel(message)
@@ -137,11 +170,11 @@ class RecordingFile:
         self.count += 1
 
     def commit(self) -> None:
-        """Close the chunk and put everything into the file."""
+        """Close the chunk and write everything to the file."""
         self._writer.flush()  # type: ignore[no-untyped-call]
 
     def close(self, end: End) -> None:
-        """Write the summary and close."""
+        """Write the summary and close the file."""
         try:
             self._writer.flush()  # type: ignore[no-untyped-call]
             self._writer.add_metadata(META_END, to_metadata(end))
@@ -151,7 +184,7 @@ class RecordingFile:
             self._target.close()
 
     def abandon(self) -> None:
-        """Leave it as it is: readable up to what was committed, without a summary. An empty one is removed."""
+        """Close the file as it is: readable up to what was committed, without a summary. An empty one is removed."""
         self._target.close()
         if not self._output.committed:
             self.path.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""``skyloop.record``: a recorder for drones that are connected, or that are named."""
+"""``skyloop.record``: a recorder for connected drones, or for drones given by their names."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from skyloop.recording.status import News, RecorderState, Status
 
 
 class Backend(Protocol):
-    """Who records: a process, or threads of this one."""
+    """What records: a process, or threads of this one."""
 
     @property
     def status(self) -> Status: ...
@@ -26,10 +26,22 @@ class Backend(Protocol):
 
 
 class Recorder:
-    """A recording that goes on until :meth:`close`, or the end of its block. Any thread."""
+    """A recording that runs until :meth:`close`, or to the end of its ``with`` block. May be used from any thread."""
 
     def __init__(self, drones: Sequence[Drone | str], path: Path, options: Options, in_process: bool) -> None:
-        """What :func:`record` calls."""
+        """Start the recording; applications call :func:`record`.
+
+        Args:
+            drones: Connected ones, or names of proxies.
+            path: The first file.
+            options: What to record and how.
+            in_process: Whether to record on threads of this process.
+
+        Raises:
+            UsageError: The drones have the same name, or the file can't be written.
+            LinkError: A drone can't be connected to, or the recorder's process ended.
+            NoAnswerError: The recorder's process does not start.
+        """
         self._listening = [drone for drone in drones if isinstance(drone, Drone)]
         self._own: list[Drone] = []  # connected by this recorder
         self._backend: Backend
@@ -56,11 +68,12 @@ class Recorder:
 
     @property
     def status(self) -> Status:
-        """All that is known now; some parts have names of their own here."""
+        """The present status; some of its parts have properties of their own."""
         return self._backend.status
 
     @property
     def state(self) -> RecorderState:
+        """Whether it records now."""
         return self.status.state
 
     @property
@@ -70,7 +83,7 @@ class Recorder:
 
     @property
     def path(self) -> Path:
-        """The file being written, or written last."""
+        """The file that is written, or that was written last."""
         return Path(self.status.path)
 
     @property
@@ -80,11 +93,12 @@ class Recorder:
 
     @property
     def seconds(self) -> float:
+        """Time since the start."""
         return self.status.seconds
 
     @property
     def bytes(self) -> int:
-        """Written so far, in all files."""
+        """Bytes written so far, in all files."""
         return self.status.bytes
 
     @property
@@ -98,7 +112,7 @@ class Recorder:
         return self.status.missed
 
     def close(self) -> None:
-        """Write what has come and close the file. Idempotent."""
+        """Write what was received, and close the file. Idempotent."""
         self._backend.stop()
         self._close_own()
 
@@ -136,19 +150,31 @@ def record(
     overwrite: bool = False,
     in_process: bool | None = None,
 ) -> Recorder:
-    """Record one drone or several to an MCAP file; returns when it records. Use it as a context manager.
+    """Record one or several drones to an MCAP file; return once the recording runs. Use it as a context manager.
 
-    ``drones``: connected ones, or names of running proxies. ``path``: a file, or a folder in which a name is chosen.
-    ``channels``: which ones (default: all), of ``commands``, ``feedback``, ``events``, ``parameters``, ``annotations``,
-    ``logs``, ``video`` and ``video.CAMERA``. ``encoding``: of frames that come raw, ``"jpeg"`` with a ``quality`` from
-    1 to 100, or ``"png"`` without any loss; frames that come as JPEG are kept as such. ``"auto"``: H.264 is kept as the
-    vehicle sent it where it sends that, else JPEG. ``rotate_mb``, ``rotate_s``: begin a new file after so much or so
-    long (``flight-0001.mcap``, …), each complete in itself, H.264 at a key picture. ``min_free_mb``: room
-    to leave on the disk: below it frames are not recorded, below a quarter of it nothing. ``buffer_mb``: how much may
-    wait for a slow disk before frames are dropped. ``overwrite``: an existing file. ``in_process``: record on threads
-    of this process and not in one of its own (default: only if the drone can't be reached from another process).
+    Args:
+        drones: Connected ones, or names of running proxies.
+        path: A file, or a folder in which a name is chosen.
+        channels: Of ``commands``, ``feedback``, ``events``, ``parameters``, ``annotations``, ``logs``, ``results``,
+            ``video`` and ``video.CAMERA``; None records all.
+        encoding: Of raw frames: ``"jpeg"``, or lossless ``"png"``; frames that arrive as JPEG are kept as such.
+            ``"auto"`` keeps the vehicle's H.264 where it sends that, and else encodes as JPEG.
+        quality: Of JPEG, 1 to 100 (best).
+        rotate_mb: Start a new file after so many megabytes (``flight-0001.mcap``, …), each complete in itself, H.264 at
+            a key frame; None does not.
+        rotate_s: The same after so many seconds.
+        min_free_mb: Space to leave on the disk: below it frames are not recorded, below a quarter of it nothing.
+        buffer_mb: How much may wait for a slow disk before frames are dropped.
+        overwrite: Whether an existing file is replaced.
+        in_process: Whether to record on threads of this process, and not in a separate one; None does so only if a
+            drone can't be reached from another process.
 
-    Raises :class:`UsageError`, :class:`UnknownNameError`, :class:`LinkError`, :class:`MissingExtraError`.
+    Raises:
+        UsageError: An argument is wrong, or the file exists or can't be written.
+        UnknownNameError: There is no such channel or camera.
+        LinkError: A drone can't be connected to, or the recorder's process can't record.
+        NoAnswerError: The recorder's process does not start.
+        MissingExtraError: The extra ``[record]`` is not installed.
     """
     several = [drones] if not isinstance(drones, Iterable) or isinstance(drones, str) else list(drones)
     if not several or not all(isinstance(drone, Drone | str) for drone in several):

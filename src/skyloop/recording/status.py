@@ -1,4 +1,4 @@
-"""What a recorder tells of itself, and how it judges the room that is left. Pure."""
+"""The status of a recorder, and its decisions when the disk fills up. Pure."""
 
 from __future__ import annotations
 
@@ -11,19 +11,21 @@ from skyloop.messages import Severity
 
 
 class RecorderState(StrEnum):
+    """Whether a recorder records."""
+
     STARTING = "starting"
     RECORDING = "recording"
-    PAUSED = "paused"  #: it can't write now, keeps what must not be lost, and tries again each second
-    CLOSED = "closed"  #: ended on purpose, the file is complete
-    FAILED = "failed"  #: its process was killed; what it had written is in the file
+    PAUSED = "paused"  #: the disk can't be written; what must not be lost waits, and writing is retried each second
+    CLOSED = "closed"  #: closed on purpose; the file is complete
+    FAILED = "failed"  #: its process was killed, or its thread ended by an error; what was written is in the file
 
 
 class Status(msgspec.Struct, frozen=True):
-    """A recording at one time."""
+    """The status of a recording at one time."""
 
     state: RecorderState = RecorderState.STARTING
     reason: str = ""  #: why it is paused or has failed
-    path: str = ""  #: the file being written, or written last
+    path: str = ""  #: the file that is written, or that was written last
     files: tuple[str, ...] = ()  #: all of them, oldest first
     seconds: float = 0.0  #: since it started
     bytes: int = 0  #: in all files
@@ -48,11 +50,17 @@ class Room(StrEnum):
     NOTHING = "nothing"
 
 
-_MARGIN: Final = 1.25  #: of the floor must be free again before more is written
+_MARGIN: Final = 1.25  #: factor of a limit that must be free again before more is written
 
 
 def judge_room(free: int, floor: int, before: Room) -> Room:
-    """All above the floor, no frames below it, nothing below a quarter of it; in bytes."""
+    """Decide what is written: all above the floor, no frames below it, nothing below a quarter of it.
+
+    Args:
+        free: Bytes that are free on the disk.
+        floor: Bytes that are to stay free.
+        before: The decision before; to write more again, a margin above the limit must be free.
+    """
     margin = _MARGIN if before is not Room.ALL else 1.0
     if free >= floor * margin:
         return Room.ALL

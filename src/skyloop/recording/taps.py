@@ -1,7 +1,8 @@
-"""What is taken from a drone: samples go from the receiving thread into the backlog, pictures by way of an encoder."""
+"""Subscriptions to one drone: samples go from the receiving thread to the backlog, frames through an encoder."""
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from collections.abc import Callable
@@ -11,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.client import Drone, Result
-from skyloop.client.delivery import Listener
+from skyloop.client.channels import Listener
 from skyloop.client.frame import Arrival, to_bgr
-from skyloop.client.slots import Buffer
+from skyloop.client.mailbox import Mailbox
 from skyloop.clock import nanoseconds
 from skyloop.errors import MissingExtraError, SkyloopError
 from skyloop.logfile.layout import Channel, Drops, FrameRecord
@@ -36,26 +37,29 @@ from skyloop.recording.backlog import Backlog, Item, Rank
 from skyloop.recording.options import VIDEO, Options
 from skyloop.recording.translation import Picture
 
-_FRAMES_WAITING: Final = 2  # a third is being encoded, a fourth on the way: more are not lent to one application
-_SIZE: Final = 400  #: bytes of an ordinary sample, roughly
-_STREAM_GONE_NS: Final = nanoseconds(2.0)  # a stream of which nothing came for so long: frames are recorded
-_PARAMETERS_S: Final = 2.0  # after a change that this could not ask for, it is asked again
+_FRAMES_WAITING: Final = 2  # a third is being encoded, a fourth arrives: one client can hold no more frame slots
+_SIZE: Final = 400  #: bytes of an ordinary sample, approximately
+_STREAM_GONE_NS: Final = nanoseconds(2.0)  # after so long without a frame of the stream, decoded frames are recorded
+_PARAMETERS_S: Final = 2.0  # pause before parameters that could not be read are read again
+
+_log = logging.getLogger(__name__)
 
 Encode = Callable[[FrameHeader, "NDArray[np.uint8]"], bytes]
 
 
 class Gaps:
-    """Counts what is missing in rising numbers. A number that is not higher begins anew."""
+    """Counts missing numbers in a rising sequence. A number that is not higher starts a new sequence."""
 
     def __init__(self) -> None:
         self.missed = 0
         self._last: int | None = None
 
     def restart(self) -> None:
-        """What is missing from here to the next number was not wanted."""
+        """Start a new sequence: what is missing up to the next number was not wanted."""
         self._last = None
 
     def follow(self, number: int) -> None:
+        """Add the next number."""
         last = self._last
         if last is not None and number > last + 1:
             self.missed += number - last - 1
@@ -63,9 +67,17 @@ class Gaps:
 
 
 class Tap:
-    """One drone's samples. ``number`` is the drone's within the recording."""
+    """Subscribes to one drone and puts its samples into the backlog."""
 
     def __init__(self, number: int, drone: Drone, options: Options, backlog: Backlog) -> None:
+        """Initialise without subscribing.
+
+        Args:
+            number: The drone's index in the recording.
+            drone: A connected drone.
+            options: What to record and how.
+            backlog: Where samples are put.
+        """
         self.drone = drone
         self._number = number
         self._options = options
@@ -80,7 +92,7 @@ class Tap:
         self._parameters = Parameters(drone, self.put_parameter) if options.wants(Channel.PARAMETERS) else None
 
     def start(self) -> None:
-        """Begin to listen."""
+        """Subscribe."""
         drone, wants = self.drone, self._options.wants
         listen: tuple[tuple[Channel, Callable[..., Listener[Any]], Callable[[Any], None]], ...] = (
             (Channel.FEEDBACK, drone.on_feedback, self._feedback),
@@ -100,7 +112,7 @@ class Tap:
             video.start()
 
     def stop(self) -> None:
-        """Listen no more; what came before is in the backlog when this returns."""
+        """Unsubscribe; what was received before is in the backlog on return."""
         for listener in self._listeners:
             listener.cancel()
         if self._parameters is not None:
@@ -109,7 +121,7 @@ class Tap:
             video.stop()
 
     def dropped(self) -> dict[str, int]:
-        """By channel, what was received and left out."""
+        """Return, by channel, how many samples were received and left out."""
         found = {
             channel: count for (number, channel), count in list(self._backlog.dropped.items()) if number == self._number
         }
@@ -119,26 +131,28 @@ class Tap:
         return found
 
     def missed(self) -> dict[str, int]:
-        """By channel, what was never received."""
+        """Return, by channel, how many samples were never received."""
         found = {channel: gap.missed for channel, gap in self._gaps.items()}
         found |= {video.channel: video.missed for video in self._videos}
         return {channel: missed for channel, missed in found.items() if missed}
 
     def look(self) -> None:
-        """Called each second: see what comes of video."""
+        """Check each second whether the vehicle's own encoding still arrives."""
         for video in self._videos:
             video.look(time.monotonic_ns())
 
     def put_drops(self, dropped: dict[str, int], missed: dict[str, int]) -> None:
+        """Put the counts of dropped and missed samples into the backlog."""
         now_ns = time.monotonic_ns()
         self._put("drops", Rank.KEPT, Drops(now_ns, dropped, missed), _SIZE, now_ns)
 
     def put_event(self, text: str, severity: Severity, data: dict[str, str]) -> None:
-        """An event of the recorder's own, into the file."""
+        """Put an event of the recorder itself into the backlog."""
         event = Event(EventKind.RECORDING, text, self.drone.now_ns, severity, app="recorder", data=dict(data))
         self._put(Channel.EVENTS.value, Rank.KEPT, event, _SIZE)
 
     def put_parameter(self, parameter: Parameter) -> None:
+        """Put a parameter into the backlog."""
         self._put(Channel.PARAMETERS.value, Rank.KEPT, parameter, _SIZE)
 
     # On the receiving thread -----------------------------------------------------------------------------------
@@ -152,9 +166,9 @@ class Tap:
         self._put("feedback", Rank.STATE, feedback, _SIZE + (40 * len(native) if native else 0))
 
     def _event(self, event: Event) -> None:
-        if event.seq:  # those of the client's own have none
+        if event.seq:  # events of the client itself have none
             self._gaps["events"].follow(event.seq)
-        if event.kind is not EventKind.RECORDING:  # the recorder's own get there by put_event
+        if event.kind is not EventKind.RECORDING:  # the recorder's own are added by put_event
             self._put("events", Rank.KEPT, event, _SIZE)
 
     def _applied(self, applied: Applied) -> None:
@@ -171,12 +185,12 @@ class Tap:
 
 
 class Stream:
-    """One camera's pictures as the vehicle encoded them, from a key picture on."""
+    """One camera's frames as the vehicle encoded them, from the first key frame on."""
 
     def __init__(self, put: Callable[..., None], drone: Drone, camera: str) -> None:
         self.gaps = Gaps()
-        self.dropped = 0  #: pictures that can't be decoded because one before them is missing
-        self.newest_ns = 0  #: when the newest one came that can be decoded, or when it started
+        self.dropped = 0  #: frames that can't be decoded because one before them is missing
+        self.newest_ns = 0  #: arrival of the newest decodable frame, or the start
         self._put = put
         self._channel = f"{VIDEO}.{camera}"
         self._topic = drone.channel(camera).stream
@@ -185,10 +199,12 @@ class Stream:
         self._sink = self._arrived
 
     def start(self) -> None:
+        """Subscribe."""
         self.newest_ns = time.monotonic_ns()
         self._topic.add(self._sink, lambda: 0)
 
     def stop(self) -> None:
+        """Unsubscribe."""
         self._topic.remove(self._sink)
 
     def _arrived(self, picture: EncodedFrame) -> None:
@@ -217,37 +233,38 @@ class Stream:
 
 
 class Video:
-    """One camera's frames: encoded on a thread of their own, unless they come as JPEG.
+    """One camera's frames: encoded on their own thread, unless they arrive as JPEG.
 
-    Where the vehicle's own encoding is to be kept, they are asked for only while nothing of that comes.
+    Where the vehicle's own encoding is to be kept, frames are subscribed to only while that does not arrive.
     """
 
     def __init__(self, put: Callable[..., None], drone: Drone, camera: str, options: Options) -> None:
         self.channel = f"{VIDEO}.{camera}"
         self.gaps = Gaps()
         self._put = put
-        self._topic = drone.channel(camera).topic
+        self._topic = drone.channel(camera)
         self._encode = encoder(options)
         self._format = "png" if options.encoding == "png" else "jpeg"
         self._stream = Stream(put, drone, camera) if options.keeps_stream(drone.channel(camera).camera) else None
         self._lock = threading.Lock()  # guards the subscription to frames
         self._listening = self._ended = False
         self._failed = 0
-        self._buffer: Buffer[Arrival] = Buffer(_FRAMES_WAITING)
+        self._buffer: Mailbox[Arrival] = Mailbox(_FRAMES_WAITING)
         self._sink = self._arrived
         self._thread = threading.Thread(target=self._run, name=f"skyloop-record-{camera}", daemon=True)
 
     @property
     def dropped(self) -> int:
-        """Frames that the encoder had no time for, could make nothing of, or that can't be decoded."""
+        """Frames that the encoder had no time for or failed on, or that can't be decoded."""
         return self._buffer.dropped + self._failed + (self._stream.dropped if self._stream is not None else 0)
 
     @property
     def missed(self) -> int:
-        """Frames that never came."""
+        """Frames that never arrived."""
         return self.gaps.missed + (self._stream.gaps.missed if self._stream is not None else 0)
 
     def start(self) -> None:
+        """Start the encoder's thread, and subscribe."""
         self._thread.start()
         if self._stream is not None:
             self._stream.start()
@@ -255,6 +272,7 @@ class Video:
             self._listen(True)
 
     def stop(self) -> None:
+        """Unsubscribe, and end the encoder's thread."""
         if self._stream is not None:
             self._stream.stop()
         self._listen(False)
@@ -264,7 +282,7 @@ class Video:
         self._thread.join()
 
     def look(self, now_ns: int) -> None:
-        """Ask for frames while the vehicle's own encoding does not come: it may send another one than announced."""
+        """Subscribe to frames while the vehicle's encoding does not arrive: it may send another one than announced."""
         if self._stream is not None:
             self._listen(now_ns - self._stream.newest_ns > _STREAM_GONE_NS)
 
@@ -281,7 +299,7 @@ class Video:
 
     def _arrived(self, arrival: Arrival) -> None:
         if self._stream is not None and arrival.received_ns - self._stream.newest_ns < _STREAM_GONE_NS:
-            return  # what is recorded again is the stream
+            return  # the stream is back, and is recorded instead
         header = arrival.header
         self.gaps.follow(header.seq)
         if header.encoding is Encoding.JPEG:
@@ -296,7 +314,7 @@ class Video:
             arrival = self._buffer.wait()
             if arrival is not None:
                 self._encode_one(arrival)
-            del arrival  # else its memory stayed on loan while this waits for the next one
+            del arrival  # else its frame slot would stay leased while this waits for the next one
 
     def _encode_one(self, arrival: Arrival) -> None:
         try:
@@ -309,8 +327,10 @@ class Video:
             else:
                 image = arrival.frame().image
             self._done(arrival, self._encode(header, image), self._format)
-        except SkyloopError:
+        except Exception as error:  # noqa: BLE001  (one frame is lost; if the thread ended, all would be)
             self._failed += 1
+            if not isinstance(error, SkyloopError):
+                _log.exception("frame %s of %s can't be recorded", arrival.header.seq, arrival.header.camera)
 
     def _done(self, arrival: Arrival, data: bytes, format_: str) -> None:
         record = FrameRecord(arrival.header, arrival.received_ns, format_)
@@ -318,7 +338,14 @@ class Video:
 
 
 def encoder(options: Options) -> Encode:
-    """Makes files of pictures, shape (height, width, 3) BGR or (height, width), uint8."""
+    """Return a function that encodes images, shape (height, width, 3) BGR or (height, width), uint8.
+
+    Args:
+        options: Format and quality.
+
+    Raises:
+        MissingExtraError: OpenCV is not installed.
+    """
     try:
         import cv2
     except ImportError as error:
@@ -341,7 +368,7 @@ def encoder(options: Options) -> Encode:
 
 
 class Parameters:
-    """All parameters at the start, then each that has changed, asked for on a thread of its own."""
+    """Reads all parameters at the start, then each that has changed, on its own thread."""
 
     def __init__(self, drone: Drone, put: Callable[[Parameter], None]) -> None:
         self._drone = drone
@@ -352,16 +379,18 @@ class Parameters:
         self._thread = threading.Thread(target=self._run, name="skyloop-record-parameters", daemon=True)
 
     def start(self) -> None:
+        """Start the thread."""
         self._wake.set()
         self._thread.start()
 
     def stop(self) -> None:
+        """End the thread."""
         self._ended = True
         self._wake.set()
         self._thread.join()
 
     def event(self, event: Event) -> None:
-        """Look again when one was written, and when the link came back."""
+        """Read again when a parameter was written, or a link came back."""
         came_back = event.kind is EventKind.APPLICATION_LINK and event.data.get("state") == LinkState.UP
         if event.kind is EventKind.PARAMETER_CHANGED or came_back or event.kind is EventKind.VEHICLE_LINK:
             self._wake.set()
@@ -376,10 +405,12 @@ class Parameters:
             again = None if self._look() else _PARAMETERS_S
 
     def _look(self) -> bool:
-        """Whether they could be asked for."""
+        """Read the parameters; return whether they could be read."""
         try:
             parameters = self._drone.config.parameters()
-        except SkyloopError:
+        except Exception as error:  # noqa: BLE001  (read again later; if the thread ended, no change would be recorded)
+            if not isinstance(error, SkyloopError):
+                _log.exception("the parameters of %s can't be recorded", self._drone.name)
             return False
         for parameter in parameters:
             if self._known.get(parameter.name) != parameter:

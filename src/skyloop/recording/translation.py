@@ -1,4 +1,4 @@
-"""From what arrived to the messages of a file: our own sample, and beside it what viewers understand. Pure."""
+"""Received samples to messages of a file: Skyloop's own, and beside it what viewers understand. Pure."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ from skyloop.recording.backlog import Item
 from skyloop.recording.output import Message
 
 _SEQUENCES: Final = 1 << 32
-_PLACES: Final = 400  #: of a path; when there are more, each second one is left out
+_PLACES: Final = 400  #: greatest number of places of a path; beyond it, every second one is removed
 _PATH_EVERY_NS: Final = 1_000_000_000
 
 
 class Picture:
-    """A frame as it goes into the file."""
+    """A frame as it is written to the file."""
 
     __slots__ = ("data", "record")
 
@@ -46,7 +46,7 @@ class Picture:
 
 
 class Path:
-    """The places where a drone has been, thinned out so that they never become many. Oldest first."""
+    """The places where a drone has been, oldest first, thinned out so that their number stays limited."""
 
     def __init__(self) -> None:
         self.places: list[Any] = []
@@ -54,6 +54,7 @@ class Path:
         self._count = 0
 
     def add(self, place: Any) -> None:
+        """Append a place, or leave it out to keep the distance between places."""
         if self._count % self._step == 0:
             self.places.append(place)
             if len(self.places) > _PLACES:
@@ -63,13 +64,22 @@ class Path:
 
 
 class Translator:
-    """Makes the messages of one drone. ``offset_ns()`` is the proxy's clock less the recorder's."""
+    """Creates the messages of one drone."""
 
     def __init__(
         self, drone: str, capabilities: Capabilities, clock: ClockPair, offset_ns: Callable[[], int] = lambda: 0
     ) -> None:
+        """Initialise the translator.
+
+        Args:
+            drone: The drone's name.
+            capabilities: Of the drone.
+            clock: Relates the recorder's clock and Unix time.
+            offset_ns: Returns the proxy's clock minus the recorder's.
+        """
         self._drone = drone
         self._cameras = capabilities.cameras
+        self._camera_names = frozenset(camera.name for camera in capabilities.cameras)
         self._clock = clock
         self._offset_ns = offset_ns
         self._topics: dict[Channel, str] = {
@@ -92,11 +102,15 @@ class Translator:
         }
 
     def messages(self, item: Item) -> Iterator[Message]:
-        """What this becomes."""
+        """Create the messages of a sample."""
         return self._makers[type(item.sample)](item.sample, self._clock.unix(item.received_ns))
 
     def prelude(self, now_ns: int) -> Iterator[Message]:
-        """What each file needs at its beginning to be complete in itself; ``now_ns`` on the recorder's clock."""
+        """Create the messages that make each file complete in itself: parameters, mountings and calibrations.
+
+        Args:
+            now_ns: On the recorder's clock.
+        """
         at_ns = self._clock.unix(now_ns)
         for parameter in list(self._parameters.values()):
             yield from self._parameter(parameter, at_ns)
@@ -114,7 +128,7 @@ class Translator:
         return Message(self._topics[channel], type(sample), data, log_ns, publish_ns, sequence % _SEQUENCES)
 
     def _unix(self, proxy_ns: int) -> int:
-        """Unix time of a time on the proxy's clock."""
+        """Return the Unix time of a time on the proxy's clock."""
         return self._clock.unix(proxy_ns, self._offset_ns())
 
     def _feedback(self, feedback: Feedback, log_ns: int) -> Iterator[Message]:
@@ -151,6 +165,8 @@ class Translator:
     def _annotation(self, annotation: Annotation, log_ns: int) -> Iterator[Message]:
         at_ns = self._unix(annotation.captured_ns)
         yield self._own(Channel.ANNOTATIONS, annotation, log_ns, at_ns)
+        if annotation.camera not in self._camera_names:
+            return  # an unknown camera: names that applications choose must not create topics
         topic = layout.drawing_topic(self._drone, annotation.camera)
         yield Message(topic, foxglove.ImageAnnotations, foxglove.drawing(annotation, at_ns), log_ns, at_ns)
 
@@ -169,7 +185,7 @@ class Translator:
         try:
             value = _listed(unpack(result.payload))
         except DecodeError:
-            value = None  # what nobody can understand is no value
+            value = None  # a payload that can't be decoded has no value
         record = ResultRecord(
             result.processor,
             result.worker,
@@ -219,7 +235,7 @@ class Translator:
 
 
 def _listed(value: Any) -> Any:
-    """As JSON can hold it: arrays as lists, keys as texts."""
+    """Convert to what JSON can hold: arrays to lists, keys to strings."""
     if isinstance(value, np.ndarray):
         return value.tolist()
     if isinstance(value, dict):

@@ -1,7 +1,9 @@
-"""The thread that writes: takes what was received, translates it, and keeps files, disk and people in order."""
+"""The writing thread: takes samples from the backlog, translates and writes them, and watches the disk."""
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import shutil
 import threading
 import time
@@ -18,26 +20,43 @@ from skyloop.messages import Severity
 from skyloop.messages.encoded import H264, Chain
 from skyloop.recording.backlog import Backlog, Item, Rank
 from skyloop.recording.options import MB, Options, numbered
-from skyloop.recording.output import CHUNK, Opener, RecordingFile, open_target
+from skyloop.recording.output import CHUNK, Message, Opener, RecordingFile, open_target
 from skyloop.recording.status import RecorderState, Room, judge_room
 from skyloop.recording.translation import Picture, Translator
 
-BEAT_S: Final = 0.05  #: what has come is taken this often, so that it need not wake anybody
-_COMMIT_NS: Final = nanoseconds(0.5)  #: what is older than this is in the file, if the disk can do it
-_REOPEN: Final = 4 * MB  #: bytes that must be free before another file is begun on a disk that was full
-_KEY_WAIT_NS: Final = nanoseconds(2.0)  #: so long a full file goes on, to end before a key picture
-_LOOK_NS: Final = nanoseconds(1.0)  #: how often the disk is looked at, and a file that can't be written tried again
+BEAT_S: Final = 0.05  #: period of polling the backlog, so that receiving threads need not wake the writer
+_COMMIT_NS: Final = nanoseconds(0.5)  #: samples older than this are in the file, unless the disk is too slow
+_REOPEN: Final = 4 * MB  #: bytes that must be free before a new file is opened on a disk that was full
+_KEY_WAIT_NS: Final = nanoseconds(2.0)  #: how long a full file is continued, to end before a key frame
+_LOOK_NS: Final = nanoseconds(1.0)  #: period of checking the disk, and of retrying a file that can't be written
 
 Tell = Callable[[str, Severity], None]
+_log = logging.getLogger(__name__)
 
 
 def free_space(folder: Path) -> int:
-    """Bytes. Raises ``OSError``."""
+    """Return the free bytes on a folder's disk.
+
+    Raises:
+        OSError: The disk can't be read.
+    """
     return shutil.disk_usage(folder).free
 
 
 class FileWriter:
-    """Writes a backlog to a file, or to one after the other. Any thread may look at its public attributes."""
+    """Writes a backlog to one file or to several in turn. Its public attributes may be read from any thread.
+
+    Attributes:
+        state: Whether it records.
+        reason: Why it is paused or has failed.
+        files: All files, oldest first.
+        room: What is written, by the space left on the disk.
+        unwritable: Samples that could not be translated.
+        unwritable_why: Channel and error of the last one.
+        dropped: Returns totals of dropped samples by drone and channel, for the end of each file.
+        missed: Returns totals of missed samples, the same way.
+        each_second: Called each second on the writing thread.
+    """
 
     def __init__(
         self,
@@ -52,10 +71,26 @@ class FileWriter:
         opener: Opener = open_target,
         free: Callable[[Path], int] = free_space,
     ) -> None:
+        """Initialise the writer without opening a file.
+
+        Args:
+            path: The first file.
+            options: How to write.
+            backlog: What is written.
+            drones: Metadata of the drones.
+            translators: One for each drone, in the same order.
+            clock: Relates monotonic and Unix time.
+            tell: Called with a text and its severity, on the writing thread (for the first file on that of
+                :meth:`start`).
+            opener: Opens a file.
+            free: Returns the free bytes of a folder's disk.
+        """
         self.state = RecorderState.STARTING
         self.reason = ""
         self.files: list[Path] = []
         self.room = Room.ALL
+        self.unwritable = 0  #: samples that could not be translated
+        self.unwritable_why = ""  #: channel and error of the last one
         self.dropped: Callable[[], dict[str, dict[str, int]]] = dict  #: totals for the end of each file
         self.missed: Callable[[], dict[str, dict[str, int]]] = dict
         self.each_second: Callable[[], None] = lambda: None
@@ -74,13 +109,17 @@ class FileWriter:
         self._closed_bytes = self._closed_messages = 0
         self._now_ns = clock.monotonic_ns
         self._opened_ns = self._commit_due_ns = self._look_due_ns = 0
-        self._due_ns = 0  # since when another file should have been begun
+        self._due_ns = 0  # since when a new file is due
         self._chains: dict[tuple[int, str], Chain] = {}  # H.264 of this file, by drone and channel
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="skyloop-recorder", daemon=True)
 
     def start(self) -> None:
-        """Open the first file and begin. Raises :class:`UsageError` where it can't be written."""
+        """Open the first file and start the thread.
+
+        Raises:
+            UsageError: The file can't be written, or the disk is too full.
+        """
         folder = self._path.parent
         try:
             free = self._free(folder)
@@ -96,42 +135,66 @@ class FileWriter:
         self._thread.start()
 
     def stop(self, timeout_s: float = 10.0) -> None:
-        """Write what has come and close the file. Idempotent. A disk that hangs longer is left to its thread."""
+        """Write what was received, and close the file. Idempotent.
+
+        Args:
+            timeout_s: How long to wait; a disk that hangs longer is left to the thread.
+        """
         self._closing.set()
         if self._thread.ident is not None:
             self._thread.join(timeout_s)
 
     @property
     def path(self) -> Path:
+        """The file that is written, or that was written last."""
         return self.files[-1] if self.files else self._path
 
     @property
     def bytes(self) -> int:
-        """In all files so far."""
+        """Bytes in all files so far."""
         file = self._file
         return self._closed_bytes + (0 if file is None else file.size)
 
     @property
     def messages(self) -> int:
-        """In all files so far."""
+        """Messages in all files so far."""
         file = self._file
         return self._closed_messages + (0 if file is None else file.count)
 
     # The thread ------------------------------------------------------------------------------------------------
 
     def _run(self) -> None:
+        try:
+            self._work()
+        except Exception as error:  # noqa: BLE001  (whatever it was, the state must not say that this still records)
+            self._fail(error)
+
+    def _work(self) -> None:
         due_s = time.monotonic()
         ending = False
         while not ending:
             due_s = max(due_s + BEAT_S, time.monotonic())
             ending = self._closing.wait(max(0.0, due_s - time.monotonic()))
             if ending:
-                self._look_due_ns = 0  # a last try, if it stands still, and the last counts
+                self._look_due_ns = 0  # a last retry if it is paused, and the last counts
             self.step(time.monotonic_ns())
         self._end()
 
+    def _fail(self, error: Exception) -> None:
+        """End after an unexpected error: report it, in the state first, and keep what was committed."""
+        self.state, self.reason = RecorderState.FAILED, f"an error in the recorder: {error!r:.300}"
+        _log.exception("the recording to %s ends", self.path)
+        file, self._file = self._file, None
+        with contextlib.suppress(Exception):
+            if file is not None:
+                file.abandon()
+                self._count(file)
+        with contextlib.suppress(Exception):
+            text = f"the recording to {self.path} has ended ({self.reason}): what was written stays, nothing is added"
+            self._tell(text, Severity.ERROR)
+
     def step(self, now_ns: int) -> None:
-        """Do what is due. Called by the thread, or by a test."""
+        """Do what is due at a time [ns, monotonic]. Called by the thread, or by a test."""
         self._now_ns = now_ns
         try:
             if now_ns >= self._look_due_ns:
@@ -145,7 +208,7 @@ class FileWriter:
             self._pause(_why(error))
 
     def _write(self) -> None:
-        """Translate and write all that waits, committing as it goes."""
+        """Translate and write all that waits, committing in between."""
         while taken := self._backlog.take(CHUNK):
             key = next((n for n, item in enumerate(taken) if _is_key(item)), None) if self._rotation_due() else None
             if key is None:
@@ -165,12 +228,23 @@ class FileWriter:
         file = self._file
         assert file is not None
         batch = [item for item in items if self._admits(item)]
-        self._uncommitted += batch  # first, so that nothing of the batch is lost when the disk fails in its midst
+        self._uncommitted += batch  # first, so that nothing is lost when the disk fails meanwhile
         for item in batch:
-            for message in self._translators[item.drone].messages(item):
+            for message in self._messages(item):
                 file.write(message)
         if sum(item.size for item in self._uncommitted) >= CHUNK:
             self._commit()
+
+    def _messages(self, item: Item) -> list[Message]:
+        """Translate a sample: all of it, or nothing if it can't be translated, whoever sent it."""
+        try:
+            return list(self._translators[item.drone].messages(item))
+        except Exception as error:  # noqa: BLE001  (samples hold what any application may send)
+            self._backlog.count(item)
+            self.unwritable += 1
+            self.unwritable_why = f"{item.channel}: {error!r:.200}"
+            _log.warning("a sample of %s can't be recorded: %r", item.channel, error)
+            return []
 
     def _admits(self, item: Item) -> bool:
         if item.rank is not Rank.FRAME or (self.room is Room.ALL and self._follows(item)):
@@ -179,7 +253,7 @@ class FileWriter:
         return False
 
     def _follows(self, item: Item) -> bool:
-        """Whether a picture can be decoded from what is in this file."""
+        """Whether a frame can be decoded from what is in this file."""
         if not isinstance(item.sample, Picture) or item.sample.record.format != H264:
             return True
         record = item.sample.record
@@ -201,7 +275,7 @@ class FileWriter:
         )
 
     def _rotate_when_due(self) -> None:
-        """Where there is H.264, :meth:`_write` does it at a key picture, unless none comes."""
+        """Start a new file when it is due; with H.264, :meth:`_write` does so at a key frame, unless none arrives."""
         if not self._rotation_due():
             return
         self._due_ns = self._due_ns or self._now_ns
@@ -216,7 +290,7 @@ class FileWriter:
 
     def _open(self) -> None:
         number = len(self.files) + 1
-        # What follows a pause has a name that was not asked for: it overwrites nothing.
+        # A file after a pause has a name that nobody chose: it must not overwrite anything.
         overwrite = self._options.overwrite and (number == 1 or self._options.rotates)
         first = number == 1 and not self._options.rotates
         path = self._path if first else self._next_free(number, overwrite)
@@ -259,7 +333,7 @@ class FileWriter:
         self._closed_messages += file.count
 
     def _pause(self, why: str) -> None:
-        """The disk does not do what it should. What was not committed waits for the next file."""
+        """Pause because the disk fails. What was not committed waits for the next file."""
         file, self._file = self._file, None
         if file is not None:
             file.abandon()
@@ -271,7 +345,7 @@ class FileWriter:
             self._tell(f"recording stands still ({why}): what was written stays, frames are lost", Severity.ERROR)
 
     def _look(self) -> None:
-        """How the disk and the file are."""
+        """Check the disk and the file."""
         file = self._file
         if file is not None and file.lost:
             self._pause(f"{file.path} was removed")
@@ -306,18 +380,21 @@ class FileWriter:
 
 
 def _is_key(item: Item) -> bool:
-    """Whether a stream of pictures that build on one another can begin here."""
+    """Whether a stream of frames that build on one another can start here."""
     sample = item.sample
     return isinstance(sample, Picture) and sample.record.format == H264 and sample.record.key
 
 
 def _why(error: OSError) -> str:
-    """For people."""
+    """Describe an error for people."""
     place = f": {error.filename}" if error.filename else ""
     return f"{error.strerror or error}{place}"
 
 
 def _version() -> str:
-    import skyloop
+    from importlib.metadata import PackageNotFoundError, version
 
-    return skyloop.__version__
+    try:
+        return version("skyloop")
+    except PackageNotFoundError:
+        return "0+unknown"

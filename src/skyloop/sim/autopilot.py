@@ -1,4 +1,4 @@
-"""The drones' own flight logic: takes commands, follows the table of states, sets the loops' set-points."""
+"""The drones' flight logic: handles commands, follows the table of states, sets the loops' set-points."""
 
 from __future__ import annotations
 
@@ -55,15 +55,18 @@ class Autopilot:
         self._warned: set[int] = set()
 
     def set_limits(self, drone: int, limits: Limits) -> None:
-        """From here on. A set-point in force is clamped only when it is given anew; the tilt, climb and altitude that
-        the loops themselves ask for follow at once."""
+        """Change a drone's limits.
+
+        A set-point in force is clamped only when it is given anew; the tilt, climb and altitude that the loops
+        themselves ask for follow at once.
+        """
         self.limits[drone] = limits
         self._loops.set_limits(drone, limits)
         if drone not in self._rising:
             self._loops.set_ceiling(drone, limits.altitude_m)
 
     def command(self, drone: int, action: AnyAction, time_s: float) -> AnyAction:
-        """Take a command; returns what was applied, :class:`Idle` where it was ignored."""
+        """Apply a command; return what was applied, :class:`Idle` where it was ignored."""
         if isinstance(action, Takeoff):
             if self._batteries.charge[drone] <= LOW_BATTERY:
                 return Idle()
@@ -84,18 +87,18 @@ class Autopilot:
         return Idle()
 
     def hover_here(self, drone: int, altitude_m: float, time_s: float) -> None:
-        """A drone in the air was put somewhere else: it holds that place, and has learnt nothing of the wind there."""
+        """Hover where a flying drone was moved to; it has learnt nothing of the wind there."""
         self._loops.start(drone, altitude_m)
         self._advance(drone, Happening.HOVER, Hover(), time_s)
 
     def supervise(self, time_s: float) -> None:
-        """Once a period of the loops: see who has reached the height of take-off."""
+        """End the take-off of drones that have reached its height; called once per period of the loops."""
         for drone, height in list(self._rising.items()):
             if self._sensors.altitude[drone] >= height - _HEIGHT_TOLERANCE_M:
                 self._advance(drone, Happening.HEIGHT_REACHED, Hover(), time_s)
 
     def watch_batteries(self, time_s: float) -> None:
-        """Now and then: land with a low battery, and fall with an empty one."""
+        """Land drones with a low battery, and stop those with an empty one; called now and then."""
         self._loops.set_strength(self._batteries.strength())
         low = (self._batteries.charge <= LOW_BATTERY).nonzero()[0].tolist()
         self._warned.intersection_update(low)  # who was given a fresh battery will be told anew
@@ -110,7 +113,7 @@ class Autopilot:
                 self._advance(drone, Happening.BATTERY_LOW, Land(), time_s)
 
     def feel(self, contacts: Contacts | None, time_s: float) -> None:
-        """Once a step: what was touched."""
+        """React to what was touched; called once per step."""
         if contacts is None:
             return
         for drone, speed, what in contacts.impacts:
@@ -182,7 +185,7 @@ class Autopilot:
 
 
 def clamp(action: Attitude | Velocity, limits: Limits) -> Attitude | Velocity:
-    """The set-point within the limits. The horizontal velocity keeps its direction."""
+    """Limit a set-point. The horizontal velocity keeps its direction."""
     yaw_rate = _within(action.yaw_rate, limits.yaw_rate_rad_s)
     if isinstance(action, Attitude):
         roll, pitch = _within(action.roll, limits.tilt_rad), _within(action.pitch, limits.tilt_rad)

@@ -1,5 +1,7 @@
-"""Batteries: charge and voltage under the power that the motors take, which goes with thrust to the power 3/2 (momentum
-theory of a rotor in hover)."""
+"""Batteries: charge and voltage under the motors' power, which grows with thrust to the power 3/2.
+
+Source: momentum theory of a rotor in hover.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,12 @@ from skyloop.sim.streams import Floats
 
 
 class Batteries:
-    """``charge``: what is left, 0 to 1, (n,). ``voltage``: at the terminals, (n,) [V]."""
+    """The drones' batteries.
+
+    Attributes:
+        charge: What is left, 0 to 1, (n,).
+        voltage: At the terminals, (n,) [V].
+    """
 
     def __init__(self, parameters: Sequence[VehicleParameters], charge: Floats) -> None:
         self.charge = charge.copy()
@@ -26,14 +33,14 @@ class Batteries:
         self.voltage = self._open_voltage()
 
     def drain(self, thrust: Floats, period_s: float) -> None:
-        """Take what ``thrust`` (per mass, (n,) [m/s²]) costs over a period."""
+        """Discharge by what ``thrust`` (per mass, (n,) [m/s²]) takes over a period."""
         power = self._hover * (thrust / GRAVITY_M_S2) ** 1.5 + self._electronics
         current = power / np.maximum(self.voltage, 1.0)
         np.maximum(self.charge - current * period_s / self._capacity, 0.0, out=self.charge)
         self.voltage = self._open_voltage() - current * self._resistance
 
     def strength(self) -> Floats:
-        """Share of the full battery's thrust that the motors can still give, (n,): thrust goes with voltage squared."""
+        """Return the share of the full battery's thrust that is left, (n,): thrust grows with voltage squared."""
         share: Floats = np.clip(self.voltage / self._full, 0.0, 1.0) ** 2
         return share
 

@@ -1,4 +1,4 @@
-"""Cameras of simulated drones: geometry of lens and mounting, rate, delay and the flaws of the sensor.
+"""Cameras of simulated drones: lens and mounting, rate, latency and the flaws of the sensor.
 
 Pixels follow OpenCV: x right, y down, the centre of the top left pixel at (0, 0). Optical axes: x right, y down, z
 forward. Body axes: x forward, y left, z up. A rotation "body from optical" turns optical into body vectors.
@@ -19,18 +19,20 @@ Vec3 = tuple[float, float, float]
 Rotation9 = tuple[float, float, float, float, float, float, float, float, float]
 Distortion = tuple[float, float, float, float, float]
 
-#: Body from optical of a camera that looks forward, level, with the picture's top up.
+#: Body from optical of a camera that looks forward, level, with the image's top up.
 LOOKING_FORWARD: Rotation9 = (0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0)
-#: Body from optical of a camera that looks straight down, with the picture's top forward.
+#: Body from optical of a camera that looks straight down, with the image's top forward.
 LOOKING_DOWN: Rotation9 = (0.0, -1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0)
 
 
 @dataclass(frozen=True, slots=True)
 class CameraPose:
-    """Where a camera is in the world.
+    """The pose of a camera in the world.
 
-    ``position_m``: optical centre, shape (3,). ``rotation``: world from optical axes, shape (3, 3). ``drone``: number
-    of the drone that carries it, whose own body the picture leaves out; None for a camera of its own.
+    Attributes:
+        position_m: Optical centre, shape (3,).
+        rotation: World from optical axes, shape (3, 3).
+        drone: Number of the drone that carries it, whose own body is not rendered; None for a free camera.
     """
 
     position_m: NDArray[np.float64]
@@ -42,7 +44,8 @@ class CameraPose:
 class CameraModel:
     """A camera as it is mounted on a drone.
 
-    Raises :class:`~skyloop.errors.UsageError` for values that no camera has.
+    Raises:
+        UsageError: A value is out of its range.
     """
 
     name: str
@@ -56,9 +59,9 @@ class CameraModel:
     distortion: Distortion = (0.0, 0.0, 0.0, 0.0, 0.0)  #: k1, k2, p1, p2, k3 as OpenCV orders them
     position_m: Vec3 = (0.0, 0.0, 0.0)  #: of the optical centre in body axes
     rotation: Rotation9 = LOOKING_FORWARD  #: body from optical, row by row
-    latency_s: float = 0.0  #: from the middle of the exposure until the picture is handed out
+    latency_s: float = 0.0  #: from the middle of the exposure until the frame is delivered
     noise_sigma: float = 0.0  #: of each channel of each pixel, in steps of 0 … 255
-    exposure_s: float = 0.0  #: how long the shutter is open, which is what blurs a turning drone's picture
+    exposure_s: float = 0.0  #: how long the shutter is open, which blurs the image of a turning drone
     exposure_gain: float = 1.0  #: brightness relative to the scene's own
     vignetting: float = 0.0  #: share of the light that is lost in the corners, 0 … 1
 
@@ -97,12 +100,12 @@ class CameraModel:
         return any(k != 0.0 for k in self.distortion)
 
     def intrinsics(self) -> Intrinsics:
-        """As it travels with each frame."""
+        """Return the intrinsics, as each frame carries them."""
         distortion = self.distortion if self.distorted else ()
         return Intrinsics(fx=self.fx, fy=self.fy, cx=self.cx, cy=self.cy, distortion=distortion)
 
     def info(self) -> CameraInfo:
-        """As a driver describes it before the first frame."""
+        """Return the camera's description, as a driver gives it before the first frame."""
         return CameraInfo(
             name=self.name,
             width=self.width,
@@ -116,12 +119,22 @@ class CameraModel:
     def pose(
         self, body_position_m: NDArray[np.float64], body_rotation: NDArray[np.float64], drone: int | None = None
     ) -> CameraPose:
-        """Where the camera is when its drone's body is at a position (3,) with a world-from-body rotation (3, 3)."""
+        """Return the camera's pose for a pose of its drone.
+
+        Args:
+            body_position_m: World axes, shape (3,).
+            body_rotation: World from body, shape (3, 3).
+            drone: Number of the drone that carries it.
+        """
         position = np.asarray(body_position_m, dtype=np.float64) + body_rotation @ np.asarray(self.position_m)
         return CameraPose(position, body_rotation @ self.rotation_matrix, drone)
 
     def scaled(self, factor: float) -> CameraModel:
-        """The same lens over a picture of another size: factor 2 turns 320×240 into 640×480."""
+        """Return the same lens over an image of another size: factor 2 turns 320×240 into 640×480.
+
+        Raises:
+            UsageError: The factor is not finite and above 0.
+        """
         if not (math.isfinite(factor) and factor > 0.0):
             raise UsageError(f"a camera can't be scaled by {factor}; the factor must be finite and above 0")
         return replace(
@@ -135,15 +148,23 @@ class CameraModel:
         )
 
     def project(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Pixels, shape (n, 2), of points in optical axes [m], shape (n, 3), all in front of the camera (z > 0)."""
+        """Project points into the image.
+
+        Args:
+            points: In optical axes [m], shape (n, 3), all in front of the camera (z > 0).
+
+        Returns:
+            Pixels, shape (n, 2).
+        """
         points = np.asarray(points, dtype=np.float64)
         bent = distort(points[:, :2] / points[:, 2:], self.distortion)
         return bent * (self.fx, self.fy) + (self.cx, self.cy)
 
     def rays(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """x/z and y/z in optical axes of what pixels see, both of shape (n, 2).
+        """Return x/z and y/z in optical axes of what pixels see, both of shape (n, 2).
 
-        Raises :class:`~skyloop.errors.UsageError` where the distortion folds the picture over itself.
+        Raises:
+            UsageError: The distortion folds the image over itself.
         """
         bent = (np.asarray(pixels, dtype=np.float64) - (self.cx, self.cy)) / (self.fx, self.fy)
         straight = undistort(bent, self.distortion) if self.distorted else bent
@@ -153,7 +174,7 @@ class CameraModel:
 
 
 def distort(points: NDArray[np.float64], distortion: Distortion) -> NDArray[np.float64]:
-    """Where a lens puts x/z, y/z, shape (n, 2). Source: the Brown-Conrady model as in OpenCV's ``calib3d``."""
+    """Return where a lens maps x/z, y/z, shape (n, 2). Source: the Brown-Conrady model as in OpenCV's ``calib3d``."""
     k1, k2, p1, p2, k3 = distortion
     x, y = points[:, 0], points[:, 1]
     r2 = x * x + y * y

@@ -1,8 +1,4 @@
-"""What happens when drones meet the floor, solid things and one another: they are put outside, bounce and rub.
-
-Most of the time nothing is near, so each drone is looked at again only when it could have reached something: from its
-clearance, its speed, and a bound on acceleration follows a step before which it can't.
-"""
+"""Collisions of drones with the floor, solid things and one another: contact, bounce and friction."""
 
 from __future__ import annotations
 
@@ -27,8 +23,13 @@ _FAR_STEPS = 250
 
 @dataclass(slots=True)
 class Contacts:
-    """What was touched in a step. ``standing``: drones with something under their feet that is no drone. ``upon``:
-    drones on drones, the upper one first. ``impacts``: drone, speed along the normal [m/s], and what it met."""
+    """What was touched in a step.
+
+    Attributes:
+        standing: Drones with something under their feet that is no drone.
+        upon: Drones on drones, the upper one first.
+        impacts: Drone, speed along the normal [m/s], and what it met.
+    """
 
     standing: set[int] = field(default_factory=set)
     upon: list[tuple[int, int]] = field(default_factory=list)
@@ -36,7 +37,7 @@ class Contacts:
 
 
 class Collisions:
-    """Keeps drones out of solids and of one another, one call a step."""
+    """Keeps drones out of solids and of one another; called once per step."""
 
     def __init__(self, parameters: Sequence[VehicleParameters], bodies: Bodies, solids: Solids) -> None:
         self._bodies = bodies
@@ -51,7 +52,7 @@ class Collisions:
         self._free = bodies.position.copy()  # where each drone last was clear of all that doesn't move
 
     def resolve(self, step: int) -> Contacts | None:
-        """Put right what the last step of the bodies made overlap; None when nothing touched anything."""
+        """Resolve the overlaps of the last step; return the contacts, or None without any."""
         contacts: Contacts | None = None
         low = self._bodies.position[2] < self._hull[2]
         if low.any():
@@ -111,9 +112,12 @@ class Collisions:
         self._bodies.position[:, drone] = position
 
     def _wedge(self, drone: int, height: float, climb: float, contacts: Contacts) -> Floats:
-        """Where a drone is that is pressed so that pushing it out of one thing leads into another: across where it was
-        clear, and upright on its way, for nothing that it is wedged between holds it there. It rubs on nothing: what
-        presses it would grow without end in a narrow enough corner, and hold it in the air for ever."""
+        """Return the position of a drone that is wedged, so that pushing it out of one thing leads into another.
+
+        It is across where it was clear, and free vertically, for nothing that it is wedged between holds it there. It
+        has no friction: what presses it would grow without end in a narrow enough corner, and hold it in the air for
+        ever.
+        """
         velocity, free = self._bodies.velocity[:, drone], self._free[:, drone]
         position = np.array([free[0], free[1], height])
         velocity[:] = 0.0, 0.0, climb

@@ -1,11 +1,4 @@
-"""The firmware's outer loops: from set-points and what the vehicle believes to attitude and thrust, for all drones.
-
-Altitude is held by a reference that moves with the commanded climb rate. A landing drone that something holds, such as
-a wall that what it has learnt about the wind presses it to, or the air between the rotors and the floor, grows heavier
-until it gives way. Horizontal velocity is a PI loop; its integral is kept in world axes, so that what it has learnt
-about the wind stays right while the drone turns, and since the integral of the velocity is a way, it also holds the
-place.
-"""
+"""The firmware's outer loops: from set-points and estimates to attitude and thrust, for all drones."""
 
 from __future__ import annotations
 
@@ -28,7 +21,7 @@ _MOST_INTEGRAL_M_S2 = 3.0  # a drone that is held by a wall stops learning here
 
 
 class ControlLoops:
-    """Set-points and state of the loops, one column a drone. Written by the flight logic between updates."""
+    """Set-points and state of the loops, one column per drone. Written by the flight logic between updates."""
 
     def __init__(
         self, parameters: Sequence[VehicleParameters], limits: Sequence[Limits], bodies: Bodies, period_s: float
@@ -60,54 +53,55 @@ class ControlLoops:
             self.set_ceiling(drone, limit.altitude_m)
 
     def set_limits(self, drone: int, limits: Limits) -> None:
+        """Change a drone's limits."""
         self._tilt_limit[drone] = limits.tilt_rad
         self._climb_limit[drone] = limits.climb_m_s
 
     def set_ceiling(self, drone: int, altitude_m: float) -> None:
-        """The altitude that the reference doesn't pass."""
+        """Set the greatest altitude of the reference [m]."""
         self._ceiling[drone] = altitude_m
 
     def set_strength(self, share: Floats) -> None:
-        """What is left of the full thrust, (n,)."""
+        """Set the share of the full thrust that is left, (n,)."""
         np.multiply(self._full_thrust, share, out=self.most_thrust)
 
     def follow_velocity(self, drone: int, forward: float, left: float, climb: float, yaw_rate: float) -> None:
-        """Levelled body axes [m/s], yaw rate [rad/s]."""
+        """Follow a velocity: levelled body axes [m/s], yaw rate [rad/s]."""
         self._set_point[:, drone] = (forward, left, climb, yaw_rate)
         self._by_velocity[drone] = True
         self._landing[drone] = False
 
     def follow_attitude(self, drone: int, roll: float, pitch: float, climb: float, yaw_rate: float) -> None:
-        """Roll right side down, pitch nose down [rad], climb [m/s], yaw rate [rad/s]."""
+        """Follow an attitude: roll right side down, pitch nose down [rad], climb [m/s], yaw rate [rad/s]."""
         self._set_point[:, drone] = (roll, pitch, climb, yaw_rate)
         self._by_velocity[drone] = False
         self._landing[drone] = False
 
     def land(self, drone: int, descent_m_s: float) -> None:
-        """Descend on the spot, whatever holds it."""
+        """Descend on the spot, whatever set-point was in force."""
         self.follow_velocity(drone, 0.0, 0.0, -descent_m_s, 0.0)
         self._landing[drone] = True
         self._behind[drone] = 0.0
 
     def start(self, drone: int, altitude_m: float) -> None:
-        """The motors run from here on, the altitude reference starts at what the vehicle believes."""
+        """Start the motors, with the altitude reference at ``altitude_m``, the estimated altitude."""
         self._running[drone] = 1.0
         self._reference[drone] = altitude_m
         self._integral[:, drone] = 0.0
         self._bodies.steady(drone)
 
     def stop(self, drone: int) -> None:
-        """The motors stop."""
+        """Stop the motors."""
         self._running[drone] = 0.0
         self._landing[drone] = False
         self._bodies.cut(drone)
 
     def rest(self, drone: int) -> None:
-        """The legs are on the ground, and hold the body level."""
+        """Rest on the legs, which hold the body level."""
         self._bodies.steady(drone)
 
     def update(self, sensors: Sensors) -> None:
-        """Work out the commands of the attitude loops and motors for one period."""
+        """Compute the commands of the attitude loops and motors for one period."""
         command = self._bodies.attitude_command
         roll, pitch = self._level_tilts(sensors.velocity)
         np.copyto(command[:2], self._set_point[:2])

@@ -1,12 +1,4 @@
-"""Quadrotors in flight: all drones at once, one array column each, in fixed steps.
-
-The attitude loops and the motors behind them are one second-order response an axis in roll and pitch and a first-order
-one in yaw rate, on Euler angles (Z-Y-X, REP 103), as the "so_rpy" models of crazyflow fit to real drones: a model that
-can be identified from flights. It is meant for tilts up to some 60°; there are no flips. Translation is Newton's: the
-thrust along body z, gravity, and linear and quadratic drag against the air.
-
-Everything works in place on arrays made once: at one drone, allocating would cost more than calculating.
-"""
+"""Dynamics of quadrotors: all drones at once, one array column each, in fixed steps."""
 
 from __future__ import annotations
 
@@ -24,17 +16,22 @@ _MOST_TILTING_AIRSPEED_M_S = 3.0  # the air tilts no further beyond: no recordin
 
 
 def column(parameters: Sequence[VehicleParameters], value: Callable[[VehicleParameters], float]) -> Floats:
-    """One value a drone, shape (drones,)."""
+    """Return one value per drone, shape (drones,)."""
     return np.array([value(p) for p in parameters], dtype=np.float64)
 
 
 class Bodies:
-    """State of the bodies. Rows are axes, columns drones.
+    """State and inputs of the bodies. Rows are axes, columns drones.
 
-    ``position``, ``velocity``: of the body's centre, world axes, (3, n) [m, m/s]. ``angles``: roll, pitch, yaw, (3, n)
-    [rad], yaw not wrapped; ``rates``: their derivatives. ``thrust``: per mass, (n,) [m/s²]. Inputs, which others write:
-    ``attitude_command``: roll, pitch [rad] and yaw rate [rad/s], (3, n); ``thrust_command``: per mass, (n,); ``air``:
-    velocity of the air, (3, n).
+    Attributes:
+        position: Of the body's centre, world axes, (3, n) [m].
+        velocity: Of the body's centre, world axes, (3, n) [m/s].
+        angles: Roll, pitch, yaw, (3, n) [rad]; yaw is not wrapped.
+        rates: Derivatives of the angles.
+        thrust: Per mass, (n,) [m/s²].
+        attitude_command: Input: roll, pitch [rad] and yaw rate [rad/s], (3, n).
+        thrust_command: Input: per mass, (n,).
+        air: Input: velocity of the air, (3, n).
     """
 
     def __init__(self, parameters: Sequence[VehicleParameters], positions: Floats, yaws: Floats) -> None:
@@ -82,17 +79,17 @@ class Bodies:
         self._ground_effect = column(parameters, lambda p: p.ground_effect**0.5 * p.rotor_radius_m / 4)
 
     def cut(self, drone: int) -> None:
-        """The motors stop: nothing holds the attitude any more."""
+        """Stop the motors: nothing holds the attitude any more."""
         self._stiff[:, drone] = 0.0
         self.attitude_command[:, drone] = 0.0
         self.thrust_command[drone] = 0.0
 
     def steady(self, drone: int) -> None:
-        """Running motors hold the attitude again, or the legs on the ground do."""
+        """Hold the attitude again, by running motors or by legs on the ground."""
         self._stiff[:, drone] = self._stiff_running[:, drone]
 
     def put(self, drone: int, position_m: Floats, yaw_rad: float, thrust: float) -> None:
-        """Level and at rest somewhere else, shape (3,) [m]; ``thrust`` is an acceleration [m/s²]."""
+        """Move a body, level and at rest; ``position_m`` has shape (3,), ``thrust`` is an acceleration [m/s²]."""
         self.position[:, drone] = position_m
         for still in (self.velocity, self.velocity_before, self.angles, self.rates):
             still[:, drone] = 0.0
@@ -102,7 +99,7 @@ class Bodies:
         np.cos(self.angles, out=self.cos)
 
     def step(self) -> None:
-        """Go on by :data:`STEP_S`, as if nothing were in the way."""
+        """Advance by :data:`STEP_S`, without collisions."""
         self._turn()
         acceleration = self._accelerate()
         np.copyto(self.velocity_before, self.velocity)
@@ -184,7 +181,7 @@ class Bodies:
 
 
 def specific_force(bodies: Bodies) -> Floats:
-    """What ideal accelerometers on the drones read, body axes, shape (3, n) [m/s²]: at rest, +g along z."""
+    """Return what ideal accelerometers on the drones measure, body axes, shape (3, n) [m/s²]: at rest, +g along z."""
     change = (bodies.velocity - bodies.velocity_before) / STEP_S
     change[2] += GRAVITY_M_S2
     force: Floats = np.einsum("nji,jn->in", rotations(bodies.sin, bodies.cos), change)
@@ -192,7 +189,7 @@ def specific_force(bodies: Bodies) -> Floats:
 
 
 def body_rates(bodies: Bodies) -> Floats:
-    """Angular velocities about the bodies' axes, shape (3, n) [rad/s], from the rates of the Euler angles."""
+    """Return angular velocities about the bodies' axes, shape (3, n) [rad/s], from the rates of the Euler angles."""
     roll_rate, pitch_rate, yaw_rate = bodies.rates
     sin_roll, sin_pitch, _ = bodies.sin
     cos_roll, cos_pitch, _ = bodies.cos
@@ -206,7 +203,7 @@ def body_rates(bodies: Bodies) -> Floats:
 
 
 def rotations(sin: Floats, cos: Floats) -> Floats:
-    """World-from-body rotations, shape (n, 3, 3), from sines and cosines of roll, pitch, yaw, each (3, n)."""
+    """Return world-from-body rotations, (n, 3, 3), from sines and cosines of roll, pitch, yaw, each (3, n)."""
     sr, sp, sy = sin
     cr, cp, cy = cos
     rows = [

@@ -1,5 +1,7 @@
-"""The autopilot's flight states as a table: what leads from which state to which. A pair that isn't here is ignored, as
-firmware ignores what doesn't fit."""
+"""The autopilot's flight states as a table: what leads from which state to which.
+
+A pair that is not in the table is ignored, as firmware ignores what does not fit.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,7 @@ from skyloop.messages import FlightState
 
 
 class Happening(Enum):
-    """What a state can change by: the pilot's commands first, then what the vehicle notices itself."""
+    """What changes a state: the pilot's commands first, then what the vehicle notices itself."""
 
     TAKEOFF = auto()
     LAND = auto()
@@ -59,5 +61,5 @@ TRANSITIONS: dict[FlightState, dict[Happening, FlightState]] = {
 
 
 def next_state(state: FlightState, happening: Happening) -> FlightState | None:
-    """The state that follows, or None where the happening is ignored."""
+    """Return the state that follows, or None where the happening is ignored."""
     return TRANSITIONS[state].get(happening)

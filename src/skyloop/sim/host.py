@@ -1,4 +1,4 @@
-"""A world with its drones that keeps time and is drawn, for those who ride on the drones."""
+"""A world with its drones that keeps time and is rendered, for the observers of the drones: drivers and emulators."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from skyloop.sim.world import TargetState, Wind
 
 if TYPE_CHECKING:
     from skyloop.sim.camera import CameraModel
-    from skyloop.sim.studio import Camera, Exposing, Screen
+    from skyloop.sim.camera_pipeline import Camera, Exposing, Screen
 
-TICK_S: Final = 0.008  #: of the clock: steps are done in bunches of so much
+TICK_S: Final = 0.008  #: simulated time of the steps that are done at once
 
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """A drone at one instant."""
+    """A drone's estimated and true state, and the targets, at one time."""
 
     believed: VehicleFeedback
     truth: VehicleTruth
@@ -34,7 +34,7 @@ class Report:
     captured_ns: int
 
 
-class Passenger(Protocol):
+class Observer(Protocol):
     """What a host calls, on the thread that steps the world. Must return quickly and never raise."""
 
     def report(self, report: Report) -> None: ...
@@ -44,20 +44,35 @@ class Passenger(Protocol):
     def wants(self, camera: str) -> bool: ...
 
     def failed(self, error: Exception) -> None:
-        """The simulation broke: nothing more will come."""
+        """Handle the failure of the simulation: nothing more will be reported."""
 
 
 class SimHost:
-    """Several drones in one world, numbered from 0, each for one :class:`Passenger`: a driver, or emulated firmware.
+    """Several drones in one world, numbered from 0, each for one :class:`Observer`: a driver, or emulated firmware.
 
-    The world is stepped while at least one of them is aboard. Raises :class:`UsageError` for a world that does
-    not exist, can't be read, or has no place for so many drones.
+    The world is stepped while at least one observer is attached.
+
+    Attributes:
+        options: Of the world and its drones.
+        wind: The present wind.
+        simulation: The world.
     """
 
     def __init__(self, options: SimOptions | None = None, drones: int = 1) -> None:
+        """Load the world and place the drones.
+
+        Args:
+            options: Of the world and its drones; None takes the defaults.
+            drones: How many.
+
+        Raises:
+            UsageError: The world has no place for so many drones.
+            UnknownNameError: There is no such world.
+            FileFormatError: The world's file is invalid.
+        """
         self.options = options or SimOptions()
         world = self.options.load_world()
-        self.wind = self.options.blowing(world.wind)  #: what blows at present
+        self.wind = self.options.blowing(world.wind)  #: the present wind
         self.simulation = Simulation(
             world,
             drones,
@@ -67,65 +82,80 @@ class SimHost:
             wind=self.wind,
         )
         self._lock = threading.Lock()
-        self._passengers: dict[int, tuple[Passenger, tuple[Camera, ...]]] = {}  # replaced as a whole, never changed
-        self._runner: Runner | None = None
+        self._observers: dict[int, tuple[Observer, tuple[Camera, ...]]] = {}  # replaced as a whole, never changed
+        self._stepper: Stepper | None = None
 
     @property
     def drones(self) -> int:
-        """How many there are."""
+        """The number of drones."""
         return self.simulation.drones
 
     def set_wind(self, wind: Wind) -> None:
-        """Another wind from now on, for all drones."""
+        """Change the wind, for all drones."""
         self.wind = wind
         self.simulation.set_wind(wind)
 
-    def board(self, drone: int, passenger: Passenger, screen: Screen, models: list[CameraModel]) -> tuple[Camera, ...]:
-        """Begin to tell a passenger about a drone and to draw its cameras; the first one starts the world.
+    def attach(self, drone: int, observer: Observer, screen: Screen, models: list[CameraModel]) -> tuple[Camera, ...]:
+        """Report about a drone to an observer from now on, and render its cameras; the first observer starts the world.
 
-        Raises :class:`UsageError` if there is no such drone or somebody else has it,
-        :class:`skyloop.errors.MissingExtraError` or :class:`skyloop.errors.UnsupportedError` if cameras are wanted and
-        what draws is not installed.
+        Args:
+            drone: Its number.
+            observer: Called on the thread that steps the world.
+            screen: Gets the cameras' frames, on the thread that renders.
+            models: The drone's cameras.
+
+        Returns:
+            The cameras.
+
+        Raises:
+            UsageError: There is no such drone, or it has an observer already.
+            MissingExtraError: Cameras are wanted, and the renderer is not installed.
+            UnsupportedError: Cameras are wanted, and the renderer does not work here.
         """
         if not 0 <= drone < self.drones:
             raise UsageError(f"no drone {drone}: they are numbered from 0 to {self.drones - 1}")
         with self._lock:
-            if drone in self._passengers:
+            if drone in self._observers:
                 raise UsageError(f"drone {drone} of this world is taken already")
             cameras = self._cameras(drone, screen, models)
-            self._passengers = {**self._passengers, drone: (passenger, cameras)}
-            if self._runner is None:
-                self._runner = self._make_runner()
+            self._observers = {**self._observers, drone: (observer, cameras)}
+            if self._stepper is None:
+                self._stepper = self._make_stepper()
             return cameras
 
-    def leave(self, drone: int, passenger: Passenger) -> None:
-        """Nothing more is told to this passenger when this returns; the last one to leave stops the world."""
+    def detach(self, drone: int, observer: Observer) -> None:
+        """Stop reporting to an observer; on return no report is under way. The last observer stops the world.
+
+        Args:
+            drone: Its number.
+            observer: The one that was attached; any other is ignored.
+        """
         with self._lock:
-            entry = self._passengers.get(drone)
-            runner = self._runner
-            if entry is None or entry[0] is not passenger or runner is None:
+            entry = self._observers.get(drone)
+            stepper = self._stepper
+            if entry is None or entry[0] is not observer or stepper is None:
                 return
-            self._passengers = {n: other for n, other in self._passengers.items() if n != drone}
-            last = not self._passengers
+            self._observers = {n: other for n, other in self._observers.items() if n != drone}
+            last = not self._observers
             if last:
-                self._runner = None
+                self._stepper = None
         if last:
-            runner.stop()
+            stepper.stop()
         else:
-            runner.forget(entry[1])
+            stepper.forget(entry[1])
 
     @property
-    def passengers(self) -> dict[int, tuple[Passenger, tuple[Camera, ...]]]:
-        """Who is told about which drone, and its cameras."""
-        return self._passengers
+    def observers(self) -> dict[int, tuple[Observer, tuple[Camera, ...]]]:
+        """By drone: its observer and its cameras."""
+        return self._observers
 
-    def _make_runner(self) -> Runner:
-        return _Threads(self)
+    def _make_stepper(self) -> Stepper:
+        return _RealTimeStepper(self)
 
     def _cameras(self, drone: int, screen: Screen, models: list[CameraModel]) -> tuple[Camera, ...]:
         if not models:
             return ()
-        from skyloop.sim.studio import Camera, Shutter, require_renderer
+        from skyloop.sim.camera_pipeline import Camera, Shutter, require_renderer
 
         require_renderer(self.options.renderer)
         cameras = []
@@ -137,72 +167,82 @@ class SimHost:
         return tuple(cameras)
 
 
-class Runner(Protocol):
-    """What moves a host's world while somebody is aboard."""
+class Stepper(Protocol):
+    """What steps a host's world while an observer is attached."""
 
     def stop(self) -> None: ...
 
     def forget(self, cameras: tuple[Camera, ...]) -> None:
-        """When this returns the round of telling that was under way is over, and no picture of these cameras comes."""
+        """Wait for the round of reports that is under way; afterwards no frame of these cameras is delivered."""
 
 
-class Teller:
-    """What the passengers of a host are told, and which pictures are taken, after each bunch of steps."""
+class ReportPublisher:
+    """Reports to the observers of a host, and exposes the cameras that are due, after each bunch of steps."""
 
-    def __init__(self, host: SimHost, make_studio: Callable[[], Exposing]) -> None:
-        self.studio: Exposing | None = None  #: made when the first picture is wanted
+    def __init__(self, host: SimHost, make_pipeline: Callable[[], Exposing]) -> None:
+        """Initialise the publisher.
+
+        Args:
+            host: Whose observers are reported to.
+            make_pipeline: Creates the pipeline of cameras when the first frame is wanted.
+        """
+        self.pipeline: Exposing | None = None  #: created when the first frame is wanted
         self._host = host
-        self._make_studio = make_studio
+        self._make_pipeline = make_pipeline
         self._period_ns = nanoseconds(1.0 / host.options.rate_hz)
         self._report_ns = 0
 
-    def tell(self, captured_ns: int) -> None:
-        """``captured_ns``: what it is on the passengers' clock."""
-        simulation, passengers = self._host.simulation, self._host.passengers
+    def publish(self, captured_ns: int) -> None:
+        """Publish what is due.
+
+        Args:
+            captured_ns: The time of the simulation's state, on the observers' clock.
+        """
+        simulation, observers = self._host.simulation, self._host.observers
         for occurrence in simulation.take_occurrences():
-            if occurrence.drone in passengers:
-                passengers[occurrence.drone][0].happened(occurrence)
+            if occurrence.drone in observers:
+                observers[occurrence.drone][0].happened(occurrence)
         if captured_ns >= self._report_ns:
             self._report_ns = max(self._report_ns + self._period_ns, captured_ns)
             targets = simulation.target_states()
-            for drone, (passenger, _) in passengers.items():
+            for drone, (observer, _) in observers.items():
                 report = Report(simulation.feedback(drone), simulation.truth(drone), targets, captured_ns)
-                passenger.report(report)
+                observer.report(report)
         self._expose(simulation.time_s, captured_ns)
 
     def _expose(self, now_s: float, captured_ns: int) -> None:
         due = [
             camera
-            for passenger, cameras in self._host.passengers.values()
+            for observer, cameras in self._host.observers.values()
             for camera in cameras
-            if camera.shutter.due(now_s, camera.model.fps) and passenger.wants(camera.model.name)
+            if camera.shutter.due(now_s, camera.model.fps) and observer.wants(camera.model.name)
         ]
         if not due:
             return
+        from skyloop.sim.camera_pipeline import expose
         from skyloop.sim.render import SceneState
-        from skyloop.sim.studio import expose
 
-        if self.studio is None:
-            self.studio = self._make_studio()
+        if self.pipeline is None:
+            self.pipeline = self._make_pipeline()
         simulation = self._host.simulation
         positions, rotations = simulation.poses()
         state = SceneState(positions, rotations, simulation.target_states())
         rates = {camera.drone: np.array(simulation.truth(camera.drone).angular_velocity_rad_s) for camera in due}
         speed = self._host.options.speed
-        self.studio.expose([expose(camera, state, rates[camera.drone], captured_ns, speed) for camera in due])
+        self.pipeline.expose([expose(camera, state, rates[camera.drone], captured_ns, speed) for camera in due])
 
 
-class _Threads:
-    """A world in real time: one thread steps it and tells, one draws."""
+class _RealTimeStepper:
+    """A world in real time: one thread steps it and reports, one draws."""
 
     def __init__(self, host: SimHost) -> None:
         self._host = host
         self._simulation = host.simulation
         self._pacer = Pacer(self._simulation.step, speed=host.options.speed)
         self._begun_s = self._simulation.time_s
-        self._teller = Teller(host, self._start_studio)
+        self._publisher = ReportPublisher(host, self._start_pipeline)
         self._stop = threading.Event()
-        self._telling = threading.Lock()
+        self._publishing = threading.Lock()
         self._thread = threading.Thread(target=self._run, name="skyloop-sim", daemon=True)
         self._thread.start()
 
@@ -210,29 +250,29 @@ class _Threads:
         self._stop.set()
         if self._thread is not threading.current_thread():
             self._thread.join()
-        if self._teller.studio is not None:
-            self._teller.studio.stop()
+        if self._publisher.pipeline is not None:
+            self._publisher.pipeline.stop()
 
     def forget(self, cameras: tuple[Camera, ...]) -> None:
         if self._thread is not threading.current_thread():
-            with self._telling:
+            with self._publishing:
                 pass
-        if self._teller.studio is not None:
-            self._teller.studio.forget(cameras)
+        if self._publisher.pipeline is not None:
+            self._publisher.pipeline.forget(cameras)
 
     def _run(self) -> None:
         try:
             while not self._stop.wait(max(self._pacer.run_due(), TICK_S)):
-                with self._telling:
-                    self._teller.tell(self._pacer.clock_ns(self._simulation.time_s - self._begun_s))
-        except Exception as error:  # noqa: BLE001  told to every driver; a thread that dies in silence helps nobody
-            for passenger, _ in self._host.passengers.values():
-                passenger.failed(error)
+                with self._publishing:
+                    self._publisher.publish(self._pacer.clock_ns(self._simulation.time_s - self._begun_s))
+        except Exception as error:  # noqa: BLE001  reported to every driver, so that the thread does not die silently
+            for observer, _ in self._host.observers.values():
+                observer.failed(error)
 
-    def _start_studio(self) -> Exposing:
-        from skyloop.sim.studio import Studio
+    def _start_pipeline(self) -> Exposing:
+        from skyloop.sim.camera_pipeline import CameraPipeline
 
         options = self._host.options
-        studio = Studio(self._simulation.world, self._host.drones, options.renderer, options.quality)
-        studio.start()
-        return studio
+        pipeline = CameraPipeline(self._simulation.world, self._host.drones, options.renderer, options.quality)
+        pipeline.start()
+        return pipeline

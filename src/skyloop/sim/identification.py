@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from skyloop.errors import FileFormatError, UsageError
+from skyloop.files import read_text
 from skyloop.messages import Attitude, Takeoff
 from skyloop.sim.dynamics import STEP_S
 from skyloop.sim.parameters import Limits, VehicleParameters, with_ideal_sensors
@@ -29,6 +30,7 @@ from skyloop.sim.world_file import parse_world
 #: How long after the beginning of a step the vehicles are compared.
 WINDOW_S = 3.0
 #: The recorded drone sends samples so often.
+_MAX_BYTES = 16 << 20  # of a track; an hour at 200 Hz takes 15 MB
 SAMPLE_PERIOD_S = 0.005
 #: Half a command and a whole one tilted the recorded drone equally far: from this magnitude on it tilts fully.
 FULL_TILT_COMMAND = 0.5
@@ -45,15 +47,21 @@ class Track:
     values: Floats
 
     def between(self, begin_s: float, end_s: float) -> Track:
-        """The samples from a time to another."""
+        """Return the samples from one time to another."""
         chosen = (self.times_s >= begin_s) & (self.times_s <= end_s)
         return Track(self.times_s[chosen], self.values[chosen])
 
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """A flight. ``command``: as recorded, but nose down positive; ``pitch``: nose down positive [rad]; ``forward``:
-    speed [m/s]. Times are seconds of the clock that stamped them."""
+    """A flight. Times are seconds of the clock that stamped them.
+
+    Attributes:
+        name: Of its folder.
+        command: As recorded, but nose down positive.
+        pitch: Nose down positive [rad].
+        forward: Speed [m/s].
+    """
 
     name: str
     command: Track
@@ -66,15 +74,20 @@ class Recording:
         return [float(time) for time in self.command.times_s[changes]]
 
     def since(self, begin_s: float) -> Recording:
-        """The same with times that count from this one."""
+        """Return the same with times that count from this one."""
         tracks = (self.command, self.pitch, self.forward)
         return Recording(self.name, *(Track(track.times_s - begin_s, track.values) for track in tracks))
 
 
 @dataclass(frozen=True, slots=True)
 class Response:
-    """What simulated vehicles did, one row each: ``pitch`` [rad] and ``forward`` [m/s], shape (vehicles, samples), at
-    ``times_s`` after the step's beginning."""
+    """What simulated vehicles did, one row each.
+
+    Attributes:
+        times_s: After the start of the step.
+        pitch: Shape (vehicles, samples) [rad].
+        forward: Shape (vehicles, samples) [m/s].
+    """
 
     times_s: Floats
     pitch: Floats
@@ -83,25 +96,33 @@ class Response:
 
 @dataclass(frozen=True, slots=True)
 class Misfit:
-    """Simulated less recorded, at the times of the recorded samples: ``pitch`` [rad], ``forward`` [m/s]."""
+    """Simulated minus recorded, at the times of the recorded samples: ``pitch`` [rad], ``forward`` [m/s]."""
 
     pitch: Floats
     forward: Floats
 
     @property
     def pitch_rms(self) -> float:
-        """[rad]"""
+        """Root mean square of the pitch's misfit [rad]."""
         return float(np.sqrt(np.mean(self.pitch**2)))
 
     @property
     def forward_rms(self) -> float:
-        """[m/s]"""
+        """Root mean square of the speed's misfit [m/s]."""
         return float(np.sqrt(np.mean(self.forward**2)))
 
 
 def read_recording(folder: Path, *, as_stamped: bool = False) -> Recording:
-    """The recording in a folder. With ``as_stamped``, samples keep the times of receipt; otherwise they get times at
-    which the drone can have taken them, see :func:`sample_times`. Raises :class:`FileFormatError`."""
+    """Read the recording in a folder.
+
+    Args:
+        folder: With the files ``command_dump.dat``, ``theta_dump.dat`` and ``vx_dump.dat``.
+        as_stamped: Whether samples keep the times of receipt; otherwise they get times at which the drone can have
+            taken them, see :func:`sample_times`.
+
+    Raises:
+        FileFormatError: A file can't be read.
+    """
     command, theta, vx = (_read(folder / f"{name}_dump.dat") for name in ("command", "theta", "vx"))
     if not as_stamped:
         theta, vx = (Track(sample_times(track.times_s), track.values) for track in (theta, vx))
@@ -110,18 +131,13 @@ def read_recording(folder: Path, *, as_stamped: bool = False) -> Recording:
 
 
 def _read(path: Path) -> Track:
-    try:
-        lines = path.read_text().splitlines()
-    except OSError as error:
-        raise FileFormatError(f"{path} can't be read: {error.strerror}") from error
-    except UnicodeDecodeError:
-        raise FileFormatError(f"{path} is no text") from None
+    lines = read_text(path, "the recorded track", _MAX_BYTES).splitlines()
     rows = []
     for number, line in enumerate(lines, start=1):
         try:
             time_s, value = map(float, line.split())
         except ValueError:
-            raise FileFormatError(f"{path}, line {number}: a time and a value are wanted, not {line!r}") from None
+            raise FileFormatError(f"{path}, line {number}: a time and a value are wanted, not {line!r:.80}") from None
         rows.append((time_s, value))
     table = np.array(rows, dtype=np.float64).reshape(-1, 2)
     if len(table) < 2 or not np.isfinite(table).all() or (np.diff(table[:, 0]) < 0).any():
@@ -130,19 +146,29 @@ def _read(path: Path) -> Track:
 
 
 def sample_times(received_s: Floats, period_s: float = SAMPLE_PERIOD_S) -> Floats:
-    """When samples were taken, at the latest, from when they were received: each a period before the one after it, or
-    earlier. A radio link that hangs and then delivers all at once makes times of receipt useless for dynamics."""
+    """Estimate when samples were taken, at the latest, from when they were received.
+
+    Each was taken a period before the one after it, or earlier. A radio link that hangs and then delivers all at once
+    makes times of receipt useless for dynamics.
+    """
     ticks = np.arange(len(received_s)) * period_s
     latest: Floats = np.minimum.accumulate((received_s - ticks)[::-1])[::-1] + ticks
     return latest
 
 
 def replay(command: Track, vehicles: Sequence[VehicleParameters], duration_s: float = WINDOW_S) -> Response:
-    """Fly a command, nose down positive, with simulated vehicles in calm air whose sensors don't err.
+    """Fly a command with simulated vehicles in calm air whose sensors have no errors.
 
     Each hovers, and from time 0 on gets the command as its pitch set-point: magnitudes from :data:`FULL_TILT_COMMAND`
-    on are the tilt limit. Where the command is 0 the set-point is level, which isn't the same as to hover. Raises
-    :class:`UsageError` if there are no vehicles, or more than have room.
+    on are the tilt limit. Where the command is 0 the set-point is level, which differs from hovering.
+
+    Args:
+        command: Nose down positive.
+        vehicles: At least one.
+        duration_s: How long.
+
+    Raises:
+        UsageError: There are no vehicles, or more than the world has room for.
     """
     if not vehicles:
         raise UsageError("at least one vehicle is wanted")
@@ -177,7 +203,7 @@ def _held(command: Track, times_s: Floats) -> list[float]:
 
 
 def compare(response: Response, recorded: Recording, begin_s: float = 0.0, end_s: float = WINDOW_S) -> list[Misfit]:
-    """How each vehicle differs from a recording with times like the response's, between two of them."""
+    """Return how each vehicle differs from a recording with times like the response's, between two of them."""
     pitch, forward = recorded.pitch.between(begin_s, end_s), recorded.forward.between(begin_s, end_s)
     return [
         Misfit(

@@ -1,4 +1,4 @@
-"""How a simulated world and its drones are made."""
+"""Options of a simulated world and its drones."""
 
 from __future__ import annotations
 
@@ -17,7 +17,24 @@ STANDARD_VEHICLE: Final = VehicleParameters()
 
 @dataclass(frozen=True, slots=True)
 class SimOptions:
-    """A simulated world and how its drones are made."""
+    """Options of a simulated world and its drones.
+
+    Attributes:
+        world: Name of a shipped world, or path of a world file.
+        seed: Of all noise and gusts.
+        speed: Of simulated time, relative to real time.
+        cameras: Of each drone.
+        noise: Factor of the sensors' noise and biases.
+        wind: Factor of the world's wind.
+        battery: Charge at the start, 0 to 1.
+        renderer: ``planar`` or ``mujoco``.
+        quality: Of the planar renderer.
+        native: Actions that the drone's driver supports natively.
+        position: Whether the drone reports its position.
+        truth: Whether the drone reports its true state too.
+        rate_hz: Of the reports.
+        parameters: Of the vehicles.
+    """
 
     world: str = "room"
     seed: int = 0
@@ -35,17 +52,22 @@ class SimOptions:
     parameters: VehicleParameters = STANDARD_VEHICLE
 
     def load_world(self) -> World:
-        """Raises :class:`UnknownNameError` or :class:`skyloop.errors.FileFormatError`."""
+        """Load the world.
+
+        Raises:
+            UnknownNameError: There is no such world.
+            FileFormatError: The world's file is invalid.
+        """
         return load_world(self.world, self.seed)
 
     def blowing(self, wind: Wind) -> Wind:
-        """The world's wind by this factor."""
+        """Return a world's wind multiplied by the factor :attr:`wind`."""
         x, y, z = wind.mean_m_s
         mean = (x * self.wind, y * self.wind, z * self.wind)
         return replace(wind, mean_m_s=mean, gust_m_s=wind.gust_m_s * self.wind)
 
     def vehicle(self) -> VehicleParameters:
-        """The vehicle, with its sensors' noise and biases by this factor."""
+        """Return the vehicle, with its sensors' noise and biases multiplied by the factor :attr:`noise`."""
         flaws = {
             field.name: getattr(self.parameters, field.name) * self.noise
             for field in fields(self.parameters)

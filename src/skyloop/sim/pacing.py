@@ -1,4 +1,4 @@
-"""Making a simulation keep time with a clock."""
+"""Running a simulation in step with a clock."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ _LONGEST_RUN_STEPS = 25
 class Pacer:
     """Runs the steps that are due, by absolute deadlines: step k is due at start + k · STEP_S / speed.
 
-    Small delays are caught up; when more than :data:`MOST_LAG_S` of the clock is behind, what is beyond is given up,
-    counted in ``lost_s``, and the deadlines move. Not thread-safe: one thread owns it::
+    Small delays are caught up. Beyond :data:`MOST_LAG_S` of the clock, the rest is given up, counted in ``lost_s``, and
+    the deadlines move. Not thread-safe: one thread owns it::
 
         while not stop.wait(pacer.run_due()):
             publish()
@@ -36,7 +36,11 @@ class Pacer:
         self.lost_s = 0.0  # of the clock, given up so far
 
     def run_due(self) -> float:
-        """Do the steps that are due, some at a time; returns how long to wait until the next is [s], 0 if one is."""
+        """Do the steps that are due, some at a time.
+
+        Returns:
+            How long to wait until the next step [s]; 0 if one is due.
+        """
         behind = self._clock() - self._due_ns(self._done + 1)
         if behind < 0:
             return -behind / NS_PER_S
@@ -53,8 +57,14 @@ class Pacer:
         return max(0.0, (self._due_ns(self._done + 1) - self._clock()) / NS_PER_S)
 
     def clock_ns(self, time_s: float) -> int:
-        """When, on the clock, the simulation was (or will be) at its time ``time_s``, counted from this pacer's start
-        and by the present deadlines."""
+        """Convert a time of the simulation to the clock, by the present deadlines.
+
+        Args:
+            time_s: Since this pacer's start.
+
+        Returns:
+            When the simulation was, or will be, at that time.
+        """
         return self._due_ns(time_s / STEP_S)
 
     def _due_ns(self, step: float) -> int:

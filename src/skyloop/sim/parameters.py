@@ -1,5 +1,7 @@
-"""What a simulated vehicle is made of, as numbers. The defaults are an AR.Drone 2 with its indoor hull, as far as
-public sources tell; a value without a source is our estimate and says so.
+"""Parameters of a simulated vehicle.
+
+The defaults are an AR.Drone 2 with its indoor hull, as far as public sources tell; a value without a source is an
+estimate and says so.
 
 Sources: [P] Parrot, AR.Drone 2.0 technical specifications. [E] J. Engel, J. Sturm, D. Cremers, "Camera-Based
 Navigation of a Low-Cost Quadrocopter", IROS 2012, with the constants c1 … c7 identified from flights that its published
@@ -19,8 +21,11 @@ GRAVITY_M_S2 = 9.80665
 
 @dataclass(frozen=True, slots=True)
 class VehicleParameters:
-    """One vehicle's body, motors, loops, battery and sensors. Raises :class:`UsageError` for values that no vehicle
-    has (not finite, negative, or zero where something is divided by it)."""
+    """One vehicle's body, motors, loops, battery and sensors.
+
+    Raises:
+        UsageError: A value is not finite, negative, or zero where something is divided by it.
+    """
 
     # Body
     mass_kg: float = 0.42  # with indoor hull [P]; only collisions between drones use it: all else is per mass
@@ -131,16 +136,17 @@ _POSITIVE = frozenset(
 
 
 def with_ideal_sensors(vehicle: VehicleParameters) -> VehicleParameters:
-    """The same vehicle, knowing exactly where it is: without noise and biases."""
+    """Return the same vehicle without sensor noise and biases."""
     flaws = [field.name for field in fields(vehicle) if "_noise_" in field.name or "_bias_" in field.name]
     return replace(vehicle, **dict.fromkeys(flaws, 0.0))
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What a vehicle lets its pilot ask for. Set-points beyond are clamped. Defaults: AR.Drone, indoor [S].
+    """Limits of a vehicle's set-points, which are clamped to them. Defaults: AR.Drone, indoor [S].
 
-    Raises :class:`UsageError` for values out of range.
+    Raises:
+        UsageError: A value is out of its range.
     """
 
     tilt_rad: float = 0.21

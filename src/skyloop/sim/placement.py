@@ -16,8 +16,11 @@ _MARGINS_M = (0.6, 0.3, 0.15)  # between hulls, and to what stands around: the f
 
 
 def place(world: World, parameters: Sequence[VehicleParameters], solids: Solids) -> list[Spawn]:
-    """A free place for each drone. Raises :class:`UsageError` when there are not enough, or when one of the world's own
-    is within something solid."""
+    """Return a free place for each drone: the world's own first.
+
+    Raises:
+        UsageError: There are not enough, or one of the world's own is within something solid.
+    """
     spawns = list(world.spawns[: len(parameters)])
     for spawn, drone in zip(spawns, parameters, strict=False):
         if not _is_clear(spawn, drone, solids, 0.0):

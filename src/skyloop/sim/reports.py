@@ -1,4 +1,4 @@
-"""What a simulation tells about its drones: their own beliefs, the truth, and what happened."""
+"""What a simulation reports about its drones: their own estimates, the truth, and what happened."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ from skyloop.sim.world import Vec3
 
 @dataclass(frozen=True, slots=True)
 class VehicleFeedback:
-    """What a drone believes, with the noise and biases of its sensors. Angles: roll right side down, pitch nose down,
-    yaw counter-clockwise from east, within ±π."""
+    """A drone's estimates, with the noise and biases of its sensors.
+
+    Angles: roll right side down, pitch nose down, yaw counter-clockwise from east, within ±π.
+    """
 
     time_s: float  #: of the simulation
     state: FlightState
@@ -30,7 +32,7 @@ class VehicleFeedback:
 
 @dataclass(frozen=True, slots=True)
 class VehicleTruth:
-    """What is really so. World axes east, north, up."""
+    """A drone's true state. World axes east, north, up."""
 
     time_s: float
     state: FlightState
@@ -47,6 +49,8 @@ class VehicleTruth:
 
 
 class OccurrenceKind(StrEnum):
+    """What can happen to a drone."""
+
     COLLISION = "collision"
     EMERGENCY = "emergency"
     BATTERY_LOW = "battery_low"

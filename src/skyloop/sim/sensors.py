@@ -1,8 +1,4 @@
-"""What the vehicles believe about themselves: truth with noise, and with biases that wander slowly.
-
-Altitude and velocity are worked out at the rate of the autopilot's loops, which fly by them. Inertial values and
-attitude are worked out when somebody looks, from noise that belongs to the step: same step, same value.
-"""
+"""The vehicles' own estimates: truth with noise, and with biases that wander slowly."""
 
 from __future__ import annotations
 
@@ -35,7 +31,12 @@ _ESTIMATE_NOISE: tuple[_Value, ...] = (lambda p: p.altitude_noise_m, *[lambda p:
 
 
 class Sensors:
-    """``altitude``: of the feet above the floor, (n,) [m]. ``velocity``: forward, left, up, levelled axes, (3, n)."""
+    """The sensors of all drones.
+
+    Attributes:
+        altitude: Of the feet above the floor, (n,) [m].
+        velocity: Forward, left, up, levelled axes, (3, n) [m/s].
+    """
 
     def __init__(
         self, parameters: Sequence[VehicleParameters], bodies: Bodies, seed: int, bias_period_s: float
@@ -60,7 +61,7 @@ class Sensors:
         self.estimate()
 
     def wander(self) -> None:
-        """Let the biases go on by one period."""
+        """Advance the biases by one period."""
         np.multiply(self._bias, self._bias_keep, out=self._bias)
         np.add(self._bias, self._bias_fresh * self._bias_normals.take(), out=self._bias)
 
@@ -77,8 +78,11 @@ class Sensors:
         np.add(self._estimate, self._estimate_noise * self._normals.take(), out=self._estimate)
 
     def inertial(self, step: int) -> Floats:
-        """Gyro [rad/s] and accelerometer [m/s²] about and along the bodies' axes, and roll, pitch, yaw [rad] (yaw not
-        wrapped), shape (9, n), at the end of a step. Worked out once a step, for all drones."""
+        """Return the inertial sensors' values at the end of a step, shape (9, n).
+
+        They are gyro [rad/s] and accelerometer [m/s²] about and along the bodies' axes, and roll, pitch, yaw [rad] (yaw
+        not wrapped). They are computed once per step, for all drones.
+        """
         if step != self._inertial_step:
             bodies = self._bodies
             # Drone after drone from one stream of the step, so that the first ones' noise isn't changed by more drones.

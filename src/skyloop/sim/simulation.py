@@ -1,7 +1,7 @@
 """A world with drones in it, stepped by its owner.
 
-Deterministic: the same world, seed, drones and commands at the same steps give the same bits. There is no wall clock in
-here: :class:`~skyloop.sim.pacing.Pacer` makes it keep time.
+Deterministic: the same world, seed, drones and commands at the same steps give the same bits. Nothing here reads a wall
+clock; :class:`~skyloop.sim.pacing.Pacer` makes it run in real time.
 """
 
 from __future__ import annotations
@@ -40,11 +40,12 @@ _STANDARD_LIMITS = Limits()
 
 
 class Simulation:
-    """All methods may be called from any thread: a lock is held for one step, or one question, at a time.
+    """A world with drones in it. All methods may be called from any thread: a lock is held for one step or one query.
 
-    ``parameters`` and ``limits`` are one for all drones or one each. ``charge`` is the batteries' at the start, 0 to 1.
-    ``wind`` replaces the world's. ``seed`` decides all noise and gusts, and with the world's own seed, which it
-    defaults to, everything. Raises :class:`UsageError` for arguments that can't be.
+    Attributes:
+        world: The world.
+        parameters: Of each drone.
+        seed: Of all noise and gusts.
     """
 
     def __init__(
@@ -58,6 +59,21 @@ class Simulation:
         charge: float = 1.0,
         wind: Wind | None = None,
     ) -> None:
+        """Place the drones on the ground.
+
+        Args:
+            world: The world.
+            drones: How many, 1 to 1000.
+            seed: Of all noise and gusts; together with the world's own seed it decides everything. None takes the
+                world's.
+            parameters: One for all drones or one for each.
+            limits: One for all drones or one for each.
+            charge: Of the batteries at the start, above 0, at most 1.
+            wind: Replaces the world's.
+
+        Raises:
+            UsageError: An argument is out of its range, or the world has no place for so many drones.
+        """
         if isinstance(drones, bool) or not isinstance(drones, int) or not 1 <= drones <= 1000:
             raise UsageError(f"drones must be a whole number from 1 to 1000, not {drones!r}")
         if not 0 < charge <= 1:
@@ -88,12 +104,12 @@ class Simulation:
 
     @property
     def drones(self) -> int:
-        """How many drones there are; they are numbered from 0."""
+        """The number of drones; they are numbered from 0."""
         return len(self.parameters)
 
     @property
     def step_count(self) -> int:
-        """Steps done."""
+        """The number of steps done."""
         return self._step
 
     @property
@@ -102,7 +118,7 @@ class Simulation:
         return self._step * STEP_S
 
     def step(self, n: int = 1) -> None:
-        """Go on by ``n`` steps of :data:`~skyloop.sim.dynamics.STEP_S`."""
+        """Advance by ``n`` steps of :data:`~skyloop.sim.dynamics.STEP_S`."""
         for _ in range(n):
             with self._lock:
                 self._step_once()
@@ -125,11 +141,18 @@ class Simulation:
     # Flying ----------------------------------------------------------------------------------------------------
 
     def command(self, drone: int, action: AnyAction) -> AnyAction:
-        """Tell a drone what to do; it stays in force until the next command.
+        """Command a drone; the command stays in force until the next one.
 
-        Returns what was applied: the action, a set-point within the limits, or :class:`~skyloop.messages.Idle` when
-        the drone ignores it in its present state (as firmware does): set-points before it hovers, a reset in the air.
-        Raises :class:`UsageError` for a number that isn't finite.
+        Args:
+            drone: Its number.
+            action: A set-point or an action.
+
+        Returns:
+            What was applied: the action, a set-point within the limits, or :class:`~skyloop.messages.Idle` when the
+            drone ignores it in its present state (as firmware does): set-points before it hovers, a reset in the air.
+
+        Raises:
+            UsageError: There is no such drone, or a number is not finite.
         """
         if not isinstance(action, Action):
             raise UsageError(f"an action from skyloop.messages is wanted, not {action!r}")
@@ -139,33 +162,43 @@ class Simulation:
             return self._autopilot.command(self._number(drone), action, self.time_s)
 
     def limits(self, drone: int) -> Limits:
-        """The limits in force."""
+        """Return the limits in force of a drone."""
         return self._autopilot.limits[self._number(drone)]
 
     def set_limits(self, drone: int, limits: Limits) -> None:
-        """Change what the drone lets its pilot ask for, from the next command on; the ceiling holds at once."""
+        """Change a drone's limits from the next command on; the ceiling applies at once."""
         with self._lock:
             self._autopilot.set_limits(self._number(drone), limits)
 
     # Conditions ------------------------------------------------------------------------------------------------
 
     def set_wind(self, wind: Wind) -> None:
-        """Another wind from now on. Its gusts begin a stream of their own."""
+        """Change the wind. Its gusts start a new stream of random numbers."""
         with self._lock:
             self._wind = WindField(wind, self.seed, self.drones, LOOP_STEPS * STEP_S)
 
     def set_charge(self, drone: int, charge: float) -> None:
-        """Set what a drone's battery has left, 0 to 1. Raises :class:`UsageError` for any other number."""
+        """Set a drone's battery charge.
+
+        Raises:
+            UsageError: There is no such drone, or the charge is not from 0 to 1.
+        """
         if not 0 <= charge <= 1:
             raise UsageError(f"charge must be from 0 to 1, not {charge!r}")
         with self._lock:
             self._batteries.charge[self._number(drone)] = charge
 
     def put(self, drone: int, position_m: Vec3, yaw_rad: float = 0.0, *, charge: float = 1.0) -> None:
-        """Put a drone that flies somewhere else, hovering, level and at rest, with a battery of this charge: the begin
-        of another try in one simulation. ``position_m``: of its centre, world axes.
+        """Move a flying drone, hovering, level and at rest: the start of another episode in one simulation.
 
-        Raises :class:`UsageError` for a drone that does not fly, and for a place that is no place.
+        Args:
+            drone: Its number.
+            position_m: Of its centre, world axes.
+            yaw_rad: Its heading.
+            charge: Of its battery, 0 to 1.
+
+        Raises:
+            UsageError: The drone does not fly, or a number is out of its range.
         """
         place = np.array(position_m, dtype=float)
         if place.shape != (3,) or not np.isfinite(place).all() or not np.isfinite(yaw_rad):
@@ -181,11 +214,11 @@ class Simulation:
     # Looking ---------------------------------------------------------------------------------------------------
 
     def state(self, drone: int) -> FlightState:
-        """The drone's flight state."""
+        """Return a drone's flight state."""
         return self._autopilot.states[self._number(drone)]
 
     def feedback(self, drone: int) -> VehicleFeedback:
-        """What the drone believes now. Altitude and velocity are up to 12 ms older: their sensors run at 62.5 Hz."""
+        """Return a drone's estimates. Altitude and velocity are up to 12 ms older: their sensors run at 62.5 Hz."""
         with self._lock:
             i, sensors = self._number(drone), self._sensors
             inertial = sensors.inertial(self._step)[:, i].tolist()
@@ -205,7 +238,7 @@ class Simulation:
             )
 
     def truth(self, drone: int) -> VehicleTruth:
-        """What is really so now."""
+        """Return a drone's true state."""
         with self._lock:
             i, bodies = self._number(drone), self._bodies
             roll, pitch, yaw = bodies.angles[:, i].tolist()
@@ -225,18 +258,25 @@ class Simulation:
             )
 
     def poses(self) -> tuple[Floats, Floats]:
-        """Positions of all bodies, world axes, shape (n, 3) [m], and world-from-body rotations, shape (n, 3, 3): new
-        arrays, true values, for a renderer or motion capture."""
+        """Return the true poses of all bodies, as new arrays, for a renderer or motion capture.
+
+        Returns:
+            Positions in world axes, shape (n, 3) [m], and world-from-body rotations, shape (n, 3, 3).
+        """
         with self._lock:
             return self._bodies.position.T.copy(), rotations(self._bodies.sin, self._bodies.cos)
 
     def target_states(self, time_s: float | None = None) -> tuple[TargetState, ...]:
-        """Where the moving targets are at a time of the simulation (now by default), in the world's order."""
+        """Return the states of the moving targets, in the world's order.
+
+        Args:
+            time_s: Of the simulation; None is now.
+        """
         time = self.time_s if time_s is None else time_s
         return tuple(track.at(time) for track in self._tracks)
 
     def take_occurrences(self) -> list[Occurrence]:
-        """What happened since the last call, oldest first; the newest 1000 are kept."""
+        """Return what happened since the last call, oldest first; only the newest 1000 are kept."""
         with self._lock:
             taken = list(self._autopilot.occurrences)
             self._autopilot.occurrences.clear()

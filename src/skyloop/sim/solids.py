@@ -1,8 +1,4 @@
-"""The solid things of a world as arrays, and how far drones are from them.
-
-A drone is an upright cylinder. Against a box, the box is grown by the cylinder's radius and half height and the drone
-becomes a point: exact at faces, and at upright edges the hull is taken as square.
-"""
+"""The solid things of a world as arrays, and the distances of drones from them."""
 
 from __future__ import annotations
 
@@ -18,8 +14,13 @@ from skyloop.sim.world import PlatformTarget, Vec3, World
 
 @dataclass(frozen=True, slots=True)
 class Overlap:
-    """A drone within a solid (or outside of the room): ``normal`` is the way out, ``depth_m`` how far, ``surface_m_s``
-    the velocity of the solid."""
+    """A drone within a solid (or outside of the room).
+
+    Attributes:
+        normal: The way out.
+        depth_m: How far.
+        surface_m_s: Velocity of the solid.
+    """
 
     normal: Vec3
     depth_m: float
@@ -27,7 +28,7 @@ class Overlap:
 
 
 class Solids:
-    """Boxes, gate bars, moving platforms, and the walls and ceiling of the room. The floor is dealt with elsewhere."""
+    """Boxes, gate bars, moving platforms, and the walls and ceiling of the room; the floor is not among them."""
 
     def __init__(self, world: World, tracks: tuple[TargetTrack, ...]) -> None:
         boxes = world.solids()
@@ -53,7 +54,7 @@ class Solids:
         return bool(self._platforms)
 
     def move(self, time_s: float) -> None:
-        """Bring the moving solids to where they are at a time."""
+        """Move the moving solids to where they are at a time."""
         for number, track in enumerate(self._platforms, self._fixed):
             state = track.at(time_s)
             top = np.array(state.position_m)
@@ -62,8 +63,14 @@ class Solids:
             self._velocity[:, number] = state.velocity_m_s
 
     def clearance(self, points: Floats, hulls: Floats) -> Floats:
-        """Distance to the nearest solid, wall or ceiling, (m,), for drones at ``points`` (3, m) with hulls of radius,
-        radius, half height (3, m). Never more than the true distance; negative within."""
+        """Return the distance to the nearest solid, wall or ceiling, (m,).
+
+        Never more than the true distance; negative within.
+
+        Args:
+            points: Of the drones, (3, m).
+            hulls: Radius, radius, half height, (3, m).
+        """
         room = np.minimum(points - self._room_low, self._room_high - points) - hulls
         nearest: Floats = room.min(axis=0)
         if self._half.shape[1]:
@@ -72,7 +79,7 @@ class Solids:
         return nearest
 
     def overlap(self, point: Floats, hull: Floats, *, moving: bool = True) -> Overlap | None:
-        """The deepest overlap of one drone, or None. ``point`` and ``hull`` are (3,)."""
+        """Return the deepest overlap of one drone, or None. ``point`` and ``hull`` are (3,)."""
         low = self._room_low[:, 0] + hull - point
         high = point - (self._room_high[:, 0] - hull)
         axis = int(np.maximum(low, high).argmax())

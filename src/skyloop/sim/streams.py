@@ -1,5 +1,7 @@
-"""Independent streams of random numbers, one for each purpose and drone, all grown from one seed: switching one
-thing on, or adding a drone, leaves the numbers of all others as they were."""
+"""Independent streams of random numbers, one for each purpose and drone, all derived from one seed.
+
+So switching one thing on, or adding a drone, leaves the numbers of all others as they were.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,7 @@ Floats = NDArray[np.float64]
 
 
 class Purpose(IntEnum):
-    """What a stream is for. The numbers are part of what a seed means: never change or reuse one."""
+    """What a stream is for. The numbers are part of what a seed means: they must never change or be reused."""
 
     TARGETS = 1
     WIND = 2
@@ -24,14 +26,18 @@ class Purpose(IntEnum):
 
 
 def stream(seed: int, purpose: Purpose, index: int = 0) -> np.random.Generator:
-    """The stream of a purpose and a number (of a drone, a target, a camera, a step): the same for the same arguments,
-    for ever. Costs some 15 µs."""
+    """Return the stream of a purpose and a number (of a drone, a target, a camera, a step). Costs some 15 µs.
+
+    It is the same for the same arguments, in every version.
+    """
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(int(purpose), index)))
 
 
 class NormalBlocks:
-    """Standard normal numbers for many drones, ``rows`` each at a time, drawn in blocks because one call to a
-    generator costs as much as a hundred numbers. Each drone has a stream of its own."""
+    """Standard normal numbers for many drones, ``rows`` each at a time. Each drone has its own stream.
+
+    They are drawn in blocks, because one call to a generator costs as much as a hundred numbers.
+    """
 
     def __init__(self, seed: int, purpose: Purpose, rows: int, drones: int, ahead: int = 64) -> None:
         generators = [stream(seed, purpose, drone) for drone in range(drones)]
@@ -41,7 +47,7 @@ class NormalBlocks:
         self._next = ahead
 
     def take(self) -> Floats:
-        """The next numbers, shape (rows, drones). Valid until the block is used up: copy what must last."""
+        """Return the next numbers, shape (rows, drones). The next block overwrites them: copy what must last."""
         if self._next == len(self._block):
             for drone, draw in enumerate(self._draws):
                 self._block[:, :, drone] = draw((len(self._block), self._rows))

@@ -1,5 +1,7 @@
-"""How moving targets move: each path is a sequence of points on a fixed grid of time, worked out as far as somebody has
-looked, so that where a target is at a time depends on that time and the seed alone."""
+"""The motion of targets: each path is a sequence of points on a fixed grid of time, computed as far as was asked for.
+
+So where a target is at a time depends on that time and the seed alone.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +48,7 @@ class _Point:
 
 
 class TargetTrack:
-    """The way of one target through time. Safe to ask from any thread."""
+    """The motion of one target over time. May be used from any thread."""
 
     def __init__(self, target: Target, seed: int, index: int) -> None:
         self.target = target
@@ -57,8 +59,11 @@ class TargetTrack:
         self._lock = threading.Lock()
 
     def at(self, time_s: float) -> TargetState:
-        """State at a time of the simulation [s], from 0. Raises :class:`UsageError` for a time before the start or
-        more than :data:`KEPT_S` before the latest one asked for."""
+        """Return the state at a time of the simulation [s].
+
+        Raises:
+            UsageError: The time is before the start, or more than :data:`KEPT_S` before the latest one asked for.
+        """
         if not (math.isfinite(time_s) and time_s >= 0):
             raise UsageError(f"time must be a finite number of at least 0 s, not {time_s!r}")
         index, part = divmod(time_s / GRID_S, 1.0)
@@ -79,7 +84,7 @@ class TargetTrack:
 
 
 def top_speed(path: Path) -> float:
-    """The greatest speed [m/s] that a target reaches on the path."""
+    """Return the greatest speed [m/s] that a target reaches on the path."""
     if isinstance(path, LissajousPath):
         rates = (a * 2 * math.pi * c / path.period_s for a, c in zip(path.amplitude_m, path.cycles, strict=True))
         return math.hypot(*rates)
@@ -151,8 +156,10 @@ def _ring_goals(path: RingWalkPath, rng: np.random.Generator) -> Iterator[Vec3]:
 def _steer(
     goals: Iterator[Vec3], speeds: tuple[float, float], acceleration: float, rng: np.random.Generator
 ) -> Iterator[tuple[Vec3, Vec3]]:
-    """Walk from goal to goal, each leg at a speed of its own, the velocity changing by the acceleration at most. A goal
-    counts as reached at the braking distance, so that a reversal there does not overshoot it."""
+    """Walk from goal to goal, each leg at its own speed, changing the velocity by the acceleration at most.
+
+    A goal counts as reached at the braking distance, so that a reversal there does not overshoot it.
+    """
     position, goal = np.array(next(goals)), np.array(next(goals))
     velocity = np.zeros(3)
     speed = float(rng.uniform(*speeds))

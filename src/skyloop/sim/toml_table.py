@@ -1,41 +1,67 @@
-"""Strict reading of TOML tables: every value is asked for by key, kind and range, and what nobody asked for is an
-error. Each refusal names the file, the table, the key, and what would be right."""
+"""Strict reading of TOML tables: every value is asked for by key, kind and range; all others are an error.
+
+Each error names the file, the table, the key, and what is allowed.
+"""
 
 from __future__ import annotations
 
 import difflib
 import math
+import re
+import reprlib
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from skyloop.errors import FileFormatError
+from skyloop.files import read_text
+
+MAX_BYTES: Final = 1 << 18  #: of a file; the largest world that is shipped takes 5 kB
+#: Parts of a key: a parser goes through all of them for each key below, which takes minutes for some ten thousand.
+MAX_DEPTH: Final = 16
+MAX_WHOLE: Final = (1 << 63) - 1  #: as TOML has it; larger ones are neither told nor computed with
+_SHOWN: Final = 80  #: characters of a wrong value in a message
+# Nothing in it is tried twice, and it begins where a part does: it is as fast for what it does not find.
+_PART = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_DEEP_KEY = re.compile(rf"(?<![A-Za-z0-9_-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{MAX_DEPTH},}}+")
 
 _KINDS = {bool: "a boolean", int: "a whole number", float: "a number", str: "a text", list: "a list", dict: "a table"}
 
 
 def parse_toml(text: str, source: str) -> TomlTable:
-    """Parse ``text``; ``source`` is the file's name for messages. Raises :class:`FileFormatError`."""
+    """Parse TOML.
+
+    Args:
+        text: The file's text.
+        source: The file's name, for messages.
+
+    Raises:
+        FileFormatError: It is not TOML.
+    """
+    if _DEEP_KEY.search(text):
+        raise FileFormatError(f"{source}: a key of more than {MAX_DEPTH} parts with dots between them")
     try:
         return TomlTable(tomllib.loads(text), source, "")
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # besides its own errors, for numbers and lists that are too large
         raise FileFormatError(f"{source}: not valid TOML: {error}") from error
 
 
 def read_toml(path: Path) -> TomlTable:
-    """Read and parse a file. Raises :class:`FileFormatError` when it can't be read, is not UTF-8 or is not TOML."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise FileFormatError(f"{path}: not UTF-8 text: {error}") from error
-    except OSError as error:
-        raise FileFormatError(f"{path}: can't be read: {error.strerror or error}") from error
-    return parse_toml(text, str(path))
+    """Read and parse a file.
+
+    Raises:
+        FileFormatError: It can't be read, is too large, or is not TOML.
+    """
+    return parse_toml(read_text(path, "the world file", MAX_BYTES), str(path))
 
 
 class TomlTable:
-    """One table of the file. Ask for all keys that may be there, then call :meth:`finish`."""
+    """One table of the file. Ask for all keys that are allowed, then call :meth:`finish`.
+
+    All methods that return a value raise :class:`FileFormatError` if the key is missing and has no default, or its
+    value is of another kind or out of range.
+    """
 
     def __init__(self, values: dict[str, Any], source: str, place: str) -> None:
         self._values = values
@@ -44,7 +70,7 @@ class TomlTable:
         self._asked: list[str] = []
 
     def error(self, key: str, problem: str) -> FileFormatError:
-        """The error to raise about ``key`` (empty: about the whole table)."""
+        """Return the error to raise about ``key`` (empty: about the whole table)."""
         where = [self._source]
         if self._place:
             where.append(f"[{self._place}]")
@@ -53,23 +79,29 @@ class TomlTable:
         return FileFormatError(f"{', '.join(where)}: {problem}")
 
     def finish(self) -> None:
-        """Refuse the first key that was never asked for."""
+        """Raise for the first key that was never asked for.
+
+        Raises:
+            FileFormatError: The table has a key that is not allowed.
+        """
         for key in self._values:
             if key not in self._asked:
                 raise self.error(key, "unknown key; " + _hint(key, self._asked))
 
     def has(self, key: str) -> bool:
-        """Whether the key is there; counts as asking for it."""
+        """Whether the key exists; counts as asking for it."""
         self._asked.append(key)
         return key in self._values
 
     def text(self, key: str, default: str | None = None) -> str:
+        """Return a string."""
         value = self._get(key, "a text", default)
         if not isinstance(value, str) or not value:
             raise self._wrong(key, value, "a text that is not empty")
         return value
 
     def choice(self, key: str, choices: Iterable[str], default: str | None = None) -> str:
+        """Return one of several strings."""
         known = list(choices)
         value = self._get(key, "one of " + ", ".join(known), default)
         if not isinstance(value, str):
@@ -79,12 +111,14 @@ class TomlTable:
         return value
 
     def flag(self, key: str, default: bool) -> bool:
+        """Return a boolean."""
         value = self._get(key, "true or false", default)
         if not isinstance(value, bool):
             raise self._wrong(key, value, "true or false")
         return value
 
     def whole(self, key: str, low: int, high: int, default: int | None = None) -> int:
+        """Return an integer within [low, high]."""
         wanted = f"a whole number from {low} to {high}"
         value = self._get(key, wanted, default)
         if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
@@ -94,7 +128,7 @@ class TomlTable:
     def number(
         self, key: str, default: float | None = None, *, low: float = -math.inf, high: float = math.inf
     ) -> float:
-        """A finite number within [low, high]."""
+        """Return a finite number within [low, high]."""
         return self._number(key, self._get(key, _wanted(low, high), default), low, high)
 
     def vector(
@@ -106,13 +140,13 @@ class TomlTable:
         low: float = -math.inf,
         high: float = math.inf,
     ) -> tuple[float, ...]:
-        """A list of ``length`` finite numbers, each within [low, high]."""
+        """Return a list of ``length`` finite numbers, each within [low, high]."""
         wanted = f"a list of {length} numbers"
         value = self._get(key, wanted, default)
         return self._vector(key, value, length, wanted, low, high)
 
     def vectors(self, key: str, length: int, least: int) -> list[tuple[float, ...]]:
-        """A list of at least ``least`` lists of ``length`` finite numbers."""
+        """Return a list of at least ``least`` lists of ``length`` finite numbers."""
         wanted = f"a list of at least {least} lists of {length} numbers"
         value = self._get(key, wanted, None)
         if not isinstance(value, list) or len(value) < least:
@@ -120,21 +154,21 @@ class TomlTable:
         return [self._vector(key, item, length, wanted, -math.inf, math.inf) for item in value]
 
     def range(self, key: str, *, low: float = -math.inf, high: float = math.inf) -> tuple[float, float]:
-        """A list [least, greatest] of two finite numbers in order."""
+        """Return a list [least, greatest] of two finite numbers in order."""
         least, greatest = self.vector(key, 2, low=low, high=high)
         if least > greatest:
             raise self.error(key, f"[{least:g}, {greatest:g}] is upside down; give [least, greatest]")
         return least, greatest
 
     def table(self, key: str) -> TomlTable:
-        """A table within this one."""
+        """Return a table within this one."""
         value = self._get(key, f"a table [{self._under(key)}]", None)
         if not isinstance(value, dict):
             raise self._wrong(key, value, f"a table [{self._under(key)}]")
         return TomlTable(value, self._source, self._under(key))
 
     def tables(self, key: str) -> list[TomlTable]:
-        """An array of tables, ``[[key]]`` in the file; none when the key is not there."""
+        """Return an array of tables, ``[[key]]`` in the file; none when the key does not exist."""
         wanted = f"tables written [[{self._under(key)}]]"
         value = self._get(key, wanted, [])
         if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
@@ -161,9 +195,11 @@ class TomlTable:
         return f" (there is {near[0]!r}; did you mean {key!r}?)" if near else ""
 
     def _number(self, key: str, value: object, low: float, high: float) -> float:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        if isinstance(value, bool) or not isinstance(value, int | float):
             raise self._wrong(key, value, _wanted(low, high))
-        if not low <= value <= high:
+        if not -MAX_WHOLE <= value <= MAX_WHOLE and isinstance(value, int):
+            raise self._wrong(key, value, _wanted(low, high))
+        if not math.isfinite(value) or not low <= value <= high:
             raise self._wrong(key, value, _wanted(low, high))
         return float(value)
 
@@ -174,7 +210,13 @@ class TomlTable:
 
     def _wrong(self, key: str, value: object, wanted: str) -> FileFormatError:
         kind = _KINDS.get(type(value), type(value).__name__)
-        return self.error(key, f"{value!r} ({kind}) given, but it must be {wanted}")
+        return self.error(key, f"{_shown(value)} ({kind}) given, but it must be {wanted}")
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, int) and not -MAX_WHOLE <= value <= MAX_WHOLE:
+        return "a number of more than 64 bits"
+    return reprlib.repr(value) if isinstance(value, list | dict) else f"{value!r:.{_SHOWN}}"
 
 
 def _wanted(low: float, high: float) -> str:

@@ -1,4 +1,4 @@
-"""Vehicles whose response was identified from recorded flights. What isn't named here is as the defaults are."""
+"""Vehicles whose response was identified from recorded flights; other parameters have their defaults."""
 
 from __future__ import annotations
 

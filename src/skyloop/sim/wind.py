@@ -1,5 +1,7 @@
-"""The wind at each drone: the world's mean and gusts of its own, a first-order Gauss-Markov process an axis (the
-low-pass part of the Dryden gust model of MIL-F-8785C)."""
+"""The wind at each drone: the world's mean, and gusts of its own.
+
+Gusts are a first-order Gauss-Markov process per axis (the low-pass part of the Dryden gust model of MIL-F-8785C).
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,7 @@ from skyloop.sim.world import Wind
 
 
 class WindField:
-    """Velocity of the air at each drone. Each drone meets gusts of its own: they are small beside the distances."""
+    """Velocity of the air at each drone. Each drone has its own gusts: they are small beside the distances."""
 
     def __init__(self, wind: Wind, seed: int, drones: int, period_s: float) -> None:
         self._mean = np.array(wind.mean_m_s)[:, None]
@@ -24,7 +26,7 @@ class WindField:
         self._gust: Floats = np.zeros((3, drones)) if self._calm else deviation * self._normals.take()
 
     def blow(self, air: Floats) -> None:
-        """Go on by one period and write the air's velocity, world axes, shape (3, drones) [m/s]."""
+        """Advance by one period, and write the air's velocity, world axes, shape (3, drones) [m/s]."""
         if not self._calm:
             np.multiply(self._gust, self._keep, out=self._gust)
             np.add(self._gust, self._fresh * self._normals.take(), out=self._gust)

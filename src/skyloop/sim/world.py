@@ -1,5 +1,4 @@
-"""What a simulated world is made of: frozen descriptions, no behaviour in time (that is ``targets``) and no file
-reading (that is ``world_file``).
+"""Descriptions of simulated worlds: frozen, without motion (see ``targets``) and file reading (see ``world_file``).
 
 World axes: x east, y north, z up, metres, radians; yaw 0 faces east, positive yaw is counter-clockwise from above.
 The room's floor is centred on the origin: x in ±size/2, y in ±size/2, z from 0 to the height.
@@ -54,7 +53,7 @@ MARKER_DICTIONARIES: dict[str, int] = {
 
 @dataclass(frozen=True, slots=True)
 class FacePose:
-    """Where a flat thing (poster, marker, board) is and where its face looks.
+    """The pose of a flat thing (poster, marker, board).
 
     ``yaw_rad`` and ``elevation_rad`` give the direction of the outward normal: its heading, and its angle above the
     horizon (π/2 looks straight up, as a marker on the floor does). ``turn_rad`` turns the picture in its own plane,
@@ -114,8 +113,15 @@ class Box:
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """A rectangular frame to fly through: ``position_m`` is the centre of the opening, ``yaw_rad`` the heading of
-    the way through, ``inner_size_m`` the opening's width and height, ``frame_m`` the thickness of its bars."""
+    """A rectangular frame to fly through.
+
+    Attributes:
+        name: The gate's name.
+        position_m: Centre of the opening.
+        inner_size_m: Width and height of the opening.
+        yaw_rad: Heading of the way through.
+        frame_m: Thickness of its bars.
+    """
 
     name: str
     position_m: Vec3
@@ -218,8 +224,11 @@ class LissajousPath:
 
 @dataclass(frozen=True, slots=True)
 class WalkPath:
-    """A seeded random walk between points of a box (``low_m`` to ``high_m``), each leg at a speed drawn from a range,
-    with rounded corners (acceleration at most ``acceleration_m_s2``) that may lead some 0.1 m out of the box."""
+    """A seeded random walk between points of a box, each leg at a speed drawn from a range.
+
+    The box is from ``low_m`` to ``high_m``. Corners are rounded (acceleration at most ``acceleration_m_s2``), which may
+    lead some 0.1 m out of the box.
+    """
 
     low_m: Vec3
     high_m: Vec3
@@ -269,8 +278,10 @@ Yaw = FixedYaw | AlongYaw | TowardsYaw
 
 @dataclass(frozen=True, slots=True)
 class BoardTarget:
-    """An upright card with a marker that is carried along a path. The path is of the card's centre, and the yaw is the
-    heading its face looks to. Drones pass through it: it is there to be seen."""
+    """An upright card with a marker that is carried along a path. Drones pass through it.
+
+    The path is of the card's centre, and the yaw is the heading of its face.
+    """
 
     name: str
     pattern: MarkerPattern
@@ -280,8 +291,10 @@ class BoardTarget:
 
 @dataclass(frozen=True, slots=True)
 class PlatformTarget:
-    """A solid slab that moves along a path, with a marker on its top. The path is of the centre of the top face, and
-    the marker's up is the platform's heading. Drones can land on it."""
+    """A solid slab that moves along a path, with a marker on its top. Drones can land on it.
+
+    The path is of the centre of the top face, and the marker's up is the platform's heading.
+    """
 
     name: str
     pattern: MarkerPattern
@@ -296,8 +309,11 @@ Target = BoardTarget | PlatformTarget
 
 @dataclass(frozen=True, slots=True)
 class TargetState:
-    """Where a moving target is at a time of the simulation: position [m], yaw [rad, within ±π], velocity [m/s], world
-    axes. For a platform the position is that of the centre of its top face."""
+    """The state of a moving target at a time of the simulation, in world axes.
+
+    Position [m], yaw [rad, within ±π] and velocity [m/s]; for a platform the position is that of the centre of its top
+    face.
+    """
 
     name: str
     time_s: float
@@ -315,8 +331,11 @@ class TargetState:
 
 @dataclass(frozen=True, slots=True)
 class Wind:
-    """Air that moves: a mean velocity (where it blows to) and gusts, a first-order Gauss-Markov process per axis with
-    ``gust_m_s`` as its standard deviation along each horizontal axis (half of it vertically)."""
+    """Moving air: a mean velocity (where it blows to) and gusts.
+
+    Gusts are a first-order Gauss-Markov process per axis with ``gust_m_s`` as its standard deviation along each
+    horizontal axis (half of it vertically).
+    """
 
     mean_m_s: Vec3 = (0.0, 0.0, 0.0)
     gust_m_s: float = 0.0
@@ -334,7 +353,7 @@ class Spawn:
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """A whole world. ``seed`` decides everything in it that is drawn by chance (the walks of its targets)."""
+    """A whole world. ``seed`` decides everything in it that is random (the walks of its targets)."""
 
     name: str
     room: Room
@@ -348,5 +367,5 @@ class World:
     seed: int = 0
 
     def solids(self) -> tuple[Box, ...]:
-        """Every standing solid: the boxes, and the bars and legs of the gates."""
+        """Return every fixed solid: the boxes, and the bars and legs of the gates."""
         return self.boxes + tuple(bar for gate in self.gates for bar in gate.bars())

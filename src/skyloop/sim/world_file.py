@@ -7,6 +7,7 @@ and this is the one place where degrees become radians. The files in ``worlds/``
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from importlib import resources
@@ -56,16 +57,22 @@ _MOUNTS = ("north", "south", "east", "west", "floor", "ceiling")
 
 
 def shipped_worlds() -> tuple[str, ...]:
-    """The names of the worlds that come with Skyloop, in order."""
+    """Return the names of the worlds that come with Skyloop, in order."""
     folder = resources.files("skyloop.sim") / "worlds"
     return tuple(sorted(e.name.removesuffix(".toml") for e in folder.iterdir() if e.name.endswith(".toml")))
 
 
 def load_world(name_or_path: str | FilePath, seed: int = 0) -> World:
-    """Load a shipped world by name, or a world from a file (anything that ends in ``.toml`` or has a separator).
+    """Load a world.
 
-    Raises :class:`UnknownNameError` for a name that isn't shipped, :class:`FileFormatError` for a file that can't be
-    read or understood, and :class:`UsageError` for a seed that is not a whole number of at least 0.
+    Args:
+        name_or_path: A shipped world's name, or a file (anything that ends in ``.toml`` or has a separator).
+        seed: Of what is random in the world.
+
+    Raises:
+        UnknownNameError: No world of that name is shipped.
+        FileFormatError: The file can't be read or understood.
+        UsageError: The seed is not a whole number of at least 0.
     """
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise UsageError(f"seed must be a whole number of at least 0, not {seed!r}")
@@ -81,7 +88,11 @@ def load_world(name_or_path: str | FilePath, seed: int = 0) -> World:
 
 
 def parse_world(text: str, name: str = "world") -> World:
-    """A world from the text of a world file. Raises :class:`FileFormatError`."""
+    """Parse a world from the text of a world file.
+
+    Raises:
+        FileFormatError: The text is no valid world.
+    """
     return _read_world(parse_toml(text, f"{name}.toml"), name)
 
 
@@ -210,8 +221,11 @@ def _read_face(table: TomlTable, room: Room) -> FacePose:
 
 
 def _mounted(mount: str, along: float, other: float, turn_rad: float, room: Room) -> FacePose:
-    """On a wall, ``along`` is x (north, south) or y (east, west) and ``other`` the height; on floor and ceiling they
-    are x and y, and the picture's up points east."""
+    """Return the pose of something that is mounted on a face of the room.
+
+    On a wall, ``along`` is x (north, south) or y (east, west) and ``other`` the height; on floor and ceiling they are x
+    and y, and the image's up points east.
+    """
     half_x, half_y, height = room.size_m[0] / 2, room.size_m[1] / 2, room.size_m[2]
     gap = _WALL_GAP_M
     if mount == "east":
@@ -261,7 +275,11 @@ def _read_waypoints(table: TomlTable, room: Room) -> Path:
         _require_inside(table, "points", point, room)
     if len(set(points)) < len(points):
         raise table.error("points", "a point stands twice in the list; each must differ from the others")
-    return WaypointPath(tuple(points), _speed(table), table.flag("closed", True))
+    closed = table.flag("closed", True)
+    for one, other in itertools.pairwise([*points, points[0]] if closed else points):
+        if math.dist(one, other) < _SMALLEST_M:
+            raise table.error("points", f"{list(one)} and {list(other)} are less than {_SMALLEST_M:g} m apart")
+    return WaypointPath(tuple(points), _speed(table), closed)
 
 
 def _read_circle(table: TomlTable, room: Room) -> Path:

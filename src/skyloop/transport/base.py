@@ -1,23 +1,25 @@
-"""The one contract that every transport keeps.
+"""The contract that every transport keeps.
 
-A transport carries whole packets between one proxy (the *server end*) and any number of applications (*client ends*):
-it knows packets and topics, but not what they mean. Whoever implements it passes
+A transport carries whole packets between one proxy (the *server end*) and any number of applications (*client ends*).
+It knows packets and topics, but not what they mean. An implementation passes the tests of
 :mod:`skyloop.transport.conformance`.
 
-- Nothing here ever blocks on the other end. What does not fit now is not sent, and the caller is told.
-- A packet arrives whole or not at all. Order is kept within one connection. It has 1 to :data:`MAX_PACKET` bytes;
-  whoever tries to send another gets a :class:`skyloop.errors.UsageError`.
-- Handlers are called on the transport's receiving threads, one call at a time per end: return quickly. A handler that
-  raises ends its own connection, not the transport.
-- When one end goes away, however it ends, the other is told by ``peer_left`` or ``closed``, once.
+- No call ever blocks on the other end. A packet that does not fit now is not sent, and the caller is told so.
+- A packet arrives whole or not at all. Order is kept within one connection. A packet has 1 to :data:`MAX_PACKET`
+  bytes; sending any other raises :class:`skyloop.errors.UsageError`.
+- Handlers are called on the transport's receiving threads, one call at a time per end, so they must return quickly. A
+  handler that raises ends its own connection, not the transport.
+- When one end goes away, for whatever reason, the other one's handler is called once, with ``peer_left`` or
+  ``closed``.
 """
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,22 +35,23 @@ COMMANDS = "commands"  #: echoes (Applied) of all commands that the proxy receiv
 ANNOTATIONS = "annotations"
 LOGS = "logs"  #: what applications log (LogEntry)
 MAX_TOPIC = 200  #: characters
+MAX_SUBSCRIPTIONS = 64  #: topics of one connection at a time
 RESULTS = "results"  #: what all processors find (ProcessorResult)
 MAX_PACKET = HEADER_SIZE + MAX_BODY  #: bytes
 
 
 def video(camera: str) -> str:
-    """The topic of a camera's frames."""
+    """Return the topic of a camera's frames."""
     return f"video/{camera}"
 
 
 def stream(camera: str) -> str:
-    """The topic of a camera's pictures as the vehicle encoded them (EncodedFrame)."""
+    """Return the topic of a camera's pictures as the vehicle encoded them (EncodedFrame)."""
     return f"stream/{camera}"
 
 
 def results(processor: str) -> str:
-    """The topic of what one processor finds (ProcessorResult)."""
+    """Return the topic of what one processor finds (ProcessorResult)."""
     return f"{RESULTS}/{processor}"
 
 
@@ -70,135 +73,319 @@ NOBODY = Peer(0, "nobody that is connected")
 
 
 class ServerHandler(Protocol):
-    """What a server end calls."""
+    """The callbacks of a server end.
+
+    Except for :meth:`topic_problem` they run on the transport's receiving threads, one call at a time.
+    """
 
     def peer_joined(self, peer: Peer) -> None:
-        """A client end connected. Nothing was received from it yet."""
+        """Handle a new connection; nothing was received from it yet.
+
+        Args:
+            peer: The connection; the same object or an equal one identifies it in all later calls.
+        """
 
     def packet(self, peer: Peer, packet: bytes) -> None:
-        """A packet came. It may be anything: the transport does not look inside."""
+        """Handle a packet from an application.
+
+        Args:
+            peer: Who sent it.
+            packet: 1 to :data:`MAX_PACKET` bytes. They may be anything: the transport does not look inside.
+        """
 
     def refused(self, peer: Peer, reason: str) -> None:
-        """A packet came that this application has no right to send, by the keys that it has; it was not handed on.
+        """Handle the refusal of a packet that the application's keys give it no right to send; it is not delivered.
 
-        ``peer`` is :data:`NOBODY` where none is known.
+        Args:
+            peer: Who sent it; :data:`NOBODY` where no connection is known.
+            reason: Why it was refused, for people.
+        """
+
+    def topic_problem(self, topic: str) -> str:
+        """Say why nobody can subscribe to a topic.
+
+        It may be called on any thread, also while another callback runs, and must answer at once.
+
+        Args:
+            topic: The name that an application asks for.
+
+        Returns:
+            Why there is no such topic, naming those that there are; empty if it exists.
+        """
+
+    def malformed(self, peer: Peer, reason: str) -> None:
+        """Handle a request to the transport itself that can't be met.
+
+        The application asked for a topic that does not exist, or for more topics than it may have.
+
+        Args:
+            peer: Who asked.
+            reason: What was wrong, for people.
         """
 
     def peer_left(self, peer: Peer, reason: str) -> None:
-        """The connection ended; called once per ``peer_joined``, after its last packet."""
+        """Handle the end of a connection; called once for each ``peer_joined``, after the connection's last packet.
+
+        Args:
+            peer: The connection.
+            reason: Why it ended, for people.
+        """
 
 
 class ServerEnd(ABC):
-    """A proxy's end. Between :meth:`start` and :meth:`stop` all methods may be called from any thread."""
+    """A proxy's end of a transport.
+
+    Between :meth:`start` and :meth:`stop` all methods may be called from any thread.
+    """
 
     @abstractmethod
     def start(self, handler: ServerHandler) -> None:
-        """Begin to accept. Raises :class:`skyloop.errors.NameTakenError` where the name is in use."""
+        """Begin to accept connections.
+
+        Args:
+            handler: Called on the transport's receiving threads, one call at a time.
+
+        Raises:
+            NameTakenError: A running proxy uses the name.
+        """
 
     @abstractmethod
     def stop(self) -> None:
-        """Disconnect everybody and give every resource back. Idempotent."""
+        """Disconnect every application and release every resource. Idempotent."""
 
     @abstractmethod
     def send(self, peer: Peer, packet: bytes) -> bool:
-        """Send to one application; False if its buffer is full or it is gone."""
+        """Send a packet to one application.
+
+        Args:
+            peer: The application, as given to the handler.
+            packet: 1 to :data:`MAX_PACKET` bytes.
+
+        Returns:
+            Whether it was handed over; False if the application's buffer is full or the application is gone.
+
+        Raises:
+            UsageError: The packet is empty or too large.
+        """
 
     @abstractmethod
     def publish(self, topic: str, packet: bytes) -> int:
-        """Send to everybody subscribed; returns to how many it could *not* be handed over."""
+        """Send a packet to every subscriber of a topic.
+
+        Args:
+            topic: A topic such as :data:`FEEDBACK`.
+            packet: 1 to :data:`MAX_PACKET` bytes.
+
+        Returns:
+            The number of subscribers to which it could *not* be handed over.
+
+        Raises:
+            UsageError: The packet is empty or too large.
+        """
 
     @abstractmethod
     def publish_frame(self, header: FrameHeader, pixels: Pixels) -> int:
-        """Hand a frame to everybody subscribed to its camera; returns to how many it could not be handed over.
+        """Send a frame to every subscriber of its camera.
 
-        ``pixels`` has ``header.size`` bytes in any shape, C-contiguous; it may be reused when the call returns.
+        Args:
+            header: The frame's header.
+            pixels: ``header.size`` bytes, dtype uint8, in any shape, C-contiguous; may be reused when the call returns.
+
+        Returns:
+            The number of subscribers to which it could *not* be handed over.
+
+        Raises:
+            UsageError: The pixels are not what the header says.
         """
 
     @abstractmethod
     def subscribers(self, topic: str) -> int:
-        """How many want this topic: work for nobody need not be done."""
+        """Return how many applications subscribed to a topic; what nobody subscribed to need not be made."""
+
+    def admit(self, peer: Peer, *, pilot: bool) -> str:  # noqa: ARG002  (all are let stay)
+        """Decide whether an application that has said who it is may stay: some places are kept for pilots.
+
+        The default lets every application stay.
+
+        Args:
+            peer: The application's connection.
+            pilot: Whether it said that it is a pilot.
+
+        Returns:
+            Why it can't stay; empty if it can.
+        """
+        return ""
 
     @abstractmethod
     def disconnect(self, peer: Peer, reason: str) -> None:
-        """End one connection; its ``peer_left`` follows with this reason."""
+        """End one connection; its ``peer_left`` follows with this reason. Does nothing if the connection is gone.
+
+        Args:
+            peer: The application's connection.
+            reason: Why, for people; both ends' handlers get it.
+        """
+
+    @property
+    def counters(self) -> dict[str, float]:
+        """What this end has counted since it started, by dotted name, for the proxy's statistics. Any thread."""
+        return {}
 
     @property
     @abstractmethod
     def address(self) -> str:
-        """Where it can be reached, for people."""
+        """Where this end can be reached, for people."""
 
 
 class ClientHandler(Protocol):
-    """What a client end calls."""
+    """The callbacks of a client end.
+
+    They run on the transport's receiving thread, one call at a time.
+    """
 
     def packet(self, packet: bytes) -> None:
-        """A packet came."""
+        """Handle a packet from the proxy."""
 
     def frame(self, header: FrameHeader, pixels: Pixels, topic: str = "") -> None:
-        """A frame came; ``topic`` is the one by which it was asked for where :attr:`ClientEnd.variants` is true.
+        """Handle a frame.
 
-        Keep ``pixels`` (or any view) for as long as needed: it costs only this application."""
+        Args:
+            header: The frame's header.
+            pixels: ``header.size`` bytes, shape (size,), dtype uint8, not writeable. They, or any view of them, may be
+                kept for as long as needed: that costs only this application.
+            topic: The topic by which the frame was asked for, where :attr:`ClientEnd.variants` is true.
+        """
 
     def closed(self, reason: str) -> None:
-        """The connection ended, by whichever end; called once, last."""
+        """Handle the end of the connection, by whichever end; called once, as the last callback.
+
+        Args:
+            reason: Why it ended, for people.
+        """
 
 
 class ClientEnd(ABC):
-    """An application's end: one connection, made by a :data:`Dialer`, never re-used after it closed."""
+    """An application's end: one connection, made by a :data:`Dialer` and never reused after it closed."""
 
     @abstractmethod
     def send(self, packet: bytes) -> bool:
-        """Send to the proxy; False if it could not be handed over. Any thread."""
+        """Send a packet to the proxy. Any thread.
 
-    def knock(self) -> None:  # noqa: B027  (nothing is a good answer)
-        """Say that a packet follows at once, so that the other end wakes up while it is still being made.
+        Args:
+            packet: 1 to :data:`MAX_PACKET` bytes.
 
-        It changes nothing but delays: a transport that gains nothing by it does nothing. Any thread.
+        Returns:
+            Whether it was handed over.
+
+        Raises:
+            UsageError: The packet is empty or too large.
         """
 
     @abstractmethod
     def subscribe(self, topic: str, on: bool = True) -> None:
-        """Ask for a topic, or no longer. Any thread. Raises :class:`skyloop.errors.UsageError` for a name too long."""
+        """Subscribe to a topic, or unsubscribe from it. Any thread.
+
+        Args:
+            topic: Its name, 1 to :data:`MAX_TOPIC` characters.
+            on: True to subscribe, False to unsubscribe.
+
+        Raises:
+            UsageError: The name is empty or too long.
+        """
 
     @abstractmethod
     def close(self) -> None:
-        """End the connection. Idempotent; ``closed`` is called before this returns, unless on the receiving thread."""
+        """End the connection. Idempotent.
+
+        The handler's ``closed`` is called before this returns, unless this runs on the receiving thread.
+        """
 
     @property
     @abstractmethod
     def same_clock(self) -> bool:
-        """Whether both ends read the same monotonic clock (one host), so that no offset needs estimating."""
+        """Whether both ends read the same monotonic clock (one host), so that no offset has to be estimated.
+
+        An application also checks what the proxy's Welcome says, for a host can have several time namespaces.
+        """
 
     @property
     def variants(self) -> bool:
-        """Whether frames come as each topic asks (:class:`skyloop.messages.VideoRequest`); else all come as they are,
-        and only the plain topic of a camera may be subscribed to."""
+        """Whether frames come in the form that each topic asks for (:class:`skyloop.messages.VideoRequest`).
+
+        Where it is false, all frames come as they are, and only the plain topic of a camera may be subscribed to.
+        """
         return False
 
     @property
     @abstractmethod
     def address(self) -> str:
-        """What it is connected to, for people."""
+        """What this end is connected to, for people."""
 
 
 #: Makes a connection and begins to deliver to the handler. Raises :class:`skyloop.errors.LinkError` when it cannot.
 Dialer = Callable[[ClientHandler], ClientEnd]
 
 
+#: What can be the name of a proxy: one of a socket's file and of one chunk of a network key.
+NAME: Final = re.compile(r"[a-z0-9][a-z0-9_.-]{0,47}")
+
+
+def check_name(name: str) -> None:
+    """Check the name of a proxy.
+
+    Args:
+        name: 1 to 48 lower-case letters, digits, ``_``, ``-`` and ``.``, the first one a letter or digit.
+
+    Raises:
+        UsageError: It is anything else.
+    """
+    if not NAME.fullmatch(name):
+        raise UsageError(
+            f"{name!r} cannot be the name of a proxy: 1 to 48 lower-case letters, digits, '_', '-' and '.', "
+            "the first one a letter or a digit"
+        )
+
+
 def check_packet(packet: bytes) -> None:
-    """Raise :class:`skyloop.errors.UsageError` for a packet that no transport carries."""
+    """Check the size of a packet.
+
+    Args:
+        packet: 1 to :data:`MAX_PACKET` bytes.
+
+    Raises:
+        UsageError: It is empty or too large.
+    """
     if not 0 < len(packet) <= MAX_PACKET:
         raise UsageError(f"a packet of {len(packet)} bytes cannot be sent; it must have 1 to {MAX_PACKET}")
 
 
 def check_topic(topic: str) -> None:
-    """Raise :class:`skyloop.errors.UsageError` for what cannot be a topic."""
+    """Check the length of a topic's name.
+
+    Args:
+        topic: 1 to :data:`MAX_TOPIC` characters.
+
+    Raises:
+        UsageError: It is empty or too long.
+    """
     if not 0 < len(topic) <= MAX_TOPIC:
         raise UsageError(f"the topic {topic[:100]!r} has {len(topic)} characters; it must have 1 to {MAX_TOPIC}")
 
 
+def too_many_topics(topic: str) -> str:
+    """Return why an application that has :data:`MAX_SUBSCRIPTIONS` topics gets no further one."""
+    return f"{topic[:64]!r} would be one more than the {MAX_SUBSCRIPTIONS} topics that a connection may subscribe to"
+
+
 def check_frame(header: FrameHeader, pixels: Pixels) -> None:
-    """Raise :class:`skyloop.errors.UsageError` for pixels that are not what their header says."""
+    """Check that pixels are what their header says.
+
+    Args:
+        header: The frame's header.
+        pixels: ``header.size`` bytes, dtype uint8, C-contiguous, in any shape.
+
+    Raises:
+        UsageError: The size, dtype or order differs.
+    """
     if pixels.nbytes != header.size or pixels.dtype != _UINT8 or not pixels.flags.c_contiguous:
         order = "" if pixels.flags.c_contiguous else ", not C-contiguous"
         raise UsageError(

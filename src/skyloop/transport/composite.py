@@ -1,45 +1,57 @@
-"""Several server ends as one: a proxy that is reached on its host and over the network at the same time."""
+"""Several server ends as one, for a proxy that is reached on its host and over the network at the same time."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from skyloop.errors import UsageError
 from skyloop.messages import FrameHeader
 from skyloop.transport.base import Peer, Pixels, ServerEnd, ServerHandler, check_packet
+from skyloop.transport.priority_lock import PriorityLock, is_command
 
 
-class _Place(NamedTuple):
-    """Which end an application came by, and who it is there."""
+class _Member(NamedTuple):
+    """The end by which an application came, and its peer at that end."""
 
     end: ServerEnd
     peer: Peer
 
 
 class CompositeServer(ServerEnd):
-    """One server end made of several, the nearest first. Its peers are numbered over all of them.
+    """One server end made of several, which numbers its peers over all of them.
 
-    The ends take turns at the handler, so that it is called by one at a time as the contract says.
+    The ends take turns at the handler, so that it gets one call at a time as the contract says: an end that brings a
+    command first, the others in the order of their arrival.
+
+    Args:
+        ends: The server ends, the nearest first; at least one.
+
+    Raises:
+        UsageError: There are no ends.
     """
 
     def __init__(self, ends: Sequence[ServerEnd]) -> None:
         if not ends:
             raise UsageError("a server end of several needs at least one")
         self._ends = tuple(ends)
-        self._turn = threading.RLock()  # whoever has it may call the handler
-        self._in_turn = 0  # identity of the thread that has it
-        self._places: dict[int, _Place] = {}  # by our number
+        self.lock = PriorityLock()  #: the thread that holds it may call the handler
+        self._members: dict[int, _Member] = {}  # by our number
         self._last_id = 0
 
     def start(self, handler: ServerHandler) -> None:
-        """Begin to accept at all ends, or at none."""
+        """Begin to accept connections at all ends, or at none.
+
+        What an end's own ``start`` raises is passed on after the ends before it were stopped.
+
+        Args:
+            handler: Called by one end at a time, on that end's receiving threads.
+        """
         started: list[ServerEnd] = []
         try:
             for end in self._ends:
-                end.start(_Door(self, end, handler))
+                end.start(_EndHandler(self, end, handler))
                 started.append(end)
         except BaseException:
             for end in reversed(started):
@@ -47,19 +59,23 @@ class CompositeServer(ServerEnd):
             raise
 
     def stop(self) -> None:
+        """Stop all ends at the same time, and wait for them unless called from a handler.
+
+        A handler's caller holds the lock that an end which stops waits for.
+        """
         threads = [threading.Thread(target=end.stop, name="skyloop-stop", daemon=True) for end in self._ends]
         for thread in threads:
             thread.start()
-        if self._in_turn != threading.get_ident():  # else an end would wait for a turn that its stopper has
+        if not self.lock.held:  # else an end would wait for a lock that its stopper holds
             for thread in threads:
                 thread.join()
 
     def send(self, peer: Peer, packet: bytes) -> bool:
-        place = self._places.get(peer.id)
-        if place is None:
+        member = self._members.get(peer.id)
+        if member is None:
             check_packet(packet)
             return False
-        return place.end.send(place.peer, packet)
+        return member.end.send(member.peer, packet)
 
     def publish(self, topic: str, packet: bytes) -> int:
         return sum(end.publish(topic, packet) for end in self._ends)
@@ -70,61 +86,75 @@ class CompositeServer(ServerEnd):
     def subscribers(self, topic: str) -> int:
         return sum(end.subscribers(topic) for end in self._ends)
 
+    def admit(self, peer: Peer, *, pilot: bool) -> str:
+        member = self._members.get(peer.id)
+        return "" if member is None else member.end.admit(member.peer, pilot=pilot)
+
     def disconnect(self, peer: Peer, reason: str) -> None:
-        place = self._places.get(peer.id)
-        if place is not None:
-            place.end.disconnect(place.peer, reason)
+        member = self._members.get(peer.id)
+        if member is not None:
+            member.end.disconnect(member.peer, reason)
+
+    @property
+    def counters(self) -> dict[str, float]:
+        return {name: count for end in self._ends for name, count in end.counters.items()}
 
     @property
     def address(self) -> str:
         return ", ".join(end.address for end in self._ends)
 
     def enter(self, end: ServerEnd, peer: Peer) -> Peer:
-        """A number of ours for somebody who came by this end. In turn."""
+        """Give an end's peer a number of this server. The caller holds the lock.
+
+        Args:
+            end: Where the application connected.
+            peer: The application, as that end knows it.
+
+        Returns:
+            The peer for the handler.
+        """
         self._last_id += 1
         ours = Peer(self._last_id, peer.address)
-        self._places[ours.id] = _Place(end, peer)
+        self._members[ours.id] = _Member(end, peer)
         return ours
 
     def leave(self, peer: Peer) -> None:
-        """Forget the number. In turn."""
-        self._places.pop(peer.id, None)
-
-    @contextmanager
-    def turn(self) -> Iterator[None]:
-        """Only one end at a time calls the handler."""
-        with self._turn:
-            self._in_turn = threading.get_ident()
-            try:
-                yield
-            finally:
-                self._in_turn = 0
+        """Forget a peer of this server. The caller holds the lock."""
+        self._members.pop(peer.id, None)
 
 
-class _Door:
-    """The handler of one end: passes on in turn, with peers as the whole knows them."""
+class _EndHandler:
+    """The handler of one end: passes calls on under the composite's lock, with the composite's peers."""
 
     def __init__(self, whole: CompositeServer, end: ServerEnd, handler: ServerHandler) -> None:
         self._whole = whole
+        self._lock = whole.lock
         self._end = end
         self._handler = handler
         self._peers: dict[int, Peer] = {}  # ours, by the end's number
 
     def peer_joined(self, peer: Peer) -> None:
-        with self._whole.turn():
+        with self._lock:
             ours = self._peers[peer.id] = self._whole.enter(self._end, peer)
             self._handler.peer_joined(ours)
 
     def packet(self, peer: Peer, packet: bytes) -> None:
-        with self._whole.turn():
+        with self._lock.urgent if is_command(packet) else self._lock:
             self._handler.packet(self._peers[peer.id], packet)
 
     def refused(self, peer: Peer, reason: str) -> None:
-        with self._whole.turn():
+        with self._lock:
             self._handler.refused(self._peers.get(peer.id, peer), reason)
 
+    def topic_problem(self, topic: str) -> str:
+        return self._handler.topic_problem(topic)
+
+    def malformed(self, peer: Peer, reason: str) -> None:
+        with self._lock:
+            self._handler.malformed(self._peers[peer.id], reason)
+
     def peer_left(self, peer: Peer, reason: str) -> None:
-        with self._whole.turn():
+        with self._lock:
             ours = self._peers.pop(peer.id)
             self._whole.leave(ours)
             self._handler.peer_left(ours, reason)

@@ -1,4 +1,4 @@
-"""The suite that every transport passes: subclass :class:`TransportSuite` in your tests and give it your two ends.
+"""The conformance tests of transports: subclass :class:`TransportSuite` in your tests and give it your two ends.
 
 ::
 
@@ -9,7 +9,7 @@
         def dialer(self, server: ServerEnd) -> Dialer:
             return my_dialer(server.address)
 
-Run it with pytest, once more under load if you can.
+Run it with pytest, and once more under load if you can.
 """
 
 from __future__ import annotations
@@ -48,19 +48,30 @@ from skyloop.transport.testing import (
 
 
 class TransportSuite(ABC):
-    """The contract of :mod:`skyloop.transport.base` as tests."""
+    """The contract of :mod:`skyloop.transport.base` as tests.
+
+    A subclass implements :meth:`make_server` and :meth:`dialer`; pytest collects the tests that it inherits.
+    """
 
     @abstractmethod
     def make_server(self) -> ServerEnd:
-        """A new server end, not started."""
+        """Return a new server end that is not started."""
 
     @abstractmethod
     def dialer(self, server: ServerEnd) -> Dialer:
-        """What connects to it."""
+        """Return a dialer that connects to a server end.
+
+        Args:
+            server: An end that :meth:`make_server` returned; it may be not started, or stopped.
+
+        Returns:
+            A dialer that raises :class:`skyloop.errors.LinkError` or :class:`skyloop.errors.UnknownNameError` where the
+            server does not run.
+        """
 
     @contextmanager
     def serving(self) -> Iterator[tuple[ServerEnd, ServerLog]]:
-        """A started server, stopped at the end."""
+        """Yield a started server and the log of its handler; stop the server at the end."""
         server, log = self.make_server(), ServerLog()
         server.start(log)
         try:
@@ -70,7 +81,14 @@ class TransportSuite(ABC):
 
     @contextmanager
     def connected(self, server: ServerEnd, log: ServerLog, *topics: str, keep: bool = True) -> Iterator[Joined]:
-        """A client, joined and subscribed, closed at the end."""
+        """Yield a client that has joined and subscribed; close it at the end.
+
+        Args:
+            server: A started server.
+            log: The log of its handler.
+            *topics: What the client subscribes to.
+            keep: Whether the client's log keeps frames (see :class:`skyloop.transport.testing.ClientLog`).
+        """
         client_log = ClientLog(keep=keep)
         known = len(log.joined)
         before = {topic: server.subscribers(topic) for topic in topics}
@@ -265,7 +283,10 @@ class TransportSuite(ABC):
         server.stop()
 
     def dial_or_link_error(self, server: ServerEnd) -> None:
-        """Dial; an unknown name is as good an answer as a refused connection."""
+        """Dial, and turn a ``UsageError`` into a ``LinkError``.
+
+        An unknown name is as good an answer as a refused connection.
+        """
         try:
             self.dialer(server)(ClientLog())
         except UsageError as error:

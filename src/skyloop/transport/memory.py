@@ -1,8 +1,8 @@
 """The transport inside one process: for tests, and for a proxy and an application that share a process.
 
-It keeps the whole contract of :mod:`skyloop.transport.base`, receiving threads and bounded queues included, so what
-works over it works over the others. :class:`Faults` makes it lose, repeat, reorder and damage what travels, exactly
-the same way for the same seed.
+It keeps the whole contract of :mod:`skyloop.transport.base`, receiving threads and bounded queues included, so code
+that works over it works over the other transports. :class:`Faults` makes it lose, repeat, reorder and damage packets
+and frames, in exactly the same way for the same seed.
 """
 
 from __future__ import annotations
@@ -17,8 +17,10 @@ from queue import SimpleQueue
 import numpy as np
 
 from skyloop.errors import LinkError, UsageError
+from skyloop.faults import FaultInjector, Faults
 from skyloop.messages import FrameHeader
 from skyloop.transport.base import (
+    MAX_SUBSCRIPTIONS,
     ClientEnd,
     ClientHandler,
     Peer,
@@ -28,9 +30,9 @@ from skyloop.transport.base import (
     check_frame,
     check_packet,
     check_topic,
+    too_many_topics,
     video,
 )
-from skyloop.transport.faults import Faults, Way
 
 __all__ = ["DEPTH", "FRAME_DEPTH", "Faults", "MemoryClient", "MemoryServer"]
 
@@ -42,15 +44,24 @@ _Frame = tuple[FrameHeader, Pixels]
 
 
 class _What(Enum):
-    """What the server's receiving thread is told about a client."""
+    """What happened to a client, for the server's receiving thread."""
 
     JOINED = auto()
     PACKET = auto()
+    MALFORMED = auto()
     LEFT = auto()
 
 
+_Item = tuple["MemoryClient", _What, str]  # the text of what is malformed
+
+
 class MemoryServer(ServerEnd):
-    """A proxy's end. :meth:`dial` is its :data:`skyloop.transport.base.Dialer`. May be started again after a stop."""
+    """A proxy's end; :meth:`dial` is its :data:`skyloop.transport.base.Dialer`. It may be started again after a stop.
+
+    Args:
+        name: For its address and the names of its threads.
+        faults: What goes wrong on the way; by default nothing.
+    """
 
     def __init__(self, name: str = "memory", *, faults: Faults | None = None) -> None:
         self._name = name
@@ -58,17 +69,28 @@ class MemoryServer(ServerEnd):
         self._lock = threading.Lock()  # guards joining and leaving; never held while a handler runs
         self._clients: dict[int, MemoryClient] = {}
         self._ids = itertools.count(1)
-        self._inbox: SimpleQueue[tuple[MemoryClient, _What] | None] = SimpleQueue()
+        self._inbox: SimpleQueue[_Item | None] = SimpleQueue()
+        self._handler: ServerHandler | None = None
         self._thread: threading.Thread | None = None
 
     def dial(self, handler: ClientHandler) -> MemoryClient:
-        """Connect. Raises :class:`LinkError` if the server is not started."""
+        """Connect to this server.
+
+        Args:
+            handler: Called on the client's own receiving thread.
+
+        Returns:
+            The connected client end.
+
+        Raises:
+            LinkError: The server is not started.
+        """
         with self._lock:
             if self._thread is None:
                 raise LinkError(f"nobody serves {self.address}: start the server end first")
             client = MemoryClient(self, Peer(next(self._ids), "this process"), handler, self._faults)
             self._clients[client.peer.id] = client
-            self._inbox.put((client, _What.JOINED))
+            self._inbox.put((client, _What.JOINED, ""))
         client.begin()
         return client
 
@@ -77,6 +99,7 @@ class MemoryServer(ServerEnd):
             if self._thread is not None:
                 raise UsageError(f"{self.address} is already started")
             self._inbox = SimpleQueue()
+            self._handler = handler
             name = f"skyloop-{self._name}-server"
             self._thread = threading.Thread(target=self._receive, args=(handler, self._inbox), name=name, daemon=True)
             self._thread.start()
@@ -122,29 +145,47 @@ class MemoryServer(ServerEnd):
         return f"memory:{self._name}"
 
     def arrived(self, client: MemoryClient) -> None:
-        """A packet was put into the client's ``outgoing``."""
-        self._inbox.put((client, _What.PACKET))
+        """Wake the receiving thread for a packet that was put into the client's ``outgoing``."""
+        self._inbox.put((client, _What.PACKET, ""))
+
+    def may_subscribe(self, client: MemoryClient, topic: str) -> bool:
+        """Return whether a client may subscribe to a topic; if not, the handler's ``malformed`` is called."""
+        problem = self._handler.topic_problem(topic) if self._handler is not None else ""
+        if len(client.topics) >= MAX_SUBSCRIPTIONS:
+            problem = problem or too_many_topics(topic)
+        if problem:
+            self._inbox.put((client, _What.MALFORMED, problem))
+        return not problem
 
     def end(self, client: MemoryClient, reason: str, *, muted: bool) -> None:
-        """End a connection, once. ``muted``: what it has sent and was not delivered yet is not wanted any more."""
+        """End a connection, once.
+
+        Args:
+            client: The connection's other end.
+            reason: Why, for the handlers of both ends.
+            muted: Whether to drop the packets from the client that were not delivered yet.
+        """
         with self._lock:
             if self._clients.pop(client.peer.id, None) is None:
                 return
             client.muted = muted
             client.end(reason)
-            self._inbox.put((client, _What.LEFT))
+            self._inbox.put((client, _What.LEFT, ""))
 
     def _subscribed(self, topic: str) -> list[MemoryClient]:
         return [client for client in list(self._clients.values()) if topic in client.topics]
 
-    def _receive(self, handler: ServerHandler, inbox: SimpleQueue[tuple[MemoryClient, _What] | None]) -> None:
+    def _receive(self, handler: ServerHandler, inbox: SimpleQueue[_Item | None]) -> None:
         while (item := inbox.get()) is not None:
-            client, what = item
+            client, what, text = item
             try:
                 if what is _What.PACKET:
                     packet = client.outgoing.popleft()
                     if not client.muted:
                         handler.packet(client.peer, packet)
+                elif what is _What.MALFORMED:
+                    if not client.muted:
+                        handler.malformed(client.peer, text)
                 elif what is _What.JOINED:
                     handler.peer_joined(client.peer)
                 else:
@@ -165,8 +206,8 @@ class MemoryClient(ClientEnd):
         self.reason = ""
         self._server = server
         self._handler = handler
-        self._up = Way(faults, f"{peer.id}/up")
-        self._down = Way(faults, f"{peer.id}/down")
+        self._up = FaultInjector(faults, f"{peer.id}/up")
+        self._down = FaultInjector(faults, f"{peer.id}/down")
         self._up_lock = threading.Lock()
         self._down_lock = threading.Lock()
         # A packet, the name of a camera whose next frame is due, or None: the connection has ended.
@@ -177,7 +218,7 @@ class MemoryClient(ClientEnd):
         self._thread = threading.Thread(target=self._receive, name=f"skyloop-memory-client-{peer.id}", daemon=True)
 
     def begin(self) -> None:
-        """Start to deliver."""
+        """Start the receiving thread."""
         self._thread.start()
 
     def send(self, packet: bytes) -> bool:
@@ -193,7 +234,8 @@ class MemoryClient(ClientEnd):
     def subscribe(self, topic: str, on: bool = True) -> None:
         check_topic(topic)
         if on:
-            self.topics.add(topic)
+            if topic not in self.topics and self._server.may_subscribe(self, topic):
+                self.topics.add(topic)
         else:
             self.topics.discard(topic)
 
@@ -212,7 +254,7 @@ class MemoryClient(ClientEnd):
         return self._server.address
 
     def deliver(self, packet: bytes) -> bool:
-        """Take a packet from the server; False if too many wait already."""
+        """Queue a packet from the server; return False if the connection has ended or too many packets wait."""
         with self._down_lock:
             if self._ended or self._inbox.qsize() >= DEPTH:
                 return False
@@ -221,7 +263,11 @@ class MemoryClient(ClientEnd):
         return True
 
     def deliver_frame(self, header: FrameHeader, pixels: Pixels) -> bool:
-        """Take a frame from the server; False if it took the place of one that still waited."""
+        """Queue a frame from the server.
+
+        Returns:
+            False if it took the place of one that waited, or if the connection has ended.
+        """
         room = True
         with self._down_lock:
             if self._ended:
@@ -237,7 +283,7 @@ class MemoryClient(ClientEnd):
         return room
 
     def end(self, reason: str) -> None:
-        """The connection has ended: called once, by the server."""
+        """Mark the connection as ended; called once, by the server."""
         with self._up_lock, self._down_lock:
             self._ended = True
             self.reason = reason

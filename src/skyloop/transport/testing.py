@@ -1,6 +1,6 @@
-"""What tests of transports, and of what stands on them, have in common: ends that write down what they were told.
+"""Helpers for tests of transports and of what builds on them: handlers that record their calls.
 
-Nothing here sleeps to wait: :func:`wait_until` waits for what must come, for at most :data:`PATIENCE_S`.
+Nothing here sleeps for a fixed time: :func:`wait_until` waits for a condition, for at most :data:`PATIENCE_S`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,15 @@ FRONT: Final = "front"
 
 
 def wait_until(condition: Callable[[], object], what: str) -> None:
-    """Return as soon as the condition holds; fail if it does not in time."""
+    """Return as soon as a condition holds.
+
+    Args:
+        condition: Called about every millisecond until it returns something true.
+        what: What is waited for, for the failure's message.
+
+    Raises:
+        AssertionError: It did not hold within :data:`PATIENCE_S`.
+    """
     deadline = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < deadline, f"waited {PATIENCE_S} s in vain until {what}"
@@ -30,7 +38,15 @@ def wait_until(condition: Callable[[], object], what: str) -> None:
 
 
 def raises(error: type[Exception], call: Callable[[], object]) -> None:
-    """Fail unless the call raises the error."""
+    """Check that a call raises an error; an error of another type passes through.
+
+    Args:
+        error: The type of the error.
+        call: A function without arguments.
+
+    Raises:
+        AssertionError: The call returned.
+    """
     try:
         call()
     except error:
@@ -39,13 +55,19 @@ def raises(error: type[Exception], call: Callable[[], object]) -> None:
 
 
 class ServerLog:
-    """A server's handler that writes down what it was told."""
+    """A server's handler that records its calls.
+
+    Its lists grow on the transport's receiving thread. ``on_packet``, if set, is called there with each packet after it
+    was recorded.
+    """
 
     def __init__(self) -> None:
         self.joined: list[Peer] = []
         self.packets: list[tuple[Peer, bytes]] = []
         self.left: list[tuple[Peer, str]] = []
         self.refusals: list[tuple[Peer, str]] = []
+        self.problems: dict[str, str] = {}  #: why these topics can't be subscribed to
+        self.complaints: list[tuple[Peer, str]] = []
         self.on_packet: Callable[[Peer, bytes], None] | None = None
 
     def peer_joined(self, peer: Peer) -> None:
@@ -59,16 +81,27 @@ class ServerLog:
     def refused(self, peer: Peer, reason: str) -> None:
         self.refusals.append((peer, reason))
 
+    def topic_problem(self, topic: str) -> str:
+        return self.problems.get(topic, "")
+
+    def malformed(self, peer: Peer, reason: str) -> None:
+        self.complaints.append((peer, reason))
+
     def peer_left(self, peer: Peer, reason: str) -> None:
         self.left.append((peer, reason))
 
     def from_peer(self, peer: Peer) -> list[bytes]:
-        """What one application sent."""
+        """Return the packets that one application sent, in order."""
         return [packet for sender, packet in list(self.packets) if sender == peer]
 
 
 class ClientLog:
-    """A client's handler that writes down what it was told, and keeps the frames while ``keep`` is true."""
+    """A client's handler that records its calls.
+
+    Args:
+        keep: Whether to keep the frames, with their pixels, in ``frames``. If false, the pixels are compared with
+            :func:`picture` at once, and ``torn`` lists the numbers of frames that differ.
+    """
 
     def __init__(self, *, keep: bool = True) -> None:
         self.keep = keep
@@ -96,7 +129,7 @@ class ClientLog:
         self.seen.append(header.seq)
 
     def saw(self, seq: int) -> bool:
-        """Whether this is the newest frame that came."""
+        """Return whether the newest frame that came has this number."""
         return self.seen[-1:] == [seq]
 
     def closed(self, reason: str) -> None:
@@ -104,17 +137,24 @@ class ClientLog:
 
 
 def header(seq: int, width: int = 32, height: int = 24, camera: str = FRONT) -> FrameHeader:
-    """A frame's header for the tests."""
+    """Return the header of a BGR8 frame for tests; both of its stamps are ``seq`` nanoseconds."""
     return FrameHeader(camera, seq, seq, seq, width, height, Encoding.BGR8, width * height * 3)
 
 
 def picture(head: FrameHeader) -> Pixels:
-    """Pixels that tell one frame from every other, in each byte."""
+    """Return the pixels of a frame for tests, in which each byte depends on the frame's number.
+
+    Args:
+        head: The frame's header.
+
+    Returns:
+        ``head.size`` bytes, shape (size,), dtype uint8.
+    """
     return (np.arange(head.size, dtype=np.uint32) * 7 + head.seq * 31).astype(np.uint8)
 
 
 class Joined:
-    """A client end that joined, its log, and how the server knows it."""
+    """A client end that has joined, with its log and its :class:`Peer` at the server."""
 
     def __init__(self, client: ClientEnd, log: ClientLog, peer: Peer) -> None:
         self.client = client
@@ -123,7 +163,10 @@ class Joined:
 
 
 def resources() -> tuple[int, int]:
-    """Threads and, where this can be told, open descriptors of this process."""
+    """Return how many threads and, where ``/proc`` tells it, open descriptors this process has.
+
+    The collector runs before they are counted.
+    """
     gc.collect()
     descriptors = Path("/proc/self/fd")
     return threading.active_count(), len(list(descriptors.iterdir())) if descriptors.exists() else 0

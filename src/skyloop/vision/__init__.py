@@ -1,5 +1,7 @@
-"""Seeing: markers, gates, colours and the ground's flow, lenses and their calibration. Needs the extra ``vision``;
-OpenCV is imported when it is used."""
+"""Computer vision: markers, gates, colours, optical flow of the ground, lens models and camera calibration.
+
+Needs the extra ``vision``; OpenCV is imported when it is first used.
+"""
 
 from skyloop.vision.board import Board, BoardFinder, BoardView
 from skyloop.vision.calibrating import Collector, calibrate

@@ -1,4 +1,4 @@
-"""Boards for calibration: ChArUco and chessboards, to be printed, and found in pictures.
+"""Calibration boards: ChArUco and chessboards, to be printed, and detected in images.
 
 ChArUco: a chessboard with a marker in each white square, so that every corner has a number and a part of the board is
 enough (Garrido-Jurado et al., "Automatic generation and detection of highly reliable fiducial markers under occlusion",
@@ -17,32 +17,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.errors import MissingExtraError, UsageError
+from skyloop.files import replacing
 from skyloop.vision.opencv import marker_dictionary, opencv
 
 Array = NDArray[np.float64]
 Kind = Literal["charuco", "chessboard"]
 MM_PER_INCH = 25.4
 _MARKER_SHARE = 0.74  # of a square's side
-_LEAST_CORNERS = 8  # of a ChArUco board in a picture
+_LEAST_CORNERS = 8  # of a ChArUco board in an image
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoardView:
-    """The corners of a board in one picture."""
+    """The corners of a board in one image."""
 
     points: Array  #: (n, 3) on the board [m]
-    pixels: Array  #: (n, 2) in the picture
-    name: str = ""  #: of the picture, for people
+    pixels: Array  #: (n, 2) in the image
+    name: str = ""  #: of the image, for messages
 
     @property
     def centre(self) -> Array:
-        """Mean of the corners (2,) [px]."""
+        """Mean of the corners, (2,) [px]."""
         return np.asarray(self.pixels.mean(axis=0))
 
 
 @dataclass(frozen=True, slots=True)
 class Board:
-    """A board of ``columns`` × ``rows`` squares. Raises :class:`UsageError` for one that can't be."""
+    """A board of ``columns`` × ``rows`` squares.
+
+    Raises:
+        UsageError: A number is out of its range, or the kind is unknown.
+    """
 
     columns: int = 7
     rows: int = 5
@@ -62,11 +67,23 @@ class Board:
 
     @property
     def corners(self) -> int:
-        """How many inner corners there are."""
+        """The number of inner corners."""
         return (self.columns - 1) * (self.rows - 1)
 
     def picture(self, square_px: int = 100) -> NDArray[np.uint8]:
-        """The board with half a square of white around it, grey, shape (h, w). Raises :class:`UsageError`."""
+        """Draw the board with a margin of half a square of white.
+
+        Args:
+            square_px: Side of a square.
+
+        Returns:
+            Grey image, shape (h, w), uint8.
+
+        Raises:
+            UsageError: The dictionary has fewer markers than the board needs.
+            UnknownNameError: OpenCV has no such dictionary.
+            MissingExtraError: OpenCV is not installed.
+        """
         cv = opencv("drawing a board")
         if self.kind == "charuco":
             size = (self.columns * square_px, self.rows * square_px)
@@ -78,8 +95,16 @@ class Board:
         return np.pad(inner, square_px // 2, constant_values=255)
 
     def save(self, path: str | Path, dpi: int = 300) -> None:
-        """Write it to be printed at its size: PNG or PDF, by the ending. Raises :class:`UsageError`,
-        :class:`MissingExtraError` without Pillow."""
+        """Write the board at its true size for printing.
+
+        Args:
+            path: A file name that ends in ``.png`` or ``.pdf``.
+            dpi: Resolution; it is adapted slightly so that a square has a whole number of pixels.
+
+        Raises:
+            UsageError: The ending is another one, or a square would not have 20 to 2000 pixels.
+            MissingExtraError: Pillow or OpenCV is not installed.
+        """
         file = Path(path)
         if file.suffix.lower() not in (".png", ".pdf"):
             raise UsageError(f"{file} must end with .png or .pdf")
@@ -92,14 +117,12 @@ class Board:
             raise UsageError(
                 f"squares of {self.square_m * 1000:g} mm at {dpi} dpi are {square_px} pixels, not 20 to 2000"
             )
-        true_dpi = square_px / (self.square_m * 1000 / MM_PER_INCH)  # so that a square is as large as it says
-        try:
+        true_dpi = square_px / (self.square_m * 1000 / MM_PER_INCH)  # makes a square exactly its size
+        with replacing(file) as part:
             if file.suffix.lower() == ".pdf":
-                Image.fromarray(self.picture(square_px)).save(file, resolution=true_dpi)
+                Image.fromarray(self.picture(square_px)).save(part, resolution=true_dpi)
             else:
-                Image.fromarray(self.picture(square_px)).save(file, dpi=(true_dpi, true_dpi))
-        except OSError as error:
-            raise UsageError(f"{file} can't be written: {error.strerror or error}") from error
+                Image.fromarray(self.picture(square_px)).save(part, dpi=(true_dpi, true_dpi))
 
     def _charuco(self, cv: Any) -> Any:
         markers = marker_dictionary(cv, self.dictionary)
@@ -113,9 +136,20 @@ class Board:
 
 
 class BoardFinder:
-    """Finds one board in pictures. Holds OpenCV's scratch memory: one finder a thread."""
+    """Detects one board in images. Holds OpenCV's scratch memory: use one finder per thread.
+
+    Attributes:
+        board: The board that is detected.
+    """
 
     def __init__(self, board: Board) -> None:
+        """Prepare the detector.
+
+        Raises:
+            UsageError: The dictionary has fewer markers than the board needs.
+            UnknownNameError: OpenCV has no such dictionary.
+            MissingExtraError: OpenCV is not installed.
+        """
         self.board = board
         self._cv = opencv("finding a board")
         self._charuco = self._detector = None
@@ -124,9 +158,17 @@ class BoardFinder:
             self._detector = self._cv.aruco.CharucoDetector(self._charuco)
 
     def find(self, image: NDArray[np.uint8], name: str = "") -> BoardView | None:
-        """The board's corners in a picture, (h, w, 3) BGR or (h, w) grey, uint8; None if it is not seen well enough.
+        """Detect the board.
 
-        Raises :class:`UsageError` for another array.
+        Args:
+            image: (h, w, 3) BGR or (h, w) grey, uint8.
+            name: Of the image; the view keeps it.
+
+        Returns:
+            The board's corners; None if it is not seen well enough.
+
+        Raises:
+            UsageError: The array has another shape or type, or is empty.
         """
         pixels = np.asarray(image)
         if pixels.dtype != np.uint8 or pixels.ndim not in (2, 3) or pixels.size == 0:
@@ -142,7 +184,7 @@ class BoardFinder:
             return None
         points = np.asarray(self._charuco.getChessboardCorners(), dtype=np.float64)[np.ravel(ids)]
         if np.linalg.matrix_rank(points[:, :2] - points[0, :2], tol=1e-6) < 2:
-            return None  # all on one line: it says nothing of a plane
+            return None  # collinear corners do not define a plane
         return BoardView(points, np.asarray(corners, dtype=np.float64).reshape(-1, 2), name)
 
     def _find_chessboard(self, grey: NDArray[np.uint8], name: str) -> BoardView | None:

@@ -1,7 +1,7 @@
 """Calibration of a camera from views of a board.
 
-Zhang, "A Flexible New Technique for Camera Calibration", IEEE PAMI 22(11), 2000, as OpenCV has it for both models.
-Views that do not go with the others (a wrong corner, a blurred or bent board) are taken out one by one, worst first.
+Zhang, "A Flexible New Technique for Camera Calibration", IEEE PAMI 22(11), 2000, as implemented by OpenCV for both
+models. Outliers among the views (a wrong corner, a blurred or bent board) are removed one by one, worst first.
 """
 
 from __future__ import annotations
@@ -23,22 +23,32 @@ Model = Literal["pinhole", "fisheye"]
 
 LEAST_VIEWS: Final = 6
 GRID: Final = (8, 6)  #: cells across and down in which coverage is counted
-_WORST_SHARE: Final = 2.5  # a view whose error is so many times the median's is taken out,
+_WORST_SHARE: Final = 2.5  # a view whose error is more than so many times the median is removed,
 _WORST_PX: Final = 0.3  # if it is larger than this
-_NEW_SHARE: Final = 0.08  # of the picture's width: a view whose corners moved less than this on average is no new one
+_NEW_SHARE: Final = 0.08  # of the image's width: a view whose corners moved less than this is no new one
 _STEPS: Final = (60, 1e-8)
 
 
 class Collector:
-    """Chooses from many pictures of a board those that differ enough from the ones chosen before. Pure."""
+    """Selects, from many images of a board, views that differ enough from the ones selected before. Pure.
+
+    Attributes:
+        views: The selected views.
+        size: Width and height of the images [px].
+    """
 
     def __init__(self, width: int, height: int) -> None:
+        """Initialise an empty collection for images of one size [px]."""
         self.views: list[BoardView] = []
-        self.size = (width, height)  #: of the pictures
+        self.size = (width, height)  #: of the images
         self._marks: list[Array] = []
 
     def offer(self, view: BoardView) -> bool:
-        """Take a view if it shows the board elsewhere, nearer, farther or otherwise tilted; whether it was taken."""
+        """Select a view if it shows the board elsewhere, nearer, farther or at another tilt.
+
+        Returns:
+            Whether it was selected.
+        """
         mark = _mark(view)
         nearest = min((float(np.abs(mark - other).max()) for other in self._marks), default=math.inf)
         if nearest < _NEW_SHARE * self.size[0]:
@@ -49,12 +59,18 @@ class Collector:
 
     @property
     def coverage(self) -> float:
-        """Share of the picture's area in which corners were seen, 0 to 1."""
+        """Share of the image area in which corners were seen, 0 to 1."""
         return coverage(self.views, *self.size)
 
 
 def coverage(views: Sequence[BoardView], width: int, height: int) -> float:
-    """Share of the cells of a grid over the picture that hold a corner, 0 to 1."""
+    """Return the share of the cells of a grid over the image that hold a corner, 0 to 1.
+
+    Args:
+        views: Of one camera.
+        width: Of the images [px].
+        height: Of the images [px].
+    """
     cells = np.zeros(GRID, dtype=bool)
     for view in views:
         column = np.clip((view.pixels[:, 0] / width * GRID[0]).astype(int), 0, GRID[0] - 1)
@@ -66,9 +82,21 @@ def coverage(views: Sequence[BoardView], width: int, height: int) -> float:
 def calibrate(
     views: Sequence[BoardView], width: int, height: int, *, model: Model = "pinhole", camera: str = ""
 ) -> tuple[Calibration, list[BoardView]]:
-    """The calibration, and the views that were taken out. ``width``, ``height``: of the pictures.
+    """Compute a camera's calibration.
 
-    Raises :class:`UsageError` for too few views, or ones from which nothing can be told.
+    Args:
+        views: At least 6, with the board at different places and tilts.
+        width: Of the images [px].
+        height: Of the images [px].
+        model: ``"pinhole"`` or ``"fisheye"``.
+        camera: The camera's name, which the calibration keeps.
+
+    Returns:
+        The calibration, and the views that were removed as outliers.
+
+    Raises:
+        UsageError: There are too few views, or they do not determine the model.
+        MissingExtraError: OpenCV is not installed.
     """
     if model not in ("pinhole", "fisheye"):
         raise UsageError(f"model is {model!r} and must be 'pinhole' or 'fisheye'")
@@ -131,7 +159,7 @@ def _fit(views: Sequence[BoardView], width: int, height: int, model: Model) -> _
 def _fit_pinhole(cv: Any, views: Sequence[BoardView], size: tuple[int, int], criteria: Any) -> _Fit:
     points = [view.points.astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32) for view in views]
-    # Without k3: of few pictures it is mostly noise, and bends the corners, where nothing was seen. Lenses that need it
+    # Without k3: from few images it is mostly noise, and bends the corners, where nothing was seen. Lenses that need it
     # are fisheyes.
     rms, k, d, _, _, deviations, _, errors = cv.calibrateCameraExtended(
         points, pixels, size, None, None, flags=cv.CALIB_FIX_K3, criteria=criteria
@@ -160,7 +188,7 @@ def _fisheye_flag(cv: Any, name: str) -> int:
 
 
 def _mark(view: BoardView) -> Array:
-    """What tells two views apart: where four points of the board are in the picture, corners seen or not."""
+    """Return what distinguishes two views: where four points of the board are in the image, (8,) [px]."""
     cv = opencv("calibration")
     ends = np.array([view.points.min(axis=0)[:2], view.points.max(axis=0)[:2]])
     homography, _ = cv.findHomography(view.points[:, :2], view.pixels)

@@ -1,4 +1,4 @@
-"""Things of one colour in a picture: which pixels have it, and what they make up."""
+"""Detection of things of one colour in an image."""
 
 from __future__ import annotations
 
@@ -23,11 +23,18 @@ _LEAST_VALUE: Final = 35  # of 255: darker pixels have no hue worth the name
 
 
 class ColourMask:
-    """Which pixels have a colour: its hue, and enough of it, however bright."""
+    """Selects pixels by their colour: by the hue, with enough saturation, at any brightness."""
 
     def __init__(self, colour: Rgb) -> None:
-        """``colour``: red, green, blue, 0 to 255. Raises :class:`UsageError` for what is no colour or has no hue,
-        :class:`MissingExtraError` without OpenCV."""
+        """Prepare the mask.
+
+        Args:
+            colour: Red, green, blue, 0 to 255.
+
+        Raises:
+            UsageError: That is no colour, or too grey to have a hue.
+            MissingExtraError: OpenCV is not installed.
+        """
         if len(colour) != 3 or not all(isinstance(part, int) and 0 <= part <= 255 for part in colour):
             raise UsageError(f"colour is {colour!r} and must be red, green and blue, each from 0 to 255")
         self._cv = opencv("finding a colour")
@@ -37,7 +44,7 @@ class ColourMask:
         self._hue, self._saturation = int(hue), int(saturation * _SATURATION)
 
     def of(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """255 where a BGR picture (h, w, 3) has the colour, 0 elsewhere, (h, w)."""
+        """Return the mask of a BGR image (h, w, 3): 255 where it has the colour, 0 elsewhere, (h, w), uint8."""
         cv = self._cv
         hsv = cv.cvtColor(cv.GaussianBlur(pixels, (3, 3), 0), cv.COLOR_BGR2HSV)
         reach = round(_HUE_DEG / 2)  # OpenCV's hue goes round in 180 steps
@@ -49,7 +56,7 @@ class ColourMask:
 
 @dataclass(frozen=True, slots=True)
 class BlobSighting:
-    """One thing of a colour in one picture."""
+    """One thing of a colour in one image."""
 
     box: tuple[float, float, float, float]  #: left, top, right, bottom [px]
     left_rad: float  #: its left edge, from the optical axis, positive to the left
@@ -57,32 +64,52 @@ class BlobSighting:
 
     @property
     def bearing_rad(self) -> float:
-        """Its middle, from the optical axis, positive to the left."""
+        """Angle of its middle from the optical axis, positive to the left."""
         return (self.left_rad + self.right_rad) / 2
 
     @property
     def width_rad(self) -> float:
-        """How wide it looks."""
+        """Its apparent width."""
         return self.left_rad - self.right_rad
 
     @property
     def outline(self) -> tuple[tuple[float, float], ...]:
-        """The box as annotations want it."""
+        """The corners of its box, for annotations."""
         left, top, right, bottom = self.box
         return (left, top), (right, top), (right, bottom), (left, bottom)
 
 
 class BlobDetector:
-    """Finds what has a colour and is large enough."""
+    """Detects connected areas of a colour that are large enough."""
 
     def __init__(self, colour: Rgb, least_px: int = 12) -> None:
-        """``least_px``: narrower or lower than this is not told. Raises as :class:`ColourMask`."""
+        """Prepare the detector.
+
+        Args:
+            colour: Red, green, blue, 0 to 255.
+            least_px: Narrower or lower areas are left out.
+
+        Raises:
+            UsageError: That is no colour, or too grey to have a hue.
+            MissingExtraError: OpenCV is not installed.
+        """
         self._mask = ColourMask(colour)
         self._cv = opencv("finding a colour")
         self._least_px = least_px
 
     def detect(self, image: NDArray[np.uint8], intrinsics: Intrinsics | None = None) -> list[BlobSighting]:
-        """Everything of the colour, the widest first; arguments and errors as :meth:`.GateDetector.detect`."""
+        """Detect everything of the colour.
+
+        Args:
+            image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR.
+            intrinsics: Of the camera; None takes the frame's.
+
+        Returns:
+            The sightings, the widest first.
+
+        Raises:
+            UsageError: The array has another shape or type, or there are no intrinsics.
+        """
         pixels, intrinsics = checked(image, intrinsics, colour=True)
         count, _, boxes, _ = self._cv.connectedComponentsWithStats(self._mask.of(pixels))
         found = []

@@ -1,10 +1,10 @@
-"""Where a camera that looks down has gone, by the motion of the ground's picture.
+"""Visual odometry of a camera that looks down, by the optical flow of the ground.
 
-Corners (Shi and Tomasi, "Good features to track", CVPR 1994) are tracked from picture to picture by pyramidal
+Corners (Shi and Tomasi, "Good features to track", CVPR 1994) are tracked from frame to frame by pyramidal
 Lucas-Kanade (Bouguet, "Pyramidal implementation of the Lucas Kanade feature tracker", Intel 2000), forth and back.
-Each ray is levelled by the attitude and meets the ground at the height that the vehicle measures; a corner that was
-first seen from a known place tells where the vehicle is now, and the median of them all is taken. It drifts only as
-corners leave the picture and new ones take their places.
+Each ray is levelled by the attitude and meets the ground at the height that the vehicle measures. A corner that was
+first seen from a known position gives the vehicle's present one, and the median of all corners is taken. The position
+drifts only as corners leave the image and new ones replace them.
 """
 
 from __future__ import annotations
@@ -24,42 +24,63 @@ Array = NDArray[np.float64]
 
 _MOST: Final = 80  # corners
 _ENOUGH: Final = 8
-_REFILL: Final = 50  # with fewer, new ones are looked for
+_REFILL: Final = 50  # with fewer, new ones are detected
 _APART_PX: Final = 12
 _RETURN_PX: Final = 0.7  # a corner tracked forth and back must come back so near
 _LOWEST_M: Final = 0.15  # nearer to the ground there is nothing to track
 
 
 class GroundTracker:
-    """Tell it each picture of a camera that looks down; it tells where the vehicle is, from where it began."""
+    """Tracks the ground in a downward camera's frames, and computes the vehicle's position relative to its start.
+
+    Attributes:
+        place: Position as of the last frame, (2,) [m], along yaw 0 and to its left.
+    """
 
     def __init__(self, camera: CameraInfo) -> None:
-        """Raises :class:`UsageError` if the camera does not say how it is mounted, :class:`MissingExtraError` without
-        OpenCV."""
+        """Initialise the tracker.
+
+        Args:
+            camera: How the camera is mounted.
+
+        Raises:
+            UsageError: The camera does not say how it is mounted.
+            MissingExtraError: OpenCV is not installed.
+        """
         self._cv: Any = opencv("optical flow")
         self._mounting = mounting_rotation(camera)
         self._offset = np.zeros(3) if camera.position is None else np.asarray(camera.position, np.float64)
         self._grey: NDArray[np.uint8] | None = None
-        self._corners = np.empty((0, 2), np.float32)  # pixels in the last picture
+        self._corners = np.empty((0, 2), np.float32)  # pixels in the last frame
         self._ground = np.empty((0, 2))  # where they are on the ground, in the axes of `place`
-        self.place = np.zeros(2)  #: of the vehicle, along yaw 0 and to its left [m], as of the last picture
+        self.place = np.zeros(2)  #: of the vehicle, along yaw 0 and to its left [m], as of the last frame
 
     @property
     def points(self) -> tuple[tuple[float, float], ...]:
-        """The corners that it goes by, pixels in the last picture."""
+        """The corners that are tracked, pixels in the last frame."""
         return tuple((float(x), float(y)) for x, y in self._corners)
 
     def forget(self) -> None:
-        """Begin anew at the present place with the next picture."""
+        """Forget all corners; the next frame starts anew at the present position."""
         self._grey, self._corners, self._ground = None, np.empty((0, 2), np.float32), np.empty((0, 2))
 
     def see(
         self, image: NDArray[np.uint8], at_capture: Feedback, intrinsics: Intrinsics | None = None
     ) -> tuple[Array, int] | None:
-        """Where the vehicle is, (2,) [m] along yaw 0 and to its left, and by how many corners; None where too few were
-        found again, or attitude or height are not known: then it begins anew at the place that it knew last.
+        """Track the ground in the next frame.
 
-        ``image`` and ``intrinsics`` as those of :meth:`.MarkerDetector.detect`; raises as that.
+        Args:
+            image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or (h, w) grey.
+            at_capture: Feedback with attitude and altitude at the capture.
+            intrinsics: Of the camera; None takes the frame's.
+
+        Returns:
+            Position (2,) [m] along yaw 0 and to its left, and the number of corners; None for the first frame, where
+            too few corners were found again, and where attitude or height are not known. Then tracking starts anew at
+            the last position.
+
+        Raises:
+            UsageError: The array has another shape or type, or there are no intrinsics.
         """
         pixels, intrinsics = checked(image, intrinsics)
         grey = self._cv.cvtColor(pixels, self._cv.COLOR_BGR2GRAY) if pixels.ndim == 3 else pixels.copy()
@@ -111,7 +132,7 @@ class GroundTracker:
     def _below(
         self, corners: NDArray[Any], at_capture: Feedback, intrinsics: Intrinsics
     ) -> tuple[Array, NDArray[np.bool_]]:
-        """Where the corners' rays meet the ground, from the vehicle, (n, 2) [m], and which of them do."""
+        """Return where the corners' rays meet the ground, from the vehicle, (n, 2) [m], and which of them do."""
         if not len(corners):
             return np.empty((0, 2)), np.empty(0, np.bool_)
         rays = normalised(np.asarray(corners, np.float64), intrinsics)

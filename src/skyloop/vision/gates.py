@@ -1,9 +1,9 @@
-"""Gates of a known colour and size: their openings in a picture, and in metres from the camera.
+"""Detection of gates of a known colour and size, and their poses.
 
-A gate is a frame of one colour around an opening. Of what has that colour, a hole that four straight sides bound is an
-opening. The sides are fitted to the hole's edge after the lens is taken out
-(OpenCV's ``fitLine`` with Huber's weights), so that the corners, where they meet, are better than a pixel. The pose is
-IPPE (Collins and Bartoli, "Infinitesimal Plane-Based Pose Estimation", IJCV 109, 2014).
+A gate is a frame of one colour around an opening. Of what has that colour, a hole that is bounded by four straight
+sides is an opening. The sides are fitted to the hole's edge after the lens distortion is removed (OpenCV's ``fitLine``
+with Huber's weights), so that the corners, where they meet, are better than a pixel. The pose is IPPE (Collins and
+Bartoli, "Infinitesimal Plane-Based Pose Estimation", IJCV 109, 2014).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from skyloop.vision.opencv import opencv
 from skyloop.vision.planar import Array, PlanarPose, PlanarSighting, checked, rectangle
 
 _LEAST_AREA_PX: Final = 150.0  # smaller openings say little about the distance
-_FARTHEST_M: Final = 8.0  # what seems to be farther off is a patch of the same colour
+_FARTHEST_M: Final = 8.0  # a farther one is more likely a patch of the same colour
 _SIDE_SHARE: Final = 0.15  # of each side, at both ends, that is not fitted: the corners are round
 _FILLED: Final = 0.6  # of the four-sided hull: something of the same colour behind the gate may reach into the hole
 _OFF_PX: Final = 1.5  # the edge's root mean square distance from its four sides
@@ -31,17 +31,27 @@ _OFF_PX: Final = 1.5  # the edge's root mean square distance from its four sides
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class GateSighting(PlanarSighting):
-    """One gate's opening in one picture; its face is the side that the camera sees."""
+    """One gate's opening in one image; its face is the side that the camera sees."""
 
 
 class GateDetector:
-    """Finds the gates of one colour whose opening has one size. The picture's top must be up, by 30° or so."""
+    """Detects gates of one colour whose opening has one size, in images that are upright within about 30°.
+
+    Attributes:
+        colour: Red, green, blue, 0 to 255.
+        inner_size_m: Width and height of the opening.
+    """
 
     def __init__(self, colour: Rgb, inner_size_m: tuple[float, float] = (1.2, 1.2)) -> None:
-        """``colour``: red, green, blue, 0 to 255; ``inner_size_m``: width and height of the opening.
+        """Prepare the detector.
 
-        Raises :class:`UsageError` for what is no colour with a hue or no size, :class:`MissingExtraError` without
-        OpenCV.
+        Args:
+            colour: Red, green, blue, 0 to 255.
+            inner_size_m: Width and height of the opening.
+
+        Raises:
+            UsageError: That is no colour with a hue, or no size.
+            MissingExtraError: OpenCV is not installed.
         """
         if not (len(inner_size_m) == 2 and all(math.isfinite(side) and side > 0 for side in inner_size_m)):
             raise UsageError(f"inner_size_m is {inner_size_m!r} and must be width and height in metres, above 0")
@@ -52,17 +62,24 @@ class GateDetector:
         self._outline = rectangle(*inner_size_m)
 
     def detect(self, image: NDArray[np.uint8], intrinsics: Intrinsics | None = None) -> list[GateSighting]:
-        """All gates in a picture, the nearest first.
+        """Detect all gates in an image.
 
-        ``image`` is a :class:`skyloop.Frame` or any uint8 array, (h, w, 3) BGR; ``intrinsics`` are taken from the frame
-        if not given. Raises :class:`UsageError` for another array, or if intrinsics are missing.
+        Args:
+            image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR.
+            intrinsics: Of the camera; None takes the frame's.
+
+        Returns:
+            The sightings, the nearest first.
+
+        Raises:
+            UsageError: The array has another shape or type, or there are no intrinsics.
         """
         pixels, intrinsics = checked(image, intrinsics, colour=True)
         found = (self._sighting(hole, intrinsics) for hole in self._holes(self._mask.of(pixels)))
         return sorted((one for one in found if one is not None), key=lambda one: one.distance_m)
 
     def _holes(self, mask: NDArray[np.uint8]) -> list[Array]:
-        """The edges of the holes, each (n, 2) pixels: their outermost pixels of the frame."""
+        """Return the edges of the holes, each (n, 2) pixels: the innermost pixels of the gate's frame."""
         contours, tree = self._cv.findContours(mask, self._cv.RETR_CCOMP, self._cv.CHAIN_APPROX_NONE)
         if tree is None:
             return []
@@ -73,7 +90,7 @@ class GateDetector:
         ]
 
     def _sighting(self, edge: Array, intrinsics: Intrinsics) -> GateSighting | None:
-        """None for what is no opening."""
+        """Return the opening that a hole's edge bounds; None if it is none."""
         rough = self._four_corners(edge)
         if rough is None:
             return None
@@ -87,7 +104,7 @@ class GateDetector:
         return GateSighting(corners=corners, position=pose.position, rotation=pose.rotation, ambiguity=pose.ambiguity)
 
     def _four_corners(self, edge: Array) -> Array | None:
-        """Roughly, (4, 2) pixels, from the top left clockwise; None for another shape."""
+        """Return rough corners, (4, 2) pixels, from the top left clockwise; None for another shape."""
         cv = self._cv
         hull = cv.convexHull(edge.astype(np.float32))
         length = cv.arcLength(hull, True)
@@ -103,8 +120,7 @@ class GateDetector:
         return np.asarray(np.roll(clockwise, -first, axis=0), np.float64)
 
     def _meeting_sides(self, edge: Array, rough: Array, intrinsics: Intrinsics) -> Array | None:
-        """x/z and y/z of the corners, (4, 2), where lines through the sides meet; None where the edge is not made of
-        four straight sides."""
+        """Return x/z and y/z of the corners, (4, 2), where the sides' lines meet; None unless all are straight."""
         lines = []
         for begin, end in zip(rough, np.roll(rough, -1, axis=0), strict=True):
             side = _along(edge, begin, end)
@@ -130,7 +146,7 @@ class GateDetector:
 
 
 def _along(edge: Array, begin: Array, end: Array) -> Array:
-    """The edge's points along one side, without its ends, (n, 2)."""
+    """Return the edge's points along one side, without its ends, (n, 2)."""
     way = end - begin
     length = float(np.linalg.norm(way))
     if length < 1.0:

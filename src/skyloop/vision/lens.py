@@ -1,4 +1,4 @@
-"""How a lens maps directions to pixels, both ways, and pictures without its distortion.
+"""Lens models: directions to pixels and back, and images without distortion.
 
 OpenCV's models: ``pinhole`` with Brown and Conrady's distortion (``calib3d``: k1, k2, p1, p2, k3, …) and ``fisheye``
 (Kannala and Brandt, "A Generic Camera Model and Calibration Method", IEEE PAMI 28(8), 2006: an odd polynomial of the
@@ -24,10 +24,18 @@ _ITERATIONS = (40, 1e-10)  # of the inverse of a distortion
 
 
 def project(points: ArrayLike, intrinsics: Intrinsics) -> Array:
-    """Pixels (n, 2) of points in optical axes (n, 3), or of directions of any length; NaN for those that the model
-    can't show: beside or behind a pinhole, or beyond the angle at which a fisheye's polynomial turns back.
+    """Project points into the image.
 
-    Raises :class:`UsageError` for another shape or an unknown model.
+    Args:
+        points: Shape (n, 3) in optical axes; points or directions of any length.
+        intrinsics: Of the camera.
+
+    Returns:
+        Pixels (n, 2); NaN for points that the model can't show: beside or behind a pinhole, or beyond the angle at
+        which a fisheye's polynomial turns back.
+
+    Raises:
+        UsageError: The shape is another one, or the model is unknown.
     """
     given = _rows(points, 3)
     if _is_fisheye(intrinsics):
@@ -43,9 +51,17 @@ def project(points: ArrayLike, intrinsics: Intrinsics) -> Array:
 
 
 def unproject(pixels: ArrayLike, intrinsics: Intrinsics) -> Array:
-    """Unit vectors (n, 3) in optical axes to what pixels (n, 2) see; NaN where the model has no such direction.
+    """Return unit vectors (n, 3) in optical axes to what pixels see.
 
-    Raises as :func:`project`.
+    Args:
+        pixels: Shape (n, 2).
+        intrinsics: Of the camera.
+
+    Returns:
+        NaN where the model has no such direction.
+
+    Raises:
+        UsageError: The shape is another one, or the model is unknown.
     """
     given = _rows(pixels, 2)
     if _is_fisheye(intrinsics):
@@ -55,7 +71,18 @@ def unproject(pixels: ArrayLike, intrinsics: Intrinsics) -> Array:
 
 
 def normalised(pixels: ArrayLike, intrinsics: Intrinsics) -> Array:
-    """x/z and y/z (n, 2) of what pixels (n, 2) see; NaN also for what is beside or behind the camera."""
+    """Return x/z and y/z (n, 2) of what pixels (n, 2) see.
+
+    Args:
+        pixels: Shape (n, 2).
+        intrinsics: Of the camera.
+
+    Returns:
+        NaN also for what is beside or behind the camera.
+
+    Raises:
+        UsageError: The shape is another one, or the model is unknown.
+    """
     if not _is_fisheye(intrinsics):
         return _ideal(_rows(pixels, 2), intrinsics)
     rays = unproject(pixels, intrinsics)
@@ -66,10 +93,20 @@ def normalised(pixels: ArrayLike, intrinsics: Intrinsics) -> Array:
 def undistort(
     image: NDArray[np.uint8], intrinsics: Intrinsics | None = None, *, balance: float = 0.0
 ) -> tuple[NDArray[np.uint8], Intrinsics]:
-    """The picture as an ideal pinhole camera would have taken it, and that camera's intrinsics.
+    """Remove the lens distortion from an image.
 
-    ``image`` is a :class:`skyloop.Frame`, or any array (h, w, 3) or (h, w) of uint8 with ``intrinsics``; ``balance`` 0
-    shows only what every pixel knows, 1 all that was seen, with black around it. Raises :class:`UsageError`.
+    Args:
+        image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) or (h, w).
+        intrinsics: Of the camera; None takes the frame's.
+        balance: From 0, which shows only what the whole image knows, to 1, which shows all that was seen, with black
+            around it.
+
+    Returns:
+        The image as an ideal pinhole camera would have taken it, and that camera's intrinsics.
+
+    Raises:
+        UsageError: An argument is out of its range, or there are no intrinsics.
+        MissingExtraError: OpenCV is not installed.
     """
     if intrinsics is None:
         intrinsics = getattr(image, "intrinsics", None)
@@ -89,7 +126,7 @@ def undistort(
 
 @lru_cache(maxsize=8)
 def _maps(intrinsics: Intrinsics, width: int, height: int, balance: float) -> tuple[Intrinsics, Any, Any]:
-    """The ideal camera, and where each of its pixels is to be taken from; once for each camera."""
+    """Return the ideal camera, and where each of its pixels is sampled; cached for each camera."""
     cv, size, turn = opencv("taking out distortion"), (width, height), np.eye(3)
     focal = _focal_length(intrinsics, width, height, balance)
     ideal = Intrinsics(focal, focal, intrinsics.cx, intrinsics.cy)
@@ -101,7 +138,7 @@ def _maps(intrinsics: Intrinsics, width: int, height: int, balance: float) -> tu
 
 
 def _focal_length(intrinsics: Intrinsics, width: int, height: int, balance: float) -> float:
-    """Of a pinhole with the same axis: from one that shows nothing that is not known to one that shows all."""
+    """Return the focal length of a pinhole with the same axis, between no unknown pixels and all that was seen."""
     across, down = np.linspace(0, width - 1, 33), np.linspace(0, height - 1, 25)
     reach = []  # how far from the axis each side is in the picture, and by the least and the greatest direction on it
     for axis, at, along in ((0, 0.0, down), (0, width - 1.0, down), (1, 0.0, across), (1, height - 1.0, across)):
@@ -115,7 +152,7 @@ def _focal_length(intrinsics: Intrinsics, width: int, height: int, balance: floa
 
 
 def _ideal(pixels: Array, intrinsics: Intrinsics) -> Array:
-    """x/z and y/z of a pinhole's pixels."""
+    """Return x/z and y/z of a pinhole's pixels."""
     if not len(pixels):
         return np.empty((0, 2))
     cv, given = opencv("taking out distortion"), pixels.reshape(-1, 1, 2)
@@ -129,7 +166,7 @@ def _ideal(pixels: Array, intrinsics: Intrinsics) -> Array:
 
 
 def _bent(points: Array, intrinsics: Intrinsics) -> Array:
-    """A fisheye's pixels of directions."""
+    """Return a fisheye's pixels of directions."""
     aside = np.hypot(points[:, 0], points[:, 1])
     angle = np.arctan2(aside, points[:, 2])
     radius, slope = _polynomial(angle, intrinsics)
@@ -139,7 +176,7 @@ def _bent(points: Array, intrinsics: Intrinsics) -> Array:
 
 
 def _straight(pixels: Array, intrinsics: Intrinsics) -> Array:
-    """Unit vectors to what a fisheye's pixels see, by Newton's method on the angle to the axis."""
+    """Return unit vectors to what a fisheye's pixels see, by Newton's method on the angle to the axis."""
     flat = (pixels - (intrinsics.cx, intrinsics.cy)) / (intrinsics.fx, intrinsics.fy)
     radius = np.hypot(flat[:, 0], flat[:, 1])
     angle = np.minimum(radius, np.pi)
@@ -155,7 +192,7 @@ def _straight(pixels: Array, intrinsics: Intrinsics) -> Array:
 
 
 def _polynomial(angle: Array, intrinsics: Intrinsics) -> tuple[Array, Array]:
-    """Distance from the axis in the picture, for f = 1, by the angle to the axis, and its derivative."""
+    """Return the distance from the axis in the image, for f = 1, by the angle to the axis, and its derivative."""
     k1, k2, k3, k4 = _distortion(intrinsics)
     square = angle * angle
     value = angle * (1.0 + square * (k1 + square * (k2 + square * (k3 + square * k4))))

@@ -1,4 +1,4 @@
-"""ArUco and AprilTag markers: where they are in a picture, and in metres from the camera.
+"""Detection of ArUco and AprilTag markers, and their poses.
 
 Detection is OpenCV's ``ArucoDetector`` (Garrido-Jurado et al., "Automatic generation and detection of highly reliable
 fiducial markers under occlusion", Pattern Recognition 47(6), 2014); the pose is IPPE for squares (Collins and Bartoli,
@@ -23,19 +23,30 @@ from skyloop.vision.planar import Array, PlanarPose, PlanarSighting, checked, re
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class MarkerSighting(PlanarSighting):
-    """One marker in one picture; its top left is that of the printed marker."""
+    """One marker in one image; its top left is that of the printed marker."""
 
     id: int
 
 
 class MarkerDetector:
-    """Finds the markers of one dictionary and one size. Holds OpenCV's scratch memory: one detector a thread."""
+    """Detects markers of one dictionary and one size. Holds OpenCV's scratch memory: use one detector per thread.
+
+    Attributes:
+        dictionary: As it was given.
+        size_m: Edge of the black square.
+    """
 
     def __init__(self, dictionary: str = "4x4_50", size_m: float = 0.3) -> None:
-        """``dictionary`` by OpenCV's name, with or without ``DICT_``; ``size_m`` is the edge of the black square.
+        """Prepare the detector.
 
-        Raises :class:`UsageError` for a bad size, :class:`UnknownNameError` for a dictionary that OpenCV does not
-        have, :class:`MissingExtraError` without OpenCV.
+        Args:
+            dictionary: OpenCV's name of it, with or without ``DICT_``.
+            size_m: Edge of the black square.
+
+        Raises:
+            UsageError: The size is not a finite number above 0.
+            UnknownNameError: OpenCV has no such dictionary.
+            MissingExtraError: OpenCV is not installed.
         """
         if not (isinstance(size_m, (int, float)) and math.isfinite(size_m) and size_m > 0):
             raise UsageError(f"size_m is {size_m!r} and must be the marker's edge in metres, above 0")
@@ -47,10 +58,17 @@ class MarkerDetector:
         self._square = rectangle(self.size_m, self.size_m)
 
     def detect(self, image: NDArray[np.uint8], intrinsics: Intrinsics | None = None) -> list[MarkerSighting]:
-        """All markers in a picture, in the order of their ids.
+        """Detect all markers in an image.
 
-        ``image`` is a :class:`skyloop.Frame` or any uint8 array, (h, w, 3) BGR or (h, w) grey; ``intrinsics`` are
-        taken from the frame if not given. Raises :class:`UsageError` for another array, or if intrinsics are missing.
+        Args:
+            image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or (h, w) grey.
+            intrinsics: Of the camera; None takes the frame's.
+
+        Returns:
+            The sightings, in the order of their ids.
+
+        Raises:
+            UsageError: The array has another shape or type, or there are no intrinsics.
         """
         pixels, intrinsics = checked(image, intrinsics)
         grey = self._cv.cvtColor(pixels, self._cv.COLOR_BGR2GRAY) if pixels.ndim == 3 else pixels
@@ -64,7 +82,7 @@ class MarkerDetector:
         return sorted((one for one in found if one is not None), key=lambda one: one.id)
 
     def _sighting(self, number: int, corners: Array, intrinsics: Intrinsics) -> MarkerSighting | None:
-        """None for corners that no square in front of the camera explains."""
+        """Return the marker's pose; None if no square in front of the camera explains the corners."""
         rays = normalised(corners, intrinsics)
         if not np.isfinite(rays).all():
             return None

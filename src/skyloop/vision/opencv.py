@@ -1,4 +1,4 @@
-"""OpenCV, imported when it is used, and what it calls its dictionaries of markers."""
+"""OpenCV, imported when it is used, and its dictionaries of markers."""
 
 from __future__ import annotations
 
@@ -8,7 +8,17 @@ from skyloop.errors import MissingExtraError, UnknownNameError
 
 
 def opencv(what: str) -> Any:
-    """The module. Raises :class:`MissingExtraError` that says what is not possible without it."""
+    """Import OpenCV.
+
+    Args:
+        what: What needs it; a noun phrase for the error message.
+
+    Returns:
+        The module ``cv2``.
+
+    Raises:
+        MissingExtraError: OpenCV is not installed.
+    """
     try:
         import cv2
     except ImportError as error:
@@ -17,7 +27,15 @@ def opencv(what: str) -> Any:
 
 
 def marker_dictionary(cv: Any, dictionary: str) -> Any:
-    """By OpenCV's name, with or without ``DICT_``. Raises :class:`UnknownNameError`."""
+    """Return one of OpenCV's predefined dictionaries.
+
+    Args:
+        cv: The module ``cv2``.
+        dictionary: Its name, with or without ``DICT_``, in any case.
+
+    Raises:
+        UnknownNameError: OpenCV has no such dictionary.
+    """
     known = {name[5:].lower(): name for name in dir(cv.aruco) if name.startswith("DICT_")}
     name = known.get(dictionary.lower().removeprefix("dict_"))
     if name is None:

@@ -1,4 +1,4 @@
-"""Flat things of known size in a picture: what markers and gates have in common.
+"""Flat things of known size in an image: what markers and gates have in common.
 
 Camera axes are optical: x right, y down, z forward. A flat thing's own axes are x right, y up, z out of its face.
 """
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class PlanarSighting:
-    """One flat thing in one picture."""
+    """One flat thing in one image."""
 
     corners: Array  #: (4, 2) pixels: its own top left, top right, bottom right, bottom left
     position: Array  #: (3,) its centre in the camera's optical axes [m]
@@ -37,35 +37,44 @@ class PlanarSighting:
 
     @property
     def pose(self) -> RigidTransform:
-        """Its pose in the camera's optical axes. Raises :class:`MissingExtraError` without SciPy."""
+        """Its pose in the camera's optical axes.
+
+        Raises:
+            MissingExtraError: SciPy is not installed.
+        """
         return transform(self.position, self.rotation)
 
     @property
     def distance_m(self) -> float:
-        """From the camera's optical centre to its centre."""
+        """Distance from the camera's optical centre to its centre."""
         return float(np.linalg.norm(self.position))
 
     @property
     def outline(self) -> tuple[tuple[float, float], ...]:
-        """The corners as annotations want them."""
+        """The corners, for annotations."""
         return tuple((float(x), float(y)) for x, y in self.corners)
 
     def position_in_body(self, camera: CameraInfo) -> Array:
-        """Its centre in the vehicle's body axes (x forward, y left, z up), shape (3,) [m].
+        """Return its centre in the vehicle's body axes (x forward, y left, z up), shape (3,) [m].
 
-        Raises :class:`UsageError` if the camera does not say how it is mounted.
+        Raises:
+            UsageError: The camera does not say how it is mounted.
         """
         offset = np.zeros(3) if camera.position is None else np.asarray(camera.position)
         return mounting_rotation(camera) @ self.position + offset
 
     def normal_in_body(self, camera: CameraInfo) -> Array:
-        """The unit vector out of its face in body axes, shape (3,). Raises as :meth:`position_in_body`."""
+        """Return the unit vector out of its face in body axes, shape (3,).
+
+        Raises:
+            UsageError: The camera does not say how it is mounted.
+        """
         return mounting_rotation(camera) @ self.normal
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlanarPose:
-    """Where four corners put a flat thing, in optical axes."""
+    """The pose of a flat thing in optical axes."""
 
     position: Array  #: (3,) [m]
     rotation: Array  #: (3, 3)
@@ -73,8 +82,17 @@ class PlanarPose:
 
     @classmethod
     def of(cls, cv: Any, outline_m: Array, rays: Array, method: int) -> Self | None:
-        """``outline_m`` (4, 3): the corners in its own axes; ``rays`` (4, 2): x/z and y/z of each in the picture;
-        ``method``: one of OpenCV's IPPE. None for corners that nothing in front of the camera explains."""
+        """Estimate the pose from four corners.
+
+        Args:
+            cv: The module ``cv2``.
+            outline_m: The corners in the thing's own axes, (4, 3).
+            rays: x/z and y/z of each corner in the image, (4, 2).
+            method: One of OpenCV's IPPE methods.
+
+        Returns:
+            The best pose; None if nothing in front of the camera explains the corners.
+        """
         count, turns, places, errors = cv.solvePnPGeneric(outline_m, rays, np.eye(3), None, flags=method)
         if not count:
             return None
@@ -88,7 +106,7 @@ class PlanarPose:
 
 
 def rectangle(width_m: float, height_m: float) -> Array:
-    """The corners of a rectangle in its own axes, (4, 3) [m], in the order of :attr:`PlanarSighting.corners`."""
+    """Return the corners of a rectangle in its own axes, (4, 3) [m], in the order of :attr:`PlanarSighting.corners`."""
     x, y = width_m / 2, height_m / 2
     return np.array([[-x, y, 0], [x, y, 0], [x, -y, 0], [-x, -y, 0]])
 
@@ -96,9 +114,15 @@ def rectangle(width_m: float, height_m: float) -> Array:
 def checked(
     image: NDArray[np.uint8], intrinsics: Intrinsics | None, *, colour: bool = False
 ) -> tuple[NDArray[np.uint8], Intrinsics]:
-    """The pixels as a plain array, and the intrinsics, the frame's own if none are given.
+    """Check an image, and return its pixels as a plain array with its intrinsics.
 
-    Raises :class:`UsageError` for what is no picture, BGR or (unless ``colour``) grey, and if intrinsics are missing.
+    Args:
+        image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or, unless ``colour``, (h, w) grey.
+        intrinsics: Of the camera; None takes the frame's.
+        colour: Whether a grey image is refused.
+
+    Raises:
+        UsageError: The array has another shape or type, is empty, or there are no intrinsics.
     """
     if intrinsics is None:
         intrinsics = getattr(image, "intrinsics", None)

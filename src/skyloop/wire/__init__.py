@@ -1,1 +1,1 @@
-"""The bytes that real vehicles speak, both ways and pure: what a driver and an emulated vehicle have in common."""
+"""The bytes that vehicles and motion capture systems speak, both ways and pure: what a driver and an emulator share."""

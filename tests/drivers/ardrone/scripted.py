@@ -6,9 +6,9 @@ from collections.abc import Callable
 from typing import Final
 
 from skyloop.clock import NS_PER_S, ManualClock, nanoseconds
+from skyloop.drivers.ardrone.configuration import own_ids
 from skyloop.drivers.ardrone.options import ArdroneOptions
-from skyloop.drivers.ardrone.session import Session
-from skyloop.drivers.ardrone.setup import own_ids
+from skyloop.drivers.ardrone.protocol import ArdroneSession
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.wire.ardrone.at import AtCommand, Ctrl, Ref, parse_commands
 from skyloop.wire.ardrone.configuration import DEFAULT_ID, format_dump, parse_value
@@ -129,7 +129,7 @@ class Rig:
 
     def __init__(self, options: ArdroneOptions | None = None, drone: ScriptedDrone | None = None) -> None:
         self.clock = ManualClock(100 * NS_PER_S)
-        self.session = Session(options or ArdroneOptions("drone"), IDS, self.clock.now_ns)
+        self.session = ArdroneSession(options or ArdroneOptions("drone"), IDS, self.clock.now_ns)
         self.drone = drone or ScriptedDrone()
         self.sink = RecordingSink()
         self.on = True  # the drone is there
@@ -164,15 +164,15 @@ class Rig:
         if session.wants_start(now_ns) and self.on:
             self.started = True
         if now_ns >= session.due_ns:
-            datagram = session.tick(now_ns)
+            datagram = session.poll(now_ns)
             self.sent.append(datagram)
             if self.on and not self.lost():
                 self.drone.take(datagram)
         self._serve_dump()
         if self.on and self.started and self._steps % NAVDATA_STEPS == 0 and not self.lost():
-            session.heard(self.drone.navdata(), now_ns)
-        for telling in session.tellings():
-            telling(self.sink)
+            session.on_navdata(self.drone.navdata(), now_ns)
+        for publish in session.drain():
+            publish(self.sink)
 
     def switch_off(self) -> None:
         self.on = self.started = False

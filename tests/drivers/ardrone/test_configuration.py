@@ -4,13 +4,23 @@ from __future__ import annotations
 
 import pytest
 
-from skyloop.drivers.ardrone.configuration import MAX_DUMP, Configurator, Exchange, Ids, Read, Step, Write
-from skyloop.drivers.ardrone.sender import Message
-from skyloop.drivers.ardrone.setup import ids_in_force, own_ids, version_of
+from skyloop.drivers.ardrone.configuration import (
+    MAX_DUMP,
+    Configurator,
+    Exchange,
+    Ids,
+    Read,
+    Step,
+    Write,
+    ids_in_force,
+    own_ids,
+    version_of,
+)
+from skyloop.wire.ardrone.at import AtMessage
 from tests.drivers.ardrone.scripted import ns
 
-CLEAR: Message = ("CTRL", (5, 0))
-SEND_ALL: Message = ("CTRL", (4, 0))
+CLEAR: AtMessage = ("CTRL", (5, 0))
+SEND_ALL: AtMessage = ("CTRL", (4, 0))
 DUMP = b"control:outdoor = TRUE\ngeneral:num_version_soft = 2.4.8\n\0"
 
 
@@ -25,7 +35,7 @@ class Desk:
     def submit(self, *steps: Step, within_s: float = 0.9) -> None:
         self.configurator.submit(Exchange(iter(steps), ns(self.now_s + within_s), self.results.append))
 
-    def says(self, after_s: float = 0.0) -> list[Message]:
+    def says(self, after_s: float = 0.0) -> list[AtMessage]:
         self.now_s += after_s
         return self.configurator.messages(ns(self.now_s))
 

@@ -10,7 +10,7 @@ import pytest
 
 from skyloop.clock import NS_PER_S
 from skyloop.drivers.ardrone.configuration import Configurator, Exchange, Read
-from skyloop.drivers.ardrone.dump_client import RETRY_NS, DumpClient
+from skyloop.drivers.ardrone.link import RETRY_NS, DumpClient
 
 DUMP = b"control:outdoor = TRUE\n\0"
 
@@ -24,7 +24,7 @@ class Desk:
         if not listening:
             self.server.close()
         self.selector = selectors.DefaultSelector()
-        self.client = DumpClient(port, self.selector)
+        self.client = DumpClient(port, self.selector, lambda: None)
         self.client.address = "127.0.0.1"
         self.configurator = Configurator()
         self.results: list[str | None] = []

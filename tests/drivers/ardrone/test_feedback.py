@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,9 +12,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.clock import NS_PER_S
-from skyloop.drivers.ardrone.feedback import ClimbMeter, control_state, feedback_of, flight_state
-from skyloop.drivers.ardrone.native import OPTION_TAGS, native_of
-from skyloop.drivers.ardrone.reception import DroneClock, Reception
+from skyloop.drivers.ardrone.telemetry import (
+    OPTION_TAGS,
+    ClimbMeter,
+    DroneClock,
+    Reception,
+    control_state,
+    feedback_of,
+    flight_state,
+    native_of,
+)
 from skyloop.drivers.recording_sink import implausible
 from skyloop.messages import Feedback, FlightState
 from skyloop.messages.codec import decode as decode_packet
@@ -22,8 +29,12 @@ from skyloop.messages.codec import encode as encode_packet
 from skyloop.wire.ardrone.navdata import ControlState, Navdata, State, decode, encode
 from skyloop.wire.ardrone.options import Demo, Gps, PhysMeasures, RawMeasures, Time, VisionDetect, Wifi
 from tests.drivers.ardrone.scripted import ns
+from tests.recordings import recorded
 
-RECORDED = decode((Path(__file__).parents[2] / "data" / "ardrone2" / "navdata-full-landed.bin").read_bytes())
+
+@functools.cache
+def navdata() -> Navdata:
+    return decode(recorded("ardrone2/navdata-full-landed.bin").read_bytes())
 
 
 def told(demo: Demo, *others: Any, climb: float | None = 0.0) -> Feedback:
@@ -31,9 +42,9 @@ def told(demo: Demo, *others: Any, climb: float | None = 0.0) -> Feedback:
 
 
 def test_the_recorded_datagram() -> None:
-    demo = RECORDED.get(Demo)
+    demo = navdata().get(Demo)
     assert demo is not None
-    feedback = feedback_of(RECORDED, demo, 5, 0.0, native_of(RECORDED, everything=True))
+    feedback = feedback_of(navdata(), demo, 5, 0.0, native_of(navdata(), everything=True))
     assert (feedback.state, feedback.battery, feedback.battery_v) == (FlightState.LANDED, 0.5, 11.686)
     assert feedback.roll == pytest.approx(math.radians(0.55))
     assert feedback.pitch == pytest.approx(math.radians(-2.974)), "nose up"
@@ -51,7 +62,7 @@ def test_the_recorded_datagram() -> None:
 
 
 def test_native_telemetry_of_everything_fits_a_packet() -> None:
-    native = native_of(RECORDED, everything=True)
+    native = native_of(navdata(), everything=True)
     assert (native["demo.vx"], native["altitude.raw"], native["wifi.link_quality"]) == (0.0585307739675045, 243, 0)
     assert native["magneto.calibrated"] == 1
     assert len(native) > 200
@@ -251,8 +262,8 @@ def test_damage_and_unknown_options_are_counted() -> None:
 
 
 def test_a_datagram_is_not_changed_by_looking_at_it() -> None:
-    demo = RECORDED.get(Demo)
+    demo = navdata().get(Demo)
     assert demo is not None
-    before = replace(RECORDED)
-    native_of(RECORDED, everything=True)
-    assert before == RECORDED
+    before = replace(navdata())
+    native_of(navdata(), everything=True)
+    assert before == navdata()

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.drivers.ardrone.health import Health, emergency_reason
+from skyloop.drivers.ardrone.telemetry import Health, emergency_reason
 from skyloop.messages import EventKind, Severity
 from skyloop.wire.ardrone.navdata import State
 

@@ -9,10 +9,11 @@ from contextlib import contextmanager
 
 import pytest
 
-from skyloop.drivers.ardrone.session import Session
+from skyloop.drivers.ardrone.protocol import ArdroneSession
 from skyloop.drivers.base import Driver
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.registry import make_driver
+from skyloop.emulators.ardrone import ArdroneFirmware, Faults, Ports
 from skyloop.errors import ParameterError, UnknownNameError
 from skyloop.messages import (
     Attitude,
@@ -26,7 +27,6 @@ from skyloop.messages import (
     ResetEmergency,
     Takeoff,
 )
-from skyloop.sim.firmware.ardrone import ArdroneFirmware, Faults, Ports
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 
@@ -180,14 +180,14 @@ def test_garbage_on_the_navdata_port() -> None:
 
 def test_an_error_of_our_own_is_told_and_does_not_end_the_flight(monkeypatch: pytest.MonkeyPatch) -> None:
     calls = iter(range(1000))
-    tick = Session.tick
+    poll = ArdroneSession.poll
 
-    def faulty(self: Session, now_ns: int) -> bytes:
+    def faulty(self: ArdroneSession, now_ns: int) -> bytes:
         if next(calls) == 3:
             raise RuntimeError("a fault")
-        return tick(self, now_ns)
+        return poll(self, now_ns)
 
-    monkeypatch.setattr(Session, "tick", faulty)
+    monkeypatch.setattr(ArdroneSession, "poll", faulty)
     with firmware() as drone, opened(drone.ports, "&video=0") as (_, sink):
         wait_up(sink)
         failures = [event for event in sink.events if event.kind is EventKind.DRIVER_ERROR]

@@ -5,13 +5,12 @@ from __future__ import annotations
 import re
 
 from skyloop.drivers.ardrone import options
-from skyloop.drivers.ardrone.cameras import cameras_of
-from skyloop.drivers.ardrone.commands import Commands
-from skyloop.drivers.ardrone.health import _REASONS
-from skyloop.drivers.ardrone.parameters import PREFIX, entries_of
-from skyloop.drivers.ardrone.pilot import Pilot
+from skyloop.drivers.ardrone.parameters import PREFIX, Commands, entries_of
+from skyloop.drivers.ardrone.setpoints import SetpointController
+from skyloop.drivers.ardrone.telemetry import _REASONS
+from skyloop.drivers.ardrone.video import cameras_of
 from skyloop.drivers.uri import parse_uri
-from skyloop.sim.firmware.ardrone.cameras import BOTTOM_2_SENT, FRONT_2
+from skyloop.emulators.ardrone.video import BOTTOM_2_SENT, FRONT_2
 from skyloop.wire.ardrone.configuration import format_value
 from skyloop.wire.ardrone.keys import keys_of
 from tests.docs.pages import rows, section
@@ -32,7 +31,7 @@ def test_common_parameters() -> None:
     told = {name for row in rows(section("docs/ardrone.md", "### Parameters")) for name in names(row[0])}
     dump = {name: format_value(key.default) for name, key in keys_of(2).items()}
     known = {name for name in entries_of(dump, 2) if not name.startswith(PREFIX)}
-    commands = {p.name for p in Commands(Pilot(), lambda message, times: None).parameters(2)}
+    commands = {p.name for p in Commands(SetpointController(), lambda message, times: None).parameters(2)}
     assert told == known | {name for name in commands if not name.startswith(PREFIX)}
     assert all(f"`{name}`" in DRIVER for name in commands)
 

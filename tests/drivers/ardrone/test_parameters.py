@@ -8,15 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.drivers.ardrone.animations import FLIGHT_ANIMATIONS, LED_ANIMATIONS
-from skyloop.drivers.ardrone.commands import Commands
-from skyloop.drivers.ardrone.parameters import active_camera, entries_of, taken, written
-from skyloop.drivers.ardrone.pilot import Condition, Pilot
-from skyloop.drivers.ardrone.sender import Message
+from skyloop.drivers.ardrone.parameters import Commands, active_camera, entries_of, taken, written
+from skyloop.drivers.ardrone.setpoints import Condition, SetpointController
 from skyloop.drivers.suite_parameters import mismatch
 from skyloop.errors import DecodeError, ParameterError, UnknownNameError
 from skyloop.messages import Parameter, ParameterType, Refusal, Value
 from skyloop.proxy.parameters import check
+from skyloop.wire.ardrone.animations import FLIGHT_ANIMATIONS, LED_ANIMATIONS
+from skyloop.wire.ardrone.at import AtMessage
 from skyloop.wire.ardrone.configuration import format_value
 from skyloop.wire.ardrone.keys import keys_of
 from skyloop.wire.ardrone.navdata import ControlState, State
@@ -166,13 +165,13 @@ def test_texts_that_a_parameter_cannot_be() -> None:
 
 
 class Desk:
-    """Commands with a pilot, and what they said."""
+    """Commands with a controller, and what they said."""
 
     def __init__(self, condition: Condition | None, version: int | None = 2) -> None:
-        self.pilot = Pilot()
-        self.pilot.condition = condition
-        self.said: list[tuple[Message, int]] = []
-        self.commands = Commands(self.pilot, lambda message, times: self.said.append((message, times)))
+        self.setpoints = SetpointController()
+        self.setpoints.condition = condition
+        self.said: list[tuple[AtMessage, int]] = []
+        self.commands = Commands(self.setpoints, lambda message, times: self.said.append((message, times)))
         self.version = version
 
     def parameter(self, name: str) -> Parameter:
@@ -258,13 +257,13 @@ def test_what_an_ardrone_1_has_not() -> None:
 
 def test_absolute_control() -> None:
     desk = Desk(AIR)
-    assert desk.pilot.reference_rad is None
+    assert desk.setpoints.reference_rad is None
     desk.write("ardrone.absolute_heading", math.pi)
-    assert desk.pilot.reference_rad is None
+    assert desk.setpoints.reference_rad is None
     desk.write("ardrone.absolute_control", True)
-    assert desk.pilot.reference_rad == math.pi
+    assert desk.setpoints.reference_rad == math.pi
     desk.write("ardrone.absolute_control", False)
-    assert desk.pilot.reference_rad is None
+    assert desk.setpoints.reference_rad is None
 
 
 @pytest.mark.parametrize(

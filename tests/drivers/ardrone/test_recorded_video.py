@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
+import functools
 import selectors
 import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
 
 import pytest
 
 from skyloop.drivers.ardrone.driver import ArdroneDriver
-from skyloop.drivers.ardrone.video import VideoCounters
+from skyloop.drivers.live_video import VideoCounters
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.registry import make_driver
 from skyloop.messages import LinkState
-from skyloop.wire.ardrone.navdata import decode
+from skyloop.wire.ardrone.navdata import Navdata, decode
 from skyloop.wire.ardrone.options import Demo, Time
 from tests.drivers.ardrone.scripted import ScriptedDrone
 from tests.drivers.ardrone.video_ports import HOST, LONG, SHORT, TcpPort, digest, frames, pieces, true_pictures
+from tests.recordings import recorded
 
-RECORDED = decode((Path(__file__).parents[2] / "data" / "ardrone2" / "navdata-full-landed.bin").read_bytes())
+
+@functools.cache
+def navdata() -> Navdata:
+    return decode(recorded("ardrone2/navdata-full-landed.bin").read_bytes())
+
+
 PATIENCE_S = 10.0
 NAVDATA_S = 0.01
 
@@ -116,7 +122,7 @@ def in_step(name: str, driver: list[ArdroneDriver], sink: RecordingSink) -> Call
 def flown(name: str) -> Iterator[tuple[ArdroneDriver, RecordingSink]]:
     """A driver whose drone sends this recording."""
     drone = ScriptedDrone()
-    drone.telemetry = [option for kind, option in RECORDED.options.items() if kind not in (Demo, Time)]
+    drone.telemetry = [option for kind, option in navdata().options.items() if kind not in (Demo, Time)]
     sink = RecordingSink()
     opened: list[ArdroneDriver] = []
     with Radio(drone) as radio, TcpPort(in_step(name, opened, sink)) as port:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
@@ -17,8 +16,9 @@ from skyloop.wire.ardrone.at import Ref
 from skyloop.wire.ardrone.navdata import State, encode
 from skyloop.wire.ardrone.options import Demo, Time
 from tests.drivers.ardrone.scripted import IDS, Rig, ScriptedDrone, ns
+from tests.recordings import content, needs_recordings
 
-RECORDED = (Path(__file__).parents[2] / "data" / "ardrone2" / "navdata-full-landed.bin").read_bytes()
+RECORDED = content("ardrone2/navdata-full-landed.bin")
 
 
 def links(rig: Rig) -> list[LinkState]:
@@ -40,8 +40,8 @@ def test_an_ardrone_2_is_set_up_within_a_second() -> None:
     assert rig.drone.state & State.DEMO
     ids = ("custom:session_id", "custom:profile_id", "custom:application_id")
     assert tuple(rig.drone.values[key] for key in ids) == (IDS.session, IDS.profile, IDS.application)
-    assert rig.session.pilot.limits is not None
-    assert rig.session.pilot.limits.tilt_rad == pytest.approx(0.2094395, rel=1e-6)
+    assert rig.session.setpoints.limits is not None
+    assert rig.session.setpoints.limits.tilt_rad == pytest.approx(0.2094395, rel=1e-6)
     assert not rig.drone.state & State.COMMAND_ACK, "the acknowledge bit is cleared behind the last answer"
 
 
@@ -130,11 +130,11 @@ def test_a_new_decision_is_said_at_once() -> None:
     rig.ready()
     rig.run(0.1)
     now_ns = rig.clock.now_ns
-    rig.session.tick(now_ns)
+    rig.session.poll(now_ns)
     now_ns = rig.clock.advance(0.012)
     rig.session.command(Takeoff(), now_ns)
     assert rig.session.due_ns == now_ns
-    rig.session.tick(now_ns)
+    rig.session.poll(now_ns)
     rig.session.command(Land(), rig.clock.advance(0.002))
     assert rig.session.due_ns == now_ns + ns(0.01), "but not sooner than the drone can take it"
 
@@ -142,7 +142,7 @@ def test_a_new_decision_is_said_at_once() -> None:
 def test_the_same_decision_hurries_nothing() -> None:
     rig = Rig()
     rig.ready()
-    rig.session.tick(rig.clock.now_ns)
+    rig.session.poll(rig.clock.now_ns)
     due_ns = rig.session.due_ns
     rig.session.command(Hover(), rig.clock.advance(0.015))
     assert rig.session.due_ns == due_ns
@@ -211,13 +211,13 @@ def test_a_drone_that_was_away_is_set_up_anew() -> None:
     rig.run(0.1)
     rig.switch_off()
     rig.run(2.0)
-    assert rig.session.pilot.limits is None
+    assert rig.session.setpoints.limits is None
     rig.drone.commands.clear()
     rig.switch_on()
     rig.until(lambda: rig.sink.link_state is LinkState.UP, 3.0)
     assert rig.drone.heard_sequence < 200, "the sequence began anew"
     assert rig.drone.values["custom:session_id"] == IDS.session
-    assert rig.session.pilot.limits is not None
+    assert rig.session.setpoints.limits is not None
     assert rig.session.reception.counts["restarts"] == 1
 
 
@@ -237,8 +237,8 @@ def test_what_was_written_is_written_again_where_the_drone_forgot_it() -> None:
     rig.drone.restart()
     rig.run(0.3)
     rig.until(lambda: rig.sink.link_state is LinkState.UP, 3.0)
-    assert rig.session.pilot.limits is not None
-    assert rig.session.pilot.limits.tilt_rad == pytest.approx(0.3)
+    assert rig.session.setpoints.limits is not None
+    assert rig.session.setpoints.limits.tilt_rad == pytest.approx(0.3)
 
 
 def test_nobody_there_is_told_and_tried_for_ever() -> None:
@@ -306,7 +306,7 @@ def test_a_drone_that_is_lost_while_it_is_set_up() -> None:
 def test_feedback_comes_with_the_counts() -> None:
     rig = Rig()
     rig.ready()
-    rig.session.heard(b"garbage", rig.clock.now_ns)
+    rig.session.on_navdata(b"garbage", rig.clock.now_ns)
     rig.run(0.5)
     feedback = rig.sink.newest
     assert feedback is not None
@@ -385,8 +385,8 @@ def test_no_takeoff_without_navdata() -> None:
 def test_commands_without_acknowledgement_are_repeated_as_often_as_wanted() -> None:
     rig = Rig()
     rig.ready()
-    rig.session.say(("FTRIM", ()))
-    rig.session.say(("ANIM", (18, 15)), 1)
+    rig.session.send(("FTRIM", ()))
+    rig.session.send(("ANIM", (18, 15)), 1)
     rig.run(0.5)
     assert rig.drone.names.count("FTRIM") == 3
     assert rig.drone.names.count("ANIM") == 1
@@ -405,6 +405,7 @@ def test_closing_ends_exchanges() -> None:
 # Damage ----------------------------------------------------------------------------------------------------------
 
 
+@needs_recordings
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.binary(max_size=64) | st.integers(0, 8 * len(RECORDED) - 1) | st.just(RECORDED), max_size=30))
 def test_whatever_comes_is_counted_and_never_raises(pieces: list[bytes | int]) -> None:
@@ -413,13 +414,13 @@ def test_whatever_comes_is_counted_and_never_raises(pieces: list[bytes | int]) -
     for piece in pieces:
         datagram = piece if isinstance(piece, bytes) else _flipped(piece)
         damaged += datagram != RECORDED
-        rig.session.heard(datagram, rig.clock.advance(0.005))
-        rig.session.tick(rig.clock.now_ns)
+        rig.session.on_navdata(datagram, rig.clock.advance(0.005))
+        rig.session.poll(rig.clock.now_ns)
     counts = rig.session.reception.counts
     assert counts["damaged"] == damaged
     assert counts["received"] + counts["late"] + damaged == len(pieces)
-    for telling in rig.session.tellings():
-        telling(rig.sink)
+    for publish in rig.session.drain():
+        publish(rig.sink)
     assert all(feedback.battery == 0.5 for feedback in rig.sink.feedbacks)
 
 
@@ -436,9 +437,9 @@ def test_reordered_navdata_never_run_backwards(order: list[int]) -> None:
     for sequence in order:
         now_ns = rig.clock.advance(0.005)
         battery = Demo(ctrl_state=0x20000, battery=sequence)
-        rig.session.heard(encode(State.DEMO, sequence, [battery, Time(sequence * 5000)]), now_ns)
-    for telling in rig.session.tellings():
-        telling(rig.sink)
+        rig.session.on_navdata(encode(State.DEMO, sequence, [battery, Time(sequence * 5000)]), now_ns)
+    for publish in rig.session.drain():
+        publish(rig.sink)
     batteries = [feedback.battery for feedback in rig.sink.feedbacks if feedback.battery is not None]
     counts = rig.session.reception.counts
     assert counts["received"] == len(batteries)
@@ -448,11 +449,12 @@ def test_reordered_navdata_never_run_backwards(order: list[int]) -> None:
     assert not [problem for problem in rig.sink.problems if "before the one" in problem]
 
 
+@needs_recordings
 def test_the_recorded_datagram_goes_through() -> None:
     rig = Rig(ArdroneOptions("drone", full=True))
-    rig.session.heard(RECORDED, rig.clock.now_ns)
-    for telling in rig.session.tellings():
-        telling(rig.sink)
+    rig.session.on_navdata(RECORDED, rig.clock.now_ns)
+    for publish in rig.session.drain():
+        publish(rig.sink)
     feedback = rig.sink.newest
     assert feedback is not None
     assert (feedback.state, feedback.battery) == (FlightState.LANDED, 0.5)

@@ -9,7 +9,7 @@ import pytest
 from skyloop.drivers.base import Driver
 from skyloop.drivers.suite import DriverSuite
 from skyloop.drivers.uri import VehicleUri, parse_uri
-from skyloop.sim.firmware.ardrone import ArdroneFirmware, Ports
+from skyloop.emulators.ardrone import ArdroneFirmware, Ports
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 

@@ -7,7 +7,7 @@ import random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.drivers.ardrone.stamps import DroneStamps
+from skyloop.drivers.ardrone.video import DroneStamps
 from skyloop.drivers.backlog import LATE_NS, MAX_FRAMES, Backlog, Coded
 
 MS = 1_000_000

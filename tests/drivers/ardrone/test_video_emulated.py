@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from skyloop.clock import seconds
-from skyloop.drivers.ardrone.video import Notice, VideoReceiver
-from skyloop.sim.firmware.ardrone import ArdroneFirmware, Ports
-from skyloop.sim.firmware.ardrone.settings import with_ardrones
+from skyloop.drivers.ardrone.video import VideoReceiver
+from skyloop.drivers.live_video import Notice
+from skyloop.emulators.ardrone import ArdroneFirmware, Ports
+from skyloop.emulators.ardrone.settings import with_ardrones
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from tests.drivers.ardrone.video_ports import HOST, Viewer

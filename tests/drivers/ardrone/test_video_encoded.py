@@ -8,8 +8,7 @@ import socket
 import pytest
 
 from skyloop.clock import ManualClock
-from skyloop.drivers.ardrone.encoded import EncodedStream
-from skyloop.drivers.ardrone.video import VideoReceiver
+from skyloop.drivers.ardrone.video import EncodedStream, VideoReceiver
 from skyloop.drivers.backlog import Coded
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.messages import Intrinsics

@@ -11,8 +11,9 @@ from contextlib import contextmanager
 import pytest
 
 from skyloop.clock import ManualClock
-from skyloop.drivers.ardrone.video import Notice, VideoCounters, VideoReceiver
+from skyloop.drivers.ardrone.video import VideoReceiver
 from skyloop.drivers.backlog import LATE_NS
+from skyloop.drivers.live_video import Notice, VideoCounters
 from skyloop.errors import MissingExtraError, UsageError
 from tests.drivers.ardrone.video_ports import (
     HOST,
@@ -25,6 +26,9 @@ from tests.drivers.ardrone.video_ports import (
     receiver_of,
     true_pictures,
 )
+from tests.recordings import needs_recordings
+
+pytestmark = needs_recordings
 
 MS = 1_000_000
 

@@ -13,11 +13,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from skyloop.clock import ManualClock
-from skyloop.drivers.ardrone.decoding import UvlcVideo
-from skyloop.drivers.ardrone.streams import WAKE
-from skyloop.drivers.ardrone.video import Notice
+from skyloop.drivers.ardrone.video import WAKE, UvlcVideo
 from skyloop.drivers.backlog import Coded
-from skyloop.sim.firmware.ardrone.uvlc import encode
+from skyloop.drivers.live_video import Notice
+from skyloop.emulators.ardrone.uvlc import encode
 from skyloop.wire.ardrone.uvlc import UvlcDecoder, is_intra, is_p264
 from tests.drivers.ardrone.video_ports import HOST, PATIENCE_S, Viewer, digest, receiver_of
 

@@ -8,15 +8,15 @@ import socket
 import threading
 from collections.abc import Callable
 from contextlib import suppress
-from pathlib import Path
 
 import av
 
 from skyloop.clock import ManualClock
-from skyloop.drivers.ardrone.video import Notice, Picture, VideoReceiver
+from skyloop.drivers.ardrone.video import VideoReceiver
+from skyloop.drivers.live_video import Notice, Picture
 from skyloop.wire.ardrone.pave import PaveFrame, PaveParser
+from tests.recordings import recorded
 
-DATA = Path(__file__).parents[2] / "data" / "ardrone2"
 HOST = "127.0.0.1"
 LONG, SHORT = "video-8s.pave", "video-64-byte-headers.pave"
 PATIENCE_S = 10.0
@@ -26,7 +26,7 @@ Digest = bytes
 
 @functools.cache
 def recording(name: str) -> bytes:
-    return (DATA / name).read_bytes()
+    return recorded(f"ardrone2/{name}").read_bytes()
 
 
 @functools.cache

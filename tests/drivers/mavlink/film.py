@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import monotonic_ns, nanoseconds
-from skyloop.sim.firmware.encoders import Encoded, Encoder, Format
+from skyloop.emulators.encoders import Encoded, Encoder, Format
 from skyloop.wire.ardrone.pave import Codec
 
 BITS, STRIPE, HEIGHT = 12, 16, 64

@@ -43,7 +43,7 @@ def payloads_of(unit: bytes, most: int) -> Iterator[bytes]:
         yield bytes((indicator, first << 7 | last << 6 | kind)) + body[start : start + step]
 
 
-class Session:
+class MavlinkSession:
     """One client's connection."""
 
     def __init__(self, server: RtspServer, connection: socket.socket) -> None:
@@ -173,7 +173,7 @@ class RtspServer:
         self.requests: list[str] = []
         self._user = user
         self._parameters = [unit for unit in units_of(parameters) if unit[0] & 31 in (_SPS, _PPS)]
-        self._sessions: list[Session] = []
+        self._sessions: list[MavlinkSession] = []
         self._changed = threading.Condition()
         self._listener: socket.socket | None = None
         self.port = 0
@@ -239,7 +239,7 @@ class RtspServer:
     def knows(self, authorization: str) -> bool:
         return not self._user or authorization == f"Basic {base64.b64encode(self._user.encode()).decode()}"
 
-    def plays(self, session: Session) -> None:
+    def plays(self, session: MavlinkSession) -> None:
         with self._changed:
             session.playing = True
             self._changed.notify_all()
@@ -250,7 +250,7 @@ class RtspServer:
                 connection, _ = listener.accept()
             except OSError:
                 return
-            session = Session(self, connection)
+            session = MavlinkSession(self, connection)
             with self._changed:
                 if self._listener is None:
                     session.close()
@@ -260,7 +260,7 @@ class RtspServer:
             self._threads.append(thread)
             thread.start()
 
-    def _serve(self, session: Session) -> None:
+    def _serve(self, session: MavlinkSession) -> None:
         with suppress(OSError):
             session.serve()
         with self._changed:

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from skyloop.clock import ManualClock, nanoseconds
-from skyloop.drivers.mavlink.connections import Peer
-from skyloop.drivers.mavlink.options import MavlinkOptions, options_of
-from skyloop.drivers.mavlink.session import TICK_NS, Session
+from skyloop.drivers.mavlink.options import MavlinkOptions, Peer, options_of
+from skyloop.drivers.mavlink.protocol import TICK_NS, MavlinkSession
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.uri import parse_uri
 from skyloop.messages import AnyAction, Feedback, FlightState, LinkState
@@ -37,6 +36,8 @@ class Vehicle:
         self.kind = 2
         self.landed = Landed.ON_GROUND
         self.ready = True
+        self.remote = False  # it hears a remote control
+        self.flags = 0x1F  #: of its estimator
         self.boot_ms = 10_000
         self.place = (0.0, 0.0, 0.0)
         self.velocity = (0.0, 0.0, 0.0)
@@ -49,7 +50,9 @@ class Vehicle:
 
     def telemetry(self) -> list[Message]:
         """Everything that flows."""
-        sensors = 0x10000000
+        receiver = 0x10000 * self.remote
+        present = receiver | 0x10000000 * (self.autopilot != PX4)  # a PX4 never says that it has this check
+        healthy = receiver | 0x10000000 * self.ready
         altitude = -self.place[2]
         return [
             m.MAVLink_local_position_ned_message(self.boot_ms, *self.place, *self.velocity),
@@ -57,8 +60,10 @@ class Vehicle:
                 self.boot_ms, 0, 0, round((self.amsl_m + altitude) * 1000), round(altitude * 1000), 0, 0, 0, 0
             ),
             m.MAVLink_extended_sys_state_message(0, int(self.landed)),
-            m.MAVLink_sys_status_message(sensors, sensors, sensors * self.ready, 0, 12_000, 0, 80, 0, 0, 0, 0, 0, 0),
-            m.MAVLink_ekf_status_report_message(0x1F, 0, 0, 0, 0, 0),
+            m.MAVLink_sys_status_message(present, present, healthy, 0, 12_000, 0, 80, 0, 0, 0, 0, 0, 0),
+            m.MAVLink_estimator_status_message(0, self.flags, 0, 0, 0, 0, 0, 0, 0, 0)
+            if self.autopilot == PX4
+            else m.MAVLink_ekf_status_report_message(self.flags, 0, 0, 0, 0, 0),
             m.MAVLink_attitude_message(self.boot_ms, 0.1, 0.2, self.yaw, 0.0, 0.0, 0.0),
         ]
 
@@ -69,7 +74,7 @@ class Bench:
     def __init__(self, vehicle: Vehicle, given: MavlinkOptions | None = None) -> None:
         self.vehicle = vehicle
         self.clock = ManualClock()
-        self.session = Session(given or options(), self.clock())
+        self.session = MavlinkSession(given or options(), self.clock())
         self.sink = RecordingSink()
         self.said: list[Message] = []
         self.frames: list[bytes] = []
@@ -79,15 +84,15 @@ class Bench:
     def hear(self, *messages: Message, peer: Peer = PEER, codec: Codec | None = None) -> None:
         for message in messages:
             frame = (codec or self.vehicle.codec).encode(message, version=self.vehicle.version)
-            self.session.heard(frame, peer, self.clock(), whole=True)
+            self.session.receive(frame, peer, self.clock(), whole=True)
         self.deliver()
 
     def deliver(self) -> None:
-        for telling in self.session.tellings():
-            telling(self.sink)
+        for publish in self.session.drain():
+            publish(self.sink)
 
     def tick(self) -> None:
-        for frame, _ in self.session.tick(self.clock()):
+        for frame, _ in self.session.poll(self.clock()):
             self.frames.append(frame)
             self.said += self._ears.decode(frame, whole=True)
         self.deliver()
@@ -117,8 +122,8 @@ class Bench:
         vehicle.place = (0.0, 0.0, -height_m)
         return self.found()
 
-    def apply(self, action: AnyAction, *, alone: bool = False) -> AnyAction:
-        applied = self.session.command(action, self.clock(), alone=alone)
+    def apply(self, action: AnyAction, *, alone: bool = False, new: bool = True) -> AnyAction:
+        applied = self.session.command(action, self.clock(), alone=alone, new=new)
         self.tick()
         return applied
 

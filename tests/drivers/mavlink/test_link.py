@@ -17,9 +17,9 @@ from skyloop.drivers.mavlink import MavlinkDriver
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.seams import ExternalPose
 from skyloop.drivers.uri import parse_uri
+from skyloop.emulators.mavlink import Faults, Kind, MavlinkFirmware, Ports, with_multirotors
 from skyloop.errors import DriverError, UnsupportedError, UsageError
 from skyloop.messages import FlightState, Land, LinkState, Takeoff, Velocity
-from skyloop.sim.firmware.mavlink import Faults, Kind, MavlinkFirmware, Ports, with_multirotors
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.transport.testing import wait_until

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from skyloop.drivers.mavlink import MavlinkDriver
-from skyloop.drivers.mavlink.options import MavlinkOptions, Way, options_of
+from skyloop.drivers.mavlink.options import ConnectionKind, MavlinkOptions, options_of
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import UsageError
 
@@ -19,16 +19,16 @@ def understood(text: str) -> MavlinkOptions:
 @pytest.mark.parametrize(
     ("text", "way", "place", "number"),
     [
-        ("mavlink://udpin:127.0.0.1:14540", Way.UDP_IN, "127.0.0.1", 14540),
-        ("mavlink://udpout:drone.local:14580", Way.UDP_OUT, "drone.local", 14580),
-        ("mavlink://tcp:192.168.4.1:5760", Way.TCP, "192.168.4.1", 5760),
-        ("mavlink://serial:/dev/ttyACM0:921600", Way.SERIAL, "/dev/ttyACM0", 921600),
-        ("mavlink://serial:/dev/ttyACM0", Way.SERIAL, "/dev/ttyACM0", 57600),
+        ("mavlink://udpin:127.0.0.1:14540", ConnectionKind.UDP_IN, "127.0.0.1", 14540),
+        ("mavlink://udpout:drone.local:14580", ConnectionKind.UDP_OUT, "drone.local", 14580),
+        ("mavlink://tcp:192.168.4.1:5760", ConnectionKind.TCP, "192.168.4.1", 5760),
+        ("mavlink://serial:/dev/ttyACM0:921600", ConnectionKind.SERIAL, "/dev/ttyACM0", 921600),
+        ("mavlink://serial:/dev/ttyACM0", ConnectionKind.SERIAL, "/dev/ttyACM0", 57600),
     ],
 )
-def test_ways(text: str, way: Way, place: str, number: int) -> None:
+def test_ways(text: str, way: ConnectionKind, place: str, number: int) -> None:
     address = understood(text).address
-    assert (address.way, address.place, address.number) == (way, place, number)
+    assert (address.kind, address.place, address.number) == (way, place, number)
 
 
 @pytest.mark.parametrize(
@@ -42,7 +42,9 @@ def test_ways(text: str, way: Way, place: str, number: int) -> None:
         ("mavlink://udpin:0.0.0.0:14550?sysid=0", "sysid"),
         ("mavlink://udpin:0.0.0.0:14550?sysid=255", "must differ"),
         ("mavlink://udpin:0.0.0.0:14550?peer=here", "peer=127.0.0.1:14580"),
-        ("mavlink://udpin:0.0.0.0:14550?speed=1", "speed"),
+        ("mavlink://udpin:0.0.0.0:14550?sped=1", "speed"),
+        ("mavlink://udpin:0.0.0.0:14550?speed=99", "speed"),
+        ("mavlink://udpin:0.0.0.0:14550?takeoff_altitude=8", "above the ceiling of 3 m: raise that too"),
         ("mavlink://udpin:0.0.0.0:14550?origin=91,0,0", "origin"),
         ("mavlink://udpin:0.0.0.0:14550?pose=mocap", "odometry"),
         ("mavlink://udpin:0.0.0.0:14550?signing_key=/nowhere", "can't be read"),

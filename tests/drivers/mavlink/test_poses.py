@@ -6,8 +6,8 @@ import math
 
 import pytest
 
+from skyloop.drivers.mavlink.microservices import pose_message
 from skyloop.drivers.mavlink.options import PoseMessage
-from skyloop.drivers.mavlink.poses import pose_message
 from skyloop.drivers.seams import ExternalPose
 from skyloop.messages.geometry import quaternion_from_euler
 from skyloop.wire.mavlink.axes import angles_of

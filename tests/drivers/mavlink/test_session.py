@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 import struct
 from contextlib import suppress
-from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyloop.drivers.mavlink.session import LOST_NS, Session
+from skyloop.drivers.mavlink.protocol import LOST_NS, MavlinkSession
 from skyloop.drivers.recording_sink import RecordingSink, implausible
 from skyloop.errors import DriverError
 from skyloop.messages import FlightState, Hover, LinkState, Severity, Takeoff, Velocity
@@ -19,8 +18,8 @@ from skyloop.wire.mavlink.codec import Codec
 from skyloop.wire.mavlink.codec import dialect as m
 from skyloop.wire.mavlink.texts import chunks_of
 from tests.drivers.mavlink.scripted import ARDUPILOT, PEER, PX4, Bench, Vehicle, options
+from tests.recordings import recorded
 
-TLOG = Path(__file__).parents[2] / "data" / "mavlink" / "arduplane-flight.tlog"
 AUTOPILOTS = pytest.mark.parametrize("autopilot", [ARDUPILOT, PX4])
 
 
@@ -33,7 +32,7 @@ def test_an_autopilot_is_known_by_its_heartbeat(autopilot: int) -> None:
     bench.found()
     assert bench.link() is LinkState.UP
     assert bench.state() is FlightState.LANDED
-    assert bench.session.commander.target == (7, 1)
+    assert bench.session.commands.target == (7, 1)
     assert bench.session.description.startswith("ArduCopter" if autopilot == ARDUPILOT else "PX4")
 
 
@@ -126,9 +125,9 @@ def test_ground_stations_and_cameras_are_no_vehicles(system: int, component: int
 def test_answers_to_other_programs_are_not_ours() -> None:
     bench = Bench(Vehicle(ARDUPILOT)).found()
     bench.hear(m.MAVLink_command_ack_message(400, 0, 0, 0, 245, 190))
-    assert bench.session.commander.answer(400, 0) is None
+    assert bench.session.commands.result(400, 0) is None
     bench.answer(400, 4)
-    assert bench.session.commander.answer(400, 0) == 4
+    assert bench.session.commands.result(400, 0) == 4
 
 
 @pytest.mark.parametrize(("autopilot", "kind", "why"), [(0, 2, "autopilot is number 0"), (3, 1, "no multirotor")])
@@ -238,16 +237,16 @@ def test_texts_and_health_become_events() -> None:
 
 
 def test_a_plane_is_seen_and_the_whole_recording_is_taken() -> None:
-    data, at, frames = TLOG.read_bytes(), 0, 0
-    session, sink = Session(options(), 0), RecordingSink()
+    data, at, frames = recorded("mavlink/arduplane-flight.tlog").read_bytes(), 0, 0
+    session, sink = MavlinkSession(options(), 0), RecordingSink()
     while at + 9 < len(data) and at + data[at + 9] + 16 <= len(data):
         now_ns = struct.unpack_from(">Q", data, at)[0] * 1000
         length = data[at + 9] + 8
-        session.heard(data[at + 8 : at + 8 + length], PEER, now_ns, whole=True)
+        session.receive(data[at + 8 : at + 8 + length], PEER, now_ns, whole=True)
         frames += 1
         at += 8 + length
-        for telling in session.tellings():
-            telling(_Timeless(sink))
+        for publish in session.drain():
+            publish(_Timeless(sink))
     assert (frames, session.codec.frames, session.codec.damaged) == (417, 417, 0)
     newest = sink.newest
     assert newest is not None
@@ -286,7 +285,7 @@ def test_hostile_messages_never_raise_and_feedback_stays_plausible(
     for kind, noise in hostile:
         number = getattr(m, f"MAVLINK_MSG_ID_{kind}")
         made = m.mavlink_map[number]
-        bench.session.heard(_frame(made, noise), PEER, bench.clock(), whole=True)
+        bench.session.receive(_frame(made, noise), PEER, bench.clock(), whole=True)
         bench.clock.advance(0.02)
         with suppress(DriverError):
             bench.session.command(Hover(), bench.clock())
@@ -313,8 +312,49 @@ def _frame(made: type, noise: bytes) -> bytes:
 def test_noise_never_raises(datagrams: list[bytes]) -> None:
     bench = Bench(Vehicle(PX4)).found()
     for datagram in datagrams:
-        bench.session.heard(datagram, PEER, bench.clock(), whole=True)
-        bench.session.heard(datagram, ("10.0.0.1", 1), bench.clock(), whole=False)
+        bench.session.receive(datagram, PEER, bench.clock(), whole=True)
+        bench.session.receive(datagram, ("10.0.0.1", 1), bench.clock(), whole=False)
         bench.tick()
     bench.go_on(0.1)
     assert bench.link() is LinkState.UP
+
+
+def test_a_px4_is_ready_by_what_it_really_sends() -> None:
+    """It tells the outcome of its checks for the mode that it is in, and never that there are any."""
+    bench = Bench(Vehicle(PX4)).found()
+    vehicle = bench.vehicle
+
+    def ready() -> object:
+        bench.go_on(1.0)
+        return (bench.newest.native or {}).get("mavlink.ready")
+
+    assert ready() is True
+    vehicle.ready = False
+    assert ready() is False, "in the mode that a take-off begins in, it means what it says"
+    for mode in ("OFFBOARD", "AUTO.LAND", "AUTO.RTL", "POSCTL"):  # what flights leave behind
+        vehicle.mode = mode
+        assert ready() is True, f"{mode} says nothing of the mode that a take-off begins in"
+    vehicle.flags = 0x07
+    assert ready() is False, "it does not know where it is"
+
+
+def test_a_px4_at_rest_is_not_lost_and_one_in_the_air_is() -> None:
+    bench = Bench(Vehicle(PX4)).found()
+    bench.vehicle.flags = 0x9F
+    bench.go_on(2.0)
+    assert "the vehicle does not know where it is" not in bench.texts
+    bench.flying("OFFBOARD")
+    bench.go_on(2.0)
+    assert "the vehicle does not know where it is" in bench.texts
+
+
+def test_an_arducopter_that_assumes_its_place_is_lost_at_rest_too() -> None:
+    bench = Bench(Vehicle(ARDUPILOT)).found()
+    bench.vehicle.flags = 0x9F
+    bench.go_on(2.0)
+    assert "the vehicle does not know where it is" in bench.texts
+
+
+def test_the_limits_in_force_are_told_at_the_start() -> None:
+    bench = Bench(Vehicle(PX4), options("mavlink://udpin:127.0.0.1:14540?parameters=no&speed=4&altitude=12")).found()
+    assert any(text.startswith("limits: 4 m/s, 1 m/s up and down, 12 m high") for text in bench.texts)

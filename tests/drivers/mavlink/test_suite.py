@@ -10,7 +10,7 @@ import pytest
 from skyloop.drivers.base import Driver
 from skyloop.drivers.suite import DriverSuite
 from skyloop.drivers.uri import parse_uri
-from skyloop.sim.firmware.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
+from skyloop.emulators.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 

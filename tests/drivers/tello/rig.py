@@ -7,10 +7,10 @@ from collections.abc import Callable, Mapping
 
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.tello.options import TelloOptions
-from skyloop.drivers.tello.session import Session
+from skyloop.drivers.tello.protocol import TelloSession
 from skyloop.messages import AnyAction, Feedback, FlightState
 from skyloop.wire.tello.commands import Sdk
-from tests.sim.firmware.tello_rig import PILOT, Bench
+from tests.emulators.tello_rig import PILOT, Bench
 
 STATE_TICKS = 5
 
@@ -28,7 +28,7 @@ class Rig:
     ) -> None:
         self._sdk, self._pads = sdk, pads
         self.bench = Bench(sdk, pads)
-        self.session = Session(options or TelloOptions("drone", video=False), self.bench.clock.now_ns)
+        self.session = TelloSession(options or TelloOptions("drone", video=False), self.bench.clock.now_ns)
         self.sink = RecordingSink()
         self.on = True
         self.deaf = False  # it hears nothing, and is heard
@@ -60,21 +60,21 @@ class Rig:
     def step(self) -> None:
         self.bench.tick()
         self._ticks += 1
-        session, board = self.session, self.bench.board
+        session, board = self.session, self.bench.logic
         if self.now_ns >= session.due_ns:
-            for datagram in session.tick(self.now_ns):
+            for datagram in session.poll(self.now_ns):
                 self.said.append(datagram.decode())
                 if self.on and not self.deaf and not self._is_lost():
                     board.receive(datagram, PILOT)
         answers, self._told = self.bench.answers[self._told :], len(self.bench.answers)
         for text, _ in answers:
             if self.on and not self._is_lost():
-                session.reply_heard(text.encode(), self.now_ns)
+                session.on_reply(text.encode(), self.now_ns)
         state = board.state_string() if board.client is not None and self._ticks % STATE_TICKS == 0 else None
         if state is not None and self.on and not self._is_lost():
-            session.state_heard(state, self.now_ns)
-        for telling in session.tellings():
-            telling(self.sink)
+            session.on_state(state, self.now_ns)
+        for publish in session.drain():
+            publish(self.sink)
 
     def _is_lost(self) -> bool:
         return self._chance.random() < self._lost

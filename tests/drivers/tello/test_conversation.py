@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from skyloop.clock import nanoseconds
-from skyloop.drivers.tello.conversation import MOTION_NS, PATIENCE_NS, TRIES, Conversation, Request
+from skyloop.drivers.tello.protocol import MOTION_NS, PATIENCE_NS, TRIES, Conversation, Request
 
 STEP = PATIENCE_NS + 1
 
@@ -19,10 +19,10 @@ def test_one_question_at_a_time() -> None:
     first, second = asked(talk, "sdk?"), asked(talk, "sn?")
     assert talk.messages(0) == ["sdk?"]
     assert talk.messages(1) == []
-    assert talk.heard("20") is None
+    assert talk.on_reply("20") is None
     assert first == ["20"]
     assert talk.messages(2) == ["sn?"]
-    talk.heard("0TQDG7REDB1X2Y")
+    talk.on_reply("0TQDG7REDB1X2Y")
     assert second == ["0TQDG7REDB1X2Y"]
     assert talk.idle
     assert talk.counts == {"answered": 2, "unanswered": 0, "stray": 0}
@@ -41,7 +41,7 @@ def test_a_late_answer_to_something_else_is_not_taken() -> None:
     talk = Conversation()
     asked(talk, "wifi?")
     talk.messages(0)
-    talk.heard("ok")
+    talk.on_reply("ok")
     assert talk.counts["stray"] == 1
     assert not talk.idle
 
@@ -51,12 +51,12 @@ def test_while_a_take_off_is_not_answered_nothing_is_asked_that_is_answered_alik
     talk.moved("takeoff", 0)
     streamon, wifi = asked(talk, "streamon"), asked(talk, "wifi?")
     assert talk.messages(1) == ["wifi?"]
-    assert talk.heard("90") is None
+    assert talk.on_reply("90") is None
     assert wifi == ["90"]
     assert talk.messages(2) == []
-    assert talk.heard("ok") == "takeoff"
+    assert talk.on_reply("ok") == "takeoff"
     assert talk.messages(3) == ["streamon"]
-    talk.heard("ok")
+    talk.on_reply("ok")
     assert streamon == ["ok"]
 
 
@@ -65,7 +65,7 @@ def test_an_error_while_something_is_moved_is_the_motions() -> None:
     talk.moved("takeoff", 0)
     replies = asked(talk, "wifi?")
     talk.messages(1)
-    assert talk.heard("error") == "takeoff"
+    assert talk.on_reply("error") == "takeoff"
     assert replies == []
 
 
@@ -75,7 +75,7 @@ def test_a_motion_that_is_never_answered_is_forgotten() -> None:
     replies = asked(talk, "mon")
     assert talk.messages(MOTION_NS - 1) == []
     assert talk.messages(MOTION_NS) == ["mon"]
-    talk.heard("ok")
+    talk.on_reply("ok")
     assert replies == ["ok"]
 
 

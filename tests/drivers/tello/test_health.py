@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from skyloop.drivers.tello.health import PAD_LOST, Health
+from skyloop.drivers.tello.telemetry import PAD_LOST, Health
 from skyloop.messages import Severity
 from skyloop.wire.tello.state import Pad, State
 

@@ -12,9 +12,9 @@ import pytest
 from skyloop.drivers.base import Driver
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.registry import make_driver
+from skyloop.emulators.tello import TelloFirmware, with_tellos
 from skyloop.errors import ParameterError, UnknownNameError
 from skyloop.messages import FlightState, LinkState, Refusal, Takeoff
-from skyloop.sim.firmware.tello import TelloFirmware, with_tellos
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from tests.drivers.tello.addresses import Addresses
@@ -129,7 +129,7 @@ def test_datagrams_of_others_are_left_out() -> None:
 def test_parameters_reach_the_drone() -> None:
     with emulated() as (firmware,), opened(address(firmware, video=0)) as (driver, sink):
         up(sink)
-        board = firmware.board
+        board = firmware.logic
         for name, value in (
             ("camera.active", "bottom"),
             ("camera.fps", 15),

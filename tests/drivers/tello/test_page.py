@@ -6,8 +6,8 @@ import re
 
 from skyloop.drivers.tello import options
 from skyloop.drivers.tello.parameters import SETTINGS, flip_parameter, scale_parameters
-from skyloop.drivers.tello.session import ALIVE_NS, DEGRADED_NS, ENTER_NS, LOST_NS
-from skyloop.drivers.tello.sticks import Scale
+from skyloop.drivers.tello.protocol import ALIVE_NS, DEGRADED_NS, ENTER_NS, LOST_NS
+from skyloop.drivers.tello.setpoints import Scale
 from tests.docs.pages import rows, section
 
 

@@ -25,7 +25,8 @@ from skyloop.messages import (
 )
 from skyloop.wire.tello.commands import Sdk
 from tests.drivers.tello.rig import Rig
-from tests.wire.tello.test_state import recorded
+from tests.emulators.tello_rig import PILOT
+from tests.wire.tello.test_state import strings
 
 
 @pytest.mark.parametrize("lost", [0.0, 0.1, 0.3])
@@ -65,6 +66,26 @@ def test_sticks_come_twenty_times_a_second_and_a_new_one_at_once() -> None:
     rig.step()
     rig.step()
     assert "rc -30 0 0 0" in rig.take_said()
+
+
+def test_a_drone_that_another_program_flies_gets_no_sticks_before_it_is_taken() -> None:
+    rig = Rig()
+    rig.ready()
+    rig.bench.logic.receive(b"takeoff", PILOT)
+    rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
+    rig.run(3.0)
+    assert not [text for text in rig.said if text.startswith(("rc", "land", "stop"))]
+    rig.do(Hover())
+    rig.run(0.2)
+    assert "rc 0 0 0 0" in rig.take_said()
+    rig.do(Land())
+    rig.until(lambda: rig.state is FlightState.LANDED, 15.0)
+    rig.run(1.0)
+    rig.take_said()
+    rig.bench.logic.receive(b"takeoff", PILOT)
+    rig.until(lambda: rig.state is FlightState.HOVERING, 12.0)
+    rig.run(1.0)
+    assert not [text for text in rig.said if text.startswith("rc")], "nor the next flight"
 
 
 def test_nothing_moves_a_drone_that_stands() -> None:
@@ -107,7 +128,7 @@ def test_a_landing_can_be_broken_off() -> None:
     rig.run(8.0)
     rig.do(Land())
     rig.do(Hover())
-    assert rig.session.pilot.watch.sinking is False
+    assert rig.session.setpoints.watch.sinking is False
 
 
 @pytest.mark.parametrize("lost", [0.0, 0.2])
@@ -180,7 +201,7 @@ def test_a_drone_that_is_not_there_is_told_and_looked_for() -> None:
 
 def test_a_firewall_is_thought_of_when_answers_come_and_no_state() -> None:
     rig = Rig()
-    rig.bench.board.state_string = lambda: None  # type: ignore[method-assign]
+    rig.bench.logic.state_string = lambda: None  # type: ignore[method-assign]
     rig.run(2.5)
     assert rig.sink.link_state is LinkState.LOST
     assert "though it answers: does a firewall of this host let UDP port 8890 in?" in rig.sink.links[-1][1]
@@ -225,15 +246,15 @@ def test_a_drone_that_was_started_again_is_set_up_again() -> None:
     rig = Rig(TelloOptions("drone", video=False, pads=True))
     rig.ready()
     rig.run(1.0)
-    assert rig.bench.board.looks_for_pads
+    assert rig.bench.logic.looks_for_pads
     rig.session.remembered["camera.fps"] = "setfps low"
     rig.on = False
     rig.until(lambda: rig.sink.link_state is LinkState.LOST, 3.0)
     rig.restart_drone()
     rig.ready()
     rig.run(1.0)
-    assert rig.bench.board.looks_for_pads
-    assert rig.bench.board.fps == 5.0
+    assert rig.bench.logic.looks_for_pads
+    assert rig.bench.logic.fps == 5.0
 
 
 def test_a_drone_that_does_not_hear_us_is_told() -> None:
@@ -262,9 +283,9 @@ def test_ports_of_its_own_need_a_drone_that_knows_them() -> None:
     options = TelloOptions("drone", video=False, state_port=9990)
     rig = Rig(options)
     rig.ready()
-    assert rig.bench.board.state_port == 9990
+    assert rig.bench.logic.state_port == 9990
     old = Rig(options, sdk=Sdk.V2_0)
-    board = old.bench.board
+    board = old.bench.logic
     board.state_string = lambda: None  # type: ignore[method-assign]  # its states go to another port
     old.run(3.0)
     assert old.reasons.count("ports_refused") == 1
@@ -277,7 +298,7 @@ def test_video_is_asked_for_until_it_comes() -> None:
     rig.ready()
     rig.run(5.0)
     assert rig.said.count("streamon") in (2, 3)
-    assert rig.bench.board.streaming
+    assert rig.bench.logic.streaming
     rig.take_said()
     for _ in range(100):
         came_ns[0] = rig.now_ns
@@ -354,7 +375,7 @@ def test_nothing_that_comes_raises(datagrams: list[tuple[bool, bytes]], flying: 
     if flying:
         rig.do(Takeoff())
     for is_state, datagram in datagrams:
-        (rig.session.state_heard if is_state else rig.session.reply_heard)(datagram, rig.now_ns)
+        (rig.session.on_state if is_state else rig.session.on_reply)(datagram, rig.now_ns)
         rig.step()
     assert not rig.sink.problems
     assert isinstance(rig.state, FlightState)
@@ -366,9 +387,9 @@ def test_recorded_states_that_were_damaged_do_not_raise(data: st.DataObject) -> 
     rig = Rig()
     rig.run(0.2)
     for _ in range(10):
-        line = bytearray(data.draw(st.sampled_from(recorded())).encode())
+        line = bytearray(data.draw(st.sampled_from(strings())).encode())
         for _ in range(data.draw(st.integers(0, 6))):
             line[data.draw(st.integers(0, len(line) - 1))] = data.draw(st.integers(0, 255))
-        rig.session.state_heard(bytes(line), rig.now_ns)
+        rig.session.on_state(bytes(line), rig.now_ns)
         rig.step()
     assert not rig.sink.problems

@@ -12,12 +12,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from skyloop.drivers.backlog import Coded
-from skyloop.drivers.tello.cameras import cameras_of, intrinsics_for
-from skyloop.drivers.tello.decoding import MOST_DAMAGED, TelloVideo
+from skyloop.drivers.tello.video import MOST_DAMAGED, TelloVideo, cameras_of, intrinsics_for
 from skyloop.drivers.uri import parse_uri
-from skyloop.sim.firmware.tello.running import GROUP, TelloPacker
-from skyloop.sim.firmware.tello.settings import FRONT
-from skyloop.sim.firmware.video import OneCamera
+from skyloop.emulators.tello.emulator import GROUP, TelloPacker
+from skyloop.emulators.tello.settings import FRONT
+from skyloop.emulators.video import OneCamera
 from skyloop.wire.tello.video import AccessUnit, Assembly, pieces
 
 pytest.importorskip("av")

@@ -5,9 +5,8 @@ from __future__ import annotations
 import pytest
 
 from skyloop.clock import nanoseconds
-from skyloop.drivers.tello.feedback import height_m, velocity_m_s
 from skyloop.drivers.tello.options import VelocityAxes
-from skyloop.drivers.tello.watch import FlightWatch
+from skyloop.drivers.tello.telemetry import FlightWatch, height_m, velocity_m_s
 from skyloop.messages import FlightState
 from skyloop.wire.tello.state import State
 
@@ -26,7 +25,7 @@ class Film:
             self._frames += 1
             self._motor_s = self._frames * PERIOD_S if motors else getattr(self, "_motor_s", 5.0)
             state = State(distance_cm=tof, height_cm=h, motor_s=int(self._motor_s), speed_dm_s=(0, 0, 0))
-            self.watch.heard(state, nanoseconds(self._frames * PERIOD_S))
+            self.watch.update(state, nanoseconds(self._frames * PERIOD_S))
         return self.watch.phase
 
 

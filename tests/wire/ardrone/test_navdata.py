@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,12 +13,12 @@ from skyloop.errors import DecodeError
 from skyloop.wire.ardrone import options
 from skyloop.wire.ardrone.navdata import MAX_DATAGRAM, ControlState, State, decode, encode
 from skyloop.wire.ardrone.options import BY_TAG_AND_SIZE, LAYOUTS, Demo, Gps, Time, VisionDetect, Wifi, Zimmu3000
+from tests.recordings import content, needs_recordings
 
-DATA = Path(__file__).parents[2] / "data" / "ardrone2"
-RECORDED = (DATA / "navdata-full-landed.bin").read_bytes()
+RECORDED = content("ardrone2/navdata-full-landed.bin")
 BOOTSTRAPS = [
     (bytes.fromhex(line.split("|")[0]), "BAD" not in line)
-    for line in (DATA / "navdata-bootstrap-hex.txt").read_text().splitlines()
+    for line in content("ardrone2/navdata-bootstrap-hex.txt").decode().splitlines()
     if line and not line.startswith("#")
 ]
 #: Sizes with tag and size as ``navdata_common.h`` has them, by tag.
@@ -37,6 +36,7 @@ def header(state: int = 0, sequence: int = 1) -> bytes:
     return struct.pack("<IIII", 0x55667788, state, sequence, 0)
 
 
+@needs_recordings
 def test_the_recorded_datagram() -> None:
     navdata = decode(RECORDED)
     assert (len(RECORDED), len(navdata.options), navdata.unknown) == (1916, 28, ())
@@ -61,11 +61,13 @@ def test_the_recorded_datagram() -> None:
     assert navdata.get(Zimmu3000) is not None
 
 
+@needs_recordings
 def test_the_recorded_datagram_encoded_again() -> None:
     navdata = decode(RECORDED)
     assert encode(navdata.state, navdata.sequence, navdata.options.values(), navdata.vision_defined) == RECORDED
 
 
+@needs_recordings
 def test_recorded_bootstraps() -> None:
     assert [good for _, good in BOOTSTRAPS] == [True, True, False]
     for datagram, good in BOOTSTRAPS:
@@ -129,7 +131,7 @@ def test_an_option_by_hand() -> None:
     [
         (b"", "0 bytes"),
         (header(), "16 bytes"),
-        (RECORDED[:-1], "checksum"),
+        pytest.param(RECORDED[:-1], "checksum", marks=needs_recordings),
         (bytes(MAX_DATAGRAM + 1), "4097 bytes"),
         (with_checksum(b"\x89" + header()[1:]), "begins with"),
         (with_checksum(header() + b"\x01\x00"), "belong to no option"),
@@ -152,6 +154,7 @@ def test_anything_is_decoded_or_refused(tail: bytes) -> None:
             continue
 
 
+@needs_recordings
 @given(st.integers(0, len(RECORDED) - 1), st.integers(0, 7))
 def test_one_flipped_bit_is_always_found(at: int, bit: int) -> None:
     damaged = bytearray(RECORDED)
@@ -160,6 +163,7 @@ def test_one_flipped_bit_is_always_found(at: int, bit: int) -> None:
         decode(bytes(damaged))
 
 
+@needs_recordings
 @given(st.integers(0, len(RECORDED) - 1))
 def test_a_cut_datagram_is_always_found(length: int) -> None:
     with pytest.raises(DecodeError):

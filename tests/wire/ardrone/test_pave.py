@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import random
 import struct
-from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skyloop.wire.ardrone.pave import DEFAULT_MAX_PAYLOAD, FrameType, PaveFrame, PaveParser
+from tests.recordings import content, needs_recordings
 
-DATA = Path(__file__).parents[2] / "data" / "ardrone2"
-LONG = (DATA / "video-8s.pave").read_bytes()
-TORN = (DATA / "video-64-byte-headers.pave").read_bytes()
+pytestmark = needs_recordings
+
+LONG = content("ardrone2/video-8s.pave")
+TORN = content("ardrone2/video-64-byte-headers.pave")
 START = LONG[:200_000]
 
 

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from skyloop.errors import UsageError
 from skyloop.wire.ardrone.pave import Codec, FrameType, PaveParser, build_header
-
-RECORDED = Path(__file__).parents[2] / "data" / "ardrone2"
+from tests.recordings import recorded
 
 
 def test_the_first_header_of_a_real_drone_of_today() -> None:
-    real = (RECORDED / "video-8s.pave").read_bytes()[:68]
+    real = recorded("ardrone2/video-8s.pave").read_bytes()[:68]
     header = build_header(
         payload_size=10253,
         type=FrameType.IDR,
@@ -33,7 +30,7 @@ def test_the_first_header_of_a_real_drone_of_today() -> None:
 
 
 def test_the_first_header_of_a_real_drone_of_early_days() -> None:
-    real = (RECORDED / "video-64-byte-headers.pave").read_bytes()[:64]
+    real = recorded("ardrone2/video-64-byte-headers.pave").read_bytes()[:64]
     header = build_header(
         payload_size=2632,
         type=FrameType.P,

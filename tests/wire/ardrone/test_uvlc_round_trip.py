@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from skyloop.emulators.ardrone.uvlc import MAX_DATAGRAM, encode
 from skyloop.errors import UsageError
-from skyloop.sim.firmware.ardrone.uvlc import MAX_DATAGRAM, encode
 from skyloop.wire.ardrone.uvlc import UvlcDecoder, UvlcPicture
 from skyloop.wire.ardrone.uvlc_tables import SIZES
 from tests.wire.ardrone.uvlc_bits import GREY, header, level, macroblock, packet, picture, run

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
@@ -13,8 +12,9 @@ from hypothesis import strategies as st
 from skyloop.errors import UsageError
 from skyloop.wire.mavlink.codec import Codec, Message
 from skyloop.wire.mavlink.codec import dialect as m
+from tests.recordings import recorded
 
-DATA = Path(__file__).parents[2] / "data" / "mavlink" / "arduplane-flight.tlog"
+FLIGHT = "mavlink/arduplane-flight.tlog"
 KEY = bytes(range(32))
 
 
@@ -110,7 +110,7 @@ def test_a_key_has_32_bytes() -> None:
 
 def test_a_recorded_flight_decodes_in_full() -> None:
     """Each frame stands behind eight bytes of time. All 417 of 5.9 s decode; the file ends within the next one."""
-    data, receiver, at = DATA.read_bytes(), Codec(255, 190), 0
+    data, receiver, at = recorded(FLIGHT).read_bytes(), Codec(255, 190), 0
     kinds: Counter[str] = Counter()
     times: list[int] = []
     while at + 9 < len(data) and at + data[at + 9] + 16 <= len(data):
@@ -129,7 +129,7 @@ def test_a_recorded_flight_decodes_in_full() -> None:
 @settings(max_examples=50)
 @given(st.data())
 def test_a_damaged_recording_never_raises(data: st.DataObject) -> None:
-    recorded = bytearray(DATA.read_bytes()[:2048])
+    flight = bytearray(recorded(FLIGHT).read_bytes()[:2048])
     for _ in range(data.draw(st.integers(1, 30))):
-        recorded[data.draw(st.integers(0, len(recorded) - 1))] = data.draw(st.integers(0, 255))
-    Codec(255, 190).decode(bytes(recorded))
+        flight[data.draw(st.integers(0, len(flight) - 1))] = data.draw(st.integers(0, 255))
+    Codec(255, 190).decode(bytes(flight))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -11,18 +10,21 @@ from hypothesis import strategies as st
 
 from skyloop.errors import DecodeError
 from skyloop.wire.tello.state import State, build, parse
+from tests.recordings import recorded
 
-RECORDED = Path(__file__).parents[2] / "data" / "tello" / "state_strings.txt"
 
-
-def recorded() -> list[str]:
-    return [line for line in RECORDED.read_text().splitlines() if line and not line.startswith("#")]
+def strings() -> list[str]:
+    return [
+        line
+        for line in recorded("tello/state_strings.txt").read_text().splitlines()
+        if line and not line.startswith("#")
+    ]
 
 
 def test_every_recorded_string_decodes_in_full() -> None:
-    states = [parse(f"{line}\r\n".encode()) for line in recorded()]
+    states = [parse(f"{line}\r\n".encode()) for line in strings()]
     assert len(states) == 9
-    for line, state in zip(recorded(), states, strict=True):
+    for line, state in zip(strings(), states, strict=True):
         told = dict(part.split(":") for part in line.strip(";").split(";"))
         assert dict(state.fields).keys() == told.keys()
         assert state.pitch_deg == float(told["pitch"])
@@ -39,7 +41,7 @@ def test_every_recorded_string_decodes_in_full() -> None:
 
 
 def test_what_means_unknown_is_unknown() -> None:
-    flying = parse(recorded()[3].encode())
+    flying = parse(strings()[3].encode())
     assert dict(flying.fields)["tof"] == 6553
     assert flying.distance_cm is None
     assert parse(b"tof:10;bat:101;pitch:1000;").battery_percent is None
@@ -49,7 +51,7 @@ def test_what_means_unknown_is_unknown() -> None:
 
 def test_attitude_and_acceleration_agree_on_their_axes() -> None:
     """At rest: nose up shows along x, right side down against y; z points down."""
-    for line in recorded():
+    for line in strings():
         state = parse(line.encode())
         assert state.acceleration_mg is not None
         assert state.pitch_deg is not None
@@ -69,7 +71,7 @@ def test_a_pad_that_is_seen() -> None:
 
 
 def test_a_string_that_was_cut_off_keeps_its_whole_fields() -> None:
-    whole = recorded()[0]
+    whole = strings()[0]
     for end in range(len(whole)):
         try:
             state = parse(whole[:end].encode())

@@ -34,6 +34,7 @@ def test_versions_know_what_older_ones_know() -> None:
         ("wifi?", "90"),
         ("battery?", "87"),
         ("baro?", "-142.60"),
+        ("time?", "12"),
         ("time?", "12s"),
         ("tof?", "100mm"),
         ("height?", "-6dm"),

@@ -1,4 +1,4 @@
-"""From the recording of the experiment to its figures."""
+"""Evaluates the recording of the experiment."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from skyloop.bench.contenders import OURS
 from skyloop.bench.delays import Cell, Delays, Series
 from skyloop.bench.machine import Machine
 from skyloop.bench.paper.marks import APPLICATION, CORNERS, FEEDBACK_HEARD, TARGET, VIDEO_HEARD
-from skyloop.bench.peers import OURS
 from skyloop.bench.schedule import COMMAND, FEEDBACK, FRAME_PERIOD_S, PACKET_PERIOD_S, VIDEO, Size
 from skyloop.bench.statistics import summarize
 from skyloop.clock import NS_PER_S
 from skyloop.errors import FileFormatError
+from skyloop.files import MAX_RESULTS, read_json
 from skyloop.logfile.layout import Channel, FrameRecord
 from skyloop.logfile.reader import Item, Progress, Recording
 from skyloop.messages import Applied, Event, EventKind, Feedback, Idle, LogEntry
@@ -32,7 +33,7 @@ _CHANNELS: Final = (Channel.FEEDBACK, Channel.COMMANDS, Channel.EVENTS, Channel.
 
 
 class Tracking(msgspec.Struct, frozen=True):
-    """How well the path was flown, by the truth [m]. Without the time in which somebody else flew."""
+    """How well the path was flown, by the truth [m], without the time in which somebody else flew."""
 
     samples: int
     rms_m: float  #: of the distance from where it should have been at that time
@@ -43,7 +44,7 @@ class Tracking(msgspec.Struct, frozen=True):
 
 
 class Way(msgspec.Struct, frozen=True):
-    """The path from above, and the error over time: what the pictures are drawn from."""
+    """The path from above, and the error over time, from which the diagrams are drawn."""
 
     at_s: list[float]  #: since the beginning
     x: list[float]  #: the truth, world axes [m]
@@ -53,7 +54,7 @@ class Way(msgspec.Struct, frozen=True):
 
 
 class Experiment(msgspec.Struct, frozen=True, tag_field="what", tag="paper"):
-    """All figures of a run; what ``results.json`` holds."""
+    """All figures of a run, as in ``results.json``."""
 
     vehicle: str  #: its address
     seconds: float  #: of the experiment, between the first and the last stamp
@@ -74,12 +75,13 @@ class Heard:
     seq: list[int] = field(default_factory=list)
 
     def add(self, sent_ns: float, delay_ns: float, seq: float) -> None:
+        """Add a sample."""
         self.sent_ns.append(int(sent_ns))
         self.delay_ns.append(int(delay_ns))
         self.seq.append(int(seq))
 
     def within(self, first_ns: int, last_ns: int) -> Heard:
-        """Those that were sent in that time."""
+        """Return the samples that were sent in a time [ns]."""
         found = Heard()
         for row in zip(self.sent_ns, self.delay_ns, self.seq, strict=True):
             if first_ns <= row[0] <= last_ns:
@@ -89,7 +91,7 @@ class Heard:
 
 @dataclass(slots=True)
 class _Gathered:
-    """What one pass through the recording finds."""
+    """The samples that one pass through the recording finds."""
 
     application: int | None = None
     heard: dict[str, Heard] = field(default_factory=lambda: {COMMAND: Heard(), FEEDBACK: Heard(), VIDEO: Heard()})
@@ -104,10 +106,16 @@ class _Gathered:
 def evaluate(
     path: str | Path, machine: Machine | None = None, load: float | None = None, progress: Progress | None = None
 ) -> Experiment:
-    """Work out a recorded experiment. ``machine``: what it ran on (default: this one), ``load``: of it at its end.
+    """Evaluate a recorded experiment.
 
-    Raises :class:`FileFormatError` for a recording that this experiment's application has not been in, and what
-    :meth:`Recording.open` raises.
+    Args:
+        path: The recording.
+        machine: What it ran on (default: this one).
+        load: The machine's load at its end.
+        progress: Called while the recording is read.
+
+    Raises:
+        FileFormatError: The experiment's application is not in the recording, or it is none.
     """
     recording = Recording.open(path)
     known = recording.drone()
@@ -146,8 +154,12 @@ def evaluate(
 
 
 def load(path: Path) -> Experiment:
-    """What ``results.json`` holds. Raises ``msgspec.ValidationError`` for anything else."""
-    return msgspec.json.decode(path.read_bytes(), type=Experiment)
+    """Read ``results.json``.
+
+    Raises:
+        FileFormatError: It is anything else.
+    """
+    return read_json(path, Experiment, "the results of the experiment", MAX_RESULTS)
 
 
 # Reading ---------------------------------------------------------------------------------------------------------
@@ -206,8 +218,10 @@ def _cells(name: str, size: str, heard: dict[str, Heard]) -> list[Cell]:
 
 
 def numbered(seq: Sequence[int], channel: str) -> int:
-    """How many samples were sent, by their numbers. Those of commands also count what only keeps the connection
-    alive, so that nothing is known of them but how many came."""
+    """Return how many samples were sent, by their numbers.
+
+    Commands are only counted as they came: their numbers also count what only keeps the connection alive.
+    """
     return len(seq) if channel == COMMAND else max(seq) - min(seq) + 1
 
 
@@ -244,7 +258,14 @@ def _track(found: _Gathered, first_ns: int, last_ns: int) -> tuple[Way, Tracking
 
 
 def distances_to_round(places: Floats) -> Floats:
-    """From places, shape (n, 3), to the nearest point of the closed line through the corners [m]."""
+    """Return the distances from places to the closed line through the corners [m].
+
+    Args:
+        places: Shape (n, 3), in world axes [m].
+
+    Returns:
+        Shape (n,), float64.
+    """
     corners = np.array(CORNERS)
     legs = zip(corners, np.roll(corners, -1, axis=0), strict=True)
     distances: Floats = np.min([_to_leg(places, begin, end) for begin, end in legs], axis=0)

@@ -1,4 +1,4 @@
-"""The experiment's application: a path controller through waypoints by motion capture, and stamps of what it hears."""
+"""The experiment's application: a path controller through waypoints by motion capture, and stamps of what it gets."""
 
 from __future__ import annotations
 
@@ -31,11 +31,20 @@ Row = tuple[int, int, int]
 
 
 class PaperFlight(Waypoints):
-    """Rounds through the corners for as long as it runs. Logs where it should be, and lets go while somebody else
-    flies: given back, it flies to where it had been on its way and goes on."""
+    """Flies rounds through the corners for as long as it runs, and logs where it should be.
+
+    It pauses while somebody else flies: when control is given back, it flies to where it had been on its way and goes
+    on.
+    """
 
     def __init__(self, drone: Drone, source: PositionSource, seconds: float) -> None:
-        """``source``: what knows where the vehicle is; ``seconds``: how long it will run at most."""
+        """Prepare the flight.
+
+        Args:
+            drone: The drone.
+            source: Knows where the vehicle is.
+            seconds: How long it will run at most [s].
+        """
         rounds = int(seconds / _LEG_S / len(CORNERS)) + 1
         super().__init__(drone, CORNERS * rounds, speed_m_s=SPEED_M_S, hold_s=HOLD_S, source=self._keep)
         self.takeovers = 0
@@ -49,6 +58,7 @@ class PaperFlight(Waypoints):
         return None if self._law is None or self.away else self._law.off_m
 
     def on_feedback(self, feedback: Feedback) -> None:
+        """Fly on, or pause while somebody else flies."""
         if self.drone.authority.state in ("preempted", "queued"):
             self.takeovers += not self.away
             self.away = True
@@ -70,8 +80,14 @@ class PaperFlight(Waypoints):
 
 
 class DelayLog:
-    """Stamps feedback and frames as this application's own receiving thread has them, and logs the stamps once a
-    second. Listens for as long as its block lasts."""
+    """Stamps feedback and frames on this application's receiving thread, and logs the stamps each second.
+
+    It does so for as long as its ``with`` block lasts.
+
+    Args:
+        drone: The drone.
+        camera: The camera of the frames.
+    """
 
     def __init__(self, drone: Drone, camera: str) -> None:
         self._drone = drone

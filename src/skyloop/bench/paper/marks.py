@@ -1,4 +1,4 @@
-"""What the experiment's application logs, so that its recording alone holds all that is worked out from it."""
+"""What the experiment's application logs, so that its recording alone holds all that is needed to evaluate it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The experiment's figures for people: tables, pictures, and a page that shows both."""
+"""The experiment's figures for people: tables, diagrams, and a page that shows both."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ import msgspec
 import numpy as np
 
 from skyloop.bench import tables
+from skyloop.bench.contenders import OURS
 from skyloop.bench.delays import PAPER_MEAN_MS
 from skyloop.bench.figures import new_figure, paper_figures, save
 from skyloop.bench.paper.evaluation import RECORDER, Experiment
 from skyloop.bench.paper.marks import CORNERS
-from skyloop.bench.peers import OURS
 from skyloop.bench.schedule import FEEDBACK, VIDEO
+from skyloop.files import write as write_file
 from skyloop.recording.review.page import Page, facts, table
 from skyloop.recording.review.svg import Line, TimeAxis, limits
 
@@ -37,22 +38,28 @@ MEANING: Final = {
 
 
 def write(results: Experiment, folder: Path) -> Path:
-    """The pictures, ``results.json`` and ``report.html`` into a folder; returns the page. Raises
-    :class:`MissingExtraError` without matplotlib, before anything is written."""
+    """Write the diagrams, ``results.json`` and ``report.html`` into a folder.
+
+    Returns:
+        The page.
+
+    Raises:
+        MissingExtraError: matplotlib is not installed; nothing is written then.
+    """
     save(lambda: figures(results), folder, ("png",))
-    (folder / "results.json").write_bytes(msgspec.json.format(msgspec.json.encode(results)))
+    write_file(folder / "results.json", msgspec.json.format(msgspec.json.encode(results)))
     page = folder / "report.html"
     _page(results).write(page)
     return page
 
 
 def figures(results: Experiment) -> dict[str, Figure]:
-    """By the names of their files."""
+    """Return the diagrams, by the names of their files."""
     return {**paper_figures(results.delays), "path": from_above(results)}
 
 
 def from_above(results: Experiment) -> Figure:
-    """What was flown, by the truth, on the round of waypoints."""
+    """Draw what was flown, by the truth, on the round of waypoints."""
     figure, axes = new_figure(5.4, 5.0)
     x, y, _ = np.array([*CORNERS, CORNERS[0]]).T
     axes.plot(results.way.x, results.way.y, color="#0b6e99", linewidth=0.8, alpha=0.8, label="flown, by the truth")
@@ -72,8 +79,10 @@ def _path_title(results: Experiment) -> str:
 
 
 def delay_table(results: Experiment) -> tables.Table:
-    """The paper's Table 1 with our figures beside it, as the controller saw the delays. How many commands were lost,
-    the recording does not tell."""
+    """Return the paper's Table 1 with our figures beside it, as the controller saw the delays.
+
+    The recording does not tell how many commands were lost.
+    """
     found = tables.paper_table(results.delays)
     spreads = [f"{results.deviation_us[channel] / 1e3:.3f}" for channel in PAPER_MEAN_MS]
     mean, paper, *others = found.rows
@@ -82,7 +91,7 @@ def delay_table(results: Experiment) -> tables.Table:
 
 
 def recorder_table(results: Experiment) -> tables.Table:
-    """The same feedback and frames as the recorder received them."""
+    """Return the delays of the same feedback and frames at the recorder."""
     rows = []
     for channel in (FEEDBACK, VIDEO):
         cells = [results.delays.summary(name, results.delays.sizes[0], channel) for name in (OURS.name, RECORDER)]
@@ -92,7 +101,7 @@ def recorder_table(results: Experiment) -> tables.Table:
 
 
 def path_table(results: Experiment) -> tables.Table:
-    """How well the path was flown."""
+    """Return how well the path was flown."""
     error = results.tracking
     rows = [] if error is None else _path_rows(error.rms_m, error.largest_m, error.across_rms_m, error.across_largest_m)
     return tables.Table("Off the path, by the truth", ["distance", "RMS", "largest"], rows)
@@ -106,7 +115,7 @@ def _path_rows(rms_m: float, largest_m: float, across_rms_m: float, across_large
 
 
 def flown(results: Experiment) -> list[tuple[str, str]]:
-    """The flight in figures."""
+    """Return the flight in figures."""
     waypoints = 0 if results.tracking is None else results.tracking.waypoints
     return [
         ("flown", f"{results.seconds:.1f} s"),

@@ -1,33 +1,35 @@
-"""The drone's configuration: keys written with their acknowledgement, and all of them read back. Pure.
+"""The drone's configuration: keys written and acknowledged, all keys read back, and the set-up after each loss. Pure.
 
-A key is written by ``CONFIG`` once the acknowledge bit of navdata is clear; the drone sets the bit when it took the
-command (which says nothing of the value), and ``CTRL 5`` clears it for the next. All keys are read by ``CTRL 4``, to
-which the drone answers on a TCP connection: :attr:`Configurator.wants_dump` asks for one.
+A key is written by ``CONFIG`` once the acknowledge bit of navdata is clear; the drone sets the bit when it accepted
+the command (which says nothing of the value), and ``CTRL 5`` clears it for the next. All keys are read by ``CTRL 4``,
+to which the drone answers on a TCP connection: :attr:`Configurator.wants_dump` asks for one.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from enum import Enum, auto
 from typing import Final, TypeAlias
+from zlib import crc32
 
 from skyloop.clock import nanoseconds
-from skyloop.drivers.ardrone.sender import Message
-from skyloop.wire.ardrone.at import Ctrl
-from skyloop.wire.ardrone.configuration import END_OF_DUMP, parse_dump
+from skyloop.drivers.ardrone.options import ArdroneOptions
+from skyloop.wire.ardrone.at import AtMessage, Ctrl
+from skyloop.wire.ardrone.configuration import END_OF_DUMP, format_value, parse_dump
+from skyloop.wire.ardrone.navdata import State
 
 REPEAT_NS: Final = nanoseconds(0.15)  #: of a CONFIG without acknowledgement; two periods of the demo mode
 REPEAT_DUMP_NS: Final = nanoseconds(0.3)
 MAX_DUMP: Final = 1 << 18  #: bytes; real ones have about 5000
-_CLEAR: Final[Message] = ("CTRL", (int(Ctrl.CLEAR_ACK), 0))
-_SEND_ALL: Final[Message] = ("CTRL", (int(Ctrl.GET_CONFIGURATION), 0))
+_CLEAR: Final[AtMessage] = ("CTRL", (int(Ctrl.CLEAR_ACK), 0))
+_SEND_ALL: Final[AtMessage] = ("CTRL", (int(Ctrl.GET_CONFIGURATION), 0))
 
 
 @dataclass(frozen=True, slots=True)
 class Write:
-    """A key and its value as text."""
+    """A step that writes a key; the value is text."""
 
     key: str
     text: str
@@ -35,7 +37,7 @@ class Write:
 
 @dataclass(frozen=True, slots=True)
 class Read:
-    """All keys, read back."""
+    """A step that reads all keys back."""
 
 
 Step: TypeAlias = Write | Read
@@ -43,9 +45,12 @@ Step: TypeAlias = Write | Read
 
 @dataclass(eq=False)
 class Exchange:
-    """Steps in order, with a time by which all must be done; ``done`` is called at the end with the failure or None.
+    """Steps in order, and what to call when they are done.
 
-    The steps may be a generator: each is asked for when the one before is done.
+    Args:
+        steps: May be a generator: each step is asked for when the one before is done.
+        deadline_ns: When all must be done.
+        done: Called at the end with why it failed, or None.
     """
 
     steps: Iterator[Step]
@@ -70,7 +75,7 @@ class _Phase(Enum):
 
 
 class Configurator:
-    """Does one exchange after the other."""
+    """Runs one exchange after the other."""
 
     def __init__(self) -> None:
         self.values: dict[str, str] = {}  #: as last read
@@ -88,16 +93,21 @@ class Configurator:
 
     @property
     def busy(self) -> bool:
+        """Whether an exchange is running or waiting."""
         return self._exchange is not None or bool(self._queue)
 
     def submit(self, exchange: Exchange) -> None:
-        """Do this after what is in line already."""
+        """Run an exchange after those that are waiting already."""
         self._queue.append(exchange)
         if self._exchange is None:
             self._next_exchange()
 
     def abandon(self, reason: str) -> None:
-        """The drone is away: all exchanges fail, and nothing that was read counts any more."""
+        """Fail all exchanges and forget what was read: the drone is away.
+
+        Args:
+            reason: Given to each exchange's ``done``.
+        """
         self.values = {}
         exchanges = ([self._exchange] if self._exchange is not None else []) + list(self._queue)
         self._queue.clear()
@@ -106,10 +116,14 @@ class Configurator:
         for exchange in exchanges:
             exchange.done(reason)
 
-    # What is heard ---------------------------------------------------------------------------------------------
+    # What is received ---------------------------------------------------------------------------------------------
 
     def heard(self, acknowledged: bool) -> bool:
-        """The acknowledge bit of the newest navdata. Whether there is something to say at once."""
+        """Handle the acknowledge bit of the newest navdata.
+
+        Returns:
+            Whether there is something to send at once.
+        """
         self._acknowledged = acknowledged
         if self._phase is _Phase.CLEARING and not acknowledged:
             self._begin_asking()
@@ -122,11 +136,15 @@ class Configurator:
         return True
 
     def dump_opened(self) -> None:
-        """The control port is connected."""
+        """Handle that the control port is connected."""
         self._dump, self._asked_ns = bytearray(), 0
 
     def dump_received(self, data: bytes) -> bool:
-        """Some bytes came over the control port; whether that was all."""
+        """Handle bytes of the control port.
+
+        Returns:
+            Whether the connection is not needed any longer.
+        """
         if self._dump is None or not isinstance(self._step, Read):
             return True
         self._dump += data
@@ -141,14 +159,14 @@ class Configurator:
         return True
 
     def dump_failed(self, reason: str) -> None:
-        """The control port refused, or closed before the end: it is tried again until the exchange's deadline."""
+        """Handle that the control port refused or closed early. It is tried again until the exchange's deadline."""
         self._dump = None
         self.trouble = reason
 
-    # What is said ----------------------------------------------------------------------------------------------
+    # What is sent ----------------------------------------------------------------------------------------------
 
-    def messages(self, now_ns: int) -> list[Message]:
-        """What is to be said now."""
+    def messages(self, now_ns: int) -> list[AtMessage]:
+        """Return the commands to send now."""
         self._expire(now_ns)
         if self._phase is _Phase.CLEARING and not self._acknowledged:
             self._begin_asking()
@@ -158,15 +176,15 @@ class Configurator:
             return self._ask_write(self._step, now_ns)
         return self._ask_dump(now_ns)
 
-    def _ask_write(self, step: Write, now_ns: int) -> list[Message]:
+    def _ask_write(self, step: Write, now_ns: int) -> list[AtMessage]:
         if not self._due(now_ns, REPEAT_NS):
             return []
-        config: Message = ("CONFIG", (step.key, step.text))
+        config: AtMessage = ("CONFIG", (step.key, step.text))
         if self.ids is None:
             return [config]
         return [("CONFIG_IDS", (self.ids.session, self.ids.profile, self.ids.application)), config]
 
-    def _ask_dump(self, now_ns: int) -> list[Message]:
+    def _ask_dump(self, now_ns: int) -> list[AtMessage]:
         if self._dump is None or self._dump or not self._due(now_ns, REPEAT_DUMP_NS):
             return []
         return [_SEND_ALL]
@@ -224,3 +242,110 @@ class Configurator:
         exchange.done(failure)
         if self._exchange is None:  # unless it submitted another one
             self._next_exchange()
+
+
+# Set-up --------------------------------------------------------------------------------------------------------------
+
+_NEW_MOTHER_BOARD: Final = 32  #: of the AR.Drone 2; the AR.Drone 1 has 17 and less
+_ID_KEYS: Final = {
+    "session": "custom:session_id",
+    "profile": "custom:profile_id",
+    "application": "custom:application_id",
+}
+
+
+def version_of(configuration: Mapping[str, str]) -> int | None:
+    """Tell an AR.Drone 1 from a 2 by the firmware or mother board in its configuration; None if it has neither."""
+    major = configuration.get("general:num_version_soft", "").partition(".")[0]
+    if major.isdecimal() and int(major) >= 1:
+        return 1 if int(major) == 1 else 2
+    board = configuration.get("general:num_version_mb", "")
+    if board.isdecimal():
+        return 2 if int(board) >= _NEW_MOTHER_BOARD else 1
+    return None
+
+
+def own_ids(session: int) -> Ids:
+    """Return Skyloop's ids.
+
+    Args:
+        session: A number. Settings of application and user persist; those of a session begin anew with each number.
+    """
+    return Ids(
+        session=f"{session & 0xFFFFFFFF:08x}",
+        profile=f"{crc32(b'skyloop user'):08x}",
+        application=f"{crc32(b'skyloop'):08x}",
+    )
+
+
+def ids_in_force(configuration: Mapping[str, str]) -> Ids | None:
+    """Return the ids that the drone's configuration names; None where it keeps nobody's settings apart."""
+    if not all(key in configuration for key in _ID_KEYS.values()):
+        return None
+    return Ids(**{name: configuration[key] for name, key in _ID_KEYS.items()})
+
+
+class Setup:
+    """The steps that set up one drone.
+
+    ``version`` is known when they are done, unless the drone does not report it. ``refused_ids`` says afterwards that
+    the drone accepted no settings of our own.
+
+    Args:
+        options: Of the vehicle's address.
+        configurator: Runs the steps.
+        ids: Ours.
+        remembered: Keys that an application wrote before the drone went away; they are written again where the drone
+            forgot them.
+    """
+
+    def __init__(
+        self, options: ArdroneOptions, configurator: Configurator, ids: Ids, remembered: Mapping[str, str]
+    ) -> None:
+        self.version = options.version
+        self.refused_ids = False
+        self._options = options
+        self._configurator = configurator
+        self._ids = ids
+        self._remembered = remembered
+
+    def steps(self, state: State) -> Iterator[Step]:
+        """Yield the steps. The configurator must do each before it asks for the next.
+
+        Args:
+            state: The state bits as they were first received.
+        """
+        options, configurator = self._options, self._configurator
+        in_demo = bool(state & State.DEMO)
+        if state & State.BOOTSTRAP or in_demo is options.full:
+            yield Write("general:navdata_demo", format_value(not options.full))
+        yield Read()
+        self.version = options.version or version_of(configurator.values)
+        if options.ids and self.version == 2:
+            yield from self._take_ids()
+        if options.navdata_options is not None:
+            yield from self._written({"general:navdata_options": str(options.navdata_options)})
+        yield from self._written(self._remembered)
+
+    def _take_ids(self) -> Iterator[Step]:
+        configurator = self._configurator
+        present = ids_in_force(configurator.values)
+        if present is None:
+            return
+        configurator.ids = present
+        for name, key in _ID_KEYS.items():
+            wanted = getattr(self._ids, name)
+            if getattr(configurator.ids, name) != wanted:
+                yield Write(key, wanted)
+                configurator.ids = replace(configurator.ids, **{name: wanted})
+        if configurator.ids != present:
+            yield Read()
+            configurator.ids = ids_in_force(configurator.values)
+            self.refused_ids = configurator.ids != self._ids
+
+    def _written(self, wanted: Mapping[str, str]) -> Iterator[Step]:
+        different = {key: text for key, text in wanted.items() if self._configurator.values.get(key, text) != text}
+        for key, text in different.items():
+            yield Write(key, text)
+        if different:
+            yield Read()

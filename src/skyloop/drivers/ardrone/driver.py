@@ -6,21 +6,17 @@ import secrets
 from typing import Final
 
 from skyloop.clock import monotonic_ns
-from skyloop.drivers.ardrone.cameras import cameras_of
-from skyloop.drivers.ardrone.commands import Commands
-from skyloop.drivers.ardrone.decoding import make_decoder
-from skyloop.drivers.ardrone.encoded import EncodedStream
-from skyloop.drivers.ardrone.link import Link
+from skyloop.drivers.ardrone.configuration import own_ids
+from skyloop.drivers.ardrone.link import ArdroneLink
 from skyloop.drivers.ardrone.options import options_of
-from skyloop.drivers.ardrone.parameters import Entry, active_camera, entries_of, taken, written
-from skyloop.drivers.ardrone.session import Session
-from skyloop.drivers.ardrone.setup import own_ids
-from skyloop.drivers.ardrone.video import VideoReceiver
+from skyloop.drivers.ardrone.parameters import Commands, Entry, active_camera, entries_of, taken, written
+from skyloop.drivers.ardrone.protocol import ArdroneSession
+from skyloop.drivers.ardrone.video import EncodedStream, VideoReceiver, cameras_of, make_decoder
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.intrinsics import intrinsics_of
 from skyloop.drivers.live_video import Notice, Picture
 from skyloop.drivers.uri import VehicleUri
-from skyloop.drivers.vehicle_session import Telling
+from skyloop.drivers.vehicle_session import SinkCallback
 from skyloop.errors import DriverError, ParameterError, SkyloopError
 from skyloop.messages import (
     AnyAction,
@@ -42,14 +38,17 @@ class ArdroneDriver(Driver):
     def __init__(self, uri: VehicleUri) -> None:
         super().__init__(uri)
         self.options = options_of(uri)
-        self._session: Session | None = None
-        self._link: Link | None = None
+        self._session: ArdroneSession | None = None
+        self._link: ArdroneLink | None = None
         self._video: VideoReceiver | None = None
         self._commands: Commands | None = None
         self._camera = "front"
 
     def capabilities(self) -> Capabilities:
-        """Cameras are those of an AR.Drone 2 unless the address says that it is a 1."""
+        """Return what the drone can do.
+
+        Its cameras are those of an AR.Drone 2 unless the address says that it is a 1.
+        """
         version = self.options.version
         return Capabilities(
             vehicle=f"ardrone{version}" if version else "ardrone",
@@ -62,11 +61,12 @@ class ArdroneDriver(Driver):
 
     def _open(self, sink: Sink) -> None:
         if self.options.video:
-            make_decoder(self.options.version or 2)  # says now what is not installed
-        session = Session(self.options, own_ids(secrets.randbits(32)), monotonic_ns(), extra=self._video_telemetry)
+            make_decoder(self.options.version or 2)  # raises if something is not installed
+        ids = own_ids(secrets.randbits(32))
+        session = ArdroneSession(self.options, ids, monotonic_ns(), extra=self._video_telemetry)
         self._session = session
-        self._link = Link(session, lambda tellings: self._deliver(sink, tellings))
-        self._commands = Commands(session.pilot, self._link.say)
+        self._link = ArdroneLink(session, lambda pending: self._deliver(sink, pending))
+        self._commands = Commands(session.setpoints, self._link.send)
         self._link.start()
 
     def _close(self) -> None:
@@ -76,10 +76,10 @@ class ArdroneDriver(Driver):
             self._video.stop()
         self._session = self._link = self._video = self._commands = None
 
-    def _deliver(self, sink: Sink, tellings: list[Telling]) -> None:
-        """On the link's thread."""
-        for telling in tellings:
-            telling(sink)
+    def _deliver(self, sink: Sink, pending: list[SinkCallback]) -> None:
+        """Run the session's callbacks. On the link's thread."""
+        for publish in pending:
+            publish(sink)
         session = self._session
         if session is not None and session.ready:
             self._camera = active_camera(session.configurator.values)
@@ -98,7 +98,7 @@ class ArdroneDriver(Driver):
     # Parameters ------------------------------------------------------------------------------------------------
 
     def parameters(self) -> list[Parameter]:
-        """The commands that are no actions and, once it was read, the drone's configuration."""
+        """Return the commands that are no actions and, once it was read, the drone's configuration."""
         if self._link is None or self._commands is None:
             return []
         with self._link.lock:
@@ -107,7 +107,20 @@ class ArdroneDriver(Driver):
         return known + [entry.parameter for entry in self._entries().values()]
 
     def set_parameter(self, name: str, value: Value) -> Value:
-        """Takes up to 0.9 s: the drone acknowledges, and what it made of it is read back."""
+        """Write a key, or give a command that is a parameter. Takes up to 0.9 s: a key is acknowledged and read back.
+
+        Args:
+            name: A name that :meth:`parameters` lists.
+            value: Of the parameter's type.
+
+        Returns:
+            The value in force, as it was read back.
+
+        Raises:
+            UnknownNameError: There is no such parameter.
+            ParameterError: The driver is not open, the configuration was not read yet, the value does not fit, or the
+                drone did not acknowledge or accept it.
+        """
         link, commands = self._link, self._commands
         if link is None or commands is None:
             raise ParameterError(f"{self.uri} is not open", code=Refusal.VEHICLE_LINK_LOST)
@@ -120,7 +133,7 @@ class ArdroneDriver(Driver):
             raise ParameterError("the drone's configuration was not read yet", code=Refusal.VEHICLE_LINK_LOST)
         return self._configure(link, *written(entries, name, value))
 
-    def _configure(self, link: Link, entry: Entry, text: str) -> Value:
+    def _configure(self, link: ArdroneLink, entry: Entry, text: str) -> Value:
         failure = link.write(entry.key, text)
         if failure is not None:
             raise ParameterError(f"{entry.parameter.name}: {failure}", code=Refusal.DRIVER_FAILED)
@@ -169,7 +182,7 @@ class ArdroneDriver(Driver):
             sink.event(EventKind.DRIVER_ERROR, f"no video: {error}", Severity.ERROR, where="video")
 
     def _intrinsics(self, width: int, height: int) -> Intrinsics | None:
-        """Of the camera that is shown, from the address; it tells those of the front camera."""
+        """Return the intrinsics of the camera that is shown; the address gives those of the front camera."""
         return intrinsics_of(self.uri, width, height) if self._camera == "front" else None
 
     def _video_telemetry(self) -> dict[str, Value]:

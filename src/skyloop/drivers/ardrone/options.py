@@ -1,4 +1,4 @@
-"""What an ``ardrone://`` address asks for. Pure. ``docs/ardrone.md`` has the options as a table."""
+"""Options of an ``ardrone://`` address. Pure. ``docs/ardrone.md`` has them as a table."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 from dataclasses import dataclass
 from typing import Final, TypeVar
 
-from skyloop.drivers.ardrone.native import OPTION_TAGS
+from skyloop.drivers.ardrone.telemetry import OPTION_TAGS
 from skyloop.drivers.base import reject_unknown_options
 from skyloop.drivers.intrinsics import INTRINSICS_OPTIONS, check_intrinsics
 from skyloop.drivers.uri import VehicleUri
@@ -28,20 +28,25 @@ _KNOWN: Final = {
 
 @dataclass(frozen=True, slots=True)
 class ArdroneOptions:
-    """An address, understood."""
+    """A parsed address."""
 
     host: str
     ports: Ports = ports.STANDARD
     version: int | None = None  #: of the drone; None: as its configuration says
     full: bool = False  #: navdata of 200 Hz with all options instead of the demo mode
-    navdata_options: int | None = None  #: a bit a tag; None: as the drone is configured
+    navdata_options: int | None = None  #: one bit for each tag; None: as the drone is configured
     rate_hz: float = 50.0  #: of feedback, at most
     video: bool = True
     ids: bool = True  #: settings of our own on an AR.Drone 2 (multi-configuration)
 
 
 def options_of(uri: VehicleUri) -> ArdroneOptions:
-    """From an address. Raises :class:`UsageError` for what makes no sense."""
+    """Parse an address.
+
+    Raises:
+        UnknownNameError: It has an unknown option, or an option has an unknown word as its value.
+        UsageError: It names no host, or an option's value makes no sense.
+    """
     reject_unknown_options(uri, _KNOWN)
     if not uri.place:
         raise UsageError(f"{uri} names no host: it looks like ardrone://192.168.1.1")
@@ -78,7 +83,10 @@ def _one_of(uri: VehicleUri, name: str, usual: str, meanings: dict[str, _Meaning
 
 
 def _mask(uri: VehicleUri) -> int | None:
-    """``navdata_options``: names of options, or a number with a bit for each tag. The demo option is always in it."""
+    """Return ``navdata_options``: names of options, or a number with a bit for each tag.
+
+    The demo option is always in it.
+    """
     given = uri.options.get("navdata_options")
     if given is None:
         return None

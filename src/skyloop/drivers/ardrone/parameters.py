@@ -1,19 +1,24 @@
-"""The drone's keys as parameters: their own names and units, and the names that all drivers share in SI. Pure."""
+"""The drone's keys and commands as parameters, by their own names and by those that all drivers share in SI. Pure."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
 import msgspec
 
+from skyloop.drivers.ardrone.setpoints import Condition, SetpointController
 from skyloop.errors import DecodeError, ParameterError, UnknownNameError
 from skyloop.messages import Parameter, ParameterType, Refusal, Value
+from skyloop.wire.ardrone.animations import FIRST_FLIP, FLIGHT_ANIMATIONS, LED_ANIMATIONS, NO_ANIMATION
+from skyloop.wire.ardrone.at import AtMessage
 from skyloop.wire.ardrone.configuration import format_value, parse_value
 from skyloop.wire.ardrone.keys import KEYS, VideoChannel, VideoCodec
+
+# Keys of the configuration -------------------------------------------------------------------------------------------
 
 PREFIX: Final = "ardrone."
 _NAME: Final = re.compile(r"[a-z0-9_]+(\.[a-z0-9_]+)*\Z")
@@ -38,7 +43,7 @@ _OURS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class _Common:
-    """A name that all drivers share, and the key behind it; the key's number by ``divisor`` is SI."""
+    """A name that all drivers share, and the key behind it; the key's number divided by ``divisor`` is SI."""
 
     name: str
     key: str
@@ -82,7 +87,11 @@ class Entry:
     names: tuple[str, ...] = ()  #: of the key's values from 0 on, where the parameter has names for them
 
     def to_text(self, value: Value) -> str:
-        """As the drone takes it. Raises :class:`ParameterError` for a type that does not fit."""
+        """Return a value as the drone takes it.
+
+        Raises:
+            ParameterError: It is of another type, not finite, or none of the names.
+        """
         if self.names:
             if value not in self.names:
                 raise _wrong(self.parameter, f"is one of {', '.join(self.names)}")
@@ -97,7 +106,11 @@ class Entry:
         return format_value(value)
 
     def from_text(self, text: str) -> Value:
-        """As the drone told it. Raises :class:`skyloop.errors.DecodeError` if it can't be."""
+        """Return a value that the drone reported.
+
+        Raises:
+            DecodeError: It is not of the key's type.
+        """
         value = parse_value(text, self.like)
         if self.names:
             number = int(str(value))
@@ -114,7 +127,12 @@ def _wrong(parameter: Parameter, what: str) -> ParameterError:
 
 
 def entries_of(values: Mapping[str, str], version: int | None) -> dict[str, Entry]:
-    """All parameters of a configuration as it was read, by name. Keys that nothing is known of are texts, read-only."""
+    """Return all parameters of a configuration, by name. Keys that Skyloop does not know are texts, read-only.
+
+    Args:
+        values: Keys and values as they were read.
+        version: Of the drone; None counts as 2.
+    """
     found: dict[str, Entry] = {}
     for name, text in values.items():
         entry = _own_entry(name, text, version)
@@ -129,7 +147,12 @@ def entries_of(values: Mapping[str, str], version: int | None) -> dict[str, Entr
 
 
 def written(entries: Mapping[str, Entry], name: str, value: Value) -> tuple[Entry, str]:
-    """The key's text for a new value. Raises :class:`UnknownNameError` and :class:`ParameterError`."""
+    """Return the entry and the key's text for a new value.
+
+    Raises:
+        UnknownNameError: There is no such parameter.
+        ParameterError: It is read-only, or the value is not of its type.
+    """
     entry = entries.get(name)
     if entry is None:
         raise UnknownNameError("parameter of the AR.Drone", name, entries)
@@ -139,7 +162,13 @@ def written(entries: Mapping[str, Entry], name: str, value: Value) -> tuple[Entr
 
 
 def taken(entry: Entry, wanted: str, told: str) -> bool:
-    """Whether the drone's text says what was written, apart from its way to write numbers."""
+    """Return whether the drone reports what was written, apart from its way of writing numbers.
+
+    Args:
+        entry: The parameter.
+        wanted: The text that was written.
+        told: The text that was read back.
+    """
     try:
         one, other = parse_value(wanted, entry.like), parse_value(told, entry.like)
     except DecodeError:
@@ -152,7 +181,7 @@ def taken(entry: Entry, wanted: str, told: str) -> bool:
 
 
 def active_camera(values: Mapping[str, str]) -> str:
-    """Which camera the video shows, as far as the configuration says it."""
+    """Return which camera the video shows according to the configuration; ``front`` if it does not say."""
     try:
         channel = int(values.get(CHANNEL_KEY, "0"))
     except ValueError:
@@ -194,7 +223,7 @@ def _own_entry(name: str, text: str, version: int | None) -> Entry | None:
 
 
 def _choices(name: str, version: int | None) -> tuple[int, ...]:
-    """Where the versions differ."""
+    """Return a key's values where the versions of the drone differ."""
     if name == CHANNEL_KEY:
         return tuple(range(len(_CHANNELS[version or 2])))
     if name == "video:video_codec":
@@ -227,7 +256,7 @@ def _common_entry(common: _Common, text: str) -> Entry | None:
     return Entry(_widened(parameter), common.key, key.default, common.divisor)
 
 
-def _si(value: bool | int | float | str | tuple[float, ...], divisor: float) -> Value:
+def _si(value: bool | float | str | tuple[float, ...], divisor: float) -> Value:
     return value / divisor if divisor != 1 and isinstance(value, int | float) else value
 
 
@@ -247,7 +276,7 @@ def _channel_entry(text: str, version: int | None) -> Entry | None:
 
 
 def _widened(parameter: Parameter) -> Parameter:
-    """A drone that has a value beyond the documented range shows that its own range is wider."""
+    """Widen a range that the present value lies outside of: this drone's own is wider than the documented one."""
     value = parameter.value
     if parameter.choices and value not in parameter.choices:
         return msgspec.structs.replace(parameter, choices=(*parameter.choices, value))
@@ -259,3 +288,170 @@ def _widened(parameter: Parameter) -> Parameter:
         minimum=low if low is None else min(low, value),
         maximum=high if high is None else max(high, value),
     )
+
+
+# Commands that are no action -----------------------------------------------------------------------------------------
+
+#: Sends a command at a number of ticks.
+Say = Callable[[AtMessage, int], None]
+
+_REPEATS: Final = 3
+_MAGNETOMETER: Final = 0  #: the device of ``CALIB``
+_HALF_TURN: Final = 3.1416  #: rad, rounded up so that π itself fits
+
+
+def _switch(name: str, description: str) -> Parameter:
+    return Parameter(name, ParameterType.BOOL, False, default=False, description=description)
+
+
+def _choice(name: str, names: tuple[str, ...], description: str) -> Parameter:
+    choices = (NO_ANIMATION, *names)
+    return Parameter(
+        name, ParameterType.TEXT, NO_ANIMATION, default=NO_ANIMATION, choices=choices, description=description
+    )
+
+
+def _number(name: str, value: float, unit: str, low: float, high: float, description: str) -> Parameter:
+    return Parameter(name, ParameterType.FLOAT, value, unit, low, high, value, description=description)
+
+
+_LEDS: Final = _choice("leds.animation", LED_ANIMATIONS, "plays this animation of the lights (LED); none: nothing")
+_LEDS_FREQUENCY: Final = _number("leds.frequency", 2.0, "1/s", 0.1, 50.0, "of the next animation of the lights")
+_LEDS_DURATION: Final = _number(
+    "leds.duration", 3.0, "s", 0.0, 3600.0, "of the next one, in whole seconds; 0: for ever"
+)
+_TRIM: Final = _switch("ardrone.flat_trim", "true: the drone takes its attitude for level (FTRIM); on the ground only")
+_CALIBRATE: Final = _switch(
+    "ardrone.calibrate_magnetometer", "true: the drone turns about itself to calibrate (CALIB); in flight only"
+)
+_ABSOLUTE: Final = _switch(
+    "ardrone.absolute_control",
+    "roll and pitch are along ardrone.absolute_heading and not along the drone's nose (PCMD_MAG)",
+)
+_HEADING: Final = _number(
+    "ardrone.absolute_heading",
+    0.0,
+    "rad",
+    -_HALF_TURN,
+    _HALF_TURN,
+    "heading that absolute control refers to: 0 is magnetic north, positive counter-clockwise",
+)
+
+
+def _flight_animations(version: int | None) -> Parameter:
+    known = FLIGHT_ANIMATIONS[:FIRST_FLIP] if version == 1 else FLIGHT_ANIMATIONS
+    names = tuple(name for name, _ in known)
+    return _choice("ardrone.flight_animation", names, "flies this animation (ANIM, said once); in flight only")
+
+
+class Commands:
+    """Commands that are no actions, as parameters, with their values.
+
+    Args:
+        setpoints: Knows the drone's condition, and takes the heading of absolute control.
+        say: Sends a command.
+    """
+
+    def __init__(self, setpoints: SetpointController, say: Say) -> None:
+        self._setpoints = setpoints
+        self._say = say
+        self._values: dict[str, Value] = {}
+
+    def parameters(self, version: int | None) -> list[Parameter]:
+        """Return the parameters that this version of the drone has."""
+        known = [_LEDS, _LEDS_FREQUENCY, _LEDS_DURATION, _TRIM, _flight_animations(version)]
+        if version != 1:
+            known += [_CALIBRATE, _ABSOLUTE, _HEADING]
+        return [self._present(parameter) for parameter in known]
+
+    def write(self, parameter: Parameter, value: Value) -> Value:
+        """Give a command.
+
+        Args:
+            parameter: One of :meth:`parameters`.
+            value: Of its type.
+
+        Returns:
+            The value that is shown from now on.
+
+        Raises:
+            ParameterError: The value does not fit, or the drone is not on the ground or in the air as the command
+                needs.
+        """
+        value = _checked(parameter, value)
+        name = parameter.name
+        if name == _LEDS.name:
+            self._light(str(value))
+        elif name == _TRIM.name and value:
+            self._give(("FTRIM", ()), on_ground=True)
+        elif name == _CALIBRATE.name and value:
+            self._give(("CALIB", (_MAGNETOMETER,)), on_ground=False)
+        elif name == "ardrone.flight_animation" and value != NO_ANIMATION:
+            self._fly(str(value))
+        self._values[name] = value
+        self._setpoints.reference_rad = self._reference()
+        return value
+
+    def _present(self, parameter: Parameter) -> Parameter:
+        return msgspec.structs.replace(parameter, value=self._values.get(parameter.name, parameter.value))
+
+    def _reference(self) -> float | None:
+        if not self._values.get(_ABSOLUTE.name, False):
+            return None
+        heading = self._values.get(_HEADING.name, 0.0)
+        assert isinstance(heading, float)
+        return heading
+
+    def _light(self, name: str) -> None:
+        self._condition()
+        if name == NO_ANIMATION:
+            return
+        frequency = self._values.get(_LEDS_FREQUENCY.name, _LEDS_FREQUENCY.value)
+        duration = self._values.get(_LEDS_DURATION.name, _LEDS_DURATION.value)
+        assert isinstance(frequency, float)
+        assert isinstance(duration, float)
+        self._say(("LED", (LED_ANIMATIONS.index(name), frequency, round(duration))), _REPEATS)
+
+    def _fly(self, name: str) -> None:
+        number = next(at for at, (known, _) in enumerate(FLIGHT_ANIMATIONS) if known == name)
+        # Sent once: a repeat would fly it again.
+        self._give(("ANIM", (number, FLIGHT_ANIMATIONS[number][1])), on_ground=False, times=1)
+
+    def _give(self, message: AtMessage, *, on_ground: bool, times: int = _REPEATS) -> None:
+        condition = self._condition()
+        if on_ground and condition.flying:
+            raise _refused(f"{message[0]} is for a drone that stands level on the ground: land first")
+        if not on_ground and (not condition.flying or condition.emergency):
+            raise _refused(f"{message[0]} is for a drone in the air: take off first")
+        self._say(message, times)
+
+    def _condition(self) -> Condition:
+        condition = self._setpoints.condition
+        if condition is None:
+            raise _refused("the drone is not heard")
+        return condition
+
+
+def _checked(parameter: Parameter, value: Value) -> Value:
+    """Return a value of the parameter's type; an int is accepted for a float."""
+    if parameter.type is ParameterType.FLOAT and isinstance(value, int | float) and not isinstance(value, bool):
+        low, high = parameter.minimum, parameter.maximum
+        assert low is not None
+        assert high is not None
+        if not low <= value <= high:
+            raise ParameterError(
+                f"{parameter.name} is from {low:g} to {high:g}, not {value!r}", code=Refusal.OUT_OF_RANGE
+            )
+        return float(value)
+    if type(value) is not type(parameter.value):
+        raise ParameterError(
+            f"{parameter.name} takes a {parameter.type.value}, not {value!r:.60}", code=Refusal.WRONG_TYPE
+        )
+    if parameter.choices and value not in parameter.choices:
+        names = [str(choice) for choice in parameter.choices]
+        raise ParameterError(str(UnknownNameError(parameter.name, str(value), names)), code=Refusal.OUT_OF_RANGE)
+    return value
+
+
+def _refused(why: str) -> ParameterError:
+    return ParameterError(why, code=Refusal.WRONG_STATE)

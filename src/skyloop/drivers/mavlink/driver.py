@@ -1,4 +1,4 @@
-"""The driver of ``mavlink://``: what the proxy calls, put together from the link, the camera and the parameters."""
+"""The driver of ``mavlink://``: what the proxy calls."""
 
 from __future__ import annotations
 
@@ -6,16 +6,22 @@ from typing import Final
 
 from skyloop.clock import monotonic_ns
 from skyloop.drivers.base import Driver, Sink
-from skyloop.drivers.mavlink.camera import Camera, camera_info, check_source
-from skyloop.drivers.mavlink.link import Link
+from skyloop.drivers.mavlink.link import MavlinkLink
+from skyloop.drivers.mavlink.microservices import pose_message
 from skyloop.drivers.mavlink.options import options_of
-from skyloop.drivers.mavlink.parameters import TAKEOFF_ALTITUDE, Entry, entries_of, entry_of, takeoff_altitude
-from skyloop.drivers.mavlink.poses import pose_message
-from skyloop.drivers.mavlink.safety import remarks_of
-from skyloop.drivers.mavlink.session import Session
+from skyloop.drivers.mavlink.parameters import (
+    VehicleParameter,
+    check_exact,
+    limit_parameters,
+    vehicle_parameters,
+    with_limit,
+    writable_parameter,
+)
+from skyloop.drivers.mavlink.protocol import MavlinkSession
+from skyloop.drivers.mavlink.video import CameraReceiver, camera_info, check_source
 from skyloop.drivers.seams import ExternalPose, Remark
 from skyloop.drivers.uri import VehicleUri
-from skyloop.drivers.vehicle_session import Telling
+from skyloop.drivers.vehicle_session import SinkCallback
 from skyloop.errors import DriverError, ParameterError
 from skyloop.messages import (
     AnyAction,
@@ -43,12 +49,12 @@ class MavlinkDriver(Driver):
         self.options = options_of(uri)
         if self.options.camera is not None:
             check_source(uri, self.options.camera)
-        self._link: Link | None = None
-        self._camera: Camera | None = None
-        self._takeoff_m = self.options.takeoff_altitude_m
+        self._link: MavlinkLink | None = None
+        self._camera: CameraReceiver | None = None
+        self._limits = dict(self.options.limits)
 
     def capabilities(self) -> Capabilities:
-        """The same for both autopilots."""
+        """Return what both autopilots can do."""
         camera = self.options.camera
         return Capabilities(
             vehicle="mavlink",
@@ -61,11 +67,11 @@ class MavlinkDriver(Driver):
 
     def _open(self, sink: Sink) -> None:
         if self.options.camera is not None:
-            self._camera = Camera(self.uri, self.options.camera, sink)
+            self._camera = CameraReceiver(self.uri, self.options.camera, sink)
             self._camera.start()
-        session = Session(self.options, monotonic_ns(), extra=self._camera_telemetry)
-        session.takeoff_m = self._takeoff_m
-        self._link = Link(session, lambda tellings: _deliver(sink, tellings))
+        session = MavlinkSession(self.options, monotonic_ns(), extra=self._camera_telemetry)
+        session.limit(self._limits)
+        self._link = MavlinkLink(session, lambda pending: _deliver(sink, pending))
         self._link.start()
 
     def _close(self) -> None:
@@ -83,8 +89,17 @@ class MavlinkDriver(Driver):
     def _apply(self, action: AnyAction) -> AnyAction:
         return self._opened().command(action)
 
+    def _repeat(self, action: AnyAction) -> AnyAction:
+        return self._opened().command(action, new=False)
+
+    def left_to(self) -> str:
+        """Return the mode that a remote control, a ground station or the autopilot itself chose."""
+        link = self._link
+        setpoints = link.session.setpoints if link is not None else None
+        return "" if setpoints is None else setpoints.ownership.others
+
     def failsafe(self, action: Hover | Land) -> bool:
-        """Hold the place, or land, by the autopilot's own mode and without a stream of set-points."""
+        """Hold the position, or land, by the autopilot's own mode and without a stream of set-points."""
         sink = self._sink
         try:
             self._opened().command(action, alone=True)
@@ -95,24 +110,24 @@ class MavlinkDriver(Driver):
         return True
 
     def external_pose(self, pose: ExternalPose) -> None:
-        """As ``ODOMETRY``, or what ``?pose=`` says."""
+        """Send the pose as ``ODOMETRY``, or as what ``?pose=`` says."""
         link = self._opened()
         if not link.session.is_heard:
             raise DriverError("the vehicle is not heard: it can't be told where it is")
-        link.say(pose_message(pose, self.options.pose))
+        link.send(pose_message(pose, self.options.pose))
 
     def checkup(self) -> list[Remark]:
-        """Which of the autopilot's own safety nets are off, and what to set."""
+        """Return which of the autopilot's own safety nets are off, and what to set."""
         link = self._opened()
         with link.lock:
             session = link.session
-            dialect, values = session.dialect, session.parameters.values
-        if dialect is None or not values:
+            autopilot, values = session.autopilot, session.parameters.values
+        if autopilot is None or not values:
             return [Remark("parameters", False, "the vehicle's parameters were not read, so nothing is known")]
         name = Remark("autopilot", True, session.description)
-        return [name, *remarks_of(dialect, values, self.options.own_system)]
+        return [name, *autopilot.safety_remarks(values, self.options.own_system)]
 
-    def _opened(self) -> Link:
+    def _opened(self) -> MavlinkLink:
         if self._link is None:
             raise DriverError(f"{self.uri} is not open")
         return self._link
@@ -120,50 +135,47 @@ class MavlinkDriver(Driver):
     # Parameters ------------------------------------------------------------------------------------------------
 
     def parameters(self) -> list[Parameter]:
-        """The autopilot's, once they were read, and the names that all drivers share."""
-        own = takeoff_altitude(self._takeoff_m)
-        return [own, *(entry.parameter for entry in self._entries().values())]
+        """Return the driver's own limits, and the autopilot's parameters once they were read."""
+        return [*limit_parameters(self._limits), *(each.parameter for each in self._vehicle_parameters().values())]
 
     def set_parameter(self, name: str, value: Value) -> Value:
-        """Takes up to 0.9 s: the vehicle confirms with the value that is in force."""
-        if name == TAKEOFF_ALTITUDE:
-            return self._set_takeoff(value)
-        entry = entry_of(self._entries(), name)
-        number = entry.to_native(value)
+        """Write a parameter, and wait up to 0.9 s for the vehicle to confirm it with the value that is in force."""
+        if name in self._limits:
+            return self._limit(name, value)
+        parameter = writable_parameter(self._vehicle_parameters(), name)
+        number = parameter.to_native(value)
         link = self._link
         if link is None:
             raise ParameterError(f"{self.uri} is not open", code=Refusal.VEHICLE_LINK_LOST)
         with link.lock:
-            held = link.session.parameters.held[entry.native]
-        if is_integer(held.kind):
-            number = round(number)
-        failure = link.write(entry.native, number)
+            before = link.session.parameters.reported[parameter.native]
+            bytewise = link.session.parameters.bytewise
+        if is_integer(before.kind):
+            number = check_exact(name, round(number), bytewise=bytewise)
+        failure = link.write(parameter.native, number)
         if failure is not None:
             raise ParameterError(f"{name}: {failure}", code=Refusal.DRIVER_FAILED)
         with link.lock:
-            told = link.session.parameters.held[entry.native]
-        return entry.from_native(told.value)
+            after = link.session.parameters.reported[parameter.native]
+        return parameter.from_native(after.value)
 
-    def _set_takeoff(self, value: Value) -> Value:
-        entry = Entry(takeoff_altitude(self._takeoff_m), "")
-        self._takeoff_m = entry.to_native(value)
+    def _limit(self, name: str, value: Value) -> Value:
+        self._limits = with_limit(self._limits, name, value)
         link = self._link
         if link is not None:
             with link.lock:
-                link.session.takeoff_m = self._takeoff_m
-                if link.session.pilot is not None:
-                    link.session.pilot.takeoff_m = self._takeoff_m
-        return self._takeoff_m
+                link.session.limit(self._limits)
+        return self._limits[name]
 
-    def _entries(self) -> dict[str, Entry]:
+    def _vehicle_parameters(self) -> dict[str, VehicleParameter]:
         link = self._link
         if link is None:
             return {}
         with link.lock:
-            held = dict(link.session.parameters.held)
-        return entries_of(held)
+            reported = dict(link.session.parameters.reported)
+        return vehicle_parameters(reported)
 
 
-def _deliver(sink: Sink, tellings: list[Telling]) -> None:
-    for telling in tellings:
-        telling(sink)
+def _deliver(sink: Sink, pending: list[SinkCallback]) -> None:
+    for publish in pending:
+        publish(sink)

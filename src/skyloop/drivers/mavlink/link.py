@@ -1,81 +1,304 @@
-"""The connection to one vehicle and the thread that serves it, made anew for ever when it is lost."""
+"""The connection to one vehicle and the thread that serves it: UDP, TCP or a serial port, reopened for ever."""
 
 from __future__ import annotations
 
-import selectors
+import select
+import socket
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from functools import partial
-from typing import Final
+from typing import Final, Protocol
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds
-from skyloop.drivers.mavlink.connections import Connection, connect
-from skyloop.drivers.mavlink.session import Session
+from skyloop.drivers.mavlink.options import Address, ConnectionKind, Peer
+from skyloop.drivers.mavlink.protocol import MavlinkSession
 from skyloop.drivers.vehicle_link import VehicleLink
-from skyloop.drivers.vehicle_session import Telling
+from skyloop.drivers.vehicle_session import SinkCallback
+from skyloop.errors import MissingExtraError
 from skyloop.messages import AnyAction
 from skyloop.wire.mavlink.codec import Message
 
-RETRY_NS: Final = nanoseconds(1.0)  #: pace of new connections
-SILENT_NS: Final = nanoseconds(8.0)  #: a connected stream without a word for so long is made anew
+MAX_DATAGRAM: Final = 65_536
+BURST: Final = 64  #: datagrams that are read before others get their turn
+CONNECT_S: Final = 1.0
+
+
+class MavlinkConnection(Protocol):
+    """An open socket or port."""
+
+    whole: bool  #: each piece is a datagram
+
+    def fileno(self) -> int: ...
+
+    def receive(self) -> list[tuple[bytes, Peer]]:
+        """Return what came, each piece with its sender.
+
+        Raises:
+            OSError: Nothing more will come.
+        """
+
+    def send(self, data: bytes, peer: Peer) -> None:
+        """Send, or drop it where there is no room.
+
+        Args:
+            data: One packet.
+            peer: The receiver of a datagram; None: whoever the address names.
+
+        Raises:
+            OSError: It can't be sent.
+        """
+
+    def close(self) -> None: ...
+
+
+class UdpListener:
+    """Listens on a UDP port, and answers whoever is heard.
+
+    Raises:
+        OSError: The port can't be opened.
+    """
+
+    whole = True
+
+    def __init__(self, address: Address) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.setblocking(False)
+            self._socket.bind((address.place, address.number))
+        except OSError:
+            self._socket.close()
+            raise
+
+    def fileno(self) -> int:
+        """Return the descriptor."""
+        return self._socket.fileno()
+
+    def receive(self) -> list[tuple[bytes, Peer]]:
+        """Return the datagrams that came, at most :data:`BURST`, each with its sender."""
+        came: list[tuple[bytes, Peer]] = []
+        for _ in range(BURST):
+            try:
+                came.append(self._socket.recvfrom(MAX_DATAGRAM))
+            except BlockingIOError:
+                break
+            except ConnectionError:  # nobody listens where we sent to: it may come back
+                continue
+        return came
+
+    def send(self, data: bytes, peer: Peer) -> None:
+        """Send a datagram; drop it if there is no peer yet, or no room."""
+        if peer is None:
+            return  # no vehicle was heard yet
+        with suppress(BlockingIOError):
+            self._socket.sendto(data, peer)
+
+    def close(self) -> None:
+        """Close the port."""
+        self._socket.close()
+
+
+class UdpSender(UdpListener):
+    """Speaks first over UDP, from a port of its own.
+
+    Raises:
+        OSError: The host is not known, or no port can be opened.
+    """
+
+    def __init__(self, address: Address) -> None:
+        found = socket.getaddrinfo(address.place, address.number, socket.AF_INET, socket.SOCK_DGRAM)
+        self._to: tuple[str, int] = str(found[0][4][0]), address.number
+        super().__init__(Address(ConnectionKind.UDP_IN, "", 0))
+
+    def send(self, data: bytes, peer: Peer) -> None:
+        """Send a datagram to the peer, or to the address until somebody was heard."""
+        super().send(data, peer or self._to)
+
+
+class TcpClient:
+    """A client of the autopilot's TCP server, which serves one client at a time: connected is not yet served.
+
+    Raises:
+        OSError: It can't be reached within :data:`CONNECT_S`.
+    """
+
+    whole = False
+
+    def __init__(self, address: Address) -> None:
+        self._socket = socket.create_connection((address.place, address.number), CONNECT_S)
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._socket.setblocking(False)
+
+    def fileno(self) -> int:
+        """Return the descriptor."""
+        return self._socket.fileno()
+
+    def receive(self) -> list[tuple[bytes, Peer]]:
+        """Return what came.
+
+        Raises:
+            OSError: The connection ended.
+        """
+        try:
+            data = self._socket.recv(MAX_DATAGRAM)
+        except BlockingIOError:
+            return []
+        if not data:
+            raise ConnectionError("the vehicle ended the connection")
+        return [(data, None)]
+
+    def send(self, data: bytes, peer: Peer) -> None:  # noqa: ARG002
+        """Send a packet, or drop it where there is no room.
+
+        Raises:
+            OSError: It was sent in part: what follows half a frame would be noise.
+        """
+        try:
+            sent = self._socket.send(data)
+        except BlockingIOError:
+            return
+        if sent < len(data):
+            raise ConnectionError("the vehicle takes nothing any more")
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._socket.close()
+
+
+class SerialPort:
+    """A serial port, through pyserial, opened for this process alone.
+
+    Raises:
+        OSError: It can't be opened.
+        MissingExtraError: pyserial is not installed.
+    """
+
+    whole = False
+
+    def __init__(self, address: Address) -> None:
+        try:
+            import serial
+        except ImportError as error:
+            raise MissingExtraError("mavlink://serial:", "mavlink", cause=str(error)) from error
+        self._port = serial.Serial(address.place, address.number, timeout=0, write_timeout=0, exclusive=True)
+
+    def fileno(self) -> int:
+        """Return the descriptor."""
+        number: int = self._port.fileno()
+        return number
+
+    def receive(self) -> list[tuple[bytes, Peer]]:
+        """Return what came.
+
+        Raises:
+            OSError: It was unplugged.
+        """
+        if not select.select([self], [], [], 0)[0]:
+            return []
+        data: bytes = self._port.read(MAX_DATAGRAM)  # raises SerialException, an OSError, once it is unplugged
+        return [(data, None)] if data else []
+
+    def send(self, data: bytes, peer: Peer) -> None:  # noqa: ARG002
+        """Send a packet."""
+        self._port.write(data)
+
+    def close(self) -> None:
+        """Close the port."""
+        self._port.close()
+
+
+_KINDS: Final[dict[ConnectionKind, type[UdpListener | TcpClient | SerialPort]]] = {
+    ConnectionKind.UDP_IN: UdpListener,
+    ConnectionKind.UDP_OUT: UdpSender,
+    ConnectionKind.TCP: TcpClient,
+    ConnectionKind.SERIAL: SerialPort,
+}
+
+
+def open_connection(address: Address) -> MavlinkConnection:
+    """Open a connection. Takes up to :data:`CONNECT_S`.
+
+    Args:
+        address: With a numeric host.
+
+    Raises:
+        OSError: It can't be opened.
+        MissingExtraError: It is a serial port, and pyserial is not installed.
+    """
+    return _KINDS[address.kind](address)
+
+
+RETRY_NS: Final = nanoseconds(1.0)  #: between attempts to connect
+SILENT_NS: Final = nanoseconds(8.0)  #: a connected stream on which nothing comes for so long is reopened
 WRITE_S: Final = 0.9  #: a parameter is written and confirmed within this, or it failed
 _CLOSE_S: Final = 3.0
 
 
-class Link(VehicleLink[Session]):
-    """As :class:`VehicleLink`."""
+class MavlinkLink(VehicleLink[MavlinkSession]):
+    """Keeps the connection and serves the session, on a thread of its own.
 
-    def __init__(self, session: Session, deliver: Callable[[list[Telling]], None], clock: Clock = monotonic_ns) -> None:
-        super().__init__("skyloop-mavlink", session, deliver, clock, close_s=_CLOSE_S)
-        self._connection: Connection | None = None
-        self._connected_ns = -RETRY_NS
+    Args:
+        session: The vehicle's protocol.
+        deliver: Called on the link's thread with what the session has for the sink.
+        clock: Monotonic, ns.
+    """
+
+    def __init__(
+        self, session: MavlinkSession, deliver: Callable[[list[SinkCallback]], None], clock: Clock = monotonic_ns
+    ) -> None:
+        super().__init__("skyloop-mavlink", session, deliver, clock, family=socket.AF_UNSPEC, close_s=_CLOSE_S)
+        self._connection: MavlinkConnection | None = None
         self._broken = False  # nothing can be sent any more
 
     # From the proxy's threads ------------------------------------------------------------------------------------
 
-    def command(self, action: AnyAction, *, alone: bool = False) -> AnyAction:
-        """Decide, and say it at once."""
-        return self._decided(partial(self.session.command, action, alone=alone))
+    def command(self, action: AnyAction, *, alone: bool = False, new: bool = True) -> AnyAction:
+        """Have the session accept an action, and send it at once. Any thread. See :meth:`MavlinkSession.command`."""
+        return self._decide(partial(self.session.command, action, alone=alone, new=new))
 
-    def say(self, message: Message) -> None:
-        """Send a message to the vehicle now."""
+    def send(self, message: Message) -> None:
+        """Send a message to the vehicle now. Any thread."""
         with self.lock:
-            self.session.say(message)
-            self._say(self._clock())
+            self.session.send(message)
+            self._send_due(self._clock())
 
     def write(self, name: str, value: float) -> str | None:
-        """Write a parameter by the autopilot's name. Returns why that failed, or None. Takes up to 0.9 s."""
+        """Write a parameter. Takes up to 0.9 s. Any thread but the link's.
+
+        Args:
+            name: The autopilot's.
+            value: In the autopilot's unit.
+
+        Returns:
+            Why it failed, or None.
+        """
 
         def ask(end: Callable[[str | None], None]) -> None:
             now_ns = self._clock()
             self.session.parameters.write(name, value, now_ns + nanoseconds(WRITE_S), end)
-            self._say(now_ns)
+            self._send_due(now_ns)
 
-        return self._answer(ask, WRITE_S + 0.2, "the driver did not get to it")
+        return self._wait_for_answer(ask, WRITE_S + 0.2, "the driver did not get to it")
 
     # On the link's thread ----------------------------------------------------------------------------------------
 
-    def _release(self) -> None:
-        with self.lock:
-            self._disconnect()
-
-    def _receive(self, _ready: object) -> None:
+    def _receive(self) -> None:
         connection = self._connection
         if connection is None:
             return
         try:
             came = connection.receive()
         except OSError as error:
-            self._drop(error)
+            self._on_failure(error)
             return
         now_ns = self._clock()
         with self.lock:
             for data, peer in came:
-                self.session.heard(data, peer, now_ns, whole=connection.whole)
+                self.session.receive(data, peer, now_ns, whole=connection.whole)
 
-    def _say(self, now_ns: int) -> None:
-        """With the lock held, on any thread."""
-        packets = self.session.tick(now_ns)
+    def _send_due(self, now_ns: int) -> None:
+        """Send what is due. With the lock held, on any thread."""
+        packets = self.session.poll(now_ns)
         connection = self._connection
         if connection is None:
             return
@@ -83,49 +306,47 @@ class Link(VehicleLink[Session]):
             for data, peer in packets:
                 connection.send(data, peer)
         except OSError as error:
-            self.session.unreachable(_reason(error))
+            self.session.failed(error)
             self._broken = not connection.whole
 
     # The connection ----------------------------------------------------------------------------------------------
 
-    def _renew(self) -> None:
-        """Make it, and make a stream anew on which nothing comes."""
-        now_ns = self._clock()
+    def _renewal_ns(self) -> int | None:
+        """Return when to reopen the connection: a stream when it breaks, or when nothing comes on it."""
         connection = self._connection
-        if connection is not None:
-            with self.lock:
-                silent = not self.session.is_heard and not connection.whole
-            if not self._broken and (not silent or now_ns - self._connected_ns < SILENT_NS):
-                return
-        elif now_ns - self._connected_ns < RETRY_NS:
-            return
-        self._connected_ns = now_ns
+        if connection is None:
+            return RETRY_NS
+        if self._broken:
+            return 0
+        return None if self.session.is_heard or connection.whole else SILENT_NS
+
+    def _open_sockets(self) -> None:
         with self.lock:
-            self._disconnect()
-        try:
-            made = connect(self.session.options.address)
-        except OSError as error:
-            with self.lock:
-                self.session.unreachable(_reason(error))
-            return
+            self._close_sockets()
+        made = open_connection(self._address())
         with self.lock:
             self._connection = made
             self.session.connected()
-        self._selector.register(made, selectors.EVENT_READ)
+        self._watch(made, self._receive)
 
-    def _drop(self, error: OSError) -> None:
+    def _address(self) -> Address:
+        """Return the address with a numeric host.
+
+        Raises:
+            OSError: The host is not known, or not yet.
+        """
+        address = self.session.options.address
+        if address.kind not in (ConnectionKind.TCP, ConnectionKind.UDP_OUT):
+            return address
+        return replace(address, place=self._lookup.address(address.place))
+
+    def _on_failure(self, error: OSError) -> None:
         with self.lock:
-            self.session.unreachable(_reason(error))
-            self._disconnect()
+            self.session.failed(error)
+            self._close_sockets()
 
-    def _disconnect(self) -> None:
+    def _close_sockets(self) -> None:
         self._broken = False
         if self._connection is not None:
-            with suppress(KeyError, ValueError):
-                self._selector.unregister(self._connection)
-            self._connection.close()
+            self._forget(self._connection)
             self._connection = None
-
-
-def _reason(error: OSError) -> str:
-    return error.strerror or str(error)

@@ -1,17 +1,55 @@
-"""What a ``mavlink://`` address asks for. Pure. ``docs/mavlink.md`` has the options as a table."""
+"""Options of a ``mavlink://`` address. Pure. ``docs/mavlink.md`` has them as a table."""
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from enum import StrEnum
-from pathlib import Path
 from typing import Final
 
 from skyloop.drivers.base import reject_unknown_options
 from skyloop.drivers.intrinsics import INTRINSICS_OPTIONS, check_intrinsics
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import UnknownNameError, UsageError
+from skyloop.files import read_bytes
+
+Peer = tuple[str, int] | None  #: of UDP; a stream has no other
+
+TAKEOFF_ALTITUDE: Final = "limits.takeoff_altitude"
+ALTITUDE: Final = "limits.altitude"
+
+
+@dataclass(frozen=True, slots=True)
+class OwnLimit:
+    """A limit of the driver's own.
+
+    Args:
+        name: Of its parameter.
+        option: Its name in an address.
+        usual: Default.
+        low: Smallest allowed value.
+        high: Largest allowed value.
+        unit: Of the values.
+        text: For people.
+    """
+
+    name: str
+    option: str
+    usual: float
+    low: float
+    high: float
+    unit: str
+    text: str
+
+
+OWN_LIMITS: Final = (
+    OwnLimit(ALTITUDE, "altitude", 3.0, 0.5, 500.0, "m", "Greatest height above the place of the start"),
+    OwnLimit("limits.climb", "climb", 1.0, 0.05, 10.0, "m/s", "Greatest speed up or down"),
+    OwnLimit("limits.speed", "speed", 2.0, 0.05, 30.0, "m/s", "Greatest horizontal speed of a velocity set-point"),
+    OwnLimit(TAKEOFF_ALTITUDE, "takeoff_altitude", 1.5, 0.5, 50.0, "m", "Where a take-off ends, above its start"),
+)
+USUAL: Final = {limit.name: limit.usual for limit in OWN_LIMITS}
 
 KEY_BYTES: Final = 32
 DEFAULT_BAUD: Final = 57_600
@@ -26,24 +64,25 @@ _EXAMPLES: Final = (
     "mavlink://serial:/dev/ttyACM0:921600"
 )
 _HOST: Final = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?\Z")
-_KNOWN: Final = {
-    *("sysid", "peer", "own_sysid", "rate", "takeoff_altitude", "parameters", "signing_key", "origin", "pose"),
+KNOWN: Final = {
+    *("sysid", "peer", "own_sysid", "rate", "parameters", "signing_key", "origin", "pose"),
+    *(limit.option for limit in OWN_LIMITS),
     *("camera", "camera_name", "camera_width", "camera_height", "camera_fps", "camera_facing"),
     *INTRINSICS_OPTIONS,
 }
 
 
-class Way(StrEnum):
+class ConnectionKind(StrEnum):
     """How the bytes travel."""
 
-    UDP_IN = "udpin"  #: listens, and answers whoever is heard
+    UDP_IN = "udpin"  #: listens, and answers whoever sends to it
     UDP_OUT = "udpout"  #: speaks first
     TCP = "tcp"  #: connects
     SERIAL = "serial"
 
 
 class PoseMessage(StrEnum):
-    """What poses from outside are sent as."""
+    """The message that poses from outside are sent as."""
 
     ODOMETRY = "odometry"
     VISION = "vision_position_estimate"
@@ -51,14 +90,20 @@ class PoseMessage(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """Where the vehicle is. ``place``: host or device; ``number``: port, or bits a second."""
+    """Where the vehicle is.
 
-    way: Way
+    Args:
+        kind: How the bytes travel.
+        place: Host or device.
+        number: Port, or bits a second.
+    """
+
+    kind: ConnectionKind
     place: str
     number: int
 
     def __str__(self) -> str:
-        return f"{self.way.value}:{self.place}:{self.number}"
+        return f"{self.kind.value}:{self.place}:{self.number}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,14 +120,14 @@ class CameraOptions:
 
 @dataclass(frozen=True, slots=True)
 class MavlinkOptions:
-    """An address, understood."""
+    """A parsed address."""
 
     address: Address
     system: int | None = None  #: of the vehicle; None: the first that is heard
-    peer: tuple[str, int] | None = None  #: whom to hear; None: whoever the vehicle is heard from first
+    peer: tuple[str, int] | None = None  #: where the vehicle sends from; None: where it is heard first
     own_system: int = 255
-    rate_hz: float = 50.0  #: of attitude, place and speed
-    takeoff_altitude_m: float = 1.5
+    rate_hz: float = 50.0  #: of attitude, position and velocity
+    limits: Mapping[str, float] = field(default_factory=lambda: dict(USUAL))  #: by the names of their parameters
     parameters: bool = True  #: whether they are read
     key: bytes | None = None
     origin: tuple[float, float, float] | None = None  #: latitude and longitude [degrees], altitude [m]
@@ -91,20 +136,31 @@ class MavlinkOptions:
 
 
 def options_of(uri: VehicleUri) -> MavlinkOptions:
-    """From an address. Raises :class:`UsageError` for what makes no sense."""
-    reject_unknown_options(uri, _KNOWN)
+    """Parse an address.
+
+    Raises:
+        UnknownNameError: It has an unknown option, or an option has an unknown word as its value.
+        UsageError: It names no place, an option's value makes no sense, or options don't go together.
+    """
+    reject_unknown_options(uri, KNOWN)
     check_intrinsics(uri)
     own = uri.whole("own_sysid", 255, minimum=1, maximum=255)
     system = uri.whole("sysid", 1, minimum=1, maximum=255) if "sysid" in uri.options else None
     if system == own:
         raise UsageError(f"{uri}: sysid is the vehicle's and own_sysid is ours: they must differ")
+    limits = {
+        limit.name: uri.number(limit.option, limit.usual, minimum=limit.low, maximum=limit.high) for limit in OWN_LIMITS
+    }
+    if limits[TAKEOFF_ALTITUDE] > limits[ALTITUDE]:
+        above = f"takeoff_altitude={limits[TAKEOFF_ALTITUDE]:g} is above the ceiling of {limits[ALTITUDE]:g} m"
+        raise UsageError(f"{uri}: {above}: raise that too, with altitude=…")
     return MavlinkOptions(
         address=address_of(uri),
         system=system,
         peer=_peer(uri),
         own_system=own,
         rate_hz=uri.number("rate", 50.0, minimum=1.0, maximum=200.0),
-        takeoff_altitude_m=uri.number("takeoff_altitude", 1.5, minimum=0.5, maximum=50.0),
+        limits=limits,
         parameters=uri.flag("parameters", default=True),
         key=_key(uri),
         origin=_origin(uri),
@@ -114,19 +170,23 @@ def options_of(uri: VehicleUri) -> MavlinkOptions:
 
 
 def address_of(uri: VehicleUri) -> Address:
-    """The place of an address. Raises :class:`UsageError`."""
+    """Parse the place of an address.
+
+    Raises:
+        UsageError: It names no known kind of connection, or no host, device or port.
+    """
     word, _, rest = uri.place.partition(":")
     place, colon, number = rest.rpartition(":")
-    if word not in [way.value for way in Way]:
-        raise UsageError(f"{uri}: {word!r} is none of {', '.join(way.value for way in Way)}: {_EXAMPLES}")
-    way = Way(word)
-    if way is Way.SERIAL and (not colon or not number.isdecimal()):
+    if word not in [kind.value for kind in ConnectionKind]:
+        raise UsageError(f"{uri}: {word!r} is none of {', '.join(ConnectionKind)}: {_EXAMPLES}")
+    kind = ConnectionKind(word)
+    if kind is ConnectionKind.SERIAL and (not colon or not number.isdecimal()):
         place, number = rest, str(DEFAULT_BAUD)
-    good = bool(place) if way is Way.SERIAL else bool(_HOST.match(place))
-    highest = 10_000_000 if way is Way.SERIAL else 65_535
+    good = bool(place) if kind is ConnectionKind.SERIAL else bool(_HOST.match(place))
+    highest = 10_000_000 if kind is ConnectionKind.SERIAL else 65_535
     if not good or not number.isdecimal() or not 1 <= int(number) <= highest:
         raise UsageError(f"{uri} names no place: {_EXAMPLES}")
-    return Address(way, place, int(number))
+    return Address(kind, place, int(number))
 
 
 def _peer(uri: VehicleUri) -> tuple[str, int] | None:
@@ -143,10 +203,7 @@ def _key(uri: VehicleUri) -> bytes | None:
     given = uri.options.get("signing_key")
     if given is None:
         return None
-    try:
-        held = Path(given).expanduser().read_bytes()
-    except OSError as error:
-        raise UsageError(f"{uri}: the file of the signing key can't be read: {error.strerror}") from error
+    held = read_bytes(given, f"{uri}: the signing key's file", 1024)
     if len(held) == KEY_BYTES:
         return held
     text = held.decode("ascii", "replace").strip()
@@ -196,4 +253,18 @@ def _camera(uri: VehicleUri) -> CameraOptions | None:
         height=uri.whole("camera_height", 480, minimum=1, maximum=16384),
         fps=uri.number("camera_fps", 30.0, minimum=0.1, maximum=1000.0),
         facing=facing,
+    )
+
+
+def takeoff_height(values: Mapping[str, float]) -> float:
+    """Return the height of the next take-off [m], never above the ceiling."""
+    return min(values[TAKEOFF_ALTITUDE], values[ALTITUDE])
+
+
+def limits_text(values: Mapping[str, float]) -> str:
+    """Return a sentence on the limits in force, for people."""
+    speed, climb, altitude = (values[name] for name in ("limits.speed", "limits.climb", ALTITUDE))
+    return (
+        f"limits: {speed:g} m/s, {climb:g} m/s up and down, {altitude:g} m high; raise them by the parameters "
+        "limits.speed, limits.climb and limits.altitude, or in the address (?speed=…&climb=…&altitude=…)"
     )

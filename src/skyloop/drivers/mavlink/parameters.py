@@ -1,35 +1,241 @@
-"""The autopilot's parameters as ours: its own names under ``mavlink.``, and the names that all drivers share. Pure."""
+"""The autopilot's parameters: over MAVLink, and as ours under ``mavlink.``. Pure."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+import struct
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from skyloop.drivers.mavlink.metadata import COMMON, MEANINGS, Common, Meaning
-from skyloop.drivers.mavlink.parameter_exchange import Held
-from skyloop.errors import ParameterError, UnknownNameError
+from skyloop.clock import nanoseconds
+from skyloop.drivers.mavlink.options import OWN_LIMITS
+from skyloop.errors import DecodeError, ParameterError, UnknownNameError
 from skyloop.messages import Parameter, ParameterType, Refusal, Value
-from skyloop.wire.mavlink.parameter_values import bounds, is_integer
+from skyloop.wire.mavlink.codec import Message
+from skyloop.wire.mavlink.codec import dialect as m
+from skyloop.wire.mavlink.parameter_values import bounds, from_field, is_integer, to_field
+
+QUIET_NS: Final = nanoseconds(0.7)  #: after silence for so long, what is missing is asked for
+AT_ONCE: Final = 20  #: missing ones that are asked for together
+LIST_NS: Final = nanoseconds(3.0)  #: between requests for the list while nothing of it comes
+GIVE_UP_NS: Final = nanoseconds(20.0)  #: reading ends after so long without a new parameter
+WRITE_NS: Final = nanoseconds(0.25)  #: between repeats of a write that is not confirmed
+NO_INDEX: Final = 0xFFFF
+MOST: Final = 8192  #: parameters of a list; one that announces more is not believed
+
+
+@dataclass(frozen=True, slots=True)
+class ReportedParameter:
+    """A parameter as the vehicle reported it."""
+
+    name: str
+    value: float
+    kind: int  #: MAV_PARAM_TYPE
+
+
+@dataclass(slots=True)
+class _PendingWrite:
+    name: str
+    value: float
+    deadline_ns: int
+    done: Callable[[str | None], None]
+    said_ns: int | None = None
+
+
+class ParameterExchange:
+    """Reads and writes one vehicle's parameters. ``bytewise`` says how its integers are encoded."""
+
+    def __init__(self) -> None:
+        self.target = (1, 1)
+        self.bytewise = False
+        self.reported: dict[str, ReportedParameter] = {}
+        self.count: int | None = None
+        self.complete = False
+        self.given_up = False
+        self._wanted = False
+        self._indices: set[int] = set()
+        self._news_ns = 0  # when something new came
+        self._asked_ns: int | None = None
+        self._writes: list[_PendingWrite] = []
+
+    def request_all(self, now_ns: int) -> None:
+        """Begin to read all of them, anew."""
+        self._wanted, self.complete, self.given_up = True, False, False
+        self._indices.clear()
+        self.count, self._asked_ns, self._news_ns = None, None, now_ns
+
+    def fail_writes(self, reason: str) -> None:
+        """Fail the writes under way: the vehicle was lost."""
+        writes, self._writes = self._writes, []
+        for write in writes:
+            write.done(reason)
+
+    def write(self, name: str, value: float, deadline_ns: int, done: Callable[[str | None], None]) -> None:
+        """Write a parameter that the vehicle reported.
+
+        Args:
+            name: The autopilot's.
+            value: In the autopilot's unit.
+            deadline_ns: When it fails if the vehicle did not confirm it.
+            done: Called with why it failed, or None.
+        """
+        self._writes.append(_PendingWrite(name, value, deadline_ns, done))
+
+    @property
+    def values(self) -> dict[str, float]:
+        """The values by the autopilot's own names."""
+        return {name: held.value for name, held in self.reported.items()}
+
+    def on_value(self, message: Message, now_ns: int) -> None:
+        """Handle a ``PARAM_VALUE``."""
+        name, kind = message.param_id, message.param_type
+        try:
+            value = from_field(message.param_value, kind, bytewise=self.bytewise)
+        except DecodeError:
+            value = math.nan
+        index, count = message.param_index, message.param_count
+        if index != NO_INDEX and 0 < count <= MOST and index < count:
+            self.count = count
+            if index not in self._indices:
+                self._indices.add(index)
+                self._news_ns = now_ns
+            self.complete = self._wanted and len(self._indices) >= count
+        if name and not math.isnan(value):
+            self.reported[name] = ReportedParameter(name, value, kind)
+            self._end_writes(name, value)
+
+    def poll(self, now_ns: int) -> list[Message]:
+        """Return the messages to send now."""
+        return self._pending_messages(now_ns) + self._ask(now_ns)
+
+    def _ask(self, now_ns: int) -> list[Message]:
+        if not self._wanted or self.complete or self.given_up:
+            return []
+        if self.count is None:
+            if now_ns - self._news_ns > GIVE_UP_NS:
+                self.given_up = True
+            elif self._asked_ns is None or now_ns - self._asked_ns > LIST_NS:
+                self._asked_ns = now_ns
+                return [m.MAVLink_param_request_list_message(*self.target)]
+            return []
+        if now_ns - self._news_ns > GIVE_UP_NS:
+            self.given_up = True
+            return []
+        if now_ns - max(self._news_ns, self._asked_ns or 0) < QUIET_NS:
+            return []
+        self._asked_ns = now_ns
+        missing = [index for index in range(self.count) if index not in self._indices][:AT_ONCE]
+        return [m.MAVLink_param_request_read_message(*self.target, b"", index) for index in missing]
+
+    def _pending_messages(self, now_ns: int) -> list[Message]:
+        messages = []
+        for write in list(self._writes):
+            if now_ns >= write.deadline_ns:
+                self._writes.remove(write)
+                told = self.reported[write.name].value
+                write.done(f"the vehicle does not confirm it, and keeps {told:g} as far as is known")
+            elif write.said_ns is None or now_ns - write.said_ns >= WRITE_NS:
+                write.said_ns = now_ns
+                kind = self.reported[write.name].kind
+                field = to_field(write.value, kind, bytewise=self.bytewise)
+                messages.append(m.MAVLink_param_set_message(*self.target, write.name.encode(), field, kind))
+        return messages
+
+    def _end_writes(self, name: str, value: float) -> None:
+        for write in list(self._writes):
+            exact = self.bytewise and is_integer(self.reported[name].kind)
+            if write.name == name and write.said_ns is not None and is_confirmed(write.value, value, exact=exact):
+                self._writes.remove(write)
+                write.done(None)
+
+
+def is_confirmed(wanted: float, told: float, *, exact: bool) -> bool:
+    """Return whether the vehicle reports the value that was written.
+
+    Args:
+        wanted: As written.
+        told: As reported.
+        exact: If not, they are compared in single precision.
+    """
+    return wanted == told if exact else math.isclose(wanted, told, rel_tol=1e-6, abs_tol=1e-9)
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterInfo:
+    """What is known of a parameter, in the autopilot's own unit."""
+
+    unit: str = ""
+    low: float | None = None
+    high: float | None = None
+    text: str = ""
+
+
+#: Units and ranges are those of the autopilots' own parameter references (ardupilot.org and docs.px4.io).
+PARAMETER_INFO: Final = {
+    # ArduCopter
+    "ANGLE_MAX": ParameterInfo("cdeg", 1000, 8000, "greatest lean angle"),
+    "ATC_ANGLE_MAX": ParameterInfo("deg", 10, 80, "greatest lean angle"),
+    "BATT_FS_LOW_ACT": ParameterInfo("", 0, 7, "what happens with a low battery: 0 nothing, 1 land, 2 return"),
+    "BATT_FS_CRT_ACT": ParameterInfo("", 0, 7, "what happens with a critical battery: 0 nothing, 1 land, 2 return"),
+    "BATT_LOW_VOLT": ParameterInfo("V", 0, None, "voltage of a low battery; 0: not watched"),
+    "DISARM_DELAY": ParameterInfo("s", 0, 127, "armed on the ground for so long, it disarms"),
+    "FENCE_ALT_MAX": ParameterInfo("m", 10, 1000, "ceiling of the fence"),
+    "FENCE_ENABLE": ParameterInfo("", 0, 1, "whether the fence works"),
+    "FS_EKF_ACTION": ParameterInfo("", 0, 3, "what happens when it does not know where it is"),
+    "FS_GCS_ENABLE": ParameterInfo(
+        "", 0, 8, "what happens when no ground station is heard: 0 nothing, 5 land, 7 brake"
+    ),
+    "FS_GCS_TIMEOUT": ParameterInfo("s", 2, 120, "silence of the ground station that is a failure"),
+    "FS_THR_ENABLE": ParameterInfo("", 0, 7, "what happens when the remote control is lost"),
+    "GUID_OPTIONS": ParameterInfo("", 0, None, "bit 3: thrust is thrust, and no climb rate"),
+    "GUID_TIMEOUT": ParameterInfo("s", 0.1, 5, "silence after which a set-point is dropped"),
+    "LAND_SPEED": ParameterInfo("cm/s", 30, 200, "speed of the last part of a landing"),
+    "MAV_GCS_SYSID": ParameterInfo("", 1, 255, "the ground station whose heartbeats count"),
+    "RTL_ALT": ParameterInfo("cm", 30, 300_000, "altitude of the way home"),
+    "WPNAV_SPEED": ParameterInfo("cm/s", 10, 2000, "horizontal speed"),
+    "WPNAV_SPEED_DN": ParameterInfo("cm/s", 10, 500, "speed of descent"),
+    "WPNAV_SPEED_UP": ParameterInfo("cm/s", 10, 1000, "speed of climb, also of the thrust field"),
+    # PX4
+    "COM_DISARM_LAND": ParameterInfo("s", None, 20, "standing for so long after a landing, it disarms"),
+    "COM_DISARM_PRFLT": ParameterInfo("s", None, 60, "armed on the ground for so long, it disarms"),
+    "COM_DL_LOSS_T": ParameterInfo("s", 5, 300, "silence of the ground station that is a failure"),
+    "COM_LOW_BAT_ACT": ParameterInfo("", 0, 3, "what happens with a low battery: 0 a warning, 2 land, 3 return"),
+    "COM_OBL_RC_ACT": ParameterInfo("", 0, 7, "what happens without set-points: 0 position mode, 5 hold"),
+    "COM_OF_LOSS_T": ParameterInfo("s", 0, 60, "silence after which set-points are missing"),
+    "GF_ACTION": ParameterInfo("", 0, 5, "what happens at the fence"),
+    "GF_MAX_VER_DIST": ParameterInfo("m", 0, 10_000, "height of the fence; 0: none"),
+    "MIS_TAKEOFF_ALT": ParameterInfo("m", 0, None, "height of a take-off that names none"),
+    "MPC_MAN_Y_MAX": ParameterInfo("deg/s", 0, 400, "greatest yaw rate"),
+    "MPC_THR_HOVER": ParameterInfo("", 0.1, 0.8, "thrust that carries the weight"),
+    "MPC_TILTMAX_AIR": ParameterInfo("deg", 20, 89, "greatest tilt"),
+    "MPC_XY_VEL_MAX": ParameterInfo("m/s", 0, 20, "greatest horizontal speed"),
+    "MPC_Z_VEL_MAX_DN": ParameterInfo("m/s", 0.5, 4, "greatest speed of descent"),
+    "MPC_Z_VEL_MAX_UP": ParameterInfo("m/s", 0.5, 8, "greatest speed of climb"),
+    "NAV_DLL_ACT": ParameterInfo("", 0, 6, "what happens when no ground station is heard: 0 nothing, 1 hold, 3 land"),
+    "NAV_RCL_ACT": ParameterInfo("", 1, 6, "what happens when the remote control is lost"),
+}
+
 
 PREFIX: Final = "mavlink."
-TAKEOFF_ALTITUDE: Final = "limits.takeoff_altitude"
-TAKEOFF_RANGE_M: Final = (0.5, 50.0)
+EXACT: Final = 1 << 24  #: up to here single precision has every whole number
 _NAME: Final = re.compile(r"[A-Za-z0-9_]{1,16}\Z")
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
-    """A parameter, and the autopilot's name and factor behind it."""
+class VehicleParameter:
+    """A parameter, and the autopilot's name behind it."""
 
     parameter: Parameter
     native: str
-    factor: float = 1.0  #: the autopilot's number times this is the parameter's
 
     def to_native(self, value: Value) -> float:
-        """As the autopilot takes it. Raises :class:`ParameterError` for what is no finite number, or no whole one."""
+        """Return a value as the autopilot takes it.
+
+        Raises:
+            ParameterError: It is no finite number, no whole one where one is needed, or out of range.
+        """
         name, whole = self.parameter.name, self.parameter.type is ParameterType.INT
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
             raise ParameterError(f"{name} takes a finite number, not {value!r:.60}", code=Refusal.WRONG_TYPE)
@@ -38,36 +244,30 @@ class Entry:
         low, high = self.parameter.minimum, self.parameter.maximum
         if (low is not None and value < low) or (high is not None and value > high):
             raise ParameterError(f"{name} is from {low} to {high}, not {value!r}", code=Refusal.OUT_OF_RANGE)
-        return value / self.factor
+        return value
 
     def from_native(self, number: float) -> Value:
-        return int(number) if self.parameter.type is ParameterType.INT else short(number * self.factor)
+        """Return a value that the autopilot reported."""
+        return int(number) if self.parameter.type is ParameterType.INT else rounded(number)
 
 
-def entries_of(held: Mapping[str, Held]) -> dict[str, Entry]:
-    """All parameters that the vehicle told, by our names."""
-    found: dict[str, Entry] = {}
+def vehicle_parameters(held: Mapping[str, ReportedParameter]) -> dict[str, VehicleParameter]:
+    """Return all parameters that the vehicle reported, by our names."""
+    found: dict[str, VehicleParameter] = {}
     for name, each in held.items():
         entry = _own(each) if _NAME.match(name) else None
         if entry is not None:
             found[entry.parameter.name] = entry
-    for common in COMMON:
-        enabled = not common.needs or (common.needs in held and held[common.needs].value != 0)
-        if common.native in held and common.name not in found and enabled and held[common.native].value > 0:
-            entry = _shared(common, held[common.native])
-            found[common.name] = entry
     return found
 
 
-def takeoff_altitude(height_m: float) -> Parameter:
-    """The driver's own."""
-    low, high = TAKEOFF_RANGE_M
-    text = "where a take-off ends, above the place of the start"
-    return Parameter(TAKEOFF_ALTITUDE, ParameterType.FLOAT, height_m, "m", low, high, description=text)
+def writable_parameter(entries: Mapping[str, VehicleParameter], name: str) -> VehicleParameter:
+    """Return a parameter that can be written.
 
-
-def entry_of(entries: Mapping[str, Entry], name: str) -> Entry:
-    """Raises :class:`UnknownNameError`, and :class:`ParameterError` for one that can only be read."""
+    Raises:
+        UnknownNameError: There is no such parameter.
+        ParameterError: It is read-only.
+    """
     entry = entries.get(name)
     if entry is None:
         raise UnknownNameError("parameter of the vehicle", name, entries)
@@ -76,27 +276,52 @@ def entry_of(entries: Mapping[str, Entry], name: str) -> Entry:
     return entry
 
 
-def short(number: float) -> float:
-    """A number in single precision without the digits that it does not have."""
+def check_exact(name: str, number: int, *, bytewise: bool) -> int:
+    """Return a whole number, if the vehicle would receive exactly that.
+
+    ArduPilot writes whole numbers as floats of single precision: those beyond 24 bits may come out as others.
+
+    Args:
+        name: Of the parameter.
+        number: To be written.
+        bytewise: Whether the vehicle takes integers as they are.
+
+    Raises:
+        ParameterError: It would receive another number.
+    """
+    if bytewise:
+        return number
+    heard = struct.unpack("<f", struct.pack("<f", number))[0]
+    if heard != number:
+        raise ParameterError(
+            f"{name}: the vehicle carries whole numbers in single precision and would hear {heard:.0f} instead of "
+            f"{number}: beyond ±{EXACT} only some can be written; set it in a ground station",
+            code=Refusal.OUT_OF_RANGE,
+        )
+    return number
+
+
+def rounded(number: float) -> float:
+    """Return a number without the digits that single precision does not have."""
     return float(f"{number:.7g}")
 
 
-def _own(held: Held) -> Entry | None:
-    meaning = MEANINGS.get(held.name, Meaning())
+def _own(held: ReportedParameter) -> VehicleParameter | None:
+    meaning = PARAMETER_INFO.get(held.name, ParameterInfo())
     name = PREFIX + held.name.lower()
     if not math.isfinite(held.value):
         parameter = Parameter(name, ParameterType.TEXT, str(held.value), read_only=True, description="no number")
-        return Entry(parameter, held.name)
+        return VehicleParameter(parameter, held.name)
     if is_integer(held.kind):
         least, most = map(float, bounds(held.kind))
         value: float = int(held.value)
         kind = ParameterType.INT
     else:
         least, most = -math.inf, math.inf
-        value, kind = short(held.value), ParameterType.FLOAT
+        value, kind = rounded(held.value), ParameterType.FLOAT
     low = meaning.low if meaning.low is not None else least
     high = meaning.high if meaning.high is not None else most
-    return Entry(
+    return VehicleParameter(
         Parameter(
             name,
             kind,
@@ -114,17 +339,36 @@ def _bound(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _shared(common: Common, held: Held) -> Entry:
-    meaning, value = MEANINGS.get(held.name, Meaning()), short(held.value * common.factor)
-    low = meaning.low * common.factor if meaning.low is not None else None
-    high = meaning.high * common.factor if meaning.high is not None else None
-    parameter = Parameter(
-        common.name,
-        ParameterType.FLOAT,
-        value,
-        common.unit,
-        low if low is None else min(low, value),
-        high if high is None else max(high, value),
-        description=f"{common.text} ({held.name})",
-    )
-    return Entry(parameter, held.name, common.factor)
+_LIMITS: Final = {limit.name: limit for limit in OWN_LIMITS}
+
+
+def limit_parameters(values: Mapping[str, float]) -> list[Parameter]:
+    """Return the driver's own limits as parameters, with their values in force."""
+    return [
+        Parameter(
+            limit.name,
+            ParameterType.FLOAT,
+            values[limit.name],
+            limit.unit,
+            limit.low,
+            limit.high,
+            limit.usual,
+            description=limit.text,
+        )
+        for limit in OWN_LIMITS
+    ]
+
+
+def with_limit(values: Mapping[str, float], name: str, value: Value) -> dict[str, float]:
+    """Return the driver's own limits after one was written.
+
+    Raises:
+        ParameterError: It is no finite number, or out of range.
+    """
+    limit = _LIMITS[name]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ParameterError(f"{name} takes a finite number, not {value!r:.60}", code=Refusal.WRONG_TYPE)
+    if not limit.low <= value <= limit.high:
+        why = f"{name} is from {limit.low:g} to {limit.high:g} {limit.unit}, not {value:g}"
+        raise ParameterError(why, code=Refusal.OUT_OF_RANGE)
+    return {**values, name: float(value)}

@@ -1,44 +1,51 @@
-"""What was heard of the vehicle last, each with its age. Pure."""
+"""The newest messages of the vehicle, as feedback and as notices of its health. Pure."""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
 from skyloop.clock import nanoseconds, seconds
-from skyloop.messages import Value
-from skyloop.wire.mavlink.axes import Vector
+from skyloop.drivers.notices import Notice
+from skyloop.messages import EventKind, Feedback, FlightState, Severity, Value
+from skyloop.wire.mavlink.axes import Vector, flip, swap, turned, yaw_between
 from skyloop.wire.mavlink.codec import Message
 from skyloop.wire.mavlink.modes import Landed, ModeFlag, SystemState
+from skyloop.wire.mavlink.texts import Texts
 
-FLOWING_S: Final = 1.0  #: older than this, attitude, place and speed are not known
+FLOWING_S: Final = 1.0  #: older than this, attitude, position and velocity are not known
 SLOW_S: Final = 6.0  #: the same for battery, GPS and the like
 LANDED_S: Final = 3.0
 PREARM: Final = 0x10000000  #: MAV_SYS_STATUS_PREARM_CHECK
-AIRBORNE_M: Final = 0.5  #: higher than this it flies, where it does not say so
+REMOTE: Final = 0x10000  #: MAV_SYS_STATUS_SENSOR_RC_RECEIVER
+AIRBORNE_M: Final = 0.5  #: higher than this it counts as flying, where it does not report that
 
 
 @dataclass(frozen=True, slots=True)
-class View:
-    """The vehicle as the pilot looks at it. World axes are MAVLink's: north, east, down."""
+class VehicleState:
+    """What is known of the vehicle. World axes are MAVLink's: north, east, down."""
 
     mode: str
     armed: bool
     status: int  #: of the heartbeat
     landed: Landed
-    ready: bool | None  #: whether it may be armed; None: it does not tell
-    place: Vector | None  #: [m], from its origin
+    ready: bool | None  #: whether it may be armed; None: unknown
+    position: Vector | None  #: [m], from its origin
     velocity: Vector | None  #: [m/s]
     yaw: float | None  #: clockwise from north [rad]
-    altitude_m: float | None  #: above where it stood, or the nearest to that that it tells
+    altitude_m: float | None  #: above where it stood, or the nearest to that which it reports
     amsl_m: float | None  #: altitude above mean sea level
+    remote: bool = False  #: a remote control is there and received, as far as the vehicle reports it
 
     @property
     def airborne(self) -> bool | None:
-        """Whether it is off the ground under its own power; None while an armed one tells neither that nor its height,
-        as when it was just found again: that is no reason to think that it stands."""
+        """Whether it is off the ground under its own power; None while that can't be known.
+
+        An armed vehicle that reports neither that nor its height, as when it was just found again, may well be flying.
+        """
         if not self.armed or self.landed is Landed.ON_GROUND:
             return False
         if self.landed is Landed.UNKNOWN:
@@ -52,15 +59,15 @@ class View:
 
 
 class Telemetry:
-    """The newest message of each kind."""
+    """The newest message of each kind, each with its age."""
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
         self._newest: dict[str, tuple[Message, int]] = {}
         self._ground_down: float | None = None  # "down" of the ground, from the origin [m]
 
-    def heard(self, message: Message, now_ns: int) -> None:
-        """One more, of the vehicle that is flown."""
+    def on_message(self, message: Message, now_ns: int) -> None:
+        """Keep a message of the vehicle that is flown."""
         kind = message.get_type()
         self._newest[kind] = message, now_ns
         self.counts[kind] += 1
@@ -70,18 +77,25 @@ class Telemetry:
                 self._ground_down = local.z + message.relative_alt / 1000.0
 
     def newest(self, kind: str, now_ns: int, max_age_s: float = math.inf) -> Message | None:
-        """The newest message of this kind, if it is not older than this."""
+        """Return the newest message of a kind.
+
+        Args:
+            kind: The message's name.
+            now_ns: The present time.
+            max_age_s: None is returned for an older one [s].
+        """
         found = self._newest.get(kind)
         if found is None or now_ns - found[1] > nanoseconds(min(max_age_s, 1e9)):
             return None
         return found[0]
 
     def age_s(self, kind: str, now_ns: int) -> float | None:
+        """Return the age of the newest message of a kind [s]; None if none came."""
         found = self._newest.get(kind)
         return None if found is None else seconds(now_ns - found[1])
 
     def ages(self, now_ns: int) -> dict[str, Value]:
-        """Of every kind, for feedback's ``native``."""
+        """Return the age [s] of each kind, for feedback's ``native``."""
         return {
             f"mavlink.age.{kind.lower()}": round(seconds(now_ns - at_ns), 3)
             for kind, (_, at_ns) in self._newest.items()
@@ -91,7 +105,7 @@ class Telemetry:
     # What it means -----------------------------------------------------------------------------------------------
 
     def custom_mode(self) -> int | None:
-        """Of whichever tells it newest."""
+        """Return the mode's number from the newest message that has it."""
         heartbeat, current = self._newest.get("HEARTBEAT"), self._newest.get("CURRENT_MODE")
         if heartbeat is None:
             return None
@@ -100,14 +114,17 @@ class Telemetry:
         return int(heartbeat[0].custom_mode)
 
     def armed(self) -> bool:
+        """Return whether it is armed, by the newest heartbeat."""
         heartbeat = self._newest.get("HEARTBEAT")
         return heartbeat is not None and bool(heartbeat[0].base_mode & ModeFlag.ARMED)
 
     def status(self) -> int:
+        """Return ``MAV_STATE`` of the newest heartbeat; 0 if none came."""
         heartbeat = self._newest.get("HEARTBEAT")
         return 0 if heartbeat is None else int(heartbeat[0].system_status)
 
     def landed(self, now_ns: int) -> Landed:
+        """Return what it reports of standing on the ground."""
         message = self.newest("EXTENDED_SYS_STATE", now_ns, LANDED_S)
         try:
             return Landed.UNKNOWN if message is None else Landed(message.landed_state)
@@ -115,23 +132,32 @@ class Telemetry:
             return Landed.UNKNOWN
 
     def prearm_good(self, now_ns: int) -> bool | None:
-        """None while it is not told, as by a vehicle that has no such check."""
+        """Return whether the pre-arm checks pass; None where the vehicle does not report them."""
         status = self.newest("SYS_STATUS", now_ns, SLOW_S)
         if status is None:
             return None
         good = bool(status.onboard_control_sensors_health & PREARM)
         return good if good or status.onboard_control_sensors_present & PREARM else None
 
+    def remote(self, now_ns: int) -> bool:
+        """Return whether the vehicle receives a remote control."""
+        status = self.newest("SYS_STATUS", now_ns, SLOW_S)
+        return status is not None and bool(
+            status.onboard_control_sensors_present & status.onboard_control_sensors_health & REMOTE
+        )
+
     def attitude(self, now_ns: int) -> Vector | None:
-        """Roll right side down, pitch nose up, yaw clockwise from north [rad]."""
+        """Return roll (right side down), pitch (nose up) and yaw (clockwise from north) [rad]."""
         message = self.newest("ATTITUDE", now_ns, FLOWING_S)
         return None if message is None else finite(message.roll, message.pitch, message.yaw)
 
-    def place(self, now_ns: int) -> Vector | None:
+    def position(self, now_ns: int) -> Vector | None:
+        """Return north, east, down from the origin [m]."""
         message = self.newest("LOCAL_POSITION_NED", now_ns, FLOWING_S)
         return None if message is None else finite(message.x, message.y, message.z)
 
     def velocity(self, now_ns: int) -> Vector | None:
+        """Return the velocity north, east, down [m/s]."""
         message = self.newest("LOCAL_POSITION_NED", now_ns, FLOWING_S)
         if message is not None:
             return finite(message.vx, message.vy, message.vz)
@@ -139,33 +165,42 @@ class Telemetry:
         return None if message is None else (message.vx / 100.0, message.vy / 100.0, message.vz / 100.0)
 
     def altitude_m(self, now_ns: int) -> float | None:
-        """Above the ground below by a sensor that looks down, above home, or above the origin: what there is."""
+        """Return the height [m] above the ground by a downward sensor, else above home, else above the origin."""
         sensor = self.newest("DISTANCE_SENSOR", now_ns, FLOWING_S)
         if sensor is not None and sensor.orientation == _DOWN and _in_range(sensor):
             return float(sensor.current_distance) / 100.0
-        place = self.place(now_ns)
-        if place is not None:
-            return (self._ground_down or 0.0) - place[2]
+        position = self.position(now_ns)
+        if position is not None:
+            return (self._ground_down or 0.0) - position[2]
         message = self.newest("GLOBAL_POSITION_INT", now_ns, FLOWING_S)
         return None if message is None else message.relative_alt / 1000.0
 
     def amsl_m(self, now_ns: int) -> float | None:
+        """Return the altitude above mean sea level [m]."""
         message = self.newest("GLOBAL_POSITION_INT", now_ns, SLOW_S)
         return None if message is None else message.alt / 1000.0
 
-    def view(self, mode: str, ready: bool | None, now_ns: int) -> View:
+    def state(self, mode: str, ready: bool | None, now_ns: int) -> VehicleState:
+        """Return all that is known of the vehicle.
+
+        Args:
+            mode: Its mode's name.
+            ready: Whether it may be armed; None: unknown.
+            now_ns: The present time.
+        """
         attitude = self.attitude(now_ns)
-        return View(
+        return VehicleState(
             mode=mode,
             armed=self.armed(),
             status=self.status(),
             landed=self.landed(now_ns),
             ready=ready,
-            place=self.place(now_ns),
+            position=self.position(now_ns),
             velocity=self.velocity(now_ns),
             yaw=attitude[2] if attitude is not None else None,
             altitude_m=self.altitude_m(now_ns),
             amsl_m=self.amsl_m(now_ns),
+            remote=self.remote(now_ns),
         )
 
 
@@ -188,5 +223,165 @@ def _in_range(sensor: Message) -> bool:
 
 
 def finite(x: float, y: float, z: float) -> Vector | None:
-    """The three numbers, or None if one of them is none."""
+    """Return the three numbers, or None if one is not finite."""
     return (x, y, z) if math.isfinite(x) and math.isfinite(y) and math.isfinite(z) else None
+
+
+STANDARD_GRAVITY: Final = 9.80665  #: m/s²
+_UNKNOWN_16: Final = 0xFFFF
+
+
+def feedback_of(
+    telemetry: Telemetry, state: FlightState, captured_ns: int, now_ns: int, native: Mapping[str, Value]
+) -> Feedback:
+    """Return the vehicle's state in our units and axes. What does not flow, or is not finite, is None.
+
+    Args:
+        telemetry: The newest messages.
+        state: The flight state.
+        captured_ns: When the vehicle was in this state.
+        now_ns: The present time.
+        native: Telemetry besides the vehicle's own.
+    """
+    attitude = telemetry.attitude(now_ns)
+    position = telemetry.position(now_ns)
+    roll, pitch, yaw = (None, None, None) if attitude is None else _turned_over(attitude)
+    return Feedback(
+        captured_ns=captured_ns,
+        state=state,
+        battery=_charge(telemetry, now_ns),
+        battery_v=_volts(telemetry, now_ns),
+        roll=roll,
+        pitch=pitch,
+        yaw=yaw,
+        altitude=telemetry.altitude_m(now_ns),
+        velocity=_velocity(telemetry.velocity(now_ns), yaw),
+        angular_velocity=_rates(telemetry, now_ns),
+        acceleration=_force(telemetry, now_ns),
+        position=None if position is None else swap(*position),
+        native={**native, **_native(telemetry, now_ns)},
+    )
+
+
+def _turned_over(attitude: Vector) -> Vector:
+    """Return roll (right side down), pitch (nose down) and yaw (counter-clockwise from east) [rad]."""
+    roll, pitch, yaw = attitude
+    return math.remainder(roll, math.tau), 0.0 - math.remainder(pitch, math.tau), yaw_between(yaw)
+
+
+def _velocity(world: Vector | None, yaw: float | None) -> Vector | None:
+    """Return the velocity forward, left, up [m/s]."""
+    if world is None or yaw is None:
+        return None
+    east, north, up = swap(*world)
+    return (*turned(east, north, -yaw), up)
+
+
+def _rates(telemetry: Telemetry, now_ns: int) -> Vector | None:
+    message = telemetry.newest("ATTITUDE", now_ns, FLOWING_S)
+    found = None if message is None else finite(message.rollspeed, message.pitchspeed, message.yawspeed)
+    return None if found is None else flip(*found)
+
+
+def _force(telemetry: Telemetry, now_ns: int) -> Vector | None:
+    """Return the specific force [m/s²]; PX4 reports m/s², ArduPilot thousandths of g."""
+    message = telemetry.newest("HIGHRES_IMU", now_ns, FLOWING_S)
+    if message is not None:
+        found = finite(message.xacc, message.yacc, message.zacc)
+        return None if found is None else flip(*found)
+    message = telemetry.newest("RAW_IMU", now_ns, FLOWING_S)
+    if message is None:
+        return None
+    unit = STANDARD_GRAVITY / 1000.0
+    return flip(message.xacc * unit, message.yacc * unit, message.zacc * unit)
+
+
+def _charge(telemetry: Telemetry, now_ns: int) -> float | None:
+    for kind in ("SYS_STATUS", "BATTERY_STATUS"):
+        message = telemetry.newest(kind, now_ns, SLOW_S)
+        if message is not None and 0 <= message.battery_remaining <= 100:
+            return float(message.battery_remaining) / 100.0
+    return None
+
+
+def _volts(telemetry: Telemetry, now_ns: int) -> float | None:
+    message = telemetry.newest("SYS_STATUS", now_ns, SLOW_S)
+    if message is None or message.voltage_battery in (0, _UNKNOWN_16):
+        return None
+    return float(message.voltage_battery) / 1000.0
+
+
+def _native(telemetry: Telemetry, now_ns: int) -> dict[str, Value]:
+    native: dict[str, Value] = telemetry.ages(now_ns)
+    gps = telemetry.newest("GPS_RAW_INT", now_ns, SLOW_S)
+    if gps is not None:
+        native["gps.fix"] = int(gps.fix_type)
+        if gps.satellites_visible != 0xFF:
+            native["gps.satellites"] = int(gps.satellites_visible)
+    position = telemetry.newest("GLOBAL_POSITION_INT", now_ns, SLOW_S)
+    if position is not None:
+        native.update(_geodetic(position))
+    return native
+
+
+def _geodetic(message: Message) -> dict[str, Value]:
+    """Return degrees, and metres above mean sea level."""
+    return {
+        "gps.latitude_deg": message.lat / 1e7,
+        "gps.longitude_deg": message.lon / 1e7,
+        "gps.altitude_amsl_m": message.alt / 1000.0,
+    }
+
+
+DEBUG: Final = 7
+GOOD_FIX: Final = 3  #: a position in three dimensions
+_PREARM_WORDS: Final = ("prearm:", "arm:", "arming denied", "preflight fail")
+_EKF: Final = ("EKF_STATUS_REPORT", "ESTIMATOR_STATUS")
+_PLACE: Final = 0x10 | 0x08
+_LOST: Final = 0x80
+
+
+class HealthMonitor:
+    """Reports each change of the vehicle's health once, and the vehicle's own texts."""
+
+    def __init__(self) -> None:
+        self._texts = Texts()
+        self._told: dict[str, bool] = {}
+
+    def on_text(self, message: Message) -> list[Notice]:
+        """Handle a ``STATUSTEXT``; return whole texts, marked where they say why it can't be armed."""
+        notices = []
+        for severity, text in self._texts.heard(message):
+            if severity >= DEBUG:
+                continue
+            weight = Severity.ERROR if severity <= 3 else Severity.WARNING if severity == 4 else Severity.INFO
+            reason = "prearm" if text.lower().startswith(_PREARM_WORDS) else "text"
+            data: dict[str, Value] = {"reason": reason, "mav_severity": severity}
+            notices.append(Notice(EventKind.VEHICLE_MESSAGE, text, weight, data))
+        return notices
+
+    def update(self, telemetry: Telemetry, vehicle: VehicleState | None, now_ns: int) -> list[Notice]:
+        """Return what changed since the last call."""
+        ready = None if vehicle is None else vehicle.ready
+        notices = self._changed("ready", ready, "the vehicle is ready to be armed", "the vehicle can't be armed now")
+        gps = telemetry.newest("GPS_RAW_INT", now_ns, SLOW_S)
+        if gps is not None:
+            good = gps.fix_type >= GOOD_FIX
+            notices += self._changed("gps", good, "the vehicle's GPS has a fix", "the vehicle's GPS has no fix")
+        for kind in _EKF:
+            ekf = telemetry.newest(kind, now_ns, SLOW_S)
+            if ekf is not None:
+                # A PX4 at rest assumes that it stands still, and says so; only in the air does that mean it is lost.
+                counts = kind != "ESTIMATOR_STATUS" or (vehicle is not None and vehicle.airborne)
+                good = bool(ekf.flags & _PLACE) and not (counts and ekf.flags & _LOST)
+                notices += self._changed(
+                    "ekf", good, "the vehicle knows where it is", "the vehicle does not know where it is"
+                )
+        return notices
+
+    def _changed(self, name: str, good: bool | None, yes: str, no: str) -> list[Notice]:
+        if good is None or self._told.get(name) is good:
+            return []
+        self._told[name] = good
+        severity = Severity.INFO if good else Severity.WARNING
+        return [Notice(EventKind.VEHICLE_MESSAGE, yes if good else no, severity, {"reason": name, "good": good})]

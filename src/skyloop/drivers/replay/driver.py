@@ -1,21 +1,16 @@
-"""The driver of ``replay://FLIGHT.mcap``: options, life cycle and the thread that plays.
-
-Options: ``speed`` (1; ``max``: as fast as one application consumes, see :mod:`skyloop.recording.lockstep`); ``loop``
-start over at the end (no); ``drone`` its name in the recording (the first); ``start`` where to begin [s] (0); ``wait``
-for somebody to look at a camera before it starts (no).
-"""
+"""The driver of ``replay://FLIGHT.mcap``: life cycle and the thread that plays."""
 
 from __future__ import annotations
 
 import threading
-from pathlib import Path
 from typing import Final
 
 from skyloop.clock import Clock
-from skyloop.drivers.base import Driver, Sink, reject_unknown_options
-from skyloop.drivers.replay.player import Player, Steps
-from skyloop.drivers.replay.tape import Tape, capabilities
-from skyloop.drivers.replay.telling import Teller
+from skyloop.drivers.base import Driver, Sink
+from skyloop.drivers.replay.options import options_of
+from skyloop.drivers.replay.player import Player, StepPlayer
+from skyloop.drivers.replay.publisher import ReplayPublisher
+from skyloop.drivers.replay.source import ReplaySource, capabilities_of
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import SkyloopError, UsageError
 from skyloop.logfile.layout import DroneRecord
@@ -31,87 +26,89 @@ from skyloop.messages import (
     Severity,
 )
 
-_OPTIONS: Final = {"speed", "loop", "drone", "start", "wait"}
-MAX: Final = "max"
 _CLOSE_S: Final = 2.0
 
 
 class ReplayDriver(Driver):
-    """A vehicle that does what was recorded, whatever it is commanded; commands are accepted, and change nothing."""
+    """A vehicle that does what was recorded: it accepts every command and follows none.
+
+    With ``speed=max`` nothing plays by itself. Its consumer sets :attr:`clock` before :meth:`open`, and then moves the
+    replay by :attr:`steps`.
+    """
+
+    shared = False
 
     def __init__(self, uri: VehicleUri) -> None:
         super().__init__(uri)
-        reject_unknown_options(uri, _OPTIONS)
-        if not uri.place:
-            raise UsageError(f"{uri} names no file: it looks like replay:///home/me/flight.mcap?speed=2")
-        self._path = Path(uri.place).expanduser()
-        #: Moved by ``steps`` by whoever consumes it and has set ``clock`` before it was opened.
-        self.stepped = uri.options.get("speed") == MAX
-        self._speed = 1.0 if self.stepped else uri.number("speed", 1.0, minimum=0.01, maximum=1000.0)
-        self._loop = uri.flag("loop")
-        self._start_s = uri.number("start", 0.0, minimum=0.0, maximum=1e6)
-        self._wait = uri.flag("wait")
-        if self.stepped and (self._loop or self._wait):
-            raise UsageError(f"{uri}: speed=max goes neither with loop nor with wait: it is through when it is through")
+        self.options = options_of(uri)
+        self.stepped = self.options.stepped
         self.clock: Clock | None = None
-        self.steps: Steps | None = None
+        self.steps: StepPlayer | None = None
         self._capabilities: Capabilities | None = None
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
-        self._teller: Teller | None = None
+        self._publisher: ReplayPublisher | None = None
 
     def capabilities(self) -> Capabilities:
-        """Looks through the file, once, for its cameras. A file that can't be read is refused by :meth:`open`."""
+        """Return the recording's cameras; the file is read once. One that can't be read is refused by :meth:`open`."""
         if self._capabilities is None:
             try:
                 recording, drone = self._read()
-                self._capabilities = capabilities(recording, drone)
+                self._capabilities = capabilities_of(recording, drone)
             except SkyloopError as error:
                 return Capabilities("replay", why_not=str(error))
         return self._capabilities
 
     def parameters(self) -> list[Parameter]:
-        """Those recorded so far, with the prefix ``recorded.``, to be read only."""
-        teller = self._teller
-        return [] if teller is None else sorted(teller.parameters.copy().values(), key=lambda parameter: parameter.name)
+        """Return the parameters recorded so far, read-only, with the prefix ``recorded.``."""
+        publisher = self._publisher
+        return (
+            []
+            if publisher is None
+            else sorted(publisher.parameters.copy().values(), key=lambda parameter: parameter.name)
+        )
 
     def failsafe(self, action: Hover | Land) -> bool:  # noqa: ARG002
-        """Nothing flies, so everything is safe."""
+        """Return True: nothing flies."""
         return True
 
-    def tape(self) -> Tape:
-        """Raises :class:`UsageError` for a recording that is not there, can't be read, or is over before its start."""
+    def source(self) -> ReplaySource:
+        """Open the recording.
+
+        Raises:
+            UsageError: It is not there, can't be read, or ends before ``start``.
+        """
         recording, drone = self._read()
-        tape = Tape(recording, drone, self._start_s)
-        if tape.empty:
+        source = ReplaySource(recording, drone, self.options.start_s)
+        if source.empty:
             raise UsageError(
                 f"{self.uri}: the recording lasts {recording.seconds:.1f} s"
-                + (f", and start is {self._start_s:g} s" if self._start_s else ": it is empty")
+                + (f", and start is {self.options.start_s:g} s" if self.options.start_s else ": it is empty")
             )
-        return tape
+        return source
 
     def _open(self, sink: Sink) -> None:
-        tape = self.tape()
+        source = self.source()
         if self.stepped:
-            self._open_steps(tape, sink)
+            self._open_steps(source, sink)
             return
-        player = Player(tape, sink, self._stop, speed=self._speed, loop=self._loop)
-        self._teller = player.teller
+        player = Player(source, sink, self._stop, speed=self.options.speed, loop=self.options.loop)
+        self._publisher = player.publisher
         self._stop.clear()
-        cameras = tuple(camera.name for camera in self.capabilities().cameras) if self._wait else ()
+        cameras = tuple(camera.name for camera in self.capabilities().cameras) if self.options.wait else ()
         self._thread = threading.Thread(
             target=self._run, args=(player, sink, cameras), name="skyloop-replay", daemon=True
         )
         self._thread.start()
 
-    def _open_steps(self, tape: Tape, sink: Sink) -> None:
+    def _open_steps(self, source: ReplaySource, sink: Sink) -> None:
         if self.clock is None:
             raise UsageError(
                 f'{self.uri}: speed=max is in step with one application: call skyloop.connect("{self.uri}") there, '
                 "or give a number, such as speed=10, to serve everybody"
             )
-        self.steps = Steps(tape, sink, self.clock)
-        self._teller = self.steps.teller
+        self.steps = StepPlayer(source, sink, self.clock)
+        self._publisher = self.steps.publisher
         self.steps.begin()
 
     def _close(self) -> None:
@@ -123,7 +120,7 @@ class ReplayDriver(Driver):
         self._thread = None
 
     def _apply(self, action: AnyAction) -> AnyAction:
-        """Taken, told to whoever listens, and without effect on what was recorded."""
+        """Accept the action; it has no effect on what was recorded."""
         return action
 
     def _run(self, player: Player, sink: Sink, cameras: tuple[str, ...]) -> None:
@@ -134,5 +131,5 @@ class ReplayDriver(Driver):
             sink.link(LinkState.LOST, f"replaying failed: {error!r}")
 
     def _read(self) -> tuple[Recording, DroneRecord]:
-        recording = Recording.open(self._path)
-        return recording, recording.drone(self.uri.options.get("drone"))
+        recording = Recording.open(self.options.path)
+        return recording, recording.drone(self.options.drone)

@@ -1,4 +1,4 @@
-"""The driver of one simulated drone."""
+"""The driver of ``sim://``: one simulated drone, in a world of its own or shared with others."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.sim import parameters as table
 from skyloop.drivers.sim.options import options_of
-from skyloop.drivers.sim.set_points import SetPointFlight
+from skyloop.drivers.sim.setpoints import SetpointController
+from skyloop.drivers.sim.telemetry import feedback_of
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import SkyloopError
 from skyloop.messages import (
     AnyAction,
     Capabilities,
     EventKind,
-    Feedback,
     Hover,
     LinkState,
     Parameter,
@@ -33,7 +33,7 @@ from skyloop.sim.reports import Occurrence, OccurrenceKind
 from skyloop.sim.world import Wind
 
 if TYPE_CHECKING:
-    from skyloop.sim.studio import Camera
+    from skyloop.sim.camera_pipeline import Camera
 
 _OCCURRENCES: Final = {
     OccurrenceKind.COLLISION: (EventKind.COLLISION, Severity.WARNING),
@@ -43,11 +43,16 @@ _OCCURRENCES: Final = {
 
 
 class SimDriver(Driver):
-    """A drone of a world of its own, or of a ``host`` that several drivers share.
+    """A drone of a world of its own, or of a host that several drivers share.
 
-    Feedback carries the truth besides, in ``native``: ``truth.x``, ``.y``, ``.z`` [m], ``.roll``, ``.pitch``, ``.yaw``
+    Feedback carries the true state too, in ``native``: ``truth.x``, ``.y``, ``.z`` [m], ``.roll``, ``.pitch``, ``.yaw``
     [rad], ``.vx``, ``.vy``, ``.vz`` [m/s], and of each moving target ``truth.target.x``, ``.y``, ``.z``, ``.yaw`` (a
     second one is ``truth.target2``), all in world axes. ``sim.time_s`` is the simulation's own time.
+
+    Args:
+        uri: The vehicle's address; its options count only without a host.
+        host: A world that is shared; None: :meth:`open` makes one.
+        drone: Its number in the host.
     """
 
     def __init__(self, uri: VehicleUri, *, host: SimHost | None = None, drone: int = 0) -> None:
@@ -62,11 +67,12 @@ class SimDriver(Driver):
         self._wind: Wind | None = None  # as written before it was opened
         self._battery = self.options.battery
         self._link = True
-        self._set_points: SetPointFlight | None = None
+        self._setpoints: SetpointController | None = None
         self._cameras: tuple[Camera, ...] = ()
         self._world_wind: Wind | None = None
 
     def capabilities(self) -> Capabilities:
+        """Return the actions and cameras that the address asks for."""
         return Capabilities(
             vehicle="sim",
             actions=self.options.native,
@@ -86,19 +92,19 @@ class SimDriver(Driver):
         simulation = host.simulation
         if self._battery != self.options.battery:
             simulation.set_charge(self.drone, self._battery)
-        self._set_points = None if "takeoff" in self.options.native else SetPointFlight(simulation, self.drone)
+        self._setpoints = None if "takeoff" in self.options.native else SetpointController(simulation, self.drone)
         simulation.set_limits(self.drone, self._in_force(self._limits))
-        self._cameras = host.board(self.drone, self, self, list(self._models))
+        self._cameras = host.attach(self.drone, self, self, list(self._models))
         sink.link(LinkState.UP)
 
     def _close(self) -> None:
         if self.host is not None:
-            self.host.leave(self.drone, self)
+            self.host.detach(self.drone, self)
         self._battery = self.options.battery
 
     def _in_force(self, limits: Limits) -> Limits:
-        """Without a take-off of its own the vehicle only lifts off, and the set-points do the rest."""
-        if self._set_points is None:
+        """Return the limits in force. By set-points alone the drone's own take-off only lifts it off."""
+        if self._setpoints is None:
             return limits
         return replace(limits, takeoff_altitude_m=LIMIT_RANGES["takeoff_altitude_m"][0])
 
@@ -109,43 +115,50 @@ class SimDriver(Driver):
             return super()._apply(action)
         host = self.host
         if host is None or self._sink is None or not self._link:
-            return action  # said into the dark
+            return action  # lost: the drone receives nothing
         return self._command(host, action)
 
     def _command(self, host: SimHost, action: AnyAction) -> AnyAction:
-        if self._set_points is not None:
-            return self._set_points.command(action)
+        if self._setpoints is not None:
+            return self._setpoints.command(action)
         return host.simulation.command(self.drone, action)
 
     # Parameters ------------------------------------------------------------------------------------------------
 
     def parameters(self) -> list[Parameter]:
+        """Return limits, cameras, battery, wind and the radio link, with their values in force."""
         return table.describe(self._present(), self._standard())
 
     def set_parameter(self, name: str, value: Value) -> Value:
+        """Write a parameter. The wind is the whole world's.
+
+        Raises:
+            UnknownNameError: There is no such parameter.
+            ParameterError: It does not take this value.
+        """
         with self._changing:
             before, standard = self._present(), self._standard()
-            after = table.written(before, standard, name, value)
+            after = table.with_value(before, standard, name, value)
             self._write(before, after)
             return next(p.value for p in table.describe(after, standard) if p.name == name)
 
-    def _present(self) -> table.State:
+    def _present(self) -> table.ParameterValues:
         wind = self._wind or (self.host.wind if self.host is not None else self._usual_wind())
-        return table.State(self._limits, self._models, wind, self._battery, self._link)
+        return table.ParameterValues(self._limits, self._models, wind, self._battery, self._link)
 
-    def _standard(self) -> table.State:
-        return table.State(Limits(), self.options.cameras, self._usual_wind(), self.options.battery)
+    def _standard(self) -> table.ParameterValues:
+        return table.ParameterValues(Limits(), self.options.cameras, self._usual_wind(), self.options.battery)
 
     def _usual_wind(self) -> Wind:
         if self._world_wind is None:
             try:
                 world = self.host.simulation.world if self.host is not None else self.options.load_world()
             except SkyloopError:
-                return Wind()  # open() will say what is wrong with the world
+                return Wind()  # open() raises what is wrong with the world
             self._world_wind = self.options.blowing(world.wind)
         return self._world_wind
 
-    def _write(self, before: table.State, after: table.State) -> None:
+    def _write(self, before: table.ParameterValues, after: table.ParameterValues) -> None:
         host = self.host if self._sink is not None else None
         self._limits, self._models, self._battery = after.limits, after.cameras, after.battery
         for camera, model in zip(self._cameras, after.cameras, strict=False):
@@ -165,7 +178,7 @@ class SimDriver(Driver):
             self._switch_link(host, after.link)
 
     def _switch_link(self, host: SimHost, on: bool) -> None:
-        """The radio fails or works again. A drone that hears nothing holds its place, as real ones do."""
+        """Switch the simulated radio. A drone that receives nothing holds its position, as real ones do."""
         sink = self._sink
         if sink is None:
             return
@@ -180,35 +193,19 @@ class SimDriver(Driver):
     # Called by the host, on its threads ------------------------------------------------------------------------
 
     def report(self, report: Report) -> None:
-        """The drone's state, as it believes and as it is."""
+        """Publish the drone's state, as it believes it to be and as it is. On a thread of the host."""
         believed, sink = report.believed, self._sink
         self._battery = believed.battery
         state = believed.state
-        if self._set_points is not None:
-            self._set_points.supervise(believed)
-            state = self._set_points.told_state(state)
+        if self._setpoints is not None:
+            self._setpoints.on_feedback(believed)
+            state = self._setpoints.reported_state(state)
         if sink is None or not self._link:
             return
-        sink.feedback(
-            Feedback(
-                captured_ns=report.captured_ns,
-                state=state,
-                battery=believed.battery,
-                battery_v=believed.battery_v,
-                roll=believed.roll_rad,
-                pitch=believed.pitch_rad,
-                yaw=believed.yaw_rad,
-                altitude=believed.altitude_m,
-                velocity=believed.velocity_m_s,
-                angular_velocity=believed.angular_velocity_rad_s,
-                acceleration=believed.acceleration_m_s2,
-                position=report.truth.position_m if self.options.position else None,
-                native=self._native(report),
-            )
-        )
+        sink.feedback(feedback_of(report, state, self.options))
 
     def happened(self, occurrence: Occurrence) -> None:
-        """A collision, a crash, a battery that is low."""
+        """Emit a collision, an emergency or a low battery. On a thread of the host."""
         sink = self._sink
         if sink is None or not self._link:
             return
@@ -219,12 +216,18 @@ class SimDriver(Driver):
             sink.event(kind, occurrence.text, severity, reason=occurrence.text)
 
     def wants(self, camera: str) -> bool:
-        """Whether a picture of this camera would be seen by anybody."""
+        """Return whether anybody would see an image of this camera."""
         sink = self._sink
         return sink is not None and self._link and sink.wants(camera)
 
     def show(self, model: CameraModel, pixels: NDArray[np.uint8], captured_ns: int) -> None:
-        """A picture is due."""
+        """Publish an image that is due.
+
+        Args:
+            model: The camera.
+            pixels: BGR, uint8, shape (height, width, 3).
+            captured_ns: When it was captured, on this host's clock.
+        """
         sink = self._sink
         if sink is not None and self._link:
             sink.frame(
@@ -237,27 +240,7 @@ class SimDriver(Driver):
             )
 
     def failed(self, error: Exception) -> None:
-        """The simulation or the drawing raised."""
+        """Emit an event that the simulation or the renderer raised an error."""
         sink = self._sink
         if sink is not None:
             sink.event(EventKind.DRIVER_ERROR, f"the simulation failed: {error!r}", Severity.ERROR, where="simulation")
-
-    def _native(self, report: Report) -> dict[str, Value]:
-        native: dict[str, Value] = {"sim.time_s": report.truth.time_s}
-        if report.believed.emergency_reason:
-            native["emergency_reason"] = report.believed.emergency_reason
-        if not self.options.truth:
-            return native
-        truth = report.truth
-        native["truth.x"], native["truth.y"], native["truth.z"] = truth.position_m
-        native["truth.vx"], native["truth.vy"], native["truth.vz"] = truth.velocity_m_s
-        native["truth.roll"], native["truth.pitch"], native["truth.yaw"] = (
-            truth.roll_rad,
-            truth.pitch_rad,
-            truth.yaw_rad,
-        )
-        for number, target in enumerate(report.targets, 1):
-            name = "truth.target" if number == 1 else f"truth.target{number}"
-            native[f"{name}.x"], native[f"{name}.y"], native[f"{name}.z"] = target.position_m
-            native[f"{name}.yaw"] = target.yaw_rad
-        return native

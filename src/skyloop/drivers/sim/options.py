@@ -1,12 +1,12 @@
-"""What a ``sim://`` address asks for. Pure.
+"""Options of a ``sim://`` address. Pure.
 
 Options: ``world`` its name or file (``room``); ``seed`` (0); ``speed`` seconds of simulation a second (1); ``cameras``
 (``front,bottom``, or ``none``); ``width``, ``height``, ``fps`` of all cameras; ``latency`` of all cameras [s];
 ``noise`` a factor on every sensor's and camera's noise (1); ``wind`` a factor on the world's wind (1); ``battery``
 charge at the start, 0 to 1 (1); ``renderer`` what draws the pictures, ``planar`` or ``mujoco`` (``planar``);
 ``quality`` of the planar ones, ``fast``, ``smooth`` or ``best`` (``smooth``); ``native`` the actions that the vehicle
-itself takes, the others being left to the proxy (all); ``position`` whether the vehicle knows its place, as with an
-indoor positioning system (0); ``truth`` whether feedback carries the true state besides (1); ``rate`` of feedback
+itself takes, the others being left to the proxy (all); ``position`` whether the vehicle knows its position, as with an
+indoor positioning system (0); ``truth`` whether feedback carries the true state too (1); ``rate`` of feedback
 [1/s] (40); ``vehicle`` whose response it has, ``quadrotor`` or ``ardrone``, as identified (``quadrotor``).
 """
 
@@ -27,15 +27,20 @@ QUALITIES: Final = ("fast", "smooth", "best")
 RENDERERS: Final = ("planar", "mujoco")
 VEHICLES: Final = {"quadrotor": STANDARD_VEHICLE, "ardrone": AR_DRONE}
 ALWAYS_NATIVE: Final = frozenset({"idle", "emergency_stop", "reset_emergency"})
-_KNOWN: Final = {
+KNOWN: Final = {
     *("world", "seed", "speed", "cameras", "width", "height", "fps", "latency", "noise", "wind", "battery"),
     *("renderer", "quality", "native", "position", "truth", "rate", "vehicle"),
 }
 
 
 def options_of(uri: VehicleUri) -> SimOptions:
-    """From an address. Raises :class:`UsageError` for what makes no sense."""
-    reject_unknown_options(uri, _KNOWN)
+    """Parse an address.
+
+    Raises:
+        UnknownNameError: It has an unknown option, or an option has an unknown word as its value.
+        UsageError: An option's value makes no sense, or options don't go together.
+    """
+    reject_unknown_options(uri, KNOWN)
     if uri.place:
         raise UsageError(f"{uri}: a simulated drone has no place; did you mean sim://?world={uri.place}")
     options = uri.options
@@ -78,7 +83,7 @@ def _models(text: str) -> list[CameraModel]:
 
 
 def _camera(uri: VehicleUri, standard: CameraModel, noise: float) -> CameraModel:
-    """The standard camera over a picture of another size: the field of view across stays, rows are cut or added."""
+    """Return the standard camera with another size: the horizontal field of view stays, rows are cut or added."""
     width = uri.whole("width", 0, minimum=16, maximum=4096)
     height = uri.whole("height", 0, minimum=16, maximum=4096)
     width = width or (round(height * standard.width / standard.height) if height else standard.width)

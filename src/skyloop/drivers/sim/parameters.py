@@ -31,7 +31,7 @@ _CAMERA: Final = (
 
 
 @dataclass(frozen=True, slots=True)
-class State:
+class ParameterValues:
     """The values of all parameters of one drone."""
 
     limits: Limits
@@ -42,18 +42,23 @@ class State:
 
 
 @dataclass(frozen=True, slots=True)
-class _Entry:
+class _Settable:
     parameter: Parameter
-    write: Callable[[State, Value], State]
+    write: Callable[[ParameterValues, Value], ParameterValues]
 
 
-def describe(state: State, standard: State) -> list[Parameter]:
-    """All parameters with their present values; ``standard`` holds the defaults."""
+def describe(state: ParameterValues, standard: ParameterValues) -> list[Parameter]:
+    """Return all parameters with their present values; ``standard`` holds the defaults."""
     return [entry.parameter for entry in _table(state, standard).values()]
 
 
-def written(state: State, standard: State, name: str, value: Value) -> State:
-    """The state after writing one. Raises :class:`UnknownNameError` and :class:`ParameterError`."""
+def with_value(state: ParameterValues, standard: ParameterValues, name: str, value: Value) -> ParameterValues:
+    """Return the values after writing one.
+
+    Raises:
+        UnknownNameError: There is no such parameter.
+        ParameterError: It does not take this value.
+    """
     table = _table(state, standard)
     if name not in table:
         raise UnknownNameError("parameter of the simulated drone", name, table)
@@ -61,39 +66,39 @@ def written(state: State, standard: State, name: str, value: Value) -> State:
     return table[name].write(state, value)
 
 
-def _table(state: State, standard: State) -> dict[str, _Entry]:
+def _table(state: ParameterValues, standard: ParameterValues) -> dict[str, _Settable]:
     entries = [*_limit_entries(state, standard), *_camera_entries(state, standard), *_world_entries(state, standard)]
     return {entry.parameter.name: entry for entry in entries}
 
 
-def _limit_entries(state: State, standard: State) -> list[_Entry]:
-    def entry(name: str, field: str, unit: str, description: str) -> _Entry:
+def _limit_entries(state: ParameterValues, standard: ParameterValues) -> list[_Settable]:
+    def entry(name: str, field: str, unit: str, description: str) -> _Settable:
         now, usual = getattr(state.limits, field), getattr(standard.limits, field)
 
-        def write(before: State, value: Value) -> State:
+        def write(before: ParameterValues, value: Value) -> ParameterValues:
             return replace(before, limits=replace(before.limits, **{field: float(value)}))  # type: ignore[arg-type]
 
-        return _Entry(_number(name, now, usual, unit, LIMIT_RANGES[field], description), write)
+        return _Settable(_number(name, now, usual, unit, LIMIT_RANGES[field], description), write)
 
     return [entry(*row) for row in _LIMITS]
 
 
-def _camera_entries(state: State, standard: State) -> list[_Entry]:
-    def entry(at: int, last: str, field: str, unit: str, span: tuple[float, float], description: str) -> _Entry:
+def _camera_entries(state: ParameterValues, standard: ParameterValues) -> list[_Settable]:
+    def entry(at: int, last: str, field: str, unit: str, span: tuple[float, float], description: str) -> _Settable:
         model, usual = state.cameras[at], getattr(standard.cameras[at], field)
 
-        def write(before: State, value: Value) -> State:
+        def write(before: ParameterValues, value: Value) -> ParameterValues:
             change: dict[str, Any] = {field: _float(value)}
             changed = replace(before.cameras[at], **change)
             return replace(before, cameras=(*before.cameras[:at], changed, *before.cameras[at + 1 :]))
 
         name = f"camera.{model.name}.{last}"
-        return _Entry(_number(name, getattr(model, field), usual, unit, span, description), write)
+        return _Settable(_number(name, getattr(model, field), usual, unit, span, description), write)
 
     return [entry(at, *row) for at in range(len(state.cameras)) for row in _CAMERA]
 
 
-def _world_entries(state: State, standard: State) -> list[_Entry]:
+def _world_entries(state: ParameterValues, standard: ParameterValues) -> list[_Settable]:
     wind = Parameter(
         name="sim.wind",
         type=ParameterType.VECTOR,
@@ -115,10 +120,10 @@ def _world_entries(state: State, standard: State) -> list[_Entry]:
         description="whether the drone's radio works: without it nothing is heard, and commands are lost",
     )
     return [
-        _Entry(wind, lambda before, value: replace(before, wind=replace(before.wind, mean_m_s=_vector(value)))),
-        _Entry(gust, lambda before, value: replace(before, wind=replace(before.wind, gust_m_s=_float(value)))),
-        _Entry(battery, lambda before, value: replace(before, battery=_float(value))),
-        _Entry(link, lambda before, value: replace(before, link=bool(value))),
+        _Settable(wind, lambda before, value: replace(before, wind=replace(before.wind, mean_m_s=_vector(value)))),
+        _Settable(gust, lambda before, value: replace(before, wind=replace(before.wind, gust_m_s=_float(value)))),
+        _Settable(battery, lambda before, value: replace(before, battery=_float(value))),
+        _Settable(link, lambda before, value: replace(before, link=bool(value))),
     ]
 
 

@@ -7,15 +7,13 @@ from typing import Final
 from skyloop.clock import monotonic_ns
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.live_video import LiveVideo, Notice, Picture
-from skyloop.drivers.tello.cameras import cameras_of, intrinsics_for
-from skyloop.drivers.tello.decoding import TelloVideo
-from skyloop.drivers.tello.link import Link
+from skyloop.drivers.tello.link import TelloLink
 from skyloop.drivers.tello.options import options_of
-from skyloop.drivers.tello.session import Session
-from skyloop.drivers.tello.settings import DroneSettings
-from skyloop.drivers.tello.stream import VideoStream
+from skyloop.drivers.tello.parameters import DroneSettings
+from skyloop.drivers.tello.protocol import TelloSession
+from skyloop.drivers.tello.video import TelloVideo, VideoStream, cameras_of, intrinsics_for
 from skyloop.drivers.uri import VehicleUri
-from skyloop.drivers.vehicle_session import Telling
+from skyloop.drivers.vehicle_session import SinkCallback
 from skyloop.errors import DriverError, ParameterError
 from skyloop.messages import AnyAction, Capabilities, Parameter, Refusal, Value
 
@@ -31,13 +29,16 @@ class TelloDriver(Driver):
         super().__init__(uri)
         self.options = options_of(uri)
         self._cameras = cameras_of(uri)
-        self._link: Link | None = None
+        self._link: TelloLink | None = None
         self._settings: DroneSettings | None = None
         self._video: LiveVideo | None = None
         self._video_ns = 0  # when a picture came last
 
     def capabilities(self) -> Capabilities:
-        """The camera that looks down is announced though only SDK 3.0 can switch to it."""
+        """Return what the drone can do.
+
+        The camera that looks down is announced though only SDK 3.0 can switch to it.
+        """
         return Capabilities(
             vehicle="tello",
             actions=ACTIONS,
@@ -49,9 +50,11 @@ class TelloDriver(Driver):
 
     def _open(self, sink: Sink) -> None:
         if self.options.video:
-            TelloVideo()  # says now what is not installed
-        session = Session(self.options, monotonic_ns(), extra=self._video_telemetry, video_ns=lambda: self._video_ns)
-        self._link = Link(session, lambda tellings: self._deliver(sink, tellings))
+            TelloVideo()  # raises if PyAV is not installed
+        session = TelloSession(
+            self.options, monotonic_ns(), extra=self._video_telemetry, video_ns=lambda: self._video_ns
+        )
+        self._link = TelloLink(session, lambda pending: self._deliver(sink, pending))
         self._settings = DroneSettings(self._link)
         self._link.start()
 
@@ -62,10 +65,10 @@ class TelloDriver(Driver):
             self._video.stop()
         self._link = self._settings = self._video = None
 
-    def _deliver(self, sink: Sink, tellings: list[Telling]) -> None:
-        """On the link's thread."""
-        for telling in tellings:
-            telling(sink)
+    def _deliver(self, sink: Sink, pending: list[SinkCallback]) -> None:
+        """Run the session's callbacks. On the link's thread."""
+        for publish in pending:
+            publish(sink)
         link, settings = self._link, self._settings
         if self._video is not None or not self.options.video or link is None or settings is None:
             return
@@ -82,18 +85,23 @@ class TelloDriver(Driver):
     # Parameters ------------------------------------------------------------------------------------------------
 
     def parameters(self) -> list[Parameter]:
-        """Those that depend on the version of its SDK come once the drone told it."""
+        """Return the parameters. Those that depend on the version of the drone's SDK appear once it is known."""
         return [] if self._settings is None else self._settings.parameters()
 
     def set_parameter(self, name: str, value: Value) -> Value:
-        """Takes up to 0.95 s: the drone answers."""
+        """Write a parameter. Takes up to 0.95 s: the drone answers.
+
+        Raises:
+            UnknownNameError: There is no such parameter.
+            ParameterError: The driver is not open, the value does not fit, or the drone refused or did not answer.
+        """
         if self._settings is None:
             raise ParameterError(f"{self.uri} is not open", code=Refusal.VEHICLE_LINK_LOST)
         return self._settings.write(name, value)
 
     # Video -----------------------------------------------------------------------------------------------------
 
-    def _start_video(self, sink: Sink, link: Link, settings: DroneSettings) -> None:
+    def _start_video(self, sink: Sink, link: TelloLink, settings: DroneSettings) -> None:
         def show(picture: Picture) -> None:
             camera = settings.camera
             picture.show(sink, camera, intrinsics_for(self._cameras[0], camera, picture.width))

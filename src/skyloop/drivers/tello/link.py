@@ -1,112 +1,134 @@
-"""The sockets of one drone and the thread that serves them: commands at their pace, answers, state."""
+"""The sockets of one drone: commands and their answers, and state."""
 
 from __future__ import annotations
 
-import selectors
+import errno
 import socket
 from collections.abc import Callable
 from functools import partial
 from typing import Final
 
-from skyloop.clock import Clock, monotonic_ns, nanoseconds
-from skyloop.drivers.tello.session import Session
-from skyloop.drivers.tello.sockets import MAX_DATAGRAM, address_of, at, towards
+from skyloop.clock import Clock, monotonic_ns
+from skyloop.drivers.tello.options import TelloOptions
+from skyloop.drivers.tello.protocol import TelloSession
 from skyloop.drivers.vehicle_link import VehicleLink
-from skyloop.drivers.vehicle_session import Telling
-from skyloop.messages import AnyAction
+from skyloop.drivers.vehicle_session import SinkCallback
 
-BURST: Final = 32  #: datagrams that are read before commands get their turn
+_BUFFER: Final = 1 << 20  # half a second of video
+
+
+def command_socket(options: TelloOptions, address: str) -> socket.socket:
+    """Return a socket that sends commands and receives their answers, from the drone's port alone.
+
+    Args:
+        options: Of the vehicle's address.
+        address: The drone's.
+
+    Raises:
+        OSError: It can't be opened.
+    """
+    made = _through(options)
+    try:
+        made.bind((options.local or "", 0))
+        made.connect((address, options.port))
+    except OSError:
+        made.close()
+        raise
+    return made
+
+
+def receiving_socket(options: TelloOptions, local: str, port: int) -> socket.socket:
+    """Return a socket that receives what comes to a port of this host, from anybody: check the sender.
+
+    Args:
+        options: Of the vehicle's address.
+        local: This host's address.
+        port: UDP.
+
+    Raises:
+        OSError: The port is in use, or can't be opened.
+    """
+    made = _through(options)
+    try:
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
+        made.bind((local, port))
+    except OSError as error:
+        made.close()
+        if error.errno == errno.EADDRINUSE:
+            raise OSError(
+                error.errno,
+                f"UDP port {port} of {local} is in use: end the other program, or see how docs/tello.md flies several",
+            ) from error
+        raise
+    return made
+
+
+def _through(options: TelloOptions) -> socket.socket:
+    made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    made.setblocking(False)
+    if options.interface is not None:
+        try:
+            made.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, options.interface.encode() + b"\0")
+        except OSError as error:
+            made.close()
+            raise OSError(error.errno, f"interface {options.interface}: {error.strerror}") from error
+    return made
+
+
 ASK_S: Final = 0.95  #: a command is answered within this, or it failed
-RENEW_NS: Final = nanoseconds(2.0)  #: pace of new sockets while nothing is heard: this host's address may have changed
 
 
-class Link(VehicleLink[Session]):
-    """As :class:`VehicleLink`."""
+class TelloLink(VehicleLink[TelloSession]):
+    """Commands with their answers, and state, of one drone.
 
-    def __init__(self, session: Session, deliver: Callable[[list[Telling]], None], clock: Clock = monotonic_ns) -> None:
+    Args:
+        session: The drone's protocol.
+        deliver: Called on the link's thread with what the session has for the sink.
+        clock: Monotonic, ns.
+    """
+
+    def __init__(
+        self, session: TelloSession, deliver: Callable[[list[SinkCallback]], None], clock: Clock = monotonic_ns
+    ) -> None:
         super().__init__("skyloop-tello", session, deliver, clock)
         self.addresses: tuple[str, str] | None = None  #: the drone's, and this host's towards it
         self._commands: socket.socket | None = None
         self._states: socket.socket | None = None
-        self._renewed_ns = -RENEW_NS
 
     # From the proxy's threads ----------------------------------------------------------------------------------
 
-    def command(self, action: AnyAction) -> AnyAction:
-        """Decide, and say it at once unless the last ``rc`` was just sent."""
-        return self._decided(partial(self.session.command, action))
-
     def ask(self, text: str) -> str | None:
-        """Say a command and wait for its answer; None if none came. Takes up to 0.95 s."""
-        return self._answer(partial(self.session.ask, text), ASK_S, None)
+        """Send a command and wait for its answer, up to 0.95 s; None if none came. Any thread but the link's."""
+        return self._wait_for_answer(partial(self.session.ask, text), ASK_S, None)
 
     # On the link's thread --------------------------------------------------------------------------------------
 
-    def _release(self) -> None:
-        with self.lock:
-            self._close_sockets()
-
-    def _receive(self, ready: object) -> None:
-        commands, states = self._commands, self._states
-        if commands is not None and ready is commands:
-            self._read(commands, self.session.reply_heard)
-        elif states is not None and ready is states:
-            self._read(states, self.session.state_heard)
-
-    def _read(self, port: socket.socket, heard: Callable[[bytes, int], None]) -> None:
-        for _ in range(BURST):
-            try:
-                datagram, sender = port.recvfrom(MAX_DATAGRAM)
-            except BlockingIOError:
-                return
-            except OSError as error:
-                with self.lock:
-                    self.session.unreachable(error.strerror or str(error))
-                return
-            if self.addresses is not None and sender[0] == self.addresses[0]:
-                with self.lock:
-                    heard(datagram, self._clock())
-
-    def _say(self, now_ns: int) -> None:
-        for datagram in self.session.tick(now_ns):
-            if self._commands is None:
-                return
-            try:
-                self._commands.send(datagram)
-            except BlockingIOError:
-                pass  # lost, like any datagram may be
-            except OSError as error:
-                self.session.unreachable(error.strerror or str(error))
-
-    # Sockets ---------------------------------------------------------------------------------------------------
-
-    def _renew(self) -> None:
-        """Make them, and make them anew now and then while the drone is not heard."""
-        now_ns = self._clock()
-        with self.lock:
-            if self.session.is_heard or now_ns - self._renewed_ns < RENEW_NS:
-                return
-            self._renewed_ns = now_ns
-            self._close_sockets()
-            try:
-                self._open_sockets()
-            except OSError as error:
-                self._close_sockets()
-                self.session.unreachable(error.strerror or str(error))
-
     def _open_sockets(self) -> None:
         options = self.session.options
-        address = address_of(options)
-        self._commands = towards(options, address)
-        self._selector.register(self._commands, selectors.EVENT_READ)
-        local = str(self._commands.getsockname()[0])
-        self._states = at(options, local, options.state_port)
-        self._selector.register(self._states, selectors.EVENT_READ)
-        self.addresses = address, local
+        with self.lock:
+            self._close_sockets()  # first: the new one for state has the same port
+        address = self._lookup.address(options.host)
+        commands = command_socket(options, address)
+        local = str(commands.getsockname()[0])
+        try:
+            states = receiving_socket(options, local, options.state_port)
+        except OSError:
+            commands.close()
+            raise
+        with self.lock:
+            self._commands, self._states = commands, states
+            self.addresses = address, local
+            self.session.local = local
+        self._watch(commands, lambda: self._read_datagrams(commands, self.session.on_reply, address))
+        self._watch(states, lambda: self._read_datagrams(states, self.session.on_state, address))
 
     def _close_sockets(self) -> None:
         for port in (self._commands, self._states):
             if port is not None:
-                self._selector.unregister(port)
-                port.close()
+                self._forget(port)
         self._commands = self._states = None
+
+    def _send_due(self, now_ns: int) -> None:
+        for datagram in self.session.poll(now_ns):
+            if self._commands is not None:
+                self._send_datagram(self._commands, datagram)

@@ -1,4 +1,4 @@
-"""What a ``tello://`` address asks for. Pure. ``docs/tello.md`` has the options as a table."""
+"""Options of a ``tello://`` address. Pure. ``docs/tello.md`` has them as a table."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _KNOWN: Final = {
 
 
 class VelocityAxes(StrEnum):
-    """Which axes the drone's ``vgx`` and ``vgy`` are along. The guides do not say."""
+    """Which axes the drone's ``vgx`` and ``vgy`` are along. The SDK's guides do not say."""
 
     START = "start"  #: x along the heading that it was switched on with
     BODY = "body"  #: x along its nose
@@ -33,7 +33,7 @@ class VelocityAxes(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class TelloOptions:
-    """An address, understood."""
+    """A parsed address."""
 
     host: str
     local: str | None = None  #: this host's address to talk from, and to be sent to
@@ -52,7 +52,12 @@ class TelloOptions:
 
 
 def options_of(uri: VehicleUri) -> TelloOptions:
-    """From an address. Raises :class:`UsageError` for what makes no sense."""
+    """Parse an address.
+
+    Raises:
+        UnknownNameError: It has an unknown option, or unknown ``velocity_axes``.
+        UsageError: It names no host, or an option's value makes no sense.
+    """
     reject_unknown_options(uri, _KNOWN)
     if not uri.place:
         raise UsageError(f"{uri} names no host: it looks like tello://192.168.10.1")

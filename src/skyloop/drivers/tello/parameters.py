@@ -1,6 +1,6 @@
-"""The driver's and the drone's settings as parameters. Pure.
+"""Settings of the driver and of the drone as parameters, and how they are written.
 
-The drone can't be asked what is set: what was written last is shown, and said again after the drone was lost.
+The drone can't be asked what is set: what was written last is shown, and sent again after the drone was lost.
 """
 
 from __future__ import annotations
@@ -8,11 +8,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Final
 
-from skyloop.drivers.tello.cameras import BOTTOM, FRONT
-from skyloop.drivers.tello.sticks import Scale
+import msgspec
+
+from skyloop.drivers.tello.link import TelloLink
+from skyloop.drivers.tello.setpoints import Scale
+from skyloop.drivers.tello.video import BOTTOM, FRONT
 from skyloop.errors import ParameterError, UnknownNameError
 from skyloop.messages import Parameter, ParameterType, Refusal, Value
 from skyloop.wire.tello.commands import Sdk
+from skyloop.wire.tello.replies import is_error
 
 NO_FLIP: Final = "none"
 FLIPS: Final = {"left": "l", "right": "r", "forward": "f", "back": "b"}
@@ -23,7 +27,7 @@ _GREATEST: Final = 10.0
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """One that the drone keeps: its parameter, since which SDK it is there, and the command of each value."""
+    """A setting that the drone keeps: its parameter, the first SDK that has it, and the command of each value."""
 
     parameter: Parameter
     since: Sdk
@@ -97,7 +101,7 @@ FULL: Final = "tello.full_stick."
 
 
 def scale_parameters(limits: Scale, full: Scale) -> list[Parameter]:
-    """What is asked for at most, and what a full stick is taken for."""
+    """Return the parameters of the greatest set-points, and of what a full stick comes to."""
     usual = Scale()
     made = []
     for name, field, unit, (low, high), text in _SCALES:
@@ -115,7 +119,11 @@ def scale_parameters(limits: Scale, full: Scale) -> list[Parameter]:
 
 
 def scaled(scale: Scale, parameter: Parameter, value: Value) -> Scale:
-    """With this one changed. Raises :class:`ParameterError`."""
+    """Return a scale with one number changed.
+
+    Raises:
+        ParameterError: The value is no number or out of the parameter's range.
+    """
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise ParameterError(f"{parameter.name} takes a number, not {value!r:.60}", code=Refusal.WRONG_TYPE)
     low, high = parameter.minimum, parameter.maximum
@@ -127,7 +135,7 @@ def scaled(scale: Scale, parameter: Parameter, value: Value) -> Scale:
 
 
 def flip_parameter(value: str) -> Parameter:
-    """Writing it flips the drone."""
+    """Return the parameter whose writing flips the drone."""
     return Parameter(
         FLIP,
         ParameterType.TEXT,
@@ -139,7 +147,7 @@ def flip_parameter(value: str) -> Parameter:
 
 
 def told_parameters(sdk: Sdk | None, serial: str) -> list[Parameter]:
-    """What the drone said of itself."""
+    """Return what the drone reported of itself, read-only."""
     made = []
     if sdk is not None:
         made.append(
@@ -155,12 +163,16 @@ def told_parameters(sdk: Sdk | None, serial: str) -> list[Parameter]:
 
 
 def known_settings(sdk: Sdk | None) -> dict[str, Setting]:
-    """Those that this version has."""
+    """Return the settings that this version of the SDK has; none while it is not known."""
     return {name: setting for name, setting in SETTINGS.items() if sdk is not None and sdk.knows(setting.since)}
 
 
 def command_of(setting: Setting, value: Value) -> str:
-    """What sets it. Raises :class:`ParameterError`."""
+    """Return the command that sets a value.
+
+    Raises:
+        ParameterError: The value is of another type, or none of the choices.
+    """
     parameter = setting.parameter
     if type(value) is not type(parameter.value):
         raise ParameterError(
@@ -170,3 +182,92 @@ def command_of(setting: Setting, value: Value) -> str:
         names = [str(choice) for choice in setting.commands]
         raise ParameterError(str(UnknownNameError(parameter.name, str(value), names)), code=Refusal.OUT_OF_RANGE)
     return setting.commands[value]
+
+
+class DroneSettings:
+    """The values of all parameters. Those of the drone are written through the link.
+
+    Args:
+        link: To the drone.
+    """
+
+    def __init__(self, link: TelloLink) -> None:
+        self._link = link
+        self._values: dict[str, Value] = {name: setting.parameter.value for name, setting in SETTINGS.items()}
+        self._values["tello.mission_pads"] = link.session.options.pads
+        self._flip = NO_FLIP
+
+    @property
+    def camera(self) -> str:
+        """The camera whose pictures come."""
+        return str(self._values[CAMERA])
+
+    def parameters(self) -> list[Parameter]:
+        """Return all parameters with their present values."""
+        with self._link.lock:
+            session = self._link.session
+            setpoints, sdk, serial = session.setpoints, session.sdk, session.serial
+            scales = scale_parameters(setpoints.limits, setpoints.full)
+        kept = [
+            msgspec.structs.replace(setting.parameter, value=self._values[name])
+            for name, setting in known_settings(sdk).items()
+        ]
+        return [*scales, flip_parameter(self._flip), *kept, *told_parameters(sdk, serial)]
+
+    def write(self, name: str, value: Value) -> Value:
+        """Write a parameter and return the value in force. Takes up to 0.95 s.
+
+        Raises:
+            UnknownNameError: There is no such parameter.
+            ParameterError: It is read-only, the value does not fit, a flip is asked for on the ground, or the drone
+                refused or did not answer.
+        """
+        known = {parameter.name: parameter for parameter in self.parameters()}
+        if name not in known:
+            raise UnknownNameError("parameter of the Tello", name, known)
+        parameter = known[name]
+        if parameter.read_only:
+            raise ParameterError(f"{name} can only be read", code=Refusal.READ_ONLY)
+        if name.startswith((LIMITS, FULL)):
+            return self._scale(parameter, value)
+        if name == FLIP:
+            return self._do_flip(value)
+        return self._configure(SETTINGS[name], value)
+
+    def _scale(self, parameter: Parameter, value: Value) -> Value:
+        with self._link.lock:
+            setpoints = self._link.session.setpoints
+            if parameter.name.startswith(LIMITS):
+                setpoints.limits = scaled(setpoints.limits, parameter, value)
+            else:
+                setpoints.full = scaled(setpoints.full, parameter, value)
+        assert isinstance(value, int | float)
+        return float(value)
+
+    def _do_flip(self, value: Value) -> Value:
+        if value != NO_FLIP and value not in FLIPS:
+            raise ParameterError(str(UnknownNameError(FLIP, str(value), FLIPS)), code=Refusal.OUT_OF_RANGE)
+        if value != NO_FLIP:
+            with self._link.lock:
+                session = self._link.session
+                if not session.setpoints.watch.in_air:
+                    raise ParameterError("a flip is for a drone in the air: take off first", code=Refusal.WRONG_STATE)
+                session.flip(FLIPS[str(value)])
+        self._flip = str(value)
+        return value
+
+    def _configure(self, setting: Setting, value: Value) -> Value:
+        command = command_of(setting, value)
+        reply = self._link.ask(command)
+        name = setting.parameter.name
+        if reply is None:
+            raise ParameterError(
+                f"{name}: the drone did not answer {command!r}; it answers nothing while it takes off or lands",
+                code=Refusal.DRIVER_FAILED,
+            )
+        if is_error(reply):
+            raise ParameterError(f"{name}: the drone answers {command!r} with {reply!r}")
+        self._values[name] = value
+        with self._link.lock:
+            self._link.session.remembered[name] = command
+        return value

@@ -1,10 +1,11 @@
-"""Decodes the frames of a PaVE stream with PyAV, which is imported here and nowhere else."""
+"""Decodes the frames of a PaVE stream with PyAV, which only this module of the drivers imports at its top."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, Literal
 
 from skyloop.errors import MissingExtraError
+from skyloop.pyav import limit_memory, new_decoder
 from skyloop.wire.ardrone.pave import Codec, PaveFrame
 
 try:
@@ -14,26 +15,19 @@ except ImportError as error:
     raise MissingExtraError("video://", "video", cause=str(error)) from error
 
 if TYPE_CHECKING:
-    from av.codec.context import CodecContext
     from av.video.codeccontext import VideoCodecContext
 
 __all__ = ["PaveDecoder", "av", "limit_memory"]
 
-MAX_PIXELS: Final = 7680 * 4320
 _DECODERS: Final[dict[int, Literal["mpeg4", "h264"]]] = {Codec.MPEG4_VISUAL: "mpeg4", Codec.MPEG4_AVC: "h264"}
 # FFmpeg refuses an MPEG-4 frame now and then that is padded by a single bit, unless the sequence's end follows.
 _ENDS: Final = {int(Codec.MPEG4_VISUAL): b"\0\0\1\xb1"}
 
 
-def limit_memory(context: CodecContext) -> None:
-    """A damaged header must not make the decoder ask for gigabytes."""
-    context.options = {**context.options, "max_pixels": str(MAX_PIXELS)}
-
-
 class PaveDecoder:
-    """Frames of a PaVE stream to pictures, one in and at most one out, without delay.
+    """Decodes frames of a PaVE stream, one in and at most one picture out, without delay.
 
-    Gives nothing before the first key frame (a stream torn open, or the stale frame with which the drone greets), and
+    Gives nothing before the first key frame (a stream torn open, or the stale frame that the drone sends first), and
     after damage or a gap in the frames' numbers nothing up to the next key frame: those pictures would be smeared.
     ``waited`` counts frames left out for that, ``damaged`` those that could not be decoded.
 
@@ -49,11 +43,11 @@ class PaveDecoder:
         self._number = 0  # of the frame before
 
     def restart(self) -> None:
-        """What comes next does not continue what came before: wait for a key frame."""
+        """Wait for a key frame: what comes next does not continue what came before."""
         self._needs_key = True
 
     def decode(self, frame: PaveFrame) -> av.VideoFrame | None:
-        """The picture of this frame, or None. Never raises for what a frame holds."""
+        """Return the picture of a frame, or None. Never raises, whatever a frame holds."""
         follows = frame.number == self._number + 1 & 0xFFFFFFFF and frame.codec == self._codec
         self._needs_key = self._needs_key or frame.after_damage or not follows
         self._number = frame.number
@@ -76,21 +70,14 @@ class PaveDecoder:
         return images[-1]
 
     def _start(self, codec: int) -> None:
-        """A fresh decoder: what an old one remembers of the pictures before the damage must not show."""
+        """Make a fresh decoder: what an old one remembers of the pictures before the damage must not show."""
         self._codec, self._context = codec, None
         name = _DECODERS.get(codec)
         if name is None:
             return
-        context = av.CodecContext.create(name, "r")
-        # A frame with errors is refused instead of patched up, and one of H.264 also if bits of it are left over: the
-        # like of it would refuse every end of an MPEG-4 sequence.
-        context.options = {"err_detect": "explode+aggressive" if codec == Codec.MPEG4_AVC else "explode"}
-        limit_memory(context)
-        context.flags |= av.codec.context.Flags.low_delay
-        context.thread_count = 1  # frame threads would hold pictures back
-        self._context, self._needs_key = context, False
+        self._context, self._needs_key = new_decoder(name, "video://"), False
 
 
 def _fits(image: av.VideoFrame, frame: PaveFrame) -> bool:
-    """Whether an H.264 picture has the size that its header says. Of MPEG-4 it is not known what real drones do."""
+    """Return whether an H.264 picture has the size that its header says. Real drones' MPEG-4 is not known."""
     return frame.codec != Codec.MPEG4_AVC or (image.width, image.height) == (frame.width, frame.height)

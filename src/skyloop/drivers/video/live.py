@@ -1,4 +1,4 @@
-"""What PyAV opens live, a network's stream or a device, as :class:`skyloop.drivers.live_video.LiveVideo` takes it.
+"""Live video that PyAV opens, from the network or a device, for :class:`skyloop.drivers.live_video.LiveVideo`.
 
 Every error of opening and reading is an OSError that says why in words.
 """
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from av.container import InputContainer
     from av.video.codeccontext import VideoCodecContext
 
-HOPELESS_S: Final = 3.0  #: of pieces that can't be decoded, and no picture between them, before it is told
-#: So many pictures later a picture comes out of FFmpeg than its first byte came in: where one ends shows when the next
-#: begins, and a transport stream's packets end in the same way once more.
+HOPELESS_S: Final = 3.0  #: how long nothing can be decoded before it is reported
+#: How many pictures FFmpeg holds back: where one ends shows when the next begins, and a transport stream's packets end
+#: in the same way once more.
 _HELD_BACK: Final = {"rtsp": 1, "h264": 1, "hevc": 1, "mpegts": 2}
 _REORDERED_NS: Final = 1_000_000_000  # a step back of the stamps up to this is one of B pictures, not a clock set back
 _NO_STAMPS: Final[Any] = av.format.Flags.no_timestamps.value
@@ -33,7 +33,7 @@ _NO_STAMPS: Final[Any] = av.format.Flags.no_timestamps.value
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Piece:
-    """A picture's bytes, and what it takes to decode them and to know when they were taken."""
+    """A picture's bytes, and what it takes to decode them and to know when they were captured."""
 
     packet: av.Packet[av.VideoStream]
     context: VideoCodecContext  # of its connection
@@ -42,13 +42,23 @@ class Piece:
 
 
 class ContainerStream:
-    """One connection to whatever PyAV opens. :meth:`read` takes up to ``read_s``: FFmpeg can't be called back earlier.
+    """One connection to whatever PyAV opens.
 
-    ``open_s`` is for the connection, the handshake and the size of the pictures, all together, but not for a device
-    that hangs. Raises OSError.
+    Args:
+        name: What FFmpeg opens: an address or a path.
+        connection: Its number.
+        clock: Monotonic, ns.
+        format_name: FFmpeg's format; None: it finds out.
+        options: FFmpeg's.
+        open_s: For the connection, the handshake and the size of the pictures, all together; a device that hangs takes
+            longer.
+        read_s: For the next picture. FFmpeg can't be interrupted earlier, so :meth:`read` takes up to this.
+
+    Raises:
+        OSError: It can't be opened, or holds no video that is known here.
     """
 
-    broken = 0  # FFmpeg does not say what of a stream it throws away
+    broken = 0  # FFmpeg does not report what it throws away
     lost_bytes = 0
 
     def __init__(
@@ -87,6 +97,11 @@ class ContainerStream:
         self._offset_ns = 0
 
     def read(self) -> list[Coded]:
+        """Return the next picture, as a list of one.
+
+        Raises:
+            OSError: The stream ended, failed, or gave nothing for ``read_s``.
+        """
         try:
             packet = next(self._packets, None)
         except av.error.ExitError as error:
@@ -106,10 +121,11 @@ class ContainerStream:
         return [Coded(piece, is_key, captured_ns, now_ns, self._connection)]
 
     def close(self) -> None:
+        """Close the connection."""
         self._container.close()
 
     def _chosen(self) -> tuple[VideoCodecContext, Iterator[av.Packet[av.VideoStream]]]:
-        """The first video, ready to be read and decoded."""
+        """Return the first video, ready to be read and decoded."""
         videos = self._container.streams.video
         if not videos:
             raise ConnectionError("what comes holds no video")
@@ -122,7 +138,7 @@ class ContainerStream:
         return context, self._container.demux(videos[0])
 
     def _offset(self, packet: av.Packet[av.VideoStream]) -> int | None:
-        """From the stream's stamps to the clock: the smallest seen lately."""
+        """Return the offset from the stream's stamps to the clock: the smallest seen lately."""
         stamp_ns = _stamp_ns(packet)
         if stamp_ns is None or self._container.format.flags & _NO_STAMPS:
             return None
@@ -133,7 +149,10 @@ class ContainerStream:
 
 
 class LiveDecoder:
-    """Pictures of one connection after the other. FFmpeg leaves out what comes before the first key picture itself."""
+    """Decodes one connection after the other.
+
+    FFmpeg itself leaves out what comes before the first key picture.
+    """
 
     def __init__(self) -> None:
         self.waited = 0
@@ -143,11 +162,16 @@ class LiveDecoder:
         self._shown = 0
 
     def restart(self) -> None:
-        """What comes next does not continue what came before."""
+        """Forget the stream so far: the next picture does not continue it."""
         self._before = None
         self._failing_ns = None
 
     def decode(self, coded: Coded, *, show: bool) -> Decoded | None:
+        """See :class:`skyloop.drivers.live_video.Decoder`.
+
+        Raises:
+            UnsupportedError: Nothing could be decoded for :data:`HOPELESS_S`.
+        """
         piece = coded.data
         if not isinstance(piece, Piece):
             raise TypeError("a piece of a live stream is wanted")
@@ -190,7 +214,7 @@ def _stamp_ns(timed: av.Packet[av.VideoStream] | av.VideoFrame) -> int | None:
 
 
 def _os_error(error: Exception) -> OSError:
-    """In words, without the address, which may hold a password."""
+    """Return an error in words, without the address, which may hold a password."""
     if isinstance(error, av.error.InvalidDataError):
         return ConnectionError("what comes is no video that is known here")
     return ConnectionError(getattr(error, "strerror", None) or str(error) or repr(error))

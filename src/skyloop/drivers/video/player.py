@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from skyloop.clock import monotonic_ns, nanoseconds, seconds
 from skyloop.drivers.base import Sink
-from skyloop.drivers.video.pacing import FilePacer, LiveClock
-from skyloop.drivers.video.sources import Picture, Source
+from skyloop.drivers.live_clock import LiveClock
+from skyloop.drivers.video.sources import DecodedImage, Source
 from skyloop.errors import SkyloopError
 from skyloop.messages import EventKind, Feedback, Intrinsics, LinkState, Severity, Value
 from skyloop.wire.ardrone.pave import PaveFrame
@@ -20,11 +20,51 @@ from skyloop.wire.ardrone.pave import PaveFrame
 FEEDBACK_NS: Final = 50_000_000
 POLL_S: Final = 0.02
 RETRY_S: Final = 1.0
-LATE_NS: Final = 100_000_000  #: a live picture older than this is passed over for a newer one
+BEHIND_NS: Final = 250_000_000  #: further behind than this, a schedule starts anew instead of rushing to catch up
+GAP_S: Final = 2.0  #: a longer step between two stamps, or one backwards, is a cut in the recording
+LATE_NS: Final = 100_000_000  #: a live picture older than this is skipped for a newer one
 
 
-class Screen:
-    """Puts pictures and feedback of one camera into a sink, and waits between them."""
+class FilePacer:
+    """Maps a recording's own time stamps to the times at which its pictures are shown.
+
+    Times never go backwards. A stamp that jumps (a cut, a clock that was set) counts as one usual period.
+
+    Args:
+        speed: Seconds of the recording in a second.
+        period_s: The usual step between two stamps.
+    """
+
+    def __init__(self, speed: float, period_s: float) -> None:
+        self._speed = speed
+        self._period_s = period_s
+        self._stamp_s: float | None = None
+        self._due_ns = 0
+
+    def due_ns(self, stamp_s: float, now_ns: int) -> int:
+        """Return when to show the image of this stamp; ``now_ns`` is when it was ready."""
+        if self._stamp_s is None:
+            self._due_ns = now_ns
+        else:
+            step_s = stamp_s - self._stamp_s
+            if not 0.0 <= step_s <= GAP_S:
+                step_s = self._period_s
+            self._due_ns += nanoseconds(step_s / self._speed)
+            if now_ns - self._due_ns > BEHIND_NS:
+                self._due_ns = now_ns
+        self._stamp_s = stamp_s
+        return self._due_ns
+
+
+class CameraPublisher:
+    """Publishes images and feedback of one camera to a sink, and waits between them.
+
+    Args:
+        sink: The proxy's.
+        camera: Its name.
+        intrinsics: Returns those for a width and height.
+        stop: Set when the driver is closed.
+    """
 
     def __init__(
         self, sink: Sink, camera: str, intrinsics: Callable[[int, int], Intrinsics | None], stop: threading.Event
@@ -42,25 +82,26 @@ class Screen:
 
     @property
     def wanted(self) -> bool:
+        """Whether somebody wants the decoded images."""
         return self.sink.wants(self._camera)
 
     @property
-    def recorded(self) -> bool:
-        """Whether somebody wants the pictures as they come."""
+    def wanted_encoded(self) -> bool:
+        """Whether somebody wants the images as they were encoded."""
         return self.sink.wants_stream(self._camera)
 
     def wait_until(self, due_ns: int) -> bool:
-        """Wait, with feedback meanwhile. False if the driver is being closed."""
+        """Wait, and publish feedback meanwhile. Return False if the driver is being closed."""
         while not self.stop.is_set():
             now_ns = monotonic_ns()
-            self.tell_state(now_ns)
+            self.publish_state(now_ns)
             if now_ns >= due_ns:
                 return True
             self.stop.wait(seconds(min(due_ns, self._feedback_ns) - now_ns))
         return False
 
-    def tell_state(self, now_ns: int, *, at_once: bool = False) -> None:
-        """Feedback, if it is time for it. A thing that can't fly knows nothing but its place in the recording."""
+    def publish_state(self, now_ns: int, *, at_once: bool = False) -> None:
+        """Publish feedback, if it is due: where the recording is, and nothing else, as nothing flies."""
         if now_ns < self._feedback_ns and not at_once:
             return
         self._feedback_ns = now_ns + FEEDBACK_NS
@@ -72,15 +113,24 @@ class Screen:
         }
         self.sink.feedback(Feedback(captured_ns=now_ns, native=native))
 
-    def show(self, picture: Picture, due_ns: int | None, captured_ns: int) -> bool:
-        """Convert now, hand over when it is due. False if the driver is being closed."""
-        pixels = _bgr(picture) if self.wanted else None
+    def show(self, image: DecodedImage, due_ns: int | None, captured_ns: int) -> bool:
+        """Convert an image now and publish it when it is due.
+
+        Args:
+            image: The image.
+            due_ns: When to publish it; None: at once.
+            captured_ns: Its capture time.
+
+        Returns:
+            False if the driver is being closed.
+        """
+        pixels = _bgr(image) if self.wanted else None
         if due_ns is not None and not self.wait_until(due_ns):
             return False
         self.shown += 1
-        self._position_s = picture.stamp_s
-        if picture.coded is not None:
-            self._hand_on(picture.coded, captured_ns)
+        self._position_s = image.stamp_s
+        if image.coded is not None:
+            self._publish_encoded(image.coded, captured_ns)
         if pixels is not None:
             height, width = pixels.shape[:2]
             self.sink.frame(
@@ -93,9 +143,9 @@ class Screen:
             )
         return not self.stop.is_set()
 
-    def _hand_on(self, coded: PaveFrame, captured_ns: int) -> None:
-        """As it came. Each that was decoded builds on the one decoded before it, or is a key."""
-        self._streaming = self.recorded and (self._streaming or coded.is_key)
+    def _publish_encoded(self, coded: PaveFrame, captured_ns: int) -> None:
+        """Publish an image as it was encoded. Each builds on the one decoded before it, or is a key."""
+        self._streaming = self.wanted_encoded and (self._streaming or coded.is_key)
         if self._streaming:
             self.sink.stream(
                 self._camera,
@@ -109,20 +159,34 @@ class Screen:
 
 
 class FilePlayer:
-    """Plays a recording once, or with ``loop`` again and again."""
+    """Plays a recording once, or with ``loop`` again and again.
 
-    def __init__(self, screen: Screen, open_source: Callable[[], Source], *, loop: bool, speed: float) -> None:
-        self._screen = screen
+    Args:
+        publisher: Publishes the images.
+        open_source: Opens the recording for another pass.
+        loop: Whether it starts over at the end.
+        speed: Seconds of the recording in a second.
+    """
+
+    def __init__(
+        self, publisher: CameraPublisher, open_source: Callable[[], Source], *, loop: bool, speed: float
+    ) -> None:
+        self._publisher = publisher
         self._open = open_source
         self._loop = loop
         self._speed = speed
 
     def run(self, source: Source, *, wait: bool) -> None:
-        """Until the end or until the driver is closed. ``wait``: start when somebody looks. Closes the source."""
-        screen = self._screen
-        screen.sink.link(LinkState.UP)
-        while wait and not (screen.wanted or screen.recorded):
-            if not screen.wait_until(monotonic_ns() + nanoseconds(POLL_S)):
+        """Play until the end, or until the driver is closed, and close the source.
+
+        Args:
+            source: The first pass over the recording.
+            wait: Whether to wait until somebody wants the images.
+        """
+        publisher = self._publisher
+        publisher.sink.link(LinkState.UP)
+        while wait and not (publisher.wanted or publisher.wanted_encoded):
+            if not publisher.wait_until(monotonic_ns() + nanoseconds(POLL_S)):
                 break
         while True:
             try:
@@ -131,50 +195,56 @@ class FilePlayer:
                 source.close()
             if not again:
                 return
-            screen.loops += 1
+            publisher.loops += 1
             try:
                 source = self._open()
             except SkyloopError as error:
-                screen.sink.link(LinkState.LOST, f"cannot start over: {error}")
+                publisher.sink.link(LinkState.LOST, f"cannot start over: {error}")
                 return
 
     def _pass(self, source: Source) -> bool:
-        """One time through. False if there shall be no other."""
-        screen = self._screen
+        """Play once through. Return whether to play again."""
+        publisher = self._publisher
         pacer = FilePacer(self._speed, 1.0 / source.fps)
-        before = screen.shown
-        for picture in source.pictures():
-            due_ns = pacer.due_ns(picture.stamp_s, monotonic_ns())
-            if not screen.show(picture, due_ns, due_ns):
+        before = publisher.shown
+        for image in source.images():
+            due_ns = pacer.due_ns(image.stamp_s, monotonic_ns())
+            if not publisher.show(image, due_ns, due_ns):
                 return False
-        if not screen.wait_until(monotonic_ns() + nanoseconds(1.0 / source.fps / self._speed)):
+        if not publisher.wait_until(monotonic_ns() + nanoseconds(1.0 / source.fps / self._speed)):
             return False
         if source.damaged:
-            screen.damaged += source.damaged
+            publisher.damaged += source.damaged
             text = f"{source.damaged} pieces of the recording are damaged and were left out"
-            screen.sink.event(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, damaged=source.damaged)
-        screen.tell_state(monotonic_ns(), at_once=True)
-        if screen.shown == before:
-            screen.sink.link(LinkState.LOST, "no picture of the recording can be decoded")
+            publisher.sink.event(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, damaged=source.damaged)
+        publisher.publish_state(monotonic_ns(), at_once=True)
+        if publisher.shown == before:
+            publisher.sink.link(LinkState.LOST, "no picture of the recording can be decoded")
             return False
         if not self._loop:
-            screen.sink.link(LinkState.CLOSED, f"end of the recording after {screen.shown} pictures")
+            publisher.sink.link(LinkState.CLOSED, f"end of the recording after {publisher.shown} pictures")
         return self._loop
 
 
 class LivePlayer:
-    """Shows a device's newest picture, and tries for ever to open a device that is not there."""
+    """Shows a device's newest image, and tries for ever to open a device that is not there.
 
-    def __init__(self, screen: Screen, open_source: Callable[[], Source], retry_s: float = RETRY_S) -> None:
-        self._screen = screen
+    Args:
+        publisher: Publishes the images.
+        open_source: Opens the device.
+        retry_s: Between attempts.
+    """
+
+    def __init__(self, publisher: CameraPublisher, open_source: Callable[[], Source], retry_s: float = RETRY_S) -> None:
+        self._publisher = publisher
         self._open = open_source
         self._retry_s = retry_s
 
     def run(self) -> None:
-        """Until the driver is closed."""
-        screen = self._screen
+        """Play until the driver is closed."""
+        publisher = self._publisher
         told = ""
-        while not screen.stop.is_set():
+        while not publisher.stop.is_set():
             try:
                 source = self._open()
             except SkyloopError as error:
@@ -182,20 +252,20 @@ class LivePlayer:
             else:
                 told = ""
                 try:
-                    if not screen.stop.is_set():  # opening may take longer than the driver was open
-                        screen.sink.link(LinkState.UP)
+                    if not publisher.stop.is_set():  # opening may take longer than the driver was open
+                        publisher.sink.link(LinkState.UP)
                         self._play(source)
                     reason = "the device ended its stream"
                 except SkyloopError as error:
                     reason = str(error)
                 finally:
                     source.close()
-            if screen.stop.is_set():
+            if publisher.stop.is_set():
                 return
             if reason != told:
-                screen.sink.link(LinkState.LOST, reason)
+                publisher.sink.link(LinkState.LOST, reason)
                 told = reason
-            screen.stop.wait(self._retry_s)
+            publisher.stop.wait(self._retry_s)
 
     def _play(self, source: Source) -> None:
         clock = LiveClock()
@@ -204,13 +274,13 @@ class LivePlayer:
             now_ns = monotonic_ns()
             return now_ns - clock.captured_ns(stamp_s, now_ns) > LATE_NS
 
-        for picture in source.pictures(late):
+        for image in source.images(late):
             now_ns = monotonic_ns()
-            self._screen.tell_state(now_ns)
-            if not self._screen.show(picture, None, clock.captured_ns(picture.stamp_s, now_ns)):
+            self._publisher.publish_state(now_ns)
+            if not self._publisher.show(image, None, clock.captured_ns(image.stamp_s, now_ns)):
                 return
 
 
-def _bgr(picture: Picture) -> NDArray[np.uint8]:
+def _bgr(image: DecodedImage) -> NDArray[np.uint8]:
     """Shape (h, w, 3), C-contiguous."""
-    return np.ascontiguousarray(picture.image.to_ndarray(format="bgr24"), dtype=np.uint8)
+    return np.ascontiguousarray(image.frame.to_ndarray(format="bgr24"), dtype=np.uint8)

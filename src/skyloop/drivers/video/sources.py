@@ -27,11 +27,11 @@ DEFAULT_FPS: Final = 30.0
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
-    """A decoded picture and its stamp on the stream's own clock [s]; not yet converted to BGR."""
+class DecodedImage:
+    """A decoded image and its stamp on the stream's own clock [s]; not yet converted to BGR."""
 
     stamp_s: float
-    image: av.VideoFrame
+    frame: av.VideoFrame
     coded: PaveFrame | None = None  #: what it was decoded from, if that is handed on as it came
 
 
@@ -47,17 +47,22 @@ class Source(Protocol):
     damaged: int  #: pieces that could not be decoded so far
     stream: str  #: codec in which pictures can be had as they come, ``h264``, or empty
 
-    def pictures(self, late: Late | None = None) -> Iterator[Picture]:
-        """The pictures in order, until the stream ends. Raises :class:`DriverError` when a device fails.
+    def images(self, late: Late | None = None) -> Iterator[DecodedImage]:
+        """Yield the pictures in order, until the stream ends.
 
-        A picture whose stamp is ``late`` is left undecoded, where no other picture depends on it.
+        Args:
+            late: Whether a picture of this stamp is too old to be shown. It is not decoded then, if no other picture
+                depends on it.
+
+        Raises:
+            DriverError: A device failed.
         """
 
     def close(self) -> None: ...
 
 
 def is_device(path: Path) -> bool:
-    """Whether the path names a device, there or not, rather than a file."""
+    """Return whether the path names a device, there or not, rather than a file."""
     if path.is_relative_to("/dev"):
         return True
     try:
@@ -67,7 +72,12 @@ def is_device(path: Path) -> bool:
 
 
 def open_file(path: Path) -> Source:
-    """Open a recording, whatever its format."""
+    """Open a recording, whatever its format.
+
+    Raises:
+        UsageError: It can't be read.
+        FileFormatError: It holds no video that is known here.
+    """
     try:
         with path.open("rb") as file:
             head = file.read(SNIFF)
@@ -81,12 +91,25 @@ def open_file(path: Path) -> Source:
 
 
 def open_device(path: Path, options: dict[str, str]) -> Source:
-    """Open a camera of this machine (Video4Linux). Raises :class:`DriverError` if it is not there or busy."""
+    """Open a camera of this machine (Video4Linux).
+
+    Args:
+        path: Such as ``/dev/video0``.
+        options: FFmpeg's, such as ``video_size``.
+
+    Raises:
+        DriverError: It is not there, or busy.
+    """
     return ContainerSource(str(path), "v4l2", options, live=True)
 
 
 class ContainerSource:
-    """Anything that PyAV opens."""
+    """Anything that PyAV opens.
+
+    Raises:
+        FileFormatError: A file can't be opened, or holds no video.
+        DriverError: A device can't be opened.
+    """
 
     def __init__(
         self, name: str, format_name: str | None = None, options: dict[str, str] | None = None, *, live: bool = False
@@ -113,7 +136,8 @@ class ContainerSource:
             self._container.close()
             raise FileFormatError(f"{name}: the size of its pictures is not told: it is damaged or cut off")
 
-    def pictures(self, late: Late | None = None) -> Iterator[Picture]:
+    def images(self, late: Late | None = None) -> Iterator[DecodedImage]:
+        """See :meth:`Source.images`."""
         independent = self._stream.codec_context.codec.intra_only
         stamp_s = -1.0 / self.fps
         for packet in self._packets():
@@ -129,7 +153,7 @@ class ContainerSource:
                     self.damaged += 1
                     continue
                 stamp_s = image.time if image.time is not None else stamp_s + 1.0 / self.fps
-                yield Picture(stamp_s, image)
+                yield DecodedImage(stamp_s, image)
 
     def _packets(self) -> Iterator[av.Packet[av.VideoStream]]:
         try:
@@ -140,6 +164,7 @@ class ContainerSource:
             self.damaged += 1  # a file that was cut off: what came so far was good
 
     def close(self) -> None:
+        """Close the file or device."""
         self._container.close()
 
     def _error(self, what: str, error: Exception) -> Exception:
@@ -154,6 +179,9 @@ class PaveSource:
 
     Pictures before the first key frame (a stream torn open, or the drone's stale first frame) and after damage up to
     the next key frame are left out: they would be smeared.
+
+    Raises:
+        FileFormatError: It holds no frame.
     """
 
     def __init__(self, path: Path) -> None:
@@ -170,15 +198,19 @@ class PaveSource:
         self.width, self.height, self.fps = first.width, first.height, DEFAULT_FPS
         self.stream = H264 if first.codec == Codec.MPEG4_AVC else ""
 
-    def pictures(self, late: Late | None = None) -> Iterator[Picture]:  # noqa: ARG002  every frame needs the one before
+    def images(self, late: Late | None = None) -> Iterator[DecodedImage]:  # noqa: ARG002  every frame needs the one before
+        """See :meth:`Source.images`. Every picture is decoded: each needs the one before."""
         decoder = PaveDecoder()
         for frame in self._parser_frames():
             image = decoder.decode(frame)
             self.damaged = decoder.damaged + self._parser.broken_frames
             if image is not None:
-                yield Picture(frame.timestamp_ms / 1000.0, image, frame if frame.codec == Codec.MPEG4_AVC else None)
+                yield DecodedImage(
+                    frame.timestamp_ms / 1000.0, image, frame if frame.codec == Codec.MPEG4_AVC else None
+                )
 
     def close(self) -> None:
+        """Close the file."""
         self._file.close()
 
     def _parser_frames(self) -> Iterator[PaveFrame]:

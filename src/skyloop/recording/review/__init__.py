@@ -1,1 +1,1 @@
-"""Looking at recorded flights: tables of their samples, a summary, a report, exports, comparisons, and mending."""
+"""Analysis of recorded flights: tables of their samples, a summary, a report, exports, comparisons, and recovery."""

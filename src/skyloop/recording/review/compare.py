@@ -1,4 +1,4 @@
-"""Two recordings' commands along time: what a changed controller does differently from the old one."""
+"""Comparison of two recordings' commands over time: what a changed controller does differently."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from skyloop.logfile.reader import Recording
 from skyloop.messages import Applied, Feedback
 from skyloop.recording.review.tables import ACTION_FIELDS, begin_ns
 
-RATE_HZ: Final = 100.0  #: at which both are compared; a command holds until the next one
-PART: Final = 0.01  #: set-points that differ by more than this [their SI unit] have parted
+RATE_HZ: Final = 100.0  #: rate at which both are compared; a command holds until the next one
+PART: Final = 0.01  #: greatest difference of set-points that are equal, in their SI unit
 _POSITION: Final = "replay.position_s"
 _UNITS: Final = {"roll": "rad", "pitch": "rad", "yaw_rate": "rad/s"}
 
@@ -32,7 +32,7 @@ class Commands:
     numbers: dict[str, NDArray[np.float64]]
 
     def at(self, times_s: NDArray[np.float64]) -> Commands:
-        """What was in force at these times: the newest command; none before the first."""
+        """Return the commands in force at some times [s]: the newest of each; none before the first."""
         index = np.searchsorted(self.times_s, times_s, side="right") - 1
         before = index < 0
         index = np.maximum(index, 0)
@@ -46,7 +46,7 @@ class Commands:
 
 @dataclass(frozen=True, slots=True)
 class FieldDifference:
-    """How far one number of the set-points differs, over the time in which both have it."""
+    """The difference of one number of the set-points, over the time in which both have it."""
 
     name: str
     unit: str
@@ -58,9 +58,9 @@ class FieldDifference:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Two flights' commands on one time axis, which begins with the older recording."""
+    """Two flights' commands on one time axis, which starts with the older recording."""
 
-    aligned: str  #: how the times were brought together, in words
+    aligned: str  #: how the times were aligned, in words
     old: Commands
     new: Commands
     seconds: float  #: compared
@@ -78,10 +78,21 @@ def compare(
     what: What = "asked",
     part: float = PART,
 ) -> Comparison:
-    """Compare what applications asked for (or what was applied), the proxies' own commands left out.
+    """Compare what applications asked for (or what was applied), without the proxies' own commands.
 
-    A recording of a replay knows which moment of the old flight each of its own is; else both begin with their first
-    command. Raises :class:`FileFormatError` for a recording without commands.
+    A recording of a replay knows which moment of the old flight each of its own is; else both start with their first
+    command.
+
+    Args:
+        old: The older recording.
+        new: The newer one.
+        drone: The drone's name; None takes the first of each.
+        what: ``"asked"`` or ``"applied"``.
+        part: Greatest difference of set-points that are equal, in their SI unit.
+
+    Raises:
+        FileFormatError: A recording has no commands.
+        UnknownNameError: The older recording has no such drone.
     """
     old_name = old.drone(drone).name
     new_name = new.drone(drone if drone in {one.name for one in new.drones} else None).name

@@ -1,4 +1,4 @@
-"""Two flights' commands drawn over each other: as a page, or as a picture."""
+"""Two flights' commands in one diagram: as a page, or as an image."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from skyloop.errors import MissingExtraError, UsageError
+from skyloop.errors import MissingExtraError
+from skyloop.files import replacing
 from skyloop.recording.review.compare import Commands, Comparison
 from skyloop.recording.review.flight import spans
 from skyloop.recording.review.page import Page, facts, table
@@ -20,8 +21,18 @@ _NEW: Final[dict[str, Any]] = {"color": "#d9480f", "lw": 1.4, "ls": "--"}
 
 
 def write_comparison(found: Comparison, old: str, new: str, path: Path) -> None:
-    """``path`` ends in ``.html``, or in ``.png``, which needs Matplotlib. Raises :class:`UsageError` where it can't be
-    written."""
+    """Write the comparison.
+
+    Args:
+        found: The comparison.
+        old: Name of the older recording.
+        new: Name of the newer one.
+        path: Ends in ``.html``, or in ``.png``, which needs Matplotlib.
+
+    Raises:
+        UsageError: The file can't be written.
+        MissingExtraError: Matplotlib is needed and not installed.
+    """
     if path.suffix == ".png":
         _picture(found, old, new, path)
     else:
@@ -29,7 +40,7 @@ def write_comparison(found: Comparison, old: str, new: str, path: Path) -> None:
 
 
 def make_page(found: Comparison, old: str, new: str) -> Page:
-    """Actions, each set-point with both recordings' lines, and the differences as a table."""
+    """Create the page: actions, each set-point of both recordings, and a table of the differences."""
     axis = _axis(found)
     page = Page(f"{new} against {old}", axis)
     page.add(f"<h1>{escape(Path(new).name)} against {escape(Path(old).name)}</h1>")
@@ -98,7 +109,5 @@ def _picture(found: Comparison, old: str, new: str, path: Path) -> None:
             axes.axvline(found.part_at_s, color="grey", ls=":", lw=1.2)
     places[0].legend(loc="upper left")
     places[-1].set_xlabel("time [s]")
-    try:
-        figure.savefig(path)
-    except OSError as error:
-        raise UsageError(f"{path} can't be written: {error.strerror}") from error
+    with replacing(path) as part:
+        figure.savefig(part)

@@ -1,4 +1,4 @@
-"""What a report shows of a flight, worked out from its tables. Pure."""
+"""What a report shows of a flight, computed from its tables. Pure."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from skyloop.recording.review.svg import Mark, Span
 from skyloop.recording.review.tables import Table
 
 Floats = NDArray[np.float64]
-_LONGEST_STEP_S: Final = 0.5  #: over a longer one a velocity says nothing about the way
+_LONGEST_STEP_S: Final = 0.5  #: over a longer step a velocity is not integrated
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,11 +27,15 @@ class Way:
 
     @property
     def length_m(self) -> float:
+        """Length of the path over ground."""
         return float(np.nansum(np.hypot(np.diff(self.x), np.diff(self.y))))
 
 
 def way(feedback: Table) -> Way | None:
-    """From the vehicle's position; else the simulator's true one; else its velocity summed up. None: nothing known."""
+    """Return where the drone was; None if nothing is known of that.
+
+    From the vehicle's position; else from the simulator's true one; else from its integrated velocity.
+    """
     t_s = feedback.numbers("t_s")
     for source, x, y in (
         ("the vehicle's own position", "position_x", "position_y"),
@@ -51,7 +55,14 @@ def way(feedback: Table) -> Way | None:
 
 
 def spans(t_s: Floats, names: NDArray[np.str_], styles: dict[str, str], end_s: float) -> list[Span]:
-    """Stretches of one name; empty names are left out. ``styles``: by name, with one for ``*``, any other."""
+    """Return the stretches of time with one name; empty names are left out.
+
+    Args:
+        t_s: Time of each sample.
+        names: Name of each sample.
+        styles: By name, with one for ``*``, any other; a name without a style is left out.
+        end_s: End of the last stretch.
+    """
     found: list[Span] = []
     if not len(t_s):
         return found
@@ -66,7 +77,7 @@ def spans(t_s: Floats, names: NDArray[np.str_], styles: dict[str, str], end_s: f
 
 
 def marks(events: Table | None) -> list[Mark]:
-    """Events as moments."""
+    """Convert events to marks on the time axis."""
     if events is None:
         return []
     rows = zip(events.numbers("t_s"), events["text"], events["severity"], strict=True)
@@ -74,7 +85,7 @@ def marks(events: Table | None) -> list[Mark]:
 
 
 def airborne_s(feedback: Table) -> float:
-    """How long it was in the air [s]."""
+    """Return how long the drone was airborne [s]."""
     flying = np.isin(feedback["state"], [state.value for state in FlightState if state.airborne])
     steps = np.diff(feedback.numbers("t_s"))
     return float(steps[flying[:-1]].sum()) if len(steps) else 0.0
@@ -83,7 +94,7 @@ def airborne_s(feedback: Table) -> float:
 def facts(
     feedback: Table | None, commands: Table | None, path: Way | None, frames: int, seconds: float
 ) -> list[tuple[str, str]]:
-    """The figures at the head of a report: what, and how much; only those that are known."""
+    """Return the figures at the head of a report: name and value; only those that are known."""
     found = [("recorded", f"{seconds:.1f} s")]
     if feedback is not None and len(feedback):
         found.append(("in the air", f"{airborne_s(feedback):.1f} s"))

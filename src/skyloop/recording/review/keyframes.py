@@ -1,4 +1,4 @@
-"""The frames that tell a flight: those at its events, and others in between."""
+"""Key frames of a flight: those at its events, and others in between."""
 
 from __future__ import annotations
 
@@ -17,11 +17,18 @@ from skyloop.recording.review.tables import Table
 WIDTH: Final = 360  #: of a thumbnail [px]
 _QUALITY: Final = 80
 _TELLING: Final = ("state_changed", "collision", "failsafe", "emergency", "authority_preempted")
-_NEAR: Final = 0.4  #: of the usual distance: a frame in between is left out if one at an event is nearer than this
+_NEAR: Final = 0.4  #: share of the usual distance: an even frame is left out if one at an event is nearer than this
 
 
 def moments(first_s: float, last_s: float, events: Table | None, most: int) -> list[tuple[float, str]]:
-    """Times to show and why, in order: up to half of them at events, the others evenly over the flight. Pure."""
+    """Select times to show, in order, each with the reason: up to half at events, the others evenly. Pure.
+
+    Args:
+        first_s: Time of the first frame.
+        last_s: Time of the last frame.
+        events: Of the flight; None without any.
+        most: How many.
+    """
     if most < 1 or last_s < first_s:
         return []
     chosen: list[tuple[float, str]] = []
@@ -43,7 +50,7 @@ def moments(first_s: float, last_s: float, events: Table | None, most: int) -> l
 
 
 def figures(recording: Recording, drone: str, camera: str, frames: Table, events: Table | None, most: int) -> list[str]:
-    """Thumbnails as HTML, each the first frame from its moment on."""
+    """Return thumbnails as HTML, each of the first frame from its moment on."""
     t_s, seq = frames.numbers("t_s"), frames["seq"]
     wanted: dict[int, tuple[float, str]] = {}
     for moment, why in moments(float(t_s[0]), float(t_s[-1]), events, most):
@@ -70,8 +77,10 @@ def _figure(picture: Picture, t_s: float, why: str) -> str:
 
 
 def thumbnail(picture: Picture) -> tuple[bytes, str]:
-    """A small picture and its format; as recorded where it can't be made smaller here. Empty if it is damaged,
-    or H.264 that nothing here decodes."""
+    """Return a small image and its format.
+
+    It is as recorded where it can't be scaled here, and empty if it is damaged, or H.264 that can't be decoded here.
+    """
     try:
         image = picture.pixels()
     except MissingExtraError:

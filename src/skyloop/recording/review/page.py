@@ -1,4 +1,4 @@
-"""An HTML page that needs nothing else: its style, its script and its data stand in it."""
+"""A self-contained HTML page: style, script and data are embedded."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from skyloop.errors import UsageError
+from skyloop.files import write
 from skyloop.recording.review.flight import Way
 from skyloop.recording.review.svg import LEFT, RIGHT, WIDTH, Floats, Line, TimeAxis, thin, time_chart
 
@@ -28,10 +28,11 @@ class Page:
         self._way: list[Any] | None = None
 
     def add(self, html: str) -> None:
+        """Append HTML."""
         self._parts.append(html)
 
     def chart(self, title: str, unit: str, lines: Sequence[Line], limits: tuple[float, float]) -> None:
-        """A panel with lines over time, their legend, and their values at the cursor."""
+        """Append a panel with lines over time, their legend, and their values at the cursor."""
         name = f"chart{len(self._charts)}"
         self._charts[name] = [[_numbers(part) for part in thin(line.t_s, line.values)] for line in lines]
         drawn = time_chart(name, lines, self.axis, limits)
@@ -41,19 +42,21 @@ class Page:
         )
 
     def way(self, way: Way) -> None:
-        """Let the cursor show the place on the map."""
+        """Let the cursor show the position on the map."""
         x, y = np.nan_to_num(way.x), np.nan_to_num(way.y)
         step = max(1, len(way.t_s) // 2000)
         self._way = [_numbers(part[::step]) for part in (way.t_s, x, y)]
 
     def write(self, path: Path) -> None:
-        """Raises :class:`UsageError` where it can't be written."""
-        try:
-            path.write_text(self.html(), encoding="utf-8")
-        except OSError as error:
-            raise UsageError(f"{path} can't be written: {error.strerror}") from error
+        """Write the page.
+
+        Raises:
+            UsageError: The file can't be written.
+        """
+        write(path, self.html().encode())
 
     def html(self) -> str:
+        """Return the whole page."""
         style, script = (
             files("skyloop.recording.review").joinpath("static", name).read_text("utf-8") for name in _FILES
         )
@@ -80,13 +83,19 @@ _FILES = ("page.css", "page.js")
 
 
 def facts(pairs: Sequence[tuple[str, str]]) -> str:
-    """Figures side by side."""
+    """Return figures side by side, as HTML."""
     cells = "".join(f"<div><dt>{escape(what)}</dt><dd>{escape(value)}</dd></div>" for what, value in pairs)
     return f'<dl class="facts">{cells}</dl>'
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]], classes: Sequence[str]) -> str:
-    """A table; ``classes`` of its columns: ``n`` is a number. Cells are HTML."""
+    """Return a table as HTML.
+
+    Args:
+        head: Titles.
+        rows: Cells, which are HTML.
+        classes: Of the columns: ``n`` is a number.
+    """
     titles = "".join(f'<th class="{kind}">{escape(title)}</th>' for title, kind in zip(head, classes, strict=True))
     lines = "".join(
         "<tr>" + "".join(f'<td class="{kind}">{cell}</td>' for cell, kind in zip(row, classes, strict=True)) + "</tr>"

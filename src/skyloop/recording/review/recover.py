@@ -1,16 +1,16 @@
-"""Mends a recording that was cut off or damaged: what can be read goes into a new file, with an index and a summary."""
+"""Recovery of recordings that were cut off or damaged: what can be read goes into a new file, with an index."""
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from skyloop.errors import UsageError
+from skyloop.files import replacing
 from skyloop.logfile.layout import PROFILE
 from skyloop.logfile.reader import Progress, Recording
-from skyloop.logfile.scan import Channel, Message, Scan, Schema, open_file, records
+from skyloop.logfile.scan import Channel, Message, Scan, Schema, attachments, open_file, records
 
 if TYPE_CHECKING:
     from mcap.writer import Writer
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Recovered:
-    """What was saved."""
+    """What was recovered."""
 
     path: Path
     messages: dict[str, int]  #: by topic
@@ -29,33 +29,35 @@ class Recovered:
 
 
 def problems(recording: Recording, progress: Progress | None = None) -> tuple[str, ...]:
-    """What is wrong with a file, looking at every byte of it; empty for one that is whole."""
+    """Read every byte of a recording, and describe what is wrong with it; empty if it is intact.
+
+    Args:
+        recording: The recording.
+        progress: Called with the share that was read, 0 to 1.
+    """
     for _ in recording.entries(progress=progress):
         pass  # checksums are looked at as it is read
     return (*([recording.cut] if recording.cut else []), *recording.found.damaged)
 
 
 def recover(recording: Recording, target: Path, progress: Progress | None = None) -> Recovered:
-    """Write what can be read to ``target``, which is there at the end or not at all.
+    """Write what can be read to a new file, which is complete at the end or not there at all.
 
-    Raises :class:`UsageError` where it exists already or can't be written.
+    Args:
+        recording: The damaged recording.
+        target: The new file.
+        progress: Called with the share that was read, 0 to 1.
+
+    Raises:
+        UsageError: ``target`` exists already, or can't be written.
     """
     from mcap.writer import CompressionType, Writer
 
     if target.exists():
         raise UsageError(f"{target} exists already: choose another name (-o)")
-    part = target.with_name(target.name + ".part")
     found = recording.found
-    try:
-        with part.open("wb") as file:
-            counts, read = _copy(found, Writer(file, compression=CompressionType.ZSTD), progress)
-            file.flush()
-            os.fsync(file.fileno())
-        part.rename(target)
-    except OSError as error:
-        raise UsageError(f"{target} can't be written: {error.strerror}") from error
-    finally:
-        part.unlink(missing_ok=True)
+    with replacing(target) as part, part.open("wb") as file:
+        counts, read = _copy(found, Writer(file, compression=CompressionType.ZSTD), progress)
     mended = Recording.open(target)
     total = sum(piece.size for piece in found.pieces)
     why = (*([found.cut] if found.cut else []), *found.damaged)
@@ -63,11 +65,11 @@ def recover(recording: Recording, target: Path, progress: Progress | None = None
 
 
 def _copy(found: Scan, writer: Writer, progress: Progress | None) -> tuple[dict[str, int], int]:
-    """Messages by topic, and bytes of pieces that were read to their end."""
+    """Return messages by topic, and the bytes of pieces that were read to their end."""
     writer.start(PROFILE, "skyloop log recover")
     for record in found.metadata:
         writer.add_metadata(record.name, record.metadata)
-    for attachment in found.attachments:
+    for attachment in attachments(found):
         writer.add_attachment(
             attachment.create_time, attachment.log_time, attachment.name, attachment.media_type, attachment.data
         )

@@ -35,13 +35,24 @@ _LINKS: Final = {"up": "", "closed": "calm", "*": "alarm"}
 _COMMANDS: Final = {"idle": "", "emergency_stop": "alarm", "takeoff": "rising", "land": "falling", "*": "flying"}
 _COLOURS: Final = ("c1", "c2", "c3", "c4", "c5", "c6")
 _MOST_EVENTS: Final = 500
-_SAME_CLOCK_S: Final = 60.0  #: a delay of more than this is none: two clocks that have nothing to do with each other
+_SAME_CLOCK_S: Final = 60.0  #: a longer delay is left out: the two clocks are unrelated
 
 
 def write_report(
     recording: Recording, drone: str, path: Path, *, pictures: int = 8, progress: Progress | None = None
 ) -> None:
-    """Write the page. Reads the recording three times. Raises :class:`UsageError` where it can't be written."""
+    """Write the report, reading the recording three times.
+
+    Args:
+        recording: The recording.
+        drone: The drone's name.
+        path: The file.
+        pictures: Greatest number of key frames for each camera.
+        progress: Called with the share that was done, 0 to 1.
+
+    Raises:
+        UsageError: The file can't be written.
+    """
     tell = progress or (lambda _: None)
     summary = summarise(recording, lambda share: tell(share / 3))
     found = tables(recording, drone, _TABLES, lambda share: tell((1 + share) / 3))
@@ -57,7 +68,7 @@ def write_report(
 
 
 def make_page(recording: Recording, drone: str, found: dict[str, Table], summary: Summary) -> Page:
-    """The head, the path and the course over time."""
+    """Create the page's head, the path and the course over time."""
     ends = [float(one.numbers("t_s")[-1]) for one in found.values() if len(one)]
     axis = TimeAxis(0.0, max([*ends, 0.1]))
     page = Page(f"{drone}: flight report", axis)

@@ -1,4 +1,4 @@
-"""What stands in the table of ``skyloop log info``: counts, rates, gaps, drops and delays by channel."""
+"""The table of ``skyloop log info``: counts, rates, gaps, drops and delays by channel."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from skyloop.logfile.layout import Channel, Drops, FrameRecord
 from skyloop.logfile.reader import Progress, Recording
 from skyloop.messages import Applied, Event, Feedback
 
-GAP_FACTOR: Final = 3.0  #: a step between two messages of so many usual ones is a gap
-MIN_STEPS: Final = 5  #: with fewer, what is usual is not known
+GAP_FACTOR: Final = 3.0  #: a step between two messages that is longer than so many usual ones is a gap
+MIN_STEPS: Final = 5  #: with fewer, the usual step is not known
 
 
 @dataclass(frozen=True, slots=True)
 class Delay:
-    """From one time to another [s]."""
+    """Statistics of the time between two stamps of a sample [s]."""
 
     what: str  #: from what to what
     median_s: float
@@ -27,7 +27,7 @@ class Delay:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One channel."""
+    """Statistics of one channel."""
 
     topic: str
     schema: str
@@ -37,13 +37,13 @@ class Row:
     longest_s: float | None  #: longest step between two messages [s]
     missing: int  #: by the gaps in the samples' own numbers
     bytes: int
-    steady: bool  #: whether it comes at a pace of its own, so that rate and gaps say something
+    steady: bool  #: whether its messages come at a steady rate, so that rate and gaps are meaningful
     delays: tuple[Delay, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """A recording at a glance."""
+    """Statistics of a recording."""
 
     rows: tuple[Row, ...]
     seconds: float
@@ -71,7 +71,12 @@ _STEADY: Final = frozenset({Channel.FEEDBACK, Channel.COMMANDS, Channel.FRAMES})
 
 
 def summarise(recording: Recording, progress: Progress | None = None) -> Summary:
-    """Read all of it once."""
+    """Compute the statistics of a recording, reading all of it once.
+
+    Args:
+        recording: The recording.
+        progress: Called with the share that was read, 0 to 1.
+    """
     series = {one.topic: one for one in recording.series}
     tallies: dict[str, _Tally] = {topic: _Tally() for topic in series}
     severities: dict[str, int] = {}
@@ -104,7 +109,7 @@ def summarise(recording: Recording, progress: Progress | None = None) -> Summary
 
 
 def notes(recording: Recording) -> list[str]:
-    """What is wrong with the file, in words."""
+    """Describe what is wrong with the file."""
     found = []
     if recording.cut:
         found.append(f"cut off: {recording.cut} (skyloop log recover mends it)")

@@ -1,4 +1,4 @@
-"""Charts as SVG text, coloured by the classes of the page that they stand on. Pure."""
+"""Charts as SVG, coloured by the classes of the page that they are on. Pure."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-WIDTH: Final = 1120  #: of everything that has time along it; the page scales it
-LEFT: Final = 64  #: room for the labels of the vertical axis
+WIDTH: Final = 1120  #: of all charts with a time axis; the page scales them
+LEFT: Final = 64  #: space for the labels of the vertical axis
 RIGHT: Final = 16
 TOP: Final = 8
-AXIS: Final = 20  #: room for the labels of the time axis
+AXIS: Final = 20  #: space for the labels of the time axis
 BUCKETS: Final = 700  #: a line has at most twice as many points: least and greatest of each bucket
-GAP_FACTOR: Final = 8.0  #: a longer step than so many usual ones is a gap in the line
+GAP_FACTOR: Final = 8.0  #: a step longer than so many usual ones is a gap in the line
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """A series over time; NaN where nothing is known. ``style`` names its colour's class."""
+    """A series over time; NaN where nothing is known. ``style`` is the CSS class of its colour."""
 
     label: str
     t_s: Floats
@@ -36,7 +36,7 @@ class Line:
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """A stretch of time with a name; ``style`` names its colour's class."""
+    """A stretch of time with a name; ``style`` is the CSS class of its colour."""
 
     begin_s: float
     end_s: float
@@ -46,7 +46,7 @@ class Span:
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """A moment."""
+    """A moment with a text; ``style`` is the CSS class of its colour."""
 
     t_s: float
     text: str
@@ -55,12 +55,13 @@ class Mark:
 
 @dataclass(frozen=True, slots=True)
 class TimeAxis:
-    """From a time to its place."""
+    """The horizontal axis of time."""
 
     begin_s: float
     end_s: float
 
     def x(self, t_s: float) -> float:
+        """Return the coordinate of a time."""
         span = max(self.end_s - self.begin_s, 1e-9)
         return LEFT + (t_s - self.begin_s) / span * (WIDTH - LEFT - RIGHT)
 
@@ -77,7 +78,13 @@ def ticks(low: float, high: float, most: int = 5) -> list[float]:
 
 
 def limits(lines: Sequence[Line], *, least_span: float, zero: bool = False) -> tuple[float, float]:
-    """Of the vertical axis: all known values with a little room; ``zero``: never above or below it."""
+    """Return the limits of the vertical axis: all known values with a margin.
+
+    Args:
+        lines: What is drawn.
+        least_span: Least distance between the limits.
+        zero: Whether 0 must be within the limits.
+    """
     known = [values for line in lines if (values := line.values[np.isfinite(line.values)]).size]
     if not known:
         return 0.0, least_span
@@ -92,7 +99,7 @@ def limits(lines: Sequence[Line], *, least_span: float, zero: bool = False) -> t
 
 
 def thin(t_s: Floats, values: Floats, buckets: int = BUCKETS) -> tuple[Floats, Floats]:
-    """At most twice as many points as buckets, with the least and the greatest of each, so that no peak is lost."""
+    """Reduce points to at most two per bucket, the least and the greatest, so that no peak is lost."""
     if len(t_s) <= 2 * buckets:
         return t_s, values
     keep: list[int] = []
@@ -106,7 +113,7 @@ def thin(t_s: Floats, values: Floats, buckets: int = BUCKETS) -> tuple[Floats, F
 
 
 def pieces(t_s: Floats, values: Floats) -> list[tuple[Floats, Floats]]:
-    """The stretches between gaps and unknown values."""
+    """Return the stretches between gaps and unknown values."""
     if not len(t_s):
         return []
     steps = np.diff(t_s)
@@ -124,7 +131,7 @@ def pieces(t_s: Floats, values: Floats) -> list[tuple[Floats, Floats]]:
 def time_chart(
     name: str, lines: Sequence[Line], axis: TimeAxis, y_limits: tuple[float, float], *, height: int = 130
 ) -> str:
-    """Lines over time, with the labels of the vertical axis."""
+    """Draw lines over time, with the labels of the vertical axis."""
     low, high = y_limits
     bottom = height - AXIS
 
@@ -142,7 +149,7 @@ def time_chart(
 
 
 def band_chart(name: str, rows: Sequence[tuple[str, Sequence[Span]]], marks: Sequence[Mark], axis: TimeAxis) -> str:
-    """Rows of named stretches, and below them a row of moments."""
+    """Draw rows of named stretches, and below them a row of marks."""
     each = 24
     height = TOP + each * (len(rows) + bool(marks)) + AXIS
     parts = [_grid(axis, height)]
@@ -173,7 +180,7 @@ def band_chart(name: str, rows: Sequence[tuple[str, Sequence[Span]]], marks: Seq
 
 
 def map_chart(name: str, x: Floats, y: Floats, t_s: Floats, *, size: int = 540) -> str:
-    """A path from above, one metre as long in both directions, coloured by time; a grid in metres."""
+    """Draw a path from above at equal scales, coloured by time, on a grid in metres."""
     known = np.isfinite(x) & np.isfinite(y)
     x, y, t_s = x[known], y[known], t_s[known]
     half = max(float(np.ptp(x)), float(np.ptp(y)), 1.0) * 0.56

@@ -1,4 +1,4 @@
-"""The samples of one drone as columns: what exports, reports and comparisons are made from."""
+"""The samples of one drone as columns, from which exports, reports and comparisons are made."""
 
 from __future__ import annotations
 
@@ -32,12 +32,13 @@ AXES: Final[dict[str, tuple[str, ...]]] = {
 }
 #: The numbers that an action may carry, in the order of the columns.
 ACTION_FIELDS: Final = ("roll", "pitch", "climb", "forward", "left", "up", "yaw_rate")
+_ABSURD: Final = 1e30  #: greatest number in any unit: its square, and a sum of many, must not overflow
 Cell = float | int | str | bool | None
 
 
 @dataclass(slots=True)
 class Table:
-    """Columns of one length. A column is of numbers (NaN: not known) or of texts (empty: not known).
+    """Columns of one length, of numbers (NaN: not known) or of strings (empty: not known).
 
     ``t_s`` is the time since the recording's first sample [s], by the proxy's clock; further times are in ns.
     """
@@ -46,25 +47,28 @@ class Table:
     columns: dict[str, NDArray[Any]] = field(default_factory=dict)
 
     def __len__(self) -> int:
+        """Return the number of rows."""
         return len(next(iter(self.columns.values()))) if self.columns else 0
 
     def __getitem__(self, column: str) -> NDArray[Any]:
+        """Return a column."""
         return self.columns[column]
 
     def numbers(self, column: str) -> NDArray[np.float64]:
-        """A column as floats; of NaN only if there is none of that name."""
+        """Return a column as floats; NaN where it does not exist, and for absurdly large numbers."""
         found = self.columns.get(column)
         if found is None:
             return np.full(len(self), np.nan)
-        return found.astype(np.float64)
+        numbers = found.astype(np.float64)
+        return np.where(np.abs(numbers) < _ABSURD, numbers, np.nan)
 
     def known(self, column: str) -> bool:
-        """Whether there is at least one number in a column."""
+        """Whether a column has at least one finite number."""
         return bool(np.isfinite(self.numbers(column)).any())
 
 
 class _Builder:
-    """Collects rows whose columns become known as they come."""
+    """Collects rows whose columns become known as they arrive."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -87,7 +91,7 @@ class _Builder:
 
 
 def _array(cells: list[Cell]) -> NDArray[Any]:
-    """Whole numbers where all are, floats where all are numbers, else texts."""
+    """Return integers where all are, floats where all are numbers, else strings."""
     kinds = {type(cell) for cell in cells}
     if kinds <= {int}:
         return np.array(cells, np.int64)
@@ -104,7 +108,17 @@ def tables(
     channels: Collection[Channel] = tuple(Channel),
     progress: Progress | None = None,
 ) -> dict[str, Table]:
-    """By name (``feedback``, ``commands``, ``frames.CAMERA`` …), in the order of the channels; without empty ones."""
+    """Read the tables of a drone.
+
+    Args:
+        recording: The recording.
+        drone: The drone's name.
+        channels: Which ones.
+        progress: Called with the share that was read, 0 to 1.
+
+    Returns:
+        By name (``feedback``, ``commands``, ``frames.CAMERA`` …), in the order of the channels; without empty ones.
+    """
     builders: dict[str, _Builder] = {}
     for item, at_ns, first_ns in timed(recording, drone, channels, progress):
         name = item.channel.value + (f".{item.camera}" if item.camera else "")
@@ -120,9 +134,9 @@ def tables(
 def timed(
     recording: Recording, drone: str, channels: Collection[Channel], progress: Progress | None = None
 ) -> Iterator[tuple[Item, int, int]]:
-    """Samples with their time and that of the recording's first one, on the proxy's clock [ns].
+    """Yield samples with their time and that of the recording's first one, on the proxy's clock [ns].
 
-    The first one is that of all channels, so that tables of several calls have the same beginning.
+    The first one is that of all channels, so that the tables of several calls have the same start.
     """
     first_ns = begin_ns(recording, drone)
     course = Course()
@@ -131,7 +145,7 @@ def timed(
 
 
 def begin_ns(recording: Recording, drone: str) -> int:
-    """The time of the first sample that has one, on the proxy's clock [ns]; 0 if none has."""
+    """Return the time of the first sample that has one, on the proxy's clock [ns]; 0 if none has."""
     course = Course()
     for item in recording.items(drone):
         course.follow(item.value)
@@ -141,7 +155,7 @@ def begin_ns(recording: Recording, drone: str) -> int:
 
 
 def row(item: Item) -> dict[str, Cell]:
-    """A sample as cells by the names of their columns."""
+    """Convert a sample to cells by the names of their columns."""
     value = item.value
     cells: dict[str, Cell]
     if isinstance(value, Feedback):

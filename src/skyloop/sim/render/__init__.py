@@ -1,14 +1,4 @@
-"""Pictures of a simulated world.
-
-::
-
-    scene = Scene(world, drones=2)               # once
-    renderer = PlanarRenderer(scene)             # one a thread
-    effects = SensorEffects(FRONT_CAMERA, seed)  # one a camera of each drone
-    state = SceneState(positions, rotations, targets)
-    pose = FRONT_CAMERA.pose(positions[0], rotations[0], drone=0)
-    picture = effects.apply(renderer.render(state, pose, FRONT_CAMERA), number)
-"""
+"""Rendering of a simulated world."""
 
 from skyloop.sim.render.base import Renderer, SceneState
 from skyloop.sim.render.effects import SensorEffects

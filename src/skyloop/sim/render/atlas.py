@@ -1,8 +1,4 @@
-"""All textures of a scene in one picture, each with its smaller versions (mip levels) beside it.
-
-One picture lets a single ``cv2.remap`` colour every pixel, whatever surface it shows. Level ``l`` of a texture of
-padded width ``W`` stands at ``x = x0 + 2 W (1 - 2^-l) + GAP l``, a closed form that needs no table per pixel.
-"""
+"""All textures of a scene in one image, each with its smaller versions (mip levels) beside it."""
 
 from __future__ import annotations
 
@@ -32,8 +28,14 @@ class Texture:
 
 @dataclass(frozen=True, slots=True)
 class Atlas:
-    """``image``: BGRA (four channels are sampled twice as fast as three). ``x0``, ``y0``: where each texture's level 0
-    starts, ``span``: twice its padded width; float64, shape (number of textures,)."""
+    """All textures in one image.
+
+    Attributes:
+        image: BGRA (four channels are sampled twice as fast as three).
+        x0: Where each texture's level 0 starts; float64, shape (number of textures,).
+        y0: The same, vertically.
+        span: Twice each texture's padded width.
+    """
 
     image: NDArray[np.uint8]
     x0: NDArray[np.float64]
@@ -42,14 +44,14 @@ class Atlas:
 
 
 class AtlasBuilder:
-    """Collects textures under keys, each made once, and packs them."""
+    """Collects textures under keys, each drawn once, and packs them."""
 
     def __init__(self) -> None:
         self._known: dict[object, Texture] = {}
         self._images: list[NDArray[np.uint8]] = []
 
     def add(self, key: object, make: Callable[[], NDArray[np.uint8]]) -> Texture:
-        """The texture known as ``key``; if there is none yet, ``make`` draws it (BGR, shape (h, w, 3))."""
+        """Return the texture known as ``key``; if there is none yet, ``make`` draws it (BGR, shape (h, w, 3))."""
         if key not in self._known:
             image = make()
             self._known[key] = Texture(len(self._images), image.shape[1], image.shape[0])
@@ -62,7 +64,7 @@ class AtlasBuilder:
         return self._images
 
     def pack(self) -> Atlas:
-        """Puts all textures on shelves, the tallest first."""
+        """Pack all textures on shelves, the tallest first."""
         sizes = [(_padded(i.shape[1]), _padded(i.shape[0])) for i in self._images]
         width = max(2048, *(_footprint(w) for w, _ in sizes))
         spots: dict[int, tuple[int, int]] = {}

@@ -1,4 +1,4 @@
-"""The seam between a simulation and what draws it."""
+"""The interface between a simulation and its renderers."""
 
 from __future__ import annotations
 
@@ -16,11 +16,15 @@ Image = NDArray[np.uint8]  # BGR, shape (height, width, 3)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneState:
-    """Where everything that moves is at one instant. A renderer may keep what it made of a state for as long as it is
-    shown the same object, so a state's arrays must not be written to afterwards.
+    """The poses of everything that moves at one time.
 
-    ``drone_positions_m``: of the bodies' origins, world axes, shape (n, 3). ``drone_rotations``: world from body,
-    shape (n, 3, 3). ``targets``: one for each target of the world, in the world's order.
+    A renderer may keep what it computed from a state for as long as it is given the same object, so a state's arrays
+    must not be written to afterwards.
+
+    Attributes:
+        drone_positions_m: Of the bodies' origins, world axes, shape (n, 3).
+        drone_rotations: World from body, shape (n, 3, 3).
+        targets: One for each target of the world, in the world's order.
     """
 
     drone_positions_m: NDArray[np.float64]
@@ -29,12 +33,22 @@ class SceneState:
 
 
 class Renderer(Protocol):
-    """Draws what an ideal sensor behind a camera's lens sees: with its distortion, without noise, blur or vignetting
-    (those are :class:`~skyloop.sim.render.effects.SensorEffects`).
+    """Renders what an ideal sensor behind a camera's lens sees: with distortion, without noise, blur or vignetting.
 
-    A renderer may keep buffers between calls: use one in one thread at a time.
+    Those are :class:`~skyloop.sim.render.effects.SensorEffects`. A renderer may keep buffers between calls: use one in
+    one thread at a time.
     """
 
     def render(self, state: SceneState, pose: CameraPose, model: CameraModel, out: Image | None = None) -> Image:
-        """The picture as BGR, shape (model.height, model.width, 3); written into ``out`` where one is given."""
+        """Render an image.
+
+        Args:
+            state: The poses of everything that moves.
+            pose: Of the camera.
+            model: Of the camera.
+            out: Where to write the image; None creates an array.
+
+        Returns:
+            BGR, shape (model.height, model.width, 3), uint8.
+        """
         ...

@@ -1,4 +1,4 @@
-"""What a real sensor adds to a picture: motion blur, exposure, vignetting and noise. Seeded, so repeatable."""
+"""The flaws of a real sensor: motion blur, exposure, vignetting and noise. Seeded, so repeatable."""
 
 from __future__ import annotations
 
@@ -17,8 +17,10 @@ _BLUR_FROM_PX = 0.8  # a shorter smear can't be told from none
 
 
 class SensorEffects:
-    """The flaws of one camera's sensor. What frame ``number`` gets depends on the seed and the number alone, not on
-    which frames came before. One thread at a time."""
+    """The flaws of one camera's sensor. To be used in one thread at a time.
+
+    What frame ``number`` gets depends on the seed and the number alone, not on which frames came before.
+    """
 
     def __init__(self, model: CameraModel, seed: int = 0) -> None:
         self._model = model
@@ -32,11 +34,16 @@ class SensorEffects:
         self._darker = np.clip(-noise, 0, 255).astype(np.uint8)
 
     def apply(self, picture: Image, number: int, body_rates_rad_s: NDArray[np.float64] | None = None) -> Image:
-        """Puts the flaws on a picture in place and returns it. ``body_rates_rad_s``: the drone's turning about its body
-        axes (x forward, y left, z up), shape (3,), which smears the picture over the time of the exposure; None for a
-        drone that does not turn.
+        """Apply the flaws to an image in place, and return it.
 
-        Raises :class:`~skyloop.errors.UsageError` for a picture of another size.
+        Args:
+            picture: BGR, of the camera's size.
+            number: Of the frame.
+            body_rates_rad_s: The drone's angular velocity about its body axes (x forward, y left, z up), shape (3,),
+                which blurs the image over the exposure; None for a drone that does not turn.
+
+        Raises:
+            UsageError: The image has another size.
         """
         model = self._model
         if picture.shape != (model.height, model.width, 3):
@@ -70,8 +77,10 @@ class SensorEffects:
 
 
 def _gain(model: CameraModel) -> Image | None:
-    """Exposure and vignetting (cos⁴-like: with the square of the distance from the centre) in steps of 1/128; None if
-    there is neither."""
+    """Return exposure and vignetting in steps of 1/128; None if there is neither.
+
+    Vignetting is cos⁴-like: with the square of the distance from the centre.
+    """
     if model.exposure_gain == 1.0 and model.vignetting == 0.0:
         return None
     x = (np.arange(model.width) - (model.width - 1) / 2) / (model.width / 2)

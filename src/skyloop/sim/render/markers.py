@@ -1,4 +1,4 @@
-"""Pictures of ArUco and AprilTag markers, printed on a card with a white margin."""
+"""Images of ArUco and AprilTag markers, printed on a card with a white margin."""
 
 from __future__ import annotations
 
@@ -17,18 +17,25 @@ _PAPER = 235
 
 @dataclass(frozen=True, slots=True)
 class Card:
-    """``image``: BGR. ``uv``: the part that the card shows: left, top, right, bottom in texels, with fractions."""
+    """An image of a marker.
+
+    Attributes:
+        image: BGR.
+        uv: The part that the card shows: left, top, right, bottom in texels, with fractions.
+    """
 
     image: NDArray[np.uint8]
     uv: tuple[float, float, float, float]
 
 
 def draw_card(pattern: MarkerPattern) -> Card:
-    """The marker with its margin; the black square is ``pattern.size_m`` of the card's ``card_size_m`` to the texel's
-    fraction.
+    """Draw a marker with its margin.
 
-    Raises :class:`~skyloop.errors.UnknownNameError` for a dictionary that OpenCV does not have, and
-    :class:`~skyloop.errors.UsageError` for an id that the dictionary does not have.
+    The black square is ``pattern.size_m`` of the card's ``card_size_m`` to the texel's fraction.
+
+    Raises:
+        UnknownNameError: OpenCV has no such dictionary.
+        UsageError: The dictionary has no such id.
     """
     code = getattr(cv2.aruco, pattern.dictionary, None) if pattern.dictionary.startswith("DICT_") else None
     if code is None:

@@ -1,4 +1,4 @@
-"""The shapes of what moves: quadrotors, marker boards on their stands, platforms. Each in axes of its own."""
+"""The shapes of what moves: quadrotors, marker boards on their stands, platforms. Each in its own axes."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ _POLE_M = 12.0  # the stand's pole goes through the floor, which hides the rest
 
 
 def paint(atlas: AtlasBuilder, rgb: Rgb) -> Texture:
-    """A small painted surface."""
+    """Return a small painted surface."""
     return atlas.add(("paint", rgb), lambda: draw_paint(rgb))
 
 
 def card(builder: QuadBuilder, atlas: AtlasBuilder, pattern: MarkerPattern, priority: int) -> None:
-    """A marker's card around the origin, in face axes: x its right, y its up, z its normal."""
+    """Add a marker's card around the origin, in face axes: x its right, y its up, z its normal."""
     drawn = draw_card(pattern)
     half = pattern.card_size_m / 2
     texture = atlas.add(("card", pattern), lambda: drawn.image)
@@ -48,8 +48,10 @@ def card(builder: QuadBuilder, atlas: AtlasBuilder, pattern: MarkerPattern, prio
 
 
 def drone(atlas: AtlasBuilder, hull: Rgb) -> Quads:
-    """A quadrotor in body axes: a hull with a nose, a crossed frame, four rotors; those in front have the hull's colour
-    so that one can see where it is heading."""
+    """Return a quadrotor in body axes: a hull with a nose, a crossed frame, four rotors.
+
+    The front rotors have the hull's colour, so that one can see where it is heading.
+    """
     shapes = QuadBuilder()
     colour, dark = paint(atlas, hull), paint(atlas, _DARK)
     shapes.box((-0.13, -0.055, -0.035), (0.07, 0.055, 0.04), colour, colour)
@@ -85,7 +87,7 @@ def _rotor(rgb: Rgb) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
 
 
 def board(atlas: AtlasBuilder, target: BoardTarget) -> Quads:
-    """A marker's card before a wooden board on a pole; origin at the card's centre, x to where its face looks."""
+    """Return a marker's card before a wooden board on a pole; origin at the card's centre, x along its normal."""
     face = QuadBuilder()
     card(face, atlas, target.pattern, priority=2)
     # face axes (right, up, normal) to (x ahead, y left, z up)
@@ -100,7 +102,7 @@ def board(atlas: AtlasBuilder, target: BoardTarget) -> Quads:
 
 
 def stand(atlas: AtlasBuilder) -> Quads:
-    """The foot of a board's pole, origin on the floor."""
+    """Return the foot of a board's pole, origin on the floor."""
     shapes = QuadBuilder()
     dark = paint(atlas, _DARK)
     shapes.box((-0.19, -0.15, 0.0), (0.11, 0.15, 0.045), dark)
@@ -108,7 +110,7 @@ def stand(atlas: AtlasBuilder) -> Quads:
 
 
 def platform(atlas: AtlasBuilder, target: PlatformTarget) -> Quads:
-    """A slab on a column with the marker on its top; origin in the middle of the top, x along its heading."""
+    """Return a slab on a column with the marker on its top; origin in the middle of the top, x along its heading."""
     x, y, z = (side / 2 for side in target.size_m)
     density = min(200.0, 160.0 / max(x, y))
     top = atlas.add(("slab", target.texture, x, y), lambda: draw_surface(target.texture, 2 * x, 2 * y, density))

@@ -1,12 +1,4 @@
-"""The renderer for machines with OpenGL: MuJoCo's, with shadows that fall where they do.
-
-It draws off screen, through EGL or OSMesa, in software where there is no GPU. OpenGL draws without a lens, so a picture
-with distortion is taken from a larger one: twice as fine and as wide as the lens sees, then put where the lens puts it.
-
-Only pictures are MuJoCo's. Flight and collisions stay the simulation's own: MuJoCo's contacts are not used, and what
-the planar renderer draws (boxes, prints, quadrotors of flat faces) is all there is to see; meshes can't be loaded from
-files. Pictures are not the same, bit by bit, from one graphics driver to the next.
-"""
+"""The renderer for machines with OpenGL: MuJoCo's, with cast shadows."""
 
 from __future__ import annotations
 
@@ -58,7 +50,11 @@ from skyloop.sim.render.mujoco_model import FARTHEST_M, NEAREST_M, build_stage  
 
 
 def require_opengl() -> None:
-    """Draws a picture of nothing. Raises :class:`~skyloop.errors.UnsupportedError` where that fails."""
+    """Check that OpenGL works, by rendering an empty image.
+
+    Raises:
+        UnsupportedError: It does not work.
+    """
     _open_context(mujoco.MjSpec().compile(), 16, 16).close()
 
 
@@ -72,11 +68,13 @@ def _open_context(model: Any, width: int, height: int) -> Any:
 
 
 class MujocoRenderer:
-    """Draws a world with a number of drones. To be made, used and dropped in one thread, which its OpenGL belongs to.
-    Implements :class:`~skyloop.sim.render.base.Renderer`.
+    """Renders a world with a number of drones by MuJoCo. Implements :class:`~skyloop.sim.render.base.Renderer`.
 
-    Making it builds the model (some tenths of a second); the first picture of each size makes an OpenGL context. Raises
-    :class:`~skyloop.errors.UsageError` where a texture, a marker dictionary or an id does not exist.
+    To be created, used and dropped in one thread, to which its OpenGL belongs. Creating it builds the model (some
+    tenths of a second); the first image of each size creates an OpenGL context.
+
+    Raises:
+        UsageError: A texture, a marker dictionary or an id does not exist.
     """
 
     def __init__(self, world: World, drones: int = 1) -> None:
@@ -88,9 +86,12 @@ class MujocoRenderer:
         self._posed: tuple[SceneState, int | None] | None = None
 
     def render(self, state: SceneState, pose: CameraPose, model: CameraModel, out: Image | None = None) -> Image:
-        """See :meth:`skyloop.sim.render.base.Renderer.render`. Raises :class:`~skyloop.errors.UsageError` where ``out``
-        or the state does not fit, or where the model's distortion can't be inverted, and
-        :class:`~skyloop.errors.UnsupportedError` where OpenGL does not work."""
+        """Render an image; see :meth:`skyloop.sim.render.base.Renderer.render`.
+
+        Raises:
+            UsageError: ``out`` or the state does not fit, or the model's distortion can't be inverted.
+            UnsupportedError: OpenGL does not work.
+        """
         shape = (model.height, model.width, 3)
         if out is None:
             out = np.empty(shape, np.uint8)
@@ -109,7 +110,7 @@ class MujocoRenderer:
         return out
 
     def close(self) -> None:
-        """Frees what OpenGL holds, in the thread that used it; the renderer can be used again."""
+        """Free what OpenGL holds, in the thread that used it; the renderer can be used again."""
         for context in self._contexts.values():
             context.close()
         self._contexts.clear()
@@ -163,8 +164,11 @@ class MujocoRenderer:
 
 @dataclass(frozen=True, slots=True)
 class _Raster:
-    """The picture that OpenGL draws for a lens. ``left`` to ``bottom``: x/z and y/z of its edges (y down). ``places``:
-    where in it each pixel of the lens lies, as ``cv2.remap`` takes it; None where it is the lens's own picture."""
+    """The image that OpenGL renders for a lens.
+
+    Attributes ``left`` to ``bottom`` are x/z and y/z of its edges (y down); ``places`` is where in it each pixel of the
+    lens lies, as ``cv2.remap`` takes it, None where it is the lens's own image.
+    """
 
     width: int
     height: int

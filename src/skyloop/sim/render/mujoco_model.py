@@ -46,8 +46,14 @@ class DroneBodies:
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """A compiled model. ``targets`` and ``stands``: mocap numbers, one for each target of the world, None for one that
-    has no stand."""
+    """A compiled model.
+
+    Attributes:
+        model: MuJoCo's.
+        targets: Mocap numbers, one for each target of the world.
+        stands: The same of their stands; None for a target without one.
+        drones: The bodies of each drone.
+    """
 
     model: Any
     targets: tuple[int, ...]
@@ -56,7 +62,7 @@ class Stage:
 
 
 def build_stage(world: World, drones: int) -> Stage:
-    """A world with a number of drones."""
+    """Build the model of a world with a number of drones."""
     atlas = AtlasBuilder()
     still = static_quads(world, atlas, painted_shadows=False)
     targets = [
@@ -161,9 +167,12 @@ class _Maker:
 
 
 def _light(spec: Any, world: World) -> None:
-    """Light from all over; and one that casts shadows: outdoors the sun, indoors a lamp as wide as the ceiling that
-    shines straight down (a slanted one would leave the room in the shadow of its own walls), with a little of the sun
-    besides, without shadows, so that walls differ. Together about as bright as the planar renderer's."""
+    """Add ambient light, and one light that casts shadows.
+
+    Outdoors that is the sun, indoors a lamp as wide as the ceiling that shines straight down (a slanted one would leave
+    the room in the shadow of its own walls), with a little of the sun besides, without shadows, so that walls differ.
+    Together they are about as bright as the planar renderer's.
+    """
     room = world.room
     reach = 0.5 * float(np.hypot(*room.size_m[:2])) + 1.0
     if room.enclosed:

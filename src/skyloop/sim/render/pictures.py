@@ -1,5 +1,7 @@
-"""Surfaces that are one thing from edge to edge: crate, door, window, posters. Each is drawn as BGR for a size in
-pixels with a given source of chance."""
+"""Surfaces with one picture from edge to edge: crate, door, window, posters.
+
+Each is drawn as BGR for a size in pixels with a given random generator.
+"""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ from skyloop.sim.render.opencv import cv2
 from skyloop.sim.render.scene import Posed, Scene
 from skyloop.sim.render.shading import Shader, sampling_table
 from skyloop.sim.render.shadows import darken
-from skyloop.sim.render.visibility import DepthBuffer, Grid, look
+from skyloop.sim.render.visibility import DepthBuffer, Grid, visible_quads
 
 
 class Quality(Enum):
@@ -36,15 +36,19 @@ class Quality(Enum):
 
 
 def use_one_core() -> None:
-    """Keeps OpenCV, in this whole process, to the calling thread. Pictures this small gain nothing from more, and its
-    worker threads would take the cores that proxies and applications need: a process that only simulates calls this
-    once when it starts."""
+    """Restrict OpenCV, in this whole process, to the calling thread.
+
+    Images this small gain nothing from more, and its worker threads would take the cores that proxies and applications
+    need: a process that only simulates calls this once when it starts.
+    """
     cv2.setNumThreads(1)
 
 
 class PlanarRenderer:
-    """Draws a :class:`~skyloop.sim.render.scene.Scene`. Holds buffers, so one thread at a time; several renderers may
-    share a scene. Implements :class:`~skyloop.sim.render.base.Renderer`."""
+    """Renders a :class:`~skyloop.sim.render.scene.Scene`. Implements :class:`~skyloop.sim.render.base.Renderer`.
+
+    It holds buffers, so it is for one thread at a time; several renderers may share a scene.
+    """
 
     def __init__(self, scene: Scene, quality: Quality = Quality.SMOOTH) -> None:
         self.scene = scene
@@ -54,8 +58,11 @@ class PlanarRenderer:
         self._posed: tuple[SceneState, Posed] | None = None
 
     def render(self, state: SceneState, pose: CameraPose, model: CameraModel, out: Image | None = None) -> Image:
-        """See :meth:`skyloop.sim.render.base.Renderer.render`. Raises :class:`~skyloop.errors.UsageError` where ``out``
-        or the state does not fit, or where the model's distortion can't be inverted."""
+        """Render an image; see :meth:`skyloop.sim.render.base.Renderer.render`.
+
+        Raises:
+            UsageError: ``out`` or the state does not fit, or the model's distortion can't be inverted.
+        """
         shape = (model.height, model.width, 3)
         if out is None:
             out = np.empty(shape, np.uint8)
@@ -75,7 +82,7 @@ class PlanarRenderer:
         posed = self._pose(state)
         quads = posed.quads
         shown = np.ones(len(quads), np.bool_) if pose.drone is None else posed.drone != pose.drone
-        view = look(quads, shown, pose, raster.grid)
+        view = visible_quads(quads, shown, pose, raster.grid)
         raster.buffer.draw(view, quads.priority[view.index])
         table = sampling_table(quads, view, pose, self.scene.atlas, 1.0 / (model.fx * model.fy))
         seen = raster.buffer.seen.reshape(-1)

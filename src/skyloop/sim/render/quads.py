@@ -14,8 +14,11 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Quads:
-    """``n`` flat convex quadrilaterals; a triangle repeats a corner. Texel u of a point X of the plane is
-    ``u_slope · X + u_start`` (v likewise), u to the right and v down, both from the texture's top left edge."""
+    """``n`` flat convex quadrilaterals; a triangle repeats a corner.
+
+    Texel u of a point X of the plane is ``u_slope · X + u_start`` (v likewise), u to the right and v down, both from
+    the texture's top left edge.
+    """
 
     corners: Floats  #: (n, 4, 3) [m], counter-clockwise seen from the front
     normals: Floats  #: (n, 3) unit, towards the front
@@ -73,8 +76,18 @@ class QuadBuilder:
         lit: bool = True,
         uv: tuple[float, float, float, float] | None = None,
     ) -> None:
-        """A rectangle from a corner and its two edges [m], as seen from its front. ``uv`` is the part of the texture
-        on it (left, top, right, bottom in texels), else the whole."""
+        """Add a rectangle, as seen from its front.
+
+        Args:
+            lower_left: Its corner [m].
+            right: The edge to the right [m].
+            up: The edge upwards [m].
+            texture: What is on it.
+            two_sided: Whether it is seen from behind too.
+            priority: Of quads in one plane the one with the highest is seen.
+            lit: Whether it is brighter where it faces the light.
+            uv: The part of the texture on it (left, top, right, bottom in texels); None is the whole.
+        """
         origin, e_right, e_up = (np.asarray(v, dtype=np.float64) for v in (lower_left, right, up))
         corners = np.array([origin, origin + e_right, origin + e_right + e_up, origin + e_up])
         self.polygon(corners, origin, e_right, e_up, texture, two_sided=two_sided, priority=priority, lit=lit, uv=uv)
@@ -92,7 +105,7 @@ class QuadBuilder:
         lit: bool = True,
         uv: tuple[float, float, float, float] | None = None,
     ) -> None:
-        """A quad (4, 3) cut from the textured rectangle that the corner and the two edges make."""
+        """Add a quad (4, 3) cut from the textured rectangle that the corner and the two edges make."""
         left, top, u_end, bottom = uv or (0.0, 0.0, float(texture.width), float(texture.height))
         normal = np.cross(right, up)
         u_slope = right * ((u_end - left) / (right @ right))
@@ -119,8 +132,14 @@ class QuadBuilder:
         sides: Texture | tuple[Texture, Texture],
         ends: Texture | None = None,
     ) -> None:
-        """An upright box between two corners [m], seen from outside: four sides (those that face along x and those that
-        face along y may differ), a top and a bottom (``ends``)."""
+        """Add an upright box, seen from outside.
+
+        Args:
+            low: Its lowest corner [m].
+            high: Its highest corner [m].
+            sides: Of the four sides; a pair is for those that face along x and those that face along y.
+            ends: Of top and bottom; None is as the sides that face along x.
+        """
         (x0, y0, z0), (x1, y1, z1) = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
         dx, dy, dz = x1 - x0, y1 - y0, z1 - z0
         for_x, for_y = sides if isinstance(sides, tuple) else (sides, sides)
@@ -133,7 +152,7 @@ class QuadBuilder:
         self.rectangle((x0, y1, z0), (dx, 0, 0), (0, -dy, 0), ends)
 
     def disc(self, centre: ArrayLike, radius_m: float, texture: Texture) -> None:
-        """A level regular octagon with the whole texture on the square around it, seen from both sides."""
+        """Add a level regular octagon with the whole texture on the square around it, seen from both sides."""
         middle = np.asarray(centre, dtype=np.float64)
         angle = np.pi / 8 + np.arange(8) * (np.pi / 4)
         rim = middle + radius_m * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(8)])
@@ -143,7 +162,7 @@ class QuadBuilder:
             self.polygon(rim[[a, b, c, d]], start, right, up, texture, two_sided=True)
 
     def build(self) -> Quads:
-        """What was collected."""
+        """Return what was collected."""
         corners, normals, u_slope, v_slope, u_start, v_start, texture, two_sided, priority, lit = zip(
             *self._rows, strict=True
         )

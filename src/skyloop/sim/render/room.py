@@ -1,4 +1,4 @@
-"""What stands still: the room or the open ground, boxes, gates, panels and markers, with soft shadows painted on."""
+"""What does not move: the room or the open ground, boxes, gates, panels and markers, with soft shadows painted on."""
 
 from __future__ import annotations
 
@@ -23,8 +23,14 @@ _LEAN = np.array([-0.16, 0.20])
 
 
 def static_quads(world: World, atlas: AtlasBuilder, *, painted_shadows: bool = True) -> Quads:
-    """All of a world that never moves. ``painted_shadows``: whether what stands on the floor has its soft shadow in the
-    floor's texture; not for a renderer that casts shadows itself."""
+    """Return all of a world that never moves.
+
+    Args:
+        world: The world.
+        atlas: Gets the textures.
+        painted_shadows: Whether what stands on the floor has its soft shadow in the floor's texture; not for a renderer
+            that casts shadows itself.
+    """
     parts = [_shell(world, atlas, world.solids() if painted_shadows else ())]
     parts += [_box(box, atlas) for box in world.solids()]
     for panel in world.panels:

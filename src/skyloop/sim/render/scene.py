@@ -1,4 +1,4 @@
-"""A world made ready to be drawn: its textures in one atlas, its still parts as quads, and what moves as templates."""
+"""A world prepared for rendering: its textures in one atlas, its fixed parts as quads, and what moves as templates."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _FADES_AT_M = 4.0  # a drone this high above a surface leaves no visible shadow 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Posed:
-    """Everything of a scene at one instant. ``drone``: whose body a quad belongs to, -1 for none, (n,)."""
+    """Everything of a scene at one time. ``drone``: whose body a quad belongs to, -1 for none, (n,)."""
 
     quads: Quads
     drone: NDArray[np.intp]
@@ -30,10 +30,13 @@ class Posed:
 
 
 class Scene:
-    """What can be drawn of a world with a number of drones. Building it draws all textures (some tenths of a second);
-    after that it never changes, so renderers in several threads may share it.
+    """What can be rendered of a world with a number of drones.
 
-    Raises :class:`~skyloop.errors.UsageError` where a texture, a marker dictionary or an id does not exist.
+    Building it draws all textures (some tenths of a second); after that it never changes, so renderers in several
+    threads may share it.
+
+    Raises:
+        UsageError: A texture, a marker dictionary or an id does not exist.
     """
 
     def __init__(self, world: World, drones: int = 1) -> None:
@@ -50,9 +53,10 @@ class Scene:
         self._tops = [(box.yaw_rad, np.array(box.position_m), np.array(box.size_m) / 2) for box in world.solids()]
 
     def posed(self, state: SceneState) -> Posed:
-        """Everything where the state says it is.
+        """Place everything that moves as a state says.
 
-        Raises :class:`~skyloop.errors.UsageError` for a state of another number of drones or targets.
+        Raises:
+            UsageError: The state has another number of drones or targets.
         """
         shape = np.shape(state.drone_positions_m), np.shape(state.drone_rotations)
         if shape != ((self.drones, 3), (self.drones, 3, 3)):

@@ -1,9 +1,4 @@
-"""The colour of samples, once it is known which quad each of them shows.
-
-For a ray r = (x, y, 1) a quad's texel is u = (a · r)/(c · r), v = (b · r)/(c · r), and c · r = 1/z. The size of a pixel
-on the texture, in texels², is |det (a, b, c)| z³ / (fx fy); half its binary logarithm is the mip level, which the
-exponent of the floating-point number gives without computing one.
-"""
+"""The colour of samples, once it is known which quad each of them shows."""
 
 from __future__ import annotations
 
@@ -28,14 +23,17 @@ _ONE = 0x3F800000  # 1.0 as the bits of a float32
 
 
 def light_on(normals: Floats) -> Floats:
-    """Brightness of faces by their normals, shape (n,), around 1."""
+    """Return the brightness of faces by their normals, shape (n,), around 1."""
     direct = np.clip(normals @ (SUN / np.linalg.norm(SUN)), 0.0, None)
     return np.asarray(_AMBIENT + _DIRECT * direct)
 
 
 def sampling_table(quads: Quads, view: View, pose: CameraPose, atlas: Atlas, pixel_area: float) -> NDArray[np.float32]:
-    """A column for each quad of the view, after a column 0 for "nothing": a', b', c (three rows each), footprint, atlas
-    x and y, and light; float32, shape (13, m + 1). ``pixel_area``: 1/(fx fy) of the picture."""
+    """Return a column for each quad of the view, after a column 0 for "nothing".
+
+    The rows are a', b', c (three each), footprint, atlas x and y, and light; float32, shape (13, m + 1). ``pixel_area``
+    is 1/(fx fy) of the image.
+    """
     k = view.index
     c = view.inverse_depth
     u_slope, v_slope = quads.u_slope[k], quads.v_slope[k]
@@ -58,7 +56,7 @@ def sampling_table(quads: Quads, view: View, pose: CameraPose, atlas: Atlas, pix
 
 
 class Shader:
-    """Colours samples from an atlas. Keeps working arrays: one thread at a time."""
+    """Colours samples from an atlas. Keeps working arrays, so it is for one thread at a time."""
 
     def __init__(self, atlas: Atlas) -> None:
         self._image = atlas.image
@@ -76,8 +74,16 @@ class Shader:
         colours: NDArray[np.uint8],
         inverse_depth: NDArray[np.float32],
     ) -> None:
-        """Fills ``colours``, BGRA, shape (n, 4), and ``inverse_depth`` [1/m], (n,), for the columns ``seen`` of a table
-        and the rays (ray_x, ray_y, 1), all (n,)."""
+        """Write the colours and inverse depths of samples.
+
+        Args:
+            table: Of :func:`sampling_table`.
+            seen: The table's column for each sample, (n,).
+            ray_x: x of the ray (x, y, 1), (n,).
+            ray_y: y of the ray, (n,).
+            colours: Is written: BGRA, shape (n, 4).
+            inverse_depth: Is written [1/m], (n,).
+        """
         for start in range(0, len(seen), CHUNK):
             part = slice(start, min(start + CHUNK, len(seen)))
             self._shade_chunk(table, seen[part], ray_x[part], ray_y[part], colours[None, part], inverse_depth[part])

@@ -18,8 +18,13 @@ _SQUARE = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0,
 
 @dataclass(frozen=True, slots=True)
 class Shadow:
-    """A level round spot: its centre in world axes [m], where it ends [m], and how much light is missing in its middle
-    (0 … 1)."""
+    """A level round spot with less light.
+
+    Attributes:
+        centre_m: World axes.
+        radius_m: Where it ends.
+        strength: How much light is missing in its middle, 0 to 1.
+    """
 
     centre_m: NDArray[np.float64]
     radius_m: float
@@ -34,8 +39,16 @@ def darken(
     ray_y: NDArray[np.float32],
     inverse_depth: NDArray[np.float32],
 ) -> None:
-    """Multiplies the pixels of a picture (h, w, 4) that show the shadow's place. ``ray_x``, ``ray_y`` and
-    ``inverse_depth``: of each pixel, flat."""
+    """Darken the pixels of an image that show the shadow's place.
+
+    Args:
+        picture: Shape (h, w, 4), changed in place.
+        shadow: The shadow.
+        pose: Of the camera.
+        ray_x: Of each pixel, flat.
+        ray_y: Of each pixel, flat.
+        inverse_depth: Of each pixel [1/m], flat.
+    """
     height, width = picture.shape[:2]
     box = _rows_and_columns(shadow, pose, ray_x.reshape(height, width), ray_y.reshape(height, width))
     if box is None:

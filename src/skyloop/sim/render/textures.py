@@ -24,7 +24,7 @@ Bgr = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """A surface to be drawn on: its size in pixels, pixels per metre, and a source of chance of its own."""
+    """A surface to be drawn on: its size in pixels, pixels per metre, and its own random generator."""
 
     height: int
     width: int
@@ -47,9 +47,10 @@ class Sheet:
 
 
 def draw_surface(name: str, width_m: float, height_m: float, per_m: float, seed: int = 0) -> NDArray[np.uint8]:
-    """A surface of a size in metres at a number of texels per metre, BGR, seen upright.
+    """Draw a surface of a size in metres at a number of texels per metre, BGR, seen upright.
 
-    Raises :class:`~skyloop.errors.UnknownNameError` for a name that is not a texture.
+    Raises:
+        UnknownNameError: There is no texture of that name.
     """
     if name not in _SURFACES and name not in PICTURES:
         raise UnknownNameError("texture", name, [*_SURFACES, *PICTURES])
@@ -61,7 +62,7 @@ def draw_surface(name: str, width_m: float, height_m: float, per_m: float, seed:
 
 
 def draw_paint(rgb: tuple[int, int, int], height: int = 64, width: int = 64) -> NDArray[np.uint8]:
-    """A painted surface, BGR: one colour with a faint unevenness and a worn rim."""
+    """Draw a painted surface, BGR: one colour with a faint unevenness and a worn rim."""
     rng = np.random.default_rng(zlib.crc32(bytes(rgb)))
     light = 1.0 + 0.05 * clouds(rng, height, width, max(4, width / 6)) + 0.02 * grain(rng, height, width)
     picture = tinted((rgb[2], rgb[1], rgb[0]), light, height, width)

@@ -27,7 +27,7 @@ _BAND = 32768  # samples of a quad drawn at a time: few enough for the working a
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Samples of a distortion-free picture plane: sample (X, Y) sees the ray ((X - cx)/fx, (Y - cy)/fy, 1)."""
+    """Samples of a distortion-free image plane: sample (X, Y) sees the ray ((X - cx)/fx, (Y - cy)/fy, 1)."""
 
     width: int
     height: int
@@ -54,9 +54,11 @@ class View:
     box: NDArray[np.intp]
 
 
-def look(quads: Quads, shown: NDArray[np.bool_], pose: CameraPose, grid: Grid) -> View:
-    """What of the ``shown`` quads, (n,), can be seen from a pose through a grid, each on its own (not yet what hides
-    what)."""
+def visible_quads(quads: Quads, shown: NDArray[np.bool_], pose: CameraPose, grid: Grid) -> View:
+    """Return the ``shown`` quads, (n,), that a pose can see through a grid, each on its own.
+
+    Occlusion is left to :class:`DepthBuffer`.
+    """
     height_m = np.einsum("ij,ij->i", quads.normals, pose.position_m - quads.corners[:, 0])
     facing = (height_m > _EDGE_ON_M) | (quads.two_sided & (height_m < -_EDGE_ON_M))
     index = np.flatnonzero(facing & shown)
@@ -107,8 +109,12 @@ def _columns(edges: Floats, grid: Grid) -> tuple[NDArray[np.int16], NDArray[np.i
 
 
 class DepthBuffer:
-    """Finds the nearest quad at each sample. ``seen``: its place in the view plus one, 0 where there is none; int32,
-    shape (height, width). Overwritten by the next :meth:`draw`."""
+    """Finds the nearest quad at each sample.
+
+    Attributes:
+        seen: Its index in the view plus one, 0 where there is none; int32, shape (height, width). Overwritten by the
+            next :meth:`draw`.
+    """
 
     def __init__(self, grid: Grid) -> None:
         shape = (grid.height, grid.width)
@@ -123,7 +129,7 @@ class DepthBuffer:
         self.seen = np.empty(shape, np.int32)
 
     def draw(self, view: View, priority: NDArray[np.intp]) -> None:
-        """Fills :attr:`seen`. ``priority``: of each quad of the view, (m,)."""
+        """Update :attr:`seen`. ``priority``: of each quad of the view, (m,)."""
         grid = self._grid
         slope = view.inverse_depth * (1.0 + PRIORITY_SHARE * priority)[:, None] / (grid.fx, grid.fy, 1.0)
         start = slope[:, 2] - slope[:, 0] * grid.cx - slope[:, 1] * grid.cy

@@ -1,10 +1,13 @@
-"""The transport of the network: Eclipse Zenoh. ``docs/network.md`` says how to use it, ``docs/wire-format.md`` what
-travels. It needs the extra ``network``; without it each function here raises :class:`MissingExtraError`."""
+"""The transport of the network, on Eclipse Zenoh.
+
+``docs/network.md`` says how to use it, ``docs/wire-format.md`` what travels. It needs the extra ``network``; without
+it each function here raises :class:`MissingExtraError`.
+"""
 
 from __future__ import annotations
 
 from skyloop.transport.fabric.client import dial
-from skyloop.transport.fabric.finding import list_proxies
+from skyloop.transport.fabric.discovery import list_proxies
 from skyloop.transport.fabric.packets import ProxyInfo
 from skyloop.transport.fabric.server import FabricServer
 from skyloop.transport.fabric.settings import FabricSettings, TlsFiles

@@ -1,28 +1,25 @@
-"""Zenoh's access control, made from a lab's roster. Pure.
+"""Zenoh's access control, made from a lab's roster; pure functions.
 
-A node applies it on each of its links, to whoever stands at the other end, by the common name in the certificate: what
-that one may *say* passes inward (ingress), what it may *hear* passes outward (egress), and nothing else passes. So each
-end protects itself, and none relies on what another one's configuration says. A router is trusted by its neighbours
-with everything, and does the same with its own neighbours.
+A node applies it on each of its links to the node at the other end, by the common name in that one's certificate. What
+that identity may *publish* passes inward (ingress), what it may *subscribe* to passes outward (egress), and nothing
+else passes. So each end protects itself and relies on nobody else's configuration. A router may publish and subscribe
+to everything, and applies the rules to its own neighbours; what it passes on is sealed besides, so that it cannot forge
+anything (:mod:`skyloop.transport.fabric.sealing`).
 
-To say and to hear are two sides of one thing: what an application says, proxies hear. Declarations count as what they
-are: who subscribes says so.
+The two directions mirror each other: what an application publishes, proxies subscribe to. Declarations and queries
+count as messages in the direction in which they travel: the declaration of a subscriber is published.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
 from typing import Any, Final
 
-from skyloop.keys.credentials import Credentials
 from skyloop.keys.identity import ALL_DRONES, Identity, KeyRole
-from skyloop.keys.ring import KeyRing
 from skyloop.transport.fabric import layout
-from skyloop.transport.fabric.settings import FabricSettings, TlsFiles
 
-SAYS: Final = "ingress"
-HEARS: Final = "egress"
+INGRESS: Final = "ingress"
+EGRESS: Final = "egress"
 _LIFE: Final = ("liveliness_query", "declare_liveliness_subscriber")
 _ANSWERS: Final = ("declare_queryable", "reply")
 _PUT: Final = ("put",)
@@ -37,7 +34,11 @@ Rules = Mapping[tuple[str, ...], list[str]]
 
 
 def access_control(identities: Iterable[Identity]) -> dict[str, Any]:
-    """Zenoh's ``access_control`` for any node of a lab with these identities. Without identities nothing passes."""
+    """Return Zenoh's ``access_control`` section for any node of a lab.
+
+    Args:
+        identities: All identities that may join; without any, nothing passes.
+    """
     rules: list[dict[str, Any]] = []
     subjects: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
@@ -45,7 +46,7 @@ def access_control(identities: Iterable[Identity]) -> dict[str, Any]:
         own = [
             {"id": f"{identity.name} {flow} {number}", "messages": list(messages), "flows": [flow]}
             | {"permission": "allow", "key_exprs": keys}
-            for flow, table in ((SAYS, says(identity)), (HEARS, hears(identity)))
+            for flow, table in ((INGRESS, may_publish(identity)), (EGRESS, may_subscribe(identity)))
             for number, (messages, keys) in enumerate(table.items())
         ]
         rules += own
@@ -55,19 +56,8 @@ def access_control(identities: Iterable[Identity]) -> dict[str, Any]:
     return {"enabled": True, "default_permission": "deny", **lists}
 
 
-def secured(settings: FabricSettings, credentials: Credentials) -> FabricSettings:
-    """These settings with a key: mutual TLS over QUIC, and access control by the roster that came with it."""
-    return replace(
-        settings,
-        tls=TlsFiles(credentials.authority_file, credentials.certificate_file, credentials.key_file),
-        who=credentials.name,
-        access_control=access_control(credentials.roster.identities),
-        ring=KeyRing(credentials),
-    )
-
-
-def says(identity: Identity) -> Rules:
-    """What an identity may send, declare and ask for."""
+def may_publish(identity: Identity) -> Rules:
+    """Return what an identity may send, declare and query."""
     if identity.role is KeyRole.ROUTER:
         return {_ALL: [f"{layout.ROOT}/**"]}
     names = _chunks(identity.drones)
@@ -90,10 +80,13 @@ def says(identity: Identity) -> Rules:
     }
 
 
-def hears(identity: Identity) -> Rules:
-    """What an identity is told: what proxies say to an application, what applications say to a proxy."""
+def may_subscribe(identity: Identity) -> Rules:
+    """Return what an identity may receive.
+
+    For an application that is what proxies send to it, for a proxy what applications send.
+    """
     if identity.role is KeyRole.ROUTER:
-        return says(identity)
+        return may_publish(identity)
     names = _chunks(identity.drones)
     everywhere = {_TOKEN: layout.proxy_tokens(_ANY), _ANSWERS: [layout.info(_ANY)], _LIFE: layout.app_watches(_ANY)}
     if identity.role is KeyRole.PROXY:
@@ -118,7 +111,7 @@ def hears(identity: Identity) -> Rules:
 
 
 def _app_puts(identity: Identity, who: str) -> list[str]:
-    """Where an application may put packets, or hear that ``who`` is awaited there."""
+    """Return where an application may put packets, or receive the subscription of ``who`` to them."""
     keys = [key for name in _seen(identity) for key in layout.observer_puts(who, name)]
     if identity.role is KeyRole.PILOT:
         keys += [key for name in _chunks(identity.drones) for key in layout.pilot_puts(who, name)]
@@ -126,12 +119,12 @@ def _app_puts(identity: Identity, who: str) -> list[str]:
 
 
 def _seen(identity: Identity) -> list[str]:
-    """A pilot may see all drones, whichever he may fly."""
+    """Return the drones that an application may see; a pilot may see all, whichever it may fly."""
     return _chunks(ALL_DRONES if identity.role is KeyRole.PILOT else identity.drones)
 
 
 def _chunks(patterns: tuple[str, ...]) -> list[str]:
-    """Patterns as one part of a key expression each, where ``*`` alone is any name and ``$*`` any characters."""
+    """Convert patterns to one chunk of a key expression each, where ``*`` is any name and ``$*`` any characters."""
     return [pattern if pattern == _ANY else pattern.replace("*", "$*") for pattern in patterns]
 
 

@@ -3,46 +3,50 @@
 from __future__ import annotations
 
 import logging
-import os
-import sys
 import threading
 import time
-from collections import deque
-from pathlib import Path
-from queue import SimpleQueue
+from datetime import UTC, datetime
+from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, Final
 
-import msgspec
-import numpy as np
-
 from skyloop.errors import DecodeError, LinkError, NoAnswerError, UnknownNameError
-from skyloop.messages import FrameHeader
-from skyloop.transport.base import MAX_PACKET, ClientEnd, ClientHandler, Dialer, check_packet, check_topic, video
-from skyloop.transport.fabric import finding, layout, packets, rights
+from skyloop.transport.base import MAX_PACKET, ClientEnd, ClientHandler, Dialer, check_name, check_packet, check_topic
+from skyloop.transport.fabric import layout, packets
+from skyloop.transport.fabric.admission import Admission
 from skyloop.transport.fabric.config import Part
-from skyloop.transport.fabric.frames import WINDOW
-from skyloop.transport.fabric.seeking import reached, renew
-from skyloop.transport.fabric.server import host_name
+from skyloop.transport.fabric.delivery import DEPTH, Outgoing, Receiver
+from skyloop.transport.fabric.discovery import proxy_reached, renew
+from skyloop.transport.fabric.joining import ProxyWatch, join
+from skyloop.transport.fabric.sealing import contents
 from skyloop.transport.fabric.session import Session, acquire, load, release, retire, undeclare
 from skyloop.transport.fabric.settings import FabricSettings
-from skyloop.transport.fabric.window import DEPTH, Recent, Taker, Window
-from skyloop.transport.names import check_name
+from skyloop.transport.fabric.subscription import Subscription
 
 if TYPE_CHECKING:
     import zenoh
 
 GLANCE_S: Final = 0.25  #: how long one session is given to find a proxy, before there is a search for others
-JOIN_S: Final = 1.0  #: how long a proxy that was found may take to let this application in
+POLL_S: Final = 0.05  #: how often to check whether something has to be sent again
+STALLED_S: Final = 5.0  #: a proxy that acknowledges nothing for so long counts as gone
+KEYS_S: Final = 0.5  #: how often to check for a newer roster
 FAREWELL_S: Final = 0.3  #: how long to wait for the proxy to answer a bye
-_VIDEO: Final = video("")
 _log = logging.getLogger(__name__)
 
 
 def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1.5) -> Dialer:
-    """The dialer of the proxy with this name on the network, which is looked for during ``find_s`` seconds.
+    """Return the dialer of a proxy on the network.
 
-    Raises :class:`UsageError` for what can't be a name and :class:`MissingExtraError`. The dialer itself raises
-    :class:`UnknownNameError` where no such proxy can be reached and :class:`LinkError` where it does not let us in.
+    The dialer raises :class:`UnknownNameError` where no such proxy can be reached, and :class:`LinkError` where the
+    proxy does not let the application in.
+
+    Args:
+        name: The proxy's name.
+        settings: How to join the network; by default by multicast, without keys.
+        find_s: How long each call of the dialer searches for the proxy [s].
+
+    Raises:
+        UsageError: The name is not valid, or the keys are not an application's.
+        MissingExtraError: The extra ``network`` is not installed.
     """
     check_name(name)
     load()
@@ -53,7 +57,8 @@ def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1
     before: FabricClient | None = None  # the connection that was made last
 
     def attempt(handler: ClientHandler, within_s: float) -> FabricClient:
-        nonlocal before
+        nonlocal before, chosen
+        chosen = chosen.current()
         if before is not None and not before.parted:
             # One end may have forgotten the other while the other has not: such a session finds nobody, or gets no
             # answers, and Zenoh does not notice. A new one has another identity, which nobody mistakes for the old.
@@ -73,7 +78,7 @@ def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1
         except BaseException:
             release(session)
             raise
-        reached()
+        proxy_reached()
         before = found
         return found
 
@@ -89,20 +94,24 @@ def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1
     return dialer
 
 
-class _Queue:
-    """What waits for the handler of one topic, from when it was subscribed to until that ends."""
-
-    def __init__(self, topic: str) -> None:
-        self.topic = topic
-        self.taker = Taker()
-        self.waiting = 0
-        self.frames: deque[tuple[int, FrameHeader, bytes]] = deque()
-        self.newest = 0  # number of the newest frame that came
-        self.recent = Recent()  # packets
+#: For the receiving thread: a packet of a topic (None: to this end alone), its number there; a frame, if it is empty.
+_Item = tuple[Subscription | None, bytes, int]
+_WAKE: Final[_Item] = (None, b"", 0)
 
 
 class FabricClient(ClientEnd):
-    """An application's end, made by the dialer that :func:`dial` returns."""
+    """An application's end, made by the dialer that :func:`dial` returns.
+
+    Args:
+        session: The Zenoh session; released when the connection ends, but not where this raises.
+        name: The proxy's name.
+        handler: Called on the receiving thread.
+        find_s: How long to search for the proxy [s].
+
+    Raises:
+        UnknownNameError: No such proxy can be reached.
+        LinkError: The proxy does not let this application in, or does not answer (:class:`NoAnswerError`).
+    """
 
     def __init__(self, session: Session, name: str, handler: ClientHandler, find_s: float) -> None:
         self._session = session
@@ -111,20 +120,21 @@ class FabricClient(ClientEnd):
         self._handler = handler
         self._who = session.settings.who
         identity = session.settings.identity
-        self._watches_only = None if identity is None or identity.may_fly(name) else identity
+        self._observer = None if identity is None or identity.may_fly(name) else identity
         self._id = layout.new_id()
-        self._run = ""
-        self._run_bytes = b""
-        self._runs: set[str] = set()  # of server ends with this name that are alive
-        self._found = threading.Condition()
+        self._run = ""  # of the proxy, once one is asked to let us in
         self._lock = threading.Lock()  # guards what follows; held while a packet is sent, so that order is kept
-        self._window = Window()
-        self._subscribers: dict[str, list[Any]] = {}
+        self._outgoing = Outgoing()
+        self._subscriptions: dict[str, tuple[Subscription, list[Any]]] = {}  # with what was declared for each
         self._command: zenoh.Publisher | None = None
-        self._queues: dict[str, _Queue] = {}
-        self._taker = Taker()
-        self._recent = Recent()  # packets to this end alone
-        self._inbox: SimpleQueue[tuple[_Queue | None, bytes, int] | None] = SimpleQueue()
+        self._command_key = layout.upward(layout.COMMAND, name, self._who, self._id)
+        self._ring = session.settings.ring
+        self._pause_s = None if self._ring is None else KEYS_S
+        self._keys_s = 0.0  # when the keys are checked next
+        self._admission = Admission()  # with keys: who the proxy is, and what packets are sealed with
+        self.forged = 0  #: packets and frames that did not come from the proxy
+        self._receiver = Receiver()  # packets to this end alone
+        self._inbox: SimpleQueue[_Item | None] = SimpleQueue()
         self._ended = False  # nothing can be sent any more
         self._closing = False  # by this end: nothing more is delivered
         self._farewell = threading.Event()  # the proxy has answered our bye, or is gone
@@ -139,97 +149,64 @@ class FabricClient(ClientEnd):
         self._thread = threading.Thread(target=self._receive, name=f"skyloop-{name}-fabric-client", daemon=True)
         self._thread.start()
 
-    # --- the begin of a connection ---
-
     def _enter(self, find_s: float) -> packets.ProxyInfo | None:
-        """Find the proxy and be let in. Raises :class:`LinkError` or :class:`UnknownNameError`."""
-        session, name, call = self._session, self._name, self._session.callback
-        watch = session.zenoh.liveliness().declare_subscriber(
-            layout.alive(name, "*"), call(self._proxy_token), history=True
-        )
-        self._held.append(watch)
-        with self._found:
-            if not self._found.wait_for(lambda: self._runs, find_s):
-                others = {known for known, _ in finding.runs(session)}
-                raise UnknownNameError(f"proxy on the network ({session.settings.reach})", name, others - {name})
-        about = self._choose()
-        self._run_bytes = bytes.fromhex(self._run)
+        """Find the proxy and be let in.
+
+        Raises:
+            LinkError: It does not let us in.
+            UnknownNameError: There is none.
+        """
+        session, name = self._session, self._name
+        watch = ProxyWatch(session, name, self._on_proxy_gone)
+        self._held.append(watch.declare())
+        candidates = watch.find(find_s)
         mine = layout.to(name, self._id)
-        self._held.append(session.zenoh.declare_subscriber(mine, call(self._own_packet)))
+        self._held.append(session.zenoh.declare_subscriber(mine, session.callback(self._on_packet)))
         self._held.append(session.zenoh.liveliness().declare_token(layout.app(name, self._who, self._id)))
-        self._ask_to_join()
-        return about
-
-    def _choose(self) -> packets.ProxyInfo | None:
-        """Which proxy of this name is meant: the oldest, if there are several."""
-        known = [about for about in finding.oldest_first(self._session, self._name) if about.run in self._runs]
-        if known:
-            self._run = known[0].run
-            return known[0]
-        with self._found:
-            if not self._runs:
-                raise NoAnswerError(f"the proxy {self._name!r} was found on the network, and is gone again")
-            self._run = min(self._runs)
-        return None
-
-    def _ask_to_join(self) -> None:
-        z = load()
-        wish = packets.Join(packets.REVISION, self._run, host_name(), os.getpid(), Path(sys.argv[0]).name[:64])
-        replies = self._session.zenoh.get(
-            layout.join(self._name, self._who, self._id),
-            payload=packets.encode_own(wish),
-            target=z.QueryTarget.ALL,
-            consolidation=z.ConsolidationMode.NONE,
-            timeout=JOIN_S,
-            priority=z.Priority.DATA_HIGH,
-            express=True,
-        )
-        for reply in replies:
-            if reply.err is not None:
-                raise LinkError(f"the proxy {self._name!r} does not let us in: {reply.err.payload.to_string()[:400]}")
+        while True:
+            self._run, about = candidates.pop(0)
             try:
-                welcome = packets.decode_welcome(bytes(reply.ok.payload)) if reply.ok is not None else None
-            except msgspec.DecodeError:
-                continue
-            if welcome is not None and welcome.run == self._run:
-                return
-        raise NoAnswerError(
-            f"the proxy {self._name!r} was found on the network but did not answer"
-            + ("" if self._session.settings.tls is None else f"; the keys of {self._who!r} may not give access to it")
-        )
+                self._admission = join(session, name, self._run, self._id)
+            except LinkError:
+                if not candidates:
+                    raise
+            else:
+                return about
 
     # --- use ---
 
     def send(self, packet: bytes) -> bool:
         if not 0 < len(packet) <= MAX_PACKET:
             check_packet(packet)
-        way = rights.way_of(packet)
+        way = layout.way_of(packet)
         with self._lock:
             if self._ended:
                 return False
-            if way != layout.ASK and self._watches_only is not None:
-                answer = rights.refusal(packet, self._watches_only, self._name)
+            if way != layout.ASK and self._observer is not None:
+                answer = layout.refusal_reply(packet, self._observer, self._name)
                 if answer is not None:
                     self._inbox.put((None, answer, 0))
                 return answer is not None
             if way == layout.COMMAND:
                 return self._send_command(packet)
-            number = self._window.send(len(packet))
-            return number > 0 and self._put(way, packet, number)
+            return self._keep(way, packet)
 
     def subscribe(self, topic: str, on: bool = True) -> None:
         check_topic(topic)
         with self._lock:
-            if self._ended or on == (topic in self._subscribers):
+            if self._ended or on == (topic in self._subscriptions):
                 return
             if on:
-                queue = self._queues[topic] = _Queue(topic)
-                self._subscribers[topic] = self._declare(queue)
-            self._put(layout.ASK, packets.subscribe(topic, on), 0)
-            gone = [] if on else self._subscribers.pop(topic)
+                wanted = Subscription(
+                    topic, bytes.fromhex(self._run), self._admission.topics, self._enqueue_published, self._reject
+                )
+                self._subscriptions[topic] = wanted, wanted.declare(self._session, self._name, self._id)
+            self._keep(layout.ASK, packets.subscribe(topic, on))
+            declared: list[Any] = []
             if not on:
-                del self._queues[topic]
-        undeclare(gone)
+                unwanted, declared = self._subscriptions.pop(topic)
+                unwanted.end()
+        undeclare(declared)
 
     def close(self) -> None:
         self._end("closed by the application")
@@ -238,7 +215,7 @@ class FabricClient(ClientEnd):
 
     @property
     def session(self) -> Session:
-        """What it goes by, together with others."""
+        """The Zenoh session, which other connections may share."""
         return self._session
 
     @property
@@ -253,40 +230,48 @@ class FabricClient(ClientEnd):
     def address(self) -> str:
         return self._address
 
-    def _declare(self, queue: _Queue) -> list[Any]:
-        z, call, name, topic = self._session.zenoh, self._session.callback, self._name, queue.topic
-        if not topic.startswith(_VIDEO):
-            return [
-                z.declare_subscriber(layout.topic(name, topic), call(lambda sample: self._published(queue, sample)))
-            ]
-        camera, _, form = topic.removeprefix(_VIDEO).partition("?")
-        keys = (layout.video(name, camera, form), layout.video_for(name, camera, form, self._id))
-        return [z.declare_subscriber(key, call(lambda sample: self._frame(queue, sample))) for key in keys]
-
     def _send_command(self, packet: bytes) -> bool:
         z = load()
         if self._command is None:
             self._command = self._session.zenoh.declare_publisher(
-                layout.upward(layout.COMMAND, self._name, self._who, self._id),
+                self._command_key,
                 congestion_control=z.CongestionControl.DROP,
                 priority=z.Priority.REAL_TIME,
                 reliability=z.Reliability.BEST_EFFORT,
                 express=True,
             )
+        payload, attachment = self._admission.sealer.seal(self._command_key, _UNNUMBERED, packet)
         try:
-            self._command.put(packet, attachment=_UNNUMBERED)
+            self._command.put(payload, attachment=attachment)
         except z.ZError:
             return False
         return True
 
+    def _keep(self, way: str, packet: bytes) -> bool:
+        """Send a packet, repeatedly until it is acknowledged; return False if there is no room for it. Locked."""
+        waits = self._outgoing.under_way
+        if not self._outgoing.put(packet, way):
+            return False
+        self._send_due()
+        if not waits:
+            self._inbox.put(_WAKE)  # the receiving thread resends what is on the way
+        return True
+
+    def _send_due(self) -> None:
+        """Send the packets that are due. Locked."""
+        for number, packet, way in self._outgoing.due(time.monotonic()):
+            self._put(way, packet, number)
+
     def _put(self, way: str, packet: bytes, number: int) -> bool:
         z = load()
+        key = layout.upward(way, self._name, self._who, self._id)
+        payload, attachment = self._admission.sealer.seal(key, packets.number(number), packet)
         try:
             self._session.zenoh.put(
-                layout.upward(way, self._name, self._who, self._id),
-                packet,
-                attachment=packets.number(number),
-                congestion_control=z.CongestionControl.BLOCK,
+                key,
+                payload,
+                attachment=attachment,
+                congestion_control=z.CongestionControl.DROP,
                 priority=z.Priority.DATA_HIGH,
                 express=True,
             )
@@ -297,94 +282,108 @@ class FabricClient(ClientEnd):
 
     # --- what Zenoh calls, on its own threads ---
 
-    def _proxy_token(self, sample: zenoh.Sample) -> None:
-        """A proxy with our name lives, or does no longer."""
-        try:
-            _, run = layout.parse_alive(str(sample.key_expr))
-        except DecodeError:
-            return
-        with self._found:
-            if sample.kind == load().SampleKind.PUT:
-                self._runs.add(run)
-            else:
-                self._runs.discard(run)
-            self._found.notify_all()
-        if run == self._run and run not in self._runs:
+    def _on_proxy_gone(self, run: str) -> None:
+        if run == self._run:
             self._farewell.set()
             self._end("the proxy is gone")
 
-    def _own_packet(self, sample: zenoh.Sample) -> None:
-        """A packet to this application alone."""
+    def _on_packet(self, sample: zenoh.Sample) -> None:
+        """Handle a packet to this application alone."""
         try:
-            number = packets.parse_number(bytes(sample.attachment or b""))
-        except DecodeError:
+            opened = contents(self._admission.opener, sample)
+            if opened is None:
+                return  # it came before, by another way
+            packet, number = opened[0], packets.parse_number(opened[1])
+        except DecodeError as error:
+            self._reject(error)
             return
-        packet = bytes(sample.payload)
-        if packets.is_own(packet):
-            try:
-                message = packets.parse(packet)
-            except DecodeError:
-                message = None
-            if isinstance(message, packets.Taken):
-                with self._lock:
-                    self._window.taken(message.number)
-                return
-            if isinstance(message, packets.Bye):
-                self.parted = True
-                self._farewell.set()
-                self._end(message.reason)
-                return
-        room = self._inbox.qsize() < 16 * DEPTH
-        if room and 0 < len(packet) <= MAX_PACKET and self._recent.is_new(number, packet):
-            self._inbox.put((None, packet, number))
+        if not number:
+            self._receiver.receive(packet, control=self._control, deliver=self._enqueue_unnumbered)
+            return
+        taken = self._receiver.receive_numbered(
+            number, packet, has_room=self._has_room, control=self._control, deliver=self._enqueue
+        )
+        self._acknowledge(packets.taken("", taken))
 
-    def _published(self, queue: _Queue, sample: zenoh.Sample) -> None:
-        """A packet of a topic."""
-        try:
-            run, number = packets.parse_published(bytes(sample.attachment or b""))
-        except DecodeError:
-            return
-        packet = bytes(sample.payload)
-        if run != self._run_bytes or not 0 < len(packet) <= MAX_PACKET:
-            return
-        if queue.waiting < DEPTH and queue.recent.is_new(number, packet):
-            queue.waiting += 1
-            self._inbox.put((queue, packet, number))
+    def _has_room(self) -> bool:
+        return self._inbox.qsize() < 16 * DEPTH
 
-    def _frame(self, queue: _Queue, sample: zenoh.Sample) -> None:
-        """A frame. The newest take the place of those that wait."""
-        try:
-            run, number, header = packets.parse_frame(bytes(sample.attachment or b""))
-        except DecodeError:
-            return
-        pixels = bytes(sample.payload)
-        if run != self._run_bytes or number <= queue.newest or len(pixels) != header.size:
-            return
-        queue.newest = number
-        if len(queue.frames) >= WINDOW:
-            queue.frames[-1] = (number, header, pixels)
+    def _enqueue(self, packet: bytes) -> None:
+        self._inbox.put((None, packet, 0))
+
+    def _enqueue_unnumbered(self, packet: bytes) -> None:
+        if self._has_room():
+            self._enqueue(packet)
+
+    def _control(self, message: packets.Message) -> bool:
+        """Handle one of the transport's own packets; return False for one that is left to the handler (garbage)."""
+        if isinstance(message, packets.Taken):
+            with self._lock:
+                self._outgoing.taken(message.number, time.monotonic())
+                self._send_due()
+        elif isinstance(message, packets.Key):
+            self._admission.topics.use(message.key, message.generation)
+        elif isinstance(message, packets.Bye):
+            self.parted = True
+            self._farewell.set()
+            self._end(message.reason)
         else:
-            queue.frames.append((number, header, pixels))
-            self._inbox.put((queue, b"", number))
+            return False
+        return True
+
+    def _enqueue_published(self, subscription: Subscription, packet: bytes, number: int) -> None:
+        self._inbox.put((subscription, packet, number))
+
+    def _reject(self, error: DecodeError) -> None:
+        """Count something that the proxy did not send, and log it the first time."""
+        self.forged += 1
+        if self.forged == 1:
+            _log.warning("%s: something came that the proxy did not send, and is left out: %s", self._name, error)
+
+    # --- keys ---
+
+    def _check_keys(self) -> None:
+        """End the connection if a newer roster shuts out the proxy or a node between. On the receiving thread."""
+        ring, proxy, expires = self._ring, self._admission.identity, self._admission.expires
+        now_s = time.monotonic()
+        if ring is None or proxy is None or now_s < self._keys_s:
+            return
+        self._keys_s = now_s + KEYS_S
+        for news in ring.poll():
+            _log.warning("%s", news)
+        linked = self._session.shut_out()
+        if not ring.admits(proxy):
+            reason = f"the keys of the proxy, {proxy}, were revoked or changed"
+        elif not ring.admits(ring.credentials.identity):
+            reason = "our own keys were revoked or changed"
+        elif expires is not None and datetime.now(UTC) >= expires:
+            reason = "the keys of the proxy have expired"
+        elif linked:
+            reason = f"linked to one whose keys were revoked or changed: {', '.join(sorted(linked))}"
+        else:
+            return
+        retire(self._session)  # a new one goes by the newer roster
+        self._end(reason)
 
     # --- the end of a connection ---
 
     def _end(self, reason: str) -> None:
-        """End the connection: the receiving thread does the rest. Any thread."""
+        """End the connection once; the receiving thread does the rest. Any thread."""
         with self._lock:
             if self._ended:
                 return
             self._reason = self._reason or reason
-            self._put(layout.ASK, packets.bye(reason), 0)
+            if not self._keep(layout.ASK, packets.bye(reason)):  # after all that was sent before
+                self._put(layout.ASK, packets.bye(reason), 0)
             self._ended = True
         self._inbox.put(None)
 
     def _undeclare(self) -> None:
-        """Give everything back. Not on Zenoh's threads."""
+        """Undeclare everything. Not on Zenoh's threads."""
         held, self._held = self._held, []
-        for subscribers in self._subscribers.values():
-            held += subscribers
-        self._subscribers = {}
+        for _, declared in self._subscriptions.values():
+            held += declared
+        self._subscriptions = {}
         if self._command is not None:
             held.append(self._command)
         undeclare(held)
@@ -392,8 +391,8 @@ class FabricClient(ClientEnd):
     # --- the receiving thread ---
 
     def _receive(self) -> None:
-        while (item := self._inbox.get()) is not None:
-            if self._closing:
+        while (item := self._next()) is not None:
+            if self._closing or item is _WAKE:
                 continue
             try:
                 self._deliver(*item)
@@ -401,7 +400,10 @@ class FabricClient(ClientEnd):
                 _log.exception("the handler of %s failed; its connection ends", self._address)
                 self._closing = True
                 self._end(f"the application's handler failed: {error!r}")
-        self._farewell.wait(FAREWELL_S)
+        until = time.monotonic() + FAREWELL_S
+        while not self._farewell.wait(POLL_S) and time.monotonic() < until:
+            with self._lock:
+                self._send_due()
         self._undeclare()
         release(self._session)
         try:
@@ -409,26 +411,29 @@ class FabricClient(ClientEnd):
         except Exception:  # noqa: BLE001  (a handler may raise anything)
             _log.exception("the handler of %s failed in closed()", self._address)
 
-    def _deliver(self, queue: _Queue | None, packet: bytes, number: int) -> None:
-        if queue is None:
-            self._handler.packet(packet)
-            if number and self._taker.took(number, len(packet)):
-                self._tell(packets.taken("", number))
-            return
-        topic = queue.topic
-        if packet:
-            queue.waiting -= 1
-            self._handler.packet(packet)
-            if queue.taker.took(number, 0):
-                self._tell(packets.taken(topic, number))
-            return
-        number, header, data = queue.frames.popleft()
-        if self._queues.get(topic) is not queue:
-            return  # nobody wants them any more
-        self._handler.frame(header, np.frombuffer(data, np.uint8), topic)
-        self._tell(packets.seen(topic, number))
+    def _next(self) -> _Item | None:
+        """Return the next item; while waiting, resend packets to the proxy and check the keys."""
+        while True:
+            self._check_keys()
+            with self._lock:
+                self._send_due()
+                waits, stalled_s = self._outgoing.under_way, self._outgoing.stalled_s(time.monotonic())
+            if stalled_s > STALLED_S and not self._ended:
+                self._end(f"the proxy took nothing of what was sent to it for {STALLED_S:g} s")
+            try:
+                return self._inbox.get(timeout=POLL_S if waits else self._pause_s)
+            except Empty:
+                continue
 
-    def _tell(self, packet: bytes) -> None:
+    def _deliver(self, subscription: Subscription | None, packet: bytes, number: int) -> None:
+        if subscription is None:
+            self._handler.packet(packet)
+            return
+        answer = subscription.deliver(self._handler, packet, number)
+        if answer:
+            self._acknowledge(answer)
+
+    def _acknowledge(self, packet: bytes) -> None:
         with self._lock:
             if not self._ended:
                 self._put(layout.ASK, packet, 0)

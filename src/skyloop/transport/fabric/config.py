@@ -1,4 +1,4 @@
-"""What a Zenoh session is told, from the settings of this process. Pure but for the search of a free port."""
+"""Zenoh's configuration, made from the settings of this process; pure but for the search of a free port."""
 
 from __future__ import annotations
 
@@ -17,12 +17,14 @@ LEASE_MS: Final = 700
 #: An address that does not answer for so long is given up, and the next one of the same peer is tried.
 OPEN_MS: Final = 800
 MAX_MESSAGE: Final = 1 << 27  #: bytes of one frame that are taken from others
+#: Bytes of one message that a proxy takes, as frames go the other way; more is dropped before it is put together.
+MAX_MESSAGE_UP: Final = 1 << 18
 _ENCRYPTED: Final = ("quic/", "tls/")
 _RETRY: Final = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
 
 
 class Part(StrEnum):
-    """What a session is in the network."""
+    """The part that a session plays in the network."""
 
     PROXY = "proxy"  #: listens, and is called by applications
     APP = "app"  #: calls proxies
@@ -34,13 +36,33 @@ KEEP_ALIVES: Final = 8
 #: Messages that wait to be sent, by priority (Zenoh's most). Its default is 2, and what comes then is dropped within a
 #: millisecond: ten drones of one process tell of the same event in the same moment.
 _QUEUES: Final = dict.fromkeys(("real_time", "data_high", "data", "data_low"), 16)
+#: A neighbour that takes none of Zenoh's own declarations for so long is cut off [µs]; one of Zenoh's few receiving
+#: threads waits for it meanwhile. All else is dropped when a link is congested.
+BLOCKED_US: Final = LEASE_MS * 1000
+#: Whatever a neighbour asks for: who does not read holds up nobody, neither here nor through a router. An answer is
+#: sent as its question came.
+_NOBODY_WAITS: Final = {
+    "id": "nobody waits",
+    "messages": ["put", "delete", "query"],
+    "flows": ["ingress", "egress"],
+    "overwrite": {"congestion_control": "drop"},
+}
 #: What keeps proxies apart from applications for Zenoh: a router passes on from one region to another, and takes those
 #: of one region to reach one another without it (https://zenoh.io/docs/migration_1.9/regions/).
 _REGIONS: Final = {Part.PROXY: "proxies", Part.APP: "apps"}
 
 
 def make(settings: FabricSettings, part: Part, listen: Iterable[str] = ()) -> dict[str, Any]:
-    """Zenoh's configuration, as its sections by name. ``listen``: endpoints, instead of those of the settings."""
+    """Return Zenoh's configuration, as its sections by name.
+
+    Args:
+        settings: How this process joins the network.
+        part: What the session is.
+        listen: Endpoints to listen at, in place of those of the settings.
+
+    Raises:
+        UsageError: An address is not valid.
+    """
     endpoints = list(listen) or endpoints_of(settings.listen, settings)
     connect = endpoints_of(settings.connect, settings)
     found_by_search = {"peer": _called(part, bool(connect)), "router": _called(part, bool(connect))}
@@ -56,16 +78,25 @@ def make(settings: FabricSettings, part: Part, listen: Iterable[str] = ()) -> di
             "unicast": {"max_links": 2, "open_timeout": OPEN_MS},
             "link": {
                 "protocols": _protocols([*endpoints, *connect], settings),
-                "tx": {"lease": LEASE_MS, "keep_alive": KEEP_ALIVES, "queue": {"size": _QUEUES}},
-                "rx": {"max_message_size": MAX_MESSAGE},
+                "tx": {
+                    "lease": LEASE_MS,
+                    "keep_alive": KEEP_ALIVES,
+                    "queue": {"size": _QUEUES, "congestion_control": {"block": {"wait_before_close": BLOCKED_US}}},
+                },
+                "rx": {"max_message_size": MAX_MESSAGE_UP if part is Part.PROXY else MAX_MESSAGE},
             },
             "shared_memory": {"enabled": False},
         },
     }
+    if part is not Part.APP:
+        found["qos"] = {"network": [_NOBODY_WAITS]}
     if part is Part.ROUTER:
         found["gateway"] = {"south": [{"filters": [{"region_names": [name]}]} for name in _REGIONS.values()]}
     else:
         found["region_name"] = _REGIONS[part]
+        # Not a gateway for Zenoh's "clients", which are not let in: all our nodes are peers. A gateway would pass on
+        # each of the clients' declarations, and thousands of them would block it for seconds.
+        found["gateway"] = {"south": []}
     if settings.tls is not None:
         found["transport"]["link"]["tls"] = _tls(settings)
     if settings.access_control is not None:
@@ -74,7 +105,15 @@ def make(settings: FabricSettings, part: Part, listen: Iterable[str] = ()) -> di
 
 
 def endpoints_of(addresses: Iterable[str], settings: FabricSettings) -> list[str]:
-    """The endpoints of some addresses. Raises :class:`UsageError` for what is none."""
+    """Convert addresses to Zenoh's endpoints.
+
+    Args:
+        addresses: ``HOST:PORT``, ``HOST`` or whole endpoints.
+        settings: With keys each address stands for QUIC, without for TCP and UDP.
+
+    Raises:
+        UsageError: An address is not valid, or with keys not encrypted.
+    """
     found: list[str] = []
     for address in addresses:
         if "/" in address:
@@ -91,12 +130,18 @@ def endpoints_of(addresses: Iterable[str], settings: FabricSettings) -> list[str
 
 
 def to_json(sections: dict[str, Any]) -> str:
-    """A configuration as a file for Zenoh's own programs."""
+    """Return a configuration as JSON, for the files of Zenoh's own programs."""
     return json.dumps(sections, indent=2)
 
 
 def listening(settings: FabricSettings) -> list[str]:
-    """Addresses to listen at, with a free port instead of port 0; all interfaces if the settings name none."""
+    """Return the addresses to listen at, with a free port in place of port 0.
+
+    Without addresses in the settings that is a free port on all interfaces.
+
+    Raises:
+        LinkError: No port is free.
+    """
     addresses = settings.listen or (f"{all_interfaces()}:0",)
     return [
         f"{address.removesuffix(':0')}:{free_port(_host(address))}"
@@ -107,7 +152,11 @@ def listening(settings: FabricSettings) -> list[str]:
 
 
 def free_port(host: str) -> int:
-    """A port that is free for TCP and for UDP now. Raises :class:`LinkError` if there is none at this host."""
+    """Return a port that is free for both TCP and UDP now.
+
+    Raises:
+        LinkError: There is none, or this host does not have the address.
+    """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         for _ in range(50):
@@ -125,10 +174,10 @@ def free_port(host: str) -> int:
 
 
 def _called(part: Part, has_addresses: bool) -> list[str]:
-    """Whom a node calls when it hears of them.
+    """Return which kinds of node a node connects to when it learns of them.
 
-    Nobody but an application calls proxies, so that a hundred proxies have no links to one another. Whoever was given
-    addresses calls no router besides: a router that was found is not called again as often as an address is.
+    Only applications connect to proxies, so that a hundred proxies have no links to one another. A node that was given
+    addresses connects to no other router: one that was found is not retried as often as an address is.
     """
     if part is Part.APP:
         return ["router", "peer"]
@@ -136,7 +185,7 @@ def _called(part: Part, has_addresses: bool) -> list[str]:
 
 
 def _protocols(endpoints: list[str], settings: FabricSettings) -> list[str]:
-    """The only protocols that are taken: with keys, nothing that is not encrypted."""
+    """Return the only protocols that are accepted; with keys, none that is not encrypted."""
     usual = ["quic"] if settings.tls is not None else ["tcp", "udp"]
     return sorted({*usual, *(endpoint.partition("/")[0] for endpoint in endpoints)})
 
@@ -158,7 +207,11 @@ def _tls(settings: FabricSettings) -> dict[str, Any]:
 
 
 def _with_port(address: str) -> str:
-    """HOST:PORT of an address. Raises :class:`UsageError`."""
+    """Return an address as HOST:PORT.
+
+    Raises:
+        UsageError: It is not an address.
+    """
     host, colon, port = address.rpartition(":")
     if address.startswith("[") and address.endswith("]"):
         return f"{address}:{DEFAULT_PORT}"
@@ -175,5 +228,5 @@ def _host(address: str) -> str:
 
 
 def all_interfaces() -> str:
-    """The address that stands for all of this host."""
+    """Return the address that stands for all interfaces of this host."""
     return "[::]" if socket.has_dualstack_ipv6() else "0.0.0.0"

@@ -1,58 +1,208 @@
-"""One application's connection, as the server end keeps it."""
+"""The applications' connections at the server end, and the thread that sends to single applications.
+
+Whoever answers an application only queues the answer here, and nothing that the thread does waits for an application.
+One that acknowledges nothing costs what is kept for it, and that is bounded.
+"""
 
 from __future__ import annotations
 
+import logging
 import threading
+import time
+from collections import deque
+from collections.abc import Callable
 from typing import Final
 
 from skyloop.transport.base import Peer
-from skyloop.transport.fabric.window import DEPTH, Recent, Taker, Window
+from skyloop.transport.fabric import packets
+from skyloop.transport.fabric.admission import Admission
+from skyloop.transport.fabric.delivery import DEPTH, MAX_BYTES, Outgoing, Receiver
 
-MAX_SUBSCRIPTIONS: Final = 64
+POLL_S: Final = 0.05  #: how often to check whether something has to be sent again
+_OWN_AT_MOST: Final = 8  # of the transport's own packets that wait; they may be lost, and are asked for again
+_log = logging.getLogger(__name__)
 
 
 class ServerConnection:
-    """What the server end knows of an application. Its lock guards the windows and topics."""
+    """An application at the server end. Its lock guards what is sent to it, and its topics.
+
+    Args:
+        peer: As the handler knows it.
+        who: Its identity.
+        connection: Its id in keys.
+        joined_s: When it asked to be let in, on the monotonic clock [s].
+        admission: The terms of the connection.
+    """
 
     __slots__ = (
+        "_own",
+        "_taken",
+        "admission",
+        "announced",
         "confirmed",
         "ended",
         "id",
         "joined_s",
+        "left",
         "lock",
+        "outgoing",
         "peer",
         "reason",
-        "recent",
-        "taker",
+        "receiver",
         "topics",
-        "waiting",
         "who",
-        "window",
     )
 
-    def __init__(self, peer: Peer, who: str, connection: str, joined_s: float) -> None:
+    def __init__(self, peer: Peer, who: str, connection: str, joined_s: float, admission: Admission) -> None:
         self.peer = peer
         self.who = who
         self.id = connection
+        self.admission = admission
         self.joined_s = joined_s  #: when it asked to be let in
-        self.confirmed = False  #: its token was seen, so that its death will be told
+        self.announced = False  #: the handler knows of it
+        self.confirmed = False  #: its token was seen, so that Zenoh will report its end
         self.ended = False  #: what still comes is not wanted any more
         self.reason = ""  #: why it ends, as soon as one end has said so
         self.lock = threading.Lock()
-        self.window = Window()  #: of packets to it
-        self.taker = Taker()  #: of packets from it
-        self.waiting = 0  #: packets of it that wait for the handler
-        self.topics: dict[str, int] = {}  #: with the number up to which it has taken each
-        self.recent = Recent()  #: packets of it
+        self.outgoing = Outgoing()  #: packets to it
+        self.receiver = Receiver()  #: packets from it
+        self._own: deque[bytes] = deque(maxlen=_OWN_AT_MOST)  # the transport's, to it
+        self._taken = 0  # the number to acknowledge its packets up to; 0: nothing to acknowledge
+        self.topics: dict[str, int] = {}  #: with the number up to which it has acknowledged each
+        self.left = False  #: it is not subscribed to anything any more, and can't be again
 
-    def missed(self, topic: str, number: int) -> bool:
-        """Whether so many packets of a topic are on the way to it that the one with this number does not fit."""
+    def may_command(self, drone: str) -> bool:
+        """Return whether it may send more than questions to this drone, by the identity that it has proved."""
+        identity = self.admission.identity
+        return identity is None or identity.may_fly(drone)
+
+    def lags(self, topic: str, number: int) -> bool:
+        """Return whether a topic's packet has no room any more: more than :data:`DEPTH` before it are not acknowledged.
+
+        Args:
+            topic: The topic.
+            number: The packet's.
+        """
         return number - self.topics.get(topic, number) > DEPTH
 
-    def took(self, topic: str, number: int) -> None:
-        """It has taken the packets of a topic (empty: its own) up to this number."""
+    def took(self, topic: str, number: int, now_s: float) -> bool:
+        """Note up to which packet it has acknowledged a topic.
+
+        Args:
+            topic: The topic; empty for packets to this application alone.
+            number: The last packet that was acknowledged.
+            now_s: The monotonic clock [s].
+
+        Returns:
+            Whether further packets to this application alone may be due.
+        """
         with self.lock:
             if not topic:
-                self.window.taken(number)
-            elif topic in self.topics:
+                self.outgoing.taken(number, now_s)
+                return True
+            if topic in self.topics:
                 self.topics[topic] = max(number, self.topics[topic])
+            return False
+
+    def queue(self, packet: bytes) -> str:
+        """Keep a packet until it is acknowledged; return why there is no room for it, empty if there is."""
+        with self.lock:
+            if self.outgoing.put(packet):
+                return ""
+        return f"more than {DEPTH} packets, or {MAX_BYTES} bytes, wait until it takes them"
+
+    def stalled_s(self, now_s: float) -> float:
+        """Return for how long it has acknowledged nothing of what was sent to it [s]; 0 if nothing is under way."""
+        with self.lock:
+            return self.outgoing.stalled_s(now_s)
+
+    def queue_own(self, packet: bytes) -> None:
+        """Queue one of the transport's own packets, which is sent once and may be lost."""
+        with self.lock:
+            self._own.append(packet)
+
+    def acknowledge(self, number: int) -> None:
+        """Have it told that its packets up to this number were taken."""
+        with self.lock:
+            self._taken = max(self._taken, number)
+
+    def due(self, now_s: float) -> tuple[list[tuple[int, bytes]], bool]:
+        """Return what is to be sent now.
+
+        Args:
+            now_s: The monotonic clock [s].
+
+        Returns:
+            The packets with their numbers (0: the transport's own), and whether more may become due as time passes.
+        """
+        with self.lock:
+            found = [(number, packet) for number, packet, _ in self.outgoing.due(now_s)]
+            if self._taken:
+                found.insert(0, (0, packets.taken("", self._taken)))
+                self._taken = 0
+            found += [(0, packet) for packet in self._own]  # a bye is the last word
+            self._own.clear()
+            return found, self.outgoing.under_way and not self.ended
+
+
+#: Sends a packet to an application: its number, or 0 for one that may be lost.
+Put = Callable[[ServerConnection, bytes, int], object]
+
+
+class Sender:
+    """Sends what the connections keep, again where it is not acknowledged. Any thread may call :meth:`wake`.
+
+    Args:
+        put: Sends one packet; called on this object's thread.
+        name: The proxy's name, for the thread's.
+    """
+
+    def __init__(self, put: Put, name: str) -> None:
+        self._put = put
+        self._changed = threading.Condition(threading.Lock())
+        self._ready: dict[ServerConnection, None] = {}  # in the order in which they came
+        self._waiting: set[ServerConnection] = set()  # something is on the way to them; this thread's alone
+        self._ended = False
+        self._thread = threading.Thread(target=self._run, name=f"skyloop-{name}-sender", daemon=True)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def wake(self, connection: ServerConnection) -> None:
+        """Have packets of a connection sent that are due."""
+        with self._changed:
+            self._ready[connection] = None
+            self._changed.notify()
+
+    def end(self) -> None:
+        """Send what can be sent at once, and end the thread. Not on that thread."""
+        with self._changed:
+            self._ended = True
+            self._changed.notify()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._ready or self._ended, POLL_S if self._waiting else None)
+                ready, self._ready = self._ready, {}
+                ended = self._ended
+            now = time.monotonic()
+            for connection in {**ready, **dict.fromkeys(self._waiting)}:
+                self._send(connection, now)
+            if ended:
+                return
+
+    def _send(self, connection: ServerConnection, now: float) -> None:
+        due, waits = connection.due(now)
+        if waits:
+            self._waiting.add(connection)
+        else:
+            self._waiting.discard(connection)
+        try:
+            for number, packet in due:
+                self._put(connection, packet, number)
+        except Exception:  # noqa: BLE001  (whatever it is, the others are to be sent theirs)
+            _log.exception("nothing could be sent to %s", connection.peer.address)

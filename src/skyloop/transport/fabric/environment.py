@@ -1,16 +1,15 @@
-"""Whether and how this process takes part in the network: by what it is told, or else by its environment."""
+"""Whether and how this process joins the network, by arguments or else by its environment."""
 
 from __future__ import annotations
 
 import logging
 import os
-from importlib import import_module
 from pathlib import Path
 from typing import Final
 
 from skyloop.errors import UsageError
 from skyloop.transport.fabric import config
-from skyloop.transport.fabric.settings import FabricSettings
+from skyloop.transport.fabric.settings import FabricSettings, secured
 
 _log = logging.getLogger(__name__)
 
@@ -26,15 +25,21 @@ Network = bool | str | FabricSettings | None
 
 
 def choose(network: Network = None, keys: Path | str | None = None) -> FabricSettings | None:
-    """The settings, None to stay on this host.
+    """Return the settings of the network, None to stay on this host.
 
-    ``network`` defaults to the variable ``SKYLOOP_NETWORK``, without which nothing leaves this host; ``keys``, the
-    folder of an identity, to ``SKYLOOP_KEYS``. That a key ends within a week is logged as a warning. Raises
-    :class:`UsageError` for addresses or a folder that make no sense.
+    A key that ends within a week is logged as a warning.
+
+    Args:
+        network: See :data:`Network`; defaults to the variable ``SKYLOOP_NETWORK``, without which nothing leaves this
+            host.
+        keys: The folder of an identity; defaults to ``SKYLOOP_KEYS``.
+
+    Raises:
+        UsageError: An address or the folder is not valid.
     """
     found = _choose(network, keys)
     if found is not None and found.ring is not None:
-        for notice in found.ring.look():
+        for notice in found.ring.poll():
             _log.warning("%s", notice)
     return found
 
@@ -61,9 +66,16 @@ def settings(
     multicast: bool = True,
     keys: Path | str | None = None,
 ) -> FabricSettings:
-    """Settings for the network, with the keys of ``SKYLOOP_KEYS`` if no other folder is given.
+    """Make settings for the network.
 
-    Raises :class:`UsageError`.
+    Args:
+        listen: Addresses to listen at.
+        connect: Addresses to connect to.
+        multicast: Whether to search, and be found, by multicast.
+        keys: The folder of an identity; defaults to ``SKYLOOP_KEYS``.
+
+    Raises:
+        UsageError: An address or the folder is not valid.
     """
     found = FabricSettings(listen=listen, connect=connect, multicast=multicast)
     config.endpoints_of((*listen, *connect), found)  # says what is wrong with an address before anything is opened
@@ -72,8 +84,13 @@ def settings(
 
 
 def secure(plain: FabricSettings, folder: Path | str) -> FabricSettings:
-    """These settings with the identity in a folder. Raises :class:`UsageError`."""
-    credentials = import_module("skyloop.keys").load(folder)
-    found: FabricSettings = import_module("skyloop.transport.fabric.access").secured(plain, credentials)
+    """Return these settings with the identity in a folder.
+
+    Raises:
+        UsageError: The folder is not valid, or an address does not go with keys.
+    """
+    from skyloop.keys import load  # with keys only: it needs cryptography
+
+    found = secured(plain, load(folder))
     config.endpoints_of((*found.listen, *found.connect), found)  # not all that are good without keys are with them
     return found

@@ -1,17 +1,18 @@
-"""The server end's video: each wanted variant of a frame encoded once, and no more on the way than a reader takes.
+"""The server end's video: each subscribed variant of a frame is encoded once, and sent no faster than readers take it.
 
 A reader has at most :data:`WINDOW` frames on the way. While it has as many, further ones pass it by, and the newest of
-them is sent as soon as it has taken one: so what a slow link shows is fewer frames, never old ones.
+them is sent as soon as it has taken one: a slow link shows fewer frames, never old ones.
 """
 
 from __future__ import annotations
 
 import contextlib
+import itertools
 import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass
 from typing import Final
 
@@ -22,10 +23,14 @@ from skyloop.errors import LinkError, MissingExtraError, UsageError
 from skyloop.messages import FrameHeader
 from skyloop.messages.video import FrameFilter, VideoRequest
 from skyloop.transport.base import Pixels
-from skyloop.transport.pictures import encode_frame
+from skyloop.transport.frame_encoding import encode_frame
 
 WINDOW: Final = 2  #: frames on the way to one reader
-#: A frame of which nothing was heard for so long is taken for lost: Zenoh drops what a congested link can't carry.
+#: Forms of one camera's frames: each costs its encoding anew, the n parts of one together no more than that. The usual
+#: ones come on top of them, so that there is room for a pilot whatever others have asked for.
+MAX_FORMS: Final = 32
+MAX_FORMS_EACH: Final = 8  #: of them that one connection may read
+#: A frame that was not acknowledged for so long counts as lost: Zenoh drops what a congested link can't carry.
 LOST_NS: Final = nanoseconds(1.0)
 _log = logging.getLogger(__name__)
 
@@ -34,7 +39,7 @@ Send = Callable[["Variant", int, FrameHeader, bytes, "tuple[Hashable, ...] | Non
 
 
 @dataclass(slots=True)
-class Picture:
+class PublishedFrame:
     """A frame as it was published."""
 
     number: int  #: from 1, over all cameras
@@ -43,7 +48,7 @@ class Picture:
 
 
 class Reader:
-    """What is on the way to one connection."""
+    """The frames that are on the way to one connection."""
 
     __slots__ = ("_on_way", "due", "waits")
 
@@ -53,40 +58,50 @@ class Reader:
         self.waits = False  #: a frame has passed it by
 
     def has_room(self, now_ns: int) -> bool:
+        """Return whether another frame may be sent; frames older than :data:`LOST_NS` count as lost."""
         while self._on_way and now_ns - self._on_way[0][1] > LOST_NS:
             self._on_way.popleft()
         return len(self._on_way) < WINDOW
 
     def promise(self, number: int, now_ns: int) -> None:
-        """The frame is due."""
+        """Mark a frame as due."""
         self._on_way.append((number, now_ns))
         self.due, self.waits = True, False
 
     def sent(self, number: int, now_ns: int) -> None:
-        """The frame that is due was sent, or a newer one in its place."""
+        """Note that the frame that is due was sent, or a newer one in its place."""
         if self._on_way:
             self._on_way[-1] = (number, now_ns)
         self.due = self.waits = False
 
-    def took(self, number: int) -> None:
+    def taken(self, number: int) -> None:
+        """Note that the frames up to this number were taken."""
         while self._on_way and self._on_way[0][0] <= number:
             self._on_way.popleft()
 
 
 class Variant:
-    """One form of one camera's frames, and who reads it."""
+    """One form of one camera's frames, and its readers."""
 
     def __init__(self, request: VideoRequest) -> None:
         self.request = request
         self.filter = FrameFilter(request)
         self.readers: dict[Hashable, Reader] = {}
-        self.newest: Picture | None = None
+        self.newest: PublishedFrame | None = None
 
 
-class Video:
-    """All cameras of a server end. Thread-safe; nothing is copied, encoded or sent under its lock."""
+class FramePublisher:
+    """All cameras of a server end. Thread-safe; nothing is copied, encoded or sent under its lock.
+
+    Args:
+        send: Sends one encoded frame; called on the camera's thread.
+        name: The proxy's name.
+        clock: The monotonic clock [ns].
+    """
 
     def __init__(self, send: Send, name: str, clock: Clock = time.monotonic_ns) -> None:
+        #: Why a topic can't be subscribed to; empty if it can.
+        self.topic_problem: Callable[[str], str] = lambda _: ""
         self._send = send
         self._name = name
         self._clock = clock
@@ -98,7 +113,15 @@ class Video:
         self._unable: set[str] = set()  # topics that can't be encoded, and of which that was said
 
     def publish(self, header: FrameHeader, pixels: Pixels) -> int:
-        """Take a frame; returns to how many readers it could not be handed over."""
+        """Take a frame and have it encoded and sent by the camera's thread.
+
+        Args:
+            header: The frame's header.
+            pixels: ``header.size`` bytes, dtype uint8; copied if anybody reads the camera.
+
+        Returns:
+            How many readers it passes by, as they have :data:`WINDOW` frames on the way.
+        """
         variants = self._variants.get(header.camera)
         if not variants:
             return 0
@@ -111,7 +134,7 @@ class Video:
         missed = due = 0
         with self._changed:
             self._number += 1
-            picture = Picture(self._number, header, copy)
+            picture = PublishedFrame(self._number, header, copy)
             for variant in wanted:
                 variant.newest = picture
                 for reader in variant.readers.values():
@@ -126,60 +149,96 @@ class Video:
         return missed
 
     def readers(self, camera: str) -> int:
-        """How many read this camera, in whatever form."""
+        """Return how many subscriptions a camera has, in all forms."""
         with self._changed:
             return sum(len(variant.readers) for variant in self._variants.get(camera, {}).values())
 
     def subscribe(self, key: Hashable, topic: str) -> bool:
-        """A connection wants frames, from the next one on; False if this is no request for video."""
-        try:
-            request = VideoRequest.parse(topic)
-        except UsageError:
-            return False
+        """Send a connection frames, from the next one on.
+
+        Args:
+            key: The connection.
+            topic: A camera's, in any form.
+
+        Returns:
+            False if it can't have them; see :meth:`problem`.
+        """
         with self._changed:
+            if self._problem(key, topic):
+                return False
+            request = VideoRequest.parse(topic)
             variants = self._variants.setdefault(request.camera, {})
             variants.setdefault(topic, Variant(request)).readers.setdefault(key, Reader())
             if request.camera not in self._threads:
                 thread = threading.Thread(
                     target=self._run, args=(request.camera,), name=f"skyloop-{self._name}-video", daemon=True
                 )
+                try:
+                    thread.start()
+                except RuntimeError:  # there are no more threads
+                    self._drop(request.camera, topic, key)
+                    return False
                 self._threads[request.camera] = thread
-                thread.start()
         return True
 
+    def problem(self, key: Hashable, topic: str) -> str:
+        """Return why a connection can't have these frames; empty if it can."""
+        with self._changed:
+            return self._problem(key, topic)
+
+    def _problem(self, key: Hashable, topic: str) -> str:
+        unknown = self.topic_problem(topic)
+        if unknown:
+            return unknown
+        try:
+            request = VideoRequest.parse(topic)
+        except UsageError as error:
+            return str(error)
+        usual = (request.plain, VideoRequest(request.camera, encoding="jpeg"))
+        variants = self._variants.get(request.camera, {})
+        if request in usual or (topic in variants and key in variants[topic].readers):
+            return ""
+        mine = [known for known, variant in variants.items() if key in variant.readers and variant.request not in usual]
+        if len(mine) >= MAX_FORMS_EACH:
+            return f"a connection reads a camera in at most {MAX_FORMS_EACH} forms beside the usual: {_listed(mine)}"
+        others = {known: variant.request for known, variant in variants.items() if variant.request not in usual}
+        if topic not in variants and sum(map(_cost, others.values())) + _cost(request) > MAX_FORMS:
+            return f"a camera's frames are encoded in at most {MAX_FORMS} forms: choose one of {_listed(others)}"
+        return ""
+
     def unsubscribe(self, key: Hashable, topic: str) -> None:
-        """A connection wants them no longer."""
+        """Send a connection the frames of a topic no longer."""
         with self._changed, contextlib.suppress(UsageError):
             camera = VideoRequest.parse(topic).camera
             self._drop(camera, topic, key)
 
     def leave(self, key: Hashable) -> None:
-        """A connection has ended."""
+        """Remove a connection that has ended from all topics."""
         with self._changed:
             for camera, variants in list(self._variants.items()):
                 for topic in list(variants):
                     self._drop(camera, topic, key)
 
-    def took(self, key: Hashable, topic: str, number: int) -> None:
-        """A connection has taken the frames of a topic up to this one."""
+    def taken(self, key: Hashable, topic: str, number: int) -> None:
+        """Note up to which frame a connection has taken a topic, and send it the newest if one has passed it by."""
         with self._changed:
             for variants in self._variants.values():
                 variant = variants.get(topic)
                 reader = variant.readers.get(key) if variant is not None else None
                 if variant is None or reader is None:
                     continue
-                reader.took(number)
+                reader.taken(number)
                 now_ns = self._clock()
                 if reader.waits and variant.newest is not None and reader.has_room(now_ns):
                     reader.promise(variant.newest.number, now_ns)
                     self._changed.notify_all()
 
     def end(self) -> None:
-        """End the threads."""
+        """End the cameras' threads."""
         with self._changed:
             self._ended = True
             self._changed.notify_all()
-        for thread in self._threads.values():
+        for thread in list(self._threads.values()):
             if thread is not threading.current_thread():
                 thread.join()
 
@@ -188,6 +247,10 @@ class Video:
         variant = variants.get(topic)
         if variant is not None and variant.readers.pop(key, None) is not None and not variant.readers:
             del variants[topic]
+            self._unable.discard(topic)
+            if not variants:  # the last reader of the camera is gone: its thread ends
+                del self._variants[camera]
+                self._changed.notify_all()
 
     # --- the thread of a camera ---
 
@@ -200,11 +263,17 @@ class Video:
             except Exception:  # noqa: BLE001  (one frame less; the next one may be better)
                 _log.exception("frame %s of %s could not be sent", picture.header.seq, camera)
 
-    def _next(self, camera: str) -> tuple[Variant, Picture, tuple[Hashable, ...] | None] | None:
-        """A variant with readers that are due, its newest frame and those readers (None: all); None at the end."""
+    def _next(self, camera: str) -> tuple[Variant, PublishedFrame, tuple[Hashable, ...] | None] | None:
+        """Wait for a variant with readers that are due.
+
+        Returns:
+            The variant, its newest frame and those readers (None: all); None at the end, or when nobody reads this
+            camera.
+        """
         with self._changed:
-            while not self._ended:
-                for variant in self._variants.get(camera, {}).values():
+            while not self._ended and camera in self._variants:
+                variants = self._variants[camera]
+                for topic, variant in variants.items():
                     due = tuple(key for key, reader in variant.readers.items() if reader.due)
                     picture = variant.newest
                     if not due or picture is None:
@@ -212,12 +281,14 @@ class Video:
                     now_ns = self._clock()
                     for key in due:
                         variant.readers[key].sent(picture.number, now_ns)
+                    variants[topic] = variants.pop(topic)  # the others come first next time
                     return variant, picture, None if len(due) == len(variant.readers) else due
                 self._changed.wait()
+            self._threads.pop(camera, None)
         return None
 
-    def _encoded(self, variant: Variant, picture: Picture) -> tuple[FrameHeader, bytes]:
-        """As it was asked for; as it is, said once, where that is not possible here."""
+    def _encoded(self, variant: Variant, picture: PublishedFrame) -> tuple[FrameHeader, bytes]:
+        """Encode a frame as it was asked for; where that is not possible, return it as it is and log so once."""
         try:
             return encode_frame(picture.header, picture.pixels, variant.request)
         except (MissingExtraError, LinkError) as error:
@@ -226,3 +297,12 @@ class Video:
                 self._unable.add(topic)
                 _log.warning("%s of %s is sent as it is: %s", topic, self._name, error)
             return picture.header, picture.pixels.tobytes()
+
+
+def _cost(request: VideoRequest) -> float:
+    """Return the share of the frames that has to be encoded for a form."""
+    return 1.0 if request.part is None else 1.0 / request.part[1]
+
+
+def _listed(topics: Iterable[str]) -> str:
+    return ", ".join(itertools.islice(topics, 3)) + ", …"

@@ -1,19 +1,41 @@
-"""The keys of the fabric transport: where each packet travels, and who may use which key. Pure: names only.
+"""The keys of the fabric transport: by which key each packet travels, and which keys each role may use; pure functions.
+
+Since a packet that asks for something has to travel by the key for that, control of keys is control of actions.
 
 ``docs/wire-format.md`` has the table. NAME is a proxy's name, WHO an application's identity (the common name of its
 certificate, ``anyone`` without keys), ID a connection: 16 hexadecimal digits, random. TOPIC, CAMERA and VARIANT may be
-any text, so they are percent-encoded to one chunk of a key each.
+any text, so each is percent-encoded to one chunk of a key.
 """
 
 from __future__ import annotations
 
 import re
 import secrets
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 from urllib.parse import quote, unquote
 
 from skyloop.errors import DecodeError, UsageError
-from skyloop.transport.names import NAME
+from skyloop.messages import (
+    Command,
+    GetParameter,
+    GetStatistics,
+    Hello,
+    JoinProcessor,
+    ListParameters,
+    Ping,
+    Refusal,
+    Refused,
+    Reply,
+    Request,
+    VehiclePose,
+    decode,
+    encode,
+)
+from skyloop.messages.codec import KINDS
+from skyloop.transport.base import NAME
+
+if TYPE_CHECKING:
+    from skyloop.keys import Identity
 
 ROOT: Final = "skyloop/1"
 ANYONE: Final = "anyone"  #: WHO without keys
@@ -26,10 +48,16 @@ ID: Final = re.compile(r"[0-9a-f]{16}")
 ASK: Final = "ask"  #: reliable; what an observer may send
 ORDER: Final = "order"  #: reliable; what only a pilot may send
 COMMAND: Final = "command"  #: best effort; the command channel
+#: What an observer may ask. A request that is not named here needs the right to order, so a new one is safe.
+ASKED: Final = (Hello, Ping, GetParameter, ListParameters, GetStatistics, JoinProcessor)
+_RANK: Final = {ASK: 0, ORDER: 1, COMMAND: 2}
+_COMMAND: Final = bytes([KINDS[Command]])
+_REQUEST: Final = bytes([KINDS[Request]])
+_POSE: Final = bytes([KINDS[VehiclePose]])  # a vehicle may fly by it
 
 
 class Sender(NamedTuple):
-    """Whom a key of an application belongs to."""
+    """The application that a key belongs to."""
 
     way: str  #: ``ask``, ``order``, ``command``, ``app`` or ``join``
     who: str
@@ -37,57 +65,74 @@ class Sender(NamedTuple):
 
 
 def new_id() -> str:
-    """An ID, or a RUN."""
+    """Return a new random ID, or RUN."""
     return secrets.token_hex(8)
 
 
 def alive(name: str, run: str) -> str:
-    """Liveliness token of a server end."""
+    """Return the key of a server end's liveliness token."""
     return f"{ROOT}/{name}/alive/{run}"
 
 
 def info(name: str) -> str:
-    """Where a proxy tells who it is, to anybody who asks."""
+    """Return the key at which a proxy says who it is, to anybody who asks."""
     return f"{ROOT}/{name}/info"
 
 
 def app(name: str, who: str, connection: str) -> str:
-    """Liveliness token of a connection."""
+    """Return the key of a connection's liveliness token."""
     return f"{ROOT}/{name}/app/{who}/{connection}"
 
 
 def join(name: str, who: str, connection: str) -> str:
-    """Where an application asks to be let in."""
+    """Return the key at which an application asks to be let in."""
     return f"{ROOT}/{name}/join/{who}/{connection}"
 
 
 def upward(way: str, name: str, who: str, connection: str) -> str:
-    """Where an application sends packets: ``way`` is :data:`ASK`, :data:`ORDER` or :data:`COMMAND`."""
+    """Return the key by which an application sends packets.
+
+    Args:
+        way: :data:`ASK`, :data:`ORDER` or :data:`COMMAND`.
+        name: The proxy's name.
+        who: The application's identity.
+        connection: The connection's id.
+    """
     return f"{ROOT}/{name}/{way}/{who}/{connection}"
 
 
 def to(name: str, connection: str) -> str:
-    """Where a proxy sends packets to one application."""
+    """Return the key by which a proxy sends packets to one application."""
     return f"{ROOT}/{name}/to/{connection}"
 
 
 def topic(name: str, topic_name: str) -> str:
-    """Where packets of a topic are published."""
+    """Return the key at which packets of a topic are published."""
     return f"{ROOT}/{name}/topic/{_chunk(topic_name)}"
 
 
 def video(name: str, camera: str, variant: str = "") -> str:
-    """Where frames are published; ``variant`` is what follows the ``?`` of their topic."""
+    """Return the key at which frames are published.
+
+    Args:
+        name: The proxy's name.
+        camera: The camera's.
+        variant: What follows the ``?`` of the frames' topic.
+    """
     return f"{ROOT}/{name}/video/{_chunk(camera)}/{_chunk(variant) or PLAIN}"
 
 
 def video_for(name: str, camera: str, variant: str, connection: str) -> str:
-    """The same for one application alone, while another one of the same variant can't keep up."""
+    """Return the key of frames for one application alone, while another one of the same variant can't keep up."""
     return f"{video(name, camera, variant)}/{connection}"
 
 
 def parse_sender(key: str) -> Sender:
-    """Whom a key belongs to. Raises :class:`DecodeError` for a key that no application of ours uses."""
+    """Return whom a key belongs to.
+
+    Raises:
+        DecodeError: It is not a key of an application.
+    """
     parts = key.split("/")
     if len(parts) == 6 and WHO.fullmatch(parts[4]) and ID.fullmatch(parts[5]):
         return Sender(parts[3], parts[4], parts[5])
@@ -95,7 +140,11 @@ def parse_sender(key: str) -> Sender:
 
 
 def parse_alive(key: str) -> tuple[str, str]:
-    """NAME and RUN of a server end's token. Raises :class:`DecodeError`."""
+    """Return NAME and RUN of a server end's token.
+
+    Raises:
+        DecodeError: It is not the key of such a token.
+    """
     parts = key.split("/")
     if len(parts) == 5 and parts[3] == "alive" and NAME.fullmatch(parts[2]) and ID.fullmatch(parts[4]):
         return parts[2], parts[4]
@@ -103,76 +152,128 @@ def parse_alive(key: str) -> tuple[str, str]:
 
 
 def parse_topic(key: str) -> str:
-    """The topic of a key made by :func:`topic`."""
+    """Return the topic of a key made by :func:`topic`."""
     return unquote(key.rpartition("/")[2])
 
 
 def check_identity(who: str) -> None:
-    """Raise :class:`UsageError` for what cannot be WHO."""
+    """Check an identity.
+
+    Raises:
+        UsageError: It can't be WHO.
+    """
     if not WHO.fullmatch(who):
         raise UsageError(
             f"{who!r} cannot be an identity: 1 to 64 letters, digits, '_', '-' and '.', the first one a letter or digit"
         )
 
 
+# By which key a packet has to travel -----------------------------------------------------------------------
+
+
+def way_of(packet: bytes) -> str:
+    """Return the key that a packet needs: :data:`ASK`, :data:`ORDER` or :data:`COMMAND`.
+
+    Bytes that are no packet need no right, as nobody obeys them.
+    """
+    kind = packet[5:6]
+    if kind == _COMMAND:
+        return COMMAND
+    if kind == _POSE:
+        return ORDER
+    if kind != _REQUEST:
+        return ASK
+    try:
+        request = decode(packet)
+    except DecodeError:
+        return ASK
+    return ASK if isinstance(request, Request) and isinstance(request.body, ASKED) else ORDER
+
+
+def refusal_reply(packet: bytes, identity: Identity, drone: str) -> bytes | None:
+    """Return the reply to a request that an application's keys give no right to, which is not sent to the proxy.
+
+    Args:
+        packet: Needs the right to fly.
+        identity: The application's.
+        drone: The proxy's name.
+
+    Returns:
+        The packet of the reply; None for a packet that is no request.
+    """
+    try:
+        sample = decode(packet)
+    except DecodeError:
+        return None
+    if not isinstance(sample, Request):
+        return None
+    text = f"these are the keys of {identity}: they give no right to fly or configure {drone!r}"
+    return encode(Reply(sample.id, Refused(Refusal.OBSERVER, text)))
+
+
+def allows(way: str, packet: bytes) -> bool:
+    """Return whether a packet may travel by the key by which it came."""
+    return _RANK[way] >= _RANK[way_of(packet)]
+
+
 # What each role may do, as key expressions (see Zenoh's "access control": a rule's ``key_exprs``) -----------------
 
 
 def observer_puts(who: str, name: str = "*") -> list[str]:
-    """Where an observer may put packets."""
+    """Return where an observer may put packets."""
     return [upward(ASK, name, who, "*")]
 
 
 def pilot_puts(who: str, name: str) -> list[str]:
-    """Where a pilot may put packets, beside those of an observer."""
+    """Return where a pilot may put packets, beside an observer's keys."""
     return [upward(ORDER, name, who, "*"), upward(COMMAND, name, who, "*")]
 
 
 def app_tokens(who: str, name: str = "*") -> list[str]:
-    """Liveliness tokens that an application may declare."""
+    """Return the liveliness tokens that an application may declare."""
     return [app(name, who, "*")]
 
 
 def app_queries(who: str, name: str = "*") -> list[str]:
-    """What an application may query."""
+    """Return what an application may query."""
     return [join(name, who, "*"), info(name)]
 
 
 def app_watches(name: str = "*") -> list[str]:
-    """Liveliness tokens that an application may ask for and watch."""
+    """Return the liveliness tokens that an application may query and watch."""
     return [alive(name, "*")]
 
 
 def app_subscriptions(name: str = "*") -> list[str]:
-    """What an application may subscribe to."""
+    """Return what an application may subscribe to."""
     return [to(name, "*"), f"{ROOT}/{name}/topic/*", f"{ROOT}/{name}/video/**"]
 
 
 def proxy_puts(name: str) -> list[str]:
-    """Where a proxy may put packets."""
+    """Return where a proxy may put packets."""
     return app_subscriptions(name)
 
 
 def proxy_tokens(name: str) -> list[str]:
-    """Liveliness tokens that a proxy may declare."""
+    """Return the liveliness tokens that a proxy may declare."""
     return [alive(name, "*")]
 
 
 def proxy_watches(name: str) -> list[str]:
-    """Liveliness tokens that a proxy may ask for and watch."""
+    """Return the liveliness tokens that a proxy may query and watch."""
     return [alive(name, "*"), app(name, "*", "*")]
 
 
 def proxy_answers(name: str) -> list[str]:
-    """Queries that a proxy may answer (its queryables)."""
+    """Return the queries that a proxy may answer (its queryables)."""
     return [join(name, "*", "*"), info(name)]
 
 
 def proxy_subscriptions(name: str) -> list[str]:
-    """What a proxy may subscribe to."""
+    """Return what a proxy may subscribe to."""
     return [upward(way, name, "*", "*") for way in (ASK, ORDER, COMMAND)]
 
 
 def _chunk(text: str) -> str:
-    """Any text as one chunk of a key: no ``/``, ``*``, ``$``, ``?`` or ``#`` is left in it."""
+    """Encode any text as one chunk of a key, without ``/``, ``*``, ``$``, ``?`` and ``#``."""
     return quote(text, safe="=&,:")

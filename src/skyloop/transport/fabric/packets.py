@@ -1,59 +1,80 @@
-"""The fabric transport's own packets and attachments: bytes to typed tuples and back. Pure; tables in
-``docs/wire-format.md``.
+"""The fabric transport's own packets and attachments: bytes to typed tuples and back, as pure functions.
 
-They share the header of all packets and have kinds from 0x50, which no sample has.
+They share the header of all packets and have kinds from 0x50, which no sample has. ``docs/wire-format.md`` has the
+tables.
 """
 
 from __future__ import annotations
 
 import struct
 from enum import IntEnum
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import msgspec
 
 from skyloop.errors import DecodeError
 from skyloop.messages import FrameHeader, decode
 from skyloop.messages.codec import HEADER, HEADER_SIZE, SIGNATURE, VERSION
-from skyloop.transport.base import MAX_TOPIC
+from skyloop.transport.base import MAX_PACKET, MAX_TOPIC
 
-REVISION: Final = 1  #: of the fabric transport
+if TYPE_CHECKING:
+    import zenoh
+
+REVISION: Final = 2  #: of the fabric transport
 MAX_REASON: Final = 400  #: bytes of UTF-8
+MAX_OWN: Final = 4096  #: bytes of a Join, a Welcome or a ProxyInfo, and of any attachment
 
 
 class FabricKind(IntEnum):
-    """The kinds of packet that the two ends exchange between themselves."""
+    """The kinds of packets that the two ends exchange between themselves."""
 
     SUBSCRIBE = 0x50  #: application to proxy
     TAKEN = 0x51  #: either way: packets up to this number were taken
     SEEN = 0x52  #: application to proxy: frames up to this number were taken
     BYE = 0x53  #: either way: why the connection ends; answered with the same
+    KEY = 0x54  #: proxy to application, sealed: what topics and frames are sealed with from now on
 
 
 class Subscribe(NamedTuple):
+    """An application subscribes to a topic, or unsubscribes from it."""
+
     topic: str
     on: bool
 
 
 class Taken(NamedTuple):
+    """Packets up to a number were taken."""
+
     topic: str  #: empty: of the packets sent to this end alone
     number: int
 
 
 class Seen(NamedTuple):
+    """Frames of a topic up to a number were taken."""
+
     topic: str
     number: int
 
 
 class Bye(NamedTuple):
+    """Why the connection ends."""
+
     reason: str
 
 
-Message = Subscribe | Taken | Seen | Bye
+class Key(NamedTuple):
+    """What topics and frames are sealed with from now on."""
+
+    generation: int
+    key: bytes  #: 32 bytes
+
+
+Message = Subscribe | Taken | Seen | Bye | Key
 
 _NUMBER = struct.Struct("<Q")
 _OWN: Final = bytes([FabricKind.SUBSCRIBE])
 _PUBLISHED = struct.Struct("<8sQ")
+_KEY = struct.Struct("<I32s")
 
 
 class Join(msgspec.Struct, frozen=True, array_like=True):
@@ -64,6 +85,7 @@ class Join(msgspec.Struct, frozen=True, array_like=True):
     host: str = ""  #: for people
     pid: int = 0  #: for people
     program: str = ""  #: for people
+    proof: bytes = b""  #: with keys: whose it is, see :mod:`skyloop.keys.agreement`
 
 
 class Welcome(msgspec.Struct, frozen=True, array_like=True):
@@ -71,6 +93,8 @@ class Welcome(msgspec.Struct, frozen=True, array_like=True):
 
     revision: int
     run: str
+    proof: bytes = b""  #: with keys: that the proxy is who it should be
+    topics: bytes = b""  #: with keys: the packet of :class:`Key`, sealed for this connection
 
 
 class ProxyInfo(msgspec.Struct, frozen=True, array_like=True):
@@ -92,24 +116,33 @@ decode_info = msgspec.msgpack.Decoder(ProxyInfo).decode
 
 
 def is_own(packet: bytes) -> bool:
-    """Whether a packet may be for the transport itself and not for the handler."""
+    """Return whether a packet may be for the transport itself and not for the handler."""
     return packet[5:6] >= _OWN and packet.startswith(SIGNATURE)
 
 
 def subscribe(topic: str, on: bool) -> bytes:
+    """Encode a :class:`Subscribe`."""
     return _packet(FabricKind.SUBSCRIBE, bytes((on,)) + topic.encode())
 
 
 def taken(topic: str, number: int) -> bytes:
+    """Encode a :class:`Taken`."""
     return _packet(FabricKind.TAKEN, _NUMBER.pack(number) + topic.encode())
 
 
 def seen(topic: str, number: int) -> bytes:
+    """Encode a :class:`Seen`."""
     return _packet(FabricKind.SEEN, _NUMBER.pack(number) + topic.encode())
 
 
 def bye(reason: str) -> bytes:
+    """Encode a :class:`Bye`; the reason is cut to :data:`MAX_REASON` bytes."""
     return _packet(FabricKind.BYE, reason.encode(errors="replace")[:MAX_REASON])
+
+
+def key(generation: int, secret: bytes) -> bytes:
+    """Encode a :class:`Key`; ``secret`` has 32 bytes."""
+    return _packet(FabricKind.KEY, _KEY.pack(generation, secret))
 
 
 def _packet(kind: FabricKind, body: bytes) -> bytes:
@@ -117,7 +150,11 @@ def _packet(kind: FabricKind, body: bytes) -> bytes:
 
 
 def parse(packet: bytes) -> Message:
-    """What one of the transport's own packets says. Raises :class:`DecodeError` for anything that is none."""
+    """Decode one of the transport's own packets.
+
+    Raises:
+        DecodeError: It is not one, or it is damaged.
+    """
     if len(packet) < HEADER_SIZE:
         raise DecodeError(f"{len(packet)} bytes are less than the header of {HEADER_SIZE}")
     signature, version, kind, reserved, length = HEADER.unpack_from(packet)
@@ -135,9 +172,21 @@ def parse(packet: bytes) -> Message:
             return Seen(_topic(body[_NUMBER.size :], least=1), *_NUMBER.unpack_from(body))
         if kind == FabricKind.BYE:
             return Bye(body[:MAX_REASON].decode(errors="replace"))
+        if kind == FabricKind.KEY:
+            return Key(*_KEY.unpack(body))
     except (IndexError, struct.error, UnicodeDecodeError) as error:
         raise DecodeError(f"bad packet of kind {kind:#x} with {length} bytes of body: {error!r}") from None
     raise DecodeError(f"unknown kind {kind:#x}")
+
+
+def parse_own(packet: bytes) -> Message | None:
+    """Decode one of the transport's own packets; return None for one that is for the handler, as garbage is, too."""
+    if not is_own(packet):
+        return None
+    try:
+        return parse(packet)
+    except DecodeError:
+        return None
 
 
 def _topic(text: bytes, least: int = 0) -> str:
@@ -147,6 +196,41 @@ def _topic(text: bytes, least: int = 0) -> str:
     return topic
 
 
+# What Zenoh has received ---------------------------------------------------------------------------------------
+
+
+def copied(data: zenoh.ZBytes | None, at_most: int) -> bytes:
+    """Return what Zenoh received as bytes; empty for None.
+
+    Args:
+        data: The payload or attachment.
+        at_most: The largest size that is copied [bytes].
+
+    Raises:
+        DecodeError: It is larger.
+    """
+    if data is None:
+        return b""
+    if len(data) > at_most:
+        raise DecodeError(f"{len(data)} bytes, and at most {at_most} are taken")
+    return bytes(data)
+
+
+def contents(sample: zenoh.Sample, at_most: int = MAX_PACKET) -> tuple[bytes, bytes]:
+    """Return the packet and the attachment of a sample.
+
+    Args:
+        sample: What Zenoh received.
+        at_most: The largest size of the packet [bytes].
+
+    Raises:
+        DecodeError: It is empty or too large.
+    """
+    if not sample.payload:
+        raise DecodeError("it is empty")
+    return copied(sample.payload, at_most), copied(sample.attachment, MAX_OWN)
+
+
 # Attachments ---------------------------------------------------------------------------------------------------
 
 #: Of a packet to one end: its number, from 1; 0 for the transport's own, which are not counted.
@@ -154,7 +238,11 @@ number = _NUMBER.pack
 
 
 def parse_number(attachment: bytes) -> int:
-    """Raises :class:`DecodeError`."""
+    """Decode the attachment of a packet to one end.
+
+    Raises:
+        DecodeError: It is damaged.
+    """
     try:
         return int(_NUMBER.unpack(attachment)[0])
     except struct.error as error:
@@ -162,12 +250,21 @@ def parse_number(attachment: bytes) -> int:
 
 
 def published(run: bytes, count: int) -> bytes:
-    """The attachment of a published packet: RUN of its proxy (8 bytes) and its number on this topic, from 1."""
+    """Encode the attachment of a published packet.
+
+    Args:
+        run: RUN of its proxy, 8 bytes.
+        count: The packet's number on this topic, from 1.
+    """
     return _PUBLISHED.pack(run, count)
 
 
 def parse_published(attachment: bytes) -> tuple[bytes, int]:
-    """RUN and number. Raises :class:`DecodeError`."""
+    """Decode the attachment of a published packet: RUN and number.
+
+    Raises:
+        DecodeError: It is damaged.
+    """
     try:
         run, count = _PUBLISHED.unpack(attachment)
     except struct.error as error:
@@ -176,12 +273,22 @@ def parse_published(attachment: bytes) -> tuple[bytes, int]:
 
 
 def frame(run: bytes, count: int, header: bytes) -> bytes:
-    """The attachment of a frame: as of a packet, then the whole packet of its :class:`FrameHeader`."""
+    """Encode the attachment of a frame.
+
+    Args:
+        run: RUN of its proxy, 8 bytes.
+        count: The frame's number.
+        header: The whole packet of its :class:`FrameHeader`.
+    """
     return _PUBLISHED.pack(run, count) + header
 
 
 def parse_frame(attachment: bytes) -> tuple[bytes, int, FrameHeader]:
-    """RUN, number and header. Raises :class:`DecodeError`."""
+    """Decode the attachment of a frame: RUN, number and header.
+
+    Raises:
+        DecodeError: It is damaged.
+    """
     run, count = parse_published(attachment[: _PUBLISHED.size])
     header = decode(attachment[_PUBLISHED.size :])
     if type(header) is not FrameHeader:

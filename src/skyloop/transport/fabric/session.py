@@ -1,13 +1,15 @@
-"""Zenoh sessions of this process: one for all that take part in the same way, however many drones they fly."""
+"""The Zenoh sessions of this process: one for all connections with the same settings, however many drones they fly."""
 
 from __future__ import annotations
 
 import atexit
 import json
 import logging
+import platform
 import threading
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 from skyloop.errors import LinkError, MissingExtraError
@@ -19,14 +21,26 @@ if TYPE_CHECKING:
     import zenoh
 
 _log = logging.getLogger(__name__)
-LINGER_S: Final = 2.0  #: a session that nobody uses stays open so long: whoever connects anew finds it as it was
+LINGER_S: Final = (
+    2.0  #: a session without users stays open for so long, so that a reconnecting client finds it as it was
+)
+REOPEN_S: Final = 2.0  #: how long an address may take to be free again
 _BORROWED: Final = 1000  # times to try again what another thread is just using …
 _BORROWED_S: Final = 0.001  # … after so long
 _ATTEMPTS: Final = 5  # to get a free port before somebody else has it
 
 
 class Session:
-    """One Zenoh session, shared; :meth:`release` gives it back."""
+    """One shared Zenoh session; :func:`release` gives it back.
+
+    Args:
+        settings: How to join the network.
+        part: What the session is.
+
+    Raises:
+        LinkError: The network can't be joined.
+        MissingExtraError: The extra ``network`` is not installed.
+    """
 
     def __init__(self, settings: FabricSettings, part: Part) -> None:
         self.settings = settings
@@ -39,17 +53,35 @@ class Session:
         self.zenoh: zenoh.Session = self._open()
 
     def callback(self, function: Callable[[Any], None]) -> Any:
-        """What Zenoh calls on its receiving thread with each sample, reply or query; it must be quick."""
+        """Wrap a function that Zenoh calls on its receiving thread with each sample, reply or query.
+
+        It must be quick.
+        """
         from zenoh.handlers import Callback
 
         return Callback(function, indirect=False)
 
+    def peers(self) -> set[str]:
+        """Return the common names in the certificates of all linked nodes; none without keys."""
+        try:
+            return {link.auth_identifier or "" for link in self.zenoh.info.links()} - {""}
+        except load().ZError:  # it is closed
+            return set()
+
+    def shut_out(self) -> frozenset[str]:
+        """Return the linked nodes that the newest roster shuts out.
+
+        Zenoh itself goes by the roster with which the session began.
+        """
+        ring = self.settings.ring
+        return ring.shut_out & self.peers() if ring is not None and ring.shut_out else frozenset()
+
     def over(self, now: float) -> bool:
-        """Whether it has lingered long enough without a user. For the pool."""
+        """Return whether it has lingered long enough without a user. For the pool."""
         return self.retired or now - self.idle_since >= LINGER_S
 
     def close(self) -> None:
-        """End it. For the pool."""
+        """Close the Zenoh session. For the pool."""
         try:
             self.zenoh.close()  # type: ignore[no-untyped-call]
         except Exception as error:  # noqa: BLE001  (whatever it is, there is nothing more that can be done)
@@ -64,14 +96,17 @@ class Session:
             try:
                 return zenoh_module.open(configure(sections))
             except zenoh_module.ZError as error:
-                # The port was found free, and somebody else was faster: only then is another attempt of any use.
+                # Another process may have taken the port that was found free: only then is another attempt of any use.
                 if attempt == _ATTEMPTS - 1 or not any(each.endswith(":0") for each in self.settings.listen or (":0",)):
                     raise LinkError(f"cannot join the network: {error}") from None
         raise AssertionError("unreachable")
 
 
 class _Pool:
-    """All sessions of this process. A thread ends those that nobody uses, and itself when there are none."""
+    """All sessions of this process.
+
+    A thread closes those that nobody uses, and ends itself when there are none.
+    """
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -79,7 +114,13 @@ class _Pool:
         self._reaper: threading.Thread | None = None
 
     def acquire(self, settings: FabricSettings, part: Part) -> Session:
-        """A session with these settings. Raises :class:`LinkError`, :class:`UsageError`, :class:`MissingExtraError`."""
+        """Return a session with these settings, opening one if there is none.
+
+        Raises:
+            LinkError: The network can't be joined.
+            UsageError: An address is not valid.
+            MissingExtraError: The extra ``network`` is not installed.
+        """
         with self._changed:
             for session in self._sessions:
                 same = (session.settings, session.part) == (settings, part)
@@ -92,7 +133,12 @@ class _Pool:
             return session
 
     def release(self, session: Session, *, linger: bool = True) -> None:
-        """Give a session back."""
+        """Give a session back.
+
+        Args:
+            session: From :meth:`acquire`.
+            linger: Whether it stays open for :data:`LINGER_S` without users; else it is closed at once.
+        """
         with self._changed:
             session.users -= 1
             session.idle_since = time.monotonic() if linger else -LINGER_S
@@ -107,12 +153,15 @@ class _Pool:
             session.close()  # outside the lock, as it may wait for the network
 
     def retire(self, session: Session) -> None:
-        """Let those who come from now on have a new one; this one ends with its last user."""
+        """Give new users another session from now on; this one ends with its last user."""
         with self._changed:
             session.retired = True
 
     def close_all(self) -> None:
-        """At the end of the process: Zenoh's threads may not call into an interpreter that is gone."""
+        """Close all sessions at the end of the process.
+
+        Zenoh's threads may not call into an interpreter that is gone.
+        """
         with self._changed:
             for session in self._sessions:
                 session.close()
@@ -143,7 +192,11 @@ atexit.register(_POOL.close_all)
 
 
 def load() -> Any:
-    """The package zenoh. Raises :class:`MissingExtraError`."""
+    """Import and return the package zenoh.
+
+    Raises:
+        MissingExtraError: It is not installed.
+    """
     try:
         import zenoh
     except ImportError as error:
@@ -151,8 +204,36 @@ def load() -> Any:
     return zenoh
 
 
+def host_name() -> str:
+    """Return the name of this host, for people."""
+    return platform.node()[:64] or "?"
+
+
+def renewed(session: Session) -> Session:
+    """Replace a session, which nobody else uses, by one at the same addresses with the newest roster.
+
+    All its links end and are made anew.
+
+    Args:
+        session: From :func:`acquire`; it is released.
+
+    Raises:
+        LinkError: The keys were revoked, or an address is not free again within :data:`REOPEN_S`.
+    """
+    settings = replace(session.settings.current(), listen=tuple(session.listens))
+    release(session, linger=False)
+    deadline = time.monotonic() + REOPEN_S
+    while True:
+        try:
+            return acquire(settings, session.part)
+        except LinkError:  # the ports are given back in a moment
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(_BORROWED_S)
+
+
 def undeclare(held: Iterable[Any]) -> None:
-    """Take back what was declared, the last first. Not on Zenoh's threads."""
+    """Undeclare what was declared on a session, the last first. Not on Zenoh's threads."""
     ended: type[Exception] = load().ZError
     for each in reversed([*held]):
         for _ in range(_BORROWED):
@@ -167,7 +248,7 @@ def undeclare(held: Iterable[Any]) -> None:
 
 
 def configure(sections: dict[str, Any]) -> zenoh.Config:
-    """Zenoh's own form of a configuration."""
+    """Convert sections of a configuration to Zenoh's own form."""
     found = load().Config()
     for path, value in _leaves("", sections):
         found.insert_json5(path, json.dumps(value))
@@ -175,7 +256,7 @@ def configure(sections: dict[str, Any]) -> zenoh.Config:
 
 
 def _leaves(path: str, value: Any) -> list[tuple[str, Any]]:
-    """The sections taken apart, so that what they leave out keeps its default; some can only be set as a whole."""
+    """Split sections so that what they leave out keeps its default; some can only be set as a whole."""
     if isinstance(value, dict) and not path.endswith(("access_control", "autoconnect", "gateway", "retry")):
         return [leaf for key, inner in value.items() for leaf in _leaves(f"{path}/{key}" if path else key, inner)]
     return [(path, value)]

@@ -1,21 +1,21 @@
-"""How this process takes part in the network: where it listens, whom it calls, and with which keys."""
+"""How this process joins the network: where it listens, whom it connects to, and with which keys."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from skyloop.errors import UsageError
+from skyloop.errors import LinkError, UsageError
 from skyloop.transport.fabric.layout import ANYONE, check_identity
 
 if TYPE_CHECKING:
-    from skyloop.keys import Identity, KeyRing
+    from skyloop.keys import Credentials, Identity, KeyRing
 
 
 @dataclass(frozen=True, slots=True)
 class TlsFiles:
-    """An identity: PEM files for mutual TLS."""
+    """An identity for mutual TLS, as PEM files."""
 
     ca: Path  #: certificate of the authority that signed everybody's
     certificate: Path
@@ -24,11 +24,14 @@ class TlsFiles:
 
 @dataclass(frozen=True, slots=True)
 class FabricSettings:
-    """One way into the network; the default finds others by multicast on the segments of this host, without keys.
+    """How to join the network; by default others on the same network segments are found by multicast, without keys.
 
     ``listen`` and ``connect`` are addresses such as ``10.0.0.5:7447``, ``[::1]:0`` (any free port) or ``10.0.0.5``
     (port 7447). Without keys each stands for TCP (what must arrive) and UDP (commands and feedback), with keys for
     QUIC. An address may also be a whole Zenoh endpoint, ``tcp/10.0.0.5:7447``, which is used as it is.
+
+    Raises:
+        UsageError: The identity is not valid, or is given without its certificate and key.
     """
 
     listen: tuple[str, ...] = ()
@@ -41,9 +44,25 @@ class FabricSettings:
     #: The keys that ``tls`` and ``access_control`` were made from.
     ring: KeyRing | None = field(default=None, compare=False)
 
+    def current(self) -> FabricSettings:
+        """Return these settings with the newest roster in the folder of the keys, for a new session.
+
+        Raises:
+            LinkError: That roster revokes these keys themselves.
+        """
+        if self.ring is None:
+            return self
+        self.ring.refresh()
+        credentials = self.ring.credentials
+        if not self.ring.admits(credentials.identity):
+            raise LinkError(f"the keys of {credentials.name} were revoked, or their rights changed: get new ones")
+        if not self.ring.outdated:
+            return self
+        return secured(self, credentials)
+
     @property
     def reach(self) -> str:
-        """Where is looked, for people."""
+        """Where proxies are searched for, for people."""
         ways = [*self.connect, *(["multicast"] if self.multicast else [])]
         return ", ".join(ways) or "nowhere"
 
@@ -56,3 +75,17 @@ class FabricSettings:
         check_identity(self.who)
         if self.tls is None and self.who != ANYONE:
             raise UsageError(f"the identity {self.who!r} needs its certificate and key")
+
+
+def secured(settings: FabricSettings, credentials: Credentials) -> FabricSettings:
+    """Return these settings with a key: mutual TLS over QUIC, and access control by the roster that came with it."""
+    from skyloop.keys import KeyRing  # with keys only: these need cryptography
+    from skyloop.transport.fabric.access import access_control
+
+    return replace(
+        settings,
+        tls=TlsFiles(credentials.authority_file, credentials.certificate_file, credentials.key_file),
+        who=credentials.name,
+        access_control=access_control(credentials.roster.identities),
+        ring=KeyRing(credentials),
+    )

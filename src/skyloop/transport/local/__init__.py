@@ -1,7 +1,7 @@
-"""The transport of one host: a Unix ``SOCK_SEQPACKET`` connection an application, frames in sealed shared memory.
+"""The transport of one host: a Unix ``SOCK_SEQPACKET`` connection per application, frames in sealed shared memory.
 
-The kernel keeps packets whole, tells at once when the other end dies, checks who may connect, and leaves nothing
-behind after a crash. It needs Linux 5.1 or later: elsewhere each name here raises :class:`UnsupportedError` when used.
+The kernel keeps packets whole, reports at once when the other end dies, checks who may connect, and leaves nothing
+behind after a crash. It needs Linux 5.1 or later; elsewhere each name here raises :class:`UnsupportedError` when used.
 """
 
 from __future__ import annotations
@@ -20,12 +20,18 @@ __all__ = ["LocalServer", "dial", "list_names"]
 
 
 def dial(name: str, *, group: str | None = None) -> Dialer:
-    """The dialer of the proxy with this name on this host.
+    """Return the dialer of a proxy on this host.
 
-    ``group`` is the group of users that shares the directory of sockets (default: the variable ``SKYLOOP_GROUP``).
-    Raises :class:`UsageError` for what can't be a name or a group. The dialer itself raises
-    :class:`UnknownNameError` where there is no such proxy, and :class:`LinkError` where it does not accept (it was
-    killed, is stopped, or is another user's); it comes back within about a second.
+    The dialer raises :class:`UnknownNameError` where there is no such proxy, and :class:`LinkError` where it does not
+    accept (it was killed, is stopped, or belongs to another user); it returns or raises within about a second.
+
+    Args:
+        name: The proxy's name.
+        group: The group of users that shares the directory of sockets (default: the variable ``SKYLOOP_GROUP``).
+
+    Raises:
+        UsageError: The name or the group is not valid.
+        UnsupportedError: This is not Linux.
     """
     _check_platform()
     from skyloop.transport.local.client import make_dialer
@@ -34,9 +40,20 @@ def dial(name: str, *, group: str | None = None) -> Dialer:
 
 
 def list_names(*, group: str | None = None) -> list[Proxy]:
-    """The proxies that run on this host and that this user may reach, by name.
+    """List the running proxies of this host that this user may reach.
 
-    Sockets left by killed ones are removed. Raises :class:`LinkError` if the directory of sockets is not safe.
+    Sockets that killed proxies left are removed.
+
+    Args:
+        group: The group of users that shares the directory of sockets (default: the variable ``SKYLOOP_GROUP``).
+
+    Returns:
+        The proxies, sorted by name.
+
+    Raises:
+        LinkError: The directory of sockets is not safe.
+        UsageError: The group is not valid.
+        UnsupportedError: This is not Linux.
     """
     _check_platform()
     from skyloop.transport.local.directory import find_directory

@@ -14,10 +14,10 @@ from skyloop.errors import DecodeError, LinkError, UnknownNameError
 from skyloop.messages.codec import HEADER_SIZE, MAX_BODY
 from skyloop.transport.base import MAX_PACKET, ClientEnd, ClientHandler, Dialer, check_packet, check_topic
 from skyloop.transport.local import packets
-from skyloop.transport.local.directory import connect, find_directory, set_timeout
+from skyloop.transport.local.directory import connect, find_directory
 from skyloop.transport.local.packets import OWN
 from skyloop.transport.local.slots import Leases
-from skyloop.transport.local.sockets import SEND_FLAGS, Socket, credentials
+from skyloop.transport.local.sockets import SEND_FLAGS, Socket, credentials, set_timeout
 
 _MAX_RECEIVED: Final = HEADER_SIZE + MAX_BODY + 256  # a frame's packet has a few bytes more than its header's
 _ANCILLARY: Final = socket.CMSG_SPACE(4 * array.array("i").itemsize)
@@ -26,7 +26,7 @@ _log = logging.getLogger(__name__)
 
 
 def make_dialer(name: str, group: str | None) -> Dialer:
-    """See :func:`skyloop.transport.local.dial`."""
+    """Return the dialer of a proxy; see :func:`skyloop.transport.local.dial`."""
     directory = find_directory(group)
     path = directory.socket_path(name)
 
@@ -48,7 +48,13 @@ def make_dialer(name: str, group: str | None) -> Dialer:
 
 
 class LocalClient(ClientEnd):
-    """An application's end, made by the dialer that :func:`skyloop.transport.local.dial` returns."""
+    """An application's end, made by the dialer that :func:`skyloop.transport.local.dial` returns.
+
+    Args:
+        sock: Connected to the proxy.
+        name: The proxy's name.
+        handler: Called on the receiving thread, which starts at once.
+    """
 
     def __init__(self, sock: Socket, name: str, handler: ClientHandler) -> None:
         self._address = f"local:{name} (pid {credentials(sock).pid})"
@@ -60,7 +66,7 @@ class LocalClient(ClientEnd):
         self._leases = Leases(self._release)
         self._closing = False
         self._reason = ""
-        self._control(packets.hello())
+        self._send_own(packets.hello())
         self._thread = threading.Thread(target=self._run, args=(sock,), name=f"skyloop-{name}-client", daemon=True)
         self._thread.start()
 
@@ -76,12 +82,9 @@ class LocalClient(ClientEnd):
             return False
         return True
 
-    def knock(self) -> None:
-        self.send(packets.KNOCK)
-
     def subscribe(self, topic: str, on: bool = True) -> None:
         check_topic(topic)
-        self._control(packets.subscribe(topic, on))
+        self._send_own(packets.subscribe(topic, on))
 
     def close(self) -> None:
         self._end("closed by the application")
@@ -97,7 +100,7 @@ class LocalClient(ClientEnd):
         return self._address
 
     def _end(self, reason: str) -> None:
-        """End the connection: the receiving thread does the rest."""
+        """End the connection once; the receiving thread does the rest."""
         sock = self._socket
         if sock is not None and not self._closing:
             self._reason = reason
@@ -105,12 +108,12 @@ class LocalClient(ClientEnd):
             sock.hang_up(packets.bye(reason))
 
     def _release(self, slot: int) -> None:
-        self._control(packets.release(slot))
+        self._send_own(packets.release(slot))
 
-    def _control(self, packet: bytes) -> None:
+    def _send_own(self, packet: bytes) -> None:
         """Send one of the transport's own packets, later if it does not fit now.
 
-        The collector may call this at any point of any thread: there must be no lock in it.
+        The garbage collector may call this at any point of any thread, so it must not acquire a lock.
         """
         sock = self._socket
         if sock is None:
@@ -147,7 +150,7 @@ class LocalClient(ClientEnd):
     def _receive(self, sock: Socket) -> str:
         """Deliver until the connection ends, and return why."""
         receive = sock.recvmsg
-        deliver, show = self._handler.packet, self._handler.frame
+        deliver, deliver_frame = self._handler.packet, self._handler.frame
         while not self._closing:
             try:
                 packet, ancillary, _, _ = receive(_MAX_RECEIVED, _ANCILLARY, socket.MSG_CMSG_CLOEXEC)
@@ -168,22 +171,25 @@ class LocalClient(ClientEnd):
             elif ancillary or packets.is_own(packet):
                 try:
                     if kind != packets.FRAME or ancillary:
-                        self._take(packet, _descriptors(ancillary))
+                        self._control(packet, _descriptors(ancillary))
                         continue
                     number, header = packets.parse_frame(packet)
                     pixels = self._leases.pixels(number, header.size)
                 except (DecodeError, LinkError, OSError) as error:
                     return f"the proxy does not keep to the protocol: {error}"
-                show(header, pixels)
+                deliver_frame(header, pixels)
                 del pixels  # else their slot stayed leased until the next packet
             else:
                 deliver(packet)
         return self._reason
 
-    def _take(self, packet: bytes, descriptors: list[int]) -> None:
-        """Take one of the transport's own packets that is no frame, and close the descriptors that came with it.
+    def _control(self, packet: bytes, descriptors: list[int]) -> None:
+        """Handle one of the transport's own packets that is no frame, and close the descriptors that came with it.
 
-        Raises ``DecodeError``, ``LinkError`` or ``OSError`` for what makes no sense.
+        Raises:
+            DecodeError: It can't be parsed.
+            LinkError: The proxy announced something that is not valid.
+            OSError: A slot can't be mapped.
         """
         try:
             message = packets.parse(packet)

@@ -1,45 +1,82 @@
-"""One application's connection, as the server keeps it."""
+"""An application's connection at the server."""
 
 from __future__ import annotations
 
 import array
 import socket
-from typing import Final
 
 from skyloop.transport.base import Peer
 from skyloop.transport.local import packets
-from skyloop.transport.local.sockets import SEND_FLAGS, Socket
-
-MAX_SUBSCRIPTIONS: Final = 64
+from skyloop.transport.local.sockets import SEND_FLAGS, Credentials, Socket, set_timeout
 
 
 class ServerConnection:
-    """Sends from any thread without waiting; everything else belongs to its receiving thread."""
+    """An application's connection: any thread may send without waiting, all else belongs to its receiving thread.
 
-    __slots__ = ("_send", "_socket", "ending", "joined", "peer", "reason", "receive", "topics")
+    Args:
+        sock: Accepted from the listener.
+        peer: As the handler knows it.
+        who: The process at the other end, as the kernel says.
+    """
 
-    def __init__(self, sock: Socket, peer: Peer) -> None:
+    __slots__ = (
+        "_send",
+        "_socket",
+        "admitted",
+        "ending",
+        "joined",
+        "peer",
+        "pilot",
+        "reason",
+        "receive",
+        "topics",
+        "who",
+    )
+
+    def __init__(self, sock: Socket, peer: Peer, who: Credentials) -> None:
         sock.limit_backlog()
+        self.who = who  #: as the kernel says
         self._socket = sock
         self._send = sock.send
         self.receive = sock.recv
         self.peer = peer
         self.joined = False  #: it said hello, and the handler knows of it
+        self.admitted = False  #: it said who it is, and the handler let it stay
+        self.pilot = False  #: it said that it is one
         self.ending = False  #: by the server: what it sent before is not wanted any more
         self.reason = ""  #: why it ends, as soon as one end has said so
         self.topics: set[str] = set()
 
+    def limit_silence(self, seconds: float) -> None:
+        """Set how long :attr:`receive` waits for a packet before it raises ``BlockingIOError``.
+
+        Args:
+            seconds: The limit [s]; 0 waits for ever.
+        """
+        set_timeout(self._socket, socket.SO_RCVTIMEO, seconds)
+
     def transmit(self, packet: bytes) -> None:
-        """Send. Raises ``OSError`` if its buffer is full or it is gone."""
+        """Send a packet without waiting. Any thread.
+
+        Raises:
+            OSError: The application's buffer is full, or the application is gone.
+        """
         self._send(packet, SEND_FLAGS)
 
     def transmit_descriptor(self, packet: bytes, descriptor: int) -> None:
-        """The same, with a descriptor."""
+        """Send a packet with a file descriptor, without waiting. Any thread.
+
+        Raises:
+            OSError: The application's buffer is full, or the application is gone.
+        """
         rights = (socket.SOL_SOCKET, socket.SCM_RIGHTS, array.array("i", (descriptor,)))
         self._socket.sendmsg((packet,), (rights,), SEND_FLAGS)
 
     def hang_up(self, reason: str) -> None:
-        """End it and tell the application why; the receiving thread hears of it as of any end. Any thread."""
+        """End the connection and send the reason to the application. Any thread.
+
+        The receiving thread notices the end as it does any other.
+        """
         if not self.ending:
             self.reason = self.reason or reason
             self.ending = True

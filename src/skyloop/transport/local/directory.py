@@ -1,12 +1,14 @@
-"""The directory of sockets: where proxies are found by name, and who may enter it.
+"""The directory of sockets, in which proxies are found by name, and who may use it.
 
-One socket a proxy, ``NAME.sock``, in a directory that only its owner (or a named group) can enter: the variable
-``SKYLOOP_RUNTIME_DIR``, or else ``skyloop`` in the user's runtime directory. There is no lock file: who changes the
-directory holds an advisory lock on the directory itself, which the kernel drops with its process.
+Each proxy has one socket, ``NAME.sock``, in a directory that only its owner (or a named group) can enter: the one of
+the variable ``SKYLOOP_RUNTIME_DIR``, or else ``skyloop`` in the user's runtime directory. A process that changes the
+directory holds an advisory lock, which the kernel releases with the process. The lock is on the directory itself, or,
+where a group may look into it, on the file ``.lock`` there, which only the owner can open, so that no member of the
+group can hold up a proxy. Reading takes no lock.
 
-A socket whose owner was killed stays as a file. Whether one listens is asked by connecting to it with the *wrong*
-type of socket, which the kernel answers with ``EPROTOTYPE`` for one that lives and ``ECONNREFUSED`` for one that does
-not, at once and without the owner noticing.
+The socket of a killed proxy stays as a file. Whether a process listens at it is found out by connecting with the
+*wrong* type of socket: the kernel answers at once, without the owner noticing, with ``EPROTOTYPE`` for one that is
+alive and ``ECONNREFUSED`` for one that is not.
 """
 
 from __future__ import annotations
@@ -18,7 +20,6 @@ import grp
 import os
 import socket
 import stat
-import struct
 import time
 import warnings
 from collections.abc import Iterator
@@ -26,8 +27,8 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from skyloop.errors import LinkError, NameTakenError, UsageError
-from skyloop.transport.local.sockets import Socket, credentials, user_name
-from skyloop.transport.names import NAME, check_name
+from skyloop.transport.base import NAME, check_name
+from skyloop.transport.local.sockets import Socket, credentials, set_timeout, user_name
 
 DIRECTORY_VARIABLE: Final = "SKYLOOP_RUNTIME_DIR"
 GROUP_VARIABLE: Final = "SKYLOOP_GROUP"
@@ -35,6 +36,7 @@ MAX_PATH: Final = 107  #: bytes that Linux allows in the path of a socket
 LOCK_TIMEOUT_S: Final = 2.0
 CONNECT_TIMEOUT_S: Final = 1.0
 _SUFFIX: Final = ".sock"
+_LOCK: Final = ".lock"
 _OPEN_TO_OTHERS: Final = 0o027  # writable by the group, or anything for others
 
 
@@ -47,14 +49,23 @@ class Proxy(NamedTuple):
 
 
 class Directory:
-    """The directory of sockets, seen by a user: :func:`find_directory` makes one."""
+    """The directory of sockets, seen by a user; :func:`find_directory` makes one.
+
+    Args:
+        path: The directory, absolute.
+        gid: The group that shares it, None for this user alone.
+    """
 
     def __init__(self, path: Path, gid: int | None) -> None:
         self.path = path
         self.gid = gid
 
     def socket_path(self, name: str) -> Path:
-        """Where the socket of a name is. Raises :class:`UsageError` for what cannot be a name, or a path too long."""
+        """Return the path of a proxy's socket.
+
+        Raises:
+            UsageError: The name can't be a proxy's, or the path is longer than :data:`MAX_PATH`.
+        """
         check_name(name)
         path = self.path / (name + _SUFFIX)
         if len(os.fsencode(path)) > MAX_PATH:
@@ -65,7 +76,12 @@ class Directory:
         return path
 
     def create(self) -> None:
-        """Make the directory if it is missing, give it to the group if there is one, and check it."""
+        """Make the directory if it is missing, give it to the group if there is one, and check it.
+
+        Raises:
+            LinkError: It is not safe; see :meth:`check`.
+            OSError: It can't be made.
+        """
         self.path.parent.mkdir(mode=0o700 if self.gid is None else 0o755, parents=True, exist_ok=True)
         with contextlib.suppress(FileExistsError):
             self.path.mkdir(mode=0o700)
@@ -75,9 +91,11 @@ class Directory:
         self.check()
 
     def check(self) -> None:
-        """Raise :class:`LinkError` if anybody else could put a socket here.
+        """Check that nobody else can put a socket here.
 
-        Raises ``FileNotFoundError`` if there is no such directory.
+        Raises:
+            LinkError: Another user owns the directory, or can change it or the one that holds it.
+            FileNotFoundError: There is no such directory.
         """
         here, above = self._lstat(self.path), self._lstat(self.path.parent)
         if not stat.S_ISDIR(here.st_mode):
@@ -101,28 +119,47 @@ class Directory:
             )
 
     def proxies(self) -> list[Proxy]:
-        """Those that run, by name; what killed ones left is removed."""
+        """List the running proxies by name, and remove the sockets that killed ones left.
+
+        Raises:
+            LinkError: The directory is not safe.
+        """
         try:
             self.check()
         except FileNotFoundError:
             return []
         found = []
-        with self.lock():
-            for path in sorted(self.path.glob("*" + _SUFFIX)):
-                name = path.name.removesuffix(_SUFFIX)
-                if not NAME.fullmatch(name):
-                    continue
-                if is_live(path):
-                    found.append(Proxy(name, owner_pid(path), path))
-                else:
-                    with contextlib.suppress(OSError):  # a group's member may look, but not remove
-                        path.unlink()
+        for path in sorted(self.path.glob("*" + _SUFFIX)):
+            name = path.name.removesuffix(_SUFFIX)
+            if not NAME.fullmatch(name):
+                continue
+            if is_live(path):
+                found.append(Proxy(name, owner_pid(path), path))
+            else:
+                self._remove_stale(path)
         return found
 
-    def listen(self, name: str) -> tuple[Socket, int]:
-        """A listening socket under this name, and the inode of its file, for :meth:`remove`.
+    def _remove_stale(self, path: Path) -> None:
+        """Remove the socket of a killed proxy, if the lock is free: a reader never waits for anybody."""
+        if self._lstat(self.path).st_uid != os.geteuid():
+            return  # a group's member may look, but not remove
+        with contextlib.suppress(OSError, LinkError), self.lock(timeout_s=0.0):
+            if not is_live(path):  # a proxy may have taken the name meanwhile
+                path.unlink()
 
-        Raises :class:`NameTakenError` if a running proxy has the name.
+    def listen(self, name: str) -> tuple[Socket, int]:
+        """Listen under a name, in place of a killed proxy of that name.
+
+        Args:
+            name: The proxy's name.
+
+        Returns:
+            The listening socket, and the inode of its file for :meth:`remove`.
+
+        Raises:
+            NameTakenError: A running proxy has the name.
+            LinkError: The directory is not safe, or stays locked for :data:`LOCK_TIMEOUT_S`.
+            UsageError: The name or its path is not valid.
         """
         path = self.socket_path(name)
         self.create()
@@ -143,18 +180,31 @@ class Directory:
             return listener, path.lstat().st_ino
 
     def remove(self, name: str, inode: int) -> None:
-        """Remove the socket of a name if it is still the one with this inode."""
+        """Remove the socket of a name if it is still the file with this inode; errors are ignored."""
         path = self.socket_path(name)
         with contextlib.suppress(OSError, LinkError), self.lock():
             if path.lstat().st_ino == inode:
                 path.unlink()
 
     @contextlib.contextmanager
-    def lock(self) -> Iterator[None]:
-        """Nobody else changes the directory meanwhile. Raises :class:`LinkError` if it can't be had in 2 s."""
-        descriptor = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    def lock(self, timeout_s: float = LOCK_TIMEOUT_S) -> Iterator[None]:
+        """Hold the directory against changes by others.
+
+        Args:
+            timeout_s: How long to wait for it [s].
+
+        Raises:
+            LinkError: Another process holds it for longer than that.
+        """
+        here, path = self._lstat(self.path), self.path
+        flags = os.O_RDONLY | os.O_DIRECTORY
+        if here.st_mode & stat.S_IRWXG:
+            path, flags = path / _LOCK, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW
+        descriptor = os.open(path, flags | os.O_CLOEXEC, 0o600)
         try:
-            _lock(descriptor, self.path)
+            if path is not self.path and os.geteuid() == 0:  # which may have made it, in somebody else's directory
+                os.fchown(descriptor, here.st_uid, -1)
+            _lock(descriptor, path, timeout_s)
             yield
         finally:
             os.close(descriptor)
@@ -168,9 +218,13 @@ class Directory:
 
 
 def find_directory(group: str | None = None) -> Directory:
-    """The directory of this user, or the one that a group shares (default: ``SKYLOOP_GROUP``). Touches nothing.
+    """Return the directory of this user, or the one that a group shares. Touches no file.
 
-    Raises :class:`UsageError` for a group that does not exist or has no directory that its members can reach.
+    Args:
+        group: The name of the group (default: the variable ``SKYLOOP_GROUP``).
+
+    Raises:
+        UsageError: The group does not exist, or no directory is configured that its members can reach.
     """
     group = group or os.environ.get(GROUP_VARIABLE) or None
     configured = os.environ.get(DIRECTORY_VARIABLE)
@@ -200,14 +254,14 @@ def _default_path() -> Path:
 
 
 def is_live(path: Path) -> bool:
-    """Whether a process holds the socket at this path."""
+    """Return whether a process holds the socket at this path."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as probe:
         code = probe.connect_ex(os.fspath(path))
     return code not in (errno.ECONNREFUSED, errno.ENOENT)
 
 
 def owner_pid(path: Path) -> int | None:
-    """The process that listens at this path; None if that can't be told at once."""
+    """Return the process that listens at this path; None if that can't be told at once."""
     probe = Socket()
     probe.setblocking(False)
     try:
@@ -218,7 +272,11 @@ def owner_pid(path: Path) -> int | None:
 
 
 def connect(path: Path) -> Socket:
-    """A connection to the socket at this path. Raises ``OSError``, within a second even if nobody accepts."""
+    """Connect to the socket at this path.
+
+    Raises:
+        OSError: There is none, or nobody accepts within :data:`CONNECT_TIMEOUT_S`.
+    """
     sock = Socket()
     # Without it a connect waits for ever where the owner is stopped and its queue of callers is full.
     set_timeout(sock, socket.SO_SNDTIMEO, CONNECT_TIMEOUT_S)
@@ -226,14 +284,8 @@ def connect(path: Path) -> Socket:
     return sock
 
 
-def set_timeout(sock: socket.socket, option: int, seconds: float) -> None:
-    """Limit how long the kernel blocks in a call; the call then fails with ``EAGAIN``."""
-    whole = int(seconds)
-    sock.setsockopt(socket.SOL_SOCKET, option, struct.pack("@ll", whole, int((seconds - whole) * 1e6)))
-
-
-def _lock(descriptor: int, path: Path) -> None:
-    deadline = time.monotonic() + LOCK_TIMEOUT_S
+def _lock(descriptor: int, path: Path, timeout_s: float) -> None:
+    deadline = time.monotonic() + timeout_s
     while True:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,8 +1,8 @@
-"""The server's frames: which slot is free, who looks at which, and who waits for the newest.
+"""The server's frame slots: which one is free, who has which, and who waits for the newest frame.
 
-A frame is copied once, into a slot that nobody looks at, and each viewer is sent a small packet that names the slot.
-A viewer that has :data:`MAX_LEASES` frames, or whose socket is full, is passed over; as soon as it gives one back it
-is sent the newest frame. There are always slots enough: each viewer can hold only so many.
+A frame is copied once, into a slot that nobody has, and each viewer is sent a small packet that names the slot. A
+viewer that has :data:`MAX_LEASES` frames, or whose socket is full, is passed over; as soon as it releases one it is
+sent the newest frame. There are always slots enough, as each viewer can hold only so many.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from skyloop.transport.base import Pixels
 from skyloop.transport.local import packets
 from skyloop.transport.local.slots import SlotMemory
 
-MAX_LEASES: Final = 4  #: frames of one camera that one client may have: on the way, or looked at
+MAX_LEASES: Final = 4  #: frames of one camera that one client may have: on the way, or in use
 _Newest = tuple[SlotMemory, bytes]
 
 
 class Connection(Protocol):
-    """What a viewer needs of its connection. Both raise ``OSError`` when the packet can't be taken now."""
+    """What a viewer needs of its connection; both methods raise ``OSError`` when the packet can't be sent now."""
 
     def transmit(self, packet: bytes) -> None: ...
 
@@ -41,12 +41,21 @@ class Viewer:
         self.connection = connection
         self.leases: dict[int, SlotMemory] = {}
         self.announced: set[int] = set()
-        self.retire_before = 0  #: slots below this number were given up, which the client was not told yet
-        self.active = True  #: it wants frames; if not, it may still look at some
+        self.retire_before = 0  #: slots below this number were retired, and the client is to be told so; 0: no
+        self.active = True  #: frames are sent to it; if not, it may still hold some
         self.waits = False  #: it was passed over
 
     def hand(self, slot: SlotMemory, packet: bytes, camera: int) -> bool:
-        """Send a frame; False, and the viewer waits, if it has enough or its socket is full."""
+        """Send a frame, unless the viewer has enough frames or its socket is full.
+
+        Args:
+            slot: Where the frame is.
+            packet: Announces it.
+            camera: The camera's number.
+
+        Returns:
+            Whether it was sent; if not, the viewer is marked as waiting.
+        """
         self.waits = True
         if len(self.leases) >= MAX_LEASES:
             return False
@@ -68,12 +77,17 @@ class Viewer:
 
 
 class Camera:
-    """The slots and viewers of one camera. Not locked: :class:`FrameExchange` sees to that."""
+    """The slots and viewers of one camera. Not thread-safe: :class:`FrameExchange` holds a lock.
+
+    Args:
+        number: The camera's number on the wire.
+        slot_numbers: Gives numbers to new slots, unique over all cameras.
+    """
 
     def __init__(self, number: int, slot_numbers: Iterator[int]) -> None:
         self.number = number
-        self.viewers: dict[Connection, Viewer] = {}  # some may want no more frames, and only look at some
-        self.active: tuple[Viewer, ...] = ()  # those who want frames
+        self.viewers: dict[Connection, Viewer] = {}  # inactive ones only hold some frames still
+        self.active: tuple[Viewer, ...] = ()  # those that frames are sent to
         self._generation = 0
         self._geometry: object = None
         self._capacity = 0
@@ -84,7 +98,11 @@ class Camera:
         self._newest: _Newest | None = None
 
     def take(self, header: FrameHeader) -> SlotMemory:
-        """A slot to write a frame to, held by the writer until :meth:`offer`. Raises ``OSError``: no memory is left."""
+        """Return a slot to write a frame to; the writer holds it until :meth:`offer`.
+
+        Raises:
+            OSError: No memory or descriptor is left.
+        """
         geometry = (header.width, header.height, header.encoding)
         if geometry != self._geometry or header.size > self._capacity:
             # Compressed frames vary in size: when one outgrows its slots, the next ones get room to spare.
@@ -102,7 +120,15 @@ class Camera:
         return slot
 
     def offer(self, slot: SlotMemory, packet: bytes) -> int:
-        """Hand a written slot to all viewers; returns how many were passed over."""
+        """Send a written slot to all viewers.
+
+        Args:
+            slot: From :meth:`take`.
+            packet: Announces the frame.
+
+        Returns:
+            How many viewers were passed over.
+        """
         missed = 0
         for viewer in self.active:
             if not viewer.hand(slot, packet, self.number):
@@ -114,13 +140,17 @@ class Camera:
         return missed
 
     def drop(self, slot: SlotMemory) -> None:
-        """One holder less."""
+        """Remove one hold on a slot; without any it is free again."""
         slot.holders -= 1
         if slot.holders == 0 and slot.generation == self._generation:
             self._free.append(slot)
 
     def released(self, viewer: Viewer, number: int) -> bool:
-        """A viewer gave a slot back; False if it did not have it."""
+        """Take a slot back from a viewer, and send it the newest frame if it waits for one.
+
+        Returns:
+            False if the viewer did not have the slot.
+        """
         slot = viewer.leases.pop(number, None)
         if slot is None:
             return False
@@ -132,12 +162,12 @@ class Camera:
         return True
 
     def subscribe(self, connection: Connection) -> None:
-        """A viewer wants frames, from the next one on."""
+        """Send frames to a connection from the next one on."""
         self.viewers.setdefault(connection, Viewer(connection)).active = True
         self._count_active()
 
     def unsubscribe(self, viewer: Viewer) -> None:
-        """A viewer wants no more frames. What it looks at stays as it is until it gives that back."""
+        """Send a viewer no more frames; those it has stay as they are until it releases them."""
         viewer.active = viewer.waits = False
         viewer.announced.clear()
         with contextlib.suppress(OSError):  # then it keeps the slots mapped until it ends
@@ -145,7 +175,7 @@ class Camera:
         self._trim()
 
     def leave(self, connection: Connection) -> None:
-        """A client is gone, and all that it looked at is free."""
+        """Remove a client that is gone, and free all slots that it had."""
         viewer = self.viewers.pop(connection, None)
         if viewer is not None:
             for slot in viewer.leases.values():
@@ -153,7 +183,7 @@ class Camera:
             self._trim()
 
     def _trim(self) -> None:
-        """Give memory back that fewer viewers cannot need."""
+        """Give memory back that the remaining viewers cannot need."""
         self._count_active()
         if not self.active or self._count > (MAX_LEASES * len(self.viewers)) + 2:
             self.retire()
@@ -162,7 +192,7 @@ class Camera:
         self.active = tuple(viewer for viewer in self.viewers.values() if viewer.active)
 
     def retire(self) -> None:
-        """Give the memory of all slots back; of those somebody looks at, when they are released."""
+        """Give the memory of all slots back; that of slots in use when they are released."""
         self._keep(None)
         self._generation += 1
         self._geometry = None
@@ -187,9 +217,18 @@ class FrameExchange:
         self._lock = threading.Lock()
         self._cameras: dict[str, Camera] = {}
         self._slot_numbers = itertools.count(1)
+        self._camera_numbers = itertools.count(1)
 
     def publish(self, header: FrameHeader, pixels: Pixels) -> int:
-        """Copy a frame and hand it on; returns to how many viewers it could not be handed."""
+        """Copy a frame once and send it to the camera's viewers.
+
+        Args:
+            header: The frame's header.
+            pixels: ``header.size`` bytes, dtype uint8, in any shape.
+
+        Returns:
+            To how many viewers it could not be sent; all of them if no memory is left.
+        """
         camera = self._cameras.get(header.camera)
         if camera is None or not camera.active:
             return 0
@@ -205,15 +244,15 @@ class FrameExchange:
             return camera.offer(slot, packet)
 
     def subscribe(self, connection: Connection, name: str) -> None:
-        """A client wants a camera's frames, from the next one on."""
+        """Send a camera's frames to a connection, from the next one on."""
         with self._lock:
             camera = self._cameras.get(name)
             if camera is None:
-                camera = self._cameras[name] = Camera(len(self._cameras) + 1, self._slot_numbers)
+                camera = self._cameras[name] = Camera(next(self._camera_numbers), self._slot_numbers)
             camera.subscribe(connection)
 
     def unsubscribe(self, connection: Connection, name: str) -> None:
-        """A client wants them no longer."""
+        """Send a camera's frames to a connection no longer."""
         with self._lock:
             camera = self._cameras.get(name)
             viewer = camera.viewers.get(connection) if camera is not None else None
@@ -221,7 +260,7 @@ class FrameExchange:
                 camera.unsubscribe(viewer)
 
     def release(self, connection: Connection, slot: int) -> bool:
-        """A client gives a slot back; False if it did not have it."""
+        """Take a slot back from a client; return False if it did not have it."""
         with self._lock:
             for camera in self._cameras.values():
                 viewer = camera.viewers.get(connection)
@@ -230,7 +269,9 @@ class FrameExchange:
         return False
 
     def leave(self, connection: Connection) -> None:
-        """A client is gone."""
+        """Remove a client that is gone from all cameras."""
         with self._lock:
-            for camera in self._cameras.values():
+            for name, camera in list(self._cameras.items()):
                 camera.leave(connection)
+                if not camera.viewers:  # it is made anew for the next one: no name is kept for nobody
+                    del self._cameras[name]

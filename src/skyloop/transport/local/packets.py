@@ -1,6 +1,7 @@
-"""The local transport's own packets: bytes to typed tuples and back. Pure; tables in ``docs/wire-format.md``.
+"""The local transport's own packets: bytes to typed tuples and back, as pure functions.
 
-They share the header of all packets and have kinds from 0x40, which no sample has.
+They share the header of all packets and have kinds from 0x40, which no sample has. ``docs/wire-format.md`` has the
+tables.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from enum import IntEnum
 from typing import Final, NamedTuple
 
 from skyloop.errors import DecodeError
-from skyloop.messages import Command, FrameHeader, Velocity, decode, encode
+from skyloop.messages import FrameHeader, decode
 from skyloop.messages.codec import HEADER, HEADER_SIZE, SIGNATURE, VERSION
 from skyloop.transport.base import MAX_TOPIC
 
@@ -19,16 +20,16 @@ MAX_REASON: Final = 400  #: bytes of UTF-8
 
 
 class LocalKind(IntEnum):
-    """The kinds of packet that the two ends exchange between themselves."""
+    """The kinds of packets that the two ends exchange between themselves."""
 
     HELLO = 0x40  #: first packet of a client
     SUBSCRIBE = 0x41  #: client to server
-    RELEASE = 0x42  #: client to server: the frame in this slot is not looked at any more
+    RELEASE = 0x42  #: client to server: the frame in this slot is not used any more
     SLOT = 0x43  #: server to client, with the slot's descriptor
     FRAME = 0x44  #: server to client: a slot is filled
     RETIRE = 0x45  #: server to client: older slots of a camera will not be used any more
     BYE = 0x46  #: either way: why the connection ends
-    KNOCK = 0x47  #: client to server: a packet follows at once, wake up
+    WAKE = 0x47  #: client to server: sent before each command by older applications, and ignored
 
 
 # The sixth byte of a packet is its kind: these are compared with it as it stands there.
@@ -37,35 +38,49 @@ FRAME: Final = bytes([LocalKind.FRAME])
 
 
 class Hello(NamedTuple):
+    """A client's first packet."""
+
     revision: int
 
 
 class Subscribe(NamedTuple):
+    """A client subscribes to a topic, or unsubscribes from it."""
+
     topic: str
     on: bool
 
 
 class Release(NamedTuple):
+    """A client gives a slot back."""
+
     slot: int
 
 
 class Slot(NamedTuple):
+    """A slot that frames of a camera will come in; ``capacity`` is in bytes."""
+
     slot: int
     camera: int
     capacity: int
 
 
 class Frame(NamedTuple):
+    """A frame that was written to a slot."""
+
     slot: int
     header: FrameHeader
 
 
 class Retire(NamedTuple):
+    """Slots of a camera below the number ``before`` are not used any more."""
+
     camera: int
     before: int
 
 
 class Bye(NamedTuple):
+    """Why the connection ends."""
+
     reason: str
 
 
@@ -79,36 +94,47 @@ _FRAME_PREFIX = struct.Struct(HEADER.format + "I")
 
 
 def is_own(packet: bytes) -> bool:
-    """Whether a packet is for the transport itself and not for the handler."""
+    """Return whether a packet is for the transport itself and not for the handler."""
     return packet[5:6] >= OWN and packet.startswith(SIGNATURE)
 
 
 def hello() -> bytes:
+    """Encode a :class:`Hello` of this revision."""
     return _packet(LocalKind.HELLO, _HELLO.pack(REVISION))
 
 
 def subscribe(topic: str, on: bool) -> bytes:
+    """Encode a :class:`Subscribe`."""
     return _packet(LocalKind.SUBSCRIBE, bytes((on,)) + topic.encode())
 
 
 def release(slot: int) -> bytes:
+    """Encode a :class:`Release`."""
     return _packet(LocalKind.RELEASE, _NUMBER.pack(slot))
 
 
 def slot(number: int, camera: int, capacity: int) -> bytes:
+    """Encode a :class:`Slot`."""
     return _packet(LocalKind.SLOT, _SLOT.pack(number, camera, capacity))
 
 
 def frame(number: int, header: bytes) -> bytes:
-    """``header`` is the whole packet of the :class:`FrameHeader`."""
+    """Encode a :class:`Frame`.
+
+    Args:
+        number: The slot's.
+        header: The whole packet of the :class:`FrameHeader`.
+    """
     return _FRAME_PREFIX.pack(SIGNATURE, VERSION, LocalKind.FRAME, 0, _NUMBER.size + len(header), number) + header
 
 
 def retire(camera: int, before: int) -> bytes:
+    """Encode a :class:`Retire`."""
     return _packet(LocalKind.RETIRE, _RETIRE.pack(camera, before))
 
 
 def bye(reason: str) -> bytes:
+    """Encode a :class:`Bye`; the reason is cut to :data:`MAX_REASON` bytes."""
     return _packet(LocalKind.BYE, reason.encode(errors="replace")[:MAX_REASON])
 
 
@@ -117,7 +143,11 @@ def _packet(kind: LocalKind, body: bytes) -> bytes:
 
 
 def parse(packet: bytes) -> Message:
-    """What one of the transport's own packets says. Raises :class:`DecodeError` for anything that is none."""
+    """Decode one of the transport's own packets.
+
+    Raises:
+        DecodeError: It is not one, or it is damaged.
+    """
     if len(packet) < HEADER_SIZE:
         raise DecodeError(f"{len(packet)} bytes are less than the header of {HEADER_SIZE}")
     if packet[5:6] == FRAME:
@@ -137,7 +167,7 @@ def parse(packet: bytes) -> Message:
         raise DecodeError(f"bad packet of kind {kind:#x} with {length} bytes of body: {error!r}") from None
 
 
-_FIXED: Final[dict[int, tuple[struct.Struct, type[Hello] | type[Release] | type[Slot] | type[Retire]]]] = {
+_FIXED: Final[dict[int, tuple[struct.Struct, type[Hello | Release | Slot | Retire]]]] = {
     LocalKind.HELLO: (_HELLO, Hello),
     LocalKind.RELEASE: (_NUMBER, Release),
     LocalKind.SLOT: (_SLOT, Slot),
@@ -146,7 +176,11 @@ _FIXED: Final[dict[int, tuple[struct.Struct, type[Hello] | type[Release] | type[
 
 
 def parse_frame(packet: bytes) -> Frame:
-    """The one that comes often: its header and slot in one go."""
+    """Decode a frame's packet, header and slot in one go, as it comes often.
+
+    Raises:
+        DecodeError: It is not one, or it is damaged.
+    """
     if len(packet) < _FRAME_PREFIX.size:
         raise DecodeError(f"{len(packet)} bytes are less than the {_FRAME_PREFIX.size} before the header of a frame")
     signature, version, _, reserved, length, slot = _FRAME_PREFIX.unpack_from(packet)
@@ -165,13 +199,4 @@ def _parse_subscribe(body: bytes) -> Subscribe:
     return Subscribe(topic, bool(on))
 
 
-KNOCK: Final = _packet(LocalKind.KNOCK, b"")
-_REHEARSED: Final = encode(Command(1, 1, 1, 1, Velocity()))
-
-
-def rehearse() -> None:
-    """What a server does when it was knocked at: decode, so that this code is in the processor's caches when it counts.
-
-    On a machine that was idle the first packet after a pause takes ten times as long to decode as the one after it.
-    """
-    decode(_REHEARSED)
+WAKE: Final = _packet(LocalKind.WAKE, b"")

@@ -1,13 +1,15 @@
-"""The proxy's end of the local transport: one connection an application, and one receiving thread each.
+"""The proxy's end of the local transport: one connection and one receiving thread per application.
 
-A thread of its own that waits in ``recv`` hands a packet over in one system call; waiting for all connections at once
+A thread of its own that waits in ``recv`` delivers a packet with one system call; waiting for all connections at once
 (epoll) needs two, which made the delay of a command a third longer on an idle machine. The threads take turns at the
-handler, so that it is called by one at a time as the contract says.
+handler, so that it gets one call at a time as the contract says: those that bring a command first, the others in the
+order of their arrival.
 """
 
 from __future__ import annotations
 
 import logging
+import os
 import threading
 from typing import Final
 
@@ -15,36 +17,49 @@ from skyloop.errors import DecodeError, UsageError
 from skyloop.messages import FrameHeader
 from skyloop.transport.base import (
     MAX_PACKET,
+    MAX_SUBSCRIPTIONS,
     Peer,
     Pixels,
     ServerEnd,
     ServerHandler,
     check_frame,
+    check_name,
     check_packet,
+    too_many_topics,
     video,
 )
 from skyloop.transport.local import packets
-from skyloop.transport.local.connection import MAX_SUBSCRIPTIONS, ServerConnection
+from skyloop.transport.local.connection import ServerConnection
 from skyloop.transport.local.directory import find_directory
 from skyloop.transport.local.frames import FrameExchange
-from skyloop.transport.local.packets import KNOCK, OWN
+from skyloop.transport.local.packets import OWN
 from skyloop.transport.local.slots import check_support
-from skyloop.transport.local.sockets import Socket, credentials, may_connect
-from skyloop.transport.names import check_name
+from skyloop.transport.local.sockets import Credentials, Socket, credentials, may_connect, user_name
+from skyloop.transport.priority_lock import PriorityLock, is_command
 
 MAX_CLIENTS: Final = 128
+#: Of them, so that no program alone can take all: a page of the cockpit that flies has a connection of its own.
+MAX_PER_PROCESS: Final = 64
+MAX_PER_USER: Final = 64  #: of a user who is let in by a group; the proxy's own has all that others leave
+PILOT_PLACES: Final = 32  #: that observers do not get
+HELLO_S: Final = 2.0  #: how long a connection may take for the first packet, which is sent with the connection
 _RETRY_ACCEPT_S: Final = 0.2
 _VIDEO: Final = video("")
 _log = logging.getLogger(__name__)
 
 
 class LocalServer(ServerEnd):
-    """A proxy's end, found on this host by its name. Started once.
+    """A proxy's end, found on this host by its name. It can be started once.
 
-    ``group`` names a group of users whose members may connect as well (default: the variable ``SKYLOOP_GROUP``).
-    Raises :class:`UsageError` for a name that can't be one; :meth:`start` raises :class:`NameTakenError` where a
-    running proxy has it, :class:`LinkError` where the directory of sockets is not safe, and
-    :class:`UnsupportedError` where the kernel lacks what is needed.
+    :meth:`start` raises :class:`NameTakenError` where a running proxy has the name, :class:`LinkError` where the
+    directory of sockets is not safe, and :class:`UnsupportedError` where the kernel lacks what is needed.
+
+    Args:
+        name: The proxy's name.
+        group: A group of users whose members may connect as well (default: the variable ``SKYLOOP_GROUP``).
+
+    Raises:
+        UsageError: The name or the group is not valid, or the socket's path would be too long.
     """
 
     def __init__(self, name: str, *, group: str | None = None) -> None:
@@ -53,11 +68,11 @@ class LocalServer(ServerEnd):
         self._directory = find_directory(group)
         self._directory.socket_path(name)  # here, and not only when it starts, it says that the path is too long
         self._exchange = FrameExchange()
-        # Changed under the turn only, and read by all: the tuples are replaced and never changed.
+        # Changed under the lock only, and read by all: the tuples are replaced and never changed.
         self._connections: set[ServerConnection] = set()
         self._peers: dict[int, ServerConnection] = {}  # by the peer's number
         self._topics: dict[str, tuple[ServerConnection, ...]] = {}
-        self._turn = threading.RLock()  # whoever has it may call the handler
+        self._lock = PriorityLock()  # whoever holds it may call the handler
         self._receivers: set[int] = set()  # identities of the receiving threads
         self._last_id = 0
         self._started = False
@@ -119,6 +134,17 @@ class LocalServer(ServerEnd):
     def subscribers(self, topic: str) -> int:
         return len(self._topics.get(topic, ()))
 
+    def admit(self, peer: Peer, *, pilot: bool) -> str:
+        with self._lock:
+            connection = self._peers.get(peer.id)
+            if connection is None:
+                return ""
+            observers = sum(other.admitted and not other.pilot for other in self._peers.values())
+            if not pilot and observers >= MAX_CLIENTS - PILOT_PLACES:
+                return f"{self.address} has {observers} observers; the other {PILOT_PLACES} places are kept for pilots"
+            connection.admitted, connection.pilot = True, pilot
+            return ""
+
     def disconnect(self, peer: Peer, reason: str) -> None:
         connection = self._peers.get(peer.id)
         if connection is not None:
@@ -145,7 +171,7 @@ class LocalServer(ServerEnd):
                 thread.join()
 
     def _accept(self, handler: ServerHandler, listener: Socket) -> threading.Thread | None:
-        """Accept one caller and begin to receive from it."""
+        """Accept one caller and begin to receive from it; return its receiving thread, None if there is none."""
         try:
             accepted, _ = listener.accept()
         except OSError as error:
@@ -155,31 +181,58 @@ class LocalServer(ServerEnd):
                 self._stopping.wait(_RETRY_ACCEPT_S)
             return None
         sock = Socket(accepted.detach())
+        who = credentials(sock)
         if not may_connect(sock, self._directory.gid):
-            sock.hang_up(packets.bye(f"{credentials(sock)} may not connect to {self.address}"))
+            sock.hang_up(packets.bye(f"{who} may not connect to {self.address}"))
             return None
-        if len(self._connections) >= MAX_CLIENTS:
-            sock.hang_up(packets.bye(f"{self.address} has {MAX_CLIENTS} connections already, and takes no more"))
+        problem = self._make_room(who)
+        if problem:
+            sock.hang_up(packets.bye(problem))
             return None
         self._last_id += 1
-        connection = ServerConnection(sock, Peer(self._last_id, str(credentials(sock))))
+        connection = ServerConnection(sock, Peer(self._last_id, str(who)), who)
+        connection.limit_silence(HELLO_S)
         thread = threading.Thread(
-            target=self._converse, args=(handler, connection), name=f"skyloop-{self._name}-peer", daemon=True
+            target=self._serve, args=(handler, connection), name=f"skyloop-{self._name}-peer", daemon=True
         )
-        with self._turn:
+        with self._lock:
             self._connections.add(connection)
         try:
             thread.start()
         except RuntimeError as error:  # no more threads
             connection.hang_up(f"{self.address} cannot serve it: {error}")
-            with self._turn:
+            with self._lock:
                 self._connections.discard(connection)
             return None
         return thread
 
+    def _make_room(self, who: Credentials) -> str:
+        """Find a place for a caller; return why there is none, empty if there is.
+
+        Where all places are taken, the oldest connection that has not said who it is gives way, so that such
+        connections keep nobody out, however many they are.
+        """
+        with self._lock:
+            present = [connection for connection in self._connections if not connection.ending]
+            # In a namespace of processes that is not ours a process has no number: 0.
+            if who.pid and sum(other.who.pid == who.pid for other in present) >= MAX_PER_PROCESS:
+                return f"pid {who.pid} has {MAX_PER_PROCESS} connections to {self.address} already: end some of them"
+            if who.uid not in (0, os.geteuid()) and sum(other.who.uid == who.uid for other in present) >= MAX_PER_USER:
+                return (
+                    f"{user_name(who.uid)} has {MAX_PER_USER} connections to {self.address} already: end some of them"
+                )
+            if len(present) < MAX_CLIENTS:
+                return ""
+            silent = [connection for connection in present if not connection.admitted]
+            if not silent:
+                return f"{self.address} has {MAX_CLIENTS} connections already, and takes no more"
+            oldest = min(silent, key=lambda connection: connection.peer.id)
+            oldest.hang_up(f"its place at {self.address} went to a newer one: it had not said who it is")
+            return ""
+
     # --- the receiving threads ---
 
-    def _converse(self, handler: ServerHandler, connection: ServerConnection) -> None:
+    def _serve(self, handler: ServerHandler, connection: ServerConnection) -> None:
         """Receive from one application until its connection ends."""
         self._receivers.add(threading.get_ident())
         try:
@@ -192,39 +245,45 @@ class LocalServer(ServerEnd):
 
     def _receive(self, handler: ServerHandler, connection: ServerConnection) -> str:
         """Hand packets on, and return why it ended. Raises what the handler raises."""
-        receive, turn, peer, deliver = connection.receive, self._turn, connection.peer, handler.packet
+        receive, lock, peer, deliver = connection.receive, self._lock, connection.peer, handler.packet
         while True:
             try:
                 packet = receive(MAX_PACKET + 1)
             except ConnectionResetError:
                 continue  # what was sent before it still comes, and then the end
+            except BlockingIOError:
+                return f"it did not say hello within {HELLO_S:g} s"
             except OSError as error:
                 return f"receiving failed: {error}"
-            if packet == KNOCK and connection.joined:
-                packets.rehearse()
-                continue
-            with turn:
+            if packet == packets.WAKE and connection.joined:
+                continue  # at once: the command that follows it does not wait in line with it
+            with lock.urgent if is_command(packet) else lock:
                 if not packet or connection.ending:
-                    # An empty packet cannot be told from the end, so it is one.
+                    # An empty packet cannot be distinguished from the end, so it counts as one.
                     return f"the application is gone ({peer.address})"
                 if len(packet) > MAX_PACKET:
                     return f"it sent a packet of more than {MAX_PACKET} bytes"
                 if not connection.joined:
                     self._welcome(handler, connection, packet)
-                elif packet[5:6] < OWN or not (packets.is_own(packet) and self._understood(connection, packet)):
+                elif packet[5:6] < OWN or not (packets.is_own(packet) and self._control(handler, connection, packet)):
                     deliver(peer, packet)
 
     def _welcome(self, handler: ServerHandler, connection: ServerConnection, packet: bytes) -> None:
-        """Take the first packet of a connection; whoever only wants to know who listens here sends none."""
+        """Handle a connection's first packet. A process that only asks who listens here sends none."""
         if packet != packets.hello():
             connection.hang_up(f"it did not say hello as revision {packets.REVISION} of the local transport does")
             return
+        connection.limit_silence(0.0)
         connection.joined = True
         self._peers[connection.peer.id] = connection
         handler.peer_joined(connection.peer)
 
-    def _understood(self, connection: ServerConnection, packet: bytes) -> bool:
-        """Take one of the transport's own packets. What makes no sense is left to the handler, as any garbage is."""
+    def _control(self, handler: ServerHandler, connection: ServerConnection, packet: bytes) -> bool:
+        """Handle one of the transport's own packets.
+
+        Returns:
+            False for one that makes no sense: it is left to the handler, as any garbage is.
+        """
         try:
             message = packets.parse(packet)
         except DecodeError:
@@ -232,28 +291,30 @@ class LocalServer(ServerEnd):
         if isinstance(message, packets.Release):
             return self._exchange.release(connection, message.slot)
         if isinstance(message, packets.Subscribe):
-            return self._subscribe(connection, message)
+            self._subscribe(handler, connection, message)
+            return True
         if isinstance(message, packets.Bye):
             connection.reason = connection.reason or message.reason
             return True
         return False
 
-    def _subscribe(self, connection: ServerConnection, wish: packets.Subscribe) -> bool:
-        topic = wish.topic
-        if wish.on and len(connection.topics) >= MAX_SUBSCRIPTIONS:
-            return False
-        if wish.on == (topic in connection.topics):
-            return True
-        if wish.on:
+    def _subscribe(self, handler: ServerHandler, connection: ServerConnection, request: packets.Subscribe) -> None:
+        topic = request.topic
+        if request.on == (topic in connection.topics):
+            return
+        if request.on:
+            problem = handler.topic_problem(topic) or _problem(topic, len(connection.topics))
+            if problem:
+                handler.malformed(connection.peer, problem)
+                return
             connection.topics.add(topic)
             self._topics[topic] = (*self._topics.get(topic, ()), connection)
         else:
             connection.topics.discard(topic)
             self._forget_topic(connection, topic)
         if topic.startswith(_VIDEO):
-            change = self._exchange.subscribe if wish.on else self._exchange.unsubscribe
+            change = self._exchange.subscribe if request.on else self._exchange.unsubscribe
             change(connection, topic.removeprefix(_VIDEO))
-        return True
 
     def _forget_topic(self, connection: ServerConnection, topic: str) -> None:
         remaining = tuple(other for other in self._topics[topic] if other is not connection)
@@ -263,7 +324,7 @@ class LocalServer(ServerEnd):
             del self._topics[topic]
 
     def _end(self, handler: ServerHandler, connection: ServerConnection, reason: str) -> None:
-        with self._turn:
+        with self._lock:
             self._connections.discard(connection)
             self._peers.pop(connection.peer.id, None)
             for topic in connection.topics:
@@ -276,3 +337,15 @@ class LocalServer(ServerEnd):
                 handler.peer_left(connection.peer, connection.reason)
             except Exception:  # noqa: BLE001  (a handler may raise anything)
                 _log.exception("the handler of %s failed in peer_left()", self.address)
+
+
+def _problem(topic: str, subscribed: int) -> str:
+    """Return why an application can't subscribe to a topic that exists; empty if it can.
+
+    Args:
+        topic: The topic.
+        subscribed: How many topics the application has.
+    """
+    if topic.startswith(_VIDEO) and "?" in topic:
+        return f"{topic[:64]!r}: frames come as they are on one host; subscribe to {topic.partition('?')[0][:64]!r}"
+    return too_many_topics(topic) if subscribed >= MAX_SUBSCRIPTIONS else ""

@@ -15,24 +15,35 @@ from skyloop.errors import LinkError, UnsupportedError
 from skyloop.transport.base import Pixels
 
 F_SEAL_FUTURE_WRITE: Final = 0x10  # Linux 5.1; missing from Python's fcntl module
-# After mapping it the server keeps its own writeable view, and nobody can make another, nor change the size: what a
-# reader has mapped cannot be cut off under its eyes, which would kill it (SIGBUS).
+# After mapping it the server keeps its own writeable view; nobody can make another, nor change the size. Were a slot to
+# shrink while a reader has it mapped, reading it would kill the reader (SIGBUS).
 _SEALS: Final = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | F_SEAL_FUTURE_WRITE | fcntl.F_SEAL_SEAL
 _MAX_CAPACITY: Final = 1 << 31  # what a client lets a server make it map
 
 
 class SlotMemory:
-    """One slot at the server: memory for a frame, and who looks at it."""
+    """One slot at the server: memory for a frame, and how many hold it."""
 
     __slots__ = ("array", "capacity", "fd", "generation", "holders", "number")
 
     def __init__(self, number: int, generation: int, capacity: int) -> None:
-        """Raises ``OSError`` if there is no memory or descriptor left."""
+        """Reserve the memory.
+
+        Args:
+            number: The slot's number on the wire.
+            generation: Which set of its camera's slots it belongs to.
+            capacity: Its size [bytes].
+
+        Raises:
+            OSError: No memory or descriptor is left.
+        """
         self.fd = -1
         self.number = number
         self.generation = generation
         self.capacity = capacity
-        self.holders = 0  #: clients that have it, and the server while it writes or keeps it for somebody
+        self.holders = (
+            0  #: clients that have it, and the server while it writes to it or keeps it for a viewer that waits
+        )
         self.fd = os.memfd_create(f"skyloop-{number}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         os.posix_fallocate(self.fd, 0, capacity)  # fails here where memory is short, and not while copying
         view = mmap.mmap(self.fd, capacity, mmap.MAP_SHARED | mmap.MAP_POPULATE)
@@ -45,7 +56,12 @@ class SlotMemory:
 
 
 def check_support() -> None:
-    """Raise :class:`UnsupportedError` where the kernel lacks sealed memory, :class:`LinkError` if none is left."""
+    """Check that the kernel has what the transport needs.
+
+    Raises:
+        UnsupportedError: It has no sealed shared memory.
+        LinkError: No memory or descriptor is left.
+    """
     try:
         SlotMemory(0, 0, mmap.PAGESIZE)
     except OSError as error:
@@ -57,16 +73,29 @@ def check_support() -> None:
 
 
 class SlotView:
-    """One slot at a client: mapped once, for reading only."""
+    """One slot at a client, mapped once, for reading only."""
 
     __slots__ = ("_interface", "camera", "capacity", "held", "number", "pixels")
 
     def __init__(self, number: int, camera: int, capacity: int, fd: int, held: set[int]) -> None:
-        """``fd`` stays the caller's. Raises :class:`LinkError` for memory that could be cut off under its reader."""
+        """Map the memory.
+
+        Args:
+            number: The slot's number on the wire.
+            camera: The camera's.
+            capacity: The slot's size [bytes].
+            fd: Its descriptor, which stays the caller's.
+            held: The numbers of all slots of this camera that the application has; shared with the camera's other
+                slots.
+
+        Raises:
+            LinkError: The memory could be cut off while it is read, or is smaller than announced.
+            OSError: It can't be mapped.
+        """
         self.number = number
         self.camera = camera
         self.capacity = capacity
-        self.held = held  #: numbers of all slots of this camera that the application looks at
+        self.held = held  #: numbers of all slots of this camera that the application has
         try:
             seals = fcntl.fcntl(fd, fcntl.F_GET_SEALS)
         except OSError:
@@ -81,7 +110,7 @@ class SlotView:
         self._interface = self._describe(capacity)
 
     def interface(self, size: int) -> dict[str, Any]:
-        """NumPy's description of the first bytes of the slot, made anew only when their number changes."""
+        """Return NumPy's description of the first ``size`` bytes; it is made anew only when their number changes."""
         if self._interface["shape"][0] != size:
             self._interface = self._describe(size)
         return self._interface
@@ -91,7 +120,7 @@ class SlotView:
 
 
 class Lease:
-    """What the pixels of a frame rest on: while any array over it lives, the server does not reuse the slot."""
+    """The owner of a frame's pixels: while any array over it lives, the server does not reuse the slot."""
 
     __slots__ = ("__array_interface__", "_leases", "_slot")
 
@@ -105,10 +134,16 @@ class Lease:
 
 
 class Leases:
-    """A client's slots. :meth:`released` is called from any thread, and at any point of one, by the collector."""
+    """A client's slots.
 
-    #: Frames of one camera that an application may look at in place; of further ones it gets copies, so that one that
-    #: collects frames does not run the server's limit out and starve.
+    :meth:`released` is called by the garbage collector, on any thread and at any point of it.
+
+    Args:
+        send_release: Gives a slot back to the server by its number; must not acquire a lock.
+    """
+
+    #: Frames of one camera that an application may have in place. It gets copies of further ones, so that one that
+    #: collects frames does not use up the server's limit and starve.
     IN_PLACE: Final = 3
 
     def __init__(self, send_release: Callable[[int], None]) -> None:
@@ -117,26 +152,48 @@ class Leases:
         self._held: dict[int, set[int]] = {}
 
     def add(self, number: int, camera: int, capacity: int, fd: int) -> None:
-        """Map a slot that the server announced. Raises :class:`LinkError` or ``OSError`` if it is not usable."""
+        """Map a slot that the server announced.
+
+        Args:
+            number: The slot's.
+            camera: The camera's number.
+            capacity: The slot's size [bytes].
+            fd: Its descriptor, which stays the caller's.
+
+        Raises:
+            LinkError: The memory is not usable.
+            OSError: It can't be mapped.
+        """
         self._slots[number] = SlotView(number, camera, capacity, fd, self._held.setdefault(camera, set()))
 
     def retire(self, camera: int, before: int) -> None:
-        """Let go of the older slots of a camera."""
+        """Forget the slots of a camera below the number ``before``."""
         for slot in list(self._slots.values()):
             if slot.camera == camera and slot.number < before:
                 del self._slots[slot.number]
 
     def end(self) -> None:
-        """The connection has ended: let go of all slots. Frames that the application still has stay.
+        """Forget all slots, as the connection has ended; frames that the application still has stay valid.
 
-        They lead here, and arrays are no part of the collector's search for cycles: a way on from here to the
-        client, its handler and the frames which that keeps would keep all of them for ever.
+        Those frames refer to this object, and the collector does not search arrays for cycles. A reference from here to
+        the client, its handler and the frames that the handler keeps would keep all of them for ever.
         """
         self._slots.clear()
         self._send_release = _to_nobody
 
     def pixels(self, number: int, size: int) -> Pixels:
-        """The frame in a slot. Raises :class:`LinkError` if the server has not announced such a slot."""
+        """Return the frame in a slot: in place, or as a copy if the application has :attr:`IN_PLACE` frames already.
+
+        Args:
+            number: The slot's.
+            size: The frame's size [bytes].
+
+        Returns:
+            Shape (size,), dtype uint8, not writeable.
+
+        Raises:
+            LinkError: The server has not announced such a slot.
+        """
         slot = self._slots.get(number)
         if slot is None or not 0 <= size <= slot.capacity:
             raise LinkError(f"the proxy sent a frame of {size} bytes in slot {number}, which it has not announced")
@@ -149,10 +206,10 @@ class Leases:
         return np.asarray(Lease(slot, size, self))
 
     def released(self, slot: SlotView) -> None:
-        """The application looks at this slot no longer."""
+        """Give a slot back to the server; the application has no array over it any more."""
         slot.held.discard(slot.number)
         self._send_release(slot.number)
 
 
 def _to_nobody(_: int) -> None:
-    """Where slots are given back to when the connection has ended."""
+    """Drop a release, as the connection has ended."""

@@ -1,4 +1,4 @@
-"""The sockets of the local transport, and who is at their other end."""
+"""The sockets of the local transport, and the processes at their other ends."""
 
 from __future__ import annotations
 
@@ -21,8 +21,11 @@ _MAX_OPTION: Final = 1024  # bytes that Python lets an option have: 256 groups
 class Socket(socket.socket):
     """A ``SOCK_SEQPACKET`` socket that closes when nobody uses it any more.
 
-    The ends *shut down* a connection and drop their references, and never close it: so no thread that is just sending
-    can find the number of its descriptor used for something else.
+    The ends *shut down* a connection and drop their references, and never close it. So the number of a descriptor that
+    a thread is just sending on can't be reused for something else.
+
+    Args:
+        fileno: An open descriptor to take over; None for a new socket.
     """
 
     def __init__(self, fileno: int | None = None) -> None:
@@ -33,11 +36,11 @@ class Socket(socket.socket):
         self.close()
 
     def limit_backlog(self) -> None:
-        """Bound what may wait unread at the other end."""
+        """Bound what may wait unread at the other end, to :data:`SEND_BUFFER` bytes."""
         self.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
 
     def hang_up(self, last_packet: bytes = b"") -> None:
-        """End the connection in both directions after a last packet, if that one fits."""
+        """End the connection in both directions, after a last packet if that one fits."""
         try:
             if last_packet:
                 self.send(last_packet, SEND_FLAGS)
@@ -53,7 +56,7 @@ class Socket(socket.socket):
 
 
 class Credentials(NamedTuple):
-    """Who is at the other end, as the kernel saw it when the connection was made."""
+    """The process at the other end, as the kernel saw it when the connection was made."""
 
     pid: int
     uid: int
@@ -64,12 +67,12 @@ class Credentials(NamedTuple):
 
 
 def credentials(sock: socket.socket) -> Credentials:
-    """Who connected, or for a client: who listens."""
+    """Return who connected or, at a client, who listens."""
     return Credentials(*_CREDENTIALS.unpack(sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)))
 
 
 def peer_groups(sock: socket.socket) -> set[int]:
-    """All groups of who connected; only the primary one of a user in more than 256."""
+    """Return all groups of who connected; only the primary one for a user in more than 256."""
     primary = credentials(sock).gid
     try:
         raw = sock.getsockopt(socket.SOL_SOCKET, _SO_PEERGROUPS, _MAX_OPTION)
@@ -79,15 +82,35 @@ def peer_groups(sock: socket.socket) -> set[int]:
 
 
 def may_connect(sock: socket.socket, gid: int | None) -> bool:
-    """Whether who connected is this process's user, the superuser, or a member of the group if one is given."""
+    """Return whether the process that connected may.
+
+    Args:
+        sock: The accepted connection.
+        gid: The group that may connect, None for none.
+
+    Returns:
+        Whether it belongs to this process's user, to the superuser, or to a member of the group.
+    """
     uid = credentials(sock).uid
     return uid in (os.geteuid(), 0) or (gid is not None and gid in peer_groups(sock))
 
 
 @functools.lru_cache(maxsize=64)
 def user_name(uid: int) -> str:
-    """The name of a user, or ``uid 123`` if it has none."""
+    """Return the name of a user, or ``uid 123`` if it has none."""
     try:
         return pwd.getpwuid(uid).pw_name
     except KeyError:
         return f"uid {uid}"
+
+
+def set_timeout(sock: socket.socket, option: int, seconds: float) -> None:
+    """Limit how long the kernel blocks in a call, which then fails with ``EAGAIN``.
+
+    Args:
+        sock: The socket.
+        option: ``SO_RCVTIMEO`` or ``SO_SNDTIMEO``.
+        seconds: The limit [s]; 0 for none.
+    """
+    whole = int(seconds)
+    sock.setsockopt(socket.SOL_SOCKET, option, struct.pack("@ll", whole, int((seconds - whole) * 1e6)))

@@ -21,6 +21,8 @@ MAX_LINE: Final = 1024  #: characters; the drone drops a longer one whole
 SILENCE_RESET_S: Final = 2.0  #: after so long without a command the drone expects the sequence from 1 again
 
 Argument: TypeAlias = int | float | str
+#: A command's name and its arguments after the sequence.
+AtMessage: TypeAlias = tuple[str, tuple[Argument, ...]]
 
 
 class Ref(IntFlag):

@@ -1,4 +1,6 @@
-"""MAVLink's axes and ours. World: north, east, down there; east, north, up here. Body: forward, right, down there;
+"""MAVLink's axes and ours.
+
+World: north, east, down there; east, north, up here. Body: forward, right, down there;
 forward, left, up here. Yaw: clockwise from north there; counter-clockwise from east here. Pure.
 
 ``flip`` and ``swap`` are their own inverses, and so is :func:`yaw_between`.

@@ -18,7 +18,7 @@ class Shape(Enum):
 
     OK = re.compile(r"ok\Z", re.IGNORECASE)
     NUMBER = re.compile(r"-?\d+(\.\d+)?\Z")  #: ``battery?``, ``wifi?``, ``sdk?``, ``speed?``, ``baro?``
-    TIME = re.compile(r"\d+ ?s\Z")  #: ``time?``
+    TIME = re.compile(r"\d+( ?s)?\Z")  #: ``time?``: a bare number, or with its unit
     LENGTH = re.compile(r"-?\d+ ?(mm|dm|cm)\Z")  #: ``height?``, ``tof?``
     TEMPERATURE = re.compile(r"-?\d+~-?\d+ ?C\Z")  #: ``temp?``
     NAME = re.compile(r"(?=.*[A-Za-z])(?!ok\Z)[0-9A-Za-z]{4,32}\Z")  #: ``sn?``

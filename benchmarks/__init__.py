@@ -1,0 +1,7 @@
+"""Measurements for Skyloop's developers. Users measure their machine by ``skyloop bench``; none of this is installed.
+
+``python -m benchmarks.NAME``, from the checkout, measures the delays of other libraries by the same contract
+(``peers``), with others on the same drone (``load``), over a path that loses packets (``network``), of drones whose
+users fail (``swarm``), of more and more proxies and observers (``scale``), and what codecs take of one core
+(``codecs``). ``hosts`` makes several hosts of one machine, ``pages`` puts the figures into the documentation.
+"""

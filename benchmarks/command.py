@@ -1,0 +1,216 @@
+"""The benchmarks' command lines: ``python -m benchmarks.NAME``, each with its own options."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import typer
+
+from skyloop.bench.tables import verdict_table
+from skyloop.cli.app import run
+from skyloop.cli.bench import (
+    Minutes,
+    Output,
+    Seconds,
+    Sizes,
+    as_rich,
+    duration_s,
+    finish,
+    measure_delays,
+    measuring,
+    parse_sizes,
+    tell_skipped,
+)
+from skyloop.errors import UsageError
+
+
+def peers(
+    peers: Annotated[
+        str, typer.Option(help="Compare with fabric, ros2, zenoh, zeromq, several with commas, or all")
+    ] = "all",
+    ros_python: Annotated[
+        str | None, typer.Option(help="The Python that has rclpy [default: $SKYLOOP_ROS_PYTHON or this one]")
+    ] = None,
+    sizes: Sizes = None,
+    seconds: Seconds = None,
+    minutes: Minutes = None,
+    output: Output = None,
+) -> None:
+    """Measure other libraries beside Skyloop and the bare hand-over, as ``skyloop bench delays`` does."""
+    from benchmarks.peers import chosen, find
+    from skyloop.bench.figures import draw
+
+    wanted_s, wanted = duration_s(seconds, minutes), parse_sizes(sizes)
+    found, skipped = find(chosen(peers), ros_python)
+    with measuring("delays", output) as progress:
+        results, shown = measure_delays(wanted_s, wanted, found, skipped, progress)
+    finish("delays", results, shown, output, draw)
+
+
+def load(
+    observers: Annotated[str | None, typer.Option(help="How many, one case for each number [default: 1,8,32]")] = None,
+    slow_processor: Annotated[
+        bool, typer.Option("--slow-processor/--no-slow-processor", help="One of 200 ms a frame")
+    ] = True,
+    stuck: Annotated[bool, typer.Option("--stuck/--no-stuck", help="One of 8 observers stopped")] = True,
+    recorder: Annotated[
+        bool, typer.Option("--recorder/--no-recorder", help="Record 640x480 at 30 frames a second")
+    ] = True,
+    disk_full: Annotated[
+        bool, typer.Option("--disk-full/--no-disk-full", help="The same onto a disk that fills up")
+    ] = True,
+    record_to: Annotated[Path | None, typer.Option(help="The folder that the recorder writes to")] = None,
+    pages: Annotated[
+        int, typer.Option(min=0, max=50, help="Of a cockpit, on 640x480 at 15 frames a second; 0 for none")
+    ] = 10,
+    seconds: Seconds = None,
+    minutes: Minutes = None,
+    output: Output = None,
+) -> None:
+    """Measure what observers, a slow processor, a recorder and pages of the cockpit do to the pilot.
+
+    It starts up to 35 processes. Nothing else should run meanwhile.
+    """
+    from benchmarks import load, tables
+    from benchmarks.onlookers import cockpit_problem, recorder_problem
+    from benchmarks.targets import judge_load
+
+    wanted_s, numbers = duration_s(seconds, minutes), parse_numbers(observers)
+    skipped = {}
+    if (recorder or disk_full) and (problem := recorder_problem()):
+        recorder = disk_full = False
+        skipped[load.RECORDED] = problem
+    if pages and (problem := cockpit_problem()):
+        skipped[load.pages_name(pages)] = problem
+        pages = 0
+    cases = load.cases_of(
+        numbers, slow_processor=slow_processor, stuck=stuck, recorder=recorder, disk_full=disk_full, pages=pages
+    )
+    with measuring("load", output) as progress:
+        results = load.measure(wanted_s, cases, record_to=record_to, skipped=skipped, progress=progress)
+    tell_skipped(results.skipped)
+    found = [tables.load_table(results), tables.cpu_table(results), verdict_table(judge_load(results))]
+    finish("load", results, as_rich(found, str(results.machine)), output)
+
+
+def codecs(seconds: Seconds = None, minutes: Minutes = None, output: Output = None) -> None:
+    """Measure what the AR.Drones' video and navdata take of one core."""
+    from benchmarks import codecs, tables
+
+    wanted_s = duration_s(seconds, minutes)
+    with measuring("codecs", output) as progress:
+        results = codecs.measure(wanted_s, progress)
+    tell_skipped(results.skipped)
+    finish("codecs", results, as_rich([tables.codecs_table(results)], str(results.machine)), output)
+
+
+def network(
+    losses: Annotated[
+        str | None, typer.Option(help="Shares of the packets that are lost [default: 0,0.01,0.1,0.3]")
+    ] = None,
+    seconds: Seconds = None,
+    minutes: Minutes = None,
+    output: Output = None,
+) -> None:
+    """Measure the channels between two hosts with a lossy path between. Needs root."""
+    from benchmarks import network, tables
+
+    wanted_s, shares = duration_s(seconds, minutes), parse_shares(losses)
+    with measuring("network", output) as progress:
+        results = network.measure(wanted_s, shares, progress=progress)
+    found = [tables.network_table(results), tables.path_table(results)]
+    finish("network", results, as_rich(found, str(results.machine)), output)
+
+
+def swarm(
+    drones: Annotated[int, typer.Option(min=1, max=50, help="How many")] = 10,
+    users: Annotated[int, typer.Option(min=1, max=10, help="Processes that share the drones")] = 1,
+    observers: Annotated[str | None, typer.Option(help="How many look on [default: 0]")] = None,
+    seconds: Seconds = None,
+    minutes: Minutes = None,
+    output: Output = None,
+) -> None:
+    """Fly simulated drones over the network whose users stand still and die, and count missed failsafes."""
+    from benchmarks import swarm, tables
+
+    wanted_s, looking_on = duration_s(seconds, minutes), parse_numbers(observers, "0")[0]
+    if users > drones:
+        raise UsageError(f"--users is {users}, and there are only {drones} drones to share")
+    with measuring("swarm", output) as progress:
+        results = swarm.measure(wanted_s, drones, users, looking_on, progress)
+    finish("swarm", results, as_rich([tables.swarm_table([results])], str(results.machine)), output)
+
+
+def scale(
+    counts: Annotated[str | None, typer.Option(help="Of proxies, and of observers [default: 1,2,5,10,20,50]")] = None,
+    seconds: Seconds = None,
+    minutes: Minutes = None,
+    output: Output = None,
+) -> None:
+    """Measure more and more proxies and observers on one host."""
+    from benchmarks import scale, tables
+    from benchmarks.scale_figure import draw
+
+    wanted_s, numbers = duration_s(seconds, minutes), parse_numbers(counts, "1,2,5,10,20,50", "--counts")
+    with measuring("scale", output) as progress:
+        results = scale.measure(wanted_s, scale.cases_of(numbers), progress)
+    tell_skipped(results.skipped)
+    found = [tables.scale_table(results, many) for many in ("proxies", "observers")]
+    finish("scale", results, as_rich(found, str(results.machine)), output, draw)
+
+
+BENCHMARKS: Final[Mapping[str, Callable[..., Any]]] = {
+    function.__name__: function for function in (peers, load, codecs, network, swarm, scale)
+}
+
+
+def build(name: str) -> typer.Typer:
+    """Return the command line of one benchmark."""
+    app = typer.Typer(
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
+    app.command(name)(BENCHMARKS[name])
+    return app
+
+
+def main(name: str) -> None:
+    """Run one benchmark; exit as ``skyloop`` does."""
+    run(build(name), sys.argv[1:], f"benchmarks.{name}")
+
+
+def parse_numbers(text: str | None, default: str = "1,8,32", option: str = "--observers") -> list[int]:
+    """Parse numbers such as ``1,8,32``.
+
+    Raises:
+        UsageError: The text is anything else.
+    """
+    words = [word.strip() for word in (default if text is None else text).split(",")]
+    if not all(word.isdecimal() and int(word) <= 100 for word in words):
+        raise UsageError(f"{option} is {text!r} and must be numbers up to 100 with commas, such as 1,8,32")
+    return [int(word) for word in words]
+
+
+def parse_shares(text: str | None) -> list[float]:
+    """Parse shares such as ``0,0.1``.
+
+    Raises:
+        UsageError: The text is anything else.
+    """
+    from benchmarks.network import LOSSES
+
+    if text is None:
+        return list(LOSSES)
+    try:
+        shares = [float(word) for word in text.split(",")]
+    except ValueError:
+        shares = [math.nan]
+    if not all(0.0 <= share < 1.0 for share in shares):
+        raise UsageError(f"--losses is {text!r} and must be shares from 0 to below 1 with commas, such as 0,0.1,0.3")
+    return list(dict.fromkeys(shares))

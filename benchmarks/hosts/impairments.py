@@ -1,0 +1,82 @@
+"""What goes wrong on a path, decided by a seed; time is an argument."""
+
+from __future__ import annotations
+
+import heapq
+import random
+from dataclasses import dataclass
+
+from skyloop.clock import nanoseconds
+from skyloop.errors import UsageError
+
+
+@dataclass(frozen=True, slots=True)
+class Impairments:
+    """What a path does to packets, each way. ``loss`` and ``reorder`` are probabilities for each packet.
+
+    Raises:
+        UsageError: A value is out of range: probabilities 0 to 1, times 0 to 60 s.
+    """
+
+    loss: float = 0.0
+    delay_s: float = 0.0
+    jitter_s: float = 0.0  #: at most so much is added to the delay, evenly; what is sent later still comes later
+    reorder: float = 0.0  #: share that is held back …
+    reorder_s: float = 0.01  #: … for so much longer, so that those behind overtake
+
+    def __post_init__(self) -> None:
+        for name in ("loss", "reorder"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise UsageError(f"{name} is {getattr(self, name)!r} and must be a probability between 0 and 1")
+        for name in ("delay_s", "jitter_s", "reorder_s"):
+            if not 0.0 <= getattr(self, name) <= 60.0:
+                raise UsageError(f"{name} is {getattr(self, name)!r} and must be between 0 and 60 s")
+
+    @property
+    def longest_s(self) -> float:
+        """The longest time that a packet which arrives was on the way [s]."""
+        return self.delay_s + self.jitter_s + (self.reorder_s if self.reorder else 0.0)
+
+
+class Way:
+    """One direction of a path: packets in, packets out when their time has come.
+
+    Args:
+        seed: Decides the fate of each packet.
+        impairments: What goes wrong.
+    """
+
+    def __init__(self, seed: object, impairments: Impairments) -> None:
+        self.impairments = impairments  #: may be changed at any time; holds for packets that come in later
+        self.lost = 0
+        self._random = random.Random(str(seed))
+        self._waiting: list[tuple[int, int, bytes]] = []
+        self._number = 0
+        self._last_ns = 0
+
+    def put(self, packet: bytes, now_ns: int) -> None:
+        """Take a packet in."""
+        wrong, chance = self.impairments, self._random.random
+        # Always three draws: what becomes of a packet depends on its number and not on the rates before it.
+        lost, held, jitter = chance() < wrong.loss, chance() < wrong.reorder, chance() * wrong.jitter_s
+        if lost:
+            self.lost += 1
+            return
+        due_ns = max(now_ns + nanoseconds(wrong.delay_s + jitter), self._last_ns)
+        self._last_ns = due_ns
+        if held:
+            due_ns += nanoseconds(wrong.reorder_s)
+        self._number += 1
+        heapq.heappush(self._waiting, (due_ns, self._number, packet))
+
+    def get(self, now_ns: int) -> tuple[int, bytes] | None:
+        """Return the next packet whose time has come, and when that was [ns]; None if none has."""
+        if self._waiting and self._waiting[0][0] <= now_ns:
+            due_ns, _, packet = heapq.heappop(self._waiting)
+            return due_ns, packet
+        return None
+
+    @property
+    def next_ns(self) -> int | None:
+        """When the next packet is due [ns]; None if none waits."""
+        return self._waiting[0][0] if self._waiting else None

@@ -1,0 +1,239 @@
+"""Hosts of network namespaces, and segments that join them."""
+
+from __future__ import annotations
+
+import contextlib
+import ipaddress
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Self, TypeVar
+
+from skyloop.errors import UnsupportedError, UsageError
+
+_Entered = TypeVar("_Entered")
+_PROGRAMS: Final = {"ip": "iproute2", "nsenter": "util-linux", "unshare": "util-linux"}
+_TUN: Final = Path("/dev/net/tun")
+_WITHIN_S: Final = 20.0  # for what takes milliseconds on a machine that is not stuck
+# It says its number, and ends with the pipe, so with whoever made it: then the kernel takes the namespaces apart.
+_HOLD: Final = 'echo "$1" > /proc/sys/kernel/hostname && echo $$ && exec cat'
+
+
+def problem() -> str:
+    """Return why no hosts can be made here; empty if they can."""
+    if sys.platform != "linux":
+        return f"network namespaces need Linux, and this is {sys.platform}"
+    if os.geteuid() != 0:
+        return "network namespaces need root"
+    for program, package in _PROGRAMS.items():
+        if shutil.which(program) is None:
+            return f"there is no program {program!r}: install {package}"
+    if not os.access(_TUN, os.R_OK | os.W_OK):
+        return f"{_TUN} cannot be opened"
+    tried = subprocess.run(
+        ["unshare", "--net", "--uts", "--time", "--monotonic", "1", "--fork", "true"],
+        capture_output=True,
+        text=True,
+        timeout=_WITHIN_S,
+        check=False,
+    )
+    return "" if tried.returncode == 0 else f"this kernel makes no namespaces: {tried.stderr.strip()}"
+
+
+class Host:
+    """A host with interfaces, a name and a directory of local sockets of its own.
+
+    Files and processes are shared with all.
+    """
+
+    def __init__(self, name: str, environment: Mapping[str, str], clock_ahead_s: float) -> None:
+        """Make the host.
+
+        Args:
+            name: Its host name.
+            environment: Variables of all that runs here, besides those of this process.
+            clock_ahead_s: How far its monotonic clock is ahead of this machine's, in whole seconds.
+
+        Raises:
+            UnsupportedError: It can't be made.
+        """
+        self.name = name
+        self.interfaces: list[str] = []
+        kinds = ["--net", "--uts"]
+        clock = []
+        if clock_ahead_s:
+            kinds.append("--time")
+            clock = ["--monotonic", str(int(clock_ahead_s)), "--boottime", str(int(clock_ahead_s)), "--fork"]
+        self._holder = subprocess.Popen(
+            ["unshare", *kinds, *clock, "sh", "-c", _HOLD, "hold", name],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        assert self._holder.stdout is not None
+        said = self._holder.stdout.readline().strip()
+        if not said.isdecimal():
+            self.close()
+            raise UnsupportedError(f"no host {name!r} could be made: {problem() or 'its shell ended'}")
+        self.pid = int(said)  #: of a process that does nothing but hold the namespaces
+        #: Put before a command, it runs here, as the very process that was started.
+        self.prefix: Sequence[str] = ("nsenter", "--target", said, *kinds, "env", *map("=".join, environment.items()))
+        self.ip("link set lo up")
+
+    def run(self, *arguments: str, said: str = "") -> str:
+        """Run a short program here.
+
+        Args:
+            *arguments: The command.
+            said: Its standard input.
+
+        Returns:
+            Its standard output.
+
+        Raises:
+            UnsupportedError: It fails.
+        """
+        ended = subprocess.run(
+            [*self.prefix, *arguments], input=said, capture_output=True, text=True, timeout=_WITHIN_S, check=False
+        )
+        if ended.returncode != 0:
+            raise UnsupportedError(f"{' '.join(arguments)} failed on host {self.name!r}: {ended.stderr.strip()}")
+        return ended.stdout
+
+    def ip(self, *lines: str) -> None:
+        """Run commands of ``ip``, given without that word."""
+        self.run("ip", "-batch", "-", said="\n".join(lines))
+
+    def add_interface(self) -> str:
+        """Return the name of one more interface, which is yet to be made."""
+        self.interfaces.append(f"eth{len(self.interfaces)}")
+        return self.interfaces[-1]
+
+    def forward(self) -> None:
+        """Pass packets on from one interface to another."""
+        self.run("sh", "-c", "echo 1 > /proc/sys/net/ipv4/ip_forward")
+
+    def masquerade(self, interface: str) -> None:
+        """Give what leaves by an interface this host's address as sender, as a NAT router does. Needs ``nft``."""
+        self.run(
+            "nft",
+            "add table ip nat; add chain ip nat out { type nat hook postrouting priority 100; }; "
+            f"add rule ip nat out oifname {interface} masquerade",
+        )
+
+    def close(self) -> None:
+        """Release the namespaces; they end with the last process in them. Idempotent."""
+        for stream in (self._holder.stdin, self._holder.stdout):
+            if stream is not None:
+                with contextlib.suppress(BrokenPipeError):  # the holder is gone already
+                    stream.close()
+        self._holder.wait(_WITHIN_S)
+
+
+class Segment:
+    """A switch, and the subnet of the hosts that joined it.
+
+    Args:
+        switch: A host of its own.
+        subnet: Such as ``10.77.1.0/24``.
+    """
+
+    def __init__(self, switch: Host, subnet: str) -> None:
+        self._switch = switch
+        self._network = ipaddress.ip_network(subnet)
+        self._addresses = self._network.hosts()
+        self._ports: dict[Host, str] = {}
+        # A group's packets go to all, also before anybody has said that they want them.
+        switch.ip("link add name switch type bridge mcast_snooping 0", "link set switch up")
+
+    def join(self, host: Host) -> str:
+        """Plug a host in; return its address on this segment.
+
+        Raises:
+            UsageError: It is plugged in already.
+        """
+        if host in self._ports:
+            raise UsageError(f"host {host.name!r} is plugged in already")
+        port, interface = f"port{len(self._ports)}", host.add_interface()
+        address = str(next(self._addresses))
+        self._switch.ip(
+            f"link add name {port} type veth peer name {interface} netns {host.pid}",
+            f"link set {port} master switch up",
+        )
+        host.ip(
+            f"link set {interface} up",
+            f"address add {address}/{self._network.prefixlen} dev {interface}",
+        )
+        self._ports[host] = port
+        return address
+
+    def cut(self, host: Host) -> None:
+        """Let nothing pass from now on, without telling the host: as out of a radio's reach."""
+        self._switch.ip(f"link set {self._ports[host]} nomaster")
+
+    def restore(self, host: Host) -> None:
+        """Let everything pass again."""
+        self._switch.ip(f"link set {self._ports[host]} master switch")
+
+    def unplug(self, host: Host) -> None:
+        """Pull the cable: the host's interface loses its carrier."""
+        self._switch.ip(f"link set {self._ports[host]} down")
+
+    def plug(self, host: Host) -> None:
+        """Put the cable back."""
+        self._switch.ip(f"link set {self._ports[host]} up")
+
+
+class Lab:
+    """Hosts and segments, which end with the ``with`` block.
+
+    Raises:
+        UnsupportedError: No hosts can be made here; see :func:`problem`.
+    """
+
+    def __init__(self) -> None:
+        if why := problem():
+            raise UnsupportedError(f"no hosts can be made here: {why}")
+        self._stack = ExitStack()
+        self._folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory(prefix="skyloop-")))
+        self._count = 0
+
+    def host(self, name: str, *, clock_ahead_s: float = 0.0, environment: Mapping[str, str] | None = None) -> Host:
+        """Make a host.
+
+        Args:
+            name: Its host name.
+            clock_ahead_s: How far its monotonic clock is ahead of all others, in whole seconds.
+            environment: Variables of all that runs there.
+        """
+        self._count += 1
+        sockets = {"SKYLOOP_RUNTIME_DIR": str(self._folder / str(self._count))}
+        host = Host(name, sockets | dict(environment or {}), clock_ahead_s)
+        self._stack.callback(host.close)
+        return host
+
+    def segment(self, subnet: str) -> Segment:
+        """Make a switch; ``subnet`` is such as ``10.77.1.0/24``."""
+        return Segment(self.host("switch"), subnet)
+
+    def enter(self, context: AbstractContextManager[_Entered]) -> _Entered:
+        """Enter a context that ends before the hosts that were made so far."""
+        return self._stack.enter_context(context)
+
+    def close(self) -> None:
+        """Take everything down, in the reverse order. Idempotent."""
+        self._stack.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()

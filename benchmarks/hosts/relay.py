@@ -1,0 +1,126 @@
+"""The process of a path: moves packets between the TUN devices of two hosts, late, in another order, or not at all."""
+
+from __future__ import annotations
+
+import ctypes
+import fcntl
+import gc
+import os
+import select
+import struct
+import time
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from benchmarks.hosts.impairments import Impairments, Way
+
+_TUNSETIFF: Final = 0x400454CA  # linux/if_tun.h
+_IFF_TUN: Final = 0x0001
+_IFF_NO_PI: Final = 0x1000
+_CLONE_NEWNET: Final = 0x40000000
+_LARGEST: Final = 65536
+_AT_ONCE: Final = 32  # packets of one direction before the other is looked at
+_NICE: Final = -10  # the delay that is asked for should not grow by that of a busy processor
+
+
+class Direction(NamedTuple):
+    """What passed one way since the last report."""
+
+    packets: int  #: that arrived
+    size: int  #: bytes of those
+    lost: int  #: on purpose
+    late_ns: list[int]  #: by how much each came later than it should have, by this process's own doing
+
+
+def device(pid: int, name: str) -> int:
+    """Make a TUN device in the network namespace of a process; return its descriptor, which does not block."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    with Path(f"/proc/{pid}/ns/net").open() as namespace:
+        if libc.setns(namespace.fileno(), _CLONE_NEWNET) != 0:
+            raise OSError(ctypes.get_errno(), f"cannot enter the network namespace of process {pid}")
+    descriptor = os.open("/dev/net/tun", os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+    fcntl.ioctl(descriptor, _TUNSETIFF, struct.pack("16sH22x", name.encode(), _IFF_TUN | _IFF_NO_PI))
+    return descriptor
+
+
+def relay(
+    pipe: Connection,
+    seed: int,
+    ends: tuple[tuple[int, str], tuple[int, str]],
+    impairments: tuple[Impairments, Impairments],
+) -> None:
+    """Relay packets until ``None`` comes through the pipe.
+
+    Two :class:`Impairments` there, one each way, hold from then on, and are answered by ``"set"``; ``"tell"`` is
+    answered by two :class:`Direction`.
+
+    Args:
+        pipe: To the measuring process.
+        seed: Decides the fate of each packet.
+        ends: A process of each host, and the name of the device that the host gets.
+        impairments: At first, each way.
+    """
+    descriptors = [device(*end) for end in ends]
+    ways = [_Wire(descriptors[0], descriptors[1], f"{seed}/0", impairments[0])]
+    ways.append(_Wire(descriptors[1], descriptors[0], f"{seed}/1", impairments[1]))
+    os.nice(_NICE)
+    gc.disable()  # nothing here makes cycles
+    pipe.send("ready")
+    control = pipe.fileno()
+    while True:
+        due = [wire.way.next_ns for wire in ways]
+        next_ns = min((at for at in due if at is not None), default=None)
+        wait_s = None if next_ns is None else max(0, next_ns - time.monotonic_ns()) / 1e9
+        ready, _, _ = select.select([*descriptors, control], [], [], wait_s)
+        for wire in ways:
+            if wire.source in ready:
+                wire.take()
+            wire.give()
+        if control in ready:
+            wish = pipe.recv()
+            if wish is None:
+                return
+            if isinstance(wish, tuple):
+                for wire, wrong in zip(ways, wish, strict=True):
+                    wire.way.impairments = wrong
+                pipe.send("set")
+            else:
+                pipe.send([wire.tell() for wire in ways])
+
+
+class _Wire:
+    """One direction, from one device to the other."""
+
+    def __init__(self, source: int, sink: int, seed: str, impairments: Impairments) -> None:
+        self.source = source
+        self.way = Way(seed, impairments)
+        self._sink = sink
+        self._size = 0
+        self._late_ns: list[int] = []
+
+    def take(self) -> None:
+        """What came in."""
+        for _ in range(_AT_ONCE):
+            try:
+                packet = os.read(self.source, _LARGEST)
+            except BlockingIOError:
+                return
+            self.way.put(packet, time.monotonic_ns())
+
+    def give(self) -> None:
+        """What is due goes out."""
+        while (found := self.way.get(now_ns := time.monotonic_ns())) is not None:
+            due_ns, packet = found
+            try:
+                os.write(self._sink, packet)
+            except OSError:  # that device is down: the packet is lost as on any other path
+                continue
+            self._size += len(packet)
+            self._late_ns.append(now_ns - due_ns)
+
+    def tell(self) -> Direction:
+        """What passed, and from then on the next."""
+        told = Direction(len(self._late_ns), self._size, self.way.lost, self._late_ns)
+        self._size, self.way.lost, self._late_ns = 0, 0, []
+        return told

@@ -1,0 +1,111 @@
+"""Processes that watch while the pilot flies: observers, a recorder, and pages of a cockpit."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from skyloop.bench.contract import Arrivals, Recorder
+from skyloop.bench.ours import Listening
+from skyloop.bench.schedule import VIDEO
+from skyloop.bench.vehicle import CAMERA
+from skyloop.bench.workers import Pipe
+from skyloop.client import connect
+from skyloop.clock import nanoseconds
+from skyloop.errors import LinkError, MissingExtraError
+
+if TYPE_CHECKING:
+    from skyloop.cockpit.testing import Pages
+
+_LOOK_S: Final = 0.02  #: shorter than the pause between two frames of a page
+
+
+def observe(pipe: Pipe, proxy: str) -> None:
+    """Run an observer of feedback and video, which connects when told to and sends at the end what it received."""
+    pipe.send("ready")
+    while pipe.recv() is not None:
+        heard = Recorder()
+        listening = Listening(heard.heard)
+        with connect(proxy, access="observe", name="observer") as drone:
+            drone.on_feedback(listening.feedback, inline=True)
+            drone.add_processor(listening.frame, camera=CAMERA, inline=True)
+            pipe.send("connected")
+            pipe.recv()
+        pipe.send(heard.arrivals)
+
+
+def record(pipe: Pipe, proxy: str, file: str, fill: bool) -> None:
+    """Run a recorder of everything; it sends at the end what it could not record, by channel, and why it stood still.
+
+    Args:
+        pipe: To the measuring process.
+        proxy: The proxy's name.
+        file: Where to record.
+        fill: Whether to record up to the disk's last byte; the file is deleted afterwards.
+    """
+    from skyloop import recording
+    from skyloop.recording.options import Options
+
+    room_mb = 0.0 if fill else Options().min_free_mb
+    with recording.record(proxy, file, in_process=True, overwrite=True, min_free_mb=room_mb) as recorder:
+        pipe.send("ready")
+        pipe.recv()
+    if fill:
+        for written in recorder.files:
+            written.unlink(missing_ok=True)
+    lost: dict[str, int] = {}
+    for by_channel in (*recorder.dropped.values(), *recorder.missed.values()):
+        for channel, number in by_channel.items():
+            lost[channel] = lost.get(channel, 0) + number
+    pipe.send((lost, recorder.reason))
+
+
+def show(pipe: Pipe, proxy: str, number: int) -> None:
+    """Run a cockpit; send its process id when ``number`` pages are open, and at the end how old the frames came."""
+    from skyloop.cockpit.child import CockpitProcess
+    from skyloop.cockpit.testing import Pages
+
+    with (
+        tempfile.TemporaryDirectory(prefix="bench-") as folder,
+        CockpitProcess(proxy, recordings=Path(folder)) as cockpit,
+        Pages(cockpit.address(), proxy, number) as pages,
+    ):
+        pipe.send(cockpit.pid)
+        pipe.send(_ages(pipe, pages))
+
+
+def _ages(pipe: Pipe, pages: Pages) -> Arrivals:
+    """Return what the pages get, until something comes through the pipe."""
+    arrivals: Arrivals = {VIDEO: []}
+    seen = [0] * len(pages.clients)
+    while not pipe.poll(_LOOK_S):
+        now_ns = time.monotonic_ns()
+        for index, page in enumerate(pages.clients):
+            frames, age_s = page.frames, page.newest_age_s
+            if frames > seen[index] and age_s is not None:
+                seen[index] = frames
+                arrivals[VIDEO].append((now_ns - nanoseconds(age_s), now_ns))
+    if pages.problem is not None:
+        raise LinkError(f"the pages ended: {pages.problem}")
+    pipe.recv()
+    return arrivals
+
+
+def recorder_problem() -> str:
+    """Return why nothing can be recorded here; empty if it can."""
+    try:
+        from skyloop.recording.child import check_installed
+
+        check_installed()
+    except ImportError as error:  # a part that is not installed is one too
+        return str(error)
+    return ""
+
+
+def cockpit_problem() -> str:
+    """Return why no cockpit can be opened here; empty if it can."""
+    missing = [name for name in ("starlette", "uvicorn", "websockets", "cv2") if find_spec(name) is None]
+    return str(MissingExtraError("the cockpit", "cockpit", cause=f"no {', '.join(missing)}")) if missing else ""

@@ -1,0 +1,33 @@
+"""The pilot's application with a processor that takes 200 ms a frame, in a thread of its own as by default."""
+
+from __future__ import annotations
+
+import time
+from typing import Final
+
+import numpy as np
+
+from skyloop.bench import ours
+from skyloop.bench.contract import Heard
+from skyloop.bench.schedule import VIDEO
+from skyloop.bench.vehicle import CAMERA
+from skyloop.client import Frame
+
+SLOW_S: Final = 0.2
+SLOW_VIDEO: Final = f"{VIDEO}, slow processor"
+
+
+class Application(ours.Application):
+    """The pilot's end, with the slow processor."""
+
+    def __init__(self, address: str, heard: Heard) -> None:
+        super().__init__(address, heard)
+
+        def slow(frame: Frame) -> None:
+            heard(SLOW_VIDEO, frame.captured_ns)
+            until = time.monotonic() + SLOW_S
+            mean = np.zeros(frame.shape, np.float32)
+            while time.monotonic() < until:  # what image processing does: long work on arrays
+                mean += 0.1 * (frame.image - mean)
+
+        self._drone.add_processor(slow, camera=CAMERA)

@@ -1,0 +1,142 @@
+// The emergency stop's gesture: press and hold. Nobody does that by chance, and who means it sees it count.
+
+import { h, setAttribute, setText } from "./dom.js";
+
+/** So long it is held [ms]. */
+export const HOLD_MS = 800;
+const HINT_MS = 1500;
+
+/** What a held press comes to. Pure. */
+export class Hold {
+  private since_ms: number | null = null;
+
+  get isHeld(): boolean {
+    return this.since_ms !== null;
+  }
+
+  press(now_ms: number): void {
+    this.since_ms ??= now_ms;
+  }
+
+  release(): void {
+    this.since_ms = null;
+  }
+
+  /** From 0 to 1; null while nothing is held. */
+  share(now_ms: number): number | null {
+    return this.since_ms === null ? null : Math.min(1, (now_ms - this.since_ms) / HOLD_MS);
+  }
+
+  /** Whether it has been held for long enough, which it is once. */
+  isDone(now_ms: number): boolean {
+    if (this.since_ms === null || now_ms - this.since_ms < HOLD_MS) return false;
+    this.since_ms = null;
+    return true;
+  }
+}
+
+/** What is done when it was held, and whose motors it is about, in words. */
+export interface Deadly {
+  what: string;
+  act: () => void;
+}
+
+/** Counts what is held, wherever that began, in the middle of the screen and above everything that is there. */
+export class Countdown {
+  readonly element: HTMLElement;
+  private readonly what = h("b", {});
+  private readonly how = h("span", { class: "counting-how" });
+  private readonly left = h("span", { class: "counting-left", "aria-hidden": "true" });
+  private readonly bar = h("i", {});
+  private readonly hold = new Hold();
+  private held: Deadly | null = null;
+  private hint: ReturnType<typeof setTimeout> | undefined;
+
+  constructor() {
+    this.element = h("div", { class: "counting", hidden: true, role: "alert" }, this.what, this.how, this.left, h("span", { class: "counting-bar" }, this.bar));
+    window.addEventListener("blur", () => this.release());
+    document.addEventListener("visibilitychange", () => document.hidden && this.release());
+  }
+
+  get isHeld(): boolean {
+    return this.hold.isHeld;
+  }
+
+  /** What is held already goes on. */
+  press(deadly: Deadly): void {
+    if (this.hold.isHeld) return;
+    clearTimeout(this.hint);
+    this.held = deadly;
+    this.hold.press(performance.now());
+    this.tick();
+    requestAnimationFrame(this.round);
+  }
+
+  /** Nothing is done, and whoever let go too early reads how it is done. */
+  release(): void {
+    if (!this.hold.isHeld) return;
+    this.end();
+    this.element.hidden = false;
+    setText(this.how, `Not done: it was let go. Press and hold for ${HOLD_MS / 1000} s`);
+    setText(this.left, "");
+    this.bar.style.setProperty("width", "0");
+    this.hint = setTimeout(() => (this.element.hidden = true), HINT_MS);
+  }
+
+  private end(): void {
+    this.hold.release();
+    this.element.hidden = true;
+    this.held = null;
+  }
+
+  private readonly round = (): void => {
+    if (!this.hold.isHeld) return;
+    this.tick();
+    requestAnimationFrame(this.round);
+  };
+
+  private tick(): void {
+    const now_ms = performance.now();
+    const { held } = this;
+    if (held === null) return;
+    const share = this.hold.share(now_ms) ?? 0;
+    this.element.hidden = false;
+    setText(this.what, held.what);
+    setText(this.how, "Keep holding, let go to cancel");
+    setText(this.left, `${(((1 - share) * HOLD_MS) / 1000).toFixed(1)} s`);
+    this.bar.style.setProperty("width", `${share * 100}%`);
+    if (!this.hold.isDone(now_ms)) return;
+    this.end();
+    held.act();
+  }
+}
+
+/** A button that is held: by pointer, or by the space bar or Enter. `deadly` is asked when the press begins. */
+export function holdButton(countdown: Countdown, deadly: () => Deadly | null, attributes: Record<string, string>, ...children: (Node | string)[]): HTMLButtonElement {
+  const button = h("button", { type: "button", ...attributes }, ...children);
+  const press = (): void => {
+    const meant = deadly();
+    if (meant === null || button.disabled) return;
+    setAttribute(button, "data-held", "true");
+    countdown.press(meant);
+  };
+  const release = (): void => {
+    if (button.getAttribute("data-held") !== "true") return;
+    setAttribute(button, "data-held", "false");
+    countdown.release();
+  };
+  button.addEventListener("pointerdown", (event) => {
+    if (event.button !== 0) return;
+    button.setPointerCapture(event.pointerId);
+    press();
+  });
+  for (const end of ["pointerup", "pointercancel", "lostpointercapture", "blur"] as const) button.addEventListener(end, release);
+  button.addEventListener("contextmenu", (event) => event.preventDefault()); // a long press on a touch screen
+  button.addEventListener("keydown", (event) => {
+    if (event.code !== "Space" && event.code !== "Enter" && event.code !== "NumpadEnter") return;
+    event.preventDefault();
+    if (!event.repeat && !event.ctrlKey) press();
+  });
+  button.addEventListener("keyup", release);
+  return button;
+}

@@ -1,0 +1,166 @@
+// What is always there: the motors of the drone that is seen, land all, stop all; and what became of that.
+
+import type { ServerClock } from "./clock.js";
+import { h, setAttribute, setDisabled, setHidden, setText, setTone } from "./dom.js";
+import { type Countdown, type Deadly, holdButton } from "./hold.js";
+import type { DroneRow } from "./model.js";
+import { type Answer, OrderLine, type Line, type Result } from "./orders.js";
+import { STEER_MS } from "./pilot.js";
+import type { Handlers } from "./socket.js";
+
+const WATCH_MS = 300;
+const SHOWN_MS = 15_000;
+
+/** The drone that a key or the gamepad would stop. */
+export interface Target {
+  name: string;
+  /** Of the emergency stop. */
+  result: Result | null;
+  stop: () => void;
+}
+
+type Deed = "land_all" | "stop_all";
+interface Each extends Answer {
+  drone: string;
+  state: "sent" | "done" | "refused";
+}
+
+export const WORDS: Readonly<Record<Deed, string>> = { land_all: "Land all", stop_all: "Stop all" };
+
+/** What became of an order to all drones, in words, the worst first. Pure. */
+export function outcome(deed: Deed, drones: readonly string[], each: ReadonlyMap<string, { state: string; why: string }>): { text: string; bad: boolean } {
+  const of = (state: string): string[] => drones.filter((name) => (each.get(name)?.state ?? "pending") === state);
+  const failed = of("refused").map((name) => `${name}: ${each.get(name)?.why}`);
+  const done = deed === "land_all" ? "landed" : "done";
+  const parts = [
+    failed.length ? `NOT ${deed === "land_all" ? "landed" : "stopped"}: ${failed.join("; ")}` : "",
+    of("pending").length ? `pending: ${of("pending").join(", ")}` : "",
+    of("sent").length ? `sent: ${of("sent").join(", ")}` : "",
+    of("done").length ? `${done}: ${of("done").join(", ")}` : "",
+  ].filter(Boolean);
+  return { text: drones.length ? `${WORDS[deed]} · ${parts.join(" · ")}` : `${WORDS[deed]} · there is no drone that flies`, bad: failed.length > 0 };
+}
+
+export class Safety {
+  readonly element: HTMLElement;
+  /** What became of it; below the bar. */
+  readonly told = h("p", { class: "banner safety-told", role: "status", hidden: true });
+  private readonly name = h("span", { class: "stop-name" });
+  private readonly fate = h("span", { class: "fate" });
+  private readonly own: HTMLButtonElement;
+  private readonly all: Record<Deed, { button: HTMLButtonElement; fate: HTMLElement }>;
+  private readonly line: OrderLine;
+  private target: Target | null = null;
+  private asked: { deed: Deed; drones: readonly string[]; each: Map<string, { state: string; why: string }>; since_ms: number } | null = null;
+  private flying = 0;
+
+  constructor(
+    connect: (handlers: Handlers) => Line,
+    clock: ServerClock,
+    private readonly countdown: Countdown,
+  ) {
+    this.own = holdButton(countdown, () => this.one(), { class: "stop own", "aria-keyshortcuts": "Control+Enter", title: "Press and hold" }, h("span", {}, "Motors off"), this.name, h("kbd", { "aria-hidden": "true" }, "hold"), this.fate);
+    const button = (deed: Deed, kind: string, keys: string): { button: HTMLButtonElement; fate: HTMLElement } => {
+      const fate = h("span", { class: "fate" });
+      return { button: holdButton(countdown, () => this.every(deed), { class: kind, "aria-keyshortcuts": keys, title: "Press and hold" }, h("span", {}, WORDS[deed]), h("kbd", { "aria-hidden": "true" }, "hold"), fate), fate };
+    };
+    this.all = { land_all: button("land_all", "land-all", ""), stop_all: button("stop_all", "stop", "Control+Shift+Enter") };
+    this.element = h("div", { class: "safety", role: "group", "aria-label": "Emergency: press and hold" }, this.own, this.all.land_all.button, this.all.stop_all.button);
+    this.line = new OrderLine(
+      connect,
+      clock,
+      { linked: () => this.show(), told: (message) => this.hear(message), refused: (order, why) => this.refused(order as Deed, why), changed: () => this.show() },
+      () => performance.now(),
+    );
+    setInterval(() => this.line.tick(WATCH_MS), STEER_MS);
+  }
+
+  /** Which drone is stopped by its own button, by keys and by the gamepad; null: none that flies is seen. */
+  aim(target: Target | null): void {
+    if (target?.name !== this.target?.name && this.countdown.isHeld) this.countdown.release(); // that was meant for another one
+    this.target = target;
+    this.show();
+  }
+
+  /** Of the last overview: those that fly. */
+  know(rows: readonly DroneRow[]): void {
+    this.flying = rows.filter((row) => row.can_fly && !isRecording(row)).length;
+    this.show();
+  }
+
+  /** Keys or the gamepad are held, or no longer. */
+  hold(which: "one" | "all" | null): void {
+    if (which === null) this.countdown.release();
+    else {
+      const meant = which === "one" ? this.one() : this.every("stop_all");
+      if (meant) this.countdown.press(meant);
+      else this.say("No drone that flies is opened and seen here: hold Stop all, or open one", true);
+    }
+  }
+
+  private one(): Deadly | null {
+    const { target } = this;
+    return target && { what: `Motors of ${target.name} off`, act: () => target.stop() };
+  }
+
+  private every(deed: Deed): Deadly {
+    const count = this.flying;
+    const whom = count === 1 ? "the only drone" : `all ${count} drones`;
+    return { what: deed === "land_all" ? `Land ${whom}` : `Motors of ${whom} off`, act: () => this.order(deed) };
+  }
+
+  private order(deed: Deed): void {
+    this.asked = { deed, drones: [], each: new Map(), since_ms: performance.now() };
+    this.line.order({ do: deed });
+    if (this.line.result(deed)?.fate === "pending") this.say(`${WORDS[deed]} · pending`, false);
+  }
+
+  private hear(message: Answer): void {
+    const { asked } = this;
+    if (!asked || message.do !== asked.deed) return;
+    if (message.type === "sent") asked.drones = (message as Answer & { drones?: string[] }).drones ?? [];
+    else if (message.type === "each") asked.each.set((message as Each).drone, { state: (message as Each).state, why: message.why ?? "" });
+    else return;
+    const { text, bad } = outcome(asked.deed, asked.drones, asked.each);
+    this.say(text, bad);
+  }
+
+  private refused(deed: Deed, why: string): void {
+    if (deed in WORDS) this.say(`${WORDS[deed]} · ${why}`, true);
+  }
+
+  private say(text: string, bad: boolean): void {
+    setTone(this.told, bad ? "bad" : "busy");
+    setText(this.told, text);
+    setHidden(this.told, false);
+    const said_ms = performance.now();
+    this.told_ms = said_ms;
+    setTimeout(() => this.told_ms === said_ms && setHidden(this.told, true), SHOWN_MS);
+  }
+  private told_ms = 0;
+
+  private show(): void {
+    if (!this.all) return; // while it is made
+    const { target } = this;
+    setHidden(this.own, target === null);
+    setText(this.name, target?.name ?? "");
+    setAttribute(this.own, "aria-label", `Motors off, ${target?.name ?? ""}: press and hold`);
+    showFate(this.own, this.fate, target?.result ?? null);
+    for (const deed of Object.keys(this.all) as Deed[]) {
+      const { button, fate } = this.all[deed];
+      setDisabled(button, this.flying === 0);
+      setAttribute(button, "aria-label", `${deed === "land_all" ? "Land all drones" : "Stop all: motors of all drones off"}, press and hold`);
+      showFate(button, fate, this.line.result(deed));
+    }
+  }
+}
+
+/** On the control itself: pending, sent, refused, not sent. */
+export function showFate(button: HTMLElement, place: HTMLElement, result: Result | null): void {
+  setAttribute(button, "data-fate", result?.fate ?? "");
+  setText(place, result?.fate ?? "");
+  setAttribute(place, "title", result?.why ?? "");
+}
+
+/** Nothing flies there: it is what was recorded. */
+export const isRecording = ({ uri }: { uri: string }): boolean => uri.startsWith("replay:") || uri.startsWith("video:");

@@ -1,0 +1,173 @@
+"""Decides which command is sent when. Pure: no socket, no thread, the time is an argument.
+
+The newest set-point wins: it is sent at once and, unless a newer one comes within one and a quarter periods, repeated
+at a steady rate on absolute deadlines. Without a set-point ``Idle`` is repeated, which keeps the authority and leaves
+the vehicle as it is. A set-point from before a lost link, a lost authority or a failsafe is never sent again.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from skyloop.clock import nanoseconds
+from skyloop.errors import UsageError
+from skyloop.messages import (
+    AnyAction,
+    Attitude,
+    EmergencyStop,
+    Failsafe,
+    Feedback,
+    FlightState,
+    Hover,
+    Idle,
+    Land,
+    ResetEmergency,
+    Takeoff,
+    Velocity,
+)
+
+_IDLE: Final = Idle()
+_HOVER: Final = Hover()
+#: Actions that are done once the vehicle is in one of these states; then they are no longer sent.
+_DONE_IN: Final[dict[type[AnyAction], frozenset[FlightState]]] = {
+    Takeoff: frozenset({FlightState.HOVERING, FlightState.FLYING}),
+    Land: frozenset({FlightState.LANDED}),
+    EmergencyStop: frozenset({FlightState.EMERGENCY}),
+    ResetEmergency: frozenset(FlightState) - {FlightState.EMERGENCY},
+}
+#: How long such an action is repeated at least, as the known state may be from before it was commanded.
+_AT_LEAST_NS: Final[dict[type[AnyAction], int]] = {
+    Takeoff: nanoseconds(0.3),
+    Land: nanoseconds(0.3),
+    EmergencyStop: nanoseconds(0.1),
+    ResetEmergency: nanoseconds(0.1),
+}
+_AT_MOST_NS: Final[dict[type[AnyAction], int]] = {
+    Takeoff: nanoseconds(20.0),
+    Land: nanoseconds(60.0),
+    EmergencyStop: nanoseconds(2.0),
+    ResetEmergency: nanoseconds(2.0),
+}
+
+
+class CommandSchedule:
+    """Keeps the newest set-point of one application. Times are on this process's clock."""
+
+    def __init__(
+        self, *, rate_hz: float = 32.0, stall_s: float = 1.0, min_interval_s: float = 0.005, keep_s: float = 0.5
+    ) -> None:
+        """Start without a set-point.
+
+        Args:
+            rate_hz: Rate of repeats, 1 to 200 Hz.
+            stall_s: Time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never.
+            min_interval_s: Least time between two set-points of the application [s]; repeats in between do not count.
+            keep_s: A set-point given while the link was down is sent when it is back, if it is not older than this [s].
+
+        Raises:
+            UsageError: If ``rate_hz`` or ``stall_s`` is out of range.
+        """
+        if not 1.0 <= rate_hz <= 200.0:
+            raise UsageError(f"rate_hz is {rate_hz!r} and must be from 1 to 200 commands a second")
+        if not stall_s > 0.0:
+            raise UsageError(f"stall_s is {stall_s!r} and must be more than 0 s (math.inf: never)")
+        self._period_ns = nanoseconds(1.0 / rate_hz)
+        self._stall_ns = None if stall_s == float("inf") else nanoseconds(stall_s)
+        self._min_interval_ns = nanoseconds(min_interval_s)
+        self._keep_ns = nanoseconds(keep_s)
+        self.action: AnyAction = _IDLE
+        self.asked: AnyAction = _IDLE  #: what the application commanded last, whether or not it is over
+        self.intent = 0
+        self._asked_ns = 0
+        # Repeats must not delay an application that commands at about the same rate: the first repeat waits a quarter
+        # period longer, and only commands of the application delay the next one.
+        self._first_ns = self._period_ns * 5 // 4
+        self._new_sent_ns = -self._min_interval_ns  # when the newest intent was first sent
+        self._sent_intent = 0
+        self._due_ns = 0
+        self._failsafe = Failsafe.NONE
+
+    def ask(self, action: AnyAction, now_ns: int) -> None:
+        """Make ``action`` the set-point of the application."""
+        stops = type(action) is Hover and type(self.action) is not Hover
+        self.action = self.asked = action
+        self.intent += 1
+        self._asked_ns = now_ns
+        if stops or type(action) in _DONE_IN:  # rare and important: at once
+            self._due_ns = now_ns
+        else:
+            self._due_ns = max(now_ns, self.open_ns)
+
+    @property
+    def open_ns(self) -> int:
+        """Time from which a new set-point is sent at once [ns]."""
+        return self._new_sent_ns + self._min_interval_ns
+
+    @property
+    def due_ns(self) -> int:
+        """When :meth:`next` has something to send [ns]."""
+        return self._due_ns
+
+    def next(self, now_ns: int) -> AnyAction | None:
+        """Return what to send now, under the present :attr:`intent`; None if it is too early."""
+        if now_ns < self._due_ns:
+            return None
+        if self._decays(now_ns):
+            self.action = _HOVER
+        elif self._expired(now_ns):
+            self.action = _IDLE
+        if self.intent != self._sent_intent:
+            self._sent_intent, self._new_sent_ns = self.intent, now_ns
+            self._due_ns = now_ns + self._first_ns
+            return self.action
+        # The next deadline follows from the last one, not from the present time, so that the rate is kept; a deadline
+        # missed by more than a period is skipped.
+        self._due_ns += self._period_ns
+        if self._due_ns <= now_ns:
+            self._due_ns = now_ns + self._period_ns
+        return self.action
+
+    def decayed(self, before: AnyAction) -> bool:
+        """Return whether the set-point ``before`` has decayed to hover because the application made no call."""
+        return self.action is _HOVER and before is not _HOVER
+
+    def observe(self, feedback: Feedback, now_ns: int) -> None:
+        """Update from the vehicle's state: end an action that is done, or a set-point that a failsafe overruled."""
+        kind = type(self.action)
+        done_in = _DONE_IN.get(kind)
+        if done_in is None:
+            over = feedback.state is FlightState.EMERGENCY
+        else:
+            over = feedback.state in done_in and now_ns - self._asked_ns >= _AT_LEAST_NS[kind]
+        if over:
+            self.action = _IDLE
+        if feedback.failsafe is not self._failsafe:
+            self._failsafe = feedback.failsafe
+            if feedback.failsafe is not Failsafe.NONE:
+                self.clear()
+
+    def clear(self) -> None:
+        """Drop the set-point, after a lost authority or a failsafe. An emergency stop stays."""
+        if not isinstance(self.action, EmergencyStop):
+            self.action = _IDLE
+
+    def resume(self, now_ns: int) -> None:
+        """Start to send (again): drop a set-point that is too old."""
+        if now_ns - self._asked_ns > self._keep_ns:
+            self.clear()
+        self._failsafe = Failsafe.NONE
+        self._due_ns = now_ns
+
+    @property
+    def wants_flight(self) -> bool:
+        """Whether the newest set-point keeps, or brings, the vehicle in the air."""
+        return isinstance(self.action, Takeoff | Hover | Velocity | Attitude)
+
+    def _decays(self, now_ns: int) -> bool:
+        if self._stall_ns is None or not isinstance(self.action, Velocity | Attitude):
+            return False
+        return now_ns - self._asked_ns >= self._stall_ns
+
+    def _expired(self, now_ns: int) -> bool:
+        longest_ns = _AT_MOST_NS.get(type(self.action))
+        return longest_ns is not None and now_ns - self._asked_ns > longest_ns

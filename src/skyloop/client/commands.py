@@ -1,0 +1,443 @@
+"""Authority and commands of one application, over whichever connection there is."""
+
+from __future__ import annotations
+
+import math
+import numbers
+import threading
+from collections.abc import Callable
+from typing import Final
+
+from skyloop.client.authority import Authority, AuthorityStatus
+from skyloop.client.channels import Emit
+from skyloop.client.command_schedule import CommandSchedule
+from skyloop.client.connection import ProxyConnection
+from skyloop.client.scheduler import Scheduler
+from skyloop.client.statistics import ChannelCounter
+from skyloop.errors import AuthorityError, LinkError, NoAnswerError, UsageError
+from skyloop.messages import (
+    ACTION_NAMES,
+    AnswerTakeover,
+    AnyAction,
+    AnyReply,
+    AuthorityGranted,
+    AuthorityQueued,
+    Command,
+    EmergencyStop,
+    Event,
+    EventKind,
+    Feedback,
+    Refused,
+    ReleaseAuthority,
+    RequestAuthority,
+    Role,
+    encode,
+)
+from skyloop.messages.config import MAX_REASON
+
+ANSWER_S: Final = 2.0  #: how long the proxy may take to answer a request for the authority
+_LATER_NS: Final = 1_000_000_000
+_ACTIONS: Final = frozenset(ACTION_NAMES)
+
+
+class CommandSender:
+    """Requests and keeps the authority, and sends the newest command at once and then at a steady rate.
+
+    It is the only one that changes its ``authority``.
+    """
+
+    def __init__(
+        self,
+        role: Role,
+        authority: Authority,
+        schedule: CommandSchedule,
+        connection: ProxyConnection,
+        scheduler: Scheduler,
+        *,
+        emit: Emit,
+        changed: Callable[[], None],
+        granted: Callable[[int], None],
+    ) -> None:
+        """Prepare to send; nothing is sent before :meth:`connected`.
+
+        Args:
+            role: Pilot or observer.
+            authority: State of the authority.
+            schedule: Decides which command is sent when.
+            connection: Sends packets and requests.
+            scheduler: Source of the time and of waiting.
+            emit: Gets the events that are made here.
+            changed: Called when the status of the authority has changed, on the thread that found out: the receiving
+                one, the supervisor's, or an application's.
+            granted: Called with the number of each new lease, on the same threads.
+        """
+        self._role = role
+        self._authority = authority
+        self._schedule = schedule
+        self._connection = connection
+        self._clock = scheduler.clock
+        self._emit = emit
+        self._changed = changed
+        self._granted = granted
+        self._lock = threading.Lock()  # guards all below; never held while waiting or in a callback
+        self._seq = 0
+        self._ask_now = False
+        self._refusal: Refused | None = None
+        self._present_until_ns: int | None = None
+        self.notifier = scheduler.notifier()  #: notified when the status of the authority changes
+        self.sends = ChannelCounter()  #: commands sent; ``dropped``: not handed to the transport
+
+    @property
+    def status(self) -> AuthorityStatus:
+        """This application's authority."""
+        return self._authority.status
+
+    @property
+    def app_id(self) -> int:
+        """Number of this application in this run of the proxy."""
+        return self._authority.app_id
+
+    @property
+    def seq(self) -> int:
+        """Number of the last command sent on this connection."""
+        return self._seq
+
+    @property
+    def open_ns(self) -> int:
+        """Time on this process's clock from which a new set-point is sent at once [ns]."""
+        return self._schedule.open_ns
+
+    @property
+    def wants_flight(self) -> bool:
+        """Whether the newest set-point keeps, or brings, the vehicle in the air."""
+        return self._schedule.wants_flight
+
+    def flown_by_person(self) -> None:
+        """Require a person's presence from now on; see :meth:`present_until`.
+
+        After a lost connection or lease the authority is no longer requested again by itself, as only that person can
+        tell whether to.
+        """
+        with self._lock:
+            self._authority.renews = False
+            self._present_until_ns = self._clock()
+
+    def present_until(self, until_ns: int) -> None:
+        """Extend the time until which the person who flies is known to be present; never shortens it.
+
+        After that time nothing is repeated and no authority is requested, so that the proxy takes the pilot for silent;
+        only an emergency stop is still sent. The sending thread checks this itself, however busy other threads are.
+
+        Args:
+            until_ns: On this process's clock.
+        """
+        with self._lock:
+            known_ns = self._present_until_ns
+            if known_ns is None or until_ns <= known_ns:
+                return
+            absent = known_ns < self._clock()
+            self._present_until_ns = until_ns
+            if absent:
+                self._schedule.clear()  # set-points from before the absence are not repeated
+        if absent:
+            self._connection.poke()
+
+    def is_present(self, now_ns: int) -> bool:
+        """Return whether the person who flies is known to be present; always True unless one is required."""
+        return self._present_until_ns is None or now_ns <= self._present_until_ns
+
+    # The application's side ------------------------------------------------------------------------------------
+
+    def command(self, action: AnyAction) -> bool:
+        """Make ``action`` the newest set-point.
+
+        Returns:
+            False if it can't be sent now, because the link is down or the authority is still awaited.
+
+        Raises:
+            AuthorityError: If another application holds the authority, none was requested, or this one only observes.
+        """
+        now_ns = self._clock()
+        stop = type(action) is EmergencyStop
+        with self._lock:
+            authority = self._authority
+            may_send = authority.held or stop
+            if (
+                not may_send
+                and self._connection.connected
+                and not (authority.wanted and authority.status.state == "none")
+            ):
+                raise self._not_ours(action)
+            if stop and self._role is Role.OBSERVER:
+                raise self._not_ours(action)
+            self._schedule.ask(action, now_ns)
+            if not may_send or not self._connection.connected:
+                return False
+            if self._schedule.due_ns <= now_ns:
+                return self._send_next(now_ns)
+        self._connection.poke()  # the last one was sent just before: the supervisor's thread sends this one
+        return True
+
+    def drop(self, action: AnyAction) -> None:
+        """Clear the set-point if it is still ``action``."""
+        with self._lock:
+            if self._schedule.action is action:
+                self._schedule.clear()
+
+    def is_newest(self, action: AnyAction) -> bool:
+        """Return whether ``action`` is the last that the application asked for, and the authority is held."""
+        return self._authority.held and self._schedule.asked is action
+
+    def lapsed(self, action: AnyAction) -> bool:
+        """Return whether ``action`` is the newest but was ended, and could be sent again now.
+
+        A failsafe, a lost link or a lost lease ends it.
+        """
+        with self._lock:
+            return self.is_newest(action) and self._schedule.action is not action and self._connection.connected
+
+    def request(self, wish: RequestAuthority, wait_s: float, *, stay: bool = False) -> AuthorityStatus:
+        """Request the authority and wait for it; see :meth:`skyloop.client.drone.Drone.request_authority`.
+
+        Args:
+            wish: The request.
+            wait_s: How long to wait in the queue [s].
+            stay: Stay in the queue after ``wait_s`` instead of raising.
+
+        Raises:
+            AuthorityError: If it is not held after ``wait_s``, if it is refused, or if this application only observes.
+            NoAnswerError: If the proxy does not answer the request.
+        """
+        if self._role is Role.OBSERVER:
+            raise AuthorityError('this application observes: connect with access="pilot" to fly', code="observer")
+        with self._lock:
+            self._authority.asked(wish)
+            self._refusal = None
+            self._ask_now = True
+        self._connection.poke()
+        if not self.notifier.wait_for(lambda: not self._authority.pending, ANSWER_S + max(0.0, wait_s)):
+            self.release(wait=False)
+            raise NoAnswerError(f"the proxy did not answer the request for the authority within {ANSWER_S:g} s")
+        self.notifier.wait_for(lambda: self._authority.held or not self._authority.wanted, max(0.0, wait_s))
+        status, refusal = self.status, self._refusal
+        if status.state == "held" or (stay and status.state in ("queued", "preempted")):
+            return status
+        self.release(wait=False)
+        if refusal is not None:
+            raise AuthorityError(f"the authority was refused: {refusal.message}", code=refusal.code.value)
+        raise AuthorityError(_busy(status, wait_s, self._authority.declined), code="busy")
+
+    def answer(self, lease: int, app_id: int, grant: bool, reason: str) -> None:
+        """Answer an application that asks for the authority. Does not wait; an answer that is too late changes nothing.
+
+        Args:
+            lease: The lease that is asked for.
+            app_id: Number of the application that asks.
+            grant: Whether to hand it over.
+            reason: Why not, for people; cut to the length that a message can hold.
+        """
+        self._connection.ask(AnswerTakeover(lease, app_id, grant, reason[:MAX_REASON]), lambda _: None, ANSWER_S)
+
+    def release(self, *, wait: bool = True) -> None:
+        """Release the authority, or leave the queue. Does nothing if it is neither held nor wanted.
+
+        Args:
+            wait: Wait for the proxy's answer.
+
+        Raises:
+            NoAnswerError: If the proxy does not answer.
+        """
+        with self._lock:
+            known = self._authority.wanted or self.status.state != "none"
+            self._schedule.clear()
+            changed = self._authority.given_back()
+        if known and self._connection.connected:
+            if wait:
+                self._connection.call(ReleaseAuthority, ANSWER_S)
+            else:
+                self._connection.ask(ReleaseAuthority(), lambda _: None, ANSWER_S)
+        if changed:
+            self._told()
+
+    # For the connection ----------------------------------------------------------------------------------------
+
+    def connected(self, app_id: int) -> None:
+        """Reset on a new connection: :meth:`tick` requests the authority again if it is wanted."""
+        with self._lock:
+            self._authority.connected(app_id)
+            self._seq = 0
+
+    def disconnected(self) -> None:
+        """Clear the set-point and the authority: nothing old is sent on the next connection."""
+        with self._lock:
+            self._schedule.clear()
+            changed = self._authority.disconnected()
+        if changed:
+            self._told()
+
+    def feedback(self, sample: Feedback, now_ns: int) -> None:
+        """Update the authority and the set-point from the vehicle's state."""
+        with self._lock:
+            before = self.status
+            changed = self._authority.feedback(sample, now_ns)
+            self._schedule.observe(sample, now_ns)
+        if changed:
+            self._moved(before, now_ns)
+
+    def event(self, event: Event, now_ns: int) -> None:
+        """Update the authority from an event."""
+        with self._lock:
+            before = self.status
+            changed = self._authority.event(event, now_ns)
+        if changed:
+            self._moved(before, now_ns)
+
+    def tick(self, now_ns: int) -> int:
+        """Send what is due.
+
+        Args:
+            now_ns: On this process's clock.
+
+        Returns:
+            When to call again at the latest [ns].
+        """
+        wish, stalled, due_ns = None, False, now_ns + _LATER_NS
+        with self._lock:
+            authority, present = self._authority, self.is_present(now_ns)
+            asks = self._ask_now or (authority.status.state == "none" and not authority.pending)
+            if authority.wanted and present and asks:
+                self._ask_now = False
+                wish = authority.wish
+                authority.asked(wish)
+            if (authority.held and present) or isinstance(self._schedule.action, EmergencyStop):
+                if self._schedule.due_ns <= now_ns:
+                    stalled = self._decay(now_ns)
+                due_ns = self._schedule.due_ns
+        if wish is not None:
+            self._connection.ask(wish, self._answered, ANSWER_S)
+        if stalled:
+            text = "the application made no call for too long: its set-point decayed to hover"
+            self._emit(EventKind.FAILSAFE, text, step="hover", reason="stalled")
+        return due_ns
+
+    # Inside ----------------------------------------------------------------------------------------------------
+
+    def _decay(self, now_ns: int) -> bool:
+        """Send what is due; return whether that was a set-point's decay to hover."""
+        before = self._schedule.action
+        self._send_next(now_ns)
+        return self._schedule.decayed(before)
+
+    def _send_next(self, now_ns: int) -> bool:
+        action = self._schedule.next(now_ns)
+        if action is None:
+            return False
+        self._seq += 1
+        connection, lease, intent = self._connection, self._authority.status.lease, self._schedule.intent
+        sent_ns = self._clock() + connection.offset_ns
+        if connection.transmit(encode(Command(self._seq, lease, intent, sent_ns, action))):
+            self.sends.add(0, now_ns, now_ns)
+            return True
+        self.sends.dropped += 1
+        return False
+
+    def _answered(self, answer: AnyReply | LinkError) -> None:
+        """Handle the answer to a request for the authority, on the receiving thread."""
+        now_ns = self._clock()
+        with self._lock:
+            before = self.status
+            if not self._authority.wanted:
+                return  # released in the meantime
+            if isinstance(answer, AuthorityGranted):
+                changed = self._authority.granted(answer.lease, now_ns, answer.until_ns or None)
+            elif isinstance(answer, AuthorityQueued):
+                changed = self._authority.queued(answer.position, answer.holder, answer.wait_s)
+            elif isinstance(answer, Refused):
+                self._refusal = answer
+                changed = self._authority.refused()
+            else:  # no answer: the next tick requests it again
+                self._authority.pending = False
+                changed = False
+        if changed:
+            self._moved(before, now_ns)
+        else:
+            self.notifier.notify()
+
+    def _moved(self, before: AuthorityStatus, now_ns: int) -> None:
+        """Handle a changed status: clear the set-point with a lost authority, start sending with a new one."""
+        status = self.status
+        with self._lock:
+            if status.state == "held":
+                self._schedule.resume(now_ns)
+            elif before.state == "held":
+                self._schedule.clear()
+        if status.state == "held" and status.lease != before.lease:
+            self._granted(status.lease)
+        self._told()
+        self._connection.poke()
+
+    def _told(self) -> None:
+        self.notifier.notify()
+        self._changed()
+
+    def _not_ours(self, action: AnyAction) -> AuthorityError:
+        status = self.status
+        if self._role is Role.OBSERVER:
+            return AuthorityError(
+                f'{action.name}: this application observes; connect with access="pilot" to fly', code="observer"
+            )
+        if status.state == "preempted":
+            return AuthorityError(
+                f"{action.name}: {status.holder or 'another application'} took over the authority; "
+                "it comes back when they give it back",
+                code="no_authority",
+            )
+        if status.state == "queued":
+            return AuthorityError(
+                f"{action.name}: {status.holder or 'another application'} holds the authority and this application "
+                "waits in line",
+                code="no_authority",
+            )
+        return AuthorityError(f"{action.name}: call request_authority() first", code="no_authority")
+
+
+def _busy(status: AuthorityStatus, wait_s: float, declined: str) -> str:
+    waited = f" and did not give it back within {wait_s:g} s" if wait_s > 0 else ""
+    expected = status.expected_wait_s
+    words = f" (number {status.position} in line, expected wait {expected:.0f} s)" if expected is not None else ""
+    said = f"; {declined}" if declined else ""
+    return (
+        f"{status.holder or 'another application'} holds the authority{waited}{words}{said}: wait longer (wait_s), ask "
+        'with a higher priority (a lower number, 0 is the highest), or look on with access="observe"'
+    )
+
+
+def checked(action: AnyAction) -> AnyAction:
+    """Return ``action`` if it can be commanded.
+
+    Raises:
+        UsageError: If it is no action, or has a number that is not finite.
+    """
+    if type(action) not in _ACTIONS:
+        raise UsageError(f"a command is one of {', '.join(sorted(ACTION_NAMES.values()))}, not {action!r}")
+    if not action.finite:
+        raise UsageError(f"{action!r} has a number that is NaN or infinite")
+    return action
+
+
+def number(name: str, value: object) -> float:
+    """Return ``value`` as a finite float.
+
+    Args:
+        name: Name of the argument, for the error.
+        value: What was given.
+
+    Raises:
+        UsageError: If it is no real number, or not finite.
+    """
+    if type(value) is not float and (isinstance(value, bool) or not isinstance(value, numbers.Real)):
+        raise UsageError(f"{name} is {value!r:.60} and must be a number")
+    number = float(value)
+    if not math.isfinite(number):
+        raise UsageError(f"{name} is {number} and must be finite")
+    return number

@@ -1,0 +1,130 @@
+"""Waits until an action is done: commanded once, and judged by feedback and refusals that are newer than it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Set
+from typing import Final
+
+from skyloop.client.commands import CommandSender
+from skyloop.client.connection import ProxyConnection
+from skyloop.client.telemetry import ClientState
+from skyloop.errors import AuthorityError, ClosedError, NoAnswerError, RefusedError, UnsupportedError
+from skyloop.messages import AnyAction, Event, FlightState, Land, Refusal
+
+_STALE_NS: Final = 100_000_000  #: feedback received sooner after a command may be older than it
+
+
+class ActionWait:
+    """One commanded action, and the wait for newer feedback that shows one of its final states."""
+
+    def __init__(
+        self,
+        action: AnyAction,
+        states: Set[FlightState],
+        send: Callable[[AnyAction], bool],
+        closed: Callable[[], bool],
+        commands: CommandSender,
+        state: ClientState,
+        connection: ProxyConnection,
+    ) -> None:
+        """Send the action.
+
+        Args:
+            action: The action.
+            states: Flight states in which it is done.
+            send: Sends it, now and where it is commanded again; returns whether it was handed over.
+            closed: Whether the drone was closed.
+            commands: Tells what became of the command.
+            state: Newest feedback and refusal.
+            connection: State of the link.
+
+        Raises:
+            AuthorityError: As ``send`` does.
+        """
+        self._action = action
+        self._states = states
+        self._send = send
+        self._closed = closed
+        self._commands = commands
+        self._state = state
+        self._connection = connection
+        self._asked_ns = state.scheduler.clock()
+        self._problem: Exception | None = None
+        self.sent = send(action)  #: whether it was handed over at once
+        self._seq = commands.seq
+
+    def wait(self, timeout_s: float, deadline_s: float) -> None:
+        """Wait until the action is done.
+
+        Args:
+            timeout_s: What the caller gave [s], for the error.
+            deadline_s: Until when, on ``time.monotonic``.
+
+        Raises:
+            NoAnswerError: If it is not done in time.
+            ClosedError: If the drone is closed.
+            AuthorityError: If another application takes over.
+            UnsupportedError: If the vehicle does not support it.
+            RefusedError: If the proxy refuses it in the present state.
+        """
+        if not self._state.notifier.wait_for(self._over, deadline_s - time.monotonic()):
+            raise NoAnswerError(self._not_reached(timeout_s))
+        if self._problem is not None:
+            self._commands.drop(self._action)  # what was refused now must not be carried out later
+            raise self._problem
+
+    def _over(self) -> bool:
+        """Whether it is done, or waiting longer is of no use."""
+        newest = self._state.newest
+        new = self._state.received_ns - self._asked_ns > _STALE_NS
+        if newest is not None and newest.state in self._states and new:
+            return True
+        self._problem = self._why_not()
+        if self._problem is not None:
+            return True
+        if type(self._action) is Land and (self._commands.lapsed(self._action) or self._is_too_old()):
+            # Old set-points are not sent again by themselves, but the caller still waits for this landing.
+            self._send(self._action)
+            self._seq = self._commands.seq
+        return False
+
+    def _why_not(self) -> Exception | None:
+        """Why waiting longer is of no use; None if it is."""
+        name = self._action.name
+        if self._closed():
+            return ClosedError(f"this drone was closed while {name} was under way")
+        status = self._commands.status
+        if status.state in ("queued", "preempted"):
+            return AuthorityError(f"{name}: {status.holder or 'another application'} took over the authority")
+        refusal = self._state.refusal
+        if refusal is None or not self._concerns(refusal):
+            return None
+        reason = refusal.data.get("reason")
+        if reason == Refusal.UNSUPPORTED:
+            return UnsupportedError(refusal.text)
+        if reason == Refusal.WRONG_STATE:
+            return RefusedError(refusal.text, code=str(reason))
+        return None
+
+    def _is_too_old(self) -> bool:
+        """Whether the proxy refused the newest command as older than a failsafe or a new lease."""
+        refusal = self._state.refusal
+        if refusal is None or refusal.data.get("reason") != Refusal.NOT_FRESH or not self._concerns(refusal):
+            return False
+        return self._commands.is_newest(self._action)
+
+    def _concerns(self, refusal: Event) -> bool:
+        """Whether a refusal is of the last command sent, or of a later one."""
+        refused = refusal.data.get("seq")
+        return isinstance(refused, int) and refused >= self._seq
+
+    def _not_reached(self, timeout_s: float) -> str:
+        newest, refusal, connection = self._state.newest, self._state.refusal, self._connection
+        state = "in a state that is not known" if newest is None else newest.state.value
+        text = f"{self._action.name} was not completed within {timeout_s:g} s: the vehicle is {state}"
+        if connection.state.value not in ("up", "degraded"):
+            return f"{text}, and the link is {connection.state.value} ({connection.reason})"
+        if refusal is not None and refusal.at_ns >= self._asked_ns + connection.offset_ns:
+            return f"{text}; {refusal.text}"
+        return text

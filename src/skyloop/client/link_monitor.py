@@ -1,0 +1,118 @@
+"""State of the hop to the proxy, judged by the times at which things arrive. Pure: the time is an argument."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+from skyloop.clock import nanoseconds
+from skyloop.messages import LinkState
+
+
+@dataclass(frozen=True, slots=True)
+class Thresholds:
+    """When a link counts as degraded and as lost."""
+
+    late_s: float = 0.3  #: no feedback for this long: degraded
+    silent_s: float = 1.0  #: nothing at all for this long: lost, and reconnected
+    missing_share: float = 0.1  #: share of the last window's samples missing or malformed: degraded
+    window_s: float = 1.0
+    malformed: int = 5  #: this many malformed packets within a window: lost, and reconnected
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What the monitor concludes from the arrivals so far."""
+
+    state: LinkState
+    reason: str
+    restart: bool = False  #: the connection should be closed and made again
+
+
+_Counts = tuple[int, int, int, int]  #: at_ns, received, missing, malformed: totals at some time
+
+
+class LinkMonitor:
+    """Watches one connection. Its other methods cost a few attribute writes; :meth:`verdict` does the work.
+
+    Samples of a connection carry numbers that grow by one: a gap is what was lost.
+    """
+
+    def __init__(self, thresholds: Thresholds, now_ns: int) -> None:
+        self._limits = thresholds
+        self._late_ns = nanoseconds(thresholds.late_s)
+        self._silent_ns = nanoseconds(thresholds.silent_s)
+        self._window_ns = nanoseconds(thresholds.window_s)
+        self.heard_ns = now_ns  #: when anything valid came last
+        self.feedback_ns = 0  #: when feedback came last; 0 for never
+        self.received = 0  #: samples of feedback
+        self.missing = 0  #: samples missing by the gaps in their numbers
+        self.malformed_count = 0
+        self._last_seq: int | None = None
+        self._past: deque[_Counts] = deque([(now_ns, 0, 0, 0)])
+
+    def feedback(self, seq: int, now_ns: int) -> bool:
+        """Note a sample of feedback; return False if it is repeated or was overtaken by a newer one."""
+        self.heard_ns = now_ns
+        last = self._last_seq
+        if last is not None:
+            if seq <= last:
+                return False
+            self.missing += seq - last - 1
+        self._last_seq = seq
+        self.feedback_ns = now_ns
+        self.received += 1
+        return True
+
+    def malformed(self) -> None:
+        """Note a packet that could not be decoded."""
+        self.malformed_count += 1
+
+    def verdict(self, now_ns: int) -> Verdict:
+        """Return the present state and why. To be called some twenty times a second."""
+        received, missing, malformed = self._window(now_ns)
+        silent_ns = now_ns - self.heard_ns
+        if silent_ns > self._silent_ns:
+            return Verdict(LinkState.LOST, f"nothing heard for {silent_ns / 1e9:.1f} s", restart=True)
+        if malformed >= self._limits.malformed:
+            return Verdict(LinkState.LOST, f"{malformed} malformed packets within a second", restart=True)
+        if not self.feedback_ns:
+            return Verdict(LinkState.CONNECTING, "no feedback yet")
+        late_ns = now_ns - self.feedback_ns
+        if late_ns > self._late_ns:
+            return Verdict(LinkState.DEGRADED, f"no feedback for {late_ns / 1e9:.1f} s")
+        bad = missing + malformed
+        if bad > self._limits.missing_share * (received + bad):
+            return Verdict(LinkState.DEGRADED, f"{bad} of {received + bad} samples missing or malformed")
+        return Verdict(LinkState.UP, "")
+
+    def _window(self, now_ns: int) -> tuple[int, int, int]:
+        """How many samples were received, missing and malformed within the window."""
+        past = self._past
+        past.append((now_ns, self.received, self.missing, self.malformed_count))
+        while len(past) > 2 and past[1][0] <= now_ns - self._window_ns:
+            past.popleft()
+        first = past[0]
+        return self.received - first[1], self.missing - first[2], self.malformed_count - first[3]
+
+
+class StallWatch:
+    """Tells when one channel has stalled although the others flow, so that it is subscribed to again."""
+
+    def __init__(self, patience_s: float, now_ns: int) -> None:
+        """Start watching.
+
+        Args:
+            patience_s: Silence after which a channel counts as stalled [s].
+            now_ns: The present time.
+        """
+        self._patience_ns = nanoseconds(patience_s)
+        self.heard_ns = now_ns  #: when something came on this channel last
+        self._asked_ns = now_ns
+
+    def stalled(self, others_flow: bool, now_ns: int) -> bool:
+        """Return whether to subscribe again now; True at most once in ``patience_s``."""
+        if not others_flow or now_ns - max(self.heard_ns, self._asked_ns) <= self._patience_ns:
+            return False
+        self._asked_ns = now_ns
+        return True

@@ -1,0 +1,186 @@
+"""Parameters of the vehicle and the proxy, as a mapping."""
+
+from __future__ import annotations
+
+import numbers
+import threading
+from collections.abc import Callable, Iterator, Mapping
+
+import numpy as np
+
+from skyloop.client.authority import Authority
+from skyloop.client.channels import Emit
+from skyloop.client.connection import ProxyConnection
+from skyloop.errors import AuthorityError, LinkError, ParameterError, RefusedError, UnknownNameError, UsageError
+from skyloop.messages import (
+    AnyReply,
+    AnyRequest,
+    EventKind,
+    GetParameter,
+    ListParameters,
+    Parameter,
+    ParameterPage,
+    ParameterValue,
+    Refusal,
+    Refused,
+    SetParameter,
+    Value,
+)
+
+ANSWER_S = 2.0
+MAX_TEXT = 4096  #: characters
+MAX_NUMBERS = 256
+_NEED_AUTHORITY = frozenset({Refusal.NO_AUTHORITY, Refusal.FOREIGN_LEASE, Refusal.OBSERVER})
+
+
+class Config(Mapping[str, Value]):
+    """Parameters as a mapping from name to value, each access one request to the proxy.
+
+    ``drone.config["limits.tilt"]`` reads, ``drone.config["limits.tilt"] = 0.2`` writes. Writing needs the authority.
+    What was written is written again after the proxy was lost, is back, and has granted the authority again. Every
+    method waits for the proxy's answer and raises :class:`NoAnswerError` if there is none within 2 s.
+    """
+
+    def __init__(self, connection: ProxyConnection, authority: Authority, emit: Emit) -> None:
+        self._connection = connection
+        self._authority = authority
+        self._emit = emit
+        self._lock = threading.Lock()
+        self._written: dict[str, Value] = {}
+        self._restore = False  #: the connection on which they were written was lost
+
+    def __getitem__(self, name: str) -> Value:
+        """Return the present value.
+
+        Raises:
+            UnknownNameError: If there is no such parameter; carries suggestions.
+        """
+        return self.describe(name).value
+
+    def __setitem__(self, name: str, value: object) -> None:
+        """Write one value.
+
+        Raises:
+            ParameterError: If the proxy refuses it, with its reason.
+            AuthorityError: If the authority is not held.
+            UnknownNameError: If there is no such parameter; carries suggestions.
+            UsageError: If the value is of no type that a parameter can have.
+        """
+        plain = plain_value(name, value)
+        answer = self._call(name, lambda: SetParameter(_name(name), plain, self._authority.status.lease))
+        if not isinstance(answer, ParameterValue):
+            raise LinkError(f"the proxy answered the writing of {name} with {type(answer).__name__}")
+        with self._lock:
+            self._written[name] = plain
+
+    def describe(self, name: str) -> Parameter:
+        """Return all that is known of a parameter: type, unit, range, default, value, description.
+
+        Raises:
+            UnknownNameError: If there is no such parameter; carries suggestions.
+        """
+        answer = self._call(name, lambda: GetParameter(_name(name)))
+        if not isinstance(answer, ParameterValue):
+            raise LinkError(f"the proxy answered the reading of {name} with {type(answer).__name__}")
+        return answer.parameter
+
+    def parameters(self) -> list[Parameter]:
+        """Return all parameters, sorted by name."""
+        found: list[Parameter] = []
+        while True:
+            first = len(found)
+            page = self._connection.call(lambda first=first: ListParameters(first), ANSWER_S)  # type: ignore[misc]
+            if not isinstance(page, ParameterPage):
+                raise LinkError(f"the proxy answered the list of parameters with {type(page).__name__}")
+            found += page.parameters
+            if not page.parameters or len(found) >= page.total:
+                return found
+
+    def __iter__(self) -> Iterator[str]:
+        return iter([parameter.name for parameter in self.parameters()])
+
+    def __len__(self) -> int:
+        return len(self.parameters())
+
+    def __contains__(self, name: object) -> bool:
+        return any(parameter.name == name for parameter in self.parameters())
+
+    def items(self) -> list[tuple[str, Value]]:  # type: ignore[override]  # one request for all, not one for each name
+        """Return (name, value) of all parameters, sorted by name."""
+        return [(parameter.name, parameter.value) for parameter in self.parameters()]
+
+    def values(self) -> list[Value]:  # type: ignore[override]
+        """Return the values of all parameters, sorted by name."""
+        return [parameter.value for parameter in self.parameters()]
+
+    # For the drone ---------------------------------------------------------------------------------------------
+
+    def disconnected(self) -> None:
+        """Note that the proxy may have lost what was written."""
+        self._restore = True
+
+    def granted(self, lease: int) -> None:
+        """Write once more what a lost connection may have undone, now that the authority is held. Does not wait."""
+        if not self._restore:
+            return
+        self._restore = False
+        with self._lock:
+            written = dict(self._written)
+        for name, value in written.items():
+            self._connection.ask(SetParameter(name, value, lease), self._restored(name, value), ANSWER_S)
+
+    def _restored(self, name: str, value: Value) -> Callable[[AnyReply | LinkError], None]:
+        def done(answer: AnyReply | LinkError) -> None:
+            if isinstance(answer, LinkError):
+                self._restore = True  # lost again: retried with the next grant
+            elif isinstance(answer, Refused):
+                text = f"{name} could not be set to {value!r} again: {answer.message}"
+                self._emit(EventKind.PARAMETER_CHANGED, text, name=name, reason=answer.code.value)
+
+        return done
+
+    def _call(self, name: str, body: Callable[[], AnyRequest]) -> AnyReply:
+        answer = self._connection.call(body, ANSWER_S)
+        if not isinstance(answer, Refused):
+            return answer
+        if answer.code is Refusal.UNKNOWN_PARAMETER:
+            raise UnknownNameError("parameter", name, (known.name for known in self.parameters()))
+        if answer.code in _NEED_AUTHORITY:
+            raise AuthorityError(f"writing {name} needs the authority: {answer.message}", code=answer.code.value)
+        kind = ParameterError if answer.code is not Refusal.PROTOCOL else RefusedError
+        words = answer.message if answer.message.startswith(name) else f"{name}: {answer.message}"
+        raise kind(words, code=answer.code.value)
+
+
+def _name(name: object) -> str:
+    if not isinstance(name, str) or not 1 <= len(name) <= 128:
+        raise UsageError(f"a parameter's name is a text of 1 to 128 characters, not {name!r}")
+    return name
+
+
+def plain_value(name: str, value: object) -> Value:
+    """Return a value that can be sent: bool, int, float, str (up to 4096 characters) or a tuple of up to 256 floats.
+
+    Args:
+        name: Name of the parameter, for the error.
+        value: Such a value, a list or an array of numbers, or a NumPy scalar.
+
+    Raises:
+        UsageError: If it is anything else.
+    """
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, str) and len(value) <= MAX_TEXT:
+        return str(value)
+    if isinstance(value, numbers.Integral) and -(2**63) <= int(value) < 2**63:
+        return int(value)
+    if isinstance(value, numbers.Real) and not isinstance(value, numbers.Integral):
+        return float(value)
+    if isinstance(value, list | tuple | np.ndarray) and len(value) <= MAX_NUMBERS:
+        many = tuple(value)
+        if all(isinstance(one, numbers.Real) for one in many):
+            return tuple(float(one) for one in many)
+    raise UsageError(
+        f"{name} can't be {value!r:.80}: a bool, a number, a text (up to {MAX_TEXT} characters) or a list of up to "
+        f"{MAX_NUMBERS} numbers is needed"
+    )

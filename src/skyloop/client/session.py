@@ -1,0 +1,378 @@
+"""One session with a proxy, from its first packet to its last: what its transport calls, and the requests to it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+from skyloop.client.clock_offset import Offset, OffsetEstimator
+from skyloop.client.frame import size_error
+from skyloop.client.link_monitor import LinkMonitor, StallWatch, Thresholds
+from skyloop.clock import Clock, clock_identity, nanoseconds
+from skyloop.errors import DecodeError, LinkError, NoAnswerError
+from skyloop.messages import (
+    Annotation,
+    AnyReply,
+    AnyRequest,
+    Applied,
+    EncodedFrame,
+    Event,
+    Feedback,
+    FrameHeader,
+    LinkState,
+    LogEntry,
+    Ping,
+    Pong,
+    ProcessorResult,
+    ProcessorShare,
+    Reply,
+    Request,
+    Sample,
+    VideoRequest,
+    Welcome,
+    decode,
+    encode,
+)
+from skyloop.transport.base import ClientEnd, Dialer, Pixels, video
+
+RETRY_S = 0.3  #: time after which an unanswered request is repeated; all requests are idempotent
+
+#: Called once with the answer, or with the error why there is none.
+Done = Callable[[AnyReply | LinkError], None]
+
+
+@dataclass(slots=True)
+class _Pending:
+    packet: bytes
+    what: str
+    done: Done
+    deadline_ns: int
+    retry_ns: int
+    timeout_s: float
+
+
+class Requests:
+    """The unanswered requests of one connection. A request is repeated until it is answered; all are idempotent."""
+
+    def __init__(self, send: Callable[[bytes], bool]) -> None:
+        self._send = send
+        self._pending: dict[int, _Pending] = {}
+        self._lock = threading.Lock()
+        self._last_id = 0
+        self._failed: LinkError | None = None
+
+    def ask(self, body: AnyRequest, done: Done, timeout_s: float, now_ns: int) -> None:
+        """Send a request.
+
+        Args:
+            body: The request.
+            done: Called once, on the receiving thread or on the one that calls :meth:`tick` or :meth:`fail`; on this
+                one if the connection has failed already.
+            timeout_s: After which ``done`` gets a :class:`NoAnswerError` [s].
+            now_ns: On this process's clock.
+        """
+        with self._lock:
+            failed = self._failed
+            if failed is None:
+                self._last_id += 1
+                number = self._last_id
+                packet = encode(Request(number, body))
+                self._pending[number] = _Pending(
+                    packet,
+                    type(body).__name__,
+                    done,
+                    now_ns + nanoseconds(timeout_s),
+                    now_ns + nanoseconds(RETRY_S),
+                    timeout_s,
+                )
+        if failed is not None:
+            done(failed)
+        else:
+            self._send(packet)  # tick() repeats it if it can't be handed over now
+
+    def answered(self, reply: Reply) -> bool:
+        """Handle an answer; return False if the request is unknown or has timed out."""
+        with self._lock:
+            pending = self._pending.pop(reply.id, None)
+        if pending is None:
+            return False
+        pending.done(reply.body)
+        return True
+
+    def tick(self, now_ns: int) -> None:
+        """Repeat requests that were not answered, and give up those that are overdue."""
+        if not self._pending:
+            return
+        with self._lock:
+            overdue = [number for number, pending in self._pending.items() if now_ns >= pending.deadline_ns]
+            given_up = [self._pending.pop(number) for number in overdue]
+            again = [pending for pending in self._pending.values() if now_ns >= pending.retry_ns]
+            for pending in again:
+                pending.retry_ns = now_ns + nanoseconds(RETRY_S)
+        for pending in again:
+            self._send(pending.packet)
+        for pending in given_up:
+            pending.done(NoAnswerError(f"the proxy did not answer {pending.what} within {pending.timeout_s:g} s"))
+
+    def fail(self, error: LinkError) -> None:
+        """Answer all requests, present and future, with ``error``: the connection is gone."""
+        with self._lock:
+            self._failed = error
+            pending, self._pending = list(self._pending.values()), {}
+        for one in pending:
+            one.done(error)
+
+
+_VIDEO: Final = video("")
+_PING_CLOCK_NS: Final = nanoseconds(1.0)  #: how often a proxy on another clock is asked for its time
+_PING_FIRST_NS: Final = nanoseconds(0.1)  #: the same until there are a few round trips
+_FIRST: Final = 5
+
+
+class ConnectionHandler(Protocol):
+    """Gets all that happens to a connection and all that arrives.
+
+    ``feedback``, ``frame`` and the other samples come on the receiving thread, the rest on the supervisor's.
+    """
+
+    def connected(self, welcome: Welcome) -> None:
+        """A proxy has answered Hello; nothing else was received from it yet."""
+
+    def disconnected(self, reason: str) -> None:
+        """The session has ended."""
+
+    def link_changed(self, state: LinkState, reason: str) -> None:
+        """The state of the hop to the proxy has changed."""
+
+    def tick(self, now_ns: int) -> int:
+        """Do what is due; called while connected.
+
+        Args:
+            now_ns: On this process's clock.
+
+        Returns:
+            When it is called again at the latest [ns].
+        """
+
+    def feedback(self, sample: Feedback, now_ns: int) -> None: ...
+    def frame(self, header: FrameHeader, pixels: Pixels, now_ns: int, topic: str = "") -> None: ...
+    def event(self, event: Event, now_ns: int) -> None: ...
+    def applied(self, applied: Applied, now_ns: int) -> None: ...
+    def annotation(self, annotation: Annotation, now_ns: int) -> None: ...
+    def log_entry(self, entry: LogEntry, now_ns: int) -> None: ...
+    def encoded(self, picture: EncodedFrame, now_ns: int) -> None: ...
+    def result(self, result: ProcessorResult, now_ns: int) -> None: ...
+    def share(self, share: ProcessorShare, now_ns: int) -> None: ...
+
+
+class ProxySession:
+    """Decodes and counts what arrives on the transport's receiving thread, and hands it to the handler.
+
+    It is the :class:`skyloop.transport.base.ClientHandler` of one connection.
+    """
+
+    def __init__(
+        self, handler: ConnectionHandler, poke: Callable[[], None], thresholds: Thresholds, clock: Clock
+    ) -> None:
+        """Make a session that is not connected.
+
+        Args:
+            handler: Gets what arrives.
+            poke: Wakes the supervisor.
+            thresholds: When the link counts as degraded and as lost.
+            clock: This process's clock.
+        """
+        self._handler = handler
+        self._poke = poke
+        self._clock = clock
+        self._end: ClientEnd | None = None
+        self._late_ns = nanoseconds(thresholds.late_s)  # a proxy that is silent for so long is pinged
+        self._same_clock = False
+        self._quiet = False  # closed by this end: ignore what still arrives
+        self._up = False
+        self._pinged_ns = 0
+        self._trips = OffsetEstimator()
+        self._video_users: dict[str, set[str]] = {}  # plain topic: topics of the requests that it serves
+        self._handlers: dict[type, Callable[..., None]] = {
+            Event: handler.event,
+            Applied: handler.applied,
+            Annotation: handler.annotation,
+            LogEntry: handler.log_entry,
+            EncodedFrame: handler.encoded,
+            ProcessorResult: handler.result,
+            ProcessorShare: handler.share,
+            Reply: self._reply,
+        }
+        self._take_feedback = handler.feedback
+        self._feedback_watch = StallWatch(1.0, clock())
+        self.monitor = LinkMonitor(thresholds, clock())
+        self.requests = Requests(self.send)
+        self.offset_ns = 0  #: the proxy's clock minus ours
+        self.closed_reason: str | None = None  #: why it ended, once it has
+        self.receiver = 0  #: identity of the receiving thread
+        self.look_ns = 0  #: when the supervisor judges its state next
+
+    # Set-up and end --------------------------------------------------------------------------------------------
+
+    def dial(self, dialer: Dialer) -> None:
+        """Connect; raises what the dialer raises."""
+        self._end = dialer(self)
+        self._same_clock = self._end.same_clock
+
+    def welcomed(self, welcome: Welcome, sent_ns: int) -> None:
+        """Take the answer to Hello as the first measure of the offset between the clocks.
+
+        On one host both are the same clock, unless the two processes are in different time namespaces.
+
+        Args:
+            welcome: The answer.
+            sent_ns: When Hello was sent, on this process's clock.
+        """
+        if welcome.clock and welcome.clock != clock_identity():
+            self._same_clock = False
+        if not self._same_clock:
+            self._take_offset(self._trips.add(sent_ns, welcome.now_ns, self._clock()))
+
+    def close(self, error: LinkError) -> None:
+        """End the session; unanswered requests get ``error``."""
+        self._quiet = True
+        if self._end is not None:
+            self._end.close()
+        self.requests.fail(error)
+
+    @property
+    def open(self) -> bool:
+        """Whether neither end has closed the session."""
+        return self.closed_reason is None and not self._quiet
+
+    @property
+    def address(self) -> str:
+        """Address of the proxy, for people."""
+        return self._end.address if self._end is not None else "nowhere"
+
+    # Sending ---------------------------------------------------------------------------------------------------
+
+    @property
+    def transmit(self) -> Callable[[bytes], bool]:
+        """The transport's own function to send, without a layer in between, for what is sent often."""
+        assert self._end is not None
+        return self._end.send
+
+    def send(self, packet: bytes) -> bool:
+        """Hand a packet to the transport; return False if it could not be."""
+        end = self._end
+        return end is not None and not self._quiet and end.send(packet)
+
+    def subscribe(self, topic: str, on: bool) -> None:
+        """Subscribe to a topic or unsubscribe.
+
+        A transport that makes no variants of video carries each camera's plain frames once for all requests.
+
+        Args:
+            topic: Name of the topic.
+            on: False unsubscribes.
+        """
+        end = self._end
+        if end is None:
+            return
+        if not end.variants and topic.startswith(_VIDEO):
+            # This transport delivers all frames as they are; each channel then filters and scales them itself.
+            plain = VideoRequest.parse(topic).plain.topic
+            users = self._video_users.setdefault(plain, set())
+            had_users = bool(users)
+            (users.add if on else users.discard)(topic)
+            topic, on = plain, bool(users)
+            if on == had_users:
+                return
+        end.subscribe(topic, on)
+
+    def tick(self, now_ns: int) -> None:
+        """Repeat requests that are due, and ping the proxy if it is silent or its clock has to be measured."""
+        self.requests.tick(now_ns)
+        end = self._end
+        if end is None:
+            return
+        silent = now_ns - self.monitor.heard_ns > self._late_ns
+        usual_ns = _PING_CLOCK_NS if len(self._trips) >= _FIRST else _PING_FIRST_NS
+        if (silent or not self._same_clock) and now_ns - self._pinged_ns > (self._late_ns if silent else usual_ns):
+            self._pinged_ns = now_ns
+            self.requests.ask(Ping(now_ns), self._ponged, 1.0, now_ns)
+
+    def feedback_stalled(self, now_ns: int) -> bool:
+        """Return whether feedback has stalled although the proxy answers, and should be subscribed to again."""
+        self._feedback_watch.heard_ns = self.monitor.feedback_ns
+        return self._feedback_watch.stalled(now_ns - self.monitor.heard_ns < 2 * self._late_ns, now_ns)
+
+    def _ponged(self, answer: AnyReply | LinkError) -> None:
+        if isinstance(answer, Pong) and not self._same_clock:
+            self._take_offset(self._trips.add(answer.sent_ns, answer.now_ns, self._clock()))
+
+    def _take_offset(self, offset: Offset) -> None:
+        self.offset_ns = offset.ns
+
+    @property
+    def uncertainty_ns(self) -> int:
+        """Largest error of :attr:`offset_ns` by now [ns]; 0 where both ends read one clock."""
+        if not self._trips:
+            return 0
+        now = self._trips.at(self._clock())
+        return now.uncertainty_ns + abs(now.ns - self.offset_ns)
+
+    # What the transport calls ----------------------------------------------------------------------------------
+
+    def packet(self, packet: bytes) -> None:
+        """Decode a packet and hand it on; on the receiving thread."""
+        now_ns = self._clock()
+        try:
+            sample: Sample = decode(packet)
+        except DecodeError:
+            self._malformed()
+            return
+        if self._quiet:
+            return
+        if type(sample) is Feedback:
+            if self.monitor.feedback(sample.seq, now_ns):
+                self._take_feedback(sample, now_ns)
+                if not self._up:  # the first one: wakes the supervisor, which reports that the link is up
+                    self._up = True
+                    self._poke()
+            return
+        handler = self._handlers.get(type(sample))
+        if handler is None:  # a kind that no proxy sends
+            self._malformed()
+            return
+        self.monitor.heard_ns = now_ns
+        handler(sample, now_ns)
+
+    def frame(self, header: FrameHeader, pixels: Pixels, topic: str = "") -> None:
+        """Check a frame's size and hand it on; on the receiving thread.
+
+        Args:
+            header: Describes the pixels.
+            pixels: Bytes of the frame, shape (size,), uint8.
+            topic: The request that the proxy made it for; empty: a plain frame of the camera.
+        """
+        now_ns = self._clock()
+        if self._quiet:
+            return
+        if size_error(header, pixels.size):
+            self._malformed()
+            return
+        self.monitor.heard_ns = now_ns
+        self._handler.frame(header, pixels, now_ns, topic)
+
+    def closed(self, reason: str) -> None:
+        """Note that the transport has ended the connection; the supervisor reconnects."""
+        self.closed_reason = reason
+        self._poke()
+
+    def _reply(self, reply: Reply, now_ns: int) -> None:  # noqa: ARG002  (all handlers are called alike)
+        if not self.receiver:
+            self.receiver = threading.get_ident()
+        self.requests.answered(reply)
+
+    def _malformed(self) -> None:
+        self.monitor.malformed()
+        self._poke()

@@ -1,0 +1,387 @@
+"""What arrives from a proxy: the newest of each kind is kept, counted, and published to consumers."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from types import TracebackType
+from typing import Final, Self
+
+from skyloop.client.channels import Channel, VideoChannel, usual
+from skyloop.client.commands import CommandSender
+from skyloop.client.connection import ProxyConnection
+from skyloop.client.feedback_history import FeedbackHistory
+from skyloop.client.frame import Arrival, Frame
+from skyloop.client.mailbox import Mailbox
+from skyloop.client.parameters import Config
+from skyloop.client.results import Result, ResultChannels, ResultMailbox
+from skyloop.client.scheduler import Scheduler
+from skyloop.client.statistics import ChannelCounter, ChannelStats
+from skyloop.errors import UnknownNameError
+from skyloop.messages import (
+    Annotation,
+    Applied,
+    CameraInfo,
+    EncodedFrame,
+    Event,
+    EventKind,
+    Feedback,
+    FlightState,
+    FrameHeader,
+    LinkState,
+    LogEntry,
+    ProcessorResult,
+    ProcessorShare,
+    Severity,
+    VideoRequest,
+    Welcome,
+)
+from skyloop.transport.base import ANNOTATIONS, COMMANDS, LOGS, Pixels
+
+RECENT_EVENTS: Final = 256
+#: What can be waited for: a flight state (or its name), one of several, or a predicate on feedback.
+Wanted = FlightState | str | Iterable[FlightState | str] | Callable[[Feedback], bool]
+_LATER_NS: Final = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class LinkStatus:
+    """State of the two hops, with the reason of the last change."""
+
+    application: LinkState  #: application–proxy
+    vehicle: LinkState  #: proxy–vehicle, as last reported by the proxy
+    reason: str = ""
+    remedy: str = ""  #: what a person can do about the vehicle's link while it is not up
+
+
+class Mailboxes:
+    """Mailboxes of the newest feedback, frame and results, for one thread that waits for all of them.
+
+    A context manager: they are filled while it is open.
+    """
+
+    def __init__(
+        self,
+        scheduler: Scheduler,
+        *,
+        feedback: Channel[Feedback] | None,
+        frames: VideoChannel | None,
+        results: Sequence[Channel[Result]],
+        max_age_s: float | None,
+    ) -> None:
+        """Make empty mailboxes.
+
+        Args:
+            scheduler: Source of the time and of waiting.
+            feedback: Channel of feedback, if it is wanted.
+            frames: Channel of frames, if they are wanted.
+            results: Channels of the results that are wanted.
+            max_age_s: Oldest age of a result that is accepted [s]; None: any.
+        """
+        self.clock = scheduler.clock  #: on which a controller's time runs
+        self.notifier = scheduler.notifier()
+        self.feedback: Mailbox[Feedback] = Mailbox(1, self.notifier)
+        self.frames: Mailbox[Arrival] = Mailbox(1, self.notifier)
+        self.results = ResultMailbox(max_age_s, self.notifier)
+        self._feedback_channel = feedback
+        self._video = frames
+        self._result_channels = results
+        self._filling = ExitStack()
+
+    def __enter__(self) -> Self:
+        if self._feedback_channel is not None:
+            self._filling.enter_context(self._feedback_channel.into(self.feedback))
+        if self._video is not None:
+            self._filling.enter_context(self._video.into(self.frames))
+        for channel in self._result_channels:
+            self._filling.enter_context(channel.into(self.results))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._filling.close()
+
+    @property
+    def waiting(self) -> bool:
+        """Whether there is something to take."""
+        return self.feedback.waiting or self.frames.waiting or self.results.waiting
+
+    def frame(self) -> Frame | None:
+        """Take the newest frame; None if it was taken already, none came, or it can't be decoded."""
+        arrival = self.frames.take()
+        return None if arrival is None or self._video is None else self._video.picture(arrival)
+
+
+class ClientState:
+    """The newest state of a connected vehicle, and the channels that publish changes of it."""
+
+    def __init__(self, name: str, connection: ProxyConnection, scheduler: Scheduler) -> None:
+        """Make the state of a drone that has not connected yet.
+
+        Args:
+            name: Name of the application.
+            connection: Where topics are subscribed to.
+            scheduler: Source of the time and of waiting.
+        """
+        self.scheduler = scheduler
+        self.welcome: Welcome | None = None
+        self.newest: Feedback | None = None
+        self.received_ns = 0  #: when the newest feedback came, on our clock
+        self.history = FeedbackHistory()
+        #: Notified with each feedback, and when something changes that somebody may wait for.
+        self.notifier = scheduler.notifier()
+        self.refusal: Event | None = None  #: the last command of ours that was refused
+        self.recent: deque[Event] = deque(maxlen=RECENT_EVENTS)
+        self.status = LinkStatus(LinkState.CONNECTING, LinkState.CONNECTING)
+        self.channels: dict[str, VideoChannel] = {}  #: by camera, with the usual request
+        self.variants: dict[str, VideoChannel] = {}  #: all channels, by the topic of their request
+        self.counter = ChannelCounter()  #: of feedback
+        self.echoes = ChannelCounter()
+        self.on_feedback: Channel[Feedback] = Channel()
+        self.on_event: Channel[Event] = Channel()
+        self.on_link: Channel[LinkStatus] = Channel()
+        self.on_command: Channel[Applied] = Channel(lambda on: connection.subscribe(COMMANDS, on))
+        self.on_annotation: Channel[Annotation] = Channel(lambda on: connection.subscribe(ANNOTATIONS, on))
+        self.on_log: Channel[LogEntry] = Channel(lambda on: connection.subscribe(LOGS, on))
+        self.on_share: Channel[ProcessorShare] = Channel()
+        self.on_welcome: Channel[Welcome] = Channel()  #: a proxy was connected; supervisor's thread
+        self.results = ResultChannels(connection, scheduler, self.history)
+        self._name = name
+        self._clock = scheduler.clock
+        self._connection = connection
+
+    def video(self, camera: CameraInfo, request: VideoRequest | None = None) -> VideoChannel:
+        """Return the channel of a camera's frames as requested, made on the first call.
+
+        Args:
+            camera: The camera.
+            request: How frames are wanted; None: see :func:`skyloop.client.channels.usual`.
+        """
+        topic = (request or usual(camera.name)).topic
+        channel = self.variants.get(topic)
+        if channel is None:
+            channel = VideoChannel(camera, self._connection, self.scheduler, self.history, request)
+            self.variants[topic] = channel
+        return channel
+
+    def emit(self, kind: EventKind, text: str, severity: Severity = Severity.WARNING, **data: str) -> None:
+        """Emit an event of the client's own (number 0).
+
+        Args:
+            kind: Kind of the event.
+            text: What happened, for people.
+            severity: How serious it is.
+            **data: Details, by name.
+        """
+        event = Event(kind, text, self._clock() + self._connection.offset_ns, severity, app=self._name, data=dict(data))
+        self.recent.append(event)
+        self.on_event.publish(event)
+        self.notifier.notify()
+
+    def stats(self, sends: ChannelCounter) -> dict[str, ChannelStats]:
+        """Return the statistics of every channel by its name.
+
+        Args:
+            sends: Counts the commands that this application sent.
+        """
+        now_ns = self._clock()
+        echoes = self.echoes.stats(now_ns)
+        found = {
+            "command": replace(sends.stats(now_ns, ages=False), delay_s=echoes.delay_s),
+            "feedback": self.counter.stats(
+                now_ns, dropped=self.on_feedback.dropped, malformed=self._connection.malformed
+            ),
+        }
+        for channel in tuple(self.variants.values()):
+            found[channel.name] = channel.stats(now_ns)
+        for results in self.results.all():
+            found[results.name] = results.stats(now_ns)
+        return found
+
+    def wake_all(self) -> None:
+        """Wake every thread that waits, so that it checks its condition again."""
+        self.notifier.notify()
+        for channel in tuple(self.variants.values()):
+            channel.notifier.notify()
+        for results in self.results.all():
+            results.notifier.notify()
+
+    def set_status(self, status: LinkStatus) -> None:
+        """Publish the changed state of the two hops."""
+        self.status = status
+        self.on_link.publish(status)
+        self.notifier.notify()
+
+    def vehicle_reason(self) -> str:
+        """Return the reason that the newest event about the vehicle's link gives; empty if there is none."""
+        for event in reversed(self.recent):
+            if event.kind is EventKind.VEHICLE_LINK:
+                return str(event.data.get("reason", "")) or event.text
+        return ""
+
+
+class Receiver:
+    """Handles what arrives from a proxy and changes of the connection.
+
+    It is the :class:`skyloop.client.session.ConnectionHandler` of every session. ``feedback``, ``frame`` and the other
+    samples come on the receiving thread, the rest on the supervisor's.
+    """
+
+    def __init__(
+        self, name: str, state: ClientState, connection: ProxyConnection, commands: CommandSender, parameters: Config
+    ) -> None:
+        self._name = name
+        self._state = state
+        self._connection = connection
+        self._commands = commands
+        self._parameters = parameters
+        self._clock = state.scheduler.clock
+
+    def connected(self, welcome: Welcome) -> None:
+        """Reset the counters, and take in the vehicle's capabilities; see :class:`ConnectionHandler`."""
+        state = self._state
+        state.welcome = welcome
+        now_ns = self._clock()
+        state.counter.last_seq = None
+        for channel in state.variants.values():
+            channel.restart(now_ns)
+        for camera in welcome.capabilities.cameras:
+            if camera.name not in state.channels:
+                state.channels[camera.name] = state.video(camera)
+        state.results.restart()
+        self._commands.connected(welcome.app_id)
+        state.on_welcome.publish(welcome)
+
+    def disconnected(self, reason: str) -> None:  # noqa: ARG002  (link_changed publishes it)
+        """Drop the authority and the set-point; ``reason`` is published by :meth:`link_changed`."""
+        self._parameters.disconnected()
+        self._commands.disconnected()
+
+    def link_changed(self, state: LinkState, reason: str) -> None:
+        """Publish the state of the hop to the proxy, and an event."""
+        severity = Severity.INFO if state in (LinkState.UP, LinkState.CLOSED) else Severity.WARNING
+        text = f"link to the proxy: {state.value}" + (f" ({reason})" if reason else "")
+        self._state.set_status(replace(self._state.status, application=state, reason=reason))
+        self._state.emit(EventKind.APPLICATION_LINK, text, severity, state=state.value, reason=reason)
+
+    def tick(self, now_ns: int) -> int:
+        """Subscribe again to cameras that have stalled, and send due commands.
+
+        Args:
+            now_ns: On this process's clock.
+
+        Returns:
+            When to call again at the latest [ns].
+        """
+        flows = self._connection.state is LinkState.UP
+        for channel in tuple(self._state.variants.values()):
+            if channel.watch.stalled(flows, now_ns):
+                self._connection.resubscribe(channel.request.topic)
+        return self._commands.tick(now_ns)
+
+    def feedback(self, sample: Feedback, now_ns: int) -> None:
+        """Keep and publish a sample of feedback, then update the statistics, the authority and the link's state."""
+        state = self._state
+        before = state.newest
+        state.history.add(sample)
+        state.newest = sample
+        state.received_ns = now_ns
+        # A failsafe or another owner ends the set-point, but not what a listener commands in answer to this sample.
+        news = before is None or sample.failsafe is not before.failsafe or sample.owner_id != before.owner_id
+        if news:
+            self._commands.feedback(sample, now_ns)
+        state.on_feedback.publish(sample)  # consumers first, then the statistics
+        state.notifier.notify()
+        offset_ns = self._connection.offset_ns
+        counter = state.counter
+        counter.follow(sample.seq)
+        counter.add(now_ns + offset_ns - sample.published_ns, sample.captured_ns - offset_ns, now_ns)
+        if not news:
+            self._commands.feedback(sample, now_ns)
+        if sample.vehicle_link is not state.status.vehicle or (
+            sample.link_reason
+            and (sample.link_reason, sample.link_remedy) != (state.status.reason, state.status.remedy)
+        ):
+            reason = sample.link_reason or state.vehicle_reason()
+            status = replace(state.status, vehicle=sample.vehicle_link, reason=reason, remedy=sample.link_remedy)
+            state.set_status(status)
+
+    def frame(self, header: FrameHeader, pixels: Pixels, now_ns: int, topic: str = "") -> None:
+        """Deliver a frame to the channels that want it.
+
+        Args:
+            header: Describes the pixels.
+            pixels: Bytes of the frame, shape (size,), uint8.
+            now_ns: When it came, on this process's clock.
+            topic: The request that the proxy made it for; empty: a plain frame of the camera, for all its channels.
+        """
+        if topic:
+            channel = self._state.variants.get(topic)
+            if channel is not None:
+                channel.receive(header, pixels, now_ns, as_asked=True)
+            return
+        for channel in tuple(self._state.variants.values()):
+            mine = channel.subscribed and channel.camera.name == header.camera
+            if mine and channel.filter.wants(header.seq, header.captured_ns):
+                channel.receive(header, pixels, now_ns, as_asked=False)
+
+    def event(self, event: Event, now_ns: int) -> None:
+        """Keep and publish an event."""
+        self._state.recent.append(event)
+        if event.kind is EventKind.COMMAND_REFUSED and event.app == self._name:
+            self._state.refusal = event
+        self._commands.event(event, now_ns)
+        self._state.on_event.publish(event)
+        self._state.notifier.notify()
+
+    def applied(self, applied: Applied, now_ns: int) -> None:
+        """Publish the echo of a command, and measure the delay of this application's own."""
+        if applied.app_id == self._commands.app_id:
+            self._state.echoes.add(applied.applied_ns - applied.sent_ns, applied.sent_ns, now_ns)
+        self._state.on_command.publish(applied)
+
+    def annotation(self, annotation: Annotation, now_ns: int) -> None:  # noqa: ARG002  (all are called alike)
+        """Publish an annotation."""
+        self._state.on_annotation.publish(annotation)
+
+    def log_entry(self, entry: LogEntry, now_ns: int) -> None:  # noqa: ARG002  (all are called alike)
+        """Publish an entry of an application's log."""
+        self._state.on_log.publish(entry)
+
+    def encoded(self, picture: EncodedFrame, now_ns: int) -> None:  # noqa: ARG002  (all are called alike)
+        """Publish a picture as the vehicle encoded it."""
+        channel = self._state.channels.get(picture.camera)
+        if channel is not None:
+            channel.stream.publish(picture)
+
+    def result(self, result: ProcessorResult, now_ns: int) -> None:
+        """Publish the result of a processor."""
+        self._state.results.receive(result, now_ns)
+
+    def share(self, share: ProcessorShare, now_ns: int) -> None:  # noqa: ARG002  (all are called alike)
+        """Publish a worker's share of a processor's frames."""
+        self._state.on_share.publish(share)
+
+
+def as_predicate(wanted: Wanted) -> tuple[Callable[[Feedback], bool], str]:
+    """Return the predicate for what is waited for, and its name for people.
+
+    Args:
+        wanted: A flight state or its name, several of them, or a predicate on feedback.
+
+    Raises:
+        UnknownNameError: If there is no flight state of that name.
+    """
+    if callable(wanted):
+        name = getattr(wanted, "__name__", "<lambda>")
+        return wanted, "as wanted" if name == "<lambda>" else name
+    names = [wanted] if isinstance(wanted, str) else list(wanted)
+    known = {state.value for state in FlightState}
+    for name in names:
+        if name not in known:
+            raise UnknownNameError("flight state", str(name), known)
+    states = frozenset(FlightState(name) for name in names)
+    return lambda feedback: feedback.state in states, " or ".join(str(name) for name in names)

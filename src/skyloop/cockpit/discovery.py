@@ -1,0 +1,141 @@
+"""Discovery: which proxies of this host and of the network there are, without any of them noticing."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple, Protocol
+
+from skyloop.transport.base import Dialer
+
+if TYPE_CHECKING:
+    from skyloop.transport.fabric import FabricSettings
+    from skyloop.transport.fabric.session import Session
+
+
+class Found(NamedTuple):
+    """A proxy that can be connected to."""
+
+    name: str
+    transport: str  #: as a person reads it: ``local``
+    dial: Dialer
+
+
+class Finder(Protocol):
+    """Searches for proxies, again and again, on threads that are not the event loop's."""
+
+    def __call__(self) -> list[Found]:
+        """Return the proxies that are there now.
+
+        Raises:
+            SkyloopError: The search is not possible now.
+            OSError: The same.
+        """
+
+    def add_name(self, name: str) -> None:
+        """Find this proxy too, where only certain names are searched for."""
+
+    def close(self) -> None:
+        """Release what searching needs. Idempotent."""
+
+
+class LocalFinder:
+    """Finds the proxies of this host that this user may reach."""
+
+    def __init__(self, names: Collection[str] = ()) -> None:
+        """Prepare the search.
+
+        Args:
+            names: Only these; none: all.
+        """
+        self._names = frozenset(names)
+        self._also: set[str] = set()
+        self._known: dict[tuple[str, Path], Found] = {}
+
+    def add_name(self, name: str) -> None:
+        self._also.add(name)
+
+    def close(self) -> None:
+        """Do nothing: it holds nothing."""
+
+    def __call__(self) -> list[Found]:
+        from skyloop.transport.base import NAME
+        from skyloop.transport.local import dial
+        from skyloop.transport.local.directory import find_directory, is_live
+
+        folder = find_directory().path
+        try:
+            files = sorted(entry.path for entry in os.scandir(folder))
+        except FileNotFoundError:
+            return []
+        found = []
+        for path in map(Path, files):
+            name = path.stem
+            if path.suffix == ".sock" and NAME.fullmatch(name) and self._wanted(name) and is_live(path):
+                found.append(self._known.setdefault((name, path), Found(name, "local", dial(name))))
+        return found
+
+    def _wanted(self, name: str) -> bool:
+        return not self._names or name in self._names or name in self._also
+
+
+class NetworkFinder:
+    """Finds the proxies of this host, and those of the network under other names.
+
+    It opens one session with the first search and keeps it, so that further ones cost little.
+    """
+
+    def __init__(self, local: Finder, settings: FabricSettings, wanted: frozenset[str] = frozenset()) -> None:
+        """Prepare the search.
+
+        Args:
+            local: Finds the proxies of this host.
+            settings: How to join the network.
+            wanted: Only these names; empty: all.
+        """
+        self._local = local
+        self._settings = settings
+        self._wanted = wanted
+        self._session: Session | None = None
+        self._known: dict[str, Found] = {}
+
+    def add_name(self, name: str) -> None:
+        self._local.add_name(name)
+        if self._wanted:
+            self._wanted |= {name}
+
+    def __call__(self) -> list[Found]:
+        from skyloop.transport.fabric.discovery import runs
+
+        found = {one.name: one for one in self._local()}
+        for name, _ in sorted(runs(self._open())):
+            if name not in found and (not self._wanted or name in self._wanted):
+                found[name] = self._found(name)
+        return [found[name] for name in sorted(found)]
+
+    def close(self) -> None:
+        from skyloop.transport.fabric.session import release
+
+        session, self._session = self._session, None
+        if session is not None:
+            release(session)
+
+    def _open(self) -> Session:
+        from skyloop.transport.fabric.config import Part
+        from skyloop.transport.fabric.session import acquire
+
+        current = self._settings.current()
+        if self._session is not None and current is not self._settings:
+            self.close()  # the lab's roster has changed: who was revoked is not to be found any more
+        self._settings = current
+        if self._session is None:
+            self._session = acquire(current, Part.APP)
+        return self._session
+
+    def _found(self, name: str) -> Found:
+        from skyloop.transport.fabric import dial
+
+        if name not in self._known:
+            self._known[name] = Found(name, "network", dial(name, self._settings))
+        return self._known[name]

@@ -1,0 +1,85 @@
+"""A page's own pilot connection to a drone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from skyloop.client import AuthorityStatus, Drone
+from skyloop.client.commands import ANSWER_S
+from skyloop.clock import monotonic_ns
+from skyloop.errors import LinkError, RefusedError
+from skyloop.messages import AnswerTakeover, FlightState, LinkState, Refused
+
+
+class PilotConnection(Drone):
+    """A pilot's connection that asks for the authority when it is told to, and not when it is opened.
+
+    Without the authority it can stop the motors in an emergency, and nothing else.
+    """
+
+    _armed = False
+
+    def set_flown_by_person(self) -> None:
+        """Hold nothing on its own, only while the page is known to be there, as a person flies by it."""
+        self._commands.flown_by_person()
+
+    def present_until(self, until_ns: int) -> None:
+        """Count the page as present until then, on this process's monotonic clock; afterwards this pilot is silent."""
+        self._commands.present_until(until_ns)
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether the page was not known to be there for too long."""
+        return not self._commands.is_present(monotonic_ns())
+
+    @property
+    def is_linked(self) -> bool:
+        """Whether there is a connection to the proxy now."""
+        return self.link.application in (LinkState.UP, LinkState.DEGRADED)
+
+    def request_authority(self, priority: int | None = None, **options: Any) -> AuthorityStatus:
+        """Do as :class:`skyloop.Drone` does, but nothing until :meth:`acquire` was called."""
+        return super().request_authority(priority, **options) if self._armed else self.authority
+
+    def acquire(self, priority: int, *, ask: bool = False) -> AuthorityStatus:
+        """Ask for the authority now.
+
+        Args:
+            priority: 0 is the highest, 31 the lowest.
+            ask: Whether the holder is asked first; this then waits in the queue instead of failing.
+
+        Raises:
+            AuthorityError: Another application has it; the message names which.
+        """
+        self._armed = True
+        return self.request_authority(priority, takeover="ask" if ask else "now", stay=ask)
+
+    def answer_takeover(self, lease: int, app_id: int, grant: bool, reason: str) -> None:
+        """Answer who asks for the authority, and wait until the proxy has the answer.
+
+        Args:
+            lease: The lease under which this connection holds the authority.
+            app_id: Who asked.
+            grant: Whether to hand it over.
+            reason: Why not, for a person.
+
+        Raises:
+            RefusedError: The authority is not held any more.
+            LinkError: The proxy does not answer.
+        """
+        reply = self._connection.call(lambda: AnswerTakeover(lease, app_id, grant, reason), ANSWER_S)
+        if isinstance(reply, Refused):
+            raise RefusedError(reply.message, code=reply.code.value)
+
+    @property
+    def proxy_now_ns(self) -> int:
+        """The time on the proxy's clock, as estimated."""
+        return monotonic_ns() + self.clock_offset_ns
+
+    @property
+    def is_flying(self) -> bool:
+        """Whether the vehicle is under way, as far as is known."""
+        try:
+            return self.feedback().state is FlightState.FLYING
+        except LinkError:
+            return False

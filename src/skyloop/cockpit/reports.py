@@ -1,0 +1,132 @@
+"""Reports on recordings: one at a time, by a child process that ends with who wanted it, and with this process.
+
+A report keeps a core busy for seconds, and everybody who may watch may ask for one. So requests wait in a short queue,
+and are refused when it is full; if who asked goes away, the request leaves the queue, or the work ends.
+
+``python -m skyloop.cockpit.reports FILE TARGET [DRONE]`` is the child.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Final
+
+from skyloop.errors import LinkError, RefusedError, SkyloopError, UsageError
+from skyloop.messages import Refusal
+
+REPORT_S: Final = 120.0  #: for one report, before the next one has its turn
+MAX_WAITING: Final = 4  #: who comes later would wait for minutes
+NICENESS: Final = 5  #: of the child, besides the cockpit's own: pages come before reports
+_TAKEN: Final = 4096  # bytes of what a child complains about
+
+#: What is run for a report of FILE, to be written to TARGET, of DRONE if one is named.
+Command = Callable[[Path, Path, str | None], Sequence[str]]
+
+
+def child_command(file: Path, target: Path, drone: str | None) -> Sequence[str]:
+    """Return the command that runs this module as a program."""
+    return [sys.executable, "-m", "skyloop.cockpit.reports", str(file), str(target), *([drone] if drone else [])]
+
+
+class Reports:
+    """Makes reports. On the event loop.
+
+    Args:
+        command: Makes the command line of a child, in place of :func:`child_command`.
+    """
+
+    def __init__(self, command: Command | None = None) -> None:
+        self._command = command or child_command
+        self._turn = asyncio.Lock()
+        self._wanted = 0  # being made, or waited for
+
+    async def make(self, file: Path, drone: str | None = None) -> str:
+        """Make a report; cancelled, it leaves nothing behind.
+
+        Args:
+            file: The recording.
+            drone: Which of the recorded ones; None for the only one.
+
+        Returns:
+            The page that ``skyloop log report`` makes.
+
+        Raises:
+            RefusedError: Too many requests wait already.
+            UsageError: The child failed; with what it says.
+            LinkError: It takes more than :data:`REPORT_S`.
+        """
+        if self._wanted > MAX_WAITING:
+            raise RefusedError(
+                f"a report is being made and {self._wanted - 1} wait, which is all that may: try again in a while",
+                code=Refusal.BUSY,
+            )
+        self._wanted += 1
+        try:
+            async with self._turn:
+                return await self._made(file, drone)
+        finally:
+            self._wanted -= 1
+
+    async def _made(self, file: Path, drone: str | None) -> str:
+        with tempfile.TemporaryDirectory(prefix="skyloop-report-") as folder:
+            target = Path(folder) / "report.html"
+            child = await asyncio.create_subprocess_exec(
+                *self._command(file.absolute(), target, drone),
+                stdin=asyncio.subprocess.PIPE,  # which ends when this process does
+                stdout=asyncio.subprocess.DEVNULL,
+                stderr=asyncio.subprocess.PIPE,
+            )
+            assert child.stderr is not None
+            try:
+                async with asyncio.timeout(REPORT_S):
+                    said = await child.stderr.read(_TAKEN)
+                    while await child.stderr.read(_TAKEN):
+                        pass
+                    await child.wait()
+            except TimeoutError:
+                raise LinkError(f"the report of {file.name} was not made within {REPORT_S:g} s") from None
+            finally:
+                if child.returncode is None:
+                    child.kill()
+                    await asyncio.shield(child.wait())
+            if child.returncode or not target.exists():
+                lines = said.decode(errors="replace").strip().splitlines()
+                raise UsageError(lines[-1] if lines else f"no report of {file.name} could be made")
+            return await asyncio.to_thread(target.read_text, encoding="utf-8")
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Make one report, unless standard input ends before: then who wanted it is gone.
+
+    Returns:
+        The exit code: 0, or 2 with a line of explanation.
+    """
+    os.nice(NICENESS)
+    threading.Thread(target=_end_with_parent, name="parent", daemon=True).start()
+    from skyloop.logfile.reader import Recording
+    from skyloop.recording.review.report import write_report
+
+    file, target, *drone = arguments
+    try:
+        recording = Recording.open(Path(file))
+        write_report(recording, recording.drone(drone[0] if drone else None).name, Path(target), pictures=8)
+    except SkyloopError as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+def _end_with_parent() -> None:
+    while os.read(sys.stdin.fileno(), 64):
+        pass
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,188 @@
+"""Takeover of control by asking: the questions to a page that holds it, and the queue position of one that asked.
+
+:class:`TakeoverQuestions` and :class:`QueueTracker` are pure, the time is an argument; :class:`TakeoverDialog` joins
+them to one page.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from skyloop.client import AuthorityStatus
+from skyloop.client.authority import TakeoverRequest, takeover_request
+from skyloop.clock import monotonic_ns, nanoseconds, seconds
+from skyloop.errors import RefusedError
+from skyloop.messages import Event, EventKind
+
+if TYPE_CHECKING:
+    from skyloop.cockpit.commands import Answer
+    from skyloop.cockpit.pilot_connection import PilotConnection
+
+Json = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class TakeoverQuestion:
+    """Somebody asks for the authority that this page holds."""
+
+    request: TakeoverRequest
+    until_ns: int  #: when the time to ask is over, on the proxy's clock
+    declined: bool = False  #: by this page; who is of higher priority gets it all the same when the time is over
+
+    def to_json(self, now_ns: int) -> Json:
+        """Return it as JSON values; ``now_ns`` is the proxy's clock."""
+        return {
+            "id": self.request.by_id,
+            "by": self.request.by,
+            "priority": self.request.priority,
+            "for_s": self.request.for_s,
+            "left_s": max(0.0, seconds(self.until_ns - now_ns)),
+            "declined": self.declined,
+        }
+
+
+class TakeoverQuestions:
+    """The open questions to a page, by the number of who asks. Times are on the proxy's clock.
+
+    Each method that changes them returns whether anything has changed.
+    """
+
+    def __init__(self) -> None:
+        self._open: dict[int, TakeoverQuestion] = {}
+
+    def find(self, by_id: int) -> TakeoverQuestion | None:
+        """Return the question of an application, None if there is none."""
+        return self._open.get(by_id)
+
+    def on_event(self, event: Event, app_id: int) -> bool:
+        """Handle an event, as the application with this number."""
+        if event.kind is EventKind.AUTHORITY_WITHDRAWN and event.data.get("app_id") == app_id:
+            by_id = event.data.get("by_id")
+            return isinstance(by_id, int) and self._open.pop(by_id, None) is not None
+        request = takeover_request(event, app_id)
+        if request is None:
+            return False
+        self._open[request.by_id] = TakeoverQuestion(request, event.at_ns + nanoseconds(request.within_s))
+        return True
+
+    def decline(self, by_id: int) -> bool:
+        """Note that the page keeps control."""
+        question = self._open.get(by_id)
+        if question is None:
+            return False
+        self._open[by_id] = replace(question, declined=True)
+        return True
+
+    def update(self, lease: int, now_ns: int) -> bool:
+        """Drop the questions of another lease, and those whose time is over."""
+        left = {by_id: one for by_id, one in self._open.items() if one.request.lease == lease and now_ns < one.until_ns}
+        changed, self._open = len(left) != len(self._open), left
+        return changed
+
+    def to_json(self, now_ns: int) -> Json:
+        """Return the message to the page; who would get the authority first comes first."""
+        ordered = sorted(self._open.values(), key=lambda one: (one.request.priority, one.until_ns))
+        return {"type": "asked", "questions": [one.to_json(now_ns) for one in ordered]}
+
+
+@dataclass(frozen=True, slots=True)
+class QueuePosition:
+    """Where a page stands in the queue for the authority."""
+
+    position: int | None  #: 1 is next; None: not known
+    until_ns: int | None  #: when it is expected to be its turn; None: not known
+    asked: bool  #: the holder was asked first
+    declined: str | None  #: and keeps it for this reason, which may be empty
+
+    def to_json(self, now_ns: int) -> Json:
+        """Return it as JSON values; ``now_ns`` is the monotonic clock."""
+        wait_s = None if self.until_ns is None else max(0.0, seconds(self.until_ns - now_ns))
+        return {"position": self.position, "wait_s": wait_s, "asked": self.asked, "declined": self.declined}
+
+
+class QueueTracker:
+    """Follows a page's position in the queue, and the answer to its question."""
+
+    def __init__(self) -> None:
+        self._asked = False
+        self._declined: str | None = None
+        self._known: tuple[int, float | None] | None = None  # what the status said last
+        self._until_ns: int | None = None
+
+    def request(self, *, ask: bool) -> None:
+        """Begin anew, as the page asks for the authority."""
+        self._asked, self._declined, self._known = ask, None, None
+
+    def on_event(self, event: Event, app_id: int) -> None:
+        """Handle an event, as the application with this number."""
+        if event.kind is EventKind.AUTHORITY_DECLINED and event.data.get("app_id") == app_id:
+            self._declined = str(event.data.get("reason", ""))
+
+    def update(self, status: AuthorityStatus, now_ns: int) -> QueuePosition | None:
+        """Return the position in the queue.
+
+        Args:
+            status: The connection's.
+            now_ns: The monotonic clock.
+
+        Returns:
+            None for who does not wait. It is equal to the last one until the status changes.
+        """
+        if status.state == "held":  # who is overruled afterwards has it back without asking
+            self.request(ask=False)
+        if status.state not in ("queued", "preempted"):
+            return None
+        known = status.position, status.expected_wait_s
+        if known != self._known:
+            self._known = known
+            wait_s = status.expected_wait_s
+            self._until_ns = None if wait_s is None else now_ns + nanoseconds(wait_s)
+        return QueuePosition(status.position or None, self._until_ns, self._asked, self._declined)
+
+
+class TakeoverDialog:
+    """Both sides of a takeover for one page. On the event loop.
+
+    Args:
+        send: Sends a message to the page.
+    """
+
+    def __init__(self, send: Callable[[Json], None]) -> None:
+        self._send = send
+        self._questions = TakeoverQuestions()
+        self._queue = QueueTracker()
+
+    def request(self, *, ask: bool) -> None:
+        """Begin anew, as the page asks for the authority."""
+        self._queue.request(ask=ask)
+
+    def on_event(self, event: Event, pilot: PilotConnection) -> None:
+        """Handle an event that came over the page's own connection."""
+        self._queue.on_event(event, pilot.app_id)
+        if self._questions.on_event(event, pilot.app_id):
+            self._send(self._questions.to_json(pilot.proxy_now_ns))
+
+    def update(self, pilot: PilotConnection | None) -> QueuePosition | None:
+        """Send the open questions if they have changed; return the page's position in the queue."""
+        lease, now_ns = (0, 0) if pilot is None else (pilot.authority.lease, pilot.proxy_now_ns)
+        if self._questions.update(lease, now_ns):
+            self._send(self._questions.to_json(now_ns))
+        return None if pilot is None else self._queue.update(pilot.authority, monotonic_ns())
+
+    async def answer(self, command: Answer, pilot: PilotConnection) -> None:
+        """Send the page's answer to the proxy.
+
+        Raises:
+            RefusedError: Nobody asks any more.
+            LinkError: The proxy does not answer.
+        """
+        question = self._questions.find(command.id)
+        if question is None:
+            raise RefusedError("nobody asks for control any more")
+        lease = question.request.lease
+        await asyncio.to_thread(pilot.answer_takeover, lease, command.id, command.grant, command.reason)
+        if not command.grant and self._questions.decline(command.id):
+            self._send(self._questions.to_json(pilot.proxy_now_ns))

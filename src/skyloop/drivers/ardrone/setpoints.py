@@ -1,0 +1,312 @@
+"""Set-points to ``REF`` and ``PCMD``: what is sent to the drone at each tick. Pure.
+
+``REF`` has take-off, landing and emergency as bits that must be repeated until navdata shows the new state. The
+emergency bit toggles: it is set only while the drone is known to be in the other state, and cleared as soon as navdata
+shows the change. ``PCMD`` takes roll (positive to the right), pitch (negative nose down), climb (positive up) and yaw
+rate (positive clockwise), each from -1 to 1: shares of the limits that the drone is configured with.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import Final
+
+from skyloop.clock import nanoseconds
+from skyloop.drivers.notices import Notice
+from skyloop.errors import DecodeError, DriverError
+from skyloop.messages import (
+    AnyAction,
+    Attitude,
+    EmergencyStop,
+    EventKind,
+    Hover,
+    Idle,
+    Land,
+    ResetEmergency,
+    Severity,
+    Takeoff,
+)
+from skyloop.wire.ardrone.at import AtMessage, Pcmd, Ref
+from skyloop.wire.ardrone.configuration import parse_value
+from skyloop.wire.ardrone.navdata import ControlState, State
+
+HEADING_ACCURACY: Final = 0.1  #: of the reference that goes with ``PCMD_MAG``, as share of half a turn
+_KEYS: Final = ("control:euler_angle_max", "control:control_vz_max", "control:control_yaw")
+
+
+@dataclass(frozen=True, slots=True)
+class StickLimits:
+    """What a stick value of 1 means."""
+
+    tilt_rad: float
+    climb_m_s: float
+    yaw_rate_rad_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Stick:
+    """The four values of ``PCMD``, each from -1 to 1, with its signs."""
+
+    roll: float
+    pitch: float
+    climb: float
+    yaw: float
+
+
+def limits_of(configuration: Mapping[str, str]) -> StickLimits | None:
+    """Return the limits in force from the drone's configuration; None if it lacks one or one is not positive."""
+    try:
+        tilt, climb_mm_s, yaw = (float(str(parse_value(configuration[key], 0.0))) for key in _KEYS)
+    except (KeyError, DecodeError):
+        return None
+    if min(tilt, climb_mm_s, yaw) <= 0:
+        return None
+    return StickLimits(tilt, climb_mm_s / 1000, yaw)
+
+
+def stick_of(action: Attitude, limits: StickLimits) -> tuple[Stick, Attitude]:
+    """Return the stick values for an attitude, and the attitude that they ask for, within the drone's limits."""
+    stick = Stick(
+        roll=_share(action.roll, limits.tilt_rad),
+        pitch=_share(-action.pitch, limits.tilt_rad),
+        climb=_share(action.climb, limits.climb_m_s),
+        yaw=_share(-action.yaw_rate, limits.yaw_rate_rad_s),
+    )
+    applied = Attitude(
+        roll=_within(action.roll, limits.tilt_rad),
+        pitch=_within(action.pitch, limits.tilt_rad),
+        climb=_within(action.climb, limits.climb_m_s),
+        yaw_rate=_within(action.yaw_rate, limits.yaw_rate_rad_s),
+    )
+    return stick, applied
+
+
+def motion(stick: Stick | None, reference_rad: float | None = None) -> AtMessage:
+    """Return ``PCMD`` for these stick values.
+
+    Args:
+        stick: None: hover.
+        reference_rad: If given, it is ``PCMD_MAG``: forward and right are then those of somebody who looks along that
+            heading (0 magnetic north, positive counter-clockwise), wherever the drone's nose points.
+    """
+    if stick is None:
+        return ("PCMD", (int(Pcmd.HOVER), 0.0, 0.0, 0.0, 0.0))
+    values = (stick.roll, stick.pitch, stick.climb, stick.yaw)
+    if reference_rad is None:
+        return ("PCMD", (int(Pcmd.PROGRESSIVE), *values))
+    heading = -reference_rad / math.pi + 0.0  # without a negative zero
+    return ("PCMD_MAG", (int(Pcmd.PROGRESSIVE | Pcmd.ABSOLUTE), *values, heading, HEADING_ACCURACY))
+
+
+def _share(value: float, limit: float) -> float:
+    return max(-1.0, min(1.0, value / limit)) + 0.0  # without a negative zero
+
+
+def _within(value: float, limit: float) -> float:
+    return max(-limit, min(limit, value))
+
+
+TAKEOFF_PATIENCE_NS: Final = nanoseconds(5.0)  #: a drone that has not started by then refuses to
+TOGGLE_NS: Final = nanoseconds(0.5)  #: the emergency bit is cleared and set anew if it showed no effect for so long
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """What the newest navdata say of the flight."""
+
+    state: State
+    control: ControlState | None = None
+
+    @property
+    def flying(self) -> bool:
+        """Whether the drone is in the air."""
+        return bool(self.state & State.FLYING)
+
+    @property
+    def emergency(self) -> bool:
+        """Whether the motors are cut."""
+        return bool(self.state & State.EMERGENCY)
+
+
+class Decision(Enum):
+    """What is wanted of take-off and landing."""
+
+    STAY = auto()  #: as it is: in the air if it flies
+    TAKE_OFF = auto()
+    LAND = auto()
+
+
+class SetpointController:
+    """Remembers the last action and turns it into commands, tick by tick.
+
+    ``reference_rad`` makes set-points relative to a heading (see :func:`skyloop.drivers.ardrone.setpoints.motion`).
+    """
+
+    def __init__(self) -> None:
+        self.condition: Condition | None = None  #: None while the drone is not heard
+        self.limits: StickLimits | None = None  #: None until they were read
+        self.reference_rad: float | None = None
+        self._decision = Decision.STAY
+        self._stick: Stick | None = None
+        self._landing_is_ours = False
+        self._decided_ns = 0
+        self._toggle: bool | None = None  #: whether the motors shall be cut (True) or released (False); None: neither
+        self._toggle_ns = 0
+        self._heard_ns = 0
+        self._told_blind = False
+        self._steering = False  # this flight was begun, or taken, here: else another program may be flying it
+        self._notices: list[Notice] = []
+
+    @property
+    def intent(self) -> tuple[object, ...]:
+        """Changes when something else is to be sent."""
+        return self._decision, self._stick, self._toggle
+
+    # What is decided -------------------------------------------------------------------------------------------
+
+    def apply(self, action: AnyAction, now_ns: int) -> AnyAction:
+        """Accept an action.
+
+        Args:
+            action: One of the driver's ``ACTIONS``.
+            now_ns: The present time.
+
+        Returns:
+            What is applied: an attitude within the drone's limits, or hover while the limits are not known.
+
+        Raises:
+            DriverError: A take-off while the drone is not heard or in emergency, a reset while it is not heard, or an
+                action that the drone does not have.
+        """
+        if isinstance(action, Idle):
+            return action
+        self._steering = True
+        if isinstance(action, EmergencyStop):
+            self._stop_motors(now_ns)
+        elif isinstance(action, ResetEmergency):
+            self._release_motors(now_ns)
+        elif isinstance(action, Takeoff):
+            self._take_off(now_ns)
+        elif isinstance(action, Land):
+            self._decision, self._stick, self._landing_is_ours = Decision.LAND, None, True
+        elif isinstance(action, Attitude):
+            return self._steer(action)
+        elif isinstance(action, Hover):
+            self._remain(None)
+        else:
+            raise DriverError(f"the AR.Drone takes no {action.name}")
+        return action
+
+    def _stop_motors(self, now_ns: int) -> None:
+        self._decision, self._stick, self._landing_is_ours = Decision.LAND, None, False
+        if self.condition is not None and self.condition.emergency:
+            self._toggle = None
+        elif self._toggle is not True:
+            self._toggle, self._toggle_ns = True, now_ns
+
+    def _release_motors(self, now_ns: int) -> None:
+        if self.condition is None:
+            raise DriverError("the drone is not heard: whether there is an emergency to reset can't be known")
+        self._decision, self._stick, self._landing_is_ours = Decision.LAND, None, False
+        if self.condition.emergency and self._toggle is not False:
+            self._toggle, self._toggle_ns = False, now_ns
+
+    def _take_off(self, now_ns: int) -> None:
+        if self.condition is None:
+            raise DriverError("the drone is not heard: it does not take off blindly")
+        if self.condition.emergency or self._toggle is not None:
+            raise DriverError("the drone is in emergency: reset it first")
+        if self._decision is not Decision.TAKE_OFF:
+            self._decided_ns = now_ns
+        self._decision, self._stick = Decision.TAKE_OFF, None
+
+    def _steer(self, action: Attitude) -> AnyAction:
+        if self.limits is None:
+            self._remain(None)
+            if not self._told_blind:
+                self._told_blind = True
+                text = "the drone's limits are not known yet: it hovers instead of following set-points"
+                self._notices.append(
+                    Notice(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, {"reason": "limits_unknown"})
+                )
+            return Hover()
+        stick, applied = stick_of(action, self.limits)
+        self._remain(stick)
+        return applied
+
+    def _remain(self, stick: Stick | None) -> None:
+        self._stick = stick
+        if self._decision is Decision.LAND:
+            self._decision = Decision.STAY
+
+    # What is received ---------------------------------------------------------------------------------------------
+
+    def on_condition(self, condition: Condition, now_ns: int) -> None:
+        """Handle the newest navdata."""
+        if self.condition is not None and self.condition.flying and not condition.flying:
+            self._stick = None
+        self.condition, self._heard_ns = condition, now_ns
+        if self._toggle is condition.emergency:
+            self._toggle = None
+        if not (condition.flying or condition.emergency) and self._decision is not Decision.TAKE_OFF:
+            self._steering = False
+        if condition.emergency:
+            self._decision, self._stick = Decision.LAND, None
+        elif self._decision is Decision.TAKE_OFF and condition.flying:
+            self._decision, self._landing_is_ours = Decision.STAY, False
+        elif not condition.flying and condition.control is not ControlState.LANDING:
+            self._landing_is_ours = False
+
+    def lost(self) -> None:
+        """Forget the drone's condition, and a take-off that is under way: the drone is not heard any more."""
+        self.condition = None
+        self._told_blind = False
+        if self._toggle is False:
+            self._toggle = None
+        if self._decision is Decision.TAKE_OFF:
+            self._decision = Decision.STAY
+
+    # What is sent ----------------------------------------------------------------------------------------------
+
+    def notices(self) -> list[Notice]:
+        """Return the notices since the last call."""
+        notices, self._notices = self._notices, []
+        return notices
+
+    def messages(self, now_ns: int) -> list[AtMessage]:
+        """Return the commands of this tick: ``PCMD``, and ``REF`` unless nothing is wanted of take-off and landing.
+
+        While another program flies the drone: only the watchdog's answer.
+        """
+        if self.condition is not None and self.condition.flying and not self._steering:
+            return [("COMWDG", ())]
+        bits = self._emergency_bits(now_ns)
+        if bits is None:
+            bits = self._flight_bits(now_ns)
+        moving = motion(self._stick, self.reference_rad if self._stick is not None else None)
+        return [moving] if bits is None else [("REF", (int(Ref.FIXED | bits),)), moving]
+
+    def _emergency_bits(self, now_ns: int) -> Ref | None:
+        if self._toggle is None:
+            return None
+        if self.condition is None or self._heard_ns - self._toggle_ns < TOGGLE_NS:
+            return Ref.EMERGENCY
+        self._toggle_ns = now_ns  # it was heard since, and shows no effect: let go once, for the next edge
+        return Ref(0)
+
+    def _flight_bits(self, now_ns: int) -> Ref | None:
+        if self._decision is Decision.TAKE_OFF:
+            if now_ns - self._decided_ns < TAKEOFF_PATIENCE_NS:
+                return Ref.TAKEOFF
+            self._decision = Decision.STAY
+            text = "the drone did not take off: it may refuse because of its battery, its tilt or its sensors"
+            self._notices.append(Notice(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, {"reason": "no_takeoff"}))
+        if self._decision is Decision.LAND:
+            return Ref(0)
+        if self.condition is None:
+            return None  # it goes on with whatever it does
+        by_itself = self.condition.control is ControlState.LANDING and not self._landing_is_ours
+        return Ref.TAKEOFF if self.condition.flying and not by_itself else Ref(0)

@@ -1,0 +1,383 @@
+"""What ArduCopter and PX4 do differently: modes, commands, thrust and safety nets. Pure.
+
+``docs/mavlink.md`` says where each was observed.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import ClassVar, Final, Protocol
+
+from skyloop.drivers.mavlink.microservices import VehicleCommand
+from skyloop.drivers.mavlink.telemetry import PREARM, SLOW_S, Telemetry, VehicleState
+from skyloop.drivers.seams import Remark
+from skyloop.wire.mavlink.codec import dialect as m
+from skyloop.wire.mavlink.modes import COPTER_NUMBERS, PX4_NUMBERS, Autopilot, Landed, copter_mode, px4_mode
+
+STANDARD_GRAVITY: Final = 9.80665  #: m/s²
+CLIMB_GAIN_PER_S: Final = 2.0
+ALTITUDE_GAIN_PER_S2: Final = 0.8
+MOST_ALTITUDE_ERROR_M: Final = 1.5
+LEAST_THRUST: Final = 0.1
+MOST_THRUST: Final = 0.9
+
+
+class ThrustModel(Protocol):
+    """The thrust field of ``SET_ATTITUDE_TARGET`` for a climb rate, in one flight by attitude.
+
+    ArduCopter takes it as a climb rate: 0.5 holds the altitude. PX4 takes it as collective thrust, and altitude is ours
+    to hold: a proportional and integral loop on the climb rate, whose integral is an altitude error.
+    """
+
+    def limit_climb(self, climb_m_s: float) -> float:
+        """Return the climb rate that the autopilot accepts, positive up [m/s]."""
+
+    def thrust(self, climb_m_s: float, climbing_m_s: float | None, tilt_rad: float, step_s: float) -> float:
+        """Return the thrust field, 0 to 1.
+
+        Args:
+            climb_m_s: The climb rate asked for, positive up.
+            climbing_m_s: The measured one, if known.
+            tilt_rad: The tilt asked for.
+            step_s: The time since the last call.
+        """
+
+
+class ClimbRateThrust:
+    """ArduCopter: a share of its fastest climb, or of its fastest descent.
+
+    Args:
+        up_m_s: Its fastest climb.
+        down_m_s: Its fastest descent, positive.
+    """
+
+    def __init__(self, up_m_s: float, down_m_s: float) -> None:
+        self._up, self._down = up_m_s, down_m_s
+
+    def limit_climb(self, climb_m_s: float) -> float:
+        """See :meth:`ThrustModel.limit_climb`."""
+        return max(-self._down, min(self._up, climb_m_s))
+
+    def thrust(self, climb_m_s: float, climbing_m_s: float | None, tilt_rad: float, step_s: float) -> float:  # noqa: ARG002
+        """See :meth:`ThrustModel.thrust`."""
+        climb = self.limit_climb(climb_m_s)
+        return 0.5 + 0.5 * climb / (self._up if climb > 0 else self._down)
+
+
+class CollectiveThrust:
+    """PX4: collective thrust, with a loop that holds the climb rate.
+
+    Args:
+        hover: The thrust that carries the weight (``MPC_THR_HOVER``); 0.5 is taken for one that makes no sense.
+    """
+
+    def __init__(self, hover: float) -> None:
+        self._hover = hover if math.isfinite(hover) and 0.1 <= hover <= 0.9 else 0.5
+        self._error_m = 0.0
+
+    def limit_climb(self, climb_m_s: float) -> float:
+        """See :meth:`ThrustModel.limit_climb`."""
+        return climb_m_s
+
+    def thrust(self, climb_m_s: float, climbing_m_s: float | None, tilt_rad: float, step_s: float) -> float:
+        """See :meth:`ThrustModel.thrust`."""
+        error = climb_m_s - climbing_m_s if climbing_m_s is not None else 0.0
+        self._error_m += error * step_s
+        self._error_m = max(-MOST_ALTITUDE_ERROR_M, min(MOST_ALTITUDE_ERROR_M, self._error_m))
+        upward = CLIMB_GAIN_PER_S * error + ALTITUDE_GAIN_PER_S2 * self._error_m
+        thrust = self._hover * (1.0 + upward / STANDARD_GRAVITY) / max(0.5, math.cos(tilt_rad))
+        return max(LEAST_THRUST, min(MOST_THRUST, thrust))
+
+
+CUSTOM: Final = 1.0  #: MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+REACHED_M: Final = 0.2  #: a take-off ends so far below its altitude
+EKF_PLACE: Final = 0x10  #: absolute horizontal position, of EKF_STATUS_REPORT and ESTIMATOR_STATUS
+EKF_RELATIVE_PLACE: Final = 0x08
+EKF_CONSTANT: Final = 0x80  #: it does not know where it is
+EKF_UNINITIALISED: Final = 0x400
+THRUST_AS_THRUST: Final = 8  #: of ArduCopter's GUID_OPTIONS
+
+Values = Mapping[str, float]  #: the autopilot's parameters by its own names
+
+
+@dataclass(frozen=True, slots=True)
+class _SafetyNet:
+    """What the autopilot does by itself when something fails, by the value of a parameter.
+
+    What a value does was observed on the real autopilots, or stands in their parameter references.
+    """
+
+    name: str  #: of the parameter
+    what: str
+    good: Callable[[float], bool]  #: whether a value is as it should be
+    otherwise: str  #: what comes of another value
+    advice: str
+
+    def remark(self, value: float) -> Remark:
+        """Judge the parameter's value."""
+        detail = f"{self.name} is {value:g}"
+        if self.good(value):
+            return Remark(self.what, True, detail)
+        return Remark(self.what, False, f"{detail}: {self.otherwise}", f"set the parameter mavlink.{self.advice}")
+
+
+def _on(value: float) -> bool:
+    return value != 0
+
+
+class AutopilotProfile(ABC):
+    """What one autopilot does its own way. Stateless."""
+
+    NAME: ClassVar[str]
+    GUIDED: ClassVar[str]  #: the mode that follows set-points
+    HOLD: ClassVar[str]  #: the mode that holds the position by itself
+    LAND: ClassVar[str]
+    ARMING: ClassVar[str]  #: the mode to be in before arming
+    HOLDING: ClassVar[frozenset[str]]  #: modes in which it stays where it is by itself
+    LANDING: ClassVar[frozenset[str]]
+    TAKING_OFF: ClassVar[frozenset[str]]
+    NEEDS_STICKS: ClassVar[frozenset[str]]  #: modes that need somebody at a remote control
+    LEAD_S: ClassVar[float]  #: set-points must flow for so long before GUIDED is entered
+    BYTEWISE: ClassVar[bool]  #: how parameters are written, unless its capabilities say otherwise
+    SAFETY_NETS: ClassVar[tuple[_SafetyNet, ...]]
+
+    @abstractmethod
+    def mode_of(self, custom_mode: int) -> str: ...
+
+    @abstractmethod
+    def mode_command(self, mode: str) -> VehicleCommand: ...
+
+    @abstractmethod
+    def takeoff_command(self, height_m: float, vehicle: VehicleState) -> VehicleCommand | None:
+        """Return the command to take off; None while the altitude for it is not known."""
+
+    @abstractmethod
+    def has_taken_off(self, vehicle: VehicleState, height_m: float, rose: bool) -> bool:
+        """Return whether a take-off is complete.
+
+        Args:
+            vehicle: What is known of it.
+            height_m: Of the take-off.
+            rose: Whether it was seen in the air since the take-off was accepted.
+        """
+
+    @abstractmethod
+    def ready(self, telemetry: Telemetry, now_ns: int) -> bool | None:
+        """Return whether it may be armed; None if it does not report that."""
+
+    @abstractmethod
+    def message_rates(self, rate_hz: float) -> dict[str, float]:
+        """Return the messages that are needed, by name, and their rates [1/s]."""
+
+    @abstractmethod
+    def thrust_model(self, values: Values) -> ThrustModel:
+        """Return how a climb rate is asked for beside an attitude."""
+
+    def safety_remarks(self, values: Values, own_system: int) -> list[Remark]:  # noqa: ARG002
+        """Return a remark for each safety net that this autopilot has a parameter for.
+
+        By default both autopilots only drop the last set-point when this computer or its link dies.
+
+        Args:
+            values: The vehicle's parameters.
+            own_system: The MAVLink system that we are.
+        """
+        return [net.remark(values[net.name]) for net in self.SAFETY_NETS if net.name in values]
+
+
+class ArduCopterProfile(AutopilotProfile):
+    """ArduCopter."""
+
+    NAME = "ArduCopter"
+    GUIDED = "GUIDED"
+    HOLD = "BRAKE"
+    LAND = "LAND"
+    ARMING = "GUIDED"
+    HOLDING = frozenset({"BRAKE"})
+    LANDING = frozenset({"LAND"})
+    TAKING_OFF: ClassVar[frozenset[str]] = frozenset()
+    NEEDS_STICKS = frozenset({"STABILIZE", "ACRO", "ALT_HOLD", "LOITER", "DRIFT", "SPORT", "POSHOLD", "FLOWHOLD"})
+    LEAD_S = 0.0
+    BYTEWISE = False
+    SAFETY_NETS = (
+        _SafetyNet(
+            "FS_GCS_ENABLE", "loss of this computer", _on, "it hovers until its battery is empty", "fs_gcs_enable=7"
+        ),
+        _SafetyNet("FS_GCS_TIMEOUT", "time to that", lambda s: s <= 5, "it takes longer than 5 s", "fs_gcs_timeout=5"),
+        _SafetyNet(
+            "GUID_TIMEOUT", "loss of set-points", lambda s: 0 < s <= 3, "it flies on for long", "guid_timeout=1"
+        ),
+        _SafetyNet("FS_EKF_ACTION", "loss of its place", _on, "nothing happens", "fs_ekf_action=1"),
+        _SafetyNet("BATT_FS_LOW_ACT", "low battery", _on, "nothing happens", "batt_fs_low_act=1"),
+        _SafetyNet("FENCE_ENABLE", "fence", _on, "there is none", "fence_enable=1"),
+    )
+
+    def mode_of(self, custom_mode: int) -> str:
+        """Return the mode's name."""
+        return copter_mode(custom_mode)
+
+    def mode_command(self, mode: str) -> VehicleCommand:
+        """Return the command that changes the mode."""
+        return VehicleCommand(m.MAV_CMD_DO_SET_MODE, (CUSTOM, float(COPTER_NUMBERS[mode])))
+
+    def takeoff_command(self, height_m: float, vehicle: VehicleState) -> VehicleCommand | None:  # noqa: ARG002
+        """Return the command to take off, with a relative altitude."""
+        return VehicleCommand(m.MAV_CMD_NAV_TAKEOFF, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, height_m))
+
+    def has_taken_off(self, vehicle: VehicleState, height_m: float, rose: bool) -> bool:
+        """Return whether the altitude is reached: nothing else shows it."""
+        return rose and vehicle.altitude_m is not None and vehicle.altitude_m >= height_m - REACHED_M
+
+    def ready(self, telemetry: Telemetry, now_ns: int) -> bool | None:
+        """Return whether its pre-arm checks pass and its estimator knows where it is."""
+        good = telemetry.prearm_good(now_ns)
+        ekf = telemetry.newest("EKF_STATUS_REPORT", now_ns, SLOW_S)
+        if not good or ekf is None:
+            return good
+        knows = ekf.flags & (EKF_PLACE | EKF_RELATIVE_PLACE)
+        return bool(knows) and not ekf.flags & (EKF_CONSTANT | EKF_UNINITIALISED)
+
+    def message_rates(self, rate_hz: float) -> dict[str, float]:
+        """Return every message that is needed: it sends nothing unasked but a heartbeat each second."""
+        return {
+            "HEARTBEAT": 5.0,
+            "ATTITUDE": rate_hz,
+            "LOCAL_POSITION_NED": rate_hz,
+            "EXTENDED_SYS_STATE": 5.0,
+            "GLOBAL_POSITION_INT": 5.0,
+            "SYS_STATUS": 2.0,
+            "EKF_STATUS_REPORT": 2.0,
+            "GPS_RAW_INT": 1.0,
+            "RAW_IMU": rate_hz,
+            "DISTANCE_SENSOR": 10.0,
+        }
+
+    def thrust_model(self, values: Values) -> ThrustModel:
+        """Return a thrust that is a climb rate, or real thrust if ``GUID_OPTIONS`` says so."""
+        if int(values.get("GUID_OPTIONS", 0)) & THRUST_AS_THRUST:
+            return CollectiveThrust(hover=values.get("MOT_THST_HOVER", 0.35))
+        return ClimbRateThrust(up_m_s=copter_speed(values, "UP", 2.5), down_m_s=copter_speed(values, "DN", 1.5))
+
+    def safety_remarks(self, values: Values, own_system: int) -> list[Remark]:
+        """Return the safety nets, and whether it watches for our heartbeats."""
+        remarks = super().safety_remarks(values, own_system)
+        listens = values.get("MAV_GCS_SYSID", values.get("SYSID_MYGCS"))
+        if listens is not None and listens != own_system:
+            detail = (
+                f"it counts heartbeats of system {listens:g} and we are system {own_system}: our loss is not noticed"
+            )
+            remarks.append(Remark("ground station", False, detail, f"give the address ?own_sysid={listens:g}"))
+        return remarks
+
+
+class Px4Profile(AutopilotProfile):
+    """PX4."""
+
+    NAME = "PX4"
+    GUIDED = "OFFBOARD"
+    HOLD = "AUTO.LOITER"
+    LAND = "AUTO.LAND"
+    ARMING = "AUTO.LOITER"
+    HOLDING = frozenset({"AUTO.LOITER"})
+    LANDING = frozenset({"AUTO.LAND", "AUTO.PRECLAND"})
+    TAKING_OFF = frozenset({"AUTO.TAKEOFF"})
+    NEEDS_STICKS = frozenset({"MANUAL", "STABILIZED", "ACRO", "ALTCTL", "POSCTL"})
+    LEAD_S = 1.0
+    BYTEWISE = True
+    SAFETY_NETS = (
+        _SafetyNet("NAV_DLL_ACT", "loss of this computer", _on, "nothing more happens", "nav_dll_act=1"),
+        _SafetyNet("COM_DL_LOSS_T", "time to that", lambda s: s <= 10, "it takes longer than 10 s", "com_dl_loss_t=5"),
+        _SafetyNet(
+            "COM_OF_LOSS_T", "time to miss set-points", lambda s: s <= 1, "it flies on for long", "com_of_loss_t=1"
+        ),
+        _SafetyNet(
+            "COM_OBL_RC_ACT",
+            "loss of set-points",
+            lambda action: action in (3, 4, 5),
+            "without a remote control it sinks to the ground",
+            "com_obl_rc_act=5",
+        ),
+        _SafetyNet("COM_LOW_BAT_ACT", "low battery", _on, "there is no more than a warning", "com_low_bat_act=2"),
+        _SafetyNet("GF_MAX_VER_DIST", "ceiling", lambda height: height > 0, "there is none", "gf_max_ver_dist=30"),
+    )
+
+    def mode_of(self, custom_mode: int) -> str:
+        """Return the mode's name."""
+        return px4_mode(custom_mode)
+
+    def mode_command(self, mode: str) -> VehicleCommand:
+        """Return the command that changes the mode."""
+        main, sub = PX4_NUMBERS[mode]
+        return VehicleCommand(m.MAV_CMD_DO_SET_MODE, (CUSTOM, float(main), float(sub)))
+
+    def takeoff_command(self, height_m: float, vehicle: VehicleState) -> VehicleCommand | None:
+        """Return the command to take off, with an altitude above mean sea level."""
+        if vehicle.amsl_m is None:
+            return None
+        nan = math.nan
+        amsl_m = vehicle.amsl_m - (vehicle.altitude_m or 0.0) + height_m
+        # To the decimetre, so that noise of a resting altitude does not make another command of a repeat.
+        return VehicleCommand(m.MAV_CMD_NAV_TAKEOFF, (0.0, 0.0, 0.0, nan, nan, nan, round(amsl_m, 1)))
+
+    def has_taken_off(self, vehicle: VehicleState, height_m: float, rose: bool) -> bool:  # noqa: ARG002
+        """It holds its place then."""
+        return rose and vehicle.mode == self.HOLD and vehicle.landed is not Landed.TAKING_OFF
+
+    def ready(self, telemetry: Telemetry, now_ns: int) -> bool | None:
+        """Return whether it may be armed; None while it does not report that.
+
+        It never says that it has this check (the *present* bit), and reports its outcome for the mode that it is in. A
+        mode in which it can't be armed, as the one that a flight left behind, says nothing of the one that a take-off
+        begins in: then what is known is whether it knows where it is.
+        """
+        status = telemetry.newest("SYS_STATUS", now_ns, SLOW_S)
+        custom_mode = telemetry.custom_mode()
+        if status is None or custom_mode is None:
+            return None
+        if status.onboard_control_sensors_health & PREARM:
+            return True
+        if self.mode_of(custom_mode) == self.ARMING:
+            return False
+        estimator = telemetry.newest("ESTIMATOR_STATUS", now_ns, SLOW_S)
+        return None if estimator is None else bool(estimator.flags & (EKF_PLACE | EKF_RELATIVE_PLACE))
+
+    def message_rates(self, rate_hz: float) -> dict[str, float]:
+        """Return the messages that are needed. The heartbeat's rate can't be changed; the mode has its own message."""
+        return {
+            "ATTITUDE": rate_hz,
+            "LOCAL_POSITION_NED": rate_hz,
+            "CURRENT_MODE": 5.0,
+            "EXTENDED_SYS_STATE": 5.0,
+            "GLOBAL_POSITION_INT": 5.0,
+            "SYS_STATUS": 2.0,
+            "ESTIMATOR_STATUS": 2.0,
+            "GPS_RAW_INT": 1.0,
+            "HIGHRES_IMU": rate_hz,
+            "DISTANCE_SENSOR": 10.0,
+        }
+
+    def thrust_model(self, values: Values) -> ThrustModel:
+        """Return collective thrust."""
+        return CollectiveThrust(hover=values.get("MPC_THR_HOVER", 0.5))
+
+
+def copter_speed(values: Values, which: str, usual_m_s: float) -> float:
+    """Return one of ArduCopter's speeds [m/s].
+
+    ``WPNAV_SPEED_UP`` and the like are in cm/s; newer firmware calls them ``WP_SPD_UP``, in m/s.
+    """
+    old, new = values.get(f"WPNAV_SPEED_{which}"), values.get(f"WP_SPD_{which}")
+    speed = new if new is not None else old / 100.0 if old is not None else usual_m_s
+    return speed if math.isfinite(speed) and speed > 0 else usual_m_s
+
+
+def profile_of(autopilot: int) -> AutopilotProfile | None:
+    """Return the profile for a heartbeat's ``MAV_AUTOPILOT``; None for one that is not known here."""
+    if autopilot == Autopilot.ARDUPILOT:
+        return ArduCopterProfile()
+    if autopilot == Autopilot.PX4:
+        return Px4Profile()
+    return None

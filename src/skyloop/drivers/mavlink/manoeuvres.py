@@ -1,0 +1,294 @@
+"""Holding, a velocity, an attitude and a take-off, each as the messages that make the vehicle fly it. Pure."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from skyloop.clock import nanoseconds, seconds
+from skyloop.drivers.mavlink.autopilots import AutopilotProfile, ThrustModel
+from skyloop.drivers.mavlink.microservices import ACCEPTED, CommandSender, VehicleCommand, result_name
+from skyloop.drivers.mavlink.telemetry import VehicleState
+from skyloop.messages import Attitude, Velocity
+from skyloop.messages.geometry import quaternion_from_euler, wrap_angle
+from skyloop.wire.mavlink.axes import Vector, flip
+from skyloop.wire.mavlink.codec import Message
+from skyloop.wire.mavlink.codec import dialect as m
+from skyloop.wire.mavlink.modes import Landed
+
+# Frames of SET_POSITION_TARGET_LOCAL_NED that both autopilots take.
+WORLD: Final = 1
+BODY: Final = 8  #: levelled
+VELOCITY_AND_YAW_RATE: Final = 0x5C7
+POSITION: Final = 0xDF8
+ATTITUDE_AND_THRUST: Final = 0x07  #: without rates
+VELOCITY_PERIOD_NS: Final = 40_000_000  #: between repeats of a velocity or position: 25 Hz
+ATTITUDE_PERIOD_NS: Final = 20_000_000  #: the same for an attitude, which turns meanwhile
+MOST_YAW_LEAD_RAD: Final = 0.5  #: the heading that is asked for waits for a vehicle that can't follow
+STOPPED_M_S: Final = 0.25  #: slower than this, the position is held instead of a speed of zero,
+STOPPING_S: Final = 3.0  #: and after this in any case
+MOST_STEP_S: Final = 0.1
+
+Target = tuple[int, int]  #: system and component
+
+
+def velocity_message(action: Velocity, target: Target) -> Message:
+    """Return the set-point of a velocity in levelled body axes."""
+    x, y, z = flip(action.forward, action.left, action.up)
+    return m.MAVLink_set_position_target_local_ned_message(
+        0, *target, BODY, VELOCITY_AND_YAW_RATE, 0, 0, 0, x, y, z, 0, 0, 0, 0, 0.0 - action.yaw_rate
+    )
+
+
+def position_message(position: Vector, target: Target) -> Message:
+    """Return the set-point of a position: north, east, down from the origin [m]."""
+    return m.MAVLink_set_position_target_local_ned_message(
+        0, *target, WORLD, POSITION, *position, 0, 0, 0, 0, 0, 0, 0, 0
+    )
+
+
+class PositionHold:
+    """Stops, then holds the position where it stopped.
+
+    Args:
+        now_ns: When it begins.
+    """
+
+    period_ns = VELOCITY_PERIOD_NS
+
+    def __init__(self, now_ns: int) -> None:
+        self._begun_ns = now_ns
+        self._position: Vector | None = None
+
+    def message(self, vehicle: VehicleState, target: Target, now_ns: int) -> Message:
+        """Return the set-point that is due now."""
+        slow = vehicle.velocity is not None and math.hypot(*vehicle.velocity) < STOPPED_M_S
+        late = seconds(now_ns - self._begun_ns) > STOPPING_S
+        if self._position is None and vehicle.position is not None and (slow or late):
+            self._position = vehicle.position
+        return (
+            velocity_message(Velocity(), target) if self._position is None else position_message(self._position, target)
+        )
+
+
+class VelocitySetpoint:
+    """Flies a velocity.
+
+    Args:
+        action: The velocity; may be replaced in flight.
+    """
+
+    period_ns = VELOCITY_PERIOD_NS
+
+    def __init__(self, action: Velocity) -> None:
+        self.action = action
+
+    def message(self, vehicle: VehicleState, target: Target, now_ns: int) -> Message:  # noqa: ARG002
+        """Return the set-point that is due now."""
+        return velocity_message(self.action, target)
+
+
+class AttitudeSetpoint:
+    """Flies an attitude with climb rate and yaw rate; the heading that is asked for turns step by step.
+
+    Args:
+        action: The attitude; may be replaced in flight.
+        thrust: Makes the thrust of a climb rate.
+    """
+
+    period_ns = ATTITUDE_PERIOD_NS
+
+    def __init__(self, action: Attitude, thrust: ThrustModel) -> None:
+        self.action = action
+        self._thrust = thrust
+        self._yaw: float | None = None  # clockwise from north
+        self._before_ns: int | None = None
+
+    def within(self, action: Attitude) -> Attitude:
+        """Return the attitude with a climb rate that the autopilot takes."""
+        return Attitude(action.roll, action.pitch, self._thrust.limit_climb(action.climb), action.yaw_rate)
+
+    def message(self, vehicle: VehicleState, target: Target, now_ns: int) -> Message:
+        """Return the set-point that is due now."""
+        action = self.action
+        step_s = 0.0 if self._before_ns is None else min(MOST_STEP_S, seconds(now_ns - self._before_ns))
+        self._before_ns = now_ns
+        yaw = self._turned(vehicle.yaw, action.yaw_rate, step_s)
+        climbing = None if vehicle.velocity is None else -vehicle.velocity[2]
+        tilt = math.hypot(action.roll, action.pitch)
+        thrust = self._thrust.thrust(action.climb, climbing, tilt, step_s)
+        q = list(quaternion_from_euler(action.roll, -action.pitch, yaw))
+        return m.MAVLink_set_attitude_target_message(0, *target, ATTITUDE_AND_THRUST, q, 0, 0, 0, thrust)
+
+    def _turned(self, heading: float | None, yaw_rate: float, step_s: float) -> float:
+        if self._yaw is None:
+            self._yaw = heading if heading is not None else 0.0
+        self._yaw -= yaw_rate * step_s
+        if heading is not None:
+            lead = wrap_angle(self._yaw - heading)
+            self._yaw = heading + max(-MOST_YAW_LEAD_RAD, min(MOST_YAW_LEAD_RAD, lead))
+        return self._yaw
+
+
+Setpoint = PositionHold | VelocitySetpoint | AttitudeSetpoint
+
+
+PATIENCE_NS: Final = nanoseconds(6.0)  #: a take-off that nobody asked for in so long is given up if it is not armed
+RISING_NS: Final = nanoseconds(8.0)  #: an armed one that does not leave the ground by then is given up
+ARM_PACE_S: Final = 1.0
+ARMED_NS: Final = nanoseconds(2.5)  #: how long an acknowledgement of arming counts, until a heartbeat shows it
+ARM: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (1.0,))
+LEFT_GROUND_M: Final = 0.3
+CUT_SHORT: Final = 0.5  #: a take-off that holds its position below this share of its height was stopped by somebody
+STRAYED_NS: Final = nanoseconds(0.6)  #: another mode must show for so long, as messages may overtake one another
+STALLED_NS: Final = nanoseconds(6.0)  #: no higher than before for so long means that something cancelled the climb
+
+
+class TakeoffSequence:
+    """One take-off, from a vehicle that stands disarmed in whatever mode to one that hovers. Level-triggered.
+
+    Each step asks for what is missing: the mode to arm in, arming, the command. Refusals are reported with the
+    vehicle's own words, and tried again, for as long as somebody asks for the take-off. ``asked_ns``: when that was
+    last.
+
+    Args:
+        autopilot: What this autopilot does differently.
+        height_m: Above the start.
+        now_ns: When it begins.
+    """
+
+    def __init__(self, autopilot: AutopilotProfile, height_m: float, now_ns: int) -> None:
+        self.asked_ns = now_ns
+        self.done = False
+        self.given_up = ""  #: why, once it is
+        self.taken_over = False  #: somebody chose another mode in the air
+        self.rose = False  #: it left the ground
+        self.lead_ns: int | None = None  #: since when set-points flow
+        self.reason = ""  #: the vehicle's own, of why it can't be armed
+        self._autopilot = autopilot
+        self._height_m = height_m
+        self._begun_ns = now_ns
+        self._armed_ns: int | None = None  # when it was first seen armed, or arming was acknowledged
+        self._climb_command: VehicleCommand | None = None
+        self._best_m = -1.0
+        self._best_ns = now_ns
+        self._position: Vector | None = None
+        self._position_ns: int | None = None
+        self._ground_m: float | None = None
+        self._other_ns: int | None = None
+        self._sent_ns = 0
+        self._seen = not autopilot.TAKING_OFF  # its mode for taking off, where it has one
+        self.refused = ""  #: why it is not armed yet
+        self.armed_here = False  #: not by others before
+        self._ready = False  # it was seen armed in the mode that it takes off in
+
+    @property
+    def started(self) -> bool:
+        """Whether the vehicle is armed for it: from then on it goes on by itself."""
+        return self._armed_ns is not None
+
+    def step(self, vehicle: VehicleState, commands: CommandSender, now_ns: int) -> list[Message]:
+        """Ask for what is missing, and return the set-points that are due.
+
+        Args:
+            vehicle: What is known of it.
+            commands: Sends what is asked for.
+            now_ns: The present time.
+        """
+        self._observe(vehicle, commands, now_ns)
+        if self.done or self.given_up or self.taken_over or self._other_ns is not None:
+            return []
+        if self.rose:
+            return self._climb(vehicle, commands.target, now_ns)
+        if not vehicle.armed and vehicle.mode != self._autopilot.ARMING and self._climb_command is None:
+            commands.request(self._autopilot.mode_command(self._autopilot.ARMING), now_ns)
+        elif self._armed_ns is None:
+            self.armed_here = True
+            commands.request(ARM, now_ns, ARM_PACE_S)
+        elif vehicle.mode in (self._autopilot.ARMING, *self._autopilot.TAKING_OFF) or self._climb_command is not None:
+            self._climb_command = self._climb_command or self._autopilot.takeoff_command(self._height_m, vehicle)
+            if self._climb_command is not None:
+                commands.request(self._climb_command, now_ns, ARM_PACE_S)
+        else:
+            commands.request(self._autopilot.mode_command(self._autopilot.ARMING), now_ns)
+        return []
+
+    def _observe(self, vehicle: VehicleState, commands: CommandSender, now_ns: int) -> None:
+        """Judge what came of it so far."""
+        answer = commands.result(ARM.number, self._begun_ns)
+        if self._armed_ns is None:
+            if vehicle.armed or answer == ACCEPTED:
+                self._armed_ns = now_ns
+                self.refused = ""
+            elif answer is not None:
+                self.refused = f"arming was {result_name(answer)}" + (f": {self.reason}" if self.reason else "")
+            if self._armed_ns is None and now_ns - self.asked_ns > PATIENCE_NS:
+                self.given_up = self.refused or "the vehicle does not answer"
+            return
+        height = vehicle.altitude_m if vehicle.altitude_m is not None else 0.0
+        self._seen = self._seen or vehicle.mode in self._autopilot.TAKING_OFF
+        told = self._climb_command is not None or vehicle.mode in self._autopilot.TAKING_OFF
+        self.rose = self.rose or (told and vehicle.armed and self._is_off_ground(vehicle.landed, height))
+        cut_short = self._is_cut_short(vehicle)
+        self._observe_mode(vehicle, cut_short, now_ns)
+        if not vehicle.armed and now_ns - self._armed_ns > ARMED_NS:
+            self.given_up = "the vehicle disarmed itself"
+        elif not self.rose and now_ns - self._armed_ns > RISING_NS:
+            result = commands.result(m.MAV_CMD_NAV_TAKEOFF, self._begun_ns)
+            refused = f": the take-off was {result_name(result)}" if result not in (None, ACCEPTED) else ""
+            self.given_up = f"it does not leave the ground{refused}"
+        elif not cut_short and self._autopilot.has_taken_off(vehicle, self._height_m, self.rose and self._seen):
+            self.done = True
+        elif self._position_ns is not None and now_ns - self._position_ns > STALLED_NS:
+            self.done = True  # as high as it gets, by the altitude that it reports
+        if height > self._best_m + 0.05:
+            self._best_m, self._best_ns = height, now_ns
+
+    def _is_off_ground(self, landed: Landed, height_m: float) -> bool:
+        """Return whether the vehicle is off the ground, by its own word, or by its altitude where it has none."""
+        if landed is not Landed.UNKNOWN:
+            return landed is not Landed.ON_GROUND
+        if self._ground_m is None:
+            self._ground_m = height_m
+        return height_m - self._ground_m > LEFT_GROUND_M
+
+    def _is_cut_short(self, vehicle: VehicleState) -> bool:
+        """Return whether somebody chose the mode for holding the position on the way up; a take-off ends in it, too."""
+        if not (self._autopilot.TAKING_OFF and self.rose and self._seen and vehicle.mode == self._autopilot.HOLD):
+            return False
+        return vehicle.altitude_m is not None and vehicle.altitude_m < CUT_SHORT * self._height_m
+
+    def _observe_mode(self, vehicle: VehicleState, cut_short: bool, now_ns: int) -> None:
+        """Notice that somebody chose another mode, on the ground already."""
+        autopilot, mode = self._autopilot, vehicle.mode
+        ours = mode in autopilot.TAKING_OFF or (mode in (autopilot.ARMING, autopilot.GUIDED) and not cut_short)
+        self._ready = self._ready or (ours and vehicle.armed)
+        if ours or not (self.rose or self._ready):
+            self._other_ns = None
+        elif self._other_ns is None:
+            self._other_ns = now_ns
+        elif now_ns - self._other_ns >= STRAYED_NS:
+            self.taken_over = True
+
+    def _climb(self, vehicle: VehicleState, target: tuple[int, int], now_ns: int) -> list[Message]:
+        """Return set-points where they must flow before the mode that follows them, which goes on from here.
+
+        If the climb was cancelled: a position to go to, which is all that helps an ArduCopter.
+        """
+        stalled = now_ns - self._best_ns > STALLED_NS and vehicle.mode == self._autopilot.GUIDED
+        if self._position is None:
+            if not stalled or vehicle.position is None or vehicle.altitude_m is None:
+                return self._lead(target, now_ns)
+            north, east, down = vehicle.position
+            self._position, self._position_ns = (north, east, down + vehicle.altitude_m - self._height_m), now_ns
+        if now_ns - self._sent_ns < VELOCITY_PERIOD_NS:
+            return []
+        self._sent_ns = now_ns
+        return [position_message(self._position, target)]
+
+    def _lead(self, target: tuple[int, int], now_ns: int) -> list[Message]:
+        if not self._autopilot.LEAD_S or now_ns - self._sent_ns < VELOCITY_PERIOD_NS:
+            return []
+        self._sent_ns = now_ns
+        self.lead_ns = self.lead_ns or now_ns
+        return [velocity_message(Velocity(), target)]

@@ -1,0 +1,334 @@
+"""MAVLink's microservices: choice of the vehicle, commands, message intervals, time, poses from outside. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from skyloop.clock import nanoseconds, seconds
+from skyloop.drivers.live_clock import LiveClock
+from skyloop.drivers.mavlink.options import Peer, PoseMessage
+from skyloop.drivers.mavlink.telemetry import Telemetry
+from skyloop.drivers.notices import Notice
+from skyloop.drivers.seams import ExternalPose
+from skyloop.messages import EventKind, Severity
+from skyloop.messages.geometry import quaternion_from_euler
+from skyloop.wire.mavlink.axes import Quaternion, angles_of, swap, yaw_between
+from skyloop.wire.mavlink.codec import Message
+from skyloop.wire.mavlink.codec import dialect as m
+from skyloop.wire.mavlink.modes import Autopilot
+
+AUTOPILOT_COMPONENT: Final = 1
+MOST_OTHERS: Final = 16  #: other vehicles that are reported; a hostile sender can make up any number
+_NO_AUTOPILOT: Final = m.MAV_AUTOPILOT_INVALID
+_GROUND_STATION: Final = m.MAV_TYPE_GCS
+#: MAV_TYPE of what holds itself in the air by several rotors.
+_MULTIROTORS: Final = frozenset({2, 3, 4, 13, 14, 15, 29, 35})
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleIdentity:
+    """A vehicle that is heard."""
+
+    system: int
+    component: int
+    peer: Peer
+
+
+class VehicleSelector:
+    """Chooses the vehicle that is flown among all that are heard.
+
+    Args:
+        system: Its system id; None: the first that is heard, and after that only that system.
+        peer: Its address and port; None: any.
+    """
+
+    def __init__(self, system: int | None, peer: tuple[str, int] | None) -> None:
+        self.system = system
+        self.chosen: VehicleIdentity | None = None
+        self._wanted_peer = peer
+        self._told: set[VehicleIdentity] = set()
+
+    def on_message(self, message: Message, peer: Peer) -> list[Notice]:
+        """Handle any message; return notices of other vehicles."""
+        if message.get_type() != "HEARTBEAT" or not _is_vehicle(message):
+            return []
+        found = VehicleIdentity(message.get_srcSystem(), message.get_srcComponent(), peer)
+        if self.chosen == found:
+            return []
+        suits = self.system in (None, found.system) and self._wanted_peer in (None, peer)
+        if self.chosen is None and suits:
+            self.chosen, self.system = found, found.system
+            return []
+        return self._notice_other(found)
+
+    def is_chosen(self, message: Message, peer: Peer) -> bool:
+        """Return whether the vehicle that is flown sent it."""
+        chosen = self.chosen
+        return (
+            chosen is not None
+            and message.get_srcSystem() == chosen.system
+            and message.get_srcComponent() == chosen.component
+            and peer == chosen.peer
+        )
+
+    def forget(self) -> None:
+        """Forget the chosen vehicle: it may come back from another peer, as the same system."""
+        self.chosen = None
+
+    def _notice_other(self, found: VehicleIdentity) -> list[Notice]:
+        if found in self._told or len(self._told) >= MOST_OTHERS:
+            return []
+        self._told.add(found)
+        where = f" at {found.peer[0]}:{found.peer[1]}" if found.peer is not None else ""
+        text = f"another vehicle is heard, system {found.system}{where}: it is left alone"
+        if self.chosen is not None and found.system == self.chosen.system:
+            text += "; two with one id are told apart by ?peer=HOST:PORT"
+        else:
+            text += f"; ?sysid={found.system} chooses it"
+        return [
+            Notice(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, {"reason": "another", "system": found.system})
+        ]
+
+
+def _is_vehicle(heartbeat: Message) -> bool:
+    return bool(
+        heartbeat.get_srcComponent() == AUTOPILOT_COMPONENT
+        and heartbeat.get_srcSystem() != 0
+        and heartbeat.autopilot != _NO_AUTOPILOT
+        and heartbeat.type != _GROUND_STATION
+    )
+
+
+def unsupported_reason(heartbeat: Message) -> str:
+    """Return why this vehicle can't be flown from here; empty if it can."""
+    if heartbeat.autopilot not in tuple(Autopilot):
+        return f"its autopilot is number {heartbeat.autopilot} of MAVLink; ArduCopter and PX4 are known here"
+    if heartbeat.type not in _MULTIROTORS:
+        return f"it is of MAVLink's type {heartbeat.type}, which is no multirotor or helicopter"
+    return ""
+
+
+ACCEPTED: Final = 0
+IN_PROGRESS: Final = 5
+_RESULTS: Final = {
+    0: "accepted",
+    1: "temporarily rejected",
+    2: "denied",
+    3: "unsupported",
+    4: "failed",
+    5: "in progress",
+    6: "cancelled",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleCommand:
+    """A MAVLink command: its ``MAV_CMD`` number and up to seven arguments."""
+
+    number: int
+    arguments: tuple[float, ...] = ()
+
+
+def result_name(result: int) -> str:
+    """Return a ``MAV_RESULT`` in words."""
+    return _RESULTS.get(result, f"result {result}")
+
+
+class CommandSender:
+    """Sends commands and keeps their results.
+
+    Level-triggered: whoever wants an effect calls :meth:`request` again and again until it shows.
+    """
+
+    def __init__(self) -> None:
+        self.target = (1, 1)  #: system and component
+        self._out: list[Message] = []
+        self._said: dict[VehicleCommand, tuple[int, int]] = {}  # when last, and how often
+        self._answers: dict[int, tuple[int, int]] = {}  # command: result, when
+
+    def request(self, command: VehicleCommand, now_ns: int, pace_s: float = 0.5) -> None:
+        """Send a command, unless it was sent within ``pace_s``.
+
+        Args:
+            command: Number and arguments.
+            now_ns: The present time.
+            pace_s: Between repeats [s].
+        """
+        last_ns, times = self._said.get(command, (None, 0))
+        if last_ns is not None and now_ns - last_ns < nanoseconds(pace_s):
+            return
+        if last_ns is None or now_ns - last_ns > 4 * nanoseconds(pace_s):
+            times = 0  # not a repeat of the same asking
+        self._said[command] = now_ns, times + 1
+        arguments = (*command.arguments, *[0.0] * (7 - len(command.arguments)))
+        self._out.append(m.MAVLink_command_long_message(*self.target, command.number, min(times, 255), *arguments))
+
+    def on_ack(self, message: Message, now_ns: int) -> None:
+        """Handle a ``COMMAND_ACK`` for us."""
+        if message.result != IN_PROGRESS:
+            self._answers[message.command] = message.result, now_ns
+
+    def result(self, command: int, since_ns: int) -> int | None:
+        """Return the newest result of a command, if it came since ``since_ns``."""
+        found = self._answers.get(command)
+        return found[0] if found is not None and found[1] >= since_ns else None
+
+    def reset(self) -> None:
+        """Forget everything: the vehicle was lost."""
+        self._out.clear()
+        self._said.clear()
+        self._answers.clear()
+
+    def pop_messages(self) -> list[Message]:
+        """Return the messages to send now."""
+        out, self._out = self._out, []
+        return out
+
+
+AT_ONCE: Final = 4  #: requests in a tick: a slow link needs room for others
+RETRY_S: Final = 3.0  #: a message that was accepted and does not flow is asked for again
+PATIENT_RETRY_S: Final = 20.0  #: the same after :data:`TRIES`, as the vehicle may not have it
+TRIES: Final = 4
+
+
+class MessageIntervals:
+    """Asks for messages at the rates that feedback needs, and again while they do not flow.
+
+    Args:
+        rates: By the message's name [1/s].
+    """
+
+    def __init__(self, rates: Mapping[str, float]) -> None:
+        self._rates = dict(rates)
+        self._asked: dict[str, tuple[int, int]] = {}  # when last, and how often
+        self._slow: set[str] = set()
+
+    def request_missing(self, telemetry: Telemetry, commands: CommandSender, now_ns: int) -> None:
+        """Ask for messages that do not flow, at most :data:`AT_ONCE` of them."""
+        left = AT_ONCE
+        for name, rate_hz in self._rates.items():
+            if not left:
+                return
+            asked_ns, times = self._asked.get(name, (None, 0))
+            if asked_ns is not None:
+                wait_s = RETRY_S if times < TRIES else PATIENT_RETRY_S
+                age_s = telemetry.age_s(name, now_ns)
+                if age_s is not None and age_s < max(RETRY_S, 3.0 / rate_hz):
+                    continue
+                if now_ns - asked_ns < nanoseconds(wait_s):
+                    continue
+            self._asked[name] = now_ns, times + 1
+            number = getattr(m, f"MAVLINK_MSG_ID_{name}")
+            commands.request(VehicleCommand(m.MAV_CMD_SET_MESSAGE_INTERVAL, (number, 1e6 / rate_hz)), now_ns, 0.0)
+            left -= 1
+
+
+ASK_NS: Final = nanoseconds(1.0)
+HURRY_NS: Final = nanoseconds(0.1)  #: between the first few
+FIRST: Final = 5
+KEEP_NS: Final = nanoseconds(10.0)
+PLAUSIBLE_NS: Final = nanoseconds(1.0)  #: a stamp that would be older than this when it arrives is of another clock
+REBOOT_MS: Final = 1000  #: stamps that go back by more mean that the vehicle was restarted
+_HALF: Final = 1 << 31
+_WRAP: Final = 1 << 32  #: of stamps in ms: 49 days
+
+
+class VehicleClock:
+    """Maps a vehicle's stamps to this host's clock: by ``TIMESYNC`` where that fits, else by the smallest delay."""
+
+    def __init__(self) -> None:
+        self.round_trip_s: float | None = None  #: of the best answer lately
+        self.restarted = False  #: its clock was set back; read and cleared by the owner
+        self._samples: deque[tuple[int, int, int]] = deque()  # when, round trip, their clock minus ours
+        self._asked_ns = 0
+        self._asked = 0
+        self._live = LiveClock()
+        self._stamp_ms: int | None = None
+        self._captured_ns = 0
+
+    def poll(self, now_ns: int) -> list[Message]:
+        """Return the ``TIMESYNC`` request that is due now, stamped on our clock."""
+        if now_ns - self._asked_ns < (HURRY_NS if self._asked < FIRST else ASK_NS):
+            return []
+        self._asked_ns, self._asked = now_ns, self._asked + 1
+        return [m.MAVLink_timesync_message(0, now_ns)]
+
+    def on_timesync(self, message: Message, now_ns: int) -> list[Message]:
+        """Handle a ``TIMESYNC``; return the answer, if it is a request."""
+        if message.tc1 == 0:
+            return [m.MAVLink_timesync_message(now_ns, message.ts1)]
+        round_trip_ns = now_ns - message.ts1
+        if 0 <= round_trip_ns <= PLAUSIBLE_NS and self._asked:
+            self._samples.append((now_ns, round_trip_ns, message.tc1 - (message.ts1 + round_trip_ns // 2)))
+            while now_ns - self._samples[0][0] > KEEP_NS:
+                self._samples.popleft()
+            self.round_trip_s = seconds(min(each[1] for each in self._samples))
+        return []
+
+    def captured_ns(self, boot_ms: int, now_ns: int) -> int:
+        """Return when a state was captured: neither after ``now_ns`` nor before the last one.
+
+        Args:
+            boot_ms: The state's stamp, in milliseconds since the vehicle's start, 32 bits.
+            now_ns: When it arrived.
+        """
+        before, self._stamp_ms = self._stamp_ms, boot_ms
+        if before is not None:
+            step = (boot_ms - before + _HALF) % _WRAP - _HALF
+            if step < -REBOOT_MS and boot_ms < before:
+                self.restarted = True
+        live_ns = self._live.captured_ns(boot_ms / 1000.0, now_ns)
+        if self._samples:
+            _, _, offset_ns = min(self._samples, key=lambda each: each[1])
+            synced_ns = boot_ms * 1_000_000 - offset_ns
+            # Stamps are cut to whole milliseconds, so they may be that much too early.
+            if 0 <= now_ns - synced_ns <= PLAUSIBLE_NS:
+                live_ns = synced_ns
+        self._captured_ns = max(self._captured_ns, min(now_ns, live_ns))
+        return self._captured_ns
+
+    def now(self, now_ns: int) -> int:
+        """Return the capture time of a state without a stamp."""
+        self._captured_ns = max(self._captured_ns, now_ns)
+        return self._captured_ns
+
+
+WORLD: Final = m.MAV_FRAME_LOCAL_NED
+BODY: Final = m.MAV_FRAME_BODY_FRD
+_NAN: Final = math.nan
+
+
+def pose_message(pose: ExternalPose, kind: PoseMessage) -> Message:
+    """Return a pose from outside as a message.
+
+    The message has north, east, down [m] and the angles of a body whose axes are forward, right, down [rad]. Its time
+    is in microseconds of our own clock: ``TIMESYNC`` tells it to the vehicle.
+
+    Args:
+        pose: In our axes.
+        kind: The message that it becomes.
+    """
+    position = swap(*pose.position)
+    roll, pitch, yaw = angles_of(pose.quaternion)
+    angles = roll, 0.0 - pitch, yaw_between(yaw)
+    covariance = _covariance(pose)
+    if kind is PoseMessage.VISION:
+        return m.MAVLink_vision_position_estimate_message(pose.captured_ns // 1000, *position, *angles, covariance, 0)
+    q: Quaternion = quaternion_from_euler(*angles)
+    unknown = [_NAN] * 21
+    estimator = m.MAV_ESTIMATOR_TYPE_MOCAP
+    return m.MAVLink_odometry_message(
+        pose.captured_ns // 1000, WORLD, BODY, *position, list(q), *[_NAN] * 6, covariance, unknown, 0, estimator, 100
+    )
+
+
+def _covariance(pose: ExternalPose) -> list[float]:
+    """Return the upper right triangle of x, y, z, roll, pitch, yaw; its first number is NaN where nothing is known."""
+    if pose.position_std_m is None or pose.attitude_std_rad is None:
+        return [_NAN] * 21
+    variances = [pose.position_std_m**2] * 3 + [pose.attitude_std_rad**2] * 3
+    return [variances[row] if row == column else 0.0 for row in range(6) for column in range(row, 6)]

@@ -1,0 +1,370 @@
+"""The protocol of one vehicle, from its first heartbeat on: bytes in, bytes and sink callbacks out. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Final, TypeAlias
+
+from skyloop.clock import nanoseconds
+from skyloop.drivers.link_trouble import LinkTrouble, serial_trouble, trouble_of
+from skyloop.drivers.mavlink.autopilots import AutopilotProfile, profile_of
+from skyloop.drivers.mavlink.microservices import (
+    CommandSender,
+    MessageIntervals,
+    VehicleClock,
+    VehicleCommand,
+    VehicleIdentity,
+    VehicleSelector,
+    unsupported_reason,
+)
+from skyloop.drivers.mavlink.options import ConnectionKind, MavlinkOptions, Peer, limits_text, takeoff_height
+from skyloop.drivers.mavlink.parameters import ParameterExchange
+from skyloop.drivers.mavlink.setpoints import SetpointController
+from skyloop.drivers.mavlink.telemetry import HealthMonitor, Telemetry, VehicleState, feedback_of
+from skyloop.drivers.notices import Notice
+from skyloop.drivers.vehicle_session import LinkTimeouts, VehicleSession
+from skyloop.errors import DriverError
+from skyloop.messages import AnyAction, EventKind, FlightState, LinkState, Severity, Value
+from skyloop.wire.mavlink.codec import Codec, Message
+from skyloop.wire.mavlink.codec import dialect as m
+from skyloop.wire.mavlink.parameter_values import BYTEWISE
+
+TICK_NS: Final = nanoseconds(0.02)
+HEARTBEAT_NS: Final = nanoseconds(1.0)
+DEGRADED_NS: Final = nanoseconds(1.2)  #: of silence
+LOST_NS: Final = nanoseconds(2.5)
+FIRST_WORD_NS: Final = nanoseconds(2.5)  #: a vehicle not heard by then is reported as lost
+PARAMETERS_NS: Final = nanoseconds(25.0)  #: the list may take so long, then the link is up without it
+QUIET_ATTITUDE_S: Final = 0.5  #: without it, other messages make feedback
+VERSION_PACE_S: Final = 1.0
+OWN_COMPONENT: Final = 190  #: MAV_COMP_ID_MISSIONPLANNER, a ground station
+_ANSWERS: Final = ("COMMAND_ACK", "PARAM_VALUE", "TIMESYNC")
+
+Packet: TypeAlias = tuple[bytes, Peer]
+_ASK_VERSION: Final = VehicleCommand(m.MAV_CMD_REQUEST_MESSAGE, (float(m.MAVLINK_MSG_ID_AUTOPILOT_VERSION),))
+
+
+class MavlinkSession(VehicleSession):
+    """The protocol of one opened driver with its vehicle. Not thread-safe.
+
+    Args:
+        options: Of the vehicle's address.
+        now_ns: The time of opening.
+        extra: Gives telemetry of others for feedback's ``native``.
+    """
+
+    TIMEOUTS = LinkTimeouts(DEGRADED_NS, LOST_NS, FIRST_WORD_NS)
+
+    def __init__(
+        self, options: MavlinkOptions, now_ns: int, *, extra: Callable[[], Mapping[str, Value]] = dict
+    ) -> None:
+        super().__init__(now_ns)
+        self.options = options
+        self.codec = Codec(options.own_system, OWN_COMPONENT, key=options.key)
+        self.telemetry = Telemetry()
+        self.parameters = ParameterExchange()
+        self.commands = CommandSender()
+        self.clock = VehicleClock()
+        self.autopilot: AutopilotProfile | None = None  #: None until it is recognised, and for one not known here
+        self.setpoints: SetpointController | None = None  #: None until then, and for what can't be flown
+        self.version: Message | None = None  #: its AUTOPILOT_VERSION
+        self.limits = options.limits  #: the driver's own
+        self._extra = extra
+        self._selector = VehicleSelector(options.system, options.peer)
+        self._health = HealthMonitor()
+        self._intervals = MessageIntervals({})
+        self._out: list[Message] = []
+        self._found_ns = 0
+        self._beaten_ns = -HEARTBEAT_NS
+        self._old = False  # it speaks MAVLink 1
+        self._signed = 0
+        self._unsupported_reason = "it is not heard"
+        self._set_link_state(LinkState.CONNECTING, f"waiting for a heartbeat on {options.address}")
+
+    @property
+    def identity(self) -> VehicleIdentity | None:
+        """The vehicle that was chosen; None while none is heard."""
+        return self._selector.chosen
+
+    @property
+    def description(self) -> str:
+        """Autopilot, version and system, for people."""
+        if self.autopilot is None:
+            return "an autopilot that is not known here"
+        system = self._selector.system
+        version = self.version.flight_sw_version if self.version is not None else 0
+        number = f" {version >> 24}.{version >> 16 & 0xFF}.{version >> 8 & 0xFF}" if version else ""
+        old = ", MAVLink 1" if self._old else ""
+        return f"{self.autopilot.NAME}{number}, system {system}{old}"
+
+    # From the driver ---------------------------------------------------------------------------------------------
+
+    def command(self, action: AnyAction, now_ns: int, *, alone: bool = False, new: bool = True) -> AnyAction:
+        """Accept an action. See :meth:`SetpointController.apply`.
+
+        Args:
+            action: What is asked for.
+            now_ns: The present time.
+            alone: Whether nobody is in command: a failsafe.
+            new: Whether an application newly asked for it; False for the library's repeats.
+
+        Returns:
+            What is applied.
+
+        Raises:
+            DriverError: The vehicle can't be flown, can't do this now, or somebody else has it.
+        """
+        if self.setpoints is None:
+            raise DriverError(f"the vehicle can't be flown: {self._unsupported_reason}")
+        applied = self.setpoints.apply(action, self.vehicle_state(now_ns), now_ns, alone=alone, new=new)
+        self.due_ns = now_ns
+        return applied
+
+    def send(self, message: Message) -> None:
+        """Send a message to the vehicle with the next tick."""
+        self._out.append(message)
+        self.due_ns = 0
+
+    def _new_notices(self) -> list[Notice]:
+        return self.setpoints.notices() if self.setpoints is not None else []
+
+    def close(self) -> None:
+        """End the session: parameter writes under way fail."""
+        self.parameters.fail_writes("the driver was closed")
+
+    def vehicle_state(self, now_ns: int) -> VehicleState | None:
+        """Return what is known of the vehicle; None while it is not heard."""
+        custom_mode = self.telemetry.custom_mode()
+        if self._heard_ns is None or self.autopilot is None or custom_mode is None:
+            return None
+        ready = self.autopilot.ready(self.telemetry, now_ns)
+        return self.telemetry.state(self.autopilot.mode_of(custom_mode), ready, now_ns)
+
+    # From the connection -----------------------------------------------------------------------------------------
+
+    def receive(self, data: bytes, peer: Peer, now_ns: int, *, whole: bool) -> None:
+        """Handle bytes that came. Never raises, whatever they hold.
+
+        Args:
+            data: What came.
+            peer: Where a datagram came from.
+            now_ns: When it came.
+            whole: Whether ``data`` is a datagram; if not, it is a piece of a stream.
+        """
+        for message in self.codec.decode(data, whole=whole):
+            self._on_message(message, peer, now_ns)
+        if self.codec.signed > self._signed:
+            first, self._signed = not self._signed, self.codec.signed
+            if first:
+                text = "the vehicle signs its messages: give its key with ?signing_key=FILE; nothing is taken without"
+                self._unreachable = text
+                self._notice(Notice(EventKind.DRIVER_ERROR, text, Severity.ERROR, {"where": "signing"}))
+
+    def connected(self) -> None:
+        """Handle a new connection: nothing is known yet of what it brings."""
+        self._unreachable = ""
+
+    def _on_message(self, message: Message, peer: Peer, now_ns: int) -> None:
+        for notice in self._selector.on_message(message, peer):
+            self._notice(notice)
+        if not self._selector.is_chosen(message, peer):
+            return
+        kind = message.get_type()
+        if self._heard_ns is None:
+            if kind != "HEARTBEAT":
+                return
+            self._find(message, now_ns)
+        self._heard_ns = now_ns
+        self._old = message.get_msgbuf()[0] == m.PROTOCOL_MARKER_V1
+        if kind not in _ANSWERS:
+            self.telemetry.on_message(message, now_ns)
+        self._dispatch(kind, message, now_ns)
+
+    def _dispatch(self, kind: str, message: Message, now_ns: int) -> None:
+        if kind == "ATTITUDE":
+            captured_ns = self.clock.captured_ns(message.time_boot_ms, now_ns)
+            if self.clock.restarted:
+                self.parameters.complete = False
+                self._lose("the vehicle was started anew", now_ns)
+                return
+            self._publish(captured_ns, now_ns)
+        elif kind == "COMMAND_ACK":
+            if message.target_system in (0, self.options.own_system):
+                self.commands.on_ack(message, now_ns)
+                self.due_ns = 0
+        elif kind == "PARAM_VALUE":
+            self.parameters.on_value(message, now_ns)
+        elif kind == "TIMESYNC":
+            self._out += self.clock.on_timesync(message, now_ns)
+        elif kind == "STATUSTEXT":
+            for notice in self._health.on_text(message):
+                self._notice(notice)
+                if self.setpoints is not None and notice.data["reason"] == "prearm":
+                    self.setpoints.on_prearm_reason(notice.text)
+        elif kind == "AUTOPILOT_VERSION":
+            self.version = message
+            self.parameters.bytewise = bool(message.capabilities & BYTEWISE)
+        elif kind in ("HEARTBEAT", "LOCAL_POSITION_NED", "EXTENDED_SYS_STATE"):
+            age_s = self.telemetry.age_s("ATTITUDE", now_ns)
+            if age_s is None or age_s > QUIET_ATTITUDE_S:
+                self._publish(self.clock.now(now_ns), now_ns)
+            if kind == "HEARTBEAT":
+                self.due_ns = 0  # whoever waits for a mode can go on
+
+    def _publish(self, captured_ns: int, now_ns: int) -> None:
+        vehicle = self.vehicle_state(now_ns)
+        native: dict[str, Value] = dict(self._extra())
+        native["link.frames"], native["link.damaged"] = self.codec.frames, self.codec.damaged
+        if vehicle is not None:
+            native["mavlink.mode"], native["mavlink.armed"] = vehicle.mode, vehicle.armed
+            if vehicle.ready is not None:
+                native["mavlink.ready"] = vehicle.ready
+        if self.clock.round_trip_s is not None:
+            native["link.round_trip_s"] = self.clock.round_trip_s
+        state = self.setpoints.state(vehicle) if self.setpoints is not None else observed_state(vehicle)
+        feedback = feedback_of(self.telemetry, state, captured_ns, now_ns, native)
+        self._pending.append(lambda sink: sink.feedback(feedback))
+
+    # Time --------------------------------------------------------------------------------------------------------
+
+    def poll(self, now_ns: int) -> list[Packet]:
+        """Return the packets to send now."""
+        self.due_ns = now_ns + TICK_NS
+        self._check_silence(now_ns)
+        identity = self.identity
+        peer = identity.peer if identity is not None else self.options.peer
+        packets = self._heartbeats(peer, now_ns)
+        out, self._out = self._out, []
+        if self._heard_ns is not None:
+            out += self.clock.poll(now_ns)
+            out += self._fly(now_ns)
+            self._check_health(now_ns)
+        packets += [(self._encoded(message), peer) for message in out]
+        return packets
+
+    def _fly(self, now_ns: int) -> list[Message]:
+        vehicle = self.vehicle_state(now_ns)
+        if self.version is None:
+            self.commands.request(_ASK_VERSION, now_ns, VERSION_PACE_S)
+        self._intervals.request_missing(self.telemetry, self.commands, now_ns)
+        messages = (
+            self.setpoints.messages(vehicle, now_ns) if self.setpoints is not None and vehicle is not None else []
+        )
+        return self.commands.pop_messages() + messages + self.parameters.poll(now_ns)
+
+    def _heartbeats(self, peer: Peer, now_ns: int) -> list[Packet]:
+        """Return the heartbeat when it is due.
+
+        A vehicle that speaks MAVLink 1 gets both versions: some autopilots change over once they hear the new one.
+        """
+        if now_ns - self._beaten_ns < HEARTBEAT_NS:
+            return []
+        self._beaten_ns = now_ns
+        versions = (1, 2) if self._old and self.options.key is None else (2,)
+        return [(self.codec.encode(_heartbeat(), version=version), peer) for version in versions]
+
+    def _encoded(self, message: Message) -> bytes:
+        return self.codec.encode(message, version=1 if self._old and message.id < 256 else 2)
+
+    def _check_health(self, now_ns: int) -> None:
+        vehicle = self.vehicle_state(now_ns)
+        for notice in self._health.update(self.telemetry, vehicle, now_ns):
+            self._notice(notice)
+        exchange = self.parameters
+        if self.link_state is not LinkState.DEGRADED or self._silent(now_ns):
+            return
+        waited = now_ns - self._found_ns > PARAMETERS_NS
+        if not self.options.parameters or exchange.complete or exchange.given_up or waited:
+            self._set_link_state(LinkState.UP)
+
+    def _silent(self, now_ns: int) -> bool:
+        return self._heard_ns is None or now_ns - self._heard_ns >= DEGRADED_NS
+
+    def _describe_silence(self, since: str, why: str) -> str:
+        system = f" of system {self._selector.system}" if self._selector.system is not None else ""
+        return f"no message{system}{since} on {self.options.address}{why}"
+
+    def _advice(self) -> str:
+        address = self.options.address
+        if address.kind is ConnectionKind.UDP_IN:
+            return f"have the vehicle send to UDP port {address.number} of this computer, and its firewall let that in"
+        if address.kind is ConnectionKind.SERIAL:
+            return f"check the vehicle's power, cable and speed ({address.number} bits a second are in the address)"
+        return f"join the vehicle's network, or start it at {address.place}, and check host and port in the address"
+
+    def _trouble(self, error: OSError) -> LinkTrouble:
+        address = self.options.address
+        if address.kind is ConnectionKind.SERIAL:
+            return serial_trouble(error, address.place, self._advice())
+        return trouble_of(error, self._advice())
+
+    # Losing and finding ------------------------------------------------------------------------------------------
+
+    def _lose(self, reason: str, now_ns: int) -> None:
+        self._heard_ns = None
+        self._selector.forget()
+        self.parameters.fail_writes(reason)
+        self.commands.reset()
+        self._out.clear()
+        if self.setpoints is not None:
+            self.setpoints.on_link_lost()
+        self.clock = VehicleClock()
+        self._publish(self.clock.now(now_ns), now_ns)  # what it does now is not known
+        self._set_link_state(LinkState.LOST, reason)
+
+    def _find(self, heartbeat: Message, now_ns: int) -> None:
+        self._found_ns, self._unreachable = now_ns, ""
+        target = heartbeat.get_srcSystem(), heartbeat.get_srcComponent()
+        self.commands.target = self.parameters.target = target
+        if self.autopilot is None:
+            self._identify(heartbeat)
+        if self.autopilot is not None:
+            self._intervals = MessageIntervals(self.autopilot.message_rates(self.options.rate_hz))
+        if self.options.origin is not None:
+            self._out.append(_origin(target[0], self.options.origin))
+        if self.options.parameters and not self.parameters.complete:
+            self.parameters.request_all(now_ns)
+        text = "its parameters are being read" if self.options.parameters else ""
+        self._set_link_state(LinkState.DEGRADED, text)
+
+    def _identify(self, heartbeat: Message) -> None:
+        found = profile_of(heartbeat.autopilot)
+        self._unsupported_reason = unsupported_reason(heartbeat)
+        if self._unsupported_reason:
+            text = f"the vehicle is heard and can't be flown: {self._unsupported_reason}"
+            self._notice(Notice(EventKind.DRIVER_ERROR, text, Severity.ERROR, {"where": "autopilot"}))
+        self.autopilot = found
+        if found is None:
+            return
+        self.parameters.bytewise = found.BYTEWISE
+        if not self._unsupported_reason:
+            height_m = takeoff_height(self.limits)
+            self.setpoints = SetpointController(
+                found, self.commands, height_m, lambda: found.thrust_model(self.parameters.values)
+            )
+            self._notice(Notice(EventKind.VEHICLE_MESSAGE, limits_text(self.limits), data={"reason": "limits"}))
+
+    def limit(self, limits: Mapping[str, float]) -> None:
+        """Set the driver's own limits."""
+        self.limits = limits
+        if self.setpoints is not None:
+            self.setpoints.takeoff_m = takeoff_height(limits)
+
+
+def observed_state(vehicle: VehicleState | None) -> FlightState:
+    """Return the flight state of a vehicle that can't be flown from here."""
+    if vehicle is None or vehicle.airborne is None:
+        return FlightState.UNKNOWN
+    return FlightState.FLYING if vehicle.airborne else FlightState.LANDED
+
+
+def _heartbeat() -> Message:
+    active = m.MAV_STATE_ACTIVE
+    return m.MAVLink_heartbeat_message(m.MAV_TYPE_GCS, m.MAV_AUTOPILOT_INVALID, 0, 0, active, 3)
+
+
+def _origin(system: int, origin: tuple[float, float, float]) -> Message:
+    latitude, longitude, altitude = origin
+    return m.MAVLink_set_gps_global_origin_message(
+        system, round(latitude * 1e7), round(longitude * 1e7), round(altitude * 1000)
+    )

@@ -1,0 +1,408 @@
+"""Turns the last decided action into the messages that are due at each tick. Pure.
+
+Set-points are streamed while somebody is at the controls, and only in the mode that follows them. A failsafe, a lost
+link and somebody else's change of mode (see :mod:`~skyloop.drivers.mavlink.ownership`) end the stream: from then on
+only the vehicle's own safety nets fly it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from enum import Enum, auto
+from typing import Final
+
+from skyloop.clock import nanoseconds
+from skyloop.drivers.mavlink.autopilots import AutopilotProfile, ThrustModel
+from skyloop.drivers.mavlink.manoeuvres import (
+    STRAYED_NS,
+    AttitudeSetpoint,
+    PositionHold,
+    Setpoint,
+    TakeoffSequence,
+    VelocitySetpoint,
+    velocity_message,
+)
+from skyloop.drivers.mavlink.microservices import CommandSender, VehicleCommand
+from skyloop.drivers.mavlink.ownership import FlightOwnership
+from skyloop.drivers.mavlink.telemetry import VehicleState
+from skyloop.drivers.notices import Notice
+from skyloop.errors import DriverError
+from skyloop.messages import (
+    AnyAction,
+    Attitude,
+    EmergencyStop,
+    EventKind,
+    FlightState,
+    Hover,
+    Idle,
+    Land,
+    ResetEmergency,
+    Severity,
+    Takeoff,
+    Velocity,
+)
+from skyloop.wire.mavlink.codec import Message
+from skyloop.wire.mavlink.codec import dialect as m
+from skyloop.wire.mavlink.modes import Landed
+
+FORCE: Final = 21196.0  #: "even in flight", of the command to disarm
+DISARM: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0,))
+CUT: Final = VehicleCommand(m.MAV_CMD_COMPONENT_ARM_DISARM, (0.0, FORCE))
+CUT_PACE_S: Final = 0.2
+CUT_FOR_NS: Final = nanoseconds(10.0)  #: a stop is sent for so long at most, while the vehicle reports that it is armed
+SETTLING_NS: Final = nanoseconds(3.0)  #: a take-off that is up counts as done by then, in whatever mode
+HURRY_NS: Final = nanoseconds(0.008)  #: a new set-point goes out no sooner after the last than this
+
+
+class Goal(Enum):
+    """What the vehicle is to do."""
+
+    NOTHING = auto()  #: it is left to itself, and to whoever else flies it
+    TAKE_OFF = auto()
+    FOLLOW = auto()  #: a stream of set-points, hovering included
+    HOLD = auto()  #: it holds its position by itself, without a stream
+    LAND = auto()
+
+
+class SetpointController:
+    """Remembers the last action and sends what it needs, tick by tick. Not thread-safe.
+
+    Args:
+        autopilot: What this autopilot does differently.
+        commands: Where commands to the vehicle go.
+        takeoff_m: Height of a take-off above its start.
+        make_thrust: Makes the thrust model for a flight by attitude.
+    """
+
+    def __init__(
+        self,
+        autopilot: AutopilotProfile,
+        commands: CommandSender,
+        takeoff_m: float,
+        make_thrust: Callable[[], ThrustModel],
+    ) -> None:
+        self.takeoff_m = takeoff_m
+        self.goal = Goal.NOTHING
+        self.stopped = False  #: the motors were stopped by us, and not released since
+        self.ownership = FlightOwnership(autopilot)
+        self._autopilot = autopilot
+        self._commands = commands
+        self._make_thrust = make_thrust
+        self._takeoff: TakeoffSequence | None = None
+        self._setpoint: Setpoint | None = None
+        self._lead_ns: int | None = None  # since when the stream flows
+        self._sent_ns = 0
+        self._entered = False  # the mode that is wanted was seen since
+        self._strayed_ns: int | None = None  # since when it is another one again
+        self._settling_ns: int | None = None  # since when a take-off is up, and waits for the mode that follows
+        self._cut_ns = 0
+        self._notices: list[Notice] = []
+
+    # What is decided ---------------------------------------------------------------------------------------------
+
+    def apply(
+        self, action: AnyAction, vehicle: VehicleState | None, now_ns: int, *, alone: bool = False, new: bool = True
+    ) -> AnyAction:
+        """Accept an action.
+
+        An emergency stop is sent from the next tick on, until :data:`CUT_FOR_NS` after the last press at most; until
+        the reset nothing else is. A vehicle whose motors could not be stopped in that time may be reset while it is
+        armed, so that it can be landed.
+
+        Args:
+            action: What is asked for.
+            vehicle: What is known of the vehicle; None while it is not heard.
+            now_ns: The present time.
+            alone: Whether nobody is in command: a failsafe.
+            new: Whether an application newly asked for it; False for the library's repeats.
+
+        Returns:
+            What is applied; idle where the action is ignored.
+
+        Raises:
+            DriverError: It can't be done now, or somebody else has the vehicle.
+        """
+        if isinstance(action, Idle):
+            return action
+        if isinstance(action, EmergencyStop):
+            self._stop_motors(now_ns)
+            return action
+        if isinstance(action, ResetEmergency):
+            return self._release_motors(action, vehicle, now_ns)
+        if alone and self._others_fly(vehicle):
+            return Idle()
+        if not alone:
+            self.ownership.check(action, now_ns, new=new)
+        if isinstance(action, Takeoff):
+            self._take_off(vehicle, now_ns)
+        elif isinstance(action, Land):
+            self._land(vehicle)
+        elif isinstance(action, Hover):
+            self._hover(vehicle, now_ns, alone=alone)
+        else:
+            action = self._steer(action, vehicle, now_ns)
+        if self.goal is not Goal.NOTHING and not isinstance(action, Idle):
+            self.ownership.take(action, vehicle, alone=alone, new=new)
+        return action
+
+    def _others_fly(self, vehicle: VehicleState | None) -> bool:
+        """Return whether somebody else has the vehicle, while nobody is at our controls."""
+        if self.ownership.others:
+            return True
+        if vehicle is None or vehicle.airborne is False or self.goal is Goal.TAKE_OFF:
+            return False
+        if not self.ownership.is_foreign(vehicle):
+            return False
+        return not self._leave(vehicle)
+
+    def _stop_motors(self, now_ns: int) -> None:
+        self._cut_ns = now_ns  # with each press: the first ones may have been lost with the link
+        self.stopped = True
+        self._end()
+
+    def _release_motors(self, action: ResetEmergency, vehicle: VehicleState | None, now_ns: int) -> AnyAction:
+        if vehicle is None:
+            raise DriverError("the vehicle is not heard: whether it lies still can't be known")
+        if vehicle.armed and now_ns - self._cut_ns < CUT_FOR_NS:
+            raise DriverError("the motors are still armed: there is nothing to reset yet")
+        self.stopped = False
+        return action
+
+    def _take_off(self, vehicle: VehicleState | None, now_ns: int) -> None:
+        if vehicle is None:
+            raise DriverError("the vehicle is not heard: it does not take off blindly")
+        if self.stopped:
+            raise DriverError("the motors were stopped in an emergency: reset it first")
+        if self.goal is Goal.TAKE_OFF and self._takeoff is not None:
+            self._takeoff.asked_ns = now_ns
+            if self._takeoff.refused and not self._takeoff.started:
+                raise DriverError(f"the vehicle does not start yet, it is tried again: {self._takeoff.refused}")
+        elif vehicle.airborne is None:
+            raise DriverError("the vehicle is armed, and does not tell yet whether it is in the air")
+        elif not vehicle.airborne:
+            self._end()
+            self.goal, self._takeoff = Goal.TAKE_OFF, TakeoffSequence(self._autopilot, self.takeoff_m, now_ns)
+        elif self.goal is not Goal.FOLLOW:
+            self._follow(PositionHold(now_ns))
+
+    def _land(self, vehicle: VehicleState | None) -> None:
+        started = self._takeoff is not None and self._takeoff.started
+        if self.stopped:
+            return
+        self._end()
+        if vehicle is None or vehicle.airborne or vehicle.armed or started:
+            self.goal = Goal.LAND
+
+    def _hover(self, vehicle: VehicleState | None, now_ns: int, *, alone: bool) -> None:
+        if self.stopped or self.goal is Goal.TAKE_OFF:
+            return  # a take-off ends in a hover
+        if vehicle is not None and vehicle.airborne is False:
+            self._end()
+        elif alone or vehicle is None:
+            self._end()
+            self.goal = Goal.HOLD
+        elif self.goal is not Goal.FOLLOW or not isinstance(self._setpoint, PositionHold):
+            self._follow(PositionHold(now_ns))
+
+    def _steer(self, action: Velocity | Attitude, vehicle: VehicleState | None, now_ns: int) -> AnyAction:
+        if vehicle is None:
+            raise DriverError("the vehicle is not heard: it takes no set-points")
+        if self.stopped or vehicle.airborne is False or self.goal is Goal.TAKE_OFF:
+            return Idle()  # a set-point would cancel a take-off
+        if vehicle.airborne is None and self.goal is not Goal.FOLLOW:
+            return Idle()  # on the ground some would start by it
+        if isinstance(action, Velocity):
+            if isinstance(self._setpoint, VelocitySetpoint) and self.goal is Goal.FOLLOW:
+                self._setpoint.action = action
+            else:
+                self._follow(VelocitySetpoint(action))
+        else:
+            if not (isinstance(self._setpoint, AttitudeSetpoint) and self.goal is Goal.FOLLOW):
+                self._follow(AttitudeSetpoint(action, self._make_thrust()))
+            assert isinstance(self._setpoint, AttitudeSetpoint)
+            action = self._setpoint.within(action)
+            self._setpoint.action = action
+        if now_ns - self._sent_ns >= HURRY_NS:
+            self._sent_ns = 0  # at once
+        return action
+
+    def _follow(self, setpoint: Setpoint) -> None:
+        streaming = self.goal is Goal.FOLLOW
+        lead_ns, entered = (self._lead_ns, self._entered) if streaming else (None, False)
+        self._end()
+        self.goal, self._setpoint = Goal.FOLLOW, setpoint
+        self._lead_ns, self._entered = lead_ns, entered
+        self._sent_ns = 0
+
+    def _end(self) -> None:
+        """End whatever was wanted, and the stream."""
+        self.goal, self._takeoff, self._setpoint = Goal.NOTHING, None, None
+        self._lead_ns, self._entered, self._strayed_ns, self._settling_ns = None, False, None, None
+
+    # What is reported -----------------------------------------------------------------------------------------------
+
+    def on_link_lost(self) -> None:
+        """End the stream, which does not go on by itself when the link is back; the vehicle must hold its position."""
+        if self.goal is Goal.FOLLOW:
+            self._end()
+            self.goal = Goal.HOLD
+        elif self.goal is Goal.TAKE_OFF:
+            started = self._takeoff is not None and self._takeoff.started
+            self._end()
+            self.goal = Goal.HOLD if started else Goal.NOTHING
+        self.ownership.on_link_lost()
+
+    def on_prearm_reason(self, reason: str) -> None:
+        """Keep the vehicle's own reason why it can't be armed."""
+        if self._takeoff is not None:
+            self._takeoff.reason = reason
+
+    def state(self, vehicle: VehicleState | None) -> FlightState:
+        """Return the flight state, as far as it is known."""
+        if vehicle is None:
+            return FlightState.UNKNOWN
+        if self.stopped:
+            return FlightState.EMERGENCY
+        if self.goal is Goal.TAKE_OFF and self._takeoff is not None and self._takeoff.started:
+            return FlightState.TAKING_OFF
+        if vehicle.airborne is None:
+            return FlightState.UNKNOWN
+        if not vehicle.airborne:
+            return FlightState.LANDED
+        if vehicle.mode in self._autopilot.LANDING or vehicle.landed is Landed.LANDING:
+            return FlightState.LANDING
+        if vehicle.mode in self._autopilot.TAKING_OFF or vehicle.landed is Landed.TAKING_OFF:
+            return FlightState.TAKING_OFF
+        if self._settling_ns is not None:
+            return FlightState.TAKING_OFF
+        if vehicle.mode in self._autopilot.HOLDING:
+            return FlightState.HOVERING
+        if vehicle.mode != self._autopilot.GUIDED:
+            return FlightState.FLYING
+        return (
+            FlightState.FLYING
+            if isinstance(self._setpoint, VelocitySetpoint | AttitudeSetpoint)
+            else FlightState.HOVERING
+        )
+
+    # What is sent ------------------------------------------------------------------------------------------------
+
+    def notices(self) -> list[Notice]:
+        """Return what happened since the last call."""
+        notices, self._notices = self._notices, []
+        return notices
+
+    def messages(self, vehicle: VehicleState, now_ns: int) -> list[Message]:
+        """Return the set-points that are due now; commands go to the command sender."""
+        if self.stopped:
+            if vehicle.armed and now_ns - self._cut_ns < CUT_FOR_NS:
+                self._commands.request(CUT, now_ns, CUT_PACE_S)
+            return []
+        if self.goal is Goal.TAKE_OFF:
+            return self._step_takeoff(vehicle, now_ns)
+        if vehicle.airborne is False and self.goal is not Goal.LAND:
+            self._flight_is_over()
+        elif self.ownership.observe(vehicle, now_ns):
+            if self.ownership.is_lost(now_ns):
+                self._leave(vehicle)
+            return []
+        if self.goal is Goal.FOLLOW:
+            return self._step_following(vehicle, now_ns)
+        if self.goal is Goal.HOLD:
+            return self._step_hold(vehicle, now_ns)
+        if self.goal is Goal.LAND:
+            self._step_land(vehicle, now_ns)
+        return []
+
+    def _flight_is_over(self) -> None:
+        """Forget the flight: whoever flies the vehicle next begins anew."""
+        self._end()
+        self.ownership.on_flight_over()
+
+    def _step_takeoff(self, vehicle: VehicleState, now_ns: int) -> list[Message]:
+        takeoff = self._takeoff
+        assert takeoff is not None
+        messages = takeoff.step(vehicle, self._commands, now_ns)
+        if takeoff.done:
+            self._follow(PositionHold(now_ns))
+            self._lead_ns, self._settling_ns = takeoff.lead_ns, now_ns
+        elif takeoff.taken_over:
+            self._leave(vehicle)
+        elif takeoff.given_up:
+            self._notify(f"the vehicle did not take off: {takeoff.given_up}", reason="no_takeoff")
+            disarm = vehicle.armed and takeoff.armed_here
+            self._end()
+            self.goal = Goal.LAND if disarm else Goal.NOTHING
+        return messages
+
+    def _step_following(self, vehicle: VehicleState, now_ns: int) -> list[Message]:
+        assert self._setpoint is not None
+        inside = vehicle.mode == self._autopilot.GUIDED
+        if inside or (self._settling_ns is not None and now_ns - self._settling_ns > SETTLING_NS):
+            self._settling_ns = None
+        if self._strayed(vehicle.mode, inside, now_ns):
+            self._leave(vehicle)
+            return []
+        if self._lead_ns is None:
+            self._lead_ns = now_ns
+        if not (inside or self._entered) and now_ns - self._lead_ns >= nanoseconds(self._autopilot.LEAD_S):
+            self._ask_for(self._autopilot.GUIDED, now_ns)
+        if now_ns - self._sent_ns < self._setpoint.period_ns:
+            return []
+        self._sent_ns = now_ns
+        return [self._setpoint.message(vehicle, self._commands.target, now_ns)]
+
+    def _ask_for(self, mode: str, now_ns: int) -> None:
+        self.ownership.on_mode_asked(mode, now_ns)
+        self._commands.request(self._autopilot.mode_command(mode), now_ns)
+
+    def _strayed(self, mode: str, inside: bool, now_ns: int) -> bool:
+        """Return whether the vehicle left the wanted mode for longer than :data:`STRAYED_NS`, after it was in it.
+
+        A mode that is the late effect of a command of ours does not count.
+        """
+        if inside:
+            self._entered, self._strayed_ns = True, None
+        elif self._entered and self.ownership.was_just_asked(mode, now_ns):
+            self._entered, self._strayed_ns = False, None
+        elif self._entered and self._strayed_ns is None:
+            self._strayed_ns = now_ns
+        return self._strayed_ns is not None and now_ns - self._strayed_ns >= STRAYED_NS
+
+    def _leave(self, vehicle: VehicleState) -> bool:
+        """Leave the vehicle to a mode that was not chosen here.
+
+        Returns:
+            Whether it is still ours to hold and to land.
+        """
+        why = "its own failsafe" if vehicle.failsafe else "not from here"
+        self._notify(f"the vehicle went to {vehicle.mode} ({why}): it is not steered any more", reason="mode")
+        self._end()
+        ours = self.ownership.leave(vehicle)
+        if ours:
+            self.goal = Goal.HOLD
+        return ours
+
+    def _step_hold(self, vehicle: VehicleState, now_ns: int) -> list[Message]:
+        if vehicle.mode in self._autopilot.HOLDING or vehicle.mode in self._autopilot.LANDING:
+            self._end()
+            return []
+        self._ask_for(self._autopilot.HOLD, now_ns)
+        if vehicle.mode == self._autopilot.GUIDED and now_ns - self._sent_ns >= PositionHold.period_ns:
+            self._sent_ns = now_ns  # until the mode shows, or if it is refused
+            return [velocity_message(Velocity(), self._commands.target)]
+        return []
+
+    def _step_land(self, vehicle: VehicleState, now_ns: int) -> None:
+        inside = vehicle.mode in self._autopilot.LANDING
+        if not vehicle.armed:
+            self._flight_is_over()
+        elif vehicle.airborne is False:
+            self._commands.request(DISARM, now_ns)
+        elif self._strayed(vehicle.mode, inside, now_ns):
+            self._leave(vehicle)
+        elif not (inside or self._entered):
+            self._ask_for(self._autopilot.LAND, now_ns)
+
+    def _notify(self, text: str, *, reason: str) -> None:
+        self._notices.append(Notice(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, {"reason": reason}))

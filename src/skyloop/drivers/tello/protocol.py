@@ -1,0 +1,391 @@
+"""The protocol of one drone, from the first datagram on: state and answers in, commands out. No socket, no clock."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from skyloop.clock import nanoseconds
+from skyloop.drivers.notices import Notice, message
+from skyloop.drivers.tello.options import TelloOptions
+from skyloop.drivers.tello.setpoints import SetpointController
+from skyloop.drivers.tello.telemetry import Health, feedback_of, native_of
+from skyloop.drivers.vehicle_session import LinkTimeouts, VehicleSession
+from skyloop.errors import DecodeError
+from skyloop.messages import AnyAction, LinkState, Severity, Value
+from skyloop.wire.tello.commands import ENTER, Sdk, decoded, ports
+from skyloop.wire.tello.replies import Shape, answers, is_error, shape_of
+from skyloop.wire.tello.state import parse
+
+PATIENCE_NS: Final = nanoseconds(0.3)  #: real ones answer within 29 ms, over a good link
+TRIES: Final = 3
+MOTION_NS: Final = nanoseconds(20.0)  #: the latest answer to a take-off or landing that is still expected
+
+#: Takes the answer, or None if there was none.
+Done = Callable[[str | None], None]
+
+
+@dataclass(slots=True)
+class Request:
+    """A command whose answer is waited for.
+
+    Args:
+        text: The command.
+        done: Called with the answer, or None if there was none.
+        tries: How often it is sent at most.
+        sent_ns: When it was sent last.
+    """
+
+    text: str
+    done: Done
+    tries: int = TRIES
+    sent_ns: int | None = None
+
+
+class Conversation:
+    """Asks one thing at a time.
+
+    *Motions*, such as a take-off, are sent by others, but answered through here, seconds later: while one is not
+    answered, nothing is asked that is answered in the same words.
+
+    ``counts``: ``answered``, ``unanswered`` requests, and ``stray`` replies that belong to nothing.
+    """
+
+    def __init__(self) -> None:
+        self.counts = Counter(dict.fromkeys(("answered", "unanswered", "stray"), 0))
+        self._queue: deque[Request] = deque()
+        self._asked: Request | None = None
+        self._motions: dict[str, int] = {}  # command, and when it was sent last
+
+    @property
+    def idle(self) -> bool:
+        """Whether nothing is asked or waits to be asked."""
+        return self._asked is None and not self._queue
+
+    def ask(self, request: Request) -> None:
+        """Ask something after what waits already."""
+        self._queue.append(request)
+
+    def moved(self, text: str, now_ns: int) -> None:
+        """Note that a motion was sent."""
+        self._motions[text] = now_ns
+
+    def abandon(self) -> None:
+        """Give up all requests: the drone is gone."""
+        waiting = [self._asked] if self._asked is not None else []
+        waiting += self._queue
+        self._queue.clear()
+        self._asked = None
+        self._motions.clear()
+        for request in waiting:
+            request.done(None)
+
+    def on_reply(self, reply: str) -> str | None:
+        """Handle a reply.
+
+        Returns:
+            The motion that it answers, None if it answers none.
+        """
+        asked = self._asked
+        plain_error = is_error(reply) and ":" not in reply
+        if asked is not None and answers(reply, asked.text) and not (plain_error and self._motions):
+            self._asked = None
+            self.counts["answered"] += 1
+            asked.done(reply)
+            return None
+        for motion in self._motions:
+            if answers(reply, motion):
+                del self._motions[motion]
+                return motion
+        self.counts["stray"] += 1
+        return None
+
+    def messages(self, now_ns: int) -> list[str]:
+        """Return the commands to send now."""
+        self._motions = {text: at for text, at in self._motions.items() if now_ns - at < MOTION_NS}
+        asked = self._asked
+        if asked is not None and asked.sent_ns is not None:
+            if now_ns - asked.sent_ns < PATIENCE_NS:
+                return []
+            asked.tries -= 1
+            if asked.tries <= 0:
+                self._asked = None
+                self.counts["unanswered"] += 1
+                asked.done(None)
+        if self._asked is None:
+            self._asked = self._next()
+        if self._asked is None:
+            return []
+        self._asked.sent_ns = now_ns
+        return [self._asked.text]
+
+    def _next(self) -> Request | None:
+        for request in self._queue:
+            if not self._motions or shape_of(request.text) is not Shape.OK:
+                self._queue.remove(request)
+                return request
+        return None
+
+
+TICK_NS: Final = nanoseconds(0.05)  #: between two ``rc``
+HURRY_NS: Final = nanoseconds(0.02)  #: least time between two ``rc``
+DEGRADED_NS: Final = nanoseconds(0.6)  #: of silence; states come ten times a second
+LOST_NS: Final = nanoseconds(1.5)
+FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a drone that was never heard by then is reported as lost
+ENTER_NS: Final = nanoseconds(0.5)  #: between two ``command`` while no state comes
+ALIVE_NS: Final = nanoseconds(4.0)  #: between questions that keep the drone from landing by itself after 15 s
+DEAF: Final = 2  #: questions in a row without an answer: our commands are not received
+VIDEO_NS: Final = nanoseconds(2.0)  #: without video for so long it is asked for
+ALIVE: Final = "wifi?"
+DEFAULT_HOST: Final = "192.168.10.1"  #: of a Tello that opens a network of its own
+_TELLOS_NETWORK: Final = "192.168.10."
+
+_SDK: Final = {"20": Sdk.V2_0, "30": Sdk.V3_0}
+
+
+class TelloSession(VehicleSession):
+    """The protocol of one opened driver with its drone. Not thread-safe.
+
+    Args:
+        options: Of the vehicle's address.
+        now_ns: The time of opening.
+        extra: Gives telemetry of others for feedback's ``native``.
+        video_ns: When video came last, 0 for never.
+    """
+
+    TIMEOUTS = LinkTimeouts(DEGRADED_NS, LOST_NS, FIRST_WORD_NS)
+
+    def __init__(
+        self,
+        options: TelloOptions,
+        now_ns: int,
+        *,
+        extra: Callable[[], Mapping[str, Value]] = dict,
+        video_ns: Callable[[], int] = lambda: 0,
+    ) -> None:
+        super().__init__(now_ns)
+        self.options = options
+        self.setpoints = SetpointController()
+        self.conversation = Conversation()
+        self.counts = Counter(dict.fromkeys(("received", "damaged"), 0))
+        self.sdk: Sdk | None = None  #: None until the drone answered ``sdk?``; SDK 1.3 answers with an error
+        self.serial = ""
+        self.ready = False  #: whether state comes and commands are answered
+        self.remembered: dict[str, str] = {}  #: parameter and the command that set it, sent again after a loss
+        self._extra = extra
+        self._video_ns = video_ns
+        self._health = Health()
+        self._entered_ns = now_ns - ENTER_NS
+        self._alive_ns = now_ns
+        self._asked_video_ns = 0
+        self._asking_version = False
+        self._deaf = 0
+        self._quality: int | None = None
+        self._rc_ns = 0
+        self._flips: list[str] = []
+        self._told_ports = False
+        self._answered = False  # while no state comes
+        self.local = ""  #: this host's address towards the drone
+        self._place = f"{options.host}, UDP port {options.port}"
+        self._set_link_state(LinkState.CONNECTING, f"waiting for the state of the Tello at {self._place}")
+        if options.pads:
+            self.remembered["tello.mission_pads"] = "mon"
+
+    # From the driver -------------------------------------------------------------------------------------------
+
+    def command(self, action: AnyAction, now_ns: int) -> AnyAction:
+        """Accept an action and have it sent soon.
+
+        Returns:
+            What is applied, after the limits.
+
+        Raises:
+            DriverError: It can't be done now; see :meth:`SetpointController.apply`.
+        """
+        before = self.setpoints.intent
+        applied = self.setpoints.apply(action, now_ns)
+        if self.setpoints.intent != before:
+            self.due_ns = min(self.due_ns, max(now_ns, self._rc_ns + HURRY_NS))
+        return applied
+
+    def ask(self, text: str, done: Done) -> None:
+        """Send a command that is answered.
+
+        Args:
+            text: The command.
+            done: Called with the answer, or None if there was none.
+        """
+        self.conversation.ask(Request(text, done))
+        self.due_ns = 0
+
+    def flip(self, direction: str) -> None:
+        """Send a flip, once: a repeat would flip it twice."""
+        self._flips.append(f"flip {direction}")
+        self.due_ns = 0
+
+    def _new_notices(self) -> list[Notice]:
+        return self.setpoints.notices()
+
+    def close(self) -> None:
+        """End the session: requests that wait get no answer."""
+        self.conversation.abandon()
+
+    # From the sockets ------------------------------------------------------------------------------------------
+
+    def on_state(self, datagram: bytes, now_ns: int) -> None:
+        """Handle a datagram of the state port, whatever it holds. Never raises."""
+        try:
+            state = parse(datagram)
+        except DecodeError:
+            self.counts["damaged"] += 1
+            return
+        self.counts["received"] += 1
+        begins, self._heard_ns = self._heard_ns is None, now_ns
+        self.setpoints.watch.update(state, now_ns)
+        self.setpoints.on_state(now_ns)
+        if begins:
+            self._begin(now_ns)
+        elif self.link_state is LinkState.DEGRADED and self.ready:
+            self._set_link_state(LinkState.UP)
+        for notice in self._health.notices(state):
+            self._notice(notice)
+        native = native_of(state)
+        native.update(self._telemetry())
+        feedback = feedback_of(state, self.setpoints.flight_state(), now_ns, self.options.velocity_axes, native)
+        self._pending.append(lambda sink: sink.feedback(feedback))
+
+    def on_reply(self, datagram: bytes, now_ns: int) -> None:
+        """Handle a datagram of the port that commands are sent from, whatever it holds. Never raises."""
+        reply = decoded(datagram)
+        if not reply:
+            self.counts["damaged"] += 1
+            return
+        if self._heard_ns is None:
+            self._answered = True
+            self._look_at_refused_ports(reply)
+            return
+        motion = self.conversation.on_reply(reply)
+        if motion is not None:
+            self.setpoints.on_answer(motion, reply, now_ns)
+        self.due_ns = min(self.due_ns, max(now_ns, self._rc_ns + HURRY_NS))
+
+    def _look_at_refused_ports(self, reply: str) -> None:
+        if self.options.own_ports and is_error(reply) and not self._told_ports:
+            self._told_ports = True
+            text = (
+                f"the drone answers {reply!r}: other ports than 8890 and 11111 need SDK 3.0; leave state_port and "
+                "video_port out"
+            )
+            self._notice(message(text, "ports_refused", Severity.ERROR))
+
+    def _telemetry(self) -> dict[str, Value]:
+        told: dict[str, Value] = {f"state.{name}": count for name, count in self.counts.items()}
+        told.update({f"replies.{name}": count for name, count in self.conversation.counts.items()})
+        if self._quality is not None:
+            told["wifi"] = self._quality
+        told.update(self._extra())
+        return told
+
+    # Time ------------------------------------------------------------------------------------------------------
+
+    def poll(self, now_ns: int) -> list[bytes]:
+        """Return the commands that are due now, each for a datagram of its own."""
+        self._check_silence(now_ns)
+        self.due_ns = now_ns + TICK_NS
+        texts = []
+        if self._heard_ns is None and now_ns - self._entered_ns >= ENTER_NS:
+            self._entered_ns = now_ns
+            texts.append(ENTER)
+            if self.options.own_ports:
+                texts.append(ports(self.options.state_port, self.options.video_port))
+        flips, self._flips = self._flips, []
+        for motion in [*self.setpoints.motions(now_ns), *flips]:
+            self.conversation.moved(motion, now_ns)
+            texts.append(motion)
+        stick = self.setpoints.stick()
+        if stick is not None and (now_ns - self._rc_ns >= HURRY_NS):
+            self._rc_ns = now_ns
+            texts.append(stick.text)
+        if self._heard_ns is not None:
+            self._keep_alive(now_ns)
+            self._keep_video(now_ns)
+            texts += self.conversation.messages(now_ns)
+        return [text.encode("ascii") for text in texts]
+
+    def _keep_alive(self, now_ns: int) -> None:
+        """Ask something now and then: it keeps the drone awake, and shows whether our commands are received."""
+        if self.ready and now_ns - self._alive_ns >= ALIVE_NS:
+            self._alive_ns = now_ns
+            self.conversation.ask(Request(ALIVE, self._alive))
+        elif not self.ready and not self._asking_version:
+            self._asking_version = True
+            self.conversation.ask(Request("sdk?", self._version_told))
+
+    def _alive(self, reply: str | None) -> None:
+        if reply is None:
+            self._deaf += 1
+            if self._deaf >= DEAF:
+                self.ready = False
+                self._set_link_state(LinkState.DEGRADED, "the drone tells its state, and answers no command")
+            return
+        self._deaf = 0
+        if reply.isdecimal():
+            self._quality = int(reply)
+
+    def _keep_video(self, now_ns: int) -> None:
+        last_ns = max(self._video_ns(), self._asked_video_ns)
+        if self.options.video and self.ready and now_ns - last_ns >= VIDEO_NS and self.conversation.idle:
+            self._asked_video_ns = now_ns
+            self.conversation.ask(Request("streamon", _whatever))
+
+    def _describe_silence(self, since: str, why: str) -> str:
+        if self._answered:
+            why += f", though it answers: does a firewall of this host let UDP port {self.options.state_port} in?"
+        if self.options.host == DEFAULT_HOST and self.local and not self.local.startswith(_TELLOS_NETWORK):
+            why += f"; this computer is in no network of a Tello, its address is {self.local}"
+        return f"no state{since} from {self._place}{why}"
+
+    def _advice(self) -> str:
+        if self._answered:
+            return f"let UDP port {self.options.state_port} in at this computer's firewall"
+        if self.options.host.startswith("127."):
+            return "start the emulated drone: skyloop sim --firmware tello"
+        return "switch the Tello on and join its Wi-Fi network, TELLO-…; or correct the host in the address"
+
+    # Losing and finding ----------------------------------------------------------------------------------------
+
+    def _lose(self, reason: str, now_ns: int) -> None:
+        self._heard_ns = None
+        self.ready = self._asking_version = False
+        self.conversation.abandon()
+        self.setpoints.lost(now_ns)
+        self._set_link_state(LinkState.LOST, reason)
+
+    def _begin(self, now_ns: int) -> None:
+        self._unreachable, self._answered = "", False
+        self._deaf, self._alive_ns, self._asked_video_ns = 0, now_ns, 0
+        self.due_ns = 0
+
+    def _version_told(self, reply: str | None) -> None:
+        self._asking_version = False
+        if self._heard_ns is None:
+            return
+        if reply is None:
+            self._set_link_state(LinkState.DEGRADED, "the drone tells its state, and answers no command")
+            return
+        self.sdk = _SDK.get(reply, Sdk.V1_3 if is_error(reply) else Sdk.V3_0)
+        self.ready, self._deaf = True, 0
+        self.conversation.ask(Request("sn?", self._serial_told))
+        for text in self.remembered.values():
+            self.conversation.ask(Request(text, _whatever))
+        self._set_link_state(LinkState.UP)
+
+    def _serial_told(self, reply: str | None) -> None:
+        if reply is not None and not is_error(reply):
+            self.serial = reply
+
+
+def _whatever(_reply: str | None) -> None:
+    """Ignore the answer: what became of the command shows in the drone's state or video."""

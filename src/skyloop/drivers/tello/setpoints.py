@@ -1,0 +1,313 @@
+"""Set-points to sticks and motions: the last action, until the drone's state shows that it is done. Pure.
+
+Answers decide nothing: they come seconds late, or not at all. A take-off or landing is sent again until it shows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum, auto
+from typing import Final
+
+from skyloop.clock import nanoseconds
+from skyloop.drivers.notices import Notice, message
+from skyloop.drivers.tello.telemetry import FlightWatch
+from skyloop.errors import DriverError
+from skyloop.messages import (
+    AnyAction,
+    Attitude,
+    EmergencyStop,
+    EventKind,
+    FlightState,
+    Hover,
+    Idle,
+    Land,
+    ResetEmergency,
+    Severity,
+    Takeoff,
+    Velocity,
+)
+from skyloop.wire.tello.commands import FULL_CLIMB_M_S, FULL_SPEED_M_S, FULL_YAW_RATE_RAD_S, LEVEL, MAX_STICK, Stick
+from skyloop.wire.tello.replies import is_error
+
+FULL_TILT_RAD: Final = 0.2  #: the attitude that is taken for a full stick: as much as an AR.Drone tilts indoors
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """A number for each stick: what a full one comes to, or the most that is asked for."""
+
+    speed: float = FULL_SPEED_M_S  #: [m/s]
+    climb: float = FULL_CLIMB_M_S  #: [m/s]
+    yaw_rate: float = FULL_YAW_RATE_RAD_S  #: [rad/s]
+    tilt: float = FULL_TILT_RAD  #: [rad]
+
+
+def sticks_of(action: Velocity | Attitude, full: Scale, limits: Scale) -> tuple[Stick, Velocity | Attitude]:
+    """Return the sticks, and what they ask for: each number within its limit, and no more than a full stick.
+
+    The Tello holds a speed, and no attitude: a tilt is taken as a share of the full stick, and so of the full speed.
+
+    Args:
+        action: The set-point.
+        full: What a full stick comes to.
+        limits: The most that is asked for.
+    """
+    climb = min(full.climb, limits.climb)
+    yaw = min(full.yaw_rate, limits.yaw_rate)
+    if isinstance(action, Velocity):
+        speed = min(full.speed, limits.speed)
+        applied = Velocity(
+            forward=_within(action.forward, speed),
+            left=_within(action.left, speed),
+            up=_within(action.up, climb),
+            yaw_rate=_within(action.yaw_rate, yaw),
+        )
+        right, ahead = -applied.left / full.speed, applied.forward / full.speed
+        return _stick(right, ahead, applied.up / full.climb, applied.yaw_rate / full.yaw_rate), applied
+    tilt = min(full.tilt, limits.tilt)
+    level = Attitude(
+        roll=_within(action.roll, tilt),
+        pitch=_within(action.pitch, tilt),
+        climb=_within(action.climb, climb),
+        yaw_rate=_within(action.yaw_rate, yaw),
+    )
+    right, ahead = level.roll / full.tilt, level.pitch / full.tilt
+    return _stick(right, ahead, level.climb / full.climb, level.yaw_rate / full.yaw_rate), level
+
+
+def _stick(right: float, forward: float, up: float, turn: float) -> Stick:
+    return Stick(*(round(MAX_STICK * share) for share in (right, forward, up, -turn)))
+
+
+def _within(value: float, limit: float) -> float:
+    return max(-limit, min(limit, value))
+
+
+AGAIN_NS: Final = nanoseconds(1.5)  #: a take-off or landing that does not show is sent again
+TAKEOFF_NS: Final = nanoseconds(8.0)  #: a drone that has not started by then refuses to
+STOP_AGAIN_NS: Final = nanoseconds(0.1)
+STOPS: Final = 5  #: an emergency stop is sent so often at least, for it may not be answered
+STOP_NS: Final = nanoseconds(5.0)  #: and for so long at most
+
+TAKEOFF, LAND, EMERGENCY = "takeoff", "land", "emergency"
+
+
+class Decision(Enum):
+    """What is wanted of take-off and landing."""
+
+    STAY = auto()  #: as it is: in the air if it flies
+    TAKE_OFF = auto()
+    LAND = auto()
+
+
+class SetpointController:
+    """Remembers the last action and turns it into commands.
+
+    ``full`` is what a full stick comes to, ``limits`` the most that is asked for.
+    """
+
+    def __init__(self) -> None:
+        self.watch = FlightWatch()
+        self.full = Scale()
+        self.limits = Scale()
+        self.heard = False  #: whether the drone's state comes
+        self._decision = Decision.STAY
+        self._stick = LEVEL
+        self._decided_ns = 0
+        self._said_ns: int | None = None  # the take-off or landing
+        self._stopped = False  # motors cut by us, until the reset
+        self._stops = 0
+        self._stop_ns = 0
+        self._stop_done = True
+        self._was_in_air = False  # when it was heard last
+        self._steering = False  # this flight was begun, or taken, here: else another program may be flying it
+        self._notices: list[Notice] = []
+
+    @property
+    def intent(self) -> tuple[object, ...]:
+        """Changes when something else is to be sent."""
+        return self._decision, self._stick, self._stop_done
+
+    def flight_state(self) -> FlightState:
+        """Return the flight state for feedback."""
+        if self._stopped:
+            return FlightState.EMERGENCY
+        if self.watch.in_air and self._stick != LEVEL:
+            return FlightState.FLYING
+        return self.watch.phase
+
+    # What is decided -------------------------------------------------------------------------------------------
+
+    def apply(self, action: AnyAction, now_ns: int) -> AnyAction:
+        """Accept an action.
+
+        Args:
+            action: One of the driver's ``ACTIONS``.
+            now_ns: The present time.
+
+        Returns:
+            What is applied: a set-point within the limits, or hover after an emergency stop.
+
+        Raises:
+            DriverError: A take-off while the drone is not heard or after an emergency stop, or a reset while it is not
+                heard or its motors still run.
+        """
+        if isinstance(action, Idle):
+            return action
+        if isinstance(action, EmergencyStop):
+            self._stop(now_ns)
+        elif isinstance(action, ResetEmergency):
+            self._reset(now_ns)
+        elif self._stopped:
+            if isinstance(action, Takeoff):
+                raise DriverError("the motors were stopped: reset the emergency first")
+            if isinstance(action, Velocity | Attitude):
+                return Hover()
+        else:
+            return self._fly(action, now_ns)
+        return action
+
+    def _fly(self, action: AnyAction, now_ns: int) -> AnyAction:
+        self._steering = True
+        if isinstance(action, Takeoff):
+            self._take_off(now_ns)
+        elif isinstance(action, Land):
+            self._decide(Decision.LAND, now_ns)
+        elif isinstance(action, Velocity | Attitude):
+            stick, applied = sticks_of(action, self.full, self.limits)
+            self._remain(stick, now_ns)
+            return applied
+        elif isinstance(action, Hover):
+            self._remain(LEVEL, now_ns)
+        return action
+
+    def _decide(self, decision: Decision, now_ns: int) -> None:
+        self._stick = LEVEL
+        if decision is self._decision:
+            return
+        self._decision, self._decided_ns, self._said_ns = decision, now_ns, None
+        self.watch.rising = decision is Decision.TAKE_OFF
+        self.watch.sinking = decision is Decision.LAND
+        self.watch.landing_answered = False
+
+    def _remain(self, stick: Stick, now_ns: int) -> None:
+        if self._decision is Decision.LAND:
+            self._decide(Decision.STAY, now_ns)
+        self._stick = stick
+
+    def _take_off(self, now_ns: int) -> None:
+        if not self.heard:
+            raise DriverError("the drone is not heard: it does not take off blindly")
+        if self.watch.in_air:
+            self._remain(LEVEL, now_ns)
+        else:
+            self._decide(Decision.TAKE_OFF, now_ns)
+
+    def _stop(self, now_ns: int) -> None:
+        self._decide(Decision.STAY, now_ns)
+        self._stick = LEVEL
+        if not self._stopped:
+            text = "the drone was told to cut its motors; reset the emergency when it lies safely"
+            self._notices.append(Notice(EventKind.EMERGENCY, text, Severity.ERROR, {"reason": "user"}))
+        self._stopped, self._stop_done = True, False
+        self._stops, self._stop_ns = 0, now_ns
+
+    def _reset(self, now_ns: int) -> None:
+        if not self._stopped:
+            return
+        if not self.heard:
+            raise DriverError("the drone is not heard: whether it lies on the ground can't be known")
+        if not self._stop_done and self.watch.motors(now_ns):
+            raise DriverError("the motors still run: the stop has not shown yet")
+        self._stopped, self._stop_done = False, True
+
+    # What is received ---------------------------------------------------------------------------------------------
+
+    def on_state(self, now_ns: int) -> None:
+        """Handle that the watch has seen a new state."""
+        phase = self.watch.phase
+        self.heard = True
+        self._was_in_air = phase.airborne
+        shown = {Decision.TAKE_OFF: FlightState.HOVERING, Decision.LAND: FlightState.LANDED}.get(self._decision)
+        if phase is shown:
+            self._decide(Decision.STAY, now_ns)
+        elif phase is FlightState.LANDED:
+            self._stick = LEVEL
+            self._steering = self._decision is not Decision.STAY
+        if self._stops >= STOPS and self.watch.motors(now_ns) is False:
+            self._stop_done = True
+
+    def on_answer(self, motion: str, reply: str, now_ns: int) -> None:
+        """Handle the answer to a take-off, landing or emergency stop.
+
+        Args:
+            motion: The command that is answered.
+            reply: The drone's answer.
+            now_ns: When it came.
+        """
+        refused = is_error(reply)
+        if motion == LAND:
+            self.watch.landing_answered = self._decision is Decision.LAND and not refused
+        elif motion == EMERGENCY:
+            self._stop_done = self._stop_done or not refused
+        elif motion == TAKEOFF and refused and self._decision is Decision.TAKE_OFF and not self.watch.phase.airborne:
+            self._decide(Decision.STAY, now_ns)
+            text = f"the drone refused to take off: {reply!r}"
+            self._notices.append(message(text, "takeoff_refused", Severity.WARNING, reply=reply))
+
+    def lost(self, now_ns: int) -> None:
+        """Cancel a take-off and level the sticks: the drone is not heard any more. A landing is still sent."""
+        self.heard = False
+        if self._decision is Decision.TAKE_OFF:
+            self._decide(Decision.STAY, now_ns)
+        self._stick = LEVEL
+        self.watch = FlightWatch()
+        self.watch.sinking = self._decision is Decision.LAND
+
+    # What is sent ----------------------------------------------------------------------------------------------
+
+    def notices(self) -> list[Notice]:
+        """Return the notices since the last call."""
+        notices, self._notices = self._notices, []
+        return notices
+
+    def motions(self, now_ns: int) -> list[str]:
+        """Return the commands due now that are answered seconds later."""
+        if self._stopped:
+            return self._emergency(now_ns)
+        if self._decision is Decision.TAKE_OFF and not self.watch.phase.airborne:
+            if now_ns - self._decided_ns >= TAKEOFF_NS:
+                self._decide(Decision.STAY, now_ns)
+                text = "the drone did not take off: it may refuse because of its battery, its heat or its tilt"
+                self._notices.append(message(text, "no_takeoff", Severity.WARNING))
+                return []
+            return self._again(TAKEOFF, now_ns)
+        landed = self.heard and self.watch.phase is FlightState.LANDED
+        if self._decision is Decision.LAND and not landed:
+            return self._again(LAND, now_ns)
+        return []
+
+    def stick(self) -> Stick | None:
+        """Return the sticks for ``rc``, None if none are to be sent.
+
+        A drone that stands, rises or sinks is left alone, and so is one that another program flies.
+        """
+        if self._stopped or self._decision is not Decision.STAY or not self._steering:
+            return None
+        if self.heard:
+            return self._stick if self.watch.in_air else None
+        return LEVEL if self._was_in_air else None
+
+    def _again(self, text: str, now_ns: int) -> list[str]:
+        if self._said_ns is not None and now_ns - self._said_ns < AGAIN_NS:
+            return []
+        self._said_ns = now_ns
+        return [text]
+
+    def _emergency(self, now_ns: int) -> list[str]:
+        late = now_ns - self._stop_ns
+        if (self._stop_done and self._stops >= STOPS) or late >= STOP_NS or late < self._stops * STOP_AGAIN_NS:
+            return []
+        self._stops += 1
+        return [EMERGENCY]

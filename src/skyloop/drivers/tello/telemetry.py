@@ -1,0 +1,233 @@
+"""State strings to feedback: units, axes and signs, the phase of flight, and the drone's health. Pure.
+
+No field of the state says what the drone is doing, so :class:`FlightWatch` finds it out: ``time`` grows by one each
+second while the motors run, and stands still otherwise; the distance sensor shows whether the ground is near. What was
+asked for only names what is seen: a climb that was asked for is a take-off.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from skyloop.clock import nanoseconds
+from skyloop.drivers.notices import Notice, message
+from skyloop.drivers.tello.options import VelocityAxes
+from skyloop.messages import Feedback, FlightState, Severity, Value
+from skyloop.messages.geometry import wrap_angle
+from skyloop.wire.tello.state import GROUND_CM, Pad, State, Vector
+
+# Feedback in SI ------------------------------------------------------------------------------------------------------
+
+STANDARD_GRAVITY: Final = 9.80665  #: m/s²
+
+
+def height_m(state: State) -> float | None:
+    """Return the height above what is below [m]: measured if possible, else above the place of take-off.
+
+    The distance sensor reports 10 cm on the ground; so does a drone that is 10 cm high, and then its height says so.
+    """
+    if state.distance_cm is not None:
+        on_ground = state.distance_cm <= GROUND_CM and (state.height_cm or 0.0) < GROUND_CM
+        return 0.0 if on_ground else state.distance_cm / 100
+    if state.height_cm is not None and state.height_cm >= 0:
+        return state.height_cm / 100
+    return None
+
+
+def velocity_m_s(state: State, axes: VelocityAxes) -> Vector | None:
+    """Return the velocity forward, left, up [m/s]; None if it is not known.
+
+    ``vgx`` and its like are in dm/s: a Tello that moved at 1 m/s reported 7 (DJITelloPy, issue 96).
+
+    Args:
+        state: The drone's.
+        axes: Which axes its numbers are along.
+    """
+    if state.speed_dm_s is None or axes is VelocityAxes.NONE:
+        return None
+    x, y, down = (part / 10 for part in state.speed_dm_s)
+    if axes is VelocityAxes.BODY:
+        return x, -y, -down
+    if state.yaw_deg is None:
+        return None
+    cos, sin = math.cos(math.radians(state.yaw_deg)), math.sin(math.radians(state.yaw_deg))
+    return cos * x + sin * y, sin * x - cos * y, -down
+
+
+def feedback_of(
+    state: State, flight: FlightState, captured_ns: int, axes: VelocityAxes, native: dict[str, Value]
+) -> Feedback:
+    """Return the drone's state in SI units and our axes. What it does not report is None.
+
+    Args:
+        state: As the drone reported it.
+        flight: The flight state.
+        captured_ns: When the state came.
+        axes: Which axes its velocity is along.
+        native: The drone's own telemetry.
+    """
+    acceleration = state.acceleration_mg
+    factor = STANDARD_GRAVITY / 1000
+    return Feedback(
+        captured_ns=captured_ns,
+        state=flight,
+        battery=None if state.battery_percent is None else state.battery_percent / 100,
+        roll=_angle(state.roll_deg),
+        pitch=_angle(None if state.pitch_deg is None else -state.pitch_deg),
+        yaw=_angle(None if state.yaw_deg is None else -state.yaw_deg),
+        altitude=height_m(state),
+        velocity=velocity_m_s(state, axes),
+        acceleration=None
+        if acceleration is None
+        else (acceleration[0] * factor, -acceleration[1] * factor, -acceleration[2] * factor),
+        native=native,
+    )
+
+
+def native_of(state: State) -> dict[str, Value]:
+    """Return the state by the drone's own names and in its own units."""
+    return dict(state.fields)
+
+
+def _angle(degrees: float | None) -> float | None:
+    return None if degrees is None else wrap_angle(math.radians(degrees))
+
+
+# The phase of flight -------------------------------------------------------------------------------------------------
+
+STILL_NS: Final = nanoseconds(1.6)  #: if the count of seconds stands still for so long, the motors are off
+GRACE_NS: Final = nanoseconds(2.5)  #: how long a count that has just ended, or not begun, is waited for
+LOW_M: Final = 0.15
+HIGH_M: Final = 0.25
+HOVER_M: Final = 0.4
+SLOW_DM_S: Final = 1.0
+SETTLED: Final = 3  #: samples in a row that are high and slow end a take-off
+RISE_NS: Final = nanoseconds(8.0)  #: the longest that a take-off is taken for one
+
+_S = FlightState
+
+
+class FlightWatch:
+    """Tracks the phase of flight: UNKNOWN, LANDED, TAKING_OFF, HOVERING (in the air), LANDING.
+
+    ``rising`` and ``sinking``: whether a take-off or a landing was asked for and is not done. ``landing_answered``:
+    whether the drone said that it landed.
+    """
+
+    def __init__(self) -> None:
+        self.phase = _S.UNKNOWN
+        self.rising = False
+        self.sinking = False
+        self.landing_answered = False
+        self._motor_s: int | None = None
+        self._counted_ns: int | None = None  # when the count grew
+        self._since_ns = 0  # when it was first seen
+        self._phase_ns = 0
+        self._settled = 0
+
+    @property
+    def in_air(self) -> bool:
+        """Whether the drone follows sticks."""
+        return self.phase is _S.HOVERING
+
+    def motors(self, now_ns: int) -> bool | None:
+        """Return whether the motors run; None while that can't be known."""
+        if self._counted_ns is not None and now_ns - self._counted_ns < STILL_NS:
+            return True
+        return None if self._motor_s is None or now_ns - self._since_ns < STILL_NS else False
+
+    def update(self, state: State, now_ns: int) -> None:
+        """Handle the newest state."""
+        self._count(state.motor_s, now_ns)
+        height = height_m(state)
+        slow = state.speed_dm_s is None or abs(state.speed_dm_s[2]) <= SLOW_DM_S
+        self._settled = self._settled + 1 if slow and height is not None and height >= HOVER_M else 0
+        phase = self._next(height, self.motors(now_ns), now_ns)
+        if phase is not self.phase:
+            self.phase, self._phase_ns = phase, now_ns
+
+    def _count(self, motor_s: int | None, now_ns: int) -> None:
+        if motor_s is None or motor_s == self._motor_s:
+            return
+        if self._motor_s is None:
+            self._since_ns = now_ns
+        elif motor_s > self._motor_s:
+            self._counted_ns = now_ns
+        self._motor_s = motor_s
+
+    def _next(self, height: float | None, motors: bool | None, now_ns: int) -> FlightState:
+        in_phase_ns = now_ns - self._phase_ns
+        low = height is not None and height <= LOW_M
+        high = height is not None and height >= HIGH_M
+        if self.phase is _S.UNKNOWN:
+            if motors:
+                return _S.HOVERING
+            return _S.LANDED if low or motors is False else _S.UNKNOWN
+        if self.phase is _S.LANDED:
+            return _S.TAKING_OFF if self._rises(high, motors, in_phase_ns) else _S.LANDED
+        if motors is False and (low or in_phase_ns > GRACE_NS):
+            return _S.LANDED
+        if self.phase is _S.LANDING and low and self.landing_answered:
+            return _S.LANDED
+        if self.sinking:
+            return _S.LANDING
+        if self.phase is _S.TAKING_OFF and self._settled < SETTLED and in_phase_ns < RISE_NS:
+            return _S.TAKING_OFF
+        return _S.HOVERING
+
+    def _rises(self, high: bool, motors: bool | None, in_phase_ns: int) -> bool:
+        """Return whether a drone that stood does not any more. Being carried about is no take-off."""
+        if self.rising and (high or motors):
+            return True
+        return bool(high and motors and in_phase_ns > GRACE_NS)
+
+
+# Health --------------------------------------------------------------------------------------------------------------
+
+HOT_C: Final = 90.0  #: estimate: people report that the motors are refused somewhat above
+COOL_C: Final = 85.0
+PAD_LOST: Final = 5  #: states in a row without it, before a pad counts as out of view
+
+
+class Health:
+    """Reports heat and mission pads, each change once."""
+
+    def __init__(self) -> None:
+        self._hot = False
+        self._pad = 0
+        self._without = 0
+
+    def notices(self, state: State) -> list[Notice]:
+        """Return what changed since the last call."""
+        return self._temperature(state.temperature_c) + self._mission_pad(state)
+
+    def _temperature(self, range_c: tuple[float, float] | None) -> list[Notice]:
+        if range_c is None:
+            return []
+        highest = range_c[1]
+        hot = highest >= (COOL_C if self._hot else HOT_C)
+        if hot is self._hot:
+            return []
+        self._hot = hot
+        text = f"the drone is hot: {highest:g} °C" if hot else "no longer: the drone is hot"
+        return [message(text, "hot", Severity.WARNING if hot else Severity.INFO, active=hot, celsius=highest)]
+
+    def _mission_pad(self, state: State) -> list[Notice]:
+        number = state.pad.number if state.pad is not None else 0
+        self._without = 0 if number else self._without + 1
+        if number == self._pad or (not number and self._without < PAD_LOST):
+            return []
+        before, self._pad = self._pad, number
+        if state.pad is not None:
+            return [_seen(state.pad)]
+        return [message(f"mission pad m{before} is out of view", "mission_pad", pad=before, in_view=False)]
+
+
+def _seen(pad: Pad) -> Notice:
+    """Report a pad with its place: the drone's, in the pad's axes [m]."""
+    text = f"mission pad m{pad.number} is in view"
+    if pad.place_cm is None:
+        return message(text, "mission_pad", pad=pad.number, in_view=True)
+    x, y, z = (part / 100 for part in pad.place_cm)
+    return message(text, "mission_pad", pad=pad.number, in_view=True, place=(x, y, z))

@@ -1,0 +1,158 @@
+"""A TCP port of the drone: clients are sent bytes, and what they send is thrown away."""
+
+from __future__ import annotations
+
+import socket
+from collections import deque
+from collections.abc import Callable
+from typing import Final
+
+from skyloop.emulators.datagrams import Address, bound
+from skyloop.emulators.loop import Loop
+
+MOST_CLIENTS: Final = 8
+MOST_BACKLOG: Final = 256 * 1024  #: bytes for one client beyond what the system holds
+_SYSTEM_BUFFER: Final = 64 * 1024
+_READ: Final = 4096
+
+
+class Outlet:
+    """One connection.
+
+    A client that reads too slowly gets no part of a stream, but whole pieces left out: from one that does not fit until
+    the next that can be understood without those before.
+
+    Args:
+        loop: Calls back when there is something to read or room to write.
+        connection: Accepted.
+        gone: Called when the client is gone.
+    """
+
+    def __init__(self, loop: Loop, connection: socket.socket, gone: Callable[[Outlet], None]) -> None:
+        self._loop = loop
+        self._socket = connection
+        self._gone = gone
+        self._waiting: deque[memoryview] = deque()
+        self._backlog = 0
+        self._writing = False
+        self._skipping = False
+        self.dropped = 0  #: pieces left out
+        connection.setblocking(False)
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SYSTEM_BUFFER)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        loop.watch(connection, self._read)
+
+    def offer(self, piece: bytes, *, starts: bool) -> None:
+        """Send a piece, unless the client is too slow.
+
+        Args:
+            piece: What is sent.
+            starts: Whether a client can begin with it.
+        """
+        if starts:
+            self._skipping = False
+        if self._skipping or self._backlog > MOST_BACKLOG:
+            self._skipping = True
+            self.dropped += 1
+            return
+        self._waiting.append(memoryview(piece))
+        self._backlog += len(piece)
+        if not self._writing:
+            self._write()
+
+    def skip_to_start(self) -> None:
+        """Leave out what comes until the next piece that a client can begin with."""
+        self._skipping = True
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._loop.forget(self._socket)
+        self._socket.close()
+
+    def _write(self) -> None:
+        try:
+            while self._waiting:
+                piece = self._waiting[0]
+                sent = self._socket.send(piece)
+                self._backlog -= sent
+                if sent == len(piece):
+                    self._waiting.popleft()
+                else:
+                    self._waiting[0] = piece[sent:]
+        except BlockingIOError:
+            pass
+        except OSError:
+            self._gone(self)
+            return
+        if self._writing != bool(self._waiting):
+            self._writing = bool(self._waiting)
+            self._loop.watch(self._socket, self._read, self._write if self._writing else None)
+
+    def _read(self) -> None:
+        try:
+            heard = self._socket.recv(_READ)
+        except BlockingIOError:
+            return
+        except OSError:
+            heard = b""
+        if not heard:
+            self._gone(self)
+
+
+class StreamPort:
+    """A listening port with its clients. Used on the loop's thread.
+
+    Args:
+        loop: Calls back when somebody connects.
+        bind: Address and port of this machine; port 0 is any free one.
+        name: For errors.
+        joined: Called with each new client. One more than :data:`MOST_CLIENTS` is turned away.
+
+    Raises:
+        LinkError: The port is taken.
+    """
+
+    def __init__(self, loop: Loop, bind: Address, *, name: str, joined: Callable[[Outlet], None] | None = None) -> None:
+        self._loop = loop
+        self._joined = joined
+        self._socket = bound(socket.SOCK_STREAM, bind, name)
+        self._socket.listen(MOST_CLIENTS)
+        self.outlets: list[Outlet] = []  #: replaced as a whole: other threads may read it
+        loop.watch(self._socket, self.accept)
+
+    @property
+    def port(self) -> int:
+        """The real port, where 0 was asked for."""
+        return int(self._socket.getsockname()[1])
+
+    def accept(self) -> None:
+        """Accept whoever waits."""
+        while True:
+            try:
+                connection, _ = self._socket.accept()
+            except OSError:  # nobody waits, or has given up meanwhile
+                return
+            if len(self.outlets) >= MOST_CLIENTS:
+                connection.close()
+                continue
+            outlet = Outlet(self._loop, connection, self._drop)
+            self.outlets = [*self.outlets, outlet]
+            if self._joined is not None:
+                self._joined(outlet)
+
+    def broadcast(self, piece: bytes, *, starts: bool = True) -> None:
+        """Send a piece to all clients."""
+        for outlet in self.outlets:
+            outlet.offer(piece, starts=starts)
+
+    def close(self) -> None:
+        """Close the port and all connections."""
+        self._loop.forget(self._socket)
+        self._socket.close()
+        for outlet in self.outlets:
+            outlet.close()
+        self.outlets = []
+
+    def _drop(self, outlet: Outlet) -> None:
+        outlet.close()
+        self.outlets = [other for other in self.outlets if other is not outlet]

@@ -1,0 +1,121 @@
+"""A UDP port of the drone, with the faults on the way to it and from it."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from typing import Final
+
+from skyloop.clock import monotonic_ns, nanoseconds
+from skyloop.emulators.loop import Loop
+from skyloop.errors import LinkError
+from skyloop.faults import FaultInjector, Faults
+
+Address = tuple[str, int]
+
+MAX_DATAGRAM: Final = 65_507
+_MOST_AT_ONCE: Final = 64  # read before others have their turn
+_SEND_BUFFER: Final = 1 << 20  # room for pictures of an AR.Drone 1
+
+
+class DatagramPort:
+    """Answers whoever sends to it, at the port that the datagram came from. Used on the loop's thread.
+
+    Args:
+        loop: Calls back when something comes.
+        bind: Address and port of this machine; port 0 is any free one.
+        heard: Called with each datagram and its sender.
+        name: For errors, and for the seeds of the faults.
+        faults: Befall the datagrams each way.
+        delay_s: By which all of them are late, each way.
+
+    Raises:
+        LinkError: The port is taken.
+    """
+
+    def __init__(
+        self,
+        loop: Loop,
+        bind: Address,
+        heard: Callable[[bytes, Address], None],
+        *,
+        name: str,
+        faults: Faults,
+        delay_s: float,
+    ) -> None:
+        self._loop = loop
+        self._heard = heard
+        self._faults = faults
+        self._name = name
+        self._delay_ns = nanoseconds(delay_s)
+        self._inward = FaultInjector(faults, f"{name}/in")
+        self._outward = FaultInjector(faults, f"{name}/out")
+        self._socket = bound(socket.SOCK_DGRAM, bind, name)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
+        loop.watch(self._socket, self._receive)
+
+    @property
+    def port(self) -> int:
+        """The real port, where 0 was asked for."""
+        return int(self._socket.getsockname()[1])
+
+    def send(self, datagram: bytes, to: Address) -> None:
+        """Send a datagram. It is lost where there is no room or nobody, as datagrams are."""
+        for each in self._outward.packets(datagram):
+            self._later(partial(self._send, each, to))
+
+    def close(self) -> None:
+        """Close the port."""
+        self._loop.forget(self._socket)
+        self._socket.close()
+
+    def _receive(self) -> None:
+        for _ in range(_MOST_AT_ONCE):
+            try:
+                datagram, sender = self._socket.recvfrom(MAX_DATAGRAM)
+            except OSError:  # nothing more, or an answer that could not be delivered
+                return
+            for each, address in self._inward.items((datagram, sender)):
+                self._later(partial(self._heard, each, address))
+
+    def _later(self, call: Callable[[], None]) -> None:
+        if self._delay_ns:
+            self._loop.at(monotonic_ns() + self._delay_ns, call)
+        else:
+            call()
+
+    def _send(self, datagram: bytes, to: Address) -> None:
+        with suppress(OSError):
+            self._socket.sendto(datagram, to)
+
+
+def bound(kind: socket.SocketKind, bind: Address, name: str) -> socket.socket:
+    """Return a non-blocking socket that is bound.
+
+    A TCP port may be bound again while connections of an earlier firmware are still winding down; a UDP port may not be
+    shared, or two firmwares would steal each other's datagrams.
+
+    Args:
+        kind: TCP or UDP.
+        bind: Address and port of this machine.
+        name: Of the port, for the error.
+
+    Raises:
+        LinkError: The port can't be opened; with what to do about it.
+    """
+    made = socket.socket(socket.AF_INET, kind)
+    made.setblocking(False)
+    if kind is socket.SOCK_STREAM:
+        made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        made.bind(bind)
+    except OSError as error:
+        made.close()
+        protocol = "TCP" if kind is socket.SOCK_STREAM else "UDP"
+        raise LinkError(
+            f"the drone's {name} port, {protocol} {bind[1]} on {bind[0]}, can't be opened ({error.strerror}): "
+            "end what uses it, or take other ports"
+        ) from error
+    return made

@@ -1,0 +1,457 @@
+"""Behaviour that both autopilots share: messages in, a simulated vehicle flown, messages out. Pure but for the vehicle.
+
+Times are the autopilot's, seconds of the simulation, so that everything goes faster in a faster world.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import ClassVar, Final
+
+from skyloop.emulators.mavlink.flight import FlightControl
+from skyloop.emulators.mavlink.links import Port
+from skyloop.emulators.mavlink.manoeuvres import Manoeuvres
+from skyloop.emulators.mavlink.parameters import ParameterTable
+from skyloop.emulators.mavlink.places import ORIGIN_ALTITUDE_M, on_earth, place_of
+from skyloop.emulators.mavlink.services import answers
+from skyloop.emulators.mavlink.streams import MAX_INTERVAL_US
+from skyloop.emulators.mavlink.telemetry import MAKERS
+from skyloop.emulators.vehicle import Vehicle
+from skyloop.messages import FlightState
+from skyloop.sim.host import Report
+from skyloop.wire.mavlink.axes import Vector
+from skyloop.wire.mavlink.codec import Message
+from skyloop.wire.mavlink.codec import dialect as m
+from skyloop.wire.mavlink.modes import ModeFlag, SystemState
+from skyloop.wire.mavlink.texts import chunks_of
+
+ACCEPTED: Final = 0
+TEMPORARILY_REJECTED: Final = 1
+DENIED: Final = 2
+UNSUPPORTED: Final = 3
+FAILED: Final = 4
+FORCE: Final = 21196  #: "even in flight", of the command to disarm
+WARNING: Final = 4
+CRITICAL: Final = 2
+INFO: Final = 6
+AFTER_LANDING_S: Final = 2.0
+POSES_S: Final = 1.0  #: poses from outside must come for so long, without GPS
+POSE_GAP_S: Final = 0.5
+_GCS: Final = 6  #: MAV_TYPE
+_COPIES: Final = 1 << 32
+_NOT_GIVEN: Final = 0x7FFFFFFF  #: of a position in COMMAND_INT, as NaN is in COMMAND_LONG
+
+Arguments = tuple[float, ...]
+Handler = Callable[[Arguments], int]
+PlaceHandler = Callable[[Arguments, int], int]
+
+
+class Autopilot(ABC):
+    """One autopilot. All methods belong to one thread. ``ports``, its links, are set before the first report.
+
+    Args:
+        vehicle: What it flies.
+        system: Its MAVLink system id.
+        boot_s: From the start until it lets itself be armed, in seconds of the simulation.
+        gps: Whether it has GPS; if not, it is not ready before poses come from outside.
+    """
+
+    AUTOPILOT: ClassVar[int]  #: MAV_AUTOPILOT
+    CAPABILITIES: ClassVar[int]
+    VERSION: ClassVar[int]
+    RATES: ClassVar[dict[int, float]]  #: of the messages that a fresh link gets unasked [1/s]
+    FRAMES: ClassVar[frozenset[int]]  #: of set-points
+    ABOVE_SEA: ClassVar[frozenset[int]]  #: frames of places on the Earth, with altitudes above mean sea level
+    ABOVE_HOME: ClassVar[frozenset[int]]  #: … above home
+    LONG_FRAMES: ClassVar[dict[int, int]]  #: frame of a command with a position in COMMAND_LONG, if it is accepted
+    NOTHING_TO_TELL: ClassVar[int]  #: result for a request of a message that it does not have
+    BYTEWISE: ClassVar[bool]
+    TELLS_PREARM: ClassVar[bool] = True  #: SYS_STATUS says that it has a check before arming, besides its outcome
+    DISARM_S: ClassVar[float]  #: armed on the ground for so long, it disarms
+
+    def __init__(self, vehicle: Vehicle, system: int, boot_s: float, gps: bool) -> None:
+        self.flight = FlightControl(vehicle)
+        self.system = system
+        self.gps = gps
+        self.ports: tuple[Port, ...] = ()
+        self.parameters: ParameterTable
+        self.report: Report
+        self.armed = False
+        self.mode = ""
+        self.failsafe = False
+        self.poses = 0  #: that came from outside
+        self.set_points = 0  #: that were taken
+        self.home: Vector = (0.0, 0.0, 0.0)  #: east, north, up of the flight's origin
+        self._home_given = False  # set by somebody: then arming does not change it
+        self._manoeuvres = Manoeuvres(self.flight)
+        self._boot_s = boot_s
+        self._begun_s: float | None = None
+        self._captured_ns = 0
+        self._armed_s = 0.0
+        self._landed_s: float | None = None
+        self._flown = False  # since it was armed
+        self._gcs_s: float | None = None
+        self._pose_s = -math.inf
+        self._posing_s = math.inf
+        self._text = 0
+        self._commands: dict[int, Handler] = {
+            m.MAV_CMD_COMPONENT_ARM_DISARM: self._arm_or_disarm,
+            m.MAV_CMD_DO_SET_MODE: self._change_mode,
+            m.MAV_CMD_NAV_TAKEOFF: self._take_off,
+            m.MAV_CMD_NAV_LAND: lambda _: self._go_by("land"),
+            m.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda _: self._go_by("return"),
+            m.MAV_CMD_DO_CHANGE_SPEED: self._change_speed,
+        }
+        self._placed_commands: dict[int, PlaceHandler] = {
+            m.MAV_CMD_DO_REPOSITION: self._reposition,
+            m.MAV_CMD_DO_SET_HOME: self._set_home,
+        }
+
+    # Time and state --------------------------------------------------------------------------------------------
+
+    @property
+    def time_s(self) -> float:
+        """Time since it was switched on [s]."""
+        return 0.0 if self._begun_s is None else self.report.believed.time_s - self._begun_s
+
+    @property
+    def boot_ms(self) -> int:
+        """The same as messages have it, 32 bits [ms]."""
+        return round(self.time_s * 1000) % _COPIES
+
+    @property
+    def boot_ns(self) -> int:
+        """The same [ns]."""
+        return round(self.time_s * 1e9)
+
+    @property
+    def has_origin(self) -> bool:
+        """Whether it knows where it is."""
+        if self.gps:
+            return self.time_s >= self._boot_s / 2
+        return self.time_s - self._posing_s >= POSES_S and self.time_s - self._pose_s < POSE_GAP_S
+
+    @property
+    def settled(self) -> bool:
+        """Whether its estimator says that the position is good, which is the last thing that a boot waits for."""
+        return self.time_s >= self._boot_s and self.has_origin
+
+    @property
+    def ready(self) -> bool:
+        """Whether it may be armed."""
+        return self.settled and self.mode_allows_arming
+
+    @property
+    def mode_allows_arming(self) -> bool:
+        """Whether it may be armed in its mode."""
+        return True
+
+    @property
+    def base_mode(self) -> int:
+        """``MAV_MODE_FLAG`` of the heartbeat."""
+        return int(ModeFlag.CUSTOM | (ModeFlag.ARMED if self.armed else 0))
+
+    @property
+    def system_status(self) -> int:
+        """``MAV_STATE`` of the heartbeat."""
+        if self.failsafe:
+            return SystemState.CRITICAL
+        return SystemState.ACTIVE if self.armed else SystemState.STANDBY
+
+    @property
+    @abstractmethod
+    def custom_mode(self) -> int: ...
+
+    # Time passes -----------------------------------------------------------------------------------------------
+
+    def tick(self, report: Report) -> None:
+        """Handle a new report: fly, and send what is due."""
+        self.report = report
+        self._captured_ns = report.captured_ns
+        if self._begun_s is None:
+            self._begun_s = report.believed.time_s
+        self.flight.update(report)
+        if self.armed:
+            self._fly()
+            self._look_at_ground()
+        else:
+            self.flight.lie()
+        self._look_at_ground_station()
+        self._send_due()
+
+    @abstractmethod
+    def _fly(self) -> None:
+        """Do what the mode does. Called at every tick while it is armed."""
+
+    def _look_at_ground(self) -> None:
+        if not self.flight.standing:
+            self._flown, self._landed_s = True, None
+            return
+        if self.flight.state is FlightState.EMERGENCY:
+            return
+        if not self._flown:
+            if self.time_s - self._armed_s > self.DISARM_S:
+                self._disarm(self._words("auto_disarm"))
+        elif self._landed_s is None:
+            self._landed_s = self.time_s
+        elif self.time_s - self._landed_s > AFTER_LANDING_S:
+            self._disarm(self._words("landed"))
+
+    def _look_at_ground_station(self) -> None:
+        lost = self._gcs_s is not None and self.time_s - self._gcs_s > self._gcs_patience_s
+        self._ground_station(lost)
+
+    @property
+    @abstractmethod
+    def _gcs_patience_s(self) -> float: ...
+
+    @abstractmethod
+    def _ground_station(self, lost: bool) -> None: ...
+
+    def _send_due(self) -> None:
+        for port in self.ports:
+            for number in port.streams.due(self.time_s):
+                made = MAKERS[number](self)
+                if made is not None:
+                    port.send(made)
+            for parameter in self.parameters.pending(port):
+                port.send(parameter)
+
+    def say(self, text: str, severity: int = WARNING) -> None:
+        """Send a text to everybody.
+
+        Args:
+            text: For people; sent in pieces if it is long.
+            severity: ``MAV_SEVERITY``.
+        """
+        self._text = self._text % 0xFFFF + 1
+        for port in self.ports:
+            for chunk in chunks_of(text, severity, self._text):
+                port.send(chunk)
+
+    def tell_heartbeat(self) -> None:
+        """Send a heartbeat besides the usual ones."""
+        for port in self.ports:
+            port.send(MAKERS[m.MAVLINK_MSG_ID_HEARTBEAT](self))
+
+    # Messages come -----------------------------------------------------------------------------------------------
+
+    def heard(self, port: Port, message: Message, now_ns: int) -> None:
+        """Handle a message. Before the first report all are ignored: it is not awake yet.
+
+        Args:
+            port: Where it came, and answers go.
+            message: Whatever it is.
+            now_ns: When it came.
+        """
+        if self._begun_s is None or getattr(message, "target_system", 0) not in (0, self.system):
+            return
+        kind = message.get_type()
+        if kind == "HEARTBEAT":
+            if message.type == _GCS and self._counts(message):
+                self._gcs_s = self.time_s
+        elif kind == "COMMAND_LONG":
+            frame = self.LONG_FRAMES.get(message.command)
+            self._command(port, message, tuple(getattr(message, f"param{n}") for n in range(1, 8)), frame)
+        elif kind == "COMMAND_INT":
+            first = tuple(getattr(message, f"param{n}") for n in range(1, 5))
+            place = (math.nan if each == _NOT_GIVEN else each / 1e7 for each in (message.x, message.y))
+            self._command(port, message, (*first, *place, message.z), message.frame)
+        elif kind == "SET_MODE":
+            self._change_mode((message.base_mode, *self._split(message.custom_mode)))
+        elif kind in ("SET_POSITION_TARGET_LOCAL_NED", "SET_POSITION_TARGET_GLOBAL_INT", "SET_ATTITUDE_TARGET"):
+            self._set_point(message)
+        elif kind in ("ODOMETRY", "VISION_POSITION_ESTIMATE", "ATT_POS_MOCAP"):
+            self._pose()
+        elif kind == "TIMESYNC":
+            if message.tc1 == 0:
+                drift_ns = max(0, now_ns - self._captured_ns)
+                port.send(m.MAVLink_timesync_message(self.boot_ns + drift_ns, message.ts1))
+        elif kind == "REQUEST_DATA_STREAM":
+            self._data_stream(port, message)
+        elif kind in ("RC_CHANNELS_OVERRIDE", "MANUAL_CONTROL"):
+            self._sticks(message)
+        elif kind.startswith("PARAM_"):
+            for answer in self.parameters.heard(port, message):
+                port.send(answer)
+        elif not self._own(port, message):
+            for answer in answers(message):
+                port.send(answer)
+
+    def _own(self, port: Port, message: Message) -> bool:  # noqa: ARG002
+        """Handle a message that only one of the autopilots answers. Return whether it was such a one."""
+        return False
+
+    @abstractmethod
+    def _counts(self, heartbeat: Message) -> bool:
+        """Return whether this ground station's heartbeat counts."""
+
+    @abstractmethod
+    def _set_point(self, message: Message) -> None: ...
+
+    @abstractmethod
+    def _sticks(self, message: Message) -> None:
+        """Handle a remote control that comes over MAVLink."""
+
+    def _pose(self) -> None:
+        self.poses += 1
+        if self.time_s - self._pose_s > POSE_GAP_S:
+            self._posing_s = self.time_s
+        self._pose_s = self.time_s
+
+    def _data_stream(self, port: Port, message: Message) -> None:
+        """Handle the old way to ask for messages: all of them at one rate."""
+        rate = min(50, message.req_message_rate) if message.start_stop else 0
+        for number in MAKERS:
+            if number not in (m.MAVLINK_MSG_ID_HEARTBEAT, m.MAVLINK_MSG_ID_TIMESYNC):
+                port.streams.set_interval(number, 1e6 / rate if rate else -1)
+
+    # Commands ----------------------------------------------------------------------------------------------------
+
+    def _command(self, port: Port, message: Message, arguments: Arguments, frame: int | None) -> None:
+        number = message.command
+        answer: Message | None = None
+        if number == m.MAV_CMD_SET_MESSAGE_INTERVAL:
+            result = self._set_interval(port, whole(arguments[0]), arguments[1])
+        elif number == m.MAV_CMD_GET_MESSAGE_INTERVAL:
+            answer = self._interval(port, whole(arguments[0]))
+            result = ACCEPTED if answer is not None else FAILED
+        elif number in (m.MAV_CMD_REQUEST_MESSAGE, m.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES):
+            asked = m.MAVLINK_MSG_ID_AUTOPILOT_VERSION if number != m.MAV_CMD_REQUEST_MESSAGE else whole(arguments[0])
+            answer = self._requested(asked)
+            result = ACCEPTED if answer is not None else self.NOTHING_TO_TELL
+        elif number == m.MAV_CMD_GET_HOME_POSITION:
+            answer = self._requested(m.MAVLINK_MSG_ID_HOME_POSITION)
+            result = ACCEPTED if answer is not None else self.NOTHING_TO_TELL
+        elif number in self._placed_commands:
+            result = UNSUPPORTED if frame is None else self._placed_commands[number](arguments, frame)
+        else:
+            handler = self._commands.get(number)
+            result = UNSUPPORTED if handler is None else handler(arguments)
+        sender = message.get_srcSystem(), message.get_srcComponent()
+        port.send(m.MAVLink_command_ack_message(number, result, 0, 0, *sender))
+        if answer is not None:
+            port.send(answer)
+
+    def _requested(self, number: int) -> Message | None:
+        if number == m.MAVLINK_MSG_ID_AUTOPILOT_VERSION:
+            none = [0] * 8
+            uid = 1000 + self.system
+            return m.MAVLink_autopilot_version_message(
+                self.CAPABILITIES, self.VERSION, 0, 0, 0, none, none, none, 0, 0, uid
+            )
+        maker = MAKERS.get(number)
+        return maker(self) if maker is not None else None
+
+    def _interval(self, port: Port, number: int) -> Message | None:
+        if not 0 <= number <= 0xFFFF:  # the answer has no room for it
+            return None
+        return m.MAVLink_message_interval_message(number, port.streams.interval_us(number))
+
+    def _set_interval(self, port: Port, number: int, interval_us: float) -> int:
+        if number not in MAKERS or not interval_us <= MAX_INTERVAL_US:  # nor for NaN
+            return FAILED
+        port.streams.set_interval(number, interval_us)
+        return ACCEPTED
+
+    def _arm_or_disarm(self, arguments: Arguments) -> int:
+        forced = whole(arguments[1]) == FORCE
+        if arguments[0] >= 0.5:
+            return ACCEPTED if self.armed else self._arm(forced)
+        if not self.armed:
+            return ACCEPTED
+        if self.flight.standing:
+            self._disarm("")
+            return ACCEPTED
+        if forced:
+            self.flight.cut()
+            self._disarm(self._words("forced"))
+            return ACCEPTED
+        return self._refuse_disarming()
+
+    def _arm(self, forced: bool) -> int:
+        refusal = None if forced else self._refuse_arming()
+        if refusal is not None:
+            return refusal
+        self.armed, self._armed_s, self._flown, self._landed_s = True, self.time_s, False, None
+        if not self._home_given:
+            self.home = self.flight.place
+        self.say(self._words("armed"), INFO)
+        return ACCEPTED
+
+    def _disarm(self, text: str) -> None:
+        self.armed = False
+        self.say(text or self._words("disarmed"), INFO)
+        self._disarmed()
+
+    def crashed(self, text: str) -> None:
+        """Disarm: the vehicle stopped its motors by itself.
+
+        Args:
+            text: Why, for people.
+        """
+        if self.armed:
+            self._disarm(f"Crash: Disarming ({text})")
+
+    @abstractmethod
+    def _disarmed(self) -> None:
+        """Change the mode after disarming."""
+
+    @abstractmethod
+    def _words(self, occasion: str) -> str:
+        """Return its text for an occasion: armed, disarmed, auto_disarm, landed, forced."""
+
+    @abstractmethod
+    def _refuse_arming(self) -> int | None:
+        """Return the result that refuses, after its text was sent; None where nothing is against it."""
+
+    @abstractmethod
+    def _refuse_disarming(self) -> int:
+        """Return the result that refuses to disarm in flight."""
+
+    def _datum(self, frame: int) -> float | None:
+        """Return how high the altitude 0 of a frame is above the flight's origin [m]; None for an unknown frame."""
+        if frame in self.ABOVE_SEA:
+            return -ORIGIN_ALTITUDE_M
+        return self.home[2] if frame in self.ABOVE_HOME else None
+
+    def _place(self, arguments: Arguments, frame: int) -> Vector | None:
+        """Return the position that a command names; None where it names none."""
+        latitude, longitude, altitude = arguments[4:7]
+        datum = self._datum(frame)
+        if datum is None or not on_earth(latitude, longitude) or not math.isfinite(altitude):
+            return None
+        return place_of(latitude, longitude, datum + altitude)
+
+    def _home_at(self, place: Vector) -> None:
+        self.home, self._home_given = place, True
+
+    @abstractmethod
+    def _change_speed(self, arguments: Arguments) -> int: ...
+
+    @abstractmethod
+    def _reposition(self, arguments: Arguments, frame: int) -> int: ...
+
+    @abstractmethod
+    def _set_home(self, arguments: Arguments, frame: int) -> int: ...
+
+    @abstractmethod
+    def _split(self, custom_mode: int) -> Arguments:
+        """Return a heartbeat's custom mode as the arguments of the command that sets it."""
+
+    @abstractmethod
+    def _change_mode(self, arguments: Arguments) -> int: ...
+
+    @abstractmethod
+    def _take_off(self, arguments: Arguments) -> int: ...
+
+    @abstractmethod
+    def _go_by(self, manoeuvre: str) -> int:
+        """Land or return, by the command that is no change of mode."""
+
+
+def whole(argument: float) -> int:
+    """Return an argument of a command as a whole number; 0 for NaN, which stands for "not given"."""
+    return round(argument) if math.isfinite(argument) else 0

@@ -1,0 +1,162 @@
+"""An emulated ArduCopter or PX4 on the network, over a drone of a simulated world."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from typing import Final
+
+from skyloop.clock import monotonic_ns
+from skyloop.emulators.emulator import NO_FAULTS, Emulator, RunningEmulator, checked_delay
+from skyloop.emulators.mavlink.arducopter import ArduCopter
+from skyloop.emulators.mavlink.autopilot import Autopilot
+from skyloop.emulators.mavlink.links import Port, TcpPort, UdpPort
+from skyloop.emulators.mavlink.px4 import Px4
+from skyloop.emulators.mavlink.settings import Kind, Ports, Settings
+from skyloop.emulators.mavlink.streams import Streams
+from skyloop.emulators.mavlink.video import CAMERA, TransportStream, encoding
+from skyloop.emulators.vehicle import SimulatedVehicle
+from skyloop.errors import UsageError
+from skyloop.faults import Faults
+from skyloop.sim.host import Report, SimHost
+from skyloop.sim.reports import Occurrence, OccurrenceKind
+
+_KINDS: dict[Kind, type[Autopilot]] = {Kind.ARDUCOPTER: ArduCopter, Kind.PX4: Px4}
+
+
+class RunningFirmware(RunningEmulator):
+    """An autopilot that is switched on. It belongs to the loop's thread."""
+
+    def __init__(self, host: SimHost, drone: int, settings: Settings) -> None:
+        super().__init__(host, drone, f"skyloop-{settings.kind.value}")
+        kind = _KINDS[settings.kind]
+        self.autopilot = kind(SimulatedVehicle(host.simulation, drone), settings.system, settings.boot_s, settings.gps)
+        try:
+            udp = UdpPort(self._loop, settings, Streams(kind.RATES), self._heard)
+            self._open.append(udp)
+            tcp = None
+            if settings.ports.tcp is not None:
+                tcp = TcpPort(self._loop, settings, Streams(kind.RATES), self._heard)
+                self._open.append(tcp)
+            self.ports = Ports(udp.port, settings.ports.remote, tcp.port if tcp is not None else None)
+            self.autopilot.ports = (udp,) if tcp is None else (udp, tcp)
+            self._loop.start()
+            if settings.video is not None:
+                stream = TransportStream(*settings.video)
+                self._open.append(stream)
+                self._video = encoding(stream)
+                self._video.start()
+            host.attach(drone, self, self, [CAMERA] if self._video is not None else [])
+        except BaseException:
+            self.stop()
+            raise
+
+    def _heard(self, port: Port, message: object) -> None:
+        self.autopilot.heard(port, message, monotonic_ns())
+
+    def _tick(self, report: Report) -> None:
+        self.autopilot.tick(report)
+
+    # Called by the host, on its threads ------------------------------------------------------------------------
+
+    def happened(self, occurrence: Occurrence) -> None:
+        """Report a crash, which stops the motors, to the autopilot."""
+        super().happened(occurrence)
+        if occurrence.kind is OccurrenceKind.EMERGENCY:
+            self._loop.post(partial(self.autopilot.crashed, occurrence.text))
+
+
+BOOT_S: Final = 2.0
+
+
+class MavlinkFirmware(Emulator[RunningFirmware]):
+    """The autopilot of one drone of a host's world. Several may share a host, each with a drone and ports of its own.
+
+    Make the host with :func:`with_multirotors`.
+
+    Args:
+        host: The simulated world.
+        drone: Its number in it.
+        kind: ArduCopter or PX4.
+        bind: The address of this machine to listen on.
+        ports: To listen on; None: those of the real one's simulation.
+        system: Its MAVLink system id, 1 to 255; None: the drone's number plus one.
+        faults: Befall UDP datagrams, each way.
+        delay_s: By which UDP datagrams are late, each way.
+        boot_s: From the start until it lets itself be armed, in seconds of the simulation (real ones take 5 to 40).
+        gps: Whether it has GPS; without it the autopilot is not ready before poses come from outside.
+        version: 1: it speaks the old MAVLink, and answers in nothing else.
+        key: 32 bytes that sign everything; None: nothing is signed.
+        video: Host and port to which the front camera's pictures are sent over UDP; None: no camera.
+
+    Raises:
+        UsageError: An argument is out of range.
+        MissingExtraError: pymavlink is not installed.
+    """
+
+    def __init__(
+        self,
+        host: SimHost,
+        drone: int = 0,
+        *,
+        kind: Kind,
+        bind: str = "127.0.0.1",
+        ports: Ports | None = None,
+        system: int | None = None,
+        faults: Faults = NO_FAULTS,
+        delay_s: float = 0.0,
+        boot_s: float = BOOT_S,
+        gps: bool = True,
+        version: int = 2,
+        key: bytes | None = None,
+        video: tuple[str, int] | None = None,
+    ) -> None:
+        number = drone + 1 if system is None else system
+        if not 1 <= number <= 255:
+            raise UsageError(f"a system id is from 1 to 255, not {number!r}")
+        if version not in (1, 2):
+            raise UsageError(f"there is MAVLink 1 and MAVLink 2, not {version!r}")
+        super().__init__(host, drone)
+        delay_s = checked_delay(delay_s)
+        ports = ports or Ports.standard(kind, drone)
+        self.settings = Settings(kind, bind, ports, number, faults, delay_s, boot_s, gps, version, key, video)
+
+    def _switched_on(self) -> RunningFirmware:
+        running = RunningFirmware(self.host, self.drone, self.settings)
+        self.settings = replace(self.settings, ports=running.ports)  # found again after a restart
+        return running
+
+    @property
+    def autopilot(self) -> Autopilot:
+        """The running autopilot, for tests; it belongs to its thread.
+
+        Raises:
+            UsageError: It is not started.
+        """
+        return self._started.autopilot
+
+    @property
+    def address(self) -> str:
+        """Address of a driver on this machine, over UDP."""
+        return f"mavlink://udpin:{self.settings.bind}:{self.settings.ports.remote}"
+
+    @property
+    def tcp_address(self) -> str:
+        """Address of a driver on this machine, over TCP.
+
+        Raises:
+            UsageError: This kind has no such port.
+        """
+        if self.settings.ports.tcp is None:
+            raise UsageError(f"an emulated {self.settings.kind.value} has no TCP port")
+        return f"mavlink://tcp:{self.settings.bind}:{self.settings.ports.tcp}"
+
+    @property
+    def description(self) -> str:
+        """Where it is, in one line for people."""
+        settings = self.settings
+        tcp = f", {self.tcp_address}" if settings.ports.tcp is not None else ""
+        return (
+            f"{settings.kind.value} drone {self.drone}, system {settings.system}, "
+            f"from udp {settings.ports.udp}: {self.address}{tcp}"
+        )

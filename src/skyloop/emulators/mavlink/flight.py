@@ -1,0 +1,180 @@
+"""The loops below an autopilot's modes: positions, world velocities and headings, over a simulated vehicle. Pure."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+from skyloop.emulators.vehicle import Vehicle
+from skyloop.messages import AnyAction, Attitude, EmergencyStop, FlightState, Hover, Land, ResetEmergency, Takeoff
+from skyloop.messages import Velocity as VelocityAction
+from skyloop.messages.geometry import wrap_angle
+from skyloop.sim.host import Report
+from skyloop.sim.parameters import GRAVITY_M_S2, Limits
+from skyloop.wire.mavlink.axes import Vector, turned
+
+LIFT_M: Final = 0.3  #: what the simulated vehicle's own take-off does, before these loops go on
+LIMITS: Final = Limits(
+    tilt_rad=0.52, climb_m_s=2.5, yaw_rate_rad_s=2.5, altitude_m=100.0, speed_m_s=8.0, takeoff_altitude_m=LIFT_M
+)
+PLACE_GAIN_PER_S: Final = 0.9
+YAW_GAIN_PER_S: Final = 2.0
+YAW_RATE_RAD_S: Final = 1.5
+GO_M_S: Final = 3.0
+SINK_M_S: Final = 1.5
+HEADROOM_M: Final = 1.0  #: kept below the ceiling
+_CLIMB_LAG_S: Final = 0.33  #: of the simulated vehicle's climb loop
+_AIRBORNE: Final = (FlightState.HOVERING, FlightState.FLYING)
+
+
+@dataclass(frozen=True, slots=True)
+class Speeds:
+    """Speeds on the way to a position [m/s]."""
+
+    across: float = GO_M_S
+    up: float = SINK_M_S
+    down: float = SINK_M_S
+
+
+USUAL: Final = Speeds()
+
+
+class FlightControl:
+    """Flies a simulated vehicle by position, velocity, attitude or thrust.
+
+    World axes are east, north, up from where the vehicle stood when it was made; yaw is counter-clockwise from east.
+    What it does must be asked for at every tick.
+
+    Args:
+        vehicle: What it flies.
+    """
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self.vehicle = vehicle
+        self.place: Vector = (0.0, 0.0, 0.0)
+        self.velocity: Vector = (0.0, 0.0, 0.0)  #: east, north, up
+        self.yaw = 0.0
+        self._home: tuple[float, float] | None = None
+        self._sinking = 0.0  # climb rate under a collective thrust
+        self._time_s = 0.0
+        self._step_s = 0.0
+        vehicle.set_limits(LIMITS)
+
+    def update(self, report: Report) -> None:
+        """Handle what the vehicle believes now."""
+        believed, (east, north, _) = report.believed, report.truth.position_m
+        if self._home is None:
+            self._home = east, north
+        self._step_s, self._time_s = max(0.0, believed.time_s - self._time_s), believed.time_s
+        self.yaw = believed.yaw_rad
+        self.place = (east - self._home[0], north - self._home[1], believed.altitude_m)
+        forward, left, up = believed.velocity_m_s
+        self.velocity = (*turned(forward, left, self.yaw), up)
+
+    @property
+    def time_s(self) -> float:
+        """Simulation time of the newest report [s]."""
+        return self._time_s
+
+    @property
+    def highest_m(self) -> float:
+        """The greatest height that it reaches: a climb to more would never end."""
+        return min(LIMITS.altitude_m, self.vehicle.ceiling_m) - HEADROOM_M
+
+    @property
+    def state(self) -> FlightState:
+        """The vehicle's flight state."""
+        return self.vehicle.state
+
+    @property
+    def airborne(self) -> bool:
+        """Whether the vehicle follows set-points."""
+        return self.vehicle.state in _AIRBORNE
+
+    @property
+    def standing(self) -> bool:
+        """Whether the vehicle is on the ground, or its motors are cut."""
+        return self.vehicle.state in (FlightState.LANDED, FlightState.EMERGENCY)
+
+    # What it does; each must be asked for again at every tick ----------------------------------------------------
+
+    def lift_off(self) -> None:
+        """Take off from the ground, or out of a landing."""
+        if self.vehicle.state in (FlightState.LANDED, FlightState.LANDING):
+            self.vehicle.command(Takeoff())
+
+    def hold(self) -> None:
+        """Stay where it is."""
+        self._fly(Hover())
+
+    def land(self) -> None:
+        """Land."""
+        if self.vehicle.state not in (FlightState.LANDING, FlightState.LANDED):
+            self.vehicle.command(Land())
+
+    def cut(self) -> None:
+        """Stop the motors, wherever it is."""
+        self.vehicle.command(EmergencyStop())
+
+    def lie(self) -> None:
+        """Let it start again after :meth:`cut`, once it lies on the ground."""
+        if self.vehicle.state is FlightState.EMERGENCY:
+            self.vehicle.command(ResetEmergency())
+
+    def move(self, east: float, north: float, up: float, yaw_rate: float) -> None:
+        """Fly a world velocity.
+
+        Args:
+            east: [m/s]
+            north: [m/s]
+            up: [m/s]
+            yaw_rate: Counter-clockwise [rad/s].
+        """
+        forward, left = turned(east, north, -self.yaw)
+        self.move_body(forward, left, up, yaw_rate)
+
+    def move_body(self, forward: float, left: float, up: float, yaw_rate: float) -> None:
+        """Fly a velocity in levelled body axes [m/s], with a yaw rate, counter-clockwise [rad/s]."""
+        self._fly(VelocityAction(forward, left, up, yaw_rate))
+
+    def go(self, place: Vector, speeds: Speeds = USUAL, *, yaw_rate: float = 0.0) -> None:
+        """Fly towards a position, slower as it comes near.
+
+        Args:
+            place: East, north, up from the origin [m].
+            speeds: The greatest ones.
+            yaw_rate: Counter-clockwise [rad/s].
+        """
+        east, north, up = (PLACE_GAIN_PER_S * (to - at) for to, at in zip(place, self.place, strict=True))
+        speed = math.hypot(east, north)
+        share = min(1.0, speeds.across / speed) if speed > 0 else 1.0
+        self.move(east * share, north * share, max(-speeds.down, min(speeds.up, up)), yaw_rate)
+
+    def lean(self, roll: float, pitch: float, climb: float, yaw_rate: float) -> None:
+        """Fly an attitude with a climb rate; signs are those of :class:`skyloop.messages.Attitude`."""
+        self._sinking = self.velocity[2]
+        self._fly(Attitude(roll, pitch, climb, yaw_rate))
+
+    def lean_by_thrust(self, roll: float, pitch: float, thrust: float, yaw_rate: float) -> None:
+        """Fly an attitude with a collective thrust, as a share of the weight."""
+        upward = GRAVITY_M_S2 * (thrust * math.cos(roll) * math.cos(pitch) - 1.0)
+        self._sinking += upward * self._step_s
+        self._sinking = max(self.velocity[2] - 1.0, min(self.velocity[2] + 1.0, self._sinking))
+        self._fly(Attitude(roll, pitch, self._sinking + upward * _CLIMB_LAG_S, yaw_rate))
+
+    def level_thrust(self) -> None:
+        """Begin a thrust set-point with the present climb rate."""
+        self._sinking = self.velocity[2]
+
+    def yaw_rate_to(self, yaw: float) -> float:
+        """Return the yaw rate that turns to this heading [rad/s]."""
+        return max(-YAW_RATE_RAD_S, min(YAW_RATE_RAD_S, YAW_GAIN_PER_S * wrap_angle(yaw - self.yaw)))
+
+    def _fly(self, action: AnyAction) -> None:
+        if not action.finite:
+            action = Hover()  # numbers that are not finite move nothing
+        if self.vehicle.state is FlightState.LANDING:
+            self.lift_off()  # the vehicle's way out of its landing
+        if self.airborne:
+            self.vehicle.command(action)

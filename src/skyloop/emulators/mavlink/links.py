@@ -1,0 +1,170 @@
+"""The emulated autopilot's ports: UDP to one peer, and a TCP server for one client."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable
+from typing import Final, Protocol
+
+from skyloop.clock import monotonic_ns, nanoseconds
+from skyloop.emulators.datagrams import Address, DatagramPort, bound
+from skyloop.emulators.loop import Loop
+from skyloop.emulators.mavlink.settings import Settings
+from skyloop.emulators.mavlink.streams import Streams
+from skyloop.wire.mavlink.codec import Codec, Message
+
+Heard = Callable[["Port", Message], None]
+
+AUTOPILOT_COMPONENT: Final = 1
+PEER_NS: Final = nanoseconds(3.0)  #: a peer that is silent for so long may be replaced by another
+_BUFFER: Final = 1 << 16
+
+
+class Port(Protocol):
+    """One link of the autopilot, with the rates that were asked for on it."""
+
+    streams: Streams
+
+    def send(self, message: Message) -> None: ...
+
+    def close(self) -> None: ...
+
+
+def _codec(settings: Settings) -> Codec:
+    return Codec(settings.system, AUTOPILOT_COMPONENT, key=settings.key)
+
+
+class UdpPort:
+    """A UDP port: sends to the remote port until somebody is heard, then to whoever was heard.
+
+    Args:
+        loop: Calls back when something comes.
+        settings: Of the firmware.
+        streams: Rates of the messages.
+        heard: Called with each message.
+
+    Raises:
+        LinkError: The port is taken.
+    """
+
+    def __init__(self, loop: Loop, settings: Settings, streams: Streams, heard: Heard) -> None:
+        self.streams = streams
+        self._settings = settings
+        self._heard = heard
+        self._codec = _codec(settings)
+        self._peer: Address = (settings.bind if settings.bind != "0.0.0.0" else "127.0.0.1", settings.ports.remote)
+        self._peer_ns = -PEER_NS
+        self._port = DatagramPort(
+            loop,
+            (settings.bind, settings.ports.udp),
+            self._receive,
+            name="MAVLink",
+            faults=settings.faults,
+            delay_s=settings.delay_s,
+        )
+
+    @property
+    def port(self) -> int:
+        """The real port, where 0 was asked for."""
+        return self._port.port
+
+    def send(self, message: Message) -> None:
+        """Send a message to the peer."""
+        self._port.send(self._codec.encode(message, version=self._settings.version), self._peer)
+
+    def close(self) -> None:
+        """Close the port."""
+        self._port.close()
+
+    def _receive(self, datagram: bytes, sender: Address) -> None:
+        messages = self._codec.decode(datagram, whole=True)
+        if not messages:
+            return
+        now_ns = monotonic_ns()
+        if sender == self._peer or now_ns - self._peer_ns >= PEER_NS:
+            self._peer, self._peer_ns = sender, now_ns
+        for message in messages:
+            self._heard(self, message)
+
+
+class TcpPort:
+    """A TCP server for one client at a time: the next one waits in the kernel, connected and without a byte.
+
+    Args:
+        loop: Calls back when something comes.
+        settings: Of the firmware.
+        streams: Rates of the messages.
+        heard: Called with each message.
+
+    Raises:
+        LinkError: The port is taken.
+    """
+
+    def __init__(self, loop: Loop, settings: Settings, streams: Streams, heard: Heard) -> None:
+        self.streams = streams
+        self._loop = loop
+        self._settings = settings
+        self._heard = heard
+        self._codec = _codec(settings)
+        self._client: socket.socket | None = None
+        self._server = bound(socket.SOCK_STREAM, (settings.bind, settings.ports.tcp or 0), "MAVLink")
+        self._server.listen(4)
+        loop.watch(self._server, self._accept)
+
+    @property
+    def port(self) -> int:
+        """The real port, where 0 was asked for."""
+        return int(self._server.getsockname()[1])
+
+    def send(self, message: Message) -> None:
+        """Send a message to the client, if there is one.
+
+        Raises:
+            OSError: The client is gone.
+        """
+        if self._client is None:
+            return
+        try:
+            self._client.send(self._codec.encode(message, version=self._settings.version))
+        except BlockingIOError:
+            return  # what does not fit is lost, as on a serial line
+        except OSError:
+            self._drop()
+            raise
+
+    def close(self) -> None:
+        """Close the server and the connection."""
+        self._loop.forget(self._server)
+        self._server.close()
+        if self._client is not None:
+            self._loop.forget(self._client)
+            self._client.close()
+
+    def _accept(self) -> None:
+        self._client, _ = self._server.accept()
+        self._client.setblocking(False)
+        self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._codec = _codec(self._settings)
+        self._loop.forget(self._server)
+        self._loop.watch(self._client, self._receive)
+
+    def _drop(self) -> None:
+        if self._client is not None:
+            self._loop.forget(self._client)
+            self._client.close()
+            self._client = None
+            self._loop.watch(self._server, self._accept)
+
+    def _receive(self) -> None:
+        assert self._client is not None
+        try:
+            data = self._client.recv(_BUFFER)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self._drop()
+            return
+        for message in self._codec.decode(data):
+            self._heard(self, message)

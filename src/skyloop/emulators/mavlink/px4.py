@@ -1,0 +1,346 @@
+"""PX4's behaviour, as observed on 1.17-alpha. ``docs/mavlink.md`` has it as a table."""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar, Final
+
+from skyloop.emulators.mavlink import parameters
+from skyloop.emulators.mavlink.autopilot import (
+    ACCEPTED,
+    CRITICAL,
+    DENIED,
+    FAILED,
+    TEMPORARILY_REJECTED,
+    UNSUPPORTED,
+    Arguments,
+    Autopilot,
+    whole,
+)
+from skyloop.emulators.mavlink.flight import USUAL, Speeds
+from skyloop.emulators.mavlink.links import Port
+from skyloop.emulators.mavlink.parameters import ParameterTable
+from skyloop.emulators.mavlink.places import ORIGIN_ALTITUDE_M, place_of
+from skyloop.emulators.mavlink.setpoints import (
+    BODY,
+    WORLD,
+    AttitudeTarget,
+    Target,
+    attitude_target_of,
+    global_target_of,
+    target_of,
+)
+from skyloop.emulators.vehicle import Vehicle
+from skyloop.wire.mavlink.axes import yaw_between
+from skyloop.wire.mavlink.codec import Message
+from skyloop.wire.mavlink.codec import dialect as m
+from skyloop.wire.mavlink.modes import PX4_MODES, px4_custom
+from skyloop.wire.mavlink.modes import Autopilot as Number
+
+SINK_IN_POSCTL_M_S: Final = -0.7  #: without a remote control
+_STICKS: Final = ("POSCTL", "ALTCTL", "MANUAL", "STABILIZED", "ACRO")
+_WORDS: Final = {
+    "armed": "Armed by external command",
+    "disarmed": "Disarmed by external command",
+    "auto_disarm": "Disarmed by auto preflight disarming",
+    "landed": "Disarmed by landing",
+    "forced": "Disarmed by external command",
+}
+
+
+class Px4(Autopilot):
+    """An emulated PX4."""
+
+    AUTOPILOT = Number.PX4
+    CAPABILITIES = 0xE8FF & ~0xC025  # files, missions, fences and rally points are not emulated
+    VERSION = 1 << 24 | 17 << 16
+    RATES: ClassVar[dict[int, float]] = {
+        m.MAVLINK_MSG_ID_HEARTBEAT: 1.0,
+        m.MAVLINK_MSG_ID_TIMESYNC: 10.0,
+        m.MAVLINK_MSG_ID_ATTITUDE: 50.0,
+        m.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 50.0,
+        m.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 30.0,
+        m.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 50.0,
+        m.MAVLINK_MSG_ID_HIGHRES_IMU: 50.0,
+        m.MAVLINK_MSG_ID_VFR_HUD: 10.0,
+        m.MAVLINK_MSG_ID_ALTITUDE: 10.0,
+        m.MAVLINK_MSG_ID_SYS_STATUS: 5.0,
+        m.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,
+        m.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: 5.0,
+        m.MAVLINK_MSG_ID_ESTIMATOR_STATUS: 1.0,
+        m.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0,
+        m.MAVLINK_MSG_ID_BATTERY_STATUS: 0.5,
+        m.MAVLINK_MSG_ID_HOME_POSITION: 0.5,
+        m.MAVLINK_MSG_ID_CURRENT_MODE: 0.5,
+    }
+    FRAMES = frozenset({WORLD, BODY})
+    ABOVE_SEA = frozenset({5})
+    ABOVE_HOME = frozenset({6})
+    LONG_FRAMES: ClassVar[dict[int, int]] = {m.MAV_CMD_DO_REPOSITION: 5, m.MAV_CMD_DO_SET_HOME: 5}
+    NOTHING_TO_TELL = DENIED
+    BYTEWISE = True
+    DISARM_S = 11.1
+    TELLS_PREARM = False
+
+    def __init__(self, vehicle: Vehicle, system: int, boot_s: float, gps: bool) -> None:
+        super().__init__(vehicle, system, boot_s, gps)
+        self.parameters = ParameterTable(parameters.PX4, bytewise=True)
+        self.mode = "AUTO.LOITER"
+        self._intended = self.mode  # what the user asked for; kept under failsafes
+        self._before = self.mode  # the mode before a manoeuvre
+        self._waiting_at: Target | None = None  # where HOLD is to be
+        self._speeds = USUAL
+        self._target: Target | AttitudeTarget | None = None
+        self._target_s = -math.inf
+        self._lost_gcs = False
+
+    @property
+    def custom_mode(self) -> int:
+        """The mode's number."""
+        return px4_custom(self.mode)
+
+    @property
+    def mode_allows_arming(self) -> bool:
+        """Whether it may be armed in its mode."""
+        return self.mode != "OFFBOARD" or self._fresh
+
+    def _counts(self, heartbeat: Message) -> bool:  # noqa: ARG002  of any ground station
+        return True
+
+    def _words(self, occasion: str) -> str:
+        return _WORDS[occasion]
+
+    @property
+    def _fresh(self) -> bool:
+        """Return whether set-points come."""
+        return self.time_s - self._target_s <= self.parameters["COM_OF_LOSS_T"]
+
+    # Modes -----------------------------------------------------------------------------------------------------
+
+    def _fly(self) -> None:
+        self._look_at_set_points()
+        if self.mode == "OFFBOARD":
+            self._fly_offboard()
+        elif self.mode == "AUTO.TAKEOFF":
+            if self._manoeuvres.rise():
+                self._set_mode("AUTO.LOITER")
+        elif self.mode == "AUTO.LAND":
+            self.flight.land()
+        elif self.mode == "AUTO.RTL":
+            self._manoeuvres.return_home(self._speeds)
+        elif self.mode in _STICKS:
+            self.flight.move_body(0.0, 0.0, SINK_IN_POSCTL_M_S, 0.0)
+            if self.flight.place[2] < 0.1:
+                self.flight.land()
+        elif self.flight.airborne:
+            self._manoeuvres.follow(self._waiting_at, self._lean, self._speeds)
+
+    def _look_at_set_points(self) -> None:
+        if self.mode == "OFFBOARD" and not self._fresh:
+            self.failsafe = True
+            self.say("Failsafe activated", CRITICAL)
+            self._enter("AUTO.LOITER" if round(self.parameters["COM_OBL_RC_ACT"]) == 5 else "POSCTL")
+        elif self.failsafe and self._intended == "OFFBOARD" and self._fresh and not self._lost_gcs:
+            self.failsafe = False  # back by itself: the user wanted it
+            self._enter("OFFBOARD")
+
+    def _fly_offboard(self) -> None:
+        target = self._target
+        if not self.flight.airborne:
+            climbs = isinstance(target, Target) and target.velocity is not None and target.velocity[2] > 0
+            rises = isinstance(target, Target) and target.place is not None and target.place[2] > 0.3
+            if climbs or rises:
+                self.flight.lift_off()
+            return
+        self._manoeuvres.follow(target, self._lean)
+
+    def _lean(self, target: AttitudeTarget) -> None:
+        roll, pitch = target.tilt
+        thrust = (target.thrust or 0.0) / self.parameters["MPC_THR_HOVER"]
+        self.flight.lean_by_thrust(roll, pitch, thrust, target.turn(self.flight))
+
+    def _enter(self, mode: str) -> None:
+        """Change the mode. The next heartbeat reports it, and nothing before."""
+        if mode != self.mode:
+            self._before, self.mode = self.mode, mode
+            self._waiting_at, self._speeds = None, USUAL
+            if mode == "AUTO.RTL":
+                self._begin_return()
+
+    def _begin_return(self) -> None:
+        """Return at RTL_RETURN_ALT, or within a cone over home; never lower than it is."""
+        east, north, up = self.flight.place
+        above, distance = up - self.home[2], math.hypot(east - self.home[0], north - self.home[1])
+        highest, near = self.parameters["RTL_RETURN_ALT"], self.parameters["NAV_ACC_RAD"]
+        height, half_cone = highest, self.parameters["RTL_CONE_ANG"]
+        if half_cone > 0:
+            if distance <= near:
+                height = 2.0 * distance
+            elif distance <= self.parameters["RTL_MIN_DIST"]:
+                cone = distance / math.tan(math.radians(max(1.0, min(89.0, half_cone))))
+                height = max(2.0 * near, min(cone, highest))
+            height = min(height, highest)
+        self._manoeuvres.begin_return(
+            self.home, self.home[2] + max(above, height), wait_s=max(0.0, self.parameters["RTL_LAND_DELAY"])
+        )
+
+    def _set_mode(self, mode: str) -> None:
+        self._intended, self.failsafe = mode, False
+        self._enter(mode)
+
+    def _split(self, custom_mode: int) -> Arguments:
+        return float(custom_mode >> 16 & 0xFF), float(custom_mode >> 24 & 0xFF)
+
+    def _change_mode(self, arguments: Arguments) -> int:
+        """Change the mode. Accepted, whatever becomes of it."""
+        main, sub = whole(arguments[1]), whole(arguments[2]) if len(arguments) > 2 else 0
+        mode = PX4_MODES.get((main, sub if main == 4 else 0))
+        if mode is None or mode == "AUTO.READY":
+            return ACCEPTED
+        if mode == "OFFBOARD" and not self._fresh:
+            self.say("Switching to Offboard is currently not available", CRITICAL)
+        elif mode in _STICKS and self.armed:
+            self.say("Switching to Position is currently not available", CRITICAL)
+        elif mode == "AUTO.MISSION":
+            self.say("Switching to Mission is currently not available: no valid mission", CRITICAL)
+        else:
+            if mode == "AUTO.TAKEOFF":
+                self._manoeuvres.begin_rise(self.home[2] + self.parameters["MIS_TAKEOFF_ALT"])
+            self._set_mode(mode)
+        return ACCEPTED
+
+    def _go_by(self, manoeuvre: str) -> int:
+        self._set_mode({"land": "AUTO.LAND", "return": "AUTO.RTL"}[manoeuvre])
+        return ACCEPTED
+
+    def _disarmed(self) -> None:
+        if self.mode in ("AUTO.LAND", "AUTO.RTL", "AUTO.TAKEOFF"):
+            self._set_mode(self._before)
+
+    # Arming and taking off -------------------------------------------------------------------------------------
+
+    def _refuse_arming(self) -> int | None:
+        if self.ready:
+            return None
+        self.say("Arming denied: Resolve system health failures first\t", CRITICAL)
+        return TEMPORARILY_REJECTED
+
+    def _refuse_disarming(self) -> int:
+        self.say("Disarming denied: not landed\t", CRITICAL)
+        return TEMPORARILY_REJECTED
+
+    def _take_off(self, arguments: Arguments) -> int:
+        """Take off, armed or not, standing or flying."""
+        amsl = arguments[6]
+        above = self.home[2] + self.parameters["MIS_TAKEOFF_ALT"]
+        height = amsl - ORIGIN_ALTITUDE_M if math.isfinite(amsl) else above
+        self._manoeuvres.begin_rise(max(0.5, height))
+        self._set_mode("AUTO.TAKEOFF")
+        return ACCEPTED
+
+    # Set-points ------------------------------------------------------------------------------------------------
+
+    def _set_point(self, message: Message) -> None:
+        made: Target | AttitudeTarget
+        if message.get_type() == "SET_ATTITUDE_TARGET":
+            made = attitude_target_of(message)
+            if not isinstance(self._target, AttitudeTarget):
+                self.flight.level_thrust()
+        elif message.get_type() == "SET_POSITION_TARGET_GLOBAL_INT":
+            found = global_target_of(message, self._datum(message.coordinate_frame))
+            if found is None:
+                self.say(
+                    f"SET_POSITION_TARGET_GLOBAL_INT invalid coordinate frame {message.coordinate_frame}\t", CRITICAL
+                )
+                return
+            if found.place is None and found.velocity is None:
+                return
+            made = found
+        elif message.coordinate_frame in self.FRAMES:
+            made = target_of(message)
+        else:
+            self.say(f"SET_POSITION_TARGET_LOCAL_NED coordinate frame {message.coordinate_frame} unsupported\t")
+            return
+        self.set_points += 1
+        self._target, self._target_s = made, self.time_s
+
+    # Places and speeds by command ------------------------------------------------------------------------------
+
+    def _reposition(self, arguments: Arguments, frame: int) -> int:  # noqa: ARG002  above the sea, whatever it says
+        """HOLD at another position. Disarmed it only changes the mode."""
+        if whole(arguments[1]) != 1:
+            return UNSUPPORTED
+        fresh = self.mode != "AUTO.LOITER"
+        self._set_mode("AUTO.LOITER")
+        if not self.armed:
+            return ACCEPTED
+        speed = arguments[0]
+        if speed > 0:
+            self._speeds = Speeds(across=speed)
+        elif fresh:
+            self._speeds = USUAL
+        (latitude, longitude, altitude), here = arguments[4:7], self.flight.place
+        elsewhere, higher = math.isfinite(latitude) and math.isfinite(longitude), math.isfinite(altitude)
+        east, north, up = here
+        if elsewhere:
+            east, north, _ = place_of(latitude, longitude, up)
+        elif self._waiting_at is not None and (higher or math.isfinite(arguments[3])):
+            east, north, _ = self._waiting_at.place or here
+        if higher:
+            up = altitude - ORIGIN_ALTITUDE_M
+        yaw = yaw_between(arguments[3]) if math.isfinite(arguments[3]) else None
+        self._waiting_at = Target((east, north, up), yaw=yaw)
+        return ACCEPTED
+
+    def _set_home(self, arguments: Arguments, frame: int) -> int:  # noqa: ARG002  above the sea, whatever it says
+        if arguments[0] > 0.5:
+            place = self.flight.place
+        elif not all(map(math.isfinite, arguments[4:7])):
+            return DENIED
+        else:
+            place = place_of(arguments[4], arguments[5], arguments[6] - ORIGIN_ALTITUDE_M)
+        if not self.has_origin:
+            return TEMPORARILY_REJECTED
+        self._home_at(place)
+        return ACCEPTED
+
+    def _change_speed(self, arguments: Arguments) -> int:
+        """Change the speed. Accepted, whatever becomes of it."""
+        self._speeds = Speeds(across=arguments[1]) if 0 < arguments[1] < math.inf else USUAL
+        return ACCEPTED
+
+    def _own(self, port: Port, message: Message) -> bool:
+        if message.get_type() != "PING" or message.target_system or message.target_component:
+            return False
+        sender = message.get_srcSystem(), message.get_srcComponent()
+        port.send(m.MAVLink_ping_message(message.time_usec, message.seq, *sender))
+        return True
+
+    def _sticks(self, message: Message) -> None:
+        """Ignore a remote control over MAVLink."""
+
+    # Losing the ground station ---------------------------------------------------------------------------------
+
+    @property
+    def _gcs_patience_s(self) -> float:
+        return self.parameters["COM_DL_LOSS_T"]
+
+    def _ground_station(self, lost: bool) -> None:
+        if lost is self._lost_gcs:
+            return
+        self._lost_gcs = lost
+        if not lost:
+            self.say("GCS connection regained")
+            return
+        self.say("Preflight Fail: No connection to the GCS\t")
+        action = round(self.parameters["NAV_DLL_ACT"])
+        if action and self.armed and not self.flight.standing:
+            self.say("Failsafe activated", CRITICAL)
+            self.failsafe = True
+            self._intended = {1: "AUTO.LOITER", 2: "AUTO.RTL", 3: "AUTO.LAND"}.get(action, "AUTO.LOITER")
+            self._enter(self._intended)
+
+    def _set_interval(self, port: Port, number: int, interval_us: float) -> int:
+        if number == m.MAVLINK_MSG_ID_HEARTBEAT:
+            return FAILED
+        return super()._set_interval(port, number, interval_us)

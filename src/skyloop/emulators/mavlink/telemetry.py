@@ -1,0 +1,207 @@
+"""Reports of the simulation to MAVLink messages, by their numbers. Pure."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import ClassVar, Final, Protocol
+
+from skyloop.emulators.mavlink.flight import FlightControl
+from skyloop.emulators.mavlink.places import ORIGIN_ALTITUDE_M, geodetic
+from skyloop.messages import FlightState
+from skyloop.messages.geometry import quaternion_from_euler
+from skyloop.sim.host import Report
+from skyloop.sim.parameters import GRAVITY_M_S2
+from skyloop.wire.mavlink.axes import Vector, flip, swap, yaw_between
+from skyloop.wire.mavlink.codec import Message
+from skyloop.wire.mavlink.codec import dialect as m
+from skyloop.wire.mavlink.modes import Landed
+
+PREARM: Final = 0x10000000
+_SENSORS: Final = 0x1 | 0x2 | 0x4 | 0x8 | 0x20  #: gyro, accelerometer, magnetometer, pressure, GPS
+_BATTERY: Final = 0x2000000
+#: Flags of an estimator that knows where it is: the position, relative and absolute, and the predictions that both will
+#: be known in the air. DroneKit waits for the last.
+_PLACED: Final = 0x8 | 0x10 | 0x100 | 0x200
+_LANDED: Final = {
+    FlightState.LANDED: Landed.ON_GROUND,
+    FlightState.EMERGENCY: Landed.ON_GROUND,
+    FlightState.TAKING_OFF: Landed.TAKING_OFF,
+    FlightState.LANDING: Landed.LANDING,
+}
+
+
+class AutopilotState(Protocol):
+    """What the messages are made from; see :class:`skyloop.emulators.mavlink.autopilot.Autopilot`."""
+
+    AUTOPILOT: ClassVar[int]  #: MAV_AUTOPILOT
+    TELLS_PREARM: ClassVar[bool]
+    flight: FlightControl
+    gps: bool
+    report: Report
+    home: Vector  #: east, north, up of the flight's origin [m]
+
+    @property
+    def boot_ms(self) -> int: ...
+    @property
+    def boot_ns(self) -> int: ...
+    @property
+    def base_mode(self) -> int: ...
+    @property
+    def custom_mode(self) -> int: ...
+    @property
+    def system_status(self) -> int: ...
+    @property
+    def has_origin(self) -> bool: ...
+    @property
+    def ready(self) -> bool: ...
+    @property
+    def settled(self) -> bool: ...
+
+
+Maker = Callable[[AutopilotState], Message | None]
+
+
+def _heartbeat(a: AutopilotState) -> Message:
+    return m.MAVLink_heartbeat_message(2, a.AUTOPILOT, a.base_mode, a.custom_mode, a.system_status, 3)
+
+
+def _angles(a: AutopilotState) -> tuple[float, float, float]:
+    believed = a.report.believed
+    return believed.roll_rad, 0.0 - believed.pitch_rad, yaw_between(believed.yaw_rad)
+
+
+def _attitude(a: AutopilotState) -> Message:
+    return m.MAVLink_attitude_message(a.boot_ms, *_angles(a), *flip(*a.report.believed.angular_velocity_rad_s))
+
+
+def _quaternion(a: AutopilotState) -> Message:
+    rates = flip(*a.report.believed.angular_velocity_rad_s)
+    return m.MAVLink_attitude_quaternion_message(a.boot_ms, *quaternion_from_euler(*_angles(a)), *rates)
+
+
+def _local(a: AutopilotState) -> Message | None:
+    if not a.has_origin:
+        return None
+    return m.MAVLink_local_position_ned_message(a.boot_ms, *swap(*a.flight.place), *swap(*a.flight.velocity))
+
+
+def _global(a: AutopilotState) -> Message | None:
+    if not a.has_origin:
+        return None
+    north, east, down = (round(each * 100) for each in swap(*a.flight.velocity))
+    heading = round(math.degrees(yaw_between(a.flight.yaw)) % 360.0 * 100) % 36000
+    relative = round((a.flight.place[2] - a.home[2]) * 1000)
+    return m.MAVLink_global_position_int_message(
+        a.boot_ms, *geodetic(a.flight.place), relative, north, east, down, heading
+    )
+
+
+def _status(a: AutopilotState) -> Message:
+    believed = a.report.believed
+    present = _SENSORS | _BATTERY | (PREARM if a.TELLS_PREARM else 0)
+    health = (present & ~PREARM) | (PREARM if a.ready else 0)
+    charge, volts = round(believed.battery * 100), round(believed.battery_v * 1000)
+    return m.MAVLink_sys_status_message(present, present, health, 250, volts, 500, charge, 0, 0, 0, 0, 0, 0)
+
+
+def _battery(a: AutopilotState) -> Message:
+    believed = a.report.believed
+    cells = [round(believed.battery_v * 1000)] + [0xFFFF] * 9
+    return m.MAVLink_battery_status_message(0, 0, 1, 32767, cells, 500, -1, -1, round(believed.battery * 100))
+
+
+def _extended(a: AutopilotState) -> Message:
+    landed = _LANDED.get(a.flight.state, Landed.IN_AIR)
+    return m.MAVLink_extended_sys_state_message(0, int(landed))
+
+
+def _gps(a: AutopilotState) -> Message:
+    latitude, longitude, altitude = geodetic(a.flight.place)
+    fix, satellites = (3, 10) if a.gps else (0, 0)
+    return m.MAVLink_gps_raw_int_message(
+        a.boot_ms * 1000, fix, latitude, longitude, altitude, 80, 90, 0, 0xFFFF, satellites
+    )
+
+
+def _ekf(a: AutopilotState) -> Message:
+    flags = 0x1 | 0x2 | 0x4 | 0x20 | (_PLACED if a.settled else 0x80)
+    return m.MAVLink_ekf_status_report_message(flags, 0.1, 0.1, 0.1, 0.1, 0.0)
+
+
+def _estimator(a: AutopilotState) -> Message:
+    """Report the estimator. At rest it assumes that it stands still (0x80), and knows its position all the same."""
+    flags = 0x1 | 0x2 | 0x4 | 0x20 | (_PLACED if a.settled else 0x80)
+    flags |= 0x80 if a.flight.standing else 0
+    return m.MAVLink_estimator_status_message(a.boot_ms * 1000, flags, 0.1, 0.1, 0.1, 0.1, 0.0, 0.0, 0.1, 0.1)
+
+
+def _home(a: AutopilotState) -> Message | None:
+    if not a.has_origin:
+        return None
+    axes = swap(*a.home)
+    return m.MAVLink_home_position_message(*geodetic(a.home), *axes, [1, 0, 0, 0], 0, 0, 0)
+
+
+def _origin(a: AutopilotState) -> Message | None:
+    return m.MAVLink_gps_global_origin_message(*geodetic((0.0, 0.0, 0.0))) if a.has_origin else None
+
+
+def _imu(a: AutopilotState) -> Message:
+    rates, force = flip(*a.report.believed.angular_velocity_rad_s), flip(*a.report.believed.acceleration_m_s2)
+    return m.MAVLink_highres_imu_message(a.boot_ms * 1000, *force, *rates, 0.2, 0.0, 0.4, 955.0, 0.0, 488.0, 20.0, 63)
+
+
+def _raw_imu(a: AutopilotState) -> Message:
+    force = (round(each / GRAVITY_M_S2 * 1000) for each in flip(*a.report.believed.acceleration_m_s2))
+    rates = (round(each * 1000) for each in flip(*a.report.believed.angular_velocity_rad_s))
+    return m.MAVLink_raw_imu_message(a.boot_ms * 1000, *force, *rates, 200, 0, 400)
+
+
+def _hud(a: AutopilotState) -> Message:
+    east, north, up = a.flight.velocity
+    heading = round(math.degrees(yaw_between(a.flight.yaw)) % 360.0) % 360
+    altitude = ORIGIN_ALTITUDE_M + a.flight.place[2]
+    return m.MAVLink_vfr_hud_message(0.0, math.hypot(east, north), heading, 50, altitude, up)
+
+
+def _altitude(a: AutopilotState) -> Message:
+    up = a.flight.place[2]
+    relative = up - a.home[2]
+    return m.MAVLink_altitude_message(a.boot_ms * 1000, up, ORIGIN_ALTITUDE_M + up, up, relative, up, math.nan)
+
+
+def _time(a: AutopilotState) -> Message:
+    return m.MAVLink_system_time_message(0, a.boot_ms)
+
+
+def _current_mode(a: AutopilotState) -> Message:
+    return m.MAVLink_current_mode_message(0, a.custom_mode, a.custom_mode)
+
+
+def _sync(a: AutopilotState) -> Message:
+    return m.MAVLink_timesync_message(0, a.boot_ns)
+
+
+MAKERS: Final[dict[int, Maker]] = {
+    m.MAVLINK_MSG_ID_HEARTBEAT: _heartbeat,
+    m.MAVLINK_MSG_ID_ATTITUDE: _attitude,
+    m.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: _quaternion,
+    m.MAVLINK_MSG_ID_LOCAL_POSITION_NED: _local,
+    m.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: _global,
+    m.MAVLINK_MSG_ID_SYS_STATUS: _status,
+    m.MAVLINK_MSG_ID_BATTERY_STATUS: _battery,
+    m.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: _extended,
+    m.MAVLINK_MSG_ID_GPS_RAW_INT: _gps,
+    m.MAVLINK_MSG_ID_EKF_STATUS_REPORT: _ekf,
+    m.MAVLINK_MSG_ID_ESTIMATOR_STATUS: _estimator,
+    m.MAVLINK_MSG_ID_HOME_POSITION: _home,
+    m.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: _origin,
+    m.MAVLINK_MSG_ID_HIGHRES_IMU: _imu,
+    m.MAVLINK_MSG_ID_RAW_IMU: _raw_imu,
+    m.MAVLINK_MSG_ID_VFR_HUD: _hud,
+    m.MAVLINK_MSG_ID_ALTITUDE: _altitude,
+    m.MAVLINK_MSG_ID_SYSTEM_TIME: _time,
+    m.MAVLINK_MSG_ID_CURRENT_MODE: _current_mode,
+    m.MAVLINK_MSG_ID_TIMESYNC: _sync,
+}

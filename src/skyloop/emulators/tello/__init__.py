@@ -1,0 +1,22 @@
+"""A Ryze Tello, emulated on the network over a simulated vehicle, for any program that flies the real one.
+
+At an address of this machine, for a test::
+
+    from skyloop.emulators.tello import TelloFirmware, with_tellos
+    from skyloop.sim.host import SimHost
+    from skyloop.sim.options import SimOptions
+
+    host = SimHost(with_tellos(SimOptions(world="room", seed=1)))
+    with TelloFirmware(host, bind="127.0.0.1", port=0) as firmware:
+        firmware.port  # UDP, where it takes commands
+        host.simulation.truth(0).position_m  # what the vehicle really does
+
+State and video go to ports 8890 and 11111 of whoever sent ``command``, or where ``port`` says (SDK 3.0). With
+``faults=Faults(seed=1, drop=0.1)`` of :mod:`skyloop.faults` datagrams get lost both ways.
+"""
+
+from skyloop.emulators.tello.emulator import TelloFirmware
+from skyloop.emulators.tello.settings import with_tellos
+from skyloop.faults import Faults
+
+__all__ = ["Faults", "TelloFirmware", "with_tellos"]

@@ -1,0 +1,303 @@
+"""The Tello's logic: handles commands, does one thing at a time, answers.
+
+Pure: the clock is an argument, and answers are given to a function.
+
+Answers in words that no guide has ("error Motor stop", "error Not joystick", "error No valid marker") are as people
+have seen them; in which case real firmware gives which is not verified.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Final
+
+from skyloop.clock import Clock, nanoseconds
+from skyloop.emulators.datagrams import Address
+from skyloop.emulators.tello import telemetry
+from skyloop.emulators.tello.manoeuvres import OK, Flipping, Going, Job, Landing, Rising, Turning
+from skyloop.emulators.tello.pads import Sighting, seen
+from skyloop.emulators.tello.protocol import MOVES, NUMBERS, numbers_of
+from skyloop.emulators.vehicle import Vehicle
+from skyloop.messages import EmergencyStop, FlightState, Hover, ResetEmergency, Velocity
+from skyloop.sim.host import Report
+from skyloop.sim.world import Vec3
+from skyloop.wire.tello.commands import (
+    ENTER,
+    FULL_CLIMB_M_S,
+    FULL_SPEED_M_S,
+    FULL_YAW_RATE_RAD_S,
+    MAX_STICK,
+    SILENCE_S,
+    STATE_PORT,
+    VIDEO_PORT,
+    Sdk,
+    decoded,
+)
+
+USUAL_SPEED_CM_S: Final = 50
+FPS: Final = {"high": 30.0, "middle": 15.0, "low": 5.0}
+SIZES: Final = {"high": (960, 720), "low": (640, 480)}
+_FLYING: Final = (FlightState.HOVERING, FlightState.FLYING)
+_SINCE: Final = {"stop": Sdk.V2_0, "mon": Sdk.V2_0, "moff": Sdk.V2_0, "sdk?": Sdk.V2_0, "sn?": Sdk.V2_0}
+_SDK_NUMBERS: Final = {Sdk.V2_0: "20", Sdk.V3_0: "30"}
+
+
+class TelloLogic:
+    """The logic of one drone. Not thread-safe. Answers are given to a function, with the address that they are for."""
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        answer: Callable[[str, Address], None],
+        clock: Clock,
+        *,
+        sdk: Sdk,
+        pads: Mapping[int, tuple[float, float]],
+        link_quality: int = 100,
+    ) -> None:
+        self._vehicle = vehicle
+        self._answer = answer
+        self._clock = clock
+        self._sdk = sdk
+        self._pads = pads
+        self._link_quality = link_quality
+        self._report: Report | None = None
+        self._job: tuple[Job, Address | None] | None = None  # and who gets the answer
+        self._heard_ns = clock()
+        self._speed_cm_s = USUAL_SPEED_CM_S
+        self._start: tuple[float, float] | None = None  # yaw when switched on, altitude at take-off
+        self._motor_s = 0.0
+        self._before_s: float | None = None
+        self.client: str | None = None  #: the address that state and video go to; None before ``command``
+        self.state_port = STATE_PORT
+        self.video_port = VIDEO_PORT
+        self.streaming = False
+        self.looks_down = False
+        self.looks_for_pads = False
+        self.fps = FPS["high"]
+        self.size = SIZES["high"]
+        self.bitrate_mbps = 0  #: 0: as the link allows
+        self.unknown = 0  #: datagrams that are no command
+
+    # Hearing ---------------------------------------------------------------------------------------------------
+
+    def receive(self, datagram: bytes, sender: Address) -> None:
+        """Execute a command and answer it. Never raises, whatever the datagram holds."""
+        text = decoded(datagram)
+        if not text or (self.client is None and text != ENTER):
+            self.unknown += 1
+            return
+        self._heard_ns = self._clock()
+        if text == ENTER:
+            self.client = sender[0]
+        said = self._obey(text, sender)
+        if said:
+            self._answer(said, sender)
+
+    def supervise(self, report: Report) -> None:
+        """Handle the newest report of the vehicle: go on with the present command. Called regularly."""
+        truth = report.truth
+        if self._start is None:
+            self._start = report.believed.yaw_rad, report.believed.altitude_m
+        if self._before_s is not None and truth.state.airborne:
+            self._motor_s += truth.time_s - self._before_s
+        self._before_s = truth.time_s
+        self._report = report
+        if truth.state is FlightState.EMERGENCY:
+            self._job = None
+            self._vehicle.command(ResetEmergency())  # taken as soon as it lies: a Tello has no state of emergency
+        if self._clock() - self._heard_ns > nanoseconds(SILENCE_S) and truth.state in _FLYING:
+            self._job = Landing(), None
+        if self._job is None:
+            return
+        job, sender = self._job
+        action, said = job.step(report)
+        if action is not None:
+            self._vehicle.command(action)
+        if said is not None:
+            self._job = None
+            if sender is not None:
+                self._answer(said, sender)
+
+    # Telling ---------------------------------------------------------------------------------------------------
+
+    def state_string(self) -> bytes | None:
+        """Return the state now; None before the first report."""
+        snapshot = self._snapshot()
+        return None if snapshot is None else telemetry.state_string(snapshot, self._sdk)
+
+    def _snapshot(self) -> telemetry.Snapshot | None:
+        if self._report is None or self._start is None:
+            return None
+        yaw_rad, altitude_m = self._start
+        return telemetry.Snapshot(self._report, yaw_rad, altitude_m, int(self._motor_s), self._pad())
+
+    def _pad(self) -> Sighting | None:
+        if not self.looks_for_pads or self._report is None:
+            return None
+        return seen(self._pads, self._report.truth)
+
+    # Commands --------------------------------------------------------------------------------------------------
+
+    def _obey(self, text: str, sender: Address) -> str | None:
+        """Execute a command. Return the answer, or None if there is none yet or ever."""
+        name, *words = text.split()
+        if not self._sdk.knows(NUMBERS[name][0] if name in NUMBERS else _SINCE.get(name, Sdk.V1_3)):
+            return f"unknown command: {text}"
+        if name in NUMBERS:
+            return self._obey_numbers(name, words, sender)
+        if name.endswith("?"):
+            return self._reply(name)
+        if name == "takeoff":
+            return self._take_off(sender)
+        if name == "land":
+            return self._land(sender)
+        if name == "emergency":
+            self._job = None
+            self._vehicle.command(EmergencyStop())
+            return OK
+        if name == "stop":
+            self._job = None
+            if self._vehicle.state in _FLYING:
+                self._vehicle.command(Hover())
+            return OK
+        if name == "flip":
+            return self._flip(words, sender)
+        return self._configure(name, words, text)
+
+    def _obey_numbers(self, name: str, words: list[str], sender: Address) -> str | None:
+        pad = None
+        if name in ("go", "curve") and words and words[-1].startswith("m"):
+            pad = words.pop()
+        numbers = numbers_of(name, words, self._sdk)
+        if isinstance(numbers, str):
+            return None if name == "rc" else numbers
+        if name == "rc":
+            self._follow(numbers)
+            return None
+        if name in MOVES or name in ("go", "curve", "cw", "ccw"):
+            return self._move(name, numbers, pad, sender)
+        if name == "speed":
+            self._speed_cm_s = numbers[0]
+        elif name == "port":
+            self.state_port, self.video_port = numbers
+        elif name == "setbitrate":
+            self.bitrate_mbps = numbers[0]
+        elif name == "downvision":
+            self.looks_down = bool(numbers[0])
+        return OK  # mdirection: pads are seen all the same
+
+    def _configure(self, name: str, words: list[str], text: str) -> str:
+        if name in ("streamon", "streamoff"):
+            self.streaming = name == "streamon"
+        elif name in ("mon", "moff"):
+            self.looks_for_pads = name == "mon"
+        elif name == "setfps" and self._sdk is Sdk.V3_0 and len(words) == 1 and words[0] in FPS:
+            self.fps = FPS[words[0]]
+        elif name == "setresolution" and self._sdk is Sdk.V3_0 and len(words) == 1 and words[0] in SIZES:
+            self.size = SIZES[words[0]]
+        elif name not in (ENTER, "wifi", "ap") and not (name == "keepalive" and self._sdk is Sdk.V3_0):
+            return f"unknown command: {text}"
+        return OK
+
+    def _reply(self, question: str) -> str:
+        own = {
+            "speed?": f"{self._speed_cm_s:.1f}\r\n",
+            "wifi?": f"{self._link_quality}\r\n",
+            "sdk?": _SDK_NUMBERS.get(self._sdk, ""),
+            "sn?": "0TQEMULATED001",
+        }
+        snapshot = self._snapshot()
+        if question in own:
+            return own[question]
+        if snapshot is None:
+            return "error"
+        try:
+            return telemetry.answer(question, snapshot)
+        except KeyError:
+            return f"unknown command: {question}"
+
+    # Flying ----------------------------------------------------------------------------------------------------
+
+    def _take_off(self, sender: Address) -> str | None:
+        if self._report is None or self._vehicle.state is not FlightState.LANDED or self._job is not None:
+            return "error"
+        self._start = (self._start or (0.0, 0.0))[0], self._report.believed.altitude_m
+        self._job = Rising(self._report), sender
+        return None
+
+    def _land(self, sender: Address) -> str | None:
+        if self._vehicle.state in (FlightState.LANDED, FlightState.EMERGENCY):
+            self._job = None  # a take-off that has not left the ground yet
+            return "error Motor stop"
+        self._job = Landing(), sender
+        return None
+
+    def _follow(self, sticks: list[int]) -> None:
+        """Handle ``rc``, which is never answered, and does nothing while the drone moves by itself."""
+        if self._vehicle.state not in _FLYING or not isinstance(self._job[0] if self._job else None, Rising | None):
+            return
+        right, forward, up, clockwise = (stick / MAX_STICK for stick in sticks)
+        if not any(sticks):
+            self._vehicle.command(Hover())
+            return
+        self._vehicle.command(
+            Velocity(
+                forward=forward * FULL_SPEED_M_S,
+                left=-right * FULL_SPEED_M_S,
+                up=up * FULL_CLIMB_M_S,
+                yaw_rate=-clockwise * FULL_YAW_RATE_RAD_S,
+            )
+        )
+
+    def _flip(self, words: list[str], sender: Address) -> str | None:
+        if len(words) != 1 or words[0] not in ("l", "r", "f", "b"):
+            return "error"
+        refused = self._not_now()
+        if refused or self._report is None:
+            return refused or "error"
+        self._job = Flipping(self._report), sender
+        return None
+
+    def _not_now(self) -> str | None:
+        if self._vehicle.state not in _FLYING:
+            return "error Motor stop"
+        return "error Not joystick" if self._job is not None else None
+
+    def _move(self, name: str, numbers: list[int], pad: str | None, sender: Address) -> str | None:
+        refused = self._not_now()
+        report = self._report
+        if refused or report is None:
+            return refused or "error"
+        if name in ("cw", "ccw"):
+            self._job = Turning(report, math.radians(numbers[0] if name == "ccw" else -numbers[0])), sender
+            return None
+        speed = self._speed_cm_s
+        if name in MOVES:
+            offsets = [[part * numbers[0] for part in MOVES[name]]]
+        else:
+            *places, speed = numbers
+            offsets = [places[at : at + 3] for at in range(0, len(places), 3)]
+        goals = self._places(offsets, pad)
+        if goals is None:
+            return "error No valid marker"
+        self._job = Going(report, goals, speed / 100), sender
+        return None
+
+    def _places(self, offsets_cm: list[list[int]], pad: str | None) -> list[Vec3] | None:
+        """Return places in world axes: from here and along the heading, or from a pad; None if that pad is not seen."""
+        assert self._report is not None
+        truth = self._report.truth
+        base, heading = truth.position_m, truth.yaw_rad
+        if pad is not None:
+            sighting = self._pad()
+            if sighting is None or pad != f"m{sighting.number}":
+                return None
+            east, north = self._pads[sighting.number]
+            base, heading = (east, north, 0.0), 0.0
+        cos, sin = math.cos(heading), math.sin(heading)
+        return [
+            (base[0] + (cos * x - sin * y) / 100, base[1] + (sin * x + cos * y) / 100, base[2] + z / 100)
+            for x, y, z in offsets_cm
+        ]

@@ -1,0 +1,126 @@
+"""Commands of a Tello that take a while, and are answered when they are done. Pure: fed with reports."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final, Protocol
+
+from skyloop.messages import AnyAction, FlightState, Hover, Land, Takeoff, Velocity
+from skyloop.messages.geometry import wrap_angle
+from skyloop.sim.host import Report
+from skyloop.sim.world import Vec3
+
+OK: Final = "ok"
+SPIN_UP_S: Final = 0.8  #: before a take-off leaves the ground; airborne after 1.1 s in a recorded flight
+TAKEOFF_ANSWER_S: Final = 8.7  #: after the command, of the same flight, though it hovers long before
+FLIP_S: Final = 1.5  #: estimate; the simulated vehicle does not turn over
+TURN_RAD_S: Final = 1.0  #: estimate
+PATIENCE_S: Final = 30.0  #: what takes longer has failed
+_NEAR_M: Final = 0.06
+_SLOW_M_S: Final = 0.12
+_NEAR_RAD: Final = 0.03
+_FLYING: Final = (FlightState.HOVERING, FlightState.FLYING)
+
+#: What the vehicle is commanded now, and the answer if the job is over.
+Step = tuple[AnyAction | None, str | None]
+
+
+class Job(Protocol):
+    """The work of one command."""
+
+    def step(self, report: Report) -> Step: ...
+
+
+class Rising:
+    """``takeoff``."""
+
+    def __init__(self, report: Report) -> None:
+        self._begun_s = report.truth.time_s
+        self._told = False
+
+    def step(self, report: Report) -> Step:
+        """Return what to command now, and the answer once it is done."""
+        elapsed_s = report.truth.time_s - self._begun_s
+        state = report.truth.state
+        if not self._told:
+            self._told = elapsed_s >= SPIN_UP_S
+            return (Takeoff() if self._told else None), None
+        if state in (FlightState.LANDED, FlightState.EMERGENCY):
+            return None, "error" if elapsed_s > SPIN_UP_S + 0.5 else None
+        return None, OK if state in _FLYING and elapsed_s >= TAKEOFF_ANSWER_S else None
+
+
+class Landing:
+    """``land``, and what a Tello does that receives no commands."""
+
+    def step(self, report: Report) -> Step:
+        """Return what to command now, and the answer once it is done."""
+        if report.truth.state in (FlightState.LANDED, FlightState.EMERGENCY):
+            return None, OK
+        return (None if report.truth.state is FlightState.LANDING else Land()), None
+
+
+class Flipping:
+    """``flip``, of which only its time is simulated."""
+
+    def __init__(self, report: Report) -> None:
+        self._until_s = report.truth.time_s + FLIP_S
+
+    def step(self, report: Report) -> Step:
+        """Return the answer once it is done."""
+        return None, OK if report.truth.time_s >= self._until_s else None
+
+
+class Turning:
+    """``cw`` and ``ccw``.
+
+    Args:
+        report: The present one.
+        by_rad: Counter-clockwise; may be several turns.
+    """
+
+    def __init__(self, report: Report, by_rad: float) -> None:
+        self._left_rad = by_rad
+        self._yaw_rad = report.truth.yaw_rad
+
+    def step(self, report: Report) -> Step:
+        """Return what to command now, and the answer once it is done."""
+        self._left_rad -= wrap_angle(report.truth.yaw_rad - self._yaw_rad)
+        self._yaw_rad = report.truth.yaw_rad
+        if abs(self._left_rad) < _NEAR_RAD:
+            return Hover(), OK
+        return Velocity(yaw_rate=max(-TURN_RAD_S, min(TURN_RAD_S, 2.5 * self._left_rad))), None
+
+
+class Going:
+    """Moves, ``go`` and ``curve``.
+
+    Args:
+        report: The present one.
+        places: To go through, in world axes [m].
+        speed_m_s: On the way.
+    """
+
+    def __init__(self, report: Report, places: Sequence[Vec3], speed_m_s: float) -> None:
+        self._places = list(places)
+        self._speed_m_s = speed_m_s
+        self._until_s = report.truth.time_s + PATIENCE_S
+
+    def step(self, report: Report) -> Step:
+        """Return what to command now, and the answer once it is done."""
+        truth = report.truth
+        if truth.time_s > self._until_s:
+            return Hover(), "error"
+        offset = [goal - here for goal, here in zip(self._places[0], truth.position_m, strict=True)]
+        distance_m = math.hypot(*offset)
+        last = len(self._places) == 1
+        if distance_m < (_NEAR_M if last else 0.15) and (not last or math.hypot(*truth.velocity_m_s) < _SLOW_M_S):
+            if last:
+                return Hover(), OK
+            del self._places[0]
+            return None, None
+        share = min(self._speed_m_s, 1.6 * distance_m) / max(distance_m, 1e-6)
+        east, north, up = (part * share for part in offset)
+        cos, sin = math.cos(truth.yaw_rad), math.sin(truth.yaw_rad)
+        return Velocity(forward=cos * east + sin * north, left=cos * north - sin * east, up=up), None

@@ -1,0 +1,95 @@
+"""A Tello's state strings and its answers to questions. Pure."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+from skyloop.emulators.tello.pads import Sighting
+from skyloop.messages.geometry import wrap_angle
+from skyloop.sim.host import Report
+from skyloop.sim.parameters import GRAVITY_M_S2
+from skyloop.wire.tello.commands import Sdk
+from skyloop.wire.tello.state import GROUND_CM, NO_DISTANCE_CM, NO_PAD, NOWHERE_CM, build
+
+FARTHEST_CM: Final = 400  #: the distance sensor measures no more; estimate
+COLD_C: Final = 60  #: lowest temperature that is reported; a simulated drone does not warm up
+BAROMETER_CM: Final = -6000  #: an arbitrary zero, as with real ones
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """The state of one instant."""
+
+    report: Report
+    start_yaw_rad: float  #: when it was switched on
+    start_altitude_m: float  #: where it took off
+    motor_s: int
+    pad: Sighting | None = None
+
+
+def fields(snapshot: Snapshot) -> dict[str, str]:
+    """Return all values, as text, in the drone's own units and axes."""
+    believed = snapshot.report.believed
+    yaw_rad = wrap_angle(believed.yaw_rad - snapshot.start_yaw_rad)
+    forward, left, up = believed.velocity_m_s
+    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    ahead, aside = cos * forward - sin * left, sin * forward + cos * left  # along the heading at the start
+    ax, ay, az = (part / GRAVITY_M_S2 * 1000 for part in believed.acceleration_m_s2)
+    altitude_cm = believed.altitude_m * 100
+    steep = math.cos(believed.roll_rad) * math.cos(believed.pitch_rad)
+    distance_cm = max(GROUND_CM, round(altitude_cm / max(steep, 0.1)))
+    return {
+        "pitch": f"{round(math.degrees(-believed.pitch_rad))}",
+        "roll": f"{round(math.degrees(believed.roll_rad))}",
+        "yaw": f"{round(math.degrees(-yaw_rad))}",
+        "vgx": f"{round(ahead * 10)}",
+        "vgy": f"{round(-aside * 10)}",
+        "vgz": f"{round(-up * 10)}",
+        "templ": f"{COLD_C}",
+        "temph": f"{COLD_C + 3}",
+        "tof": f"{distance_cm if distance_cm <= FARTHEST_CM else NO_DISTANCE_CM}",
+        "h": f"{round((believed.altitude_m - snapshot.start_altitude_m) * 10) * 10}",
+        "bat": f"{max(0, min(100, round(believed.battery * 100)))}",
+        "baro": f"{(BAROMETER_CM + altitude_cm) / 100:.2f}",
+        "time": f"{snapshot.motor_s}",
+        "agx": f"{ax:.2f}",
+        "agy": f"{-ay:.2f}",
+        "agz": f"{-az:.2f}",
+    }
+
+
+def state_string(snapshot: Snapshot, sdk: Sdk) -> bytes:
+    """Return the datagram that is sent ten times a second."""
+    told = list(fields(snapshot).items())
+    return build(told if sdk is Sdk.V1_3 else [*_pad_fields(snapshot.pad), *told])
+
+
+def answer(question: str, snapshot: Snapshot) -> str:
+    """Return the answer to a question about the state.
+
+    Raises:
+        KeyError: The question is not about the state.
+    """
+    told = fields(snapshot)
+    answers = {
+        "battery?": told["bat"],
+        "time?": told["time"],
+        "height?": f"{int(told['h']) // 10}dm",
+        "temp?": f"{told['templ']}~{told['temph']}C",
+        "attitude?": "".join(f"{name}:{told[name]};" for name in ("pitch", "roll", "yaw")),
+        "baro?": told["baro"],
+        "acceleration?": "".join(f"{name}:{told[name]};" for name in ("agx", "agy", "agz")),
+        "tof?": f"{int(told['tof']) * 10}mm",
+    }
+    return f"{answers[question]}\r\n"
+
+
+def _pad_fields(pad: Sighting | None) -> list[tuple[str, str]]:
+    if pad is None:
+        numbers = (NO_PAD, NOWHERE_CM, NOWHERE_CM, NOWHERE_CM)
+    else:
+        x, y, z = (round(part * 100) for part in pad.place_m)
+        numbers = (pad.number, x, y, z)
+    return [*zip(("mid", "x", "y", "z"), map(str, numbers), strict=True), ("mpry", "0,0,0")]

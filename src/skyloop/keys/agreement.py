@@ -1,0 +1,150 @@
+"""The two ends of a connection prove to each other who they are, and agree on secrets that nobody between them knows.
+
+The certificates of a link tell who is at the other end of that *link*: a router, where there is one. So the two ends of
+a connection show theirs to each other as well, in an exchange as in SIGMA (Krawczyk, CRYPTO 2003) and TLS 1.3: each
+signs a fresh X25519 share together with the terms of the connection, and the proxy also all that the application said.
+The secrets are derived from both shares and the transcript (HKDF-SHA256), so recorded messages open nothing, and a key
+that is lost later opens nothing that was recorded before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from hashlib import sha256
+from pathlib import Path
+from typing import Final
+
+import msgspec
+from cryptography.hazmat.primitives.asymmetric.x25519 import X25519PrivateKey, X25519PublicKey
+from cryptography.hazmat.primitives.hashes import SHA256
+from cryptography.hazmat.primitives.kdf.hkdf import HKDF
+
+from skyloop.errors import DecodeError, LinkError, UsageError
+from skyloop.keys import certificates
+from skyloop.keys.identity import Identity
+from skyloop.keys.ring import KeyRing
+
+SECRET_BYTES: Final = 32
+_PURPOSE: Final = "fabric connection 1"  # what is signed begins with it: no signature of anything else fits
+_OFFER, _ANSWER = "offer", "answer"
+
+
+class Proof(msgspec.Struct, frozen=True, array_like=True):
+    """What one end shows to the other."""
+
+    certificate: bytes  #: DER
+    share: bytes  #: X25519, 32 bytes
+    signature: bytes  #: ECDSA with SHA-256 by the key of the certificate, DER
+
+
+@dataclass(frozen=True, slots=True)
+class Agreed:
+    """The identity at the other end, and the secrets of this connection."""
+
+    identity: Identity  #: the other end's
+    expires: datetime  #: when its certificate does
+    up: bytes  #: for what the application sends
+    down: bytes  #: for what the proxy sends
+
+
+class Agreement:
+    """One end's part in the exchange.
+
+    Args:
+        ring: This end's keys, and the roster.
+        *terms: What the connection is about, the same for both ends.
+    """
+
+    def __init__(self, ring: KeyRing, *terms: str) -> None:
+        self._ring = ring
+        self._terms = terms
+        self._private = X25519PrivateKey.generate()
+        self._offered = b""
+
+        self._share = self._private.public_key().public_bytes_raw()
+
+    def offer(self) -> bytes:
+        """Return the application's first message, a :class:`Proof` as MessagePack."""
+        self._offered = self._prove(self._claim(_OFFER, self._share))
+        return self._offered
+
+    def answer(self, offer: bytes, now: datetime | None = None) -> tuple[bytes, Agreed]:
+        """Check the application's offer, and make the proxy's answer.
+
+        Args:
+            offer: As it came.
+            now: The time in UTC; by default of this machine.
+
+        Returns:
+            The answer, a :class:`Proof` as MessagePack, and what is agreed.
+
+        Raises:
+            LinkError: The other end could not prove an identity that the roster admits.
+        """
+        proof = _decode(offer)
+        identity, expires = self._check(proof, self._claim(_OFFER, proof.share), now)
+        claim = self._claim(_ANSWER, self._share, offer)
+        return self._prove(claim), self._agree(identity, expires, proof.share, claim)
+
+    def accept(self, answer: bytes, now: datetime | None = None) -> Agreed:
+        """Check the proxy's answer.
+
+        Args:
+            answer: As it came.
+            now: The time in UTC; by default of this machine.
+
+        Returns:
+            What is agreed.
+
+        Raises:
+            LinkError: The other end could not prove an identity that the roster admits.
+        """
+        proof = _decode(answer)
+        claim = self._claim(_ANSWER, proof.share, self._offered)
+        identity, expires = self._check(proof, claim, now)
+        return self._agree(identity, expires, proof.share, claim)
+
+    def _claim(self, what: str, share: bytes, offer: bytes = b"") -> bytes:
+        return msgspec.msgpack.encode([_PURPOSE, what, self._terms, share, offer])
+
+    def _prove(self, claim: bytes) -> bytes:
+        own = self._ring.credentials
+        proof = Proof(certificates.der(own.certificate), self._share, certificates.sign(own.key, claim))
+        return msgspec.msgpack.encode(proof)
+
+    def _check(self, proof: Proof, claim: bytes, now: datetime | None) -> tuple[Identity, datetime]:
+        try:
+            certificate = certificates.read_der(proof.certificate)
+            path = Path("its certificate")
+            certificates.check_issued(certificate, self._ring.credentials.authority, path)
+            certificates.check_time(certificate, "its key", now or datetime.now(UTC))
+            identity = certificates.identity_of(certificate, path)
+        except (DecodeError, UsageError) as error:
+            raise LinkError(f"the other end shows no key of this lab: {error}") from None
+        if not certificates.signed_by(certificate, claim, proof.signature):
+            raise LinkError(f"the other end shows the certificate of {identity.name}, and does not have its key")
+        if not self._ring.admits(identity):
+            raise LinkError(f"the roster (number {self._ring.roster.number}) does not have {identity}: {_WHY}")
+        return identity, certificate.not_valid_after_utc
+
+    def _agree(self, identity: Identity, expires: datetime, share: bytes, claim: bytes) -> Agreed:
+        try:
+            shared = self._private.exchange(X25519PublicKey.from_public_bytes(share))
+        except ValueError as error:
+            raise LinkError(f"the other end's share is of no use: {error}") from None
+        salt = sha256(claim).digest()
+        secrets = HKDF(SHA256(), 2 * SECRET_BYTES, salt, _PURPOSE.encode()).derive(shared)
+        return Agreed(identity, expires, secrets[:SECRET_BYTES], secrets[SECRET_BYTES:])
+
+
+def _decode(proof: bytes) -> Proof:
+    try:
+        return msgspec.msgpack.decode(proof, type=Proof)
+    except msgspec.DecodeError:
+        raise LinkError(
+            "the other end shows no key: with keys both ends need them, and a version that shows them"
+        ) from None
+
+
+_WHY: Final = "it was revoked, its rights were changed, or a newer roster is needed here"

@@ -1,0 +1,215 @@
+"""VRPN as a source of frames: a TCP client that distinguishes the sensors of a tracker."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterable
+from typing import Final
+
+from skyloop.clock import monotonic_ns, nanoseconds
+from skyloop.errors import DecodeError, LinkError, UsageError
+from skyloop.motion_capture.address import System
+from skyloop.motion_capture.worker import RawFrame, Seen
+from skyloop.wire import vrpn
+
+CONNECT_S: Final = 1.0  #: how long a server may take to accept
+AGAIN_S: Final = 0.5  #: pause before the next attempt to connect
+SILENT_S: Final = 3.0  #: a connection without a pose for so long is given up: the server may have been restarted
+SETTLE_S: Final = 0.3  #: how long other sensors of a tracker have to report before its sensor 0 is taken for the body
+POLL_S: Final = 0.1  #: how often a reader that receives nothing checks whether it is to end
+CHUNK: Final = 65_536  #: bytes that are received at a time
+MAX_SENSORS: Final = 1_000  #: of a tracker that are remembered
+
+
+class SensorSelection:
+    """Decides which sensor of which tracker belongs to which body. Pure: the time is an argument.
+
+    A body's name is ``TRACKER:SENSOR``, or ``TRACKER`` for the sensor that the address names. Where neither names one,
+    it is sensor 0, as long as no other sensor of that tracker has ever reported. If another one has, it is unknown
+    which is meant, and the body has no pose.
+    """
+
+    def __init__(self, names: Iterable[str], sensor: int | None = None) -> None:
+        """Initialise the selection.
+
+        Args:
+            names: Of the bodies.
+            sensor: Of bodies whose name has none; None if the address names none.
+
+        Raises:
+            UsageError: Two names mean the same sensor.
+        """
+        self._bodies: dict[tuple[str, int], str] = {}
+        self._unnamed: set[str] = set()  # trackers without a named sensor
+        self._reported: dict[str, tuple[int, set[int]]] = {}  # of those: since when, and which sensors
+        for name in names:
+            tracker, named = split_name(name)
+            number = sensor if named is None else named
+            if number is None:
+                self._unnamed.add(tracker)
+                number = 0
+            if (tracker, number) in self._bodies:
+                other = self._bodies[tracker, number]
+                raise UsageError(f"bodies {other!r} and {name!r} are both sensor {number} of tracker {tracker!r}")
+            self._bodies[tracker, number] = name
+        self._wanted = set(self._bodies.values())
+
+    def select(self, poses: Iterable[vrpn.TrackerPose], now_ns: int) -> dict[str, Seen]:
+        """Return the newest pose of each body.
+
+        Args:
+            poses: In the order in which they arrived.
+            now_ns: The time of their arrival.
+
+        Returns:
+            Poses by name of the body; a sensor that belongs to no body is named ``TRACKER:SENSOR``.
+        """
+        poses = list(poses)
+        for pose in poses:
+            if pose.tracker in self._unnamed:
+                _, sensors = self._reported.setdefault(pose.tracker, (now_ns, set()))
+                if len(sensors) < MAX_SENSORS:
+                    sensors.add(pose.sensor)
+        found: dict[str, Seen] = {}
+        for pose in poses:
+            name = self._bodies.get((pose.tracker, pose.sensor))
+            if name is None:
+                name = f"{pose.tracker}:{pose.sensor}"
+                if name in self._wanted:  # it coincides with the name of another body
+                    continue
+            elif name in self._unnamed and not self._certain(name, now_ns):
+                continue
+            found[name] = (pose.position, pose.quaternion)
+        return found
+
+    def settled(self, now_ns: int) -> bool:
+        """Whether it is known, for every tracker that reports, if its sensor must be named."""
+        return all(now_ns - since_ns >= nanoseconds(SETTLE_S) for since_ns, _ in self._reported.values())
+
+    @property
+    def refused(self) -> dict[str, str]:
+        """Trackers whose sensor must be named and is not, each with the reason and the remedy."""
+        return {
+            tracker: f"tracker {tracker!r} reports {_listed(sensors)}, and which one is the body is not given: name it "
+            f"in bodies, as {f'{tracker}:{min(sensors)}'!r}, or as ?sensor={min(sensors)} in the address"
+            for tracker, (_, sensors) in self._reported.items()
+            if sensors != {0}
+        }
+
+    def _certain(self, tracker: str, now_ns: int) -> bool:
+        since_ns, sensors = self._reported[tracker]
+        return sensors == {0} and now_ns - since_ns >= nanoseconds(SETTLE_S)
+
+
+class VrpnSource:
+    """Receives from a VRPN server and passes each frame on, on its own thread.
+
+    A connection that ends, falls silent or carries other data than VRPN is replaced until :meth:`close`. What has piled
+    up in the socket counts as one frame: the newest pose of each body.
+    """
+
+    def __init__(
+        self, system: System, names: Iterable[str], take: Callable[[RawFrame], None], trouble: Callable[[str], None]
+    ) -> None:
+        """Initialise without connecting.
+
+        Args:
+            system: The server's address.
+            names: Of the bodies: ``TRACKER`` or ``TRACKER:SENSOR``.
+            take: Called with each frame, on the reading thread.
+            trouble: Called with a description of each trouble, on the reading thread.
+
+        Raises:
+            UsageError: Two names mean the same sensor.
+        """
+        self._system = system
+        self._selection = SensorSelection(names, system.sensor)
+        self._take = take
+        self._trouble = trouble
+        self._refused: dict[str, str] = {}  # as the selection's, for other threads
+        self._failure = ""  # why the last connection ended
+        self._ended = threading.Event()
+        self._ready = threading.Event()  # poses arrive, or are refused
+        self._reader = threading.Thread(target=self._run, name="skyloop-mocap", daemon=True)
+
+    def start(self, timeout_s: float) -> None:
+        """Connect, and wait for the first frame.
+
+        Raises:
+            LinkError: No frame comes.
+            UsageError: A tracker has several sensors, and which one is meant is not given.
+        """
+        self._reader.start()
+        ready = self._ready.wait(timeout_s)
+        if ready and not self._refused:
+            return
+        self.close()
+        if self._refused:
+            raise UsageError(f"{self._system.address}: {'; '.join(self._refused.values())}")
+        raise LinkError(f"{self._system.address} sent no frame within {timeout_s:g} s{self._failure}")
+
+    def close(self) -> None:
+        """Close the connection. Idempotent."""
+        self._ended.set()
+        if self._reader.ident is not None and self._reader is not threading.current_thread():
+            self._reader.join(CONNECT_S + 1.0)  # looking a name up may take longer, and ends by itself
+
+    # --- reader thread ---
+
+    def _run(self) -> None:
+        while not self._ended.is_set():
+            try:
+                self._receive()
+            except (OSError, UnicodeError, LinkError, DecodeError) as error:
+                self._failure = f": {error}"
+                if not self._ended.is_set():
+                    self._trouble(f"{self._system.address} is not heard{self._failure}; trying again")
+            self._ended.wait(AGAIN_S)
+
+    def _receive(self) -> None:
+        """Run one connection from its start to its end."""
+        address = self._system.host, self._system.port or vrpn.DEFAULT_PORT
+        with socket.create_connection(address, CONNECT_S) as connection:
+            connection.settimeout(POLL_S)
+            connection.sendall(vrpn.COOKIE)
+            decoder = vrpn.Decoder()
+            last_s = time.monotonic()
+            while not self._ended.is_set():
+                if time.monotonic() - last_s > SILENT_S:
+                    raise LinkError(f"it sent no pose for {SILENT_S:g} s")
+                try:
+                    data = connection.recv(CHUNK)
+                except TimeoutError:
+                    continue
+                received_ns = monotonic_ns()
+                if not data:
+                    raise LinkError("the server ended the connection")
+                if poses := decoder.feed(data):
+                    last_s = time.monotonic()
+                    self._publish(poses, received_ns)
+
+    def _publish(self, poses: list[vrpn.TrackerPose], received_ns: int) -> None:
+        bodies = self._selection.select(poses, received_ns)
+        refused = self._selection.refused
+        for tracker in refused.keys() - self._refused.keys():
+            self._trouble(f"{self._system.address}: {refused[tracker]}")
+        self._refused = refused
+        if bodies and not self._ended.is_set():
+            self._take(RawFrame(received_ns, bodies))
+        if refused or (bodies and self._selection.settled(received_ns)):
+            self._ready.set()
+
+
+def split_name(name: str) -> tuple[str, int | None]:
+    """Split a body's name into tracker and sensor; the sensor is None for a name without a number after a colon."""
+    tracker, _, number = name.rpartition(":")
+    if tracker and number.isascii() and number.isdigit() and len(number) <= 9:
+        return tracker, int(number)
+    return name, None
+
+
+def _listed(sensors: set[int]) -> str:
+    shown = ", ".join(str(sensor) for sensor in sorted(sensors)[:16])
+    return f"sensor{'s' if len(sensors) > 1 else ''} {shown}{', …' if len(sensors) > 16 else ''}"

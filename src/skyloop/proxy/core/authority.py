@@ -1,0 +1,367 @@
+"""Who may command: numbered leases, priorities, a queue of waiting pilots. Pure: the time is an argument.
+
+Priority 0 is the highest, 31 the lowest. At any time at most one application *holds* the authority, under a lease
+whose number was never used before in this run. A strictly higher priority takes over at once, or after the holder was
+asked; a pre-empted pilot waits in the queue at the position that its priority and first arrival give it. A holder that
+said for how long it wants the authority loses it when that time is over and somebody waits. The rules in words are in
+``docs/proxy.md``.
+"""
+
+from __future__ import annotations
+
+from bisect import insort
+from dataclasses import dataclass, field, replace
+
+from skyloop.clock import nanoseconds
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class QueueEntry:
+    """An application that holds the authority or waits for it. Sorts in the order of being served."""
+
+    priority: int  #: 0 is the highest
+    arrival: int  #: number of its first request since it last held or wanted nothing
+    app_id: int
+    term_ns: int | None = field(default=None, compare=False)  #: for how long it is wanted, from the grant; None: open
+    #: Until when the holder is asked before it is pre-empted; None: it is not asked (any more).
+    asks_until_ns: int | None = field(default=None, compare=False)
+
+    def asks(self, now_ns: int) -> bool:
+        """Whether the holder is still being asked."""
+        return self.asks_until_ns is not None and now_ns < self.asks_until_ns
+
+
+@dataclass(frozen=True, slots=True)
+class Granted:
+    """The authority was given to ``app_id`` under a new lease."""
+
+    app_id: int
+    priority: int
+    lease: int
+    until_ns: int | None = None  #: when its time is over
+
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """The lease ended: ``released``, ``silent``, ``gone``, or ``expired`` because its time is over and others wait."""
+
+    app_id: int
+    lease: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Preempted:
+    """The lease ended because somebody of strictly higher priority wants it, or the holder ``granted`` it.
+
+    The loser waits in the queue.
+    """
+
+    app_id: int
+    lease: int
+    by_id: int
+    by_priority: int
+    granted: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Queued:
+    """An application waits in the queue or has moved in it, ``position`` 1 being next."""
+
+    app_id: int
+    priority: int
+    position: int
+    wait_ns: int | None = None  #: expected; None: not known
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """The holder is asked to hand the authority over."""
+
+    app_id: int  #: the holder
+    lease: int
+    by_id: int
+    by_priority: int
+    until_ns: int  #: when ``by_id`` wins if its priority is strictly higher
+    term_ns: int | None = None  #: for how long it is wanted
+
+
+@dataclass(frozen=True, slots=True)
+class Declined:
+    """The holder does not hand it over to ``app_id``, who waits on."""
+
+    app_id: int
+    holder_id: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Withdrawn:
+    """Who asked the holder does so no more: it has left the queue, or waits without asking."""
+
+    app_id: int  #: the holder
+    lease: int
+    by_id: int
+
+
+@dataclass(frozen=True, slots=True)
+class Expired:
+    """The holder's time is over; it keeps the authority until somebody wants it. Told once."""
+
+    app_id: int
+    lease: int
+
+
+Effect = Granted | Lost | Preempted | Queued | Asked | Declined | Withdrawn | Expired
+
+
+class Authority:
+    """Who holds the authority over one vehicle and who waits for it. Methods return what changed, in order."""
+
+    def __init__(self, timeout_s: float = 2.0, ask_s: float = 10.0) -> None:
+        self.timeout_ns = nanoseconds(timeout_s)  #: a holder silent for so long loses the lease
+        self.ask_ns = nanoseconds(ask_s)  #: how long a holder that is asked may wait before the higher priority wins
+        self.holder: QueueEntry | None = None
+        self.lease = 0  #: the lease in force; 0 for none
+        self.heard_ns = 0  #: when the holder sent its last valid command, or got the lease
+        self.until_ns: int | None = None  #: when the holder's time is over
+        self.silent: QueueEntry | None = (
+            None  #: who lost the lease by silence and keeps the name on it until somebody asks
+        )
+        self._last_lease = 0
+        self._arrivals = 0
+        self._waiting: list[QueueEntry] = []
+        self._known_positions: dict[int, int] = {}
+        self._expiry_reported = False
+
+    @property
+    def owner(self) -> QueueEntry | None:
+        """Whose name is on it: the holder's, or that of one who lost the lease by silence and whom nobody followed."""
+        return self.holder or self.silent
+
+    @property
+    def waiting(self) -> tuple[QueueEntry, ...]:
+        """Those in the queue, the next one first."""
+        return tuple(self._waiting)
+
+    def position(self, app_id: int) -> int:
+        """Return the position in the queue from 1; 0 for an application that does not wait."""
+        return next((position for position, entry in enumerate(self._waiting, 1) if entry.app_id == app_id), 0)
+
+    def asking(self, app_id: int, now_ns: int) -> bool:
+        """Whether this application waits while the holder is asked to hand it over."""
+        return any(entry.app_id == app_id and entry.asks(now_ns) for entry in self._waiting)
+
+    def wait_ns(self, app_id: int, now_ns: int) -> int | None:
+        """Return how long a waiting application will wait if each keeps to its time; None: somebody gave none."""
+        if self.holder is None or not self._waiting:
+            return None
+        wait_ns = None if self.until_ns is None else max(0, self.until_ns - now_ns)
+        first = self._waiting[0]
+        if first.asks_until_ns is not None and first.priority < self.holder.priority:
+            asked_ns = max(0, first.asks_until_ns - now_ns)
+            wait_ns = asked_ns if wait_ns is None else min(wait_ns, asked_ns)
+        for entry in self._waiting:
+            if entry.app_id == app_id:
+                return wait_ns
+            wait_ns = None if wait_ns is None or entry.term_ns is None else wait_ns + entry.term_ns
+        return None
+
+    # What applications do --------------------------------------------------------------------------------------
+
+    def request(
+        self,
+        app_id: int,
+        priority: int,
+        queue: bool,
+        now_ns: int,
+        *,
+        term_ns: int | None = None,
+        ask: bool = False,
+    ) -> list[Effect]:
+        """Ask for the authority, or change the priority or the time of an earlier request.
+
+        ``queue`` False: do not wait. ``term_ns``: for how long it is wanted; None: until it is given back.
+        ``ask``: let the holder be asked first. Afterwards the application holds the authority, or has a
+        :meth:`position`, or was refused because somebody of at least the same priority holds it.
+        """
+        effects: list[Effect] = []
+        if self.holder is not None and self.holder.app_id == app_id:
+            self.holder = replace(self.holder, priority=priority)
+            self._change_term(term_ns, now_ns)
+            if not (self._waiting and self._is_over(now_ns)):
+                return self._settle(now_ns)
+            effects.append(self._relieve())  # and asks anew, as everybody else does
+        entry, asked_before = self._dequeue(app_id, priority, term_ns, ask, now_ns)
+        if queue or self._may_be_taken(entry, now_ns):
+            insort(self._waiting, entry)
+            self._known_positions.pop(app_id, None)
+        effects += self._hand_over(now_ns)
+        if not queue and entry in self._waiting:  # somebody of higher priority was waiting
+            self._waiting.remove(entry)
+        effects += self._moved(now_ns)
+        holder = self.holder
+        if holder is None or holder.app_id == app_id:
+            return effects
+        asks_until_ns = entry.asks_until_ns if entry in self._waiting else None
+        if asks_until_ns is not None and not asked_before:
+            effects.append(Asked(holder.app_id, self.lease, app_id, priority, asks_until_ns, term_ns))
+        elif asks_until_ns is None and asked_before:
+            effects.append(Withdrawn(holder.app_id, self.lease, app_id))
+        return effects
+
+    def answer(self, app_id: int, lease: int, by_id: int, grant: bool, reason: str, now_ns: int) -> list[Effect]:
+        """The holder answers who asks. Does nothing if ``app_id`` is not the holder, or ``by_id`` does not ask.
+
+        Granting is to step back: the first in the queue gets it, and the holder waits, with no higher priority than
+        that one has. Declining is reported; a strictly higher priority wins all the same when the time to ask is over.
+        """
+        holder = self.holder
+        asker = next((entry for entry in self._waiting if entry.app_id == by_id), None)
+        if holder is None or (holder.app_id, self.lease) != (app_id, lease):
+            return []
+        if asker is None or asker.asks_until_ns is None:
+            return []
+        if not grant:
+            return [Declined(by_id, app_id, reason)]
+        return self._pre_empt(now_ns, granted=True) + self._moved(now_ns)
+
+    def release(self, app_id: int, now_ns: int) -> list[Effect]:
+        """Give the authority back, or leave the queue. Does nothing for an application that does neither."""
+        return self._drop(app_id, "released", now_ns)
+
+    def gone(self, app_id: int, now_ns: int) -> list[Effect]:
+        """The application's connection ended."""
+        return self._drop(app_id, "gone", now_ns)
+
+    def update(self, now_ns: int) -> list[Effect]:
+        """Do what goes by time; call at a steady pace.
+
+        The lease of a silent holder ends, and of one whose time is over while others wait; a holder that was asked for
+        long enough is pre-empted.
+        """
+        holder = self.holder
+        if holder is None:
+            return []
+        if now_ns - self.heard_ns >= self.timeout_ns:
+            effects = self._drop(holder.app_id, "silent", now_ns)
+            if self.holder is None:
+                self.silent = holder
+            return effects
+        effects = self._settle(now_ns)
+        if self._is_over(now_ns) and not self._expiry_reported:  # nobody waits, or it would have been relieved
+            self._expiry_reported = True
+            effects.append(Expired(holder.app_id, self.lease))
+        return effects
+
+    # Inside ----------------------------------------------------------------------------------------------------
+
+    def _dequeue(
+        self, app_id: int, priority: int, term_ns: int | None, ask: bool, now_ns: int
+    ) -> tuple[QueueEntry, bool]:
+        """Return the application's entry, out of the queue, and whether the holder was asked for it before."""
+        known = next((entry for entry in self._waiting if entry.app_id == app_id), None)
+        asked_before = known is not None and known.asks(now_ns)
+        if known is not None:
+            self._waiting.remove(known)
+            arrival = known.arrival
+        else:
+            self._arrivals += 1
+            arrival = self._arrivals
+        asks_until_ns = known.asks_until_ns if known is not None and asked_before else now_ns + self.ask_ns
+        return QueueEntry(priority, arrival, app_id, term_ns, asks_until_ns if ask else None), asked_before
+
+    def _may_be_taken(self, entry: QueueEntry, now_ns: int) -> bool:
+        """Whether this entry need not wait."""
+        holder = self.holder
+        if holder is None or self._is_over(now_ns):
+            return True
+        return entry.priority < holder.priority and not entry.asks(now_ns)
+
+    def _is_over(self, now_ns: int) -> bool:
+        return self.holder is not None and self.until_ns is not None and now_ns >= self.until_ns
+
+    def _change_term(self, term_ns: int | None, now_ns: int) -> None:
+        """The holder wants it for so long from now; no longer than before while others wait. None: as before."""
+        if term_ns is None:
+            return
+        until_ns = now_ns + term_ns
+        if self._waiting and self.until_ns is not None:
+            until_ns = min(until_ns, self.until_ns)
+        self.until_ns, self._expiry_reported = until_ns, False
+
+    def _pre_empt(self, now_ns: int, *, granted: bool = False) -> list[Effect]:
+        """Give it to the first in the queue; the holder waits.
+
+        It keeps what is left of its time, and has no higher priority than the new one, or it would take it back.
+        """
+        holder, lease = self.holder, self.lease
+        assert holder is not None
+        left_ns = None if self.until_ns is None else max(1, self.until_ns - now_ns)
+        grant = self._grant(now_ns)
+        priority = max(holder.priority, grant.priority)
+        insort(self._waiting, replace(holder, priority=priority, term_ns=left_ns))
+        return [Preempted(holder.app_id, lease, grant.app_id, grant.priority, granted), grant]
+
+    def _relieve(self) -> Lost:
+        """The holder's time is over and others wait."""
+        assert self.holder is not None
+        lost = Lost(self.holder.app_id, self.lease, "expired")
+        self._vacate()
+        return lost
+
+    def _vacate(self) -> None:
+        self.holder, self.lease, self.until_ns, self._expiry_reported = None, 0, None, False
+
+    def _drop(self, app_id: int, reason: str, now_ns: int) -> list[Effect]:
+        effects: list[Effect] = []
+        if self.holder is not None and self.asking(app_id, now_ns):
+            effects.append(Withdrawn(self.holder.app_id, self.lease, app_id))
+        self._waiting = [entry for entry in self._waiting if entry.app_id != app_id]
+        if self.silent is not None and self.silent.app_id == app_id:
+            self.silent = None
+        if self.holder is not None and self.holder.app_id == app_id:
+            effects.append(Lost(app_id, self.lease, reason))
+            self._vacate()
+        return effects + self._settle(now_ns)
+
+    def _settle(self, now_ns: int) -> list[Effect]:
+        """Hand the authority over if it is time to, then report who has moved in the queue."""
+        return self._hand_over(now_ns) + self._moved(now_ns)
+
+    def _hand_over(self, now_ns: int) -> list[Effect]:
+        """Give the authority to the first in the queue if it is time to.
+
+        That is if nobody holds it, the holder's time is over, or somebody of strictly higher priority need not ask any
+        longer.
+        """
+        effects: list[Effect] = []
+        holder = self.holder
+        if holder is not None and self._waiting:
+            if self._is_over(now_ns):
+                effects.append(self._relieve())
+            elif any(entry.priority < holder.priority and not entry.asks(now_ns) for entry in self._waiting):
+                effects += self._pre_empt(now_ns)
+        if self.holder is None and self._waiting:
+            effects.append(self._grant(now_ns))
+        return effects
+
+    def _grant(self, now_ns: int) -> Granted:
+        first = self._waiting.pop(0)
+        self._last_lease += 1
+        self.holder, self.lease, self.heard_ns = replace(first, asks_until_ns=None), self._last_lease, now_ns
+        self.until_ns = None if first.term_ns is None else now_ns + first.term_ns
+        self._expiry_reported = False
+        self.silent = None
+        return Granted(first.app_id, first.priority, self.lease, self.until_ns)
+
+    def _moved(self, now_ns: int) -> list[Effect]:
+        """Report whoever's position in the queue has changed."""
+        positions = {entry.app_id: position for position, entry in enumerate(self._waiting, 1)}
+        moved: list[Effect] = [
+            Queued(entry.app_id, entry.priority, positions[entry.app_id], self.wait_ns(entry.app_id, now_ns))
+            for entry in self._waiting
+            if self._known_positions.get(entry.app_id) != positions[entry.app_id]
+        ]
+        self._known_positions = positions
+        return moved

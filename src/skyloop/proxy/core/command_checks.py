@@ -1,0 +1,280 @@
+"""The checks that a command passes before it reaches the vehicle. Pure: the time is an argument.
+
+In this order: sequence, age, lease, finite numbers (these four, :meth:`CommandChecks.receive`, say whether the holder
+was *heard*), then freshness, the vehicle's link, support, whose the flight is, the flight state, limits, safety box and
+zones (:meth:`CommandChecks.decide`). The rules in words are in ``docs/proxy.md``.
+"""
+
+from __future__ import annotations
+
+from enum import Enum, auto
+from typing import Final, NamedTuple
+
+from skyloop.clock import nanoseconds, seconds
+from skyloop.messages import (
+    Action,
+    AnyAction,
+    Attitude,
+    Command,
+    Failsafe,
+    Feedback,
+    FlightState,
+    Hover,
+    Idle,
+    Land,
+    LinkState,
+    Refusal,
+    ResetEmergency,
+    Takeoff,
+    Velocity,
+)
+from skyloop.proxy.core.authority import Authority
+from skyloop.proxy.core.failsafe import REASONS, FailsafeLadder
+from skyloop.proxy.core.limits import Ceiling, Clamp, Limits
+from skyloop.proxy.core.ownership import Ownership, Whose
+from skyloop.proxy.core.zones import Safety
+
+MAX_AHEAD_S: Final = 0.05  #: how far in the future a command's time may lie: the error of the clocks' offset
+_MAX_AHEAD_NS: Final = nanoseconds(MAX_AHEAD_S)
+_HOVER_ACTION: Final = Hover()
+_SET_POINTS: Final = (Velocity, Attitude)
+_TAKING: Final = (Takeoff, Hover, Land)  #: newly asked for, they take a vehicle that others fly
+
+
+class CommandSequence:
+    """The sequence numbers and intents of one connection's commands: which are newer, and which are fresh."""
+
+    __slots__ = ("acted", "floor", "intent", "seq")
+
+    def __init__(self) -> None:
+        self.seq = -1  #: of the newest command received
+        self.intent = 0  #: highest received, refused commands included
+        self.floor = -1  #: intents up to this one are from before something that ended them
+        self.acted = 0  #: highest that was acted on, or refused: a command with a higher one is no repeat
+
+    def receive(self, command: Command, now_ns: int, max_age_ns: int, lease: int, holds: bool) -> Refusal | None:
+        """Check sequence, age, lease and numbers, and remember the sequence and the intent.
+
+        ``lease`` is the one in force (0 for none), ``holds`` whether the sender holds it. None: the holder was heard.
+        """
+        if command.seq <= self.seq:
+            return Refusal.OUT_OF_SEQUENCE
+        self.seq = command.seq
+        if command.intent > self.intent:
+            self.intent = command.intent
+        if not -_MAX_AHEAD_NS <= now_ns - command.sent_ns <= max_age_ns:
+            return Refusal.STALE
+        if command.lease != lease or not holds:
+            named_one = command.lease not in (0, lease)
+            return Refusal.FOREIGN_LEASE if named_one else Refusal.NO_AUTHORITY
+        if not command.action.finite:
+            return Refusal.NON_FINITE
+        return None
+
+    def note(self, command: Command) -> None:
+        """Remember a command that is carried out whatever its sequence: an emergency stop."""
+        self.seq, self.intent = max(self.seq, command.seq), max(self.intent, command.intent)
+
+    def fresh(self, command: Command) -> bool:
+        """Whether the application asked for it after the last thing that ended older intents."""
+        return command.intent > self.floor
+
+    def end_intents(self) -> None:
+        """Only what the application asks for from now on counts: a repeat of anything older is not fresh."""
+        self.floor = self.intent
+
+
+class StatePolicy(Enum):
+    """What becomes of an action in a flight state."""
+
+    APPLY = auto()
+    HOLD = auto()  #: accepted, and nothing is done: it is so already, or a manoeuvre in progress goes on
+    HOVER = auto()  #: a take-off of what flies already: hover
+    REFUSE = auto()
+
+
+def _row(**policies: StatePolicy) -> dict[FlightState, StatePolicy]:
+    other = policies.pop("other")
+    return {state: policies.get(state.value, other) for state in FlightState}
+
+
+_APPLY, _HOLD, _HOVER, _REFUSE = StatePolicy.APPLY, StatePolicy.HOLD, StatePolicy.HOVER, StatePolicy.REFUSE
+_SET_POINT: Final = _row(landed=_REFUSE, taking_off=_HOLD, landing=_HOLD, emergency=_REFUSE, other=_APPLY)
+
+#: In a state that is not known everything is passed on: some vehicles never tell.
+STATE_POLICIES: Final[dict[type[Action], dict[FlightState, StatePolicy]]] = {
+    Idle: _row(other=_HOLD),
+    Takeoff: _row(landed=_APPLY, unknown=_APPLY, taking_off=_HOLD, emergency=_REFUSE, other=_HOVER),
+    Hover: _row(landed=_HOLD, emergency=_REFUSE, other=_APPLY),
+    Land: _row(landed=_HOLD, landing=_HOLD, emergency=_REFUSE, other=_APPLY),
+    ResetEmergency: _row(emergency=_APPLY, unknown=_APPLY, other=_REFUSE),
+    Attitude: _SET_POINT,
+    Velocity: _SET_POINT,
+}
+
+
+class Decision(NamedTuple):
+    """What becomes of a command whose sender was heard."""
+
+    action: AnyAction | None = None  #: what the vehicle must do; None: nothing new
+    refusal: Refusal | None = None
+    why: str = ""  #: of the refusal, for a person
+    new: bool = False  #: the application newly asked for it; else the library repeats it
+    takes_off: bool = False
+    clamps: tuple[Clamp, ...] = ()  #: the limits that shortened it
+    enforced: bool | None = None  #: whether the safety box and zones could be; None: there are none, or no set-point
+
+
+class CommandChecks:
+    """Decides what becomes of the commands for one vehicle.
+
+    Args:
+        authority: who holds the lease; :meth:`receive` notes when its holder was heard.
+        ladder: the failsafe ladder.
+        ownership: whose the flight is.
+        supported: the actions that the vehicle or the software autopilot can do.
+        why_not: why others are not supported, for people; may be empty.
+    """
+
+    def __init__(
+        self,
+        authority: Authority,
+        ladder: FailsafeLadder,
+        ownership: Ownership,
+        *,
+        supported: frozenset[type[Action]],
+        why_not: str,
+    ) -> None:
+        self.limits = Limits()
+        self.safety: Safety | None = None  #: the safety box and zones; None: there are none
+        self.max_age_ns = 0
+        self._authority = authority
+        self._ladder = ladder
+        self._ownership = ownership
+        self._supported = supported
+        self._why_not = why_not
+        self._ceiling = Ceiling()
+
+    def receive(self, command: Command, sequence: CommandSequence, app_id: int, now_ns: int) -> Refusal | None:
+        """Check sequence, age, lease and numbers. None: the holder was heard, which keeps its lease."""
+        authority = self._authority
+        holder = authority.holder
+        holds = holder is not None and holder.app_id == app_id
+        refusal = sequence.receive(command, now_ns, self.max_age_ns, authority.lease, holds)
+        if refusal is None:
+            authority.heard_ns = now_ns
+        return refusal
+
+    def explain(self, refusal: Refusal, command: Command, sequence: CommandSequence, now_ns: int) -> str:
+        """Return why :meth:`receive` refused a command, for a person."""
+        lease = self._authority.lease
+        return explain(refusal, command, sequence, now_ns=now_ns, max_age_ns=self.max_age_ns, lease=lease)
+
+    def decide(
+        self,
+        command: Command,
+        sequence: CommandSequence,
+        state: FlightState,
+        link: LinkState,
+        feedback: Feedback | None,
+        now_ns: int,
+    ) -> Decision:
+        """Decide what the vehicle does of a command that :meth:`receive` let through. Not for an emergency stop.
+
+        Args:
+            command: any action but :class:`Idle` and :class:`EmergencyStop`.
+            sequence: that of the sender's connection.
+            state: the flight state now.
+            link: the state of the link to the vehicle.
+            feedback: the newest sample, for altitude and position; None: none came yet.
+            now_ns: the time now, on the proxy's clock [ns].
+        """
+        action = command.action
+        kind = type(action)
+        policy = STATE_POLICIES[kind][state]
+        new = command.intent > sequence.acted
+        if new:
+            sequence.acted = command.intent
+        problem = self._problem(command, sequence, state, link, new)
+        if problem is not None:
+            return Decision(None, *problem, new)
+        is_set_point = kind is Velocity or kind is Attitude
+        if policy is StatePolicy.HOLD and is_set_point and self._ladder.step is Failsafe.LAND:
+            policy = StatePolicy.HOVER  # the ladder's landing, not a pilot's: a pilot who is back breaks it off
+        if policy is StatePolicy.REFUSE:
+            return Decision(None, Refusal.WRONG_STATE, explain_state(action, state), new)
+        if policy is StatePolicy.HOLD:
+            return Decision(new=new)
+        clamps: tuple[Clamp, ...] = ()
+        enforced = None
+        if policy is StatePolicy.HOVER or kind is Hover:
+            action, clamps = self._hover_below_ceiling(state, feedback)
+        elif is_set_point:
+            action, clamps = self.limits.clamp(action, feedback.altitude if feedback else None)  # type: ignore[arg-type]
+            if self.safety is not None:
+                action, walls, enforced = self.safety.clamp(action, feedback, now_ns)
+                clamps += walls
+        takes_off = kind is Takeoff and policy is StatePolicy.APPLY
+        return Decision(action, None, "", new, takes_off, clamps, enforced)
+
+    def _problem(
+        self, command: Command, sequence: CommandSequence, state: FlightState, link: LinkState, new: bool
+    ) -> tuple[Refusal, str] | None:
+        """What forbids a command of the holder, whatever the policy of the flight state is."""
+        kind = type(command.action)
+        if not sequence.fresh(command):
+            return Refusal.NOT_FRESH, "it repeats what was asked for before a failsafe or a new lease: ask anew"
+        if link is not LinkState.UP and link is not LinkState.DEGRADED:
+            return Refusal.VEHICLE_LINK_LOST, f"the link to the vehicle is {link.value}"
+        if kind not in self._supported:
+            why = self._why_not or "neither the vehicle nor the software autopilot can do it"
+            return Refusal.UNSUPPORTED, f"{command.action.name} is not possible: {why}"
+        if self._ownership.whose is Whose.OTHERS:
+            others = self._ownership.others
+            if kind in _SET_POINTS:
+                return Refusal.WRONG_STATE, f"{others}: hover, take off or land first, which takes it"
+            if not new and kind in _TAKING:
+                return Refusal.WRONG_STATE, f"{others}, and repeating an order does not take it back: ask anew"
+        if self._ladder.barred and kind is not Land:
+            return Refusal.WRONG_STATE, f"only landing is possible: {REASONS[self._ladder.barred]}"
+        if STATE_POLICIES[kind][state] is StatePolicy.HOVER and Hover not in self._supported:
+            return Refusal.UNSUPPORTED, f"{command.action.name} is not possible while {state.value}"
+        return None
+
+    def _hover_below_ceiling(
+        self, state: FlightState, feedback: Feedback | None
+    ) -> tuple[AnyAction, tuple[Clamp, ...]]:
+        """Hover, or come down first where it is above ``limits.altitude``."""
+        in_place = state is FlightState.HOVERING or state is FlightState.FLYING
+        if Velocity not in self._supported or feedback is None or not in_place:
+            return _HOVER_ACTION, ()
+        sink, clamps = self._ceiling.instead(self.limits, feedback.altitude)
+        return (_HOVER_ACTION, ()) if sink is None else (sink, clamps)
+
+
+def explain(
+    reason: Refusal, command: Command, sequence: CommandSequence, *, now_ns: int, max_age_ns: int, lease: int
+) -> str:
+    """Why a command was refused by :meth:`CommandSequence.receive`, and what would be right, in words for a person."""
+    if reason is Refusal.OUT_OF_SEQUENCE:
+        return f"number {command.seq} is not newer than {sequence.seq}, the last one received"
+    if reason is Refusal.STALE:
+        age = seconds(now_ns - command.sent_ns)
+        if age < 0:
+            return f"it was sent {-age:.3f} s in the future, at most {MAX_AHEAD_S:g} s are allowed"
+        return f"it is {age:.3f} s old, at most {seconds(max_age_ns):g} s are allowed (command.max_age_s)"
+    if reason is Refusal.FOREIGN_LEASE:
+        force = f"lease {lease} is in force" if lease else "no lease is in force"
+        return f"it was sent under lease {command.lease}, and {force}"
+    if reason is Refusal.NO_AUTHORITY:
+        return "the sender does not hold the authority: request it first"
+    return f"{command.action.name} has a number that is NaN or infinite"
+
+
+def explain_state(action: Action, state: FlightState) -> str:
+    """Why an action is refused in a flight state."""
+    if state is FlightState.EMERGENCY:
+        return f"{action.name} is not possible in an emergency: reset it first"
+    if isinstance(action, ResetEmergency):
+        return f"there is no emergency to reset: the vehicle is {state.value}"
+    return f"{action.name} is not possible while {state.value}: take off first"

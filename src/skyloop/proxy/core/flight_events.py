@@ -1,0 +1,69 @@
+"""The events of commands, failsafe and ownership: their kinds, texts for people and data. Pure."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from skyloop.messages import Command, EventKind, Failsafe, Refusal, Severity, Value
+from skyloop.proxy.core.events import EventDraft
+from skyloop.proxy.core.failsafe import REASONS, BatteryLow, StepChange
+from skyloop.proxy.core.limits import Clamp
+from skyloop.proxy.core.ownership import Changed, Whose
+
+_ENFORCED: Final = "enforced: its position is known again"
+_NOT_ENFORCED: Final = "not enforced: the vehicle's position is not known"
+
+
+def refused_event(name: str, command: Command, reason: Refusal, why: str) -> EventDraft:
+    """A command of the application ``name`` was refused."""
+    text = f"{name}: {command.action.name} refused: {why}"
+    return EventDraft(EventKind.COMMAND_REFUSED, text, app=name, data={"reason": reason.value, "seq": command.seq})
+
+
+def clamped_event(name: str, clamp: Clamp) -> EventDraft:
+    """A limit shortened a set-point of the application ``name``."""
+    text = f"{name}: {clamp.limit} made {clamp.applied:.3g} of {clamp.asked:.3g}"
+    data: dict[str, Value] = {"limit": clamp.limit, "asked": clamp.asked, "applied": clamp.applied}
+    return EventDraft(EventKind.COMMAND_CLAMPED, text, Severity.INFO, name, data)
+
+
+def enforcement_event(enforced: bool) -> EventDraft:
+    """The safety box and zones are, or are not, enforced from now on."""
+    text = f"the safety box and zones are {_ENFORCED if enforced else _NOT_ENFORCED}"
+    severity = Severity.INFO if enforced else Severity.WARNING
+    return EventDraft(EventKind.VEHICLE_MESSAGE, text, severity, data={"reason": "safety", "enforced": enforced})
+
+
+def emergency_event(name: str) -> EventDraft:
+    """The application ``name`` stopped the motors."""
+    text = f"emergency stop by {name}"
+    return EventDraft(EventKind.EMERGENCY, text, Severity.ERROR, name, {"reason": text})
+
+
+def failsafe_event(change: StepChange) -> EventDraft:
+    """A step of the failsafe ladder was taken or left."""
+    why = REASONS.get(change.reason, change.reason)
+    if change.step is Failsafe.NONE:
+        text, severity = f"failsafe ended: {why}", Severity.INFO
+    else:
+        text, severity = f"failsafe: {change.step.value}, because {why}", Severity.WARNING
+    data: dict[str, Value] = {"step": change.step.value, "reason": change.reason}
+    return EventDraft(EventKind.FAILSAFE, text, severity, data=data)
+
+
+def battery_event(low: BatteryLow) -> EventDraft:
+    """The battery fell below the warning level."""
+    text = f"battery low: {low.battery:.0%} left"
+    return EventDraft(EventKind.BATTERY_LOW, text, data={"battery": low.battery})
+
+
+def taken_event(name: str, action: str, others: str) -> EventDraft:
+    """The application ``name`` took the vehicle from others by an action; ``others`` says what they did with it."""
+    text = f"{name} took the vehicle by {action}: {others}"
+    return EventDraft(EventKind.VEHICLE_MESSAGE, text, app=name, data={"reason": "taken"})
+
+
+def ownership_event(changed: Changed) -> EventDraft:
+    """The flight is somebody else's, or an earlier run's."""
+    reason = "others" if changed.whose is Whose.OTHERS else "flight"
+    return EventDraft(EventKind.VEHICLE_MESSAGE, changed.why, data={"reason": reason})

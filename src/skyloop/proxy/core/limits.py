@@ -1,0 +1,105 @@
+"""The limits of set-points, and which of them begin to matter. Pure: the time is an argument."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+from skyloop.clock import NS_PER_S
+from skyloop.messages import AnyAction, Attitude, Velocity
+
+#: Climb allowed per metre that is left below ``limits.altitude`` [1/s]: the vehicle slows down before it is there, and
+#: sinks at this rate per metre that it is above.
+ALTITUDE_GAIN: Final = 1.0
+#: So little above ``limits.altitude`` is the altimeter's noise [m].
+SLACK_M: Final = 0.15
+#: A vehicle that hovers is brought down from so far above it [m], at this speed at least [m/s].
+HOVER_SLACK_M: Final = 0.3
+SINK_M_S: Final = 0.2
+#: A limit not touched for so long begins a new episode when it is touched again.
+EPISODE_NS: Final = NS_PER_S
+
+
+@dataclass(frozen=True, slots=True)
+class Clamp:
+    """A limit that was in the way of a set-point. For tilt and speed the two numbers are lengths of the vector."""
+
+    limit: str  #: name of the parameter
+    asked: float
+    applied: float
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """The limits in force."""
+
+    tilt: float = 0.35  #: greatest tilt from the vertical by roll and pitch together [rad]
+    climb: float = 1.0  #: greatest speed up or down [m/s]
+    yaw_rate: float = 1.75  #: [rad/s]
+    speed: float = 2.0  #: greatest horizontal speed [m/s]
+    altitude: float = 5.0  #: highest height above ground [m]
+
+    def clamp(self, action: Attitude | Velocity, altitude: float | None) -> tuple[AnyAction, tuple[Clamp, ...]]:
+        """Return the nearest set-point within the limits, and what was in the way of it.
+
+        Tilt and horizontal speed are shortened with their direction kept. ``altitude`` [m] of the vehicle, if known.
+        """
+        if type(action) is Velocity:
+            x, y, up, yaw_rate, longest = action.forward, action.left, action.up, action.yaw_rate, self.speed
+        else:
+            assert isinstance(action, Attitude)
+            x, y, up, yaw_rate, longest = action.roll, action.pitch, action.climb, action.yaw_rate, self.tilt
+        highest = self.climb
+        if altitude is not None:  # above the limit it is negative: the vehicle comes down
+            room = self.altitude - altitude
+            highest = max(-self.climb, min(highest, room * ALTITUDE_GAIN)) if not -SLACK_M <= room <= 0.0 else 0.0
+        if (
+            x * x + y * y <= longest * longest
+            and -self.climb <= up <= highest
+            and -self.yaw_rate <= yaw_rate <= self.yaw_rate
+        ):
+            return action, ()
+        clamps: list[Clamp] = []
+        length = math.hypot(x, y)
+        if length > longest:
+            clamps.append(Clamp("limits.speed" if type(action) is Velocity else "limits.tilt", length, longest))
+            x, y = x / length * longest, y / length * longest
+        allowed_up = max(-self.climb, min(highest, up))
+        if allowed_up != up:
+            near_the_top = up > highest and highest < self.climb
+            clamps.append(Clamp("limits.altitude" if near_the_top else "limits.climb", up, allowed_up))
+        allowed_yaw_rate = max(-self.yaw_rate, min(self.yaw_rate, yaw_rate))
+        if allowed_yaw_rate != yaw_rate:
+            clamps.append(Clamp("limits.yaw_rate", yaw_rate, allowed_yaw_rate))
+        return type(action)(x, y, allowed_up, allowed_yaw_rate), tuple(clamps)
+
+
+class Ceiling:
+    """Brings a vehicle down that is to hover above ``limits.altitude``, as one that overshot it is."""
+
+    def __init__(self) -> None:
+        self._sinking = False
+
+    def instead(self, limits: Limits, altitude: float | None) -> tuple[Velocity | None, tuple[Clamp, ...]]:
+        """Return what to do instead of hovering at this altitude [m], and what was in the way of it; None: hover."""
+        above = 0.0 if altitude is None else altitude - limits.altitude
+        self._sinking = above > (SLACK_M if self._sinking else HOVER_SLACK_M)
+        if not self._sinking:
+            return None, ()
+        up = -min(limits.climb, max(SINK_M_S, above * ALTITUDE_GAIN))
+        return Velocity(up=up), (Clamp("limits.altitude", 0.0, up),)
+
+
+class Episodes:
+    """Which limits are touched now, so that each is published once and not with every repeat of a set-point."""
+
+    def __init__(self) -> None:
+        self._touched_ns: dict[str, int] = {}
+
+    def begun(self, clamps: tuple[Clamp, ...], now_ns: int) -> list[Clamp]:
+        """Return those of the clamps that begin an episode."""
+        new = [clamp for clamp in clamps if now_ns - self._touched_ns.get(clamp.limit, -EPISODE_NS) >= EPISODE_NS]
+        for clamp in clamps:
+            self._touched_ns[clamp.limit] = now_ns
+        return new

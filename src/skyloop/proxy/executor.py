@@ -1,0 +1,127 @@
+"""Carries actions out: what the vehicle takes goes to its driver, the rest to the software autopilot.
+
+Not thread-safe: the command handler's lock is held around every call, which keeps the driver's calls one at a time.
+"""
+
+from __future__ import annotations
+
+from skyloop.drivers.base import Driver
+from skyloop.messages import (
+    ACTION_NAMES,
+    Action,
+    AnyAction,
+    Attitude,
+    Capabilities,
+    FlightState,
+    Hover,
+    Idle,
+    Land,
+    Takeoff,
+    Velocity,
+)
+from skyloop.proxy.core.autopilot import Autopilot, software_actions
+from skyloop.proxy.publisher import VehiclePublisher
+
+_FLYING = (Takeoff, Hover, Attitude, Velocity)
+
+
+class ActionExecutor:
+    """Sends supported actions to the driver and does the rest with the software autopilot.
+
+    Args:
+        driver: the vehicle's driver.
+        capabilities: what it told about the vehicle.
+        autopilot: the software autopilot; None for a vehicle that it adds nothing to.
+        publisher: what the vehicle reported, and where the driver's failures are reported.
+    """
+
+    def __init__(
+        self, driver: Driver, capabilities: Capabilities, autopilot: Autopilot | None, publisher: VehiclePublisher
+    ) -> None:
+        software = software_actions(capabilities.actions)
+        self.native = frozenset(kind for kind, name in ACTION_NAMES.items() if name in capabilities.actions)
+        self.supported: frozenset[type[Action]] = self.native | {
+            kind for kind, name in ACTION_NAMES.items() if name in software
+        }
+        self.why_not = capabilities.why_not
+        self.autopilot = autopilot
+        self._driver = driver
+        self._vehicle = publisher
+        self._in_force: AnyAction = Idle()
+        self._noticed = False
+
+    @property
+    def state(self) -> FlightState:
+        """The flight state now, which may be newer than the last feedback."""
+        return self._vehicle.state_of(self._vehicle.reported_state)
+
+    @property
+    def airborne(self) -> bool:
+        """Whether the vehicle flies, or may: one that never reports its state does from its first command on."""
+        state = self.state
+        return state.airborne or (state is FlightState.UNKNOWN and isinstance(self._in_force, _FLYING))
+
+    def left_to(self) -> str:
+        """Return what others made of the vehicle since it was steered from here, as the driver observes it."""
+        return self._driver.left_to()
+
+    def stop_autopilot(self) -> None:
+        """Stop the software autopilot because others steer."""
+        if self.autopilot is not None:
+            self.autopilot.stop("idle")
+
+    def execute(self, action: AnyAction, now_ns: int, *, new: bool = True) -> AnyAction:
+        """Carry out a supported action and return what was really applied. Raises what the driver raises.
+
+        ``new``: an application newly asked for it; else it repeats what was applied before.
+        """
+        if type(action) in self.native:
+            applied = self._driver.apply(action, new=new)
+            if self.autopilot is not None:
+                self.autopilot.stop(action.name)
+        else:
+            self._start(action, now_ns)
+            applied = action
+        self._in_force = applied
+        return applied
+
+    def failsafe(self, action: Hover | Land, now_ns: int) -> bool:
+        """Hover or land with nobody in command; returns whether it was taken. A failure is published, not raised."""
+        if type(action) in self.native:
+            try:
+                taken = self._driver.failsafe(action)
+            except Exception as error:  # noqa: BLE001  it is reported, and tried again
+                self._vehicle.driver_failed("failsafe", error)
+                return False
+            if taken and self.autopilot is not None:
+                self.autopilot.stop(action.name)
+        elif type(action) in self.supported:
+            self._start(action, now_ns)
+            taken = True
+        else:
+            return False
+        if taken:
+            self._in_force = action
+        return taken
+
+    def step(self, now_ns: int) -> AnyAction | None:
+        """Let the software autopilot steer, if it is on; returns what it made the driver apply."""
+        if self.autopilot is None:
+            return None
+        feedback = self._vehicle.feedback_now
+        if not self._noticed and feedback is not None and feedback.altitude is not None:
+            self._noticed = True
+            self.autopilot.notice(feedback)
+        action = self.autopilot.step(now_ns, feedback)
+        if action is None:
+            return None
+        try:
+            return self._driver.apply(action)
+        except Exception as error:  # noqa: BLE001  it is reported, and the next step tries again
+            self._vehicle.driver_failed("autopilot", error)
+            return None
+
+    def _start(self, action: AnyAction, now_ns: int) -> None:
+        assert self.autopilot is not None
+        assert isinstance(action, Takeoff | Hover | Land | Velocity)
+        self.autopilot.start(action, now_ns, self._vehicle.feedback_now)

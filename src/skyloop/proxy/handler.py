@@ -1,0 +1,459 @@
+"""The command handler: what applications ask of the vehicle, what the time asks of it, and one lock around both.
+
+Every decision about the flight is made under this lock, for as long as the decision and the driver's call last. The
+transport's threads bring commands and requests for the authority, the ticker brings the time, the thread of requests
+asks who holds the authority. The decisions themselves are pure, in :mod:`skyloop.proxy.core`.
+
+Lock order: this lock first, then the publisher's, then the events'. Nothing that is called under those two calls back
+here; a driver publishes what it receives from any thread without this lock.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from typing import Final
+
+from skyloop.clock import Clock, nanoseconds, seconds
+from skyloop.messages import (
+    AnswerTakeover,
+    AnyAction,
+    AnyReply,
+    Applied,
+    AuthorityGranted,
+    AuthorityQueued,
+    Command,
+    Done,
+    EmergencyStop,
+    Failsafe,
+    FlightState,
+    Hover,
+    Idle,
+    Refusal,
+    Refused,
+    ReleaseAuthority,
+    RequestAuthority,
+    Role,
+    Takeoff,
+    Takeover,
+    encode,
+)
+from skyloop.messages.numbers import LATEST_NS
+from skyloop.proxy.core.authority import Authority, Granted, Lost, Preempted
+from skyloop.proxy.core.authority import Effect as AuthorityEffect
+from skyloop.proxy.core.authority_events import EventContext, authority_event
+from skyloop.proxy.core.command_checks import CommandChecks, Decision
+from skyloop.proxy.core.failsafe import BatteryLow, FailsafeAction, FailsafeInputs, FailsafeLadder
+from skyloop.proxy.core.failsafe import Effect as FailsafeEffect
+from skyloop.proxy.core.flight_events import (
+    battery_event,
+    clamped_event,
+    emergency_event,
+    enforcement_event,
+    failsafe_event,
+    ownership_event,
+    refused_event,
+    taken_event,
+)
+from skyloop.proxy.core.ownership import Ownership, Whose
+from skyloop.proxy.events import Counters, EventPublisher
+from skyloop.proxy.executor import ActionExecutor
+from skyloop.proxy.parameters import FlightSettings
+from skyloop.proxy.publisher import VehiclePublisher
+from skyloop.proxy.sessions import Session
+from skyloop.transport.base import COMMANDS, ServerEnd
+
+#: What an echo shows for a command that made the vehicle do nothing new: refused, or held.
+_NOTHING: Final = Idle()
+
+
+class CommandHandler:
+    """Authority, commands, failsafe and ownership of one vehicle. Public methods may be called from any thread.
+
+    Args:
+        executor: carries actions out; called under the lock only.
+        publisher: what the vehicle reported.
+        events: where events are published.
+        counters: the proxy's counters.
+        server: where echoes of commands are published.
+        sessions: the connections, by the application's number; read here, changed by the proxy.
+        clock: the proxy's clock [ns].
+        shared: whether others may fly the vehicle too.
+    """
+
+    def __init__(
+        self,
+        *,
+        executor: ActionExecutor,
+        publisher: VehiclePublisher,
+        events: EventPublisher,
+        counters: Counters,
+        server: ServerEnd,
+        sessions: Mapping[int, Session],
+        clock: Clock,
+        shared: bool,
+    ) -> None:
+        self.authority = Authority()
+        self.ladder = FailsafeLadder()
+        self.ownership = Ownership(shared=shared)
+        self.checks = CommandChecks(
+            self.authority, self.ladder, self.ownership, supported=executor.supported, why_not=executor.why_not
+        )
+        self.on_ownership: Callable[[bool], None] = lambda _: None  #: called with whether the flight is ours, locked
+        self._lock = threading.RLock()
+        self._executor = executor
+        self._vehicle = publisher
+        self._events = events
+        self._counts = counters.counts
+        self._delays_ns = counters.delays_ns
+        self._publish = server.publish
+        self._subscribers = server.subscribers
+        self._sessions = sessions
+        self._clock = clock
+        self._pilot = "none"  # why nobody holds the authority, or "held"
+        self._breaks_seen = 0  # of the vehicle's link, when last looked at
+        self._enforced = True  # whether the safety box and zones could be, at the last set-point
+        self._stamp()
+
+    # From the proxy: what decides takes the lock -----------------------------------------------------------------
+
+    def begin(self, now_ns: int) -> None:
+        """Begin the run, before the server starts. A flight of an earlier run waits for its pilot, as if just heard."""
+        self.authority.heard_ns = now_ns
+
+    def configure(self, settings: FlightSettings) -> None:
+        """Let new values of the parameters take effect."""
+        with self._lock:
+            self.checks.limits = settings.limits
+            self.checks.safety = settings.safety
+            self.checks.max_age_ns = settings.max_age_ns
+            self.authority.timeout_ns = settings.authority_timeout_ns
+            self.authority.ask_ns = settings.authority_ask_ns
+            self.ladder.settings = settings.failsafe
+            if self._executor.autopilot is not None:
+                self._executor.autopilot.settings = settings.autopilot
+
+    def command(self, session: Session, command: Command, now_ns: int) -> None:
+        """Check a command and carry it out, on the thread that received it."""
+        with self._lock:
+            if type(command.action) is EmergencyStop:
+                applied, applied_ns = self._stop_motors(session, command, now_ns)
+            else:
+                applied, applied_ns = self._obey(session, command, now_ns)
+        self._counts["commands.received"] += 1
+        if self._subscribers(COMMANDS):
+            sent_ns = max(-LATEST_NS, min(command.sent_ns, LATEST_NS))  # others' counters take no more than that
+            action, app_id = command.action, session.app_id
+            echo = Applied(command.seq, command.lease, app_id, sent_ns, applied_ns, action, applied)
+            self._publish(COMMANDS, encode(echo))
+
+    def request_authority(self, session: Session, request: RequestAuthority, now_ns: int) -> AnyReply:
+        """Give the authority, or a position in the queue, or say who holds it."""
+        if session.role is not Role.PILOT:
+            return Refused(Refusal.OBSERVER, "observers get no authority: connect as a pilot")
+        term_ns = None if request.for_s is None else nanoseconds(request.for_s)
+        ask = request.takeover is Takeover.ASK
+        app_id, authority = session.app_id, self.authority
+        with self._lock:
+            effects = authority.request(app_id, request.priority, request.queue, now_ns, term_ns=term_ns, ask=ask)
+            self._apply_authority(effects, now_ns)
+            holder = authority.holder
+            assert holder is not None  # a request leaves somebody in command
+            if holder.app_id == app_id:
+                return AuthorityGranted(authority.lease, authority.until_ns or 0)
+            name, position = self._name(holder.app_id), authority.position(app_id)
+            wait_ns, asked = authority.wait_ns(app_id, now_ns), authority.asking(app_id, now_ns)
+        if position:
+            wait_s = None if wait_ns is None else seconds(wait_ns)
+            return AuthorityQueued(position, name, holder.priority, wait_s, asked)
+        why = f"{name} holds the authority with priority {holder.priority}: ask with a higher one (0 is the highest)"
+        return Refused(Refusal.BUSY, why)
+
+    def answer_takeover(self, session: Session, answer: AnswerTakeover, now_ns: int) -> AnyReply:
+        """Let the holder grant or decline what it was asked for."""
+        with self._lock:
+            if not self.holds(session, answer.lease):
+                return Refused(Refusal.FOREIGN_LEASE, "only the holder can answer, under its own lease")
+            effects = self.authority.answer(
+                session.app_id, answer.lease, answer.app_id, answer.grant, answer.reason, now_ns
+            )
+            self._apply_authority(effects, now_ns)
+        return Done()
+
+    def release_authority(self, session: Session, _request: ReleaseAuthority, now_ns: int) -> AnyReply:
+        """Take the authority back from an application, or remove it from the queue."""
+        with self._lock:
+            self._apply_authority(self.authority.release(session.app_id, now_ns), now_ns)
+        return Done()
+
+    def application_left(self, session: Session, now_ns: int) -> None:
+        """An application's connection ended; it must still be among the sessions."""
+        with self._lock:
+            self._apply_authority(self.authority.gone(session.app_id, now_ns), now_ns)
+
+    def holds(self, session: Session, lease: int) -> bool:
+        """Return whether the application holds the authority under this lease."""
+        with self._lock:
+            holder = self.authority.holder
+            return holder is not None and holder.app_id == session.app_id and lease == self.authority.lease
+
+    def tick(self, now_ns: int) -> None:
+        """Update authority and failsafe, and let the software autopilot steer. Call at a steady pace."""
+        with self._lock:
+            self._observe_link(now_ns)
+            effects = self.authority.update(now_ns)
+            if effects:
+                self._apply_authority(effects, now_ns)
+            self._update_failsafe(now_ns)
+            steered = self._executor.step(now_ns)
+            if steered is not None:
+                self._echo_own(steered, now_ns)
+
+    def order_landing(self, now_ns: int) -> bool:
+        """Land because the proxy is about to end. Returns whether there is anything to land."""
+        with self._lock:
+            self._observe_ownership(now_ns)
+            if not (self._executor.airborne and self.ownership.ours):
+                return False
+            self.ladder.order_landing()
+            self._update_failsafe(now_ns)
+            return True
+
+    def leave_hovering(self, now_ns: int) -> None:
+        """The proxy ends now: leave what flies hovering, as far as the vehicle can by itself."""
+        with self._lock:
+            self._observe_ownership(now_ns)
+            flies = self._executor.airborne and self._executor.state is not FlightState.LANDING
+            if flies and self.ownership.ours:
+                self._executor.failsafe(Hover(), now_ns)
+
+    @property
+    def airborne(self) -> bool:
+        """Whether the vehicle flies, or may, and is the proxy's to land. Takes no lock."""
+        return self._executor.airborne and self.ownership.ours
+
+    # Commands: all below is called under the lock ----------------------------------------------------------------
+
+    def _obey(self, session: Session, command: Command, now_ns: int) -> tuple[AnyAction, int]:
+        """Return what was applied, and when: the time of receipt for a command that was refused."""
+        # Each call of a function costs microseconds on a machine that was idle, and a command comes when it was: an
+        # ordinary command is received, decided and executed here; what went wrong is put into words elsewhere.
+        vehicle, checks, ownership = self._vehicle, self.checks, self.ownership
+        if vehicle.link_breaks != self._breaks_seen:
+            self._observe_link(now_ns)
+        refusal = checks.receive(command, session.sequence, session.app_id, now_ns)
+        if refusal is not None:
+            if session.role is not Role.PILOT:
+                return self._refuse_role(session, command), now_ns
+            why = checks.explain(refusal, command, session.sequence, now_ns)
+            return self._refuse(session, command, refusal, why), now_ns
+        kind = type(command.action)
+        if kind is Idle:
+            return _NOTHING, self._count_applied(command)
+        state = self._executor.state
+        if not ownership.ours:
+            self._observe_ownership(now_ns)
+        decision = checks.decide(command, session.sequence, state, vehicle.link_state, vehicle.feedback_now, now_ns)
+        if decision.refusal is not None:
+            return self._refuse(session, command, decision.refusal, decision.why), now_ns
+        applied: AnyAction = _NOTHING
+        if decision.action is not None:
+            if decision.clamps or (decision.enforced is not None and decision.enforced is not self._enforced):
+                self._report_limits(session, decision, now_ns)
+            try:
+                applied = self._executor.execute(decision.action, now_ns, new=decision.new)
+            except Exception as error:  # noqa: BLE001  it is reported, and the flight goes on
+                if kind is Takeoff and ownership.ours:
+                    ownership.claim(now_ns)  # it may be trying
+                why = vehicle.driver_refused("apply", error)
+                return self._refuse(session, command, Refusal.DRIVER_FAILED, why), now_ns
+            if decision.takes_off:
+                ownership.claim(now_ns)
+            if not ownership.ours or kind is Takeoff:
+                self._take_vehicle(session, applied, decision.new)
+        applied_ns = self._count_applied(command)
+        if not self.ladder.idle:
+            self._apply_failsafe(self.ladder.fresh_command(), now_ns)
+        return applied, applied_ns
+
+    def _stop_motors(self, session: Session, command: Command, now_ns: int) -> tuple[AnyAction, int]:
+        """Carry out the emergency stop of any pilot: without a lease, however old or out of sequence."""
+        session.sequence.note(command)
+        if session.role is not Role.PILOT:
+            return self._refuse_role(session, command), now_ns
+        if EmergencyStop not in self._executor.native:
+            why = "the vehicle cannot stop its motors"
+            return self._refuse(session, command, Refusal.UNSUPPORTED, why), now_ns
+        try:
+            applied = self._executor.execute(command.action, now_ns)
+        except Exception as error:  # noqa: BLE001  it is reported, and the repeats try again
+            why = self._vehicle.driver_refused("emergency_stop", error)
+            return self._refuse(session, command, Refusal.DRIVER_FAILED, why), now_ns
+        self._end_intents()
+        self._events.publish_repeated((session.app_id, "emergency"), lambda: emergency_event(session.name))
+        return applied, self._count_applied(command)
+
+    def _count_applied(self, command: Command) -> int:
+        applied_ns = self._clock()
+        self._counts["commands.applied"] += 1
+        self._delays_ns.append(applied_ns - command.sent_ns)
+        return applied_ns
+
+    def _report_limits(self, session: Session, decision: Decision, now_ns: int) -> None:
+        if decision.enforced is not None and decision.enforced is not self._enforced:
+            self._enforced = decision.enforced
+            self._events.publish_draft(enforcement_event(decision.enforced))
+        if decision.clamps:
+            self._counts["commands.clamped"] += 1
+            for clamp in session.episodes.begun(decision.clamps, now_ns):
+                self._events.publish_draft(clamped_event(session.name, clamp))
+
+    def _refuse_role(self, session: Session, command: Command) -> AnyAction:
+        if session.role is Role.OBSERVER:
+            return self._refuse(session, command, Refusal.OBSERVER, "observers command nothing: connect as a pilot")
+        return self._refuse(session, command, Refusal.PROTOCOL, "the first packet on a connection is a Hello request")
+
+    def _refuse(self, session: Session, command: Command, reason: Refusal, why: str) -> AnyAction:
+        self._counts["commands.refused"] += 1
+        self._counts[f"commands.refused.{reason.value}"] += 1
+        self._events.publish_repeated(
+            (session.app_id, reason), lambda: refused_event(session.name, command, reason, why)
+        )
+        return _NOTHING
+
+    def _end_intents(self) -> None:
+        """Refuse repeats of what the holder asked for until now."""
+        holder = self.authority.holder
+        session = self._sessions.get(holder.app_id) if holder is not None else None
+        if session is not None:
+            session.sequence.end_intents()
+
+    def _echo_own(self, action: AnyAction, now_ns: int) -> None:
+        """Publish what the proxy itself made the vehicle do."""
+        if self._subscribers(COMMANDS):
+            echo = Applied(0, self.authority.lease, 0, now_ns, self._clock(), action, action)
+            self._publish(COMMANDS, encode(echo))
+
+    # Authority ---------------------------------------------------------------------------------------------------
+
+    def _apply_authority(self, effects: list[AuthorityEffect], now_ns: int) -> None:
+        """Make the vehicle hover where the authority changes hands, then publish the changes."""
+        for effect in effects:
+            if isinstance(effect, Lost):
+                self._pilot = effect.reason
+            elif isinstance(effect, Granted):
+                self._pilot = "held"
+                self._sessions[effect.app_id].sequence.end_intents()
+                self.ladder.hand_over(now_ns)
+        self._stamp()
+        ended = [effect for effect in effects if isinstance(effect, (Lost, Preempted))]
+        for effect in ended:
+            self._publish_authority(effect, now_ns)
+        self._update_failsafe(now_ns)  # which hovers, before anybody hears that it has the authority
+        for effect in effects:
+            if effect not in ended:
+                self._publish_authority(effect, now_ns)
+
+    def _publish_authority(self, effect: AuthorityEffect, now_ns: int) -> None:
+        holder = self.authority.holder
+        holder_name = "" if holder is None else self._name(holder.app_id)
+        self._events.publish_draft(
+            authority_event(effect, EventContext(now_ns, self._name, self._identity, holder_name))
+        )
+
+    def _identity(self, app_id: int) -> str:
+        """What the transport knows about an application."""
+        session = self._sessions.get(app_id)
+        return "" if session is None else session.peer.address
+
+    def _name(self, app_id: int) -> str:
+        session = self._sessions.get(app_id)
+        return session.name if session is not None else f"application {app_id}"
+
+    def _stamp(self) -> None:
+        """Let feedback show who is in command, the failsafe's step and whose the flight is."""
+        owner = self.authority.owner
+        self._vehicle.stamp(
+            {
+                "owner": self._name(owner.app_id) if owner is not None else None,
+                "owner_id": owner.app_id if owner is not None else 0,
+                "owner_priority": owner.priority if owner is not None else None,
+                "lease": self.authority.lease,
+                "failsafe": self.ladder.step,
+                "others": self.ownership.others or None,
+            }
+        )
+
+    # The vehicle's link, and whose the flight is -----------------------------------------------------------------
+
+    def _observe_link(self, now_ns: int) -> None:
+        """Act on what happened to the vehicle's link since it was last observed.
+
+        Intents end when it breaks and when it is back, so that nothing asked for in between is done later. Hover is
+        given both times: a driver must not go on with an old set-point.
+        """
+        breaks = self._vehicle.link_breaks
+        if breaks != self._breaks_seen:
+            self._breaks_seen = breaks
+            self._end_intents()
+            self.ladder.hand_over(now_ns)
+            self._update_failsafe(now_ns)
+
+    def _take_vehicle(self, session: Session, applied: AnyAction, new: bool) -> None:
+        """Make the flight ours if an application's new command was carried out, or nobody else's flight goes on."""
+        if type(applied) is Idle or not (new or self.ownership.whose is not Whose.OTHERS):
+            return
+        others = self.ownership.others
+        self.ownership.take()
+        self._stamp()
+        if others:
+            self._events.publish_draft(taken_event(session.name, applied.name, others))
+        self.on_ownership(True)
+
+    def _observe_ownership(self, now_ns: int) -> None:
+        """Observe whose flight it is by now, and act on a change."""
+        executor = self._executor
+        changed = self.ownership.observe(executor.state, executor.airborne, executor.left_to(), now_ns)
+        if changed is None:
+            return
+        self.on_ownership(changed.whose is Whose.OURS)
+        self._stamp()
+        if changed.whose is Whose.OTHERS:
+            executor.stop_autopilot()
+        elif changed.why:  # found on a flight that is ours: its pilot may come back, as if just heard
+            self.authority.heard_ns = max(self.authority.heard_ns, now_ns)
+        if changed.why and executor.supported:  # a recording that is played flies by itself, and nobody wonders
+            self._events.publish_draft(ownership_event(changed))
+
+    # Failsafe ----------------------------------------------------------------------------------------------------
+
+    def _update_failsafe(self, now_ns: int) -> None:
+        self._observe_ownership(now_ns)
+        feedback = self._vehicle.feedback_now
+        inputs = FailsafeInputs(
+            state=self._executor.state,
+            airborne=self._executor.airborne,
+            heard_ns=self.authority.heard_ns,
+            pilot=self._pilot,
+            link_up=self._vehicle.link_up,
+            battery=feedback.battery if feedback is not None else None,
+            ours=self.ownership.ours,
+        )
+        effects = self.ladder.update(now_ns, inputs)
+        if effects:
+            self._apply_failsafe(effects, now_ns)
+
+    def _apply_failsafe(self, effects: list[FailsafeEffect], now_ns: int) -> None:
+        for effect in effects:
+            if isinstance(effect, FailsafeAction):
+                taken = self._executor.failsafe(effect.action, now_ns)
+                self.ladder.attempted(taken)
+                if taken:
+                    self._echo_own(effect.action, now_ns)
+            elif isinstance(effect, BatteryLow):
+                self._events.publish_draft(battery_event(effect))
+            else:
+                self._stamp()
+                if effect.step is not Failsafe.NONE:
+                    self._end_intents()
+                self._events.publish_draft(failsafe_event(effect))

@@ -1,0 +1,377 @@
+"""Publishes what the driver reports: feedback, frames, streams, the vehicle's link, events; on the driver's thread.
+
+It also knows which topics the proxy has: no others can be subscribed to, so that made-up names cost nothing.
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Callable, Collection
+from math import isfinite
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.clock import NS_PER_S, Clock
+from skyloop.errors import SkyloopError, UnknownNameError, UsageError
+from skyloop.messages import (
+    CameraInfo,
+    Capabilities,
+    EncodedFrame,
+    Encoding,
+    EventKind,
+    Feedback,
+    FlightState,
+    FrameHeader,
+    Intrinsics,
+    LinkState,
+    Severity,
+    Value,
+    VideoRequest,
+    encode,
+)
+from skyloop.messages.encoded import H264, MAX_ENCODED
+from skyloop.messages.feedback import MAX_LINK_TEXT
+from skyloop.messages.result import PROCESSOR_NAME
+from skyloop.proxy.core.events import EventDraft
+from skyloop.proxy.events import Counters, EventPublisher
+from skyloop.transport.base import (
+    ANNOTATIONS,
+    COMMANDS,
+    EVENTS,
+    FEEDBACK,
+    LOGS,
+    RESULTS,
+    ServerEnd,
+    stream,
+    video,
+)
+
+#: A vehicle silent for so long: the proxy publishes what it knows itself (authority, links), so at 4 Hz.
+KEEP_ALIVE_NS: Final = NS_PER_S // 4
+
+#: The topics without a name in them.
+PLAIN: Final = frozenset({FEEDBACK, EVENTS, COMMANDS, ANNOTATIONS, LOGS, RESULTS})
+_VIDEO_TOPIC: Final = video("")
+_STREAM_TOPIC: Final = stream("")
+_RESULTS_TOPIC: Final = RESULTS + "/"
+
+_CHANNELS: Final = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
+_LINK_UP: Final = frozenset({LinkState.UP, LinkState.DEGRADED})
+_replace = msgspec.structs.replace
+_NUMBERS: Final = ("battery", "battery_v", "roll", "pitch", "yaw", "altitude")
+_VECTORS: Final = ("velocity", "angular_velocity", "acceleration", "position")
+
+
+class VehiclePublisher:
+    """The driver's :class:`skyloop.drivers.base.Sink`, and the newest that is known of the vehicle.
+
+    It takes no lock that is held while the driver is called, so that a driver may call it from any thread and from
+    inside its own calls.
+
+    Args:
+        server: where samples and frames are published.
+        events: where events are published.
+        counters: the proxy's counters.
+        clock: the proxy's clock [ns].
+        capabilities: what the driver told about the vehicle: its cameras.
+        state_of: the flight state, given the one that the driver reported; the software autopilot may know better.
+        on_link_up: called on the driver's thread when the vehicle's link has come up.
+    """
+
+    def __init__(
+        self,
+        *,
+        server: ServerEnd,
+        events: EventPublisher,
+        counters: Counters,
+        clock: Clock,
+        capabilities: Capabilities,
+        state_of: Callable[[FlightState], FlightState],
+        on_link_up: Callable[[], None],
+    ) -> None:
+        self.feedback_now: Feedback | None = None  #: the newest sample as it was published
+        self.reported_state = FlightState.UNKNOWN  #: as the driver said it, before the software autopilot
+        self.link_state = LinkState.CONNECTING
+        self.link_reason = ""  #: what is waited for, and what failed last
+        self.link_remedy = ""  #: what a person can do about it
+        self.link_up = False
+        self.link_breaks = 0  #: how often the link went from up to not, or came back
+        self.state_of = state_of
+        self._on_link_up = on_link_up
+        self._owner: dict[str, Any] = {}
+        self._publish = server.publish
+        self._publish_frame = server.publish_frame
+        self._subscribers = server.subscribers
+        self._events = events
+        self._counts = counters.counts
+        self._clock = clock
+        self._publishing = threading.Condition(threading.Lock())
+        self._raw: Feedback | None = None
+        self._seq = 0
+        self._published_ns = -KEEP_ALIVE_NS
+        self._state = FlightState.UNKNOWN
+        self._frame_lock = threading.Lock()
+        self._frame_seq: dict[str, int] = {}
+        self._stream_seq: dict[str, int] = {}
+        self._cameras: dict[str, CameraInfo] = {camera.name: camera for camera in capabilities.cameras}
+        self._topics: dict[str, str] = {camera: video(camera) for camera in self._cameras}
+
+    # Feedback --------------------------------------------------------------------------------------------------
+
+    def feedback(self, feedback: Feedback) -> None:
+        """The vehicle's newest state, from the driver."""
+        feedback = self._finite(feedback)
+        with self._publishing:
+            self._raw = feedback
+            before, after = self._send(feedback, self._clock())
+        if before is not after:
+            self._publish_state(before, after)
+
+    def _finite(self, raw: Feedback) -> Feedback:
+        """A number that is NaN or infinite is not known: nothing here and at no application has to reckon with it."""
+        vectors = (raw.velocity, raw.angular_velocity, raw.acceleration, raw.position)
+        total = (raw.battery or 0.0) + (raw.battery_v or 0.0) + (raw.altitude or 0.0)
+        total += (raw.roll or 0.0) + (raw.pitch or 0.0) + (raw.yaw or 0.0)
+        for vector in vectors:
+            if vector is not None:
+                total += vector[0] + vector[1] + vector[2]
+        if isfinite(total):
+            return raw
+        wrong = [name for name in _NUMBERS if not isfinite(getattr(raw, name) or 0.0)]
+        wrong += [name for name in _VECTORS if not all(map(isfinite, getattr(raw, name) or ()))]
+        if wrong:
+            self._fail("feedback", f"the vehicle's {', '.join(wrong)} came as NaN or infinite, and count as not known")
+        return _replace(raw, **dict.fromkeys(wrong))
+
+    def stamp(self, owner: dict[str, Any]) -> None:
+        """The proxy's own fields of feedback from now on; shown at the next tick at the latest."""
+        self._owner = owner
+        self._published_ns = -KEEP_ALIVE_NS
+
+    def keep_alive(self, now_ns: int) -> None:
+        """Publish what the proxy knows if the vehicle has been silent. Call some times a second."""
+        if now_ns - self._published_ns < KEEP_ALIVE_NS:
+            return
+        with self._publishing:
+            before, after = self._send(self._raw or Feedback(captured_ns=now_ns), now_ns)
+        if before is not after:
+            self._publish_state(before, after)
+
+    def wait_for(self, wanted: Callable[[FlightState], bool], timeout_s: float) -> bool:
+        """Block until the flight state is as wanted; False if the time runs out. Not for the driver's threads."""
+        with self._publishing:
+            return self._publishing.wait_for(lambda: wanted(self._state), timeout_s)
+
+    def _send(self, raw: Feedback, now_ns: int) -> tuple[FlightState, FlightState]:
+        self._seq += 1
+        self.reported_state = raw.state
+        state = self.state_of(raw.state)
+        sample = _replace(
+            raw,
+            state=state,
+            seq=self._seq,
+            published_ns=now_ns,
+            vehicle_link=self.link_state,
+            link_reason=self.link_reason,
+            link_remedy=self.link_remedy,
+            **self._owner,
+        )
+        self.feedback_now = sample
+        self._published_ns = now_ns
+        try:
+            packet = encode(sample)
+        except (ValueError, TypeError, OverflowError) as error:
+            self._fail("feedback", f"feedback cannot be sent with its native telemetry: {error}")
+            packet = encode(_replace(sample, native=None))
+        missed = self._publish(FEEDBACK, packet)
+        self._counts["feedback.published"] += 1
+        if missed:
+            self._counts["feedback.missed"] += missed
+        before = self._state
+        if state is not before:
+            self._state = state
+            self._publishing.notify_all()
+        return before, state
+
+    def _publish_state(self, before: FlightState, after: FlightState) -> None:
+        severity = Severity.ERROR if after is FlightState.EMERGENCY else Severity.INFO
+        text = f"flight state: {before.value} → {after.value}"
+        self._events.publish(
+            EventKind.STATE_CHANGED, text, severity, data={"before": before.value, "after": after.value}
+        )
+
+    # Frames ----------------------------------------------------------------------------------------------------
+
+    def frame(
+        self,
+        camera: str,
+        pixels: NDArray[np.uint8],
+        captured_ns: int,
+        *,
+        width: int,
+        height: int,
+        encoding: Encoding = Encoding.BGR8,
+        intrinsics: Intrinsics | None = None,
+    ) -> None:
+        """A whole frame, from the driver."""
+        with self._frame_lock:
+            seq = self._frame_seq[camera] = self._frame_seq.get(camera, 0) + 1
+        channels = _CHANNELS.get(encoding)
+        if channels is not None and pixels.nbytes != width * height * channels:
+            expected = f"{width} × {height} {encoding.value} is {width * height * channels} bytes"
+            self._fail("frame", f"frame of camera {camera} has {pixels.nbytes} bytes, and {expected}")
+        elif self.wants(camera):
+            if intrinsics is None:
+                intrinsics = self._nominal_intrinsics(camera, width, height)
+            header = FrameHeader(
+                camera, seq, captured_ns, self._clock(), width, height, encoding, pixels.nbytes, intrinsics
+            )
+            self._hand_on(header, pixels)
+        self._counts[f"frames.{camera}.received"] += 1
+
+    def _hand_on(self, header: FrameHeader, pixels: NDArray[np.uint8]) -> None:
+        camera = header.camera
+        try:
+            missed = self._publish_frame(header, pixels)
+        except (ValueError, TypeError) as error:
+            self._fail("frame", f"frame of camera {camera} cannot be published: {error}")
+            return
+        self._counts[f"frames.{camera}.published"] += 1
+        if missed:
+            self._counts[f"frames.{camera}.missed"] += missed
+
+    def cameras(self) -> Collection[str]:
+        """The names of those that the vehicle has, and of any that gave a frame all the same. Any thread."""
+        return {*self._cameras, *self._frame_seq.copy()}
+
+    def wants(self, camera: str) -> bool:
+        """Whether anybody looks at this camera now."""
+        topic = self._topics.get(camera)
+        if topic is None:
+            topic = self._topics[camera] = video(camera)
+        return self._subscribers(topic) > 0
+
+    def stream(
+        self,
+        camera: str,
+        data: bytes,
+        captured_ns: int,
+        *,
+        width: int,
+        height: int,
+        key: bool,
+        intrinsics: Intrinsics | None = None,
+    ) -> None:
+        """A picture as the vehicle encoded it, from the driver."""
+        with self._frame_lock:
+            seq = self._stream_seq[camera] = self._stream_seq.get(camera, 0) + 1
+        self._counts[f"streams.{camera}.received"] += 1
+        if len(data) > MAX_ENCODED:
+            self._counts[f"streams.{camera}.too_large"] += 1
+            why = f"a picture of {camera} as it came has {len(data)} bytes, at most {MAX_ENCODED} are handed on"
+            self._fail("stream", f"{why}: the stream goes on with the next key picture that is smaller")
+            return
+        if intrinsics is None:
+            intrinsics = self._nominal_intrinsics(camera, width, height)
+        now_ns = self._clock()
+        sample = EncodedFrame(camera, seq, captured_ns, now_ns, width, height, H264, key, data, intrinsics)
+        try:
+            packet = encode(sample)
+        except (ValueError, TypeError, OverflowError) as error:
+            self._fail("stream", f"a picture of {camera} as it came cannot be published: {error}")
+            return
+        missed = self._publish(stream(camera), packet)
+        self._counts[f"streams.{camera}.published"] += 1
+        if missed:
+            self._counts[f"streams.{camera}.missed"] += missed
+
+    def wants_stream(self, camera: str) -> bool:
+        """Whether anybody takes this camera's pictures as they come."""
+        return self._subscribers(stream(camera)) > 0
+
+    def _nominal_intrinsics(self, camera: str, width: int, height: int) -> Intrinsics | None:
+        info = self._cameras.get(camera)
+        if info is not None and (info.width, info.height) == (width, height):
+            return info.intrinsics
+        return None
+
+    # Link and events -------------------------------------------------------------------------------------------
+
+    def link(self, state: LinkState, reason: str = "", remedy: str = "") -> None:
+        """The hop to the vehicle changed, from the driver. Told at once; the flight acts on it at its next step."""
+        reason, remedy = reason[:MAX_LINK_TEXT], remedy[:MAX_LINK_TEXT]
+        with self._publishing:
+            same = (state, reason, remedy) == (self.link_state, self.link_reason, self.link_remedy)
+            before, self.link_state = self.link_state, state
+            self.link_reason, self.link_remedy = reason, remedy
+            was_up, self.link_up = self.link_up, state in _LINK_UP
+            if was_up != self.link_up and (was_up or self.link_breaks):  # not when it comes up for the first time
+                self.link_breaks += 1
+            self._published_ns = -KEEP_ALIVE_NS  # shown in feedback at the next tick
+        if same:
+            return
+        change = state.value if before is state else f"{before.value} → {state.value}"
+        text = f"link to the vehicle: {change}" + (f" ({reason})" if reason else "") + (f": {remedy}" if remedy else "")
+        severity = Severity.INFO if state is LinkState.UP else Severity.WARNING
+        data: dict[str, Value] = {"state": state.value, "reason": reason, "remedy": remedy}
+        self._events.publish(EventKind.VEHICLE_LINK, text, severity, data=data)
+        if before is state:
+            return
+        if self.link_up and (not was_up or state is LinkState.UP):  # all of it may be known now: read it again
+            self._on_link_up()
+
+    def event(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: Value) -> None:
+        """Something happened, from the driver. Driver errors that go on are told once a second."""
+        if kind is EventKind.DRIVER_ERROR:
+            self._events.publish_repeated(("driver", text), lambda: EventDraft(kind, text, severity, data=dict(data)))
+        else:
+            self._events.publish(kind, text, severity, data=data)
+
+    def driver_failed(self, where: str, error: BaseException) -> None:
+        """A call of the driver raised."""
+        self._counts["driver.errors"] += 1
+        self._fail(where, f"driver failed in {where}: {error!r}")
+
+    def driver_refused(self, where: str, error: BaseException) -> str:
+        """A command made the driver raise: the words for whoever sent it. What is no driver's error is told besides."""
+        if isinstance(error, SkyloopError):  # the vehicle's own reason
+            self._counts["driver.errors"] += 1
+            return str(error)
+        self.driver_failed(where, error)
+        return f"the driver failed: {error!r}"
+
+    def _fail(self, where: str, text: str) -> None:
+        self._events.publish_repeated(
+            ("driver", where), lambda: EventDraft(EventKind.DRIVER_ERROR, text, Severity.ERROR, data={"where": where})
+        )
+
+
+def topic_problem(topic: str, cameras: Callable[[], Collection[str]]) -> str:
+    """Return why a topic can't be subscribed to, with those that can; empty if it can.
+
+    What a processor finds may be waited for before it has a worker.
+    """
+    if topic in PLAIN:
+        return ""
+    if topic.startswith(_RESULTS_TOPIC):
+        name = topic.removeprefix(_RESULTS_TOPIC)
+        known = re.fullmatch(PROCESSOR_NAME, name)
+        return "" if known else f"{name[:64]!r} is no name of a processor: it has 1 to 64 letters, digits and _ . -"
+    if topic.startswith(_STREAM_TOPIC):
+        return camera_problem(topic.removeprefix(_STREAM_TOPIC), cameras)
+    if topic.startswith(_VIDEO_TOPIC):
+        try:
+            return camera_problem(VideoRequest.parse(topic).camera, cameras)
+        except UsageError as error:
+            return str(error)
+    return UnknownNameError("topic", topic[:64], {*PLAIN, *map(video, cameras()), *map(stream, cameras())}).message
+
+
+def camera_problem(camera: str, cameras: Callable[[], Collection[str]]) -> str:
+    """Return why this is no camera of the vehicle, with those that are; empty if it is one."""
+    known = cameras()
+    return "" if camera in known else UnknownNameError("camera of this vehicle", camera[:64], known).message

@@ -1,0 +1,174 @@
+"""Rehearsals: flights in simulated time, by a clock that stands still while the controller computes.
+
+Simulator, driver, proxy and application share this process. Whenever the application waits, in
+:meth:`Controller.run`, for the next frame, or for a state, the time advances to what comes next. So a flight of a
+minute takes as long as its computation does, a slow machine misses nothing, and the same seeds give the same flight.
+Delay, loss and noise of the position between proxy and vehicle are simulated.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import math
+import random
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any, Final, cast
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.client import Drone
+from skyloop.clock import NS_PER_S, ManualClock, nanoseconds
+from skyloop.drivers.base import Sink
+from skyloop.drivers.sim import SimDriver, options_of
+from skyloop.drivers.uri import VehicleUri, parse_uri
+from skyloop.errors import UsageError
+from skyloop.messages import AnyAction, Feedback
+from skyloop.proxy.proxy import Proxy
+from skyloop.sim.camera import CameraModel
+from skyloop.sim.host import Report, SimHost
+from skyloop.stepping.executor import StepExecutor
+from skyloop.stepping.host import SteppedHost
+from skyloop.stepping.scheduler import StepScheduler
+from skyloop.stepping.transport import SteppedServer
+
+_BEGIN_NS: Final = 10 * NS_PER_S
+_CONNECT_S: Final = 20.0
+
+
+@dataclass(frozen=True, slots=True)
+class Radio:
+    """Delays, losses and noise between proxy and vehicle.
+
+    Raises:
+        UsageError: A number is negative or not finite, or ``drop`` is not below 1.
+    """
+
+    command_delay_s: float = 0.04
+    feedback_delay_s: float = 0.02
+    picture_delay_s: float = 0.02  #: of frames, in addition to the camera's own latency
+    drop: float = 0.05  #: probability that a command, a sample of feedback or a frame is lost
+    position_noise_m: float = 0.01  #: standard deviation of each component of the position in feedback
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("command_delay_s", "feedback_delay_s", "picture_delay_s", "position_noise_m"):
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise UsageError(f"{name} is {getattr(self, name)!r} and must be a finite number, 0 or more")
+        if not 0.0 <= self.drop < 1.0:
+            raise UsageError(f"drop is {self.drop!r} and must be a probability below 1")
+
+
+@contextmanager
+def rehearse(uri: str = "sim://?position=1&cameras=none", *, radio: Radio | None = None) -> Iterator[Drone]:
+    """Connect as a pilot to a drone of a simulated world.
+
+    Only the thread of the ``with`` block may wait. Frames are rendered at their exposure, without real time.
+
+    Args:
+        uri: As of ``sim://``, without ``speed``.
+        radio: Between proxy and vehicle; None takes the defaults.
+
+    Yields:
+        The connected drone.
+
+    Raises:
+        UsageError: The address is not one of ``sim://``, or has a ``speed``.
+    """
+    address = parse_uri(uri)
+    if address.scheme != "sim" or "speed" in address.options:
+        raise UsageError(f"{uri} can't be rehearsed: it must be an address as sim://?seed=3, without speed")
+    clock = ManualClock(_BEGIN_NS)
+    host = SteppedHost(replace(options_of(address), speed=1.0), clock)
+    driver = _RehearsalDriver(address, host, radio or Radio(), clock)
+    executor = StepExecutor("skyloop-rehearsal")
+    try:
+        server = SteppedServer(executor)
+        proxy = Proxy(driver, server, name="rehearsal", clock=clock, ticker=False)
+        scheduler = StepScheduler(clock, executor, proxy, lambda: driver, _BEGIN_NS)
+        proxy.start()
+        try:
+            with Drone(server.dial, app="rehearsal", scheduler=scheduler).open(timeout_s=_CONNECT_S) as drone:
+                yield drone
+        finally:
+            proxy.stop()
+    finally:
+        executor.close()
+
+
+class _RehearsalDriver(SimDriver):
+    """The simulated drone behind a radio, moved step by step; all on one thread."""
+
+    def __init__(self, uri: VehicleUri, host: SimHost, radio: Radio, clock: ManualClock) -> None:
+        super().__init__(uri, host=host)
+        self._radio = radio
+        self._clock = clock
+        self._random = random.Random(f"rehearsal/{radio.seed}")
+        # A generator of its own, so that cameras don't change the losses of commands and feedback.
+        self._of_pictures = random.Random(f"rehearsal/pictures/{radio.seed}")
+        self._on_the_way: list[tuple[int, int, Callable[[], None]]] = []  # a heap by time of arrival
+        self._numbers = itertools.count()
+
+    @property
+    def due_ns(self) -> int | None:
+        """When the world is to be stepped, or something arrives."""
+        assert isinstance(self.host, SteppedHost)
+        step_ns = self.host.due_ns
+        if step_ns is None or not self._on_the_way:
+            return step_ns
+        return min(step_ns, self._on_the_way[0][0])
+
+    def step(self) -> None:
+        """Do what is due: arrivals first."""
+        assert isinstance(self.host, SteppedHost)
+        if self._on_the_way and self._on_the_way[0][0] <= self._clock.now_ns:
+            heapq.heappop(self._on_the_way)[2]()
+        else:
+            self.host.step()
+
+    def open(self, sink: Sink) -> None:
+        super().open(cast(Sink, _NoisySink(sink, self._radio.position_noise_m, self._random)))
+
+    def report(self, report: Report) -> None:
+        self._send(self._radio.feedback_delay_s, lambda: SimDriver.report(self, report), self._random)
+
+    def show(self, model: CameraModel, pixels: NDArray[np.uint8], captured_ns: int) -> None:
+        def arrive() -> None:
+            SimDriver.show(self, model, pixels, captured_ns)
+
+        self._send(self._radio.picture_delay_s, arrive, self._of_pictures)
+
+    def _command(self, host: SimHost, action: AnyAction) -> AnyAction:
+        self._send(self._radio.command_delay_s, lambda: self._arrive(host, action), self._random)
+        return action
+
+    def _arrive(self, host: SimHost, action: AnyAction) -> None:
+        if self._sink is not None:
+            super()._command(host, action)
+
+    def _send(self, delay_s: float, arrive: Callable[[], None], chance: random.Random) -> None:
+        if chance.random() >= self._radio.drop:
+            due_ns = self._clock.now_ns + nanoseconds(delay_s)
+            heapq.heappush(self._on_the_way, (due_ns, next(self._numbers), arrive))
+
+
+class _NoisySink:
+    """A sink that adds noise to positions and passes on all else unchanged."""
+
+    def __init__(self, sink: Sink, noise_m: float, chance: random.Random) -> None:
+        self._sink = sink
+        self._noise_m = noise_m
+        self._gauss = chance.gauss
+
+    def feedback(self, feedback: Feedback) -> None:
+        if feedback.position is not None:
+            x, y, z = (value + self._gauss(0.0, self._noise_m) for value in feedback.position)
+            feedback = msgspec.structs.replace(feedback, position=(x, y, z))
+        self._sink.feedback(feedback)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._sink, name)

@@ -1,0 +1,78 @@
+"""A replay in step with its application: ``skyloop.connect("replay://flight.mcap?speed=max")``.
+
+Proxy, recording and application share this process, and a clock that stands still while the application's code runs.
+Whenever the application waits, for the next frame, for a state, or in :meth:`Controller.run`, the clock advances to
+what comes next: a sample of the recording, a repeat of a command, a tick of the proxy. So each sample is consumed
+before the next one exists, the application sees the recording's times, and two runs of one controller give the same
+commands.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+from skyloop.clock import NS_PER_S, ManualClock
+from skyloop.drivers.replay import ReplayDriver
+from skyloop.drivers.uri import parse_uri
+from skyloop.proxy.proxy import Proxy
+from skyloop.stepping.executor import StepExecutor
+from skyloop.stepping.scheduler import StepScheduler
+from skyloop.stepping.transport import SteppedServer
+from skyloop.transport.base import Dialer
+
+LEAD_NS: Final = NS_PER_S  #: time before the recording starts: for connecting, which takes a few ticks
+
+
+def connector(uri: str) -> SteppedReplay | None:
+    """Create a stepped replay; this is the entry point ``replay`` of the group ``skyloop.connectors``.
+
+    Args:
+        uri: The address, ``replay://…``.
+
+    Returns:
+        The replay for ``speed=max``; None for any other, which a private proxy serves.
+
+    Raises:
+        UsageError: The address or the recording is invalid.
+    """
+    driver = ReplayDriver(parse_uri(uri))
+    return SteppedReplay(driver) if driver.stepped else None
+
+
+class SteppedReplay:
+    """The proxy of a replay, and the time that it shares with its one application."""
+
+    def __init__(self, driver: ReplayDriver) -> None:
+        """Start the proxy.
+
+        Args:
+            driver: Of the replay.
+        """
+        self.reach = None
+        self._executor = StepExecutor("skyloop-stepping")
+        try:
+            source = driver.source()
+            clock = ManualClock(source.begin_ns - LEAD_NS)
+            driver.clock = clock
+            server = SteppedServer(self._executor)
+            name = Path(driver.uri.place).stem[:64] or "replay"
+            self._proxy = Proxy(driver, server, name=name, clock=clock, ticker=False)
+            self.scheduler = StepScheduler(clock, self._executor, self._proxy, lambda: driver.steps, source.begin_ns)
+            self._proxy.start()
+        except BaseException:
+            self._executor.close()
+            raise
+        self._server = server
+        self._ended = False
+
+    def dialer(self, deadline_s: float) -> Dialer:  # noqa: ARG002  (it serves already)
+        """Return how to connect to the proxy, which serves already."""
+        return self._server.dial
+
+    def close(self) -> None:
+        """Stop the proxy and the thread. Idempotent."""
+        if not self._ended:
+            self._ended = True
+            self._proxy.stop()
+            self._executor.close()

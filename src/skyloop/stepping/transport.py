@@ -1,0 +1,182 @@
+"""A transport within one thread: what one end sends is delivered to the other before anything else happens."""
+
+from __future__ import annotations
+
+import threading
+from typing import Final
+
+import numpy as np
+
+from skyloop.errors import LinkError, UsageError
+from skyloop.messages import FrameHeader
+from skyloop.stepping.executor import StepExecutor
+from skyloop.transport.base import (
+    ClientEnd,
+    ClientHandler,
+    Peer,
+    Pixels,
+    ServerEnd,
+    ServerHandler,
+    check_frame,
+    check_packet,
+    check_topic,
+    video,
+)
+
+ADDRESS: Final = "this process, in step with one application"
+
+
+class SteppedServer(ServerEnd):
+    """A proxy's end, for one client at a time. Handlers are called on the executor's thread."""
+
+    def __init__(self, executor: StepExecutor) -> None:
+        self._executor = executor
+        self._handler: ServerHandler | None = None
+        self._client: SteppedClient | None = None
+        self._number = 0
+
+    def dial(self, handler: ClientHandler) -> ClientEnd:
+        """Connect a client.
+
+        Args:
+            handler: Called on the executor's thread.
+
+        Raises:
+            LinkError: Another client is connected, or the server was stopped.
+        """
+        server = self._handler
+        if server is None:
+            raise LinkError("the replay has ended")
+        if self._client is not None:
+            raise LinkError(
+                "a replay with speed=max is in step with one application, and that one is connected already"
+            )
+        self._number += 1
+        peer = Peer(self._number, "this process")
+        client = self._client = SteppedClient(self, self._executor, peer, handler)
+        self._executor.post(lambda: server.peer_joined(peer))
+        return client
+
+    def start(self, handler: ServerHandler) -> None:
+        if self._handler is not None:
+            raise UsageError("the replay is served already")
+        self._handler = handler
+
+    def stop(self) -> None:
+        client = self._client
+        if client is not None:
+            self.drop(client, "the replay has ended")
+        self._handler = None
+
+    def send(self, peer: Peer, packet: bytes) -> bool:
+        check_packet(packet)
+        client = self._client
+        if client is None or client.peer.id != peer.id:
+            return False
+        self._executor.post(lambda: client.packet(packet))
+        return True
+
+    def publish(self, topic: str, packet: bytes) -> int:
+        check_packet(packet)
+        client = self._client
+        if client is not None and topic in client.topics:
+            self._executor.post(lambda: client.packet(packet))
+        return 0
+
+    def publish_frame(self, header: FrameHeader, pixels: Pixels) -> int:
+        check_frame(header, pixels)
+        client = self._client
+        if client is not None and video(header.camera) in client.topics:
+            copy = np.frombuffer(pixels.tobytes(), np.uint8)
+            self._executor.post(lambda: client.frame(header, copy))
+        return 0
+
+    def subscribers(self, topic: str) -> int:
+        client = self._client
+        return int(client is not None and topic in client.topics)
+
+    def disconnect(self, peer: Peer, reason: str) -> None:
+        client = self._client
+        if client is not None and client.peer.id == peer.id:
+            self.drop(client, reason)
+
+    @property
+    def address(self) -> str:
+        return ADDRESS
+
+    def receive(self, peer: Peer, packet: bytes) -> None:
+        """Handle a packet of the client. To be called on the executor's thread."""
+        if self._handler is not None:
+            self._handler.packet(peer, packet)
+
+    def drop(self, client: SteppedClient, reason: str) -> None:
+        """End a connection, once; each end's handler is called after what was sent before."""
+        if self._client is not client:
+            return
+        self._client = None
+        handler = self._handler
+
+        def notify() -> None:
+            if handler is not None:
+                handler.peer_left(client.peer, reason)
+            client.ended(reason)
+
+        self._executor.post(notify)
+
+
+class SteppedClient(ClientEnd):
+    """A client's end."""
+
+    def __init__(self, server: SteppedServer, executor: StepExecutor, peer: Peer, handler: ClientHandler) -> None:
+        self.peer = peer
+        self.topics: set[str] = set()
+        self._server = server
+        self._executor = executor
+        self._handler = handler
+        self._closing = False
+        self._closed = threading.Event()
+
+    def send(self, packet: bytes) -> bool:
+        check_packet(packet)
+        if self._closing or self._closed.is_set():
+            return False
+        self._executor.post(lambda: self._server.receive(self.peer, packet))
+        return True
+
+    def subscribe(self, topic: str, on: bool = True) -> None:
+        check_topic(topic)
+        if on:
+            self.topics.add(topic)
+        else:
+            self.topics.discard(topic)
+
+    def close(self) -> None:
+        self._closing = True
+        self._server.drop(self, "closed by the application")
+        if not self._executor.is_current:
+            self._closed.wait()
+
+    @property
+    def same_clock(self) -> bool:
+        return True
+
+    @property
+    def address(self) -> str:
+        return ADDRESS
+
+    # On the executor's thread -------------------------------------------------------------------------------------
+
+    def packet(self, packet: bytes) -> None:
+        """Deliver a packet of the server."""
+        if not self._closing:
+            self._handler.packet(packet)
+
+    def frame(self, header: FrameHeader, pixels: Pixels, topic: str = "") -> None:  # noqa: ARG002
+        """Deliver a frame of the server."""
+        if not self._closing:
+            self._handler.frame(header, pixels)
+
+    def ended(self, reason: str) -> None:
+        """Report the end of the connection to the handler, once."""
+        self._handler.closed(reason)
+        self._closed.set()

@@ -1,0 +1,195 @@
+"""Who is let in: applications that prove their identity with their keys, while there is a place for them.
+
+With the proofs the two ends also agree on the keys that they seal packets with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from skyloop.errors import DecodeError, LinkError
+from skyloop.transport.fabric import layout, packets
+from skyloop.transport.fabric.sealing import PLAIN, TRAILER, Open, Opener, Seal, Sealer
+
+if TYPE_CHECKING:
+    from datetime import datetime
+
+    from skyloop.keys import Identity, KeyRing
+
+MAX_CLIENTS: Final = 256  #: connections in all: each costs memory, and its share of the thread that calls the handler
+#: Of one key. A program has one connection to a drone; a lab's cockpit and its recorders and workers share a key.
+PER_KEY: Final = 64
+#: Places that only keys which may fly this drone get: so many others can't keep a pilot out, with however many keys.
+FOR_PILOTS: Final = 64
+#: Signs of life of one key that are remembered: they come before the connection that they are of.
+TOKENS_PER_KEY: Final = 4 * PER_KEY
+#: Without keys all have the same name, and no application can be distinguished from a flood.
+TOKENS: Final = 16 * MAX_CLIENTS
+
+
+class Admission(NamedTuple):
+    """The terms of a connection; without keys only ``welcome`` is set."""
+
+    welcome: bytes = b""  #: the proxy's answer
+    offer: bytes = b""  #: the proof that was asked with
+    identity: Identity | None = None  #: who the other end has proved to be
+    expires: datetime | None = None  #: when its key does
+    sealer: Sealer = PLAIN  #: of packets to it
+    opener: Opener = PLAIN  #: of packets from it
+    topics: Opener = PLAIN  #: of what is published: the application's
+    generation: int = 0  #: of the key for that
+
+
+def admit(
+    ring: KeyRing | None, name: str, run: str, sender: layout.Sender, wish: packets.Join, topics: Seal | None
+) -> Admission:
+    """Check a request to join, and make the proxy's answer.
+
+    Args:
+        ring: The proxy's keys, None without.
+        name: The proxy's name.
+        run: This run of the proxy.
+        sender: Who asks, by the key of the request.
+        wish: The request.
+        topics: The seal of what is published, None without keys.
+
+    Returns:
+        The terms of the connection, with the answer.
+
+    Raises:
+        LinkError: The application has no key of this lab, another's, or one without a right to see this drone.
+    """
+    if ring is None or topics is None:
+        return Admission(packets.encode_own(packets.Welcome(packets.REVISION, run)))
+    from skyloop.keys.agreement import Agreement
+
+    proof, agreed = Agreement(ring, *_terms(name, run, sender)).answer(wish.proof)
+    identity = agreed.identity
+    if identity.name != sender.who:
+        raise LinkError(f"these are the keys of {identity}, and not of {sender.who}")
+    if not identity.may_see(name):
+        raise LinkError(f"these are the keys of {identity}: they are not for {name}")
+    sealer = Seal(agreed.down)
+    where = layout.join(name, sender.who, sender.id)
+    sealed, trailer = sealer.seal(where, b"", packets.key(topics.generation, topics.key))
+    welcome = packets.encode_own(packets.Welcome(packets.REVISION, run, proof, trailer + sealed))
+    return Admission(
+        welcome, wish.proof, identity, agreed.expires, sealer, Open().use(agreed.up), generation=topics.generation
+    )
+
+
+class JoinRequest:
+    """The application's request to be let in, which accepts only the answer of the proxy.
+
+    Args:
+        ring: The application's keys, None without.
+        name: The proxy's name.
+        run: The run of the proxy that is asked.
+        sender: This application and connection.
+    """
+
+    def __init__(self, ring: KeyRing | None, name: str, run: str, sender: layout.Sender) -> None:
+        self._name = name
+        self._sender = sender
+        self.proof = b""
+        if ring is not None:
+            from skyloop.keys.agreement import Agreement
+
+            self._agreement = Agreement(ring, *_terms(name, run, sender))
+            self.proof = self._agreement.offer()
+
+    def accept(self, welcome: packets.Welcome) -> Admission:
+        """Check the proxy's answer.
+
+        Returns:
+            The terms of the connection.
+
+        Raises:
+            LinkError: Whoever answered has no key to serve this drone, or the answer is damaged.
+        """
+        if not self.proof:
+            return Admission()
+        agreed = self._agreement.accept(welcome.proof)
+        if not agreed.identity.may_serve(self._name):
+            raise LinkError(f"it answers with the keys of {agreed.identity}: they are not for the name {self._name!r}")
+        opener = Open().use(agreed.down)
+        where, trailer = layout.join(self._name, self._sender.who, self._sender.id), welcome.topics[:TRAILER]
+        try:
+            opened = opener.open(where, trailer, welcome.topics[TRAILER:])
+            message = packets.parse(opened[0]) if opened is not None else None
+        except DecodeError as error:
+            raise LinkError(f"its answer does not hold together: {error}") from None
+        if not isinstance(message, packets.Key):
+            raise LinkError("its answer has no key for topics")
+        topics = Open().use(message.key, message.generation)
+        return Admission(
+            b"", self.proof, agreed.identity, agreed.expires, Seal(agreed.up), opener, topics, message.generation
+        )
+
+
+def _terms(name: str, run: str, sender: layout.Sender) -> tuple[str, ...]:
+    return name, run, sender.who, sender.id
+
+
+def no_place_reason(who: str, may_fly: bool, present: Iterable[tuple[str, bool]]) -> str:
+    """Return why there is no place for one more connection, empty if there is.
+
+    Args:
+        who: The identity that asks.
+        may_fly: Whether it may fly this drone.
+        present: The connections there are: the identity of each, and whether it may fly this drone.
+    """
+    here = list(present)
+    own = sum(other == who for other, _ in here)
+    if own >= PER_KEY:
+        return f"the key of {who!r} has {own} connections already, and may have {PER_KEY}: end some of them"
+    if len(here) >= MAX_CLIENTS:
+        return f"there are {len(here)} connections already, and at most {MAX_CLIENTS} are taken: end some of them"
+    lookers = sum(not flies for _, flies in here)
+    if not may_fly and lookers >= MAX_CLIENTS - FOR_PILOTS:
+        return (
+            f"there are {lookers} connections of keys that may not fly this drone already, and the other {FOR_PILOTS} "
+            "places are kept for pilots: end some of them"
+        )
+    return ""
+
+
+class Tokens:
+    """The liveliness tokens of connections, bounded for each identity. Not thread-safe.
+
+    Args:
+        by_key: Whether identities are proved by keys; else all connections share one name and a larger bound.
+    """
+
+    def __init__(self, *, by_key: bool) -> None:
+        self._most = TOKENS_PER_KEY if by_key else TOKENS
+        self._seen: dict[str, set[str]] = {}
+
+    def add(self, who: str, connection: str) -> bool:
+        """Remember a token; return False if this identity has too many."""
+        seen = self._seen.setdefault(who, set())
+        if len(seen) >= self._most and connection not in seen:
+            return False
+        seen.add(connection)
+        return True
+
+    def discard(self, who: str, connection: str) -> None:
+        """Forget a token."""
+        seen = self._seen.get(who)
+        if seen is not None:
+            seen.discard(connection)
+            if not seen:
+                del self._seen[who]
+
+    def has(self, who: str, connection: str) -> bool:
+        """Return whether a connection's token is there."""
+        return connection in self._seen.get(who, ())
+
+    def any_of(self, connections: Mapping[str, str]) -> bool:
+        """Return whether the token of any of these connections is there.
+
+        Args:
+            connections: The identity of each connection, by its id.
+        """
+        return any(self.has(who, connection) for connection, who in connections.items())

@@ -1,0 +1,260 @@
+"""Numbered packets that arrive once each and in order, whatever is lost on the way.
+
+How many are under way is bounded. Time is an argument, and nothing here sends.
+
+Nothing that is sent may block its sender, so Zenoh drops what a congested path can't carry, here or at a router; it
+also drops what comes to a node before the subscription does. So each numbered packet is kept and sent again until the
+other end acknowledges it, and few are under way at once, so that they do not congest a slow path.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from skyloop.transport.fabric import packets
+
+DEPTH: Final = 256  #: packets to an end that are not acknowledged yet, before further ones are refused
+MAX_BYTES: Final = 1 << 20  #: the same in bytes
+RECENT_PACKETS: Final = 64  #: packets of an end among which a repeated one is recognised
+ACKNOWLEDGE_AFTER: Final = DEPTH // 8  #: packets of a topic after which they are acknowledged
+#: Packets on the way at once: as many as Zenoh queues for a link before it drops one (config._QUEUES).
+ON_THE_WAY: Final = 16
+ON_THE_WAY_BYTES: Final = 1 << 18
+AGAIN_S: Final = 0.2  #: after so long without an answer what is on the way is sent again; then after twice as long, …
+AGAIN_AT_MOST_S: Final = 0.5  #: … and never later than after so long
+
+
+@dataclass(slots=True)
+class _Packet:
+    number: int
+    data: bytes
+    way: str
+    sent_s: float = 0.0  #: when last; 0: not yet
+
+
+class Outgoing:
+    """The packets for one end that it has not acknowledged yet. Not thread-safe.
+
+    Args:
+        depth: How many are kept at most.
+        most_bytes: How many bytes of them; a single packet may be larger.
+    """
+
+    def __init__(self, depth: int = DEPTH, most_bytes: int = MAX_BYTES) -> None:
+        self._depth = depth
+        self._most = most_bytes
+        self._kept: deque[_Packet] = deque()  # those on the way first, then those that wait to be
+        self._bytes = 0
+        self._under_way = 0  # packets
+        self._under_way_bytes = 0
+        self._next = 1
+        self._again_s = AGAIN_S
+        self._headway_s = (
+            0.0  # when the other end last took something, or when the first packet of an idle time was sent
+        )
+
+    def put(self, packet: bytes, way: str = "") -> bool:
+        """Keep one more packet.
+
+        Args:
+            packet: The packet.
+            way: By which key it is sent, for the sender.
+
+        Returns:
+            False if there is no room for it.
+        """
+        if len(self._kept) >= self._depth or (self._kept and self._bytes + len(packet) > self._most):
+            return False
+        self._kept.append(_Packet(self._next, packet, way))
+        self._bytes += len(packet)
+        self._next += 1
+        return True
+
+    def due(self, now_s: float) -> list[tuple[int, bytes, str]]:
+        """Return what is to be sent now: packets for which there is room on the way, and those that seem lost.
+
+        Args:
+            now_s: The monotonic clock [s].
+
+        Returns:
+            Number, packet and way of each.
+        """
+        found: list[tuple[int, bytes, str]] = []
+        if self._under_way and now_s - self._kept[0].sent_s >= self._again_s:
+            self._again_s = min(2 * self._again_s, AGAIN_AT_MOST_S)
+            for index in range(self._under_way):
+                packet = self._kept[index]
+                packet.sent_s = now_s
+                found.append((packet.number, packet.data, packet.way))
+        while self._under_way < min(len(self._kept), ON_THE_WAY):
+            packet = self._kept[self._under_way]
+            if self._under_way and self._under_way_bytes + len(packet.data) > ON_THE_WAY_BYTES:
+                break
+            if not self._under_way:
+                self._headway_s = now_s
+            packet.sent_s = now_s
+            self._under_way += 1
+            self._under_way_bytes += len(packet.data)
+            found.append((packet.number, packet.data, packet.way))
+        return found
+
+    def taken(self, number: int, now_s: float) -> None:
+        """Drop the packets up to this number, as the other end has acknowledged them.
+
+        A number of a packet that was not sent yet is ignored.
+
+        Args:
+            number: The last packet that was acknowledged.
+            now_s: The monotonic clock [s].
+        """
+        if not self._under_way or number >= self._kept[0].number + self._under_way:
+            return
+        while self._under_way and self._kept[0].number <= number:
+            packet = self._kept.popleft()
+            self._bytes -= len(packet.data)
+            self._under_way -= 1
+            self._under_way_bytes -= len(packet.data)
+            self._headway_s = now_s
+            self._again_s = AGAIN_S
+
+    @property
+    def under_way(self) -> bool:
+        """Whether something was sent and is not acknowledged yet."""
+        return self._under_way > 0
+
+    def stalled_s(self, now_s: float) -> float:
+        """Return for how long the other end has acknowledged nothing of what is under way [s]; 0 if nothing is."""
+        return now_s - self._headway_s if self._under_way else 0.0
+
+
+class Incoming:
+    """Puts the numbered packets of the other end's :class:`Outgoing` in order. Not thread-safe."""
+
+    def __init__(self) -> None:
+        self.taken = 0  #: the number up to which all packets came, to be acknowledged
+        self._early: dict[int, bytes] = {}
+
+    def take(self, number: int, packet: bytes) -> list[bytes]:
+        """Return the packets that can be delivered now that this one came, in order.
+
+        Args:
+            number: The packet's, from 1.
+            packet: The packet.
+
+        Returns:
+            Nothing if it came before, or if one before it is missing.
+        """
+        if number != self.taken + 1:
+            if self.taken < number <= self.taken + ON_THE_WAY:
+                self._early.setdefault(number, packet)
+            return []
+        found = [packet]
+        self.taken += 1
+        while (early := self._early.pop(self.taken + 1, None)) is not None:
+            found.append(early)
+            self.taken += 1
+        return found
+
+
+class AckPolicy:
+    """Decides when a subscriber acknowledges the packets of a topic. Not thread-safe."""
+
+    def __init__(self) -> None:
+        self._acknowledged = 0
+        self._bytes = 0
+
+    def count(self, number: int, size: int) -> bool:
+        """Count a packet; return whether to acknowledge now.
+
+        Args:
+            number: The packet's.
+            size: Its size [bytes].
+        """
+        self._bytes += size
+        if number - self._acknowledged < ACKNOWLEDGE_AFTER and self._bytes < MAX_BYTES // 8:
+            return False
+        self._acknowledged = number
+        self._bytes = 0
+        return True
+
+
+class RecentPackets:
+    """The last packets that came: where there is a direct path and one through a router, each comes twice.
+
+    Args:
+        depth: How many are remembered.
+    """
+
+    def __init__(self, depth: int = RECENT_PACKETS) -> None:
+        self._packets: deque[tuple[int, bytes]] = deque(maxlen=depth)
+
+    def is_new(self, number: int, packet: bytes) -> bool:
+        """Return whether a packet is not among the last ones, and remember it."""
+        if (number, packet) in self._packets:
+            return False
+        self._packets.append((number, packet))
+        return True
+
+
+class Receiver:
+    """Receives what comes to one end of a connection: numbered packets once each and in order, the others once each.
+
+    The transport's own packets are given to ``control``, which returns whether it has handled them; those that it has
+    not, and all others, to ``deliver``. Thread-safe: for numbered packets one thread at a time calls both.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._incoming = Incoming()
+        self._recent = RecentPackets()
+
+    def receive_numbered(
+        self,
+        number: int,
+        packet: bytes,
+        *,
+        has_room: Callable[[], bool],
+        control: Callable[[packets.Message], bool],
+        deliver: Callable[[bytes], object],
+    ) -> int:
+        """Receive a packet that is sent again until it is acknowledged.
+
+        Args:
+            number: The packet's, from 1.
+            packet: The packet.
+            has_room: Whether another packet can be taken now; if not, this one is ignored and will be sent again.
+            control: Handles the transport's own packets.
+            deliver: Handles all others.
+
+        Returns:
+            The number up to which all packets were taken, to be acknowledged.
+        """
+        with self._lock:
+            if has_room():
+                for each in self._incoming.take(number, packet):
+                    message = packets.parse_own(each)
+                    if message is None or not control(message):
+                        deliver(each)
+            return self._incoming.taken
+
+    def receive(
+        self, packet: bytes, *, control: Callable[[packets.Message], bool], deliver: Callable[[bytes], object]
+    ) -> None:
+        """Receive a packet that may be lost.
+
+        Args:
+            packet: The packet.
+            control: Handles the transport's own packets.
+            deliver: Handles all others.
+        """
+        message = packets.parse_own(packet)
+        if message is not None and control(message):
+            return
+        with self._lock:
+            new = self._recent.is_new(0, packet)
+        if new:
+            deliver(packet)

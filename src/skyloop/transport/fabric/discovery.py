@@ -1,0 +1,199 @@
+"""Discovery: which proxies are on the network, and how one that comes back is found soon.
+
+Zenoh retries the addresses that it was given, but searches by multicast only after 1, 2, 4 and then every 8 seconds.
+Whoever misses a proxy searches here meanwhile, without a connection, and opens a new session when a node answers that
+the present one does not know: that node is then found within milliseconds.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from dataclasses import replace
+from typing import Any, Final
+
+import msgspec
+
+from skyloop.errors import DecodeError
+from skyloop.transport.fabric import config, layout, packets
+from skyloop.transport.fabric.config import Part
+from skyloop.transport.fabric.packets import ProxyInfo
+from skyloop.transport.fabric.session import Session, acquire, configure, load, release, retire
+from skyloop.transport.fabric.settings import FabricSettings
+
+#: How long after it was opened a session has found who can be found at once: by multicast, or at the addresses given.
+SETTLE_S: Final = 0.6
+ANSWER_S: Final = 0.5
+#: How long a linked node may take to list the tokens that it knows: milliseconds, unless it is flooded with tokens.
+SYNC_S: Final = 5.0
+RUNS_PER_NAME: Final = 8  #: proxies of one name that are listed: one, and two or three where a network was cut in two
+SEARCH_S: Final = 0.25  #: how long to wait for answers to a search
+YOUNG_S: Final = 1.0  #: for so long a new session searches well by itself
+FORGET_S: Final = 10.0  #: a peer that a new session could not reach either is not tried again for so long
+_POLL_S: Final = 0.05
+
+
+def list_proxies(settings: FabricSettings) -> list[ProxyInfo]:
+    """List the proxies that this process can reach over the network. It takes about a second.
+
+    Args:
+        settings: How to join the network.
+
+    Returns:
+        The proxies by name; those of one name by age, the oldest first.
+
+    Raises:
+        LinkError: The network can't be joined.
+    """
+    session = acquire(settings, Part.APP)
+    try:
+        _settle(session)
+        runs(session)  # when that is answered, all is known that there is
+        return sorted(_ask(session, "*"), key=lambda about: (about.name, about.since_ns))
+    finally:
+        release(session)
+
+
+def ask(settings: FabricSettings, name: str) -> list[ProxyInfo]:
+    """Return the proxies with this name, the oldest first; there are several only where a network was cut in two.
+
+    Args:
+        settings: How to join the network.
+        name: The proxy's name.
+
+    Raises:
+        LinkError: The network can't be joined.
+    """
+    if not settings.multicast and not settings.connect:
+        return []  # others have to connect to us, and we don't listen yet
+    session = acquire(replace(settings, listen=()), Part.APP)
+    try:
+        _settle(session)
+        runs(session, name)
+        return oldest_first(session, name)
+    finally:
+        release(session)
+
+
+def oldest_first(session: Session, name: str) -> list[ProxyInfo]:
+    """Return the proxies with this name, the oldest first, on a session that is open."""
+    return sorted(_ask(session, name), key=lambda about: about.since_ns)
+
+
+def runs(session: Session, name: str = "*") -> set[tuple[str, str]]:
+    """Return NAME and RUN of the server ends whose tokens are seen now.
+
+    It takes as long as the linked nodes need to tell what they know, at most :data:`SYNC_S`.
+    """
+    found = set()
+    for reply in session.zenoh.liveliness().get(layout.alive(name, "*"), timeout=SYNC_S):
+        if reply.ok is not None:
+            try:
+                found.add(layout.parse_alive(str(reply.ok.key_expr)))
+            except DecodeError:
+                continue
+    return found
+
+
+def _settle(session: Session) -> None:
+    """Wait until a session that was just opened knows the nodes that can be found."""
+    while (left_s := session.opened + SETTLE_S - time.monotonic()) > 0.0:
+        time.sleep(min(left_s, _POLL_S))
+
+
+def _ask(session: Session, name: str) -> list[ProxyInfo]:
+    z = load()
+    found: dict[str, ProxyInfo] = {}
+    replies = session.zenoh.get(
+        layout.info(name), target=z.QueryTarget.ALL, consolidation=z.ConsolidationMode.NONE, timeout=ANSWER_S
+    )
+    for reply in replies:
+        if reply.ok is None:
+            continue
+        try:
+            about = packets.decode_info(packets.copied(reply.ok.payload, packets.MAX_OWN))
+        except (DecodeError, msgspec.DecodeError):
+            continue
+        if str(reply.ok.key_expr) == layout.info(about.name):
+            found[about.run] = about
+    return _oldest_of_each(list(found.values()))
+
+
+def _oldest_of_each(found: list[ProxyInfo]) -> list[ProxyInfo]:
+    """Return the oldest ones of each name, so that many answers for one name hide no other."""
+    counts: Counter[str] = Counter()
+    few = []
+    for about in sorted(found, key=lambda about: about.since_ns):
+        counts[about.name] += 1
+        if counts[about.name] <= RUNS_PER_NAME:
+            few.append(about)
+    return few
+
+
+class UnreachablePeers:
+    """Peers that answered a search and could not be reached, such as another lab's with other keys."""
+
+    def __init__(self) -> None:
+        self._tried: dict[str, float] = {}
+
+    def any_new(self, answered: set[str], known: set[str], now_s: float) -> bool:
+        """Return whether a peer answered that is not known and for which no new session was opened yet.
+
+        Args:
+            answered: Who answered a search.
+            known: Who is linked.
+            now_s: The monotonic clock [s].
+        """
+        self._tried = {who: at for who, at in self._tried.items() if now_s - at < FORGET_S}
+        new = answered - known - self._tried.keys()
+        self._tried |= dict.fromkeys(new, now_s)
+        return bool(new)
+
+    def clear(self) -> None:
+        """Forget the peers: a proxy was reached, so earlier attempts say nothing about the next one."""
+        self._tried.clear()
+
+
+_UNREACHABLE: Final = UnreachablePeers()
+_lock: Final = threading.Lock()
+
+
+def proxy_reached() -> None:
+    """Forget which peers could not be reached, as a proxy was."""
+    with _lock:
+        _UNREACHABLE.clear()
+
+
+def renew(session: Session) -> bool:
+    """Search for nodes that a session does not know.
+
+    Returns:
+        True if there is one: the session is then retired, and another one has to be acquired.
+    """
+    if not session.settings.multicast or time.monotonic() - session.opened < YOUNG_S:
+        return False
+    answered = _search(session)
+    known = {str(zid) for zid in (*session.zenoh.info.peers_zid(), *session.zenoh.info.routers_zid())}
+    with _lock:
+        found = _UNREACHABLE.any_new(answered, known, time.monotonic())
+    if found:
+        retire(session)
+    return found
+
+
+def _search(session: Session) -> set[str]:
+    """Return the identities of the nodes that answer now and can be connected to."""
+    answered: set[str] = set()
+
+    def hello(answer: Any) -> None:
+        if answer.locators:
+            answered.add(str(answer.zid))
+
+    sections = config.make(session.settings, session.part, [])
+    scouting = load().scout(
+        session.callback(hello), what="peer|router", config=configure({"scouting": sections["scouting"]})
+    )
+    time.sleep(SEARCH_S)
+    scouting.stop()
+    return answered

@@ -1,0 +1,114 @@
+"""The queue of the one thread that calls a handler: commands first, and the connections in turns.
+
+So two hundred requests of one connection keep the others waiting no longer than one does.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Hashable
+from typing import Final, Generic, TypeVar
+
+Item = TypeVar("Item")
+#: After so many commands in a row one other packet is handled, so that endless commands don't keep others from asking
+#: for the authority.
+IN_A_ROW: Final = 16
+
+
+class _Lane(Generic[Item]):
+    """Queues of the connections, which take turns."""
+
+    def __init__(self) -> None:
+        self._order: deque[Hashable] = deque()
+        self._waiting: dict[Hashable, deque[Item]] = {}
+
+    def __bool__(self) -> bool:
+        return bool(self._order)
+
+    def count(self, of: Hashable) -> int:
+        return len(self._waiting.get(of, ()))
+
+    def put(self, of: Hashable, item: Item) -> None:
+        waiting = self._waiting.get(of)
+        if waiting is None:
+            self._waiting[of] = deque((item,))
+            self._order.append(of)
+        else:
+            waiting.append(item)
+
+    def get(self) -> Item:
+        of = self._order.popleft()
+        waiting = self._waiting[of]
+        item = waiting.popleft()
+        if waiting:
+            self._order.append(of)
+        else:
+            del self._waiting[of]
+        return item
+
+
+class HandlerQueue(Generic[Item]):
+    """A queue with many producers and one consumer; the items of one connection and urgency keep their order."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition(threading.Lock())
+        self._urgent: _Lane[Item] = _Lane()
+        self._others: _Lane[Item] = _Lane()
+        self._in_a_row = 0
+        self._closed = False
+
+    def put(self, of: Hashable, item: Item, *, urgent: bool = False, at_most: int | None = None) -> bool:
+        """Queue an item. Any thread.
+
+        Args:
+            of: The connection whose item it is.
+            item: The item.
+            urgent: Whether it goes before all items that are not urgent.
+            at_most: How many items of this connection and urgency may wait before further ones are refused; None: no
+                bound.
+
+        Returns:
+            False if it was refused.
+        """
+        with self._changed:
+            lane = self._urgent if urgent else self._others
+            if at_most is not None and lane.count(of) >= at_most:
+                return False
+            lane.put(of, item)
+            self._changed.notify()
+            return True
+
+    def waiting(self, of: Hashable) -> int:
+        """Return how many items of a connection wait that are not urgent."""
+        with self._changed:
+            return self._others.count(of)
+
+    def close(self) -> None:
+        """Make :meth:`get` wait no longer; items that are queued still come."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+
+    def get(self, timeout_s: float) -> Item | None:
+        """Return the next item.
+
+        Args:
+            timeout_s: How long to wait for one [s].
+
+        Returns:
+            The item; None if none came in time, or if the queue is closed and empty.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._urgent or self._others or self._closed, timeout_s)
+            if self._urgent and not (self._others and self._in_a_row >= IN_A_ROW):
+                self._in_a_row += 1
+                return self._urgent.get()
+            self._in_a_row = 0
+            return self._others.get() if self._others else None
+
+    @property
+    def over(self) -> bool:
+        """Whether the queue is closed and empty."""
+        with self._changed:
+            return self._closed and not self._urgent and not self._others

@@ -1,0 +1,148 @@
+"""How an application's connection begins: find the proxy of a name, and be let in by it."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+
+from skyloop.errors import DecodeError, LinkError, NoAnswerError, UnknownNameError
+from skyloop.transport.fabric import discovery, layout, packets
+from skyloop.transport.fabric.admission import Admission, JoinRequest
+from skyloop.transport.fabric.session import Session, host_name, load
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import zenoh
+
+JOIN_S: Final = 1.0  #: how long a proxy that was found may take to let this application in
+MAX_CANDIDATES: Final = 4  #: with keys: so many proxies of one name are asked until one proves that it is it
+
+
+class ProxyWatch:
+    """Watches which server ends with one name are alive.
+
+    Args:
+        session: The Zenoh session.
+        name: The proxy's name.
+        on_gone: Called with the run of a server end that goes away, on one of Zenoh's threads.
+    """
+
+    def __init__(self, session: Session, name: str, on_gone: Callable[[str], None]) -> None:
+        self._session = session
+        self._name = name
+        self._on_gone = on_gone
+        self._runs: set[str] = set()
+        self._changed = threading.Condition()
+
+    def declare(self) -> Any:
+        """Begin to watch; the caller undeclares what is returned."""
+        return self._session.zenoh.liveliness().declare_subscriber(
+            layout.alive(self._name, "*"), self._session.callback(self._on_token), history=True
+        )
+
+    def find(self, within_s: float) -> list[tuple[str, packets.ProxyInfo | None]]:
+        """Wait for a proxy with this name.
+
+        Args:
+            within_s: How long [s].
+
+        Returns:
+            The run of each candidate with what it says of itself, the best first. That is the oldest; with keys the
+            next ones follow, as the oldest may turn out to have no key for this name.
+
+        Raises:
+            UnknownNameError: None can be reached.
+            NoAnswerError: One was found and is gone again.
+        """
+        with self._changed:
+            found = self._changed.wait_for(lambda: bool(self._runs), within_s)
+        if not found:
+            # A node that is flooded with tokens may list many others before the proxy's: this waits for all of them.
+            known = discovery.runs(self._session)
+            with self._changed:
+                self._runs.update(run for other, run in known if other == self._name)
+                found = bool(self._runs)
+            if not found:
+                others = {other for other, _ in known} - {self._name}
+                where = f"proxy on the network ({self._session.settings.reach})"
+                raise UnknownNameError(where, self._name, others)
+        return self._candidates()
+
+    def _candidates(self) -> list[tuple[str, packets.ProxyInfo | None]]:
+        told = [about for about in discovery.oldest_first(self._session, self._name) if about.run in self._runs]
+        with self._changed:
+            found: list[tuple[str, packets.ProxyInfo | None]] = [(about.run, about) for about in told]
+            found += [(run, None) for run in sorted(self._runs - {run for run, _ in found})]
+        if not found:
+            raise NoAnswerError(f"the proxy {self._name!r} was found on the network, and is gone again")
+        return found[: 1 if self._session.settings.ring is None else MAX_CANDIDATES]
+
+    def _on_token(self, sample: zenoh.Sample) -> None:
+        """Note that a proxy with this name came or went."""
+        try:
+            _, run = layout.parse_alive(str(sample.key_expr))
+        except DecodeError:
+            return
+        alive = sample.kind == load().SampleKind.PUT
+        with self._changed:
+            (self._runs.add if alive else self._runs.discard)(run)
+            self._changed.notify_all()
+        if not alive:
+            self._on_gone(run)
+
+
+def join(session: Session, name: str, run: str, connection: str) -> Admission:
+    """Ask a proxy to let a connection in.
+
+    Args:
+        session: The Zenoh session.
+        name: The proxy's name.
+        run: The run of the proxy that is meant.
+        connection: The connection's id.
+
+    Returns:
+        The terms of the connection.
+
+    Raises:
+        LinkError: The proxy refuses, does not answer (:class:`NoAnswerError`), or somebody else answers in its place.
+    """
+    z, who, ring = load(), session.settings.who, session.settings.ring
+    request = JoinRequest(ring, name, run, layout.Sender("join", who, connection))
+    program = Path(sys.argv[0]).name[:64]
+    asked = packets.Join(packets.REVISION, run, host_name(), os.getpid(), program, request.proof)
+    impostor: LinkError | None = None
+    replies = session.zenoh.get(
+        layout.join(name, who, connection),
+        payload=packets.encode_own(asked),
+        target=z.QueryTarget.ALL,
+        consolidation=z.ConsolidationMode.NONE,
+        timeout=JOIN_S,
+        priority=z.Priority.DATA_HIGH,
+        express=True,
+    )
+    for reply in replies:
+        if reply.err is not None:
+            raise LinkError(f"the proxy {name!r} does not let us in: {reply.err.payload.to_string()[:400]}")
+        try:
+            ok = reply.ok
+            welcome = None if ok is None else packets.decode_welcome(packets.copied(ok.payload, packets.MAX_OWN))
+        except (DecodeError, msgspec.DecodeError):
+            continue
+        if welcome is None or welcome.run != run:
+            continue
+        try:
+            return request.accept(welcome)
+        except LinkError as error:  # perhaps somebody else answers, too
+            impostor = error
+    if impostor is not None:
+        raise LinkError(f"who answers as the proxy {name!r} is not it: {impostor}")
+    raise NoAnswerError(
+        f"the proxy {name!r} was found on the network but did not answer"
+        + ("" if session.settings.tls is None else f"; the keys of {who!r} may not give access to it")
+    )

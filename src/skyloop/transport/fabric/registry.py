@@ -1,0 +1,361 @@
+"""The connections of a proxy: lets applications in, and ends connections.
+
+It ends those whose application is gone, has lost its rights, or takes nothing of what is sent to it.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+
+from skyloop.errors import DecodeError, LinkError
+from skyloop.transport.base import NOBODY, Peer, ServerHandler
+from skyloop.transport.fabric import layout, packets
+from skyloop.transport.fabric.admission import MAX_CLIENTS, Admission, Tokens, admit, no_place_reason
+from skyloop.transport.fabric.connection import Sender, ServerConnection
+from skyloop.transport.fabric.handler_queue import HandlerQueue
+from skyloop.transport.fabric.publishing import Publisher
+from skyloop.transport.fabric.sealing import Seal, TopicSeal
+from skyloop.transport.fabric.session import load
+
+if TYPE_CHECKING:
+    import zenoh
+
+    from skyloop.keys import KeyRing
+
+CONFIRM_S: Final = 3.0  #: how long an application may take to show its token after it was let in
+#: An application that acknowledges nothing of what is sent to it for so long is disconnected. Its end of the transport
+#: acknowledges at once, however slow the application's code is.
+STALLED_S: Final = 3.0
+_SHUT_OUT: Final = "its key was revoked, or its rights were changed"
+
+#: For the thread that calls the handler: a packet, or True: joined, False: left.
+Item = tuple[ServerConnection, bytes | bool]
+
+
+class ConnectionRegistry:
+    """The connections of one server end.
+
+    Thread-safe, but for :meth:`check`, which belongs to the thread that calls the handler.
+
+    Args:
+        name: The proxy's name.
+        run: This run of the proxy.
+        ring: The proxy's keys, None without.
+        topic_keys: The seal of what is published, None without keys.
+        publisher: Has the subscriptions.
+        sender: Sends to single applications.
+        queue: Of the thread that calls the handler.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        run: str,
+        ring: KeyRing | None,
+        topic_keys: TopicSeal | None,
+        *,
+        publisher: Publisher,
+        sender: Sender,
+        queue: HandlerQueue[Item],
+    ) -> None:
+        self._name = name
+        self._run = run
+        self._ring = ring
+        self._topic_keys = topic_keys
+        self._publisher = publisher
+        self._sender = sender
+        self._queue = queue
+        self._lock = threading.RLock()  # guards what follows
+        self._open = False
+        self._tokens = Tokens(by_key=ring is not None)  # connections that show that they live
+        self._connections: dict[str, ServerConnection] = {}
+        self._peers: dict[int, ServerConnection] = {}
+        self._left = threading.Condition()  # notified when a connection has gone
+        self._last_id = 0
+        self._shut: frozenset[str] = frozenset()  # who was shut out when the key of topics was made
+        self.dropped = 0  #: applications that were disconnected because they did not take what was sent to them
+        self.turned_away = 0  #: connections and signs of life that were too many of one key, or in all
+        self._away = ""  # why, until the handler was told
+        self.strays = 0  #: samples and queries that came from nobody that is connected
+        self._stray_commands = 0  # commands and orders among them that the handler was not told of yet
+
+    def open(self) -> None:
+        """Let applications in from now on."""
+        with self._lock:
+            self._open = True
+
+    def farewell(self, reason: str, within_s: float) -> None:
+        """Let nobody in any more, disconnect all applications, and wait until they have gone.
+
+        Args:
+            reason: Why, for the applications.
+            within_s: How long to wait at most [s].
+        """
+        with self._lock:
+            self._open = False
+        for connection in self.connections:
+            self.disconnect(connection, reason, forget=False)
+        with self._left:
+            self._left.wait_for(
+                lambda: not self._tokens.any_of({each.id: each.who for each in self.connections}), within_s
+            )
+
+    @property
+    def connections(self) -> list[ServerConnection]:
+        """The present connections, a copy."""
+        return list(self._connections.values())
+
+    def of_peer(self, peer: Peer) -> ServerConnection | None:
+        """Return the connection of a peer, None if it is gone."""
+        return self._peers.get(peer.id)
+
+    def of_sender(self, sender: layout.Sender) -> ServerConnection:
+        """Return the connection that a key belongs to.
+
+        Raises:
+            DecodeError: There is none with this id and identity.
+        """
+        connection = self._connections.get(sender.id)
+        if connection is None or connection.who != sender.who:
+            raise DecodeError("it is not connected")
+        return connection
+
+    def is_shut_out(self, connection: ServerConnection) -> bool:
+        """Return whether a newer roster shuts a connection's key out; if so, the connection is ended."""
+        if self._ring is None or connection.who not in self._ring.shut_out:
+            return False
+        self._shut_out(connection, _SHUT_OUT)
+        return True
+
+    def stray(self, key: str) -> None:
+        """Count a packet from nobody that is connected, by the key by which it came."""
+        self.strays += 1
+        if f"/{layout.ASK}/" not in key:  # what an application says when it leaves may come late
+            self._stray_commands += 1
+
+    # --- what Zenoh calls, on its own threads ---
+
+    def on_token(self, sample: zenoh.Sample) -> None:
+        """Note that an application's token came or went. On Zenoh's threads."""
+        try:
+            sender = layout.parse_sender(str(sample.key_expr))
+        except DecodeError:
+            self.strays += 1
+            return
+        connection = self._connections.get(sender.id)
+        if sample.kind == load().SampleKind.PUT:
+            if not self._tokens.add(sender.who, sender.id):
+                self._turn_away(f"the key of {sender.who!r} shows more signs of life than it may have connections")
+            if connection is not None:
+                connection.confirmed = True
+            return
+        self._tokens.discard(sender.who, sender.id)
+        with self._left:
+            self._left.notify_all()
+        if connection is not None and connection.who == sender.who:
+            self.end(connection, f"the application is gone ({connection.peer.address})")
+
+    def on_join(self, query: zenoh.Query) -> None:
+        """Answer an application that asks to be let in. On Zenoh's threads."""
+        with query:
+            try:
+                sender = layout.parse_sender(str(query.key_expr))
+                request = packets.decode_join(packets.copied(query.payload, packets.MAX_OWN))
+            except (DecodeError, msgspec.DecodeError):
+                self.strays += 1
+                return
+            if request.run != self._run:
+                return  # another proxy of this name is meant
+            try:
+                admission = self._admit(sender, request)
+                problem = self._join(sender, request, admission)
+            except LinkError as error:
+                problem = str(error)
+            if problem:
+                query.reply_err(problem)
+                return
+            connection = self._connections.get(sender.id)
+            query.reply(query.key_expr, (connection.admission if connection else admission).welcome)
+            if connection is not None and self._topic_keys is not None:
+                self._send_topic_key(connection, self._topic_keys.newest)
+
+    def _admit(self, sender: layout.Sender, request: packets.Join) -> Admission:
+        """Check who asks.
+
+        Raises:
+            LinkError: It has no key for this drone.
+        """
+        if self._ring is not None and sender.who in self._ring.shut_out:
+            raise LinkError(_SHUT_OUT)
+        newest = self._topic_keys.newest if self._topic_keys else None
+        return admit(self._ring, self._name, self._run, sender, request, newest)
+
+    def _join(self, sender: layout.Sender, request: packets.Join, admission: Admission) -> str:
+        """Let an application in; return why not, empty if it was."""
+        if request.revision != packets.REVISION:
+            return f"it speaks revision {request.revision} of the fabric transport, and this proxy {packets.REVISION}"
+        with self._lock:
+            if not self._open:
+                return "the proxy is about to stop"
+            if sender.id in self._connections:
+                before = self._connections[sender.id]  # which asks again, or its question came by two ways
+                same = before.who == sender.who and before.admission.offer == request.proof
+                return "" if same else "its number is taken"
+            address = f"{sender.who} at {request.host[:64] or '?'}"
+            problem = self._no_place(sender.who)
+            if problem:
+                self._turn_away(f"{address} was not let in: {problem}")
+                return problem
+            self._last_id += 1
+            peer = Peer(self._last_id, f"{address} (pid {request.pid})")
+            connection = ServerConnection(peer, sender.who, sender.id, time.monotonic(), admission)
+            connection.confirmed = self._tokens.has(sender.who, sender.id)
+            self._connections[sender.id] = connection
+            self._peers[connection.peer.id] = connection
+            self._queue.put(connection, (connection, True))
+        return ""
+
+    def _no_place(self, who: str) -> str:
+        """Return why there is no place for one more connection of this identity.
+
+        Without keys only their total counts.
+        """
+        if self._ring is None:
+            full = len(self._connections) >= MAX_CLIENTS
+            return f"fabric:{self._name} has {MAX_CLIENTS} connections already, and takes no more" if full else ""
+        known = {entry.name: entry.identity for entry in self._ring.roster.entries}
+
+        def may_fly(name: str) -> bool:
+            return name in known and known[name].may_fly(self._name)
+
+        return no_place_reason(who, may_fly(who), [(each.who, may_fly(each.who)) for each in self.connections])
+
+    def _turn_away(self, reason: str) -> None:
+        self.turned_away += 1
+        self._away = reason
+
+    # --- from time to time, on the thread that calls the handler ---
+
+    def check(self, handler: ServerHandler) -> None:
+        """End connections that must not go on; call it from time to time on the thread that calls the handler.
+
+        Those are connections whose application was let in and never showed its token, takes nothing of what is sent to
+        it, or has no right to be here any more. The handler is told of commands from nobody that is connected, and of
+        connections that were turned away.
+
+        Args:
+            handler: Its ``refused`` is called; what it raises is passed on.
+        """
+        self._check_keys()
+        commands, self._stray_commands = self._stray_commands, 0
+        if commands:
+            handler.refused(NOBODY, f"{commands} commands or orders came from nobody that is connected")
+        away, self._away = self._away, ""
+        if away:
+            handler.refused(NOBODY, away)
+        now = time.monotonic()
+        for connection in self.connections:
+            if not connection.confirmed and now - connection.joined_s > CONFIRM_S:
+                self._shut_out(connection, "no token of it was seen")
+            elif connection.stalled_s(now) > STALLED_S:
+                self.drop(connection, f"it took nothing of what was sent to it for {STALLED_S:g} s")
+
+    def _check_keys(self) -> None:
+        """End the connections whose keys were shut out or have expired.
+
+        If there were any, a new key is made for what is published from now on, which they can't read.
+        """
+        ring, keys = self._ring, self._topic_keys
+        if ring is None or keys is None:
+            return
+        ring.refresh()
+        now = datetime.now(UTC)
+        gone = False
+        for connection in self.connections:
+            who, expires = connection.admission.identity, connection.admission.expires
+            if who is not None and not ring.admits(who):
+                self._shut_out(connection, _SHUT_OUT)
+            elif expires is not None and now >= expires:
+                self._shut_out(connection, "its key has expired")
+            else:
+                continue
+            gone = True
+        if gone or not ring.shut_out <= self._shut:
+            self._shut = ring.shut_out
+            with self._lock:
+                keys.renew()
+                staying = self.connections
+            for connection in staying:
+                self._send_topic_key(connection, keys.newest)
+
+    def _send_topic_key(self, connection: ServerConnection, newest: Seal) -> None:
+        if connection.admission.generation < newest.generation:
+            self.send(connection, packets.key(newest.generation, newest.key))
+
+    # --- sending to one, and the ends of connections: any thread ---
+
+    def send(self, connection: ServerConnection, packet: bytes) -> bool:
+        """Send a packet that has to arrive. Any thread.
+
+        Returns:
+            False if the connection has ended, or ends now because too much waits for it already.
+        """
+        if connection.ended:
+            return False
+        problem = connection.queue(packet)
+        if problem:
+            self.drop(connection, problem)
+            return False
+        self._sender.wake(connection)
+        return True
+
+    def send_own(self, connection: ServerConnection, packet: bytes) -> None:
+        """Send one of the transport's own packets that may be lost; others are sent with :meth:`send`. Any thread."""
+        connection.queue_own(packet)
+        self._sender.wake(connection)
+
+    def drop(self, connection: ServerConnection, reason: str) -> None:
+        """Disconnect an application that does not take what is sent to it, and count it."""
+        self.dropped += connection.id in self._connections
+        self.disconnect(connection, reason)
+
+    def disconnect(self, connection: ServerConnection, reason: str, *, forget: bool = True) -> None:
+        """Disconnect an application; packets from it that were not handled yet are dropped. Any thread.
+
+        Args:
+            connection: The application's.
+            reason: Why, for the application.
+            forget: Whether to remove the connection at once; else it is removed when the application answers, or when
+                its token is gone.
+        """
+        self._hang_up(connection, reason)
+        connection.ended = True
+        if forget:
+            self.end(connection, reason)
+
+    def end(self, connection: ServerConnection, reason: str) -> None:
+        """Remove a connection; the handler is told after the connection's last packet. Any thread."""
+        with self._lock:
+            if self._connections.pop(connection.id, None) is None:
+                return
+            self._peers.pop(connection.peer.id, None)
+            connection.reason = connection.reason or reason
+            self._publisher.leave(connection)
+            self._queue.put(connection, (connection, False))
+        with self._left:
+            self._left.notify_all()
+
+    def _shut_out(self, connection: ServerConnection, reason: str) -> None:
+        """Disconnect an application, but let what it sent before be handled."""
+        self._hang_up(connection, reason)
+        self.end(connection, reason)
+
+    def _hang_up(self, connection: ServerConnection, reason: str) -> None:
+        if not connection.ended:
+            connection.reason = connection.reason or reason
+            self.send_own(connection, packets.bye(reason))

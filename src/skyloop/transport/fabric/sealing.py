@@ -1,0 +1,259 @@
+"""Packets sealed from end to end: nobody between a proxy and its applications can read, change or repeat them.
+
+The seal is ChaCha20-Poly1305 (RFC 8439), which also authenticates the key that a packet travels by and its attachment.
+Without keys nothing is sealed. ``docs/wire-format.md`` has the bytes.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import struct
+import threading
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Final, Protocol
+
+from skyloop.errors import DecodeError
+from skyloop.transport.base import MAX_PACKET
+from skyloop.transport.fabric import packets
+
+if TYPE_CHECKING:
+    import zenoh
+
+TAG: Final = 16  #: bytes by which a sealed payload is longer
+_TRAILER = struct.Struct("<IQ")  # generation and number: at the end of the attachment, and the nonce
+TRAILER: Final = _TRAILER.size
+KEY_BYTES: Final = 32
+#: How far behind the newest a packet may come: datagrams overtake what is sent again, 100 a second for 10 s.
+WIDTH: Final = 1024
+GENERATIONS: Final = 3  #: keys of topics that an application keeps: in force, on the way, and one in between
+#: A new key of topics is in use so long after it was sent: what is sealed with it should not be there before it is.
+SWITCH_S: Final = 0.5
+
+
+class Sealer(Protocol):
+    """Seals packets."""
+
+    def seal(self, where: str, attachment: bytes, data: bytes) -> tuple[bytes, bytes]:
+        """Seal a packet. Any thread.
+
+        Args:
+            where: The key that it will be sent by.
+            attachment: Sent beside it, authenticated but readable.
+            data: The packet.
+
+        Returns:
+            The payload and the attachment to send.
+        """
+
+
+class Opener(Protocol):
+    """Opens sealed packets."""
+
+    tag: int  #: bytes by which a payload is longer than the data
+    trailer: int  #: bytes by which an attachment is longer than it was
+
+    def open(self, where: str, attachment: bytes, payload: bytes) -> tuple[bytes, bytes] | None:
+        """Open what came. Any thread.
+
+        Args:
+            where: The key by which it came.
+            attachment: As it came.
+            payload: As it came.
+
+        Returns:
+            The packet and its attachment; None if it came before, or can't be opened yet.
+
+        Raises:
+            DecodeError: The other end did not send this.
+        """
+
+    def use(self, key: bytes, generation: int = 0) -> Opener:
+        """Open what is sealed with this key, too, and forget the oldest of more than :data:`GENERATIONS` keys.
+
+        Args:
+            key: :data:`KEY_BYTES` bytes.
+            generation: The key's number, which grows.
+
+        Returns:
+            This object.
+        """
+
+
+class Plain:
+    """The sealer and opener without keys, which change nothing."""
+
+    tag = trailer = 0
+
+    def seal(self, where: str, attachment: bytes, data: bytes) -> tuple[bytes, bytes]:  # noqa: ARG002
+        return data, attachment
+
+    def open(self, where: str, attachment: bytes, payload: bytes) -> tuple[bytes, bytes] | None:  # noqa: ARG002
+        return payload, attachment
+
+    def use(self, key: bytes, generation: int = 0) -> Plain:  # noqa: ARG002
+        return self
+
+
+PLAIN: Final = Plain()
+
+
+class Seal:
+    """Seals with one key, and uses no number twice.
+
+    Args:
+        key: :data:`KEY_BYTES` bytes.
+        generation: The key's number.
+    """
+
+    def __init__(self, key: bytes, generation: int = 0) -> None:
+        self.key = key
+        self.generation = generation
+        self._cipher = _cipher(key)
+        self._numbers = itertools.count(1)
+
+    def seal(self, where: str, attachment: bytes, data: bytes) -> tuple[bytes, bytes]:
+        trailer = _TRAILER.pack(self.generation, next(self._numbers))
+        attachment += trailer
+        return self._cipher.encrypt(trailer, data, _bound(where, attachment)), attachment
+
+
+class Open:
+    """Opens what the other end's :class:`Seal` has sealed, once each."""
+
+    tag = TAG
+    trailer = TRAILER
+
+    def __init__(self) -> None:
+        self._ciphers: dict[int, Cipher] = {}
+        self._windows: dict[tuple[str, int], ReplayWindow] = {}  # only of keys by which something true has come
+
+    def use(self, key: bytes, generation: int = 0) -> Open:
+        self._ciphers = dict(sorted([*self._ciphers.items(), (generation, _cipher(key))])[-GENERATIONS:])
+        self._windows = {at: window for at, window in self._windows.items() if at[1] in self._ciphers}
+        return self
+
+    def open(self, where: str, attachment: bytes, payload: bytes) -> tuple[bytes, bytes] | None:
+        trailer = attachment[-TRAILER:]
+        if len(trailer) < TRAILER:
+            raise DecodeError("it is not sealed")
+        generation, number = _TRAILER.unpack(trailer)
+        cipher = self._ciphers.get(generation)
+        if cipher is None:
+            if generation > max(self._ciphers, default=0):
+                return None  # the key is still on the way
+            raise DecodeError(f"it is sealed with a key that is not in use any more, of generation {generation}")
+        try:
+            data = cipher.decrypt(trailer, payload, _bound(where, attachment))
+        except (_forged(), ValueError):
+            raise DecodeError("it was not sealed by the other end, or was changed on the way") from None
+        window = self._windows.get((where, generation))
+        if window is None:
+            window = self._windows.setdefault((where, generation), ReplayWindow())
+        return (data, attachment[:-TRAILER]) if window.is_new(number) else None
+
+
+def contents(opener: Opener, sample: zenoh.Sample) -> tuple[bytes, bytes] | None:
+    """Open a sample as :meth:`Opener.open` does, without copying what is too large.
+
+    Args:
+        opener: Opens it.
+        sample: What Zenoh received.
+
+    Returns:
+        The packet and the attachment; None if it came before, or can't be opened yet.
+
+    Raises:
+        DecodeError: The other end did not send this, or it is empty or too large.
+    """
+    payload, attachment = packets.contents(sample, MAX_PACKET + opener.tag)
+    opened = opener.open(str(sample.key_expr), attachment, payload)
+    if opened is not None and not 0 < len(opened[0]) <= MAX_PACKET:
+        raise DecodeError(f"a packet of {len(opened[0])} bytes")
+    return opened
+
+
+class ReplayWindow:
+    """The numbers that have come, as in IPsec (RFC 4303).
+
+    Each number is new once, and one that is :data:`WIDTH` or more behind the newest never is. Thread-safe.
+    """
+
+    def __init__(self) -> None:
+        self._newest = 0
+        self._seen = 0  # a bit for each number from the newest one down
+        self._lock = threading.Lock()
+
+    def is_new(self, number: int) -> bool:
+        """Return whether a number is new, and remember it."""
+        with self._lock:
+            ahead = number - self._newest
+            if ahead > 0:
+                self._seen = (self._seen << ahead | 1) & _MASK if ahead < WIDTH else 1
+                self._newest = number
+                return True
+            if -ahead >= WIDTH or self._seen >> -ahead & 1:
+                return False
+            self._seen |= 1 << -ahead
+            return True
+
+
+class TopicSeal:
+    """Seals what all applications of a proxy may read, with a key that changes when one of them is shut out.
+
+    Args:
+        clock: The monotonic clock [s].
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self.newest = Seal(os.urandom(KEY_BYTES), 1)
+        self._in_use = self.newest
+        self._since = 0.0
+
+    def renew(self) -> None:
+        """Make a new key, :attr:`newest`, to be sent to all who stay; it is in use after :data:`SWITCH_S`.
+
+        A switch that is pending is not put off by another one: who was shut out first would read on meanwhile. Those
+        who stay may then miss what is published until the newer key is there.
+        """
+        if self._in_use is self.newest:
+            self._since = self._clock() + SWITCH_S
+        self.newest = Seal(os.urandom(KEY_BYTES), self.newest.generation + 1)
+
+    def seal(self, where: str, attachment: bytes, data: bytes) -> tuple[bytes, bytes]:
+        """Seal with the key in use; see :meth:`Sealer.seal`."""
+        if self._in_use is not self.newest and self._clock() >= self._since:
+            self._in_use = self.newest
+        return self._in_use.seal(where, attachment, data)
+
+
+class Cipher(Protocol):
+    """An authenticated cipher, as the package cryptography has them."""
+
+    def encrypt(self, nonce: bytes, data: bytes, associated_data: bytes | None) -> bytes: ...
+    def decrypt(self, nonce: bytes, data: bytes, associated_data: bytes | None) -> bytes: ...
+
+
+def _cipher(key: bytes) -> Cipher:
+    from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305  # with keys only
+
+    return ChaCha20Poly1305(key)
+
+
+def _forged() -> type[Exception]:
+    from cryptography.exceptions import InvalidTag
+
+    return InvalidTag
+
+
+def _bound(where: str, attachment: bytes) -> bytes:
+    """Return what is authenticated beside the data.
+
+    No key holds a zero byte, so nothing can be moved between the two parts.
+    """
+    return where.encode() + b"\0" + attachment
+
+
+_MASK: Final = (1 << WIDTH) - 1

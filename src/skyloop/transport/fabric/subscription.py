@@ -1,0 +1,136 @@
+"""One topic that an application subscribed to: its packets or frames that wait for the handler."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from skyloop.errors import DecodeError
+from skyloop.messages import FrameHeader
+from skyloop.transport.base import ClientHandler, video
+from skyloop.transport.fabric import layout, packets
+from skyloop.transport.fabric.delivery import DEPTH, AckPolicy, RecentPackets
+from skyloop.transport.fabric.frames import WINDOW
+from skyloop.transport.fabric.sealing import Opener, contents
+from skyloop.transport.fabric.session import Session
+
+if TYPE_CHECKING:
+    import zenoh
+
+_VIDEO: Final = video("")
+
+
+class Subscription:
+    """Sorts what comes of a topic on Zenoh's threads, and delivers it on the receiving thread.
+
+    Args:
+        topic: Of packets, or of a camera's frames in one form.
+        run: Of the proxy: what others publish under its name is left out.
+        opener: Opens what the proxy publishes.
+        enqueue: Called with this subscription, a packet (empty: a frame is due) and its number, which are to be given
+            back to :meth:`deliver` in order.
+        reject: Called with the reason for what the proxy did not publish.
+    """
+
+    def __init__(
+        self,
+        topic: str,
+        run: bytes,
+        opener: Opener,
+        enqueue: Callable[[Subscription, bytes, int], object],
+        reject: Callable[[DecodeError], None],
+    ) -> None:
+        self._topic = topic
+        self._run = run
+        self._opener = opener
+        self._enqueue = enqueue
+        self._reject = reject
+        self._ack_policy = AckPolicy()
+        self._recent = RecentPackets()
+        self._waiting = 0  # packets
+        self._frames: deque[tuple[int, FrameHeader, bytes]] = deque()
+        self._newest = 0  # number of the newest frame that came
+        self._ended = False
+
+    def declare(self, session: Session, name: str, connection: str) -> list[Any]:
+        """Subscribe on a Zenoh session.
+
+        Args:
+            session: The session.
+            name: The proxy's name.
+            connection: This connection's id.
+
+        Returns:
+            What was declared; the caller undeclares it.
+        """
+        z, call, topic = session.zenoh, session.callback, self._topic
+        if not topic.startswith(_VIDEO):
+            return [z.declare_subscriber(layout.topic(name, topic), call(self._on_packet))]
+        camera, _, form = topic.removeprefix(_VIDEO).partition("?")
+        keys = (layout.video(name, camera, form), layout.video_for(name, camera, form, connection))
+        return [z.declare_subscriber(key, call(self._on_frame)) for key in keys]
+
+    def end(self) -> None:
+        """Deliver no more frames, also of those that wait."""
+        self._ended = True
+
+    def deliver(self, handler: ClientHandler, packet: bytes, number: int) -> bytes:
+        """Deliver the next item to the handler.
+
+        Args:
+            handler: The application's.
+            packet: As it was given to ``enqueue``.
+            number: As it was given to ``enqueue``.
+
+        Returns:
+            The packet by which to acknowledge it to the proxy; empty for none.
+        """
+        if packet:
+            self._waiting -= 1
+            handler.packet(packet)
+            return packets.taken(self._topic, number) if self._ack_policy.count(number, 0) else b""
+        number, header, data = self._frames.popleft()
+        if self._ended:
+            return b""
+        handler.frame(header, np.frombuffer(data, np.uint8), self._topic)
+        return packets.seen(self._topic, number)
+
+    # --- what Zenoh calls, on its own threads ---
+
+    def _on_packet(self, sample: zenoh.Sample) -> None:
+        try:
+            opened = contents(self._opener, sample)
+            if opened is None:
+                return
+            packet = opened[0]
+            run, number = packets.parse_published(opened[1])
+        except DecodeError as error:
+            self._reject(error)
+            return
+        if run == self._run and self._waiting < DEPTH and self._recent.is_new(number, packet):
+            self._waiting += 1
+            self._enqueue(self, packet, number)
+
+    def _on_frame(self, sample: zenoh.Sample) -> None:
+        """Queue a frame; the newest takes the place of those that wait."""
+        opener = self._opener
+        try:
+            attachment = packets.copied(sample.attachment, packets.MAX_OWN)
+            run, number, header = packets.parse_frame(attachment[: len(attachment) - opener.trailer])
+            if run != self._run or number <= self._newest or len(sample.payload) != header.size + opener.tag:
+                return
+            opened = opener.open(str(sample.key_expr), attachment, bytes(sample.payload))
+            if opened is None:
+                return
+        except DecodeError as error:
+            self._reject(error)
+            return
+        self._newest = number
+        if len(self._frames) >= WINDOW:
+            self._frames[-1] = (number, header, opened[0])
+        else:
+            self._frames.append((number, header, opened[0]))
+            self._enqueue(self, b"", number)

@@ -1,0 +1,96 @@
+"""Frames in the form that a request for video asks for; pure functions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+from skyloop.errors import LinkError, MissingExtraError
+from skyloop.messages import Encoding, FrameHeader, Intrinsics
+from skyloop.messages.video import VideoRequest
+from skyloop.transport.base import Pixels
+
+_CHANNELS = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
+
+
+def encode_frame(header: FrameHeader, pixels: Pixels, request: VideoRequest) -> tuple[FrameHeader, bytes]:
+    """Encode a frame as it was asked for.
+
+    A frame that is JPEG already is returned as it is, whatever was asked for.
+
+    Args:
+        header: The frame's header.
+        pixels: ``header.size`` bytes, dtype uint8.
+        request: Scale, encoding and quality to send it in.
+
+    Returns:
+        The header that describes the result, and its bytes.
+
+    Raises:
+        MissingExtraError: OpenCV is needed and not installed.
+        LinkError: OpenCV could not make a JPEG of it.
+    """
+    channels = _CHANNELS.get(header.encoding)
+    if channels is None or (request.encoding == "raw" and request.scale == 1.0):
+        return header, pixels.tobytes()
+    picture: Any = pixels.reshape(header.height, header.width, channels)
+    if request.scale != 1.0:
+        header = scaled_header(header, request.scale)
+        picture = resized(picture, header)
+    if request.encoding == "raw":
+        return header, picture.tobytes()
+    cv2 = _opencv()
+    if header.encoding is Encoding.RGB8:
+        picture = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
+    done, jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, request.quality])
+    if not done:
+        raise LinkError(f"frame {header.seq} of {header.camera} could not be made a JPEG")
+    return msgspec.structs.replace(header, encoding=Encoding.JPEG, size=int(jpeg.size)), jpeg.tobytes()
+
+
+def scaled_header(header: FrameHeader, scale: float) -> FrameHeader:
+    """Return the header of a frame that is made smaller, with intrinsics that fit.
+
+    Args:
+        header: The frame's header.
+        scale: The factor for width and height [1].
+
+    Returns:
+        The header; ``size`` is that of plain pixels.
+    """
+    width, height = max(1, round(header.width * scale)), max(1, round(header.height * scale))
+    x, y = width / header.width, height / header.height
+    lens = header.intrinsics
+    if lens is not None:
+        # The centre of the first pixel is at (0, 0), so its corner at (-0.5, -0.5) is what stays in place.
+        lens = Intrinsics(
+            lens.fx * x, lens.fy * y, (lens.cx + 0.5) * x - 0.5, (lens.cy + 0.5) * y - 0.5, lens.distortion, lens.model
+        )
+    size = width * height * _CHANNELS.get(header.encoding, 3)
+    return msgspec.structs.replace(header, width=width, height=height, size=size, intrinsics=lens)
+
+
+def resized(picture: Any, header: FrameHeader) -> Any:
+    """Resize a picture by averaging areas.
+
+    Args:
+        picture: Shape (height, width, channels), dtype uint8.
+        header: Gives the new width and height [pixels].
+
+    Returns:
+        The picture in the new size, shape (height, width, channels).
+
+    Raises:
+        MissingExtraError: OpenCV is not installed.
+    """
+    size = (header.width, header.height)
+    return _opencv().resize(picture, size, interpolation=_opencv().INTER_AREA).reshape(header.height, header.width, -1)
+
+
+def _opencv() -> Any:
+    try:
+        import cv2
+    except ImportError as error:
+        raise MissingExtraError("smaller or encoded video", "network", cause=str(error)) from None
+    return cv2

@@ -1,0 +1,60 @@
+"""Ten simulated drones, each flown by its own controller, all from this process."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from benchmarks.swarm_flight import SwarmFlight, fly, missed, report
+from skyloop.client.statistics import Distribution
+from tests.processes.conftest import Process
+
+DRONES = 10
+
+
+@pytest.fixture
+def drones(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Ten of them in one world, with small pictures."""
+    options = ("cameras=front", "width=64", "fps=5", "truth=0")
+    arguments = [word for option in options for word in ("--option", option)]
+    with tempfile.TemporaryDirectory(prefix="skyloop-") as folder:
+        monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", str(Path(folder) / "run"))
+        process = Process(
+            "-m", "skyloop", "sim", "--drones", str(DRONES), "--name", "drone", "--world", "empty", *arguments
+        )
+        try:
+            process.until(f"ready drone{DRONES}", 60.0)
+            yield
+        finally:
+            process.end()
+
+
+@pytest.mark.process
+def test_ten_drones_with_a_controller_each_from_one_process(drones: None) -> None:
+    flights = fly("drone*", seconds=3.0, land_after_s=1.0)
+    assert {flight.name for flight in flights} == {f"drone{number}" for number in range(1, DRONES + 1)}
+    for flight in flights:
+        assert flight.commands > 0
+        assert flight.command is not None
+        assert 0.0 < flight.command.median <= flight.command.maximum
+        assert flight.feedback is not None
+        assert flight.frames > 0
+    assert missed(flights) == []
+
+
+def test_the_table_and_who_missed_it() -> None:
+    delays = Distribution(0.001, 0.002, 0.003, 0.001, 9)
+    good = SwarmFlight("a", 9, delays, delays, 5, 0, 0, 0.02, True)
+    flights = [
+        good,
+        SwarmFlight("b", 0, None, None, 0, 2, 1, None, False),
+        SwarmFlight("c", 9, delays, None, 0, 0, 0, 0.1, False),
+    ]
+    assert missed(flights) == ["b", "c"]
+    table = report(flights)
+    assert len({len(row) for row in table}) == 1
+    assert table[1] == ["a", "9", "1.00", "2.00", "3.00", "1.00", "2.00", "5", "0", "0", "20", "yes"]
+    assert table[2] == ["b", "0", "", "", "", "", "", "0", "2", "1", "missed", "no"]

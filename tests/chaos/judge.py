@@ -1,0 +1,193 @@
+"""From the journals of a lane to what became of its promises. Pure.
+
+Times are of one host's monotonic clock. A *disruption* is a fault that takes pilot or proxy away, so that a failsafe is
+what is wanted; any other fault must leave the flight as it is.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+from tests.chaos.journal import Entry
+from tests.chaos.vehicle import NUMBERS
+
+HOVER_AFTER_S: Final = 0.5  #: the proxy's defaults: failsafe.hover_after_s …
+LAND_AFTER_S: Final = 5.0  #: … failsafe.land_after_s …
+MAX_AGE_S: Final = 0.25  #: … and command.max_age_s
+STALL_S: Final = 1.0  #: how long the library repeats a set-point without a call
+#: Between the moment that counts and the line in the journal lie the scheduler and, on a loaded machine, its queue.
+SLACK_S: Final = 0.05
+#: A failsafe that is later than this was missed.
+LATE_S: Final = 1.0
+DISRUPTIONS: Final = frozenset({"pilot_stop", "pilot_kill", "proxy_stop", "proxy_kill"})
+_PILOT: Final = frozenset({"pilot_stop", "pilot_kill"})
+_AIRBORNE: Final = frozenset({"state:taking_off", "state:hovering", "state:flying"})
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """What was done to a lane, from when until when [ns]."""
+
+    kind: str
+    begin_ns: int
+    end_ns: int
+
+
+@dataclass(slots=True)
+class Verdict:
+    """What one lane showed. Times in s."""
+
+    calls: int = 0
+    applied: int = 0
+    stale: list[str] = field(default_factory=list)
+    needless: list[str] = field(default_factory=list)
+    missed: list[str] = field(default_factory=list)
+    unrecovered: list[str] = field(default_factory=list)
+    justified: int = 0  #: failsafes that somebody's silence or death asked for
+    hover_late_s: list[float] = field(default_factory=list)  #: after ``failsafe.hover_after_s``; negative: before
+    recovery_s: dict[str, list[float]] = field(default_factory=dict)
+    delay_s: list[float] = field(default_factory=list)  #: from the call to the vehicle
+
+
+def faults_of(entries: Iterable[Entry]) -> list[Fault]:
+    """The faults that were begun and ended, from ``begin:KIND`` and ``end:KIND``; they do not overlap in a lane."""
+    faults, begun = [], {}
+    for entry in entries:
+        verb, _, kind = entry.what.partition(":")
+        if verb == "begin":
+            begun[kind] = entry.at_ns
+        elif verb == "end" and kind in begun:
+            faults.append(Fault(kind, begun.pop(kind), entry.at_ns))
+    return faults
+
+
+def judge(pilot: Sequence[Entry], vehicle: Sequence[Entry], faults: Sequence[Fault]) -> Verdict:
+    """What became of the promises of one lane, from its sorted journals."""
+    verdict = Verdict(calls=sum(entry.what == "call" for entry in pilot))
+    calls = _Calls(pilot)
+    failsafes = [entry.at_ns for entry in vehicle if entry.what.startswith("failsafe:")]
+    _judge_ages(verdict, calls, vehicle, failsafes)
+    disruptions = [fault for fault in faults if fault.kind in DISRUPTIONS]
+    windows = _judge_recoveries(verdict, calls, vehicle, disruptions)
+    windows += [(entry.at_ns, entry.at_ns + _ns(1.0)) for entry in vehicle if entry.what == "open"]
+    _judge_needless(verdict, calls, vehicle, windows, faults)
+    _judge_missed(verdict, vehicle, disruptions)
+    return verdict
+
+
+class _Calls:
+    """When the pilot's calls began and ended."""
+
+    def __init__(self, pilot: Sequence[Entry]) -> None:
+        self.begins = [entry.at_ns for entry in pilot if entry.what == "call"]
+        self._by_number: dict[int, list[tuple[int, int]]] = {}
+        ends = {entry.number: entry.at_ns for entry in pilot if entry.what == "called"}
+        for entry in pilot:
+            if entry.what == "call":
+                times = entry.at_ns, ends.get(entry.number, entry.at_ns)
+                self._by_number.setdefault(entry.number % NUMBERS, []).append(times)
+
+    def of(self, number: int, at_ns: int) -> tuple[int, int] | None:
+        """Beginning and end of the newest call with this number that began before this time."""
+        known = [times for times in self._by_number.get(number, []) if times[0] <= at_ns]
+        return known[-1] if known else None
+
+
+def _judge_ages(verdict: Verdict, calls: _Calls, vehicle: Sequence[Entry], failsafes: Sequence[int]) -> None:
+    """Nothing old is executed: no set-point that nobody asked for lately, none from before a failsafe."""
+    for entry in vehicle:
+        if entry.what != "velocity":
+            continue
+        verdict.applied += 1
+        times = calls.of(entry.number, entry.at_ns)
+        if times is None:
+            verdict.stale.append(f"number {entry.number} was executed and never asked for")
+            continue
+        begin_ns, end_ns = times
+        verdict.delay_s.append((entry.at_ns - begin_ns) / 1e9)
+        age_s = (entry.at_ns - end_ns) / 1e9
+        if age_s > STALL_S + MAX_AGE_S + SLACK_S:
+            verdict.stale.append(f"number {entry.number} was executed {age_s:.3f} s after its call")
+        # A command under way when the failsafe came may still be executed, if it is young enough.
+        after = bisect_right(failsafes, end_ns + _ns(MAX_AGE_S + SLACK_S))
+        if after < len(failsafes) and failsafes[after] < entry.at_ns:
+            verdict.stale.append(f"number {entry.number} was executed after a failsafe that came after its call")
+
+
+def _judge_recoveries(
+    verdict: Verdict, calls: _Calls, vehicle: Sequence[Entry], disruptions: Sequence[Fault]
+) -> list[tuple[int, int]]:
+    """How soon each disruption was over, and the spans of time in which a failsafe is what is wanted."""
+    windows = []
+    velocities = [entry for entry in vehicle if entry.what == "velocity"]
+    times = [entry.at_ns for entry in velocities]
+    for fault in disruptions:
+        flown_ns = None
+        for entry in velocities[bisect_left(times, fault.end_ns) :]:
+            asked = calls.of(entry.number, entry.at_ns)
+            if asked is not None and asked[1] >= fault.end_ns:
+                flown_ns = entry.at_ns
+                break
+        if flown_ns is None:
+            verdict.unrecovered.append(f"{fault.kind} at {fault.begin_ns / 1e9:.1f} s")
+            windows.append((fault.begin_ns, fault.end_ns + _ns(60.0)))
+        else:
+            verdict.recovery_s.setdefault(fault.kind, []).append((flown_ns - fault.end_ns) / 1e9)
+            windows.append((fault.begin_ns, flown_ns + _ns(HOVER_AFTER_S)))
+    return windows
+
+
+def _judge_needless(
+    verdict: Verdict,
+    calls: _Calls,
+    vehicle: Sequence[Entry],
+    windows: Sequence[tuple[int, int]],
+    faults: Sequence[Fault],
+) -> None:
+    for entry in vehicle:
+        if not entry.what.startswith("failsafe:"):
+            continue
+        last = bisect_right(calls.begins, entry.at_ns)
+        silent_s = (entry.at_ns - calls.begins[last - 1]) / 1e9 if last else float("inf")
+        if silent_s >= HOVER_AFTER_S - SLACK_S or any(begin <= entry.at_ns <= end for begin, end in windows):
+            verdict.justified += 1
+        else:
+            before = [fault for fault in faults if fault.begin_ns <= entry.at_ns]
+            when = f"{(entry.at_ns - before[-1].begin_ns) / 1e9:.3f} s after {before[-1].kind} began" if before else ""
+            verdict.needless.append(f"{entry.what} {silent_s:.3f} s after a call, {when or 'before any fault'}")
+
+
+def _judge_missed(verdict: Verdict, vehicle: Sequence[Entry], disruptions: Sequence[Fault]) -> None:
+    """A pilot that is stopped or killed is followed by hover, then by landing, while the proxy runs."""
+    states = [entry for entry in vehicle if entry.what.startswith("state:")]
+    times = [entry.at_ns for entry in states]
+
+    def airborne(at_ns: int) -> bool:
+        place = bisect_right(times, at_ns)
+        return place > 0 and states[place - 1].what in _AIRBORNE
+
+    absences = [fault for fault in disruptions if fault.kind not in _PILOT]
+    for fault in disruptions:
+        if fault.kind not in _PILOT:
+            continue
+        for step, after_s in (("hover", HOVER_AFTER_S), ("land", LAND_AFTER_S)):
+            limit_ns = fault.begin_ns + _ns(after_s + LATE_S)
+            proxy_away = any(other.begin_ns < limit_ns and other.end_ns > fault.begin_ns for other in absences)
+            if fault.end_ns < limit_ns or proxy_away or not airborne(fault.begin_ns + _ns(after_s) // 2):
+                continue
+            came = [
+                entry.at_ns
+                for entry in vehicle
+                if entry.what == f"failsafe:{step}" and fault.begin_ns - _ns(SLACK_S) <= entry.at_ns <= limit_ns
+            ]
+            if not came:
+                verdict.missed.append(f"{step} after {fault.kind} at {fault.begin_ns / 1e9:.3f} s")
+            elif step == "hover":
+                verdict.hover_late_s.append((came[0] - fault.begin_ns) / 1e9 - HOVER_AFTER_S)
+
+
+def _ns(span_s: float) -> int:
+    return round(span_s * 1e9)

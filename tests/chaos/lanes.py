@@ -1,0 +1,339 @@
+"""A lane: one vehicle's proxy and pilot as processes, and what can be done to them."""
+
+from __future__ import annotations
+
+import os
+import random
+import select
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from skyloop.clock import monotonic_ns
+from tests.chaos.journal import Entry, Journal, read
+from tests.chaos.judge import Verdict, faults_of, judge
+
+STARTS_WITHIN_S: Final = 60.0
+RECOVERS_WITHIN_S: Final = 20.0
+TIME_NAMESPACE_S: Final = 5000
+
+
+class Process:
+    """A child that is ended by its own number."""
+
+    def __init__(self, *command: str, log: Path, environment: dict[str, str]) -> None:
+        with log.open("ab") as errors:
+            self._popen = subprocess.Popen(
+                command,
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                env={**os.environ, **environment},
+                start_new_session=True,
+            )
+
+    @property
+    def pid(self) -> int:
+        """Its number."""
+        return self._popen.pid
+
+    @property
+    def alive(self) -> bool:
+        """Whether it runs, or is stopped."""
+        return self._popen.poll() is None
+
+    def until(self, word: str) -> None:
+        """Wait for a word at its standard output. Raises ``RuntimeError`` if it does not come."""
+        stream = self._popen.stdout
+        assert stream is not None
+        said, deadline = b"", time.monotonic() + STARTS_WITHIN_S
+        while word.encode() not in said:
+            ready, _, _ = select.select([stream], [], [], max(0.0, deadline - time.monotonic()))
+            more = os.read(stream.fileno(), 4096) if ready else b""
+            if not more:
+                raise RuntimeError(f"{self._popen.args!r} did not say {word!r} but {said.decode()!r}")
+            said += more
+
+    def signal(self, number: signal.Signals) -> None:
+        """Send it a signal."""
+        os.kill(self.pid, number)
+
+    def kill(self) -> None:
+        """End it and what it started, and wait."""
+        with suppress(ProcessLookupError):
+            os.killpg(self.pid, signal.SIGKILL)
+        self._popen.wait(10)
+        if self._popen.stdout is not None:
+            self._popen.stdout.close()
+
+
+@dataclass(frozen=True, slots=True)
+class Resources:
+    """What a proxy holds."""
+
+    descriptors: int
+    threads: int
+    memory_mb: float
+
+    @classmethod
+    def of(cls, pid: int) -> Resources:
+        """As the kernel counts."""
+        status = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
+        descriptors = len(list(Path(f"/proc/{pid}/fd").iterdir()))
+        return cls(descriptors, int(status["Threads"]), int(status["VmRSS"].split()[0]) / 1024)
+
+
+class Lane:
+    """One vehicle with its pilot. ``network``: an address at which they meet, else on this host."""
+
+    def __init__(self, name: str, folder: Path, *, network: str | None = None) -> None:
+        self.name = name
+        self.network = network
+        self.folder = folder
+        self.disk = folder / "disk"
+        self.faults = Journal(folder / f"{name}.faults")
+        self._pilots_rooms = folder / ("elsewhere" if network else "run")  # where the proxy's socket can't be found
+        self.proxy = self._start_proxy()
+        self.pilot = self._start_pilot()
+        self.baseline: Resources | None = None
+
+    @property
+    def socket(self) -> Path:
+        """The proxy's, on this host."""
+        return self.folder / "run" / f"{self.name}.sock"
+
+    def settled(self) -> None:
+        """Note what the proxy holds while nothing happens."""
+        self.baseline = Resources.of(self.proxy.pid)
+
+    def run(self, module: str, *arguments: str, prefix: Sequence[str] = (), remote: bool = False) -> Process:
+        """A program of this package beside the lane."""
+        rooms = self._pilots_rooms if remote else self.folder / "run"
+        return Process(
+            *prefix,
+            sys.executable,
+            "-m",
+            f"tests.chaos.{module}",
+            *arguments,
+            log=self.folder / f"{self.name}.log",
+            environment={"SKYLOOP_RUNTIME_DIR": str(rooms), "XDG_STATE_HOME": str(self.disk / "state")},
+        )
+
+    def restart_proxy(self) -> None:
+        """A new one, once the one before is dead; returns when it serves."""
+        self.proxy = self._start_proxy()
+        self.proxy.until("ready")
+
+    def restart_pilot(self) -> None:
+        """A new one, once the one before is dead."""
+        self.pilot = self._start_pilot()
+
+    def flown_since(self, since_ns: int) -> bool:
+        """Whether the vehicle executed a set-point after this time."""
+        return any(entry.what == "velocity" and entry.at_ns > since_ns for entry in _tail(self._vehicle_path))
+
+    def verdict(self) -> Verdict:
+        """What its journals tell."""
+        vehicle = read(self._vehicle_path)  # first, so that each call that it executed is in the pilot's
+        faults = faults_of(read(self.folder / f"{self.name}.faults"))
+        return judge(read(self.folder / f"{self.name}.pilot"), vehicle, faults)
+
+    def close(self) -> None:
+        """End its processes."""
+        for process in (self.pilot, self.proxy):
+            process.kill()
+        self.faults.close()
+
+    @property
+    def _vehicle_path(self) -> Path:
+        return self.folder / f"{self.name}.vehicle"
+
+    def _start_proxy(self) -> Process:
+        return self.run("vehicle", self.name, str(self.folder), *([self.network] if self.network else []))
+
+    def _start_pilot(self) -> Process:
+        arguments = [self.network] if self.network else []
+        return self.run("pilot", self.name, str(self.folder), *arguments, remote=True)
+
+
+Fault = Callable[[Lane, random.Random, threading.Event], None]
+
+
+def pilot_stop(lane: Lane, source: random.Random, ending: threading.Event) -> None:
+    """The pilot is stopped, and goes on."""
+    with _stopped(lane.pilot):
+        ending.wait(source.choice((0.2, 0.7, 2.5, 7.0)))
+
+
+def pilot_kill(lane: Lane, source: random.Random, ending: threading.Event) -> None:
+    """The pilot dies, and another one comes."""
+    lane.pilot.kill()
+    ending.wait(source.choice((0.1, 1.0, 7.0)))
+    lane.restart_pilot()
+
+
+def proxy_stop(lane: Lane, source: random.Random, ending: threading.Event) -> None:
+    """The proxy is stopped, and goes on."""
+    with _stopped(lane.proxy):
+        ending.wait(source.choice((0.2, 0.7, 3.0)))
+
+
+def proxy_kill(lane: Lane, source: random.Random, ending: threading.Event) -> None:
+    """The proxy dies, and another one takes its name."""
+    lane.proxy.kill()
+    ending.wait(source.choice((0.0, 1.0, 3.0)))
+    lane.restart_proxy()
+
+
+def observer_stop(lane: Lane, source: random.Random, ending: threading.Event) -> None:
+    """An observer of everything is stopped, and later killed."""
+    remote = lane.network is not None
+    where = [lane.network] if lane.network else []
+    with _running(lane.run("trouble", "observe", lane.name, *where, remote=remote)) as observer, _stopped(observer):
+        ending.wait(source.uniform(1.0, 5.0))
+
+
+def foreign_clock(lane: Lane, source: random.Random, ending: threading.Event) -> None:
+    """An observer whose clock began at another time."""
+    apart = ("unshare", "--time", "--fork", "--kill-child", "--monotonic", str(TIME_NAMESPACE_S))
+    remote = lane.network is not None
+    where = [lane.network] if lane.network else []
+    with _running(lane.run("trouble", "observe", lane.name, *where, prefix=apart, remote=remote)):
+        ending.wait(source.uniform(1.0, 4.0))
+
+
+def starvation(lane: Lane, source: random.Random, ending: threading.Event) -> None:
+    """As many programs compute as make each core serve three."""
+    with ExitStack() as stack:
+        for _ in range(2 * (os.cpu_count() or 1)):
+            stack.enter_context(_running(lane.run("trouble", "hog")))
+        ending.wait(source.uniform(2.0, 6.0))
+
+
+def silent_flood(lane: Lane, source: random.Random, ending: threading.Event) -> None:
+    """Connections that never say hello."""
+    with _running(lane.run("trouble", "silent", str(lane.socket))):
+        ending.wait(source.uniform(2.0, 5.0))
+
+
+def garbage_flood(lane: Lane, source: random.Random, ending: threading.Event) -> None:
+    """Connections that send what is no packet."""
+    with _running(lane.run("trouble", "garbage", str(lane.socket))):
+        ending.wait(source.uniform(2.0, 5.0))
+
+
+def request_flood(lane: Lane, source: random.Random, ending: threading.Event) -> None:
+    """Connections that ask for much and read nothing."""
+    with _running(lane.run("trouble", "requests", str(lane.socket))):
+        ending.wait(source.uniform(2.0, 5.0))
+
+
+def network_flood(lane: Lane, source: random.Random, ending: threading.Event) -> None:
+    """Observers on the network ask for much, and are stopped."""
+    assert lane.network is not None
+    greedy = lane.run("trouble", "network_requests", lane.name, lane.network, remote=True)
+    with _running(greedy), _stopped(greedy):
+        ending.wait(source.uniform(2.0, 6.0))
+
+
+def disk_full(lane: Lane, source: random.Random, ending: threading.Event) -> None:
+    """The disk fills up on which the flight is being recorded and audited."""
+    with _running(lane.run("trouble", "record", lane.name, str(lane.disk))):
+        with _running(lane.run("trouble", "fill", str(lane.disk))):
+            ending.wait(source.uniform(2.0, 5.0))
+        (lane.disk / "ballast").unlink(missing_ok=True)
+
+
+#: The first four are what the judge knows as disruptions.
+LOCAL: Final[tuple[Fault, ...]] = (
+    pilot_stop,
+    pilot_kill,
+    proxy_stop,
+    proxy_kill,
+    observer_stop,
+    starvation,
+    silent_flood,
+    garbage_flood,
+    request_flood,
+    disk_full,
+    foreign_clock,
+)
+NETWORK: Final[tuple[Fault, ...]] = (
+    pilot_stop,
+    pilot_kill,
+    proxy_stop,
+    proxy_kill,
+    observer_stop,
+    network_flood,
+    request_flood,
+    foreign_clock,
+)
+
+
+def torment(
+    lane: Lane,
+    faults: Sequence[Fault],
+    source: random.Random,
+    ending: threading.Event,
+    report: Callable[[str], None],
+) -> None:
+    """One fault after another, each kind as often as the others, until ``ending``; waits for recovery in between."""
+    while not ending.is_set():
+        for fault in source.sample(faults, len(faults)):
+            if ending.is_set():
+                return
+            kind = fault.__name__
+            lane.faults.write(f"begin:{kind}")
+            report(f"{lane.name}: {kind.replace('_', ' ')}")
+            try:
+                fault(lane, source, ending)
+            except (RuntimeError, OSError, AssertionError) as error:
+                report(f"{lane.name}: {kind} could not be done: {error}")
+                lane.faults.write(f"broken:{kind}")
+            lane.faults.write(f"end:{kind}")
+            _await_flight(lane, ending)
+            ending.wait(source.uniform(0.5, 2.0))
+
+
+def _await_flight(lane: Lane, ending: threading.Event) -> None:
+    """Until the vehicle is flown again; after a while without, the judge will find it so."""
+    over_ns = monotonic_ns()
+    deadline = time.monotonic() + RECOVERS_WITHIN_S
+    while time.monotonic() < deadline and not lane.flown_since(over_ns + 500_000_000):
+        if ending.wait(0.1):
+            return
+
+
+def _tail(path: Path) -> list[Entry]:
+    """The last entries of a journal that is being written."""
+    with path.open("rb") as file:
+        file.seek(0, os.SEEK_END)
+        file.seek(max(0, file.tell() - 2000))
+        lines = file.read().decode().splitlines()[1:]
+    whole = [line.split() for line in lines if len(line.split()) == 3]
+    return [Entry(int(at_ns), what, int(number)) for at_ns, what, number in whole]
+
+
+@contextmanager
+def _stopped(process: Process) -> Iterator[None]:
+    process.signal(signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        with suppress(ProcessLookupError):
+            process.signal(signal.SIGCONT)
+
+
+@contextmanager
+def _running(process: Process) -> Iterator[Process]:
+    try:
+        process.until("ready")
+        yield process
+    finally:
+        process.kill()

@@ -1,0 +1,117 @@
+"""Listeners: their own pace, their own errors."""
+
+from __future__ import annotations
+
+import logging
+import threading
+
+import pytest
+
+from skyloop.client.channels import Channel, Listener
+
+WAIT_S = 10.0
+
+
+class Bench:
+    def __init__(self) -> None:
+        self.changes: list[bool] = []
+        self.reports: list[tuple[str, str]] = []
+        self.channel: Channel[int] = Channel(self.changes.append)
+
+    def report(self, where: str, error: Exception) -> None:
+        self.reports.append((where, str(error)))
+
+    def listen(self, function: object, **options: object) -> Listener[int]:
+        return Listener(function, self.channel, self.report, name="mine", **options)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
+def test_a_slow_listener_gets_the_newest_and_a_quick_one_everything(bench: Bench) -> None:
+    entered, go_on, done = threading.Event(), threading.Event(), threading.Event()
+    slow_got: list[int] = []
+    quick_got: list[int] = []
+
+    def slow(number: int) -> None:
+        slow_got.append(number)
+        entered.set()
+        go_on.wait(WAIT_S)
+        if number == 9:
+            done.set()
+
+    with bench.listen(slow) as slow_listener, bench.listen(quick_got.append, inline=True) as quick_listener:
+        bench.channel.publish(0)
+        assert entered.wait(WAIT_S)
+        for number in range(1, 10):
+            bench.channel.publish(number)
+        go_on.set()
+        assert done.wait(WAIT_S)
+        assert (slow_listener.delivered, slow_listener.dropped) == (2, 8)
+        assert (quick_listener.delivered, quick_listener.dropped) == (10, 0)
+        assert bench.channel.dropped == 8
+    assert slow_got == [0, 9]
+    assert quick_got == list(range(10))
+    assert bench.channel.dropped == 8, "drops of listeners that are gone still count"
+
+
+def test_the_first_subscribes_and_the_last_unsubscribes(bench: Bench) -> None:
+    first = bench.listen(lambda _: None)
+    second = bench.listen(lambda _: None, inline=True)
+    first.cancel()
+    assert bench.changes == [True]
+    second.cancel()
+    second.cancel()
+    assert bench.changes == [True, False]
+
+
+@pytest.mark.parametrize("inline", [True, False])
+def test_a_raising_listener_is_told_and_goes_on(bench: Bench, caplog: pytest.LogCaptureFixture, inline: bool) -> None:
+    seen = threading.Semaphore(0)
+
+    def raising(number: int) -> None:
+        seen.release()
+        raise RuntimeError(f"no {number}")
+
+    other: list[int] = []
+    with (
+        caplog.at_level(logging.ERROR),
+        bench.listen(raising, inline=inline) as listener,
+        bench.listen(other.append, inline=True),
+    ):
+        for number in range(3):
+            bench.channel.publish(number)
+            assert seen.acquire(timeout=WAIT_S)
+    assert (listener.errors, listener.delivered) == (3, 3)
+    assert bench.reports == [("mine", "no 0")], "one that always fails is told once a second"
+    assert other == [0, 1, 2]
+    assert "RuntimeError('no 0')" in caplog.text
+
+
+def test_a_listener_may_cancel_itself(bench: Bench) -> None:
+    done = threading.Event()
+
+    def once(number: int) -> None:
+        listener.cancel()
+        done.set()
+
+    listener = bench.listen(once)
+    bench.channel.publish(1)
+    assert done.wait(WAIT_S)
+    assert listener._thread is not None
+    listener._thread.join(WAIT_S)
+    assert not listener._thread.is_alive()
+    bench.channel.publish(2)
+    assert listener.delivered == 1
+
+
+def test_nothing_is_called_after_cancel(bench: Bench) -> None:
+    got: list[int] = []
+    listener = bench.listen(got.append)
+    listener.cancel()
+    bench.channel.publish(1)
+    assert got == []
+    assert listener._thread is not None
+    assert not listener._thread.is_alive()

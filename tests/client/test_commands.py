@@ -1,0 +1,376 @@
+"""Commands and authority against a proxy that is played by the test."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from skyloop.client import AuthorityStatus, Drone
+from skyloop.errors import AuthorityError, ClosedError, NoAnswerError, RefusedError, UnsupportedError, UsageError
+from skyloop.messages import (
+    Attitude,
+    Command,
+    EmergencyStop,
+    Event,
+    EventKind,
+    Failsafe,
+    Feedback,
+    FlightState,
+    Hover,
+    Idle,
+    Land,
+    Refusal,
+    Refused,
+    ReleaseAuthority,
+    RequestAuthority,
+    Takeoff,
+    Velocity,
+)
+from tests.client.scripted import QUICK, WAIT_S, ScriptedProxy, background, flown, scripted
+
+
+@pytest.fixture
+def proxy() -> Iterator[ScriptedProxy]:
+    with scripted() as proxy:
+        yield proxy
+
+
+@pytest.fixture
+def drone(proxy: ScriptedProxy) -> Iterator[Drone]:
+    with flown(proxy) as drone:
+        yield drone
+
+
+def test_a_command_goes_out_at_once_and_is_repeated(proxy: ScriptedProxy, drone: Drone) -> None:
+    sent_ns = time.monotonic_ns()
+    up: Any = np.float32(0.25)
+    assert drone.velocity(forward=0.5, left=1, up=up, yaw_rate=-0.5)
+    wanted = Velocity(0.5, 1.0, 0.25, -0.5)
+    first = proxy.until_commanded(wanted)
+    assert (first.lease, first.intent) == (1, 1)
+    assert first.sent_ns >= sent_ns
+    proxy.until(lambda: proxy.actions().count(wanted) >= 4)
+    repeats = [command for command in proxy.commands if command.action == wanted]
+    assert {command.intent for command in repeats} == {1}
+    seqs = [command.seq for command in proxy.commands]
+    assert seqs == sorted(set(seqs))
+    assert drone.attitude(roll=0.1, pitch=0.2, climb=0.3, yaw_rate=0.4)
+    assert proxy.until_commanded(Attitude(0.1, 0.2, 0.3, 0.4)).intent == 2
+    assert drone.idle()
+    assert drone.command(Hover())
+    proxy.until_commanded(Hover())
+
+
+def test_idle_keeps_the_authority_before_the_first_command(proxy: ScriptedProxy, drone: Drone) -> None:
+    proxy.until(lambda: len(proxy.commands) >= 3)
+    assert set(proxy.actions()) == {Idle()}
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda drone: drone.velocity(forward=math.nan), "forward is nan and must be finite"),
+        (lambda drone: drone.velocity(yaw_rate=math.inf), "yaw_rate is inf"),
+        (lambda drone: drone.velocity(left="1"), "left is '1' and must be a number"),
+        (lambda drone: drone.velocity(up=None), "up is None"),
+        (lambda drone: drone.velocity(up=True), "up is True"),
+        (lambda drone: drone.attitude(pitch=[0.1]), "pitch is "),
+        (lambda drone: drone.attitude(climb=-math.inf), "climb is -inf"),
+        (lambda drone: drone.command("hover"), "a command is one of attitude, "),
+        (lambda drone: drone.command(Velocity(forward=math.nan)), "NaN"),
+        (lambda drone: drone.request_authority(32), "from 0"),
+    ],
+)
+def test_unusable_arguments(drone: Drone, call: Callable[[Any], object], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        call(drone)
+
+
+def test_take_off_and_land(proxy: ScriptedProxy, drone: Drone) -> None:
+    def vehicle() -> None:
+        proxy.until_commanded(Takeoff())
+        proxy.state = FlightState.TAKING_OFF
+        proxy.until(lambda: proxy.actions().count(Takeoff()) > 3)
+        proxy.state = FlightState.HOVERING
+        proxy.until_commanded(Land())
+        proxy.state = FlightState.LANDING
+        proxy.until(lambda: proxy.actions().count(Land()) > 3)
+        proxy.state = FlightState.LANDED
+
+    thread = threading.Thread(target=vehicle)
+    thread.start()
+    assert drone.takeoff(timeout_s=WAIT_S)
+    assert drone.feedback().state is FlightState.HOVERING
+    assert drone.land(timeout_s=WAIT_S)
+    assert drone.feedback().state is FlightState.LANDED
+    thread.join(WAIT_S)
+    after = len(proxy.commands)
+    proxy.until(lambda: Idle() in proxy.actions()[after:], "a landed vehicle is told to land for ever")
+
+
+def failsafe(proxy: ScriptedProxy, _: Command) -> None:
+    proxy.more["failsafe"] = Failsafe.HOVER
+
+
+def not_fresh(proxy: ScriptedProxy, command: Command) -> None:
+    proxy.event(EventKind.COMMAND_REFUSED, "me: ask anew", "me", reason=Refusal.NOT_FRESH.value, seq=command.seq)
+
+
+def lost_link(proxy: ScriptedProxy, _: Command) -> None:
+    proxy.stop()
+    proxy.start()
+
+
+def lost_lease(proxy: ScriptedProxy, _: Command) -> None:
+    assert proxy.owner is not None
+    app_id, name, lease = proxy.owner
+    proxy.owner = None
+    proxy.event(EventKind.AUTHORITY_LOST, "", name, app_id=app_id, lease=lease, reason="silent")
+
+
+@pytest.mark.parametrize("ending", [failsafe, not_fresh, lost_link, lost_lease])
+def test_a_landing_that_something_ended_is_asked_for_anew(
+    proxy: ScriptedProxy, drone: Drone, ending: Callable[[ScriptedProxy, Command], None]
+) -> None:
+    def vehicle() -> None:
+        first = proxy.until_commanded(Land())
+        ending(proxy, first)
+        proxy.until(lambda: any(command.intent > first.intent for command in proxy.commands), "a new intent to land")
+        proxy.more.clear()
+        proxy.state = FlightState.LANDED
+
+    proxy.state = FlightState.HOVERING
+    drone.wait(lambda feedback: feedback.state is FlightState.HOVERING, WAIT_S)
+    landing = background(vehicle)
+    assert drone.land(timeout_s=2 * WAIT_S)
+    landing.join(WAIT_S)
+    assert {command.action for command in proxy.commands if command.intent > 0} <= {Land(), Idle()}
+
+
+def test_a_landing_that_something_newer_ended_is_over(proxy: ScriptedProxy, drone: Drone) -> None:
+    def change_of_mind() -> None:
+        proxy.until_commanded(Land())
+        drone.hover()
+        proxy.until_commanded(Hover())
+        proxy.more["failsafe"] = Failsafe.HOVER
+
+    proxy.state = FlightState.HOVERING
+    drone.wait(lambda feedback: feedback.state is FlightState.HOVERING, WAIT_S)
+    changing = background(change_of_mind)
+    with pytest.raises(NoAnswerError, match="land was not completed"):
+        drone.land(timeout_s=0.5)
+    changing.join(WAIT_S)
+    assert len({command.intent for command in proxy.commands if command.action == Land()}) == 1
+
+
+def test_a_take_off_that_a_failsafe_ended_is_not_asked_for_anew(proxy: ScriptedProxy, drone: Drone) -> None:
+    taking_off = background(lambda: failsafe(proxy, proxy.until_commanded(Takeoff())))
+    with pytest.raises(NoAnswerError, match="takeoff was not completed"):
+        drone.takeoff(timeout_s=0.5)
+    taking_off.join(WAIT_S)
+    assert len({command.intent for command in proxy.commands if command.action == Takeoff()}) == 1
+
+
+def test_take_off_that_does_not_happen(proxy: ScriptedProxy, drone: Drone) -> None:
+    with pytest.raises(NoAnswerError, match=r"takeoff was not completed within 0\.05 s: the vehicle is landed$"):
+        drone.takeoff(timeout_s=0.05)
+    proxy.commands.clear()
+
+    def vehicle() -> None:
+        command = proxy.until_commanded(Takeoff())
+        proxy.event(EventKind.COMMAND_REFUSED, "me: no GPS", "me", reason="vehicle_link_lost", seq=command.seq)
+
+    thread = threading.Thread(target=vehicle)
+    thread.start()
+    with pytest.raises(NoAnswerError, match="landed; me: no GPS"):
+        drone.takeoff(timeout_s=1.5)
+    thread.join(WAIT_S)
+
+
+@pytest.mark.parametrize(
+    ("reason", "error"), [(Refusal.UNSUPPORTED, UnsupportedError), (Refusal.WRONG_STATE, RefusedError)]
+)
+def test_take_off_that_is_refused_for_good(
+    proxy: ScriptedProxy, drone: Drone, reason: Refusal, error: type[Exception]
+) -> None:
+    def vehicle() -> None:
+        command = proxy.until_commanded(Takeoff())
+        proxy.event(EventKind.COMMAND_REFUSED, "somebody: no", "somebody", reason=reason.value, seq=command.seq)
+        proxy.event(EventKind.COMMAND_REFUSED, "me: never", "me", reason=reason.value, seq=command.seq)
+
+    thread = threading.Thread(target=vehicle)
+    thread.start()
+    with pytest.raises(error, match="me: never"):
+        drone.takeoff(timeout_s=WAIT_S)
+    thread.join(WAIT_S)
+    after = len(proxy.commands)
+    proxy.until(lambda: Idle() in proxy.actions()[after:], "what was refused is asked for no longer")
+
+
+def test_closing_or_losing_the_authority_ends_a_take_off(proxy: ScriptedProxy, drone: Drone) -> None:
+    taking_over = background(lambda: proxy.until_commanded(Takeoff()), proxy.take_over)
+    with pytest.raises(AuthorityError, match="boss took over"):
+        drone.takeoff(timeout_s=WAIT_S)
+    taking_over.join(WAIT_S)
+    proxy.give_back(drone.app_id, "me")
+    drone.wait(lambda _: drone.authority.state == "held", WAIT_S)
+    closing = background(lambda: proxy.until(lambda: proxy.actions().count(Takeoff()) > 5), drone.close)
+    with pytest.raises(ClosedError):
+        drone.takeoff(timeout_s=WAIT_S)
+    closing.join(WAIT_S)
+
+
+def test_a_vehicle_that_cannot_fly() -> None:
+    with scripted(can_fly=False) as proxy, flown(proxy) as drone:
+        assert drone.authority.state == "held"
+        for call in (drone.takeoff, drone.hover, drone.velocity, drone.land):
+            with pytest.raises(UnsupportedError, match="it has no motors"):
+                call()
+
+
+def test_a_stalled_application_hovers_and_is_told(proxy: ScriptedProxy) -> None:
+    events: list[Event] = []
+    with flown(proxy, stall_s=0.1) as drone, drone.on_event(events.append):
+        drone.velocity(forward=1.0)
+        proxy.until_commanded(Hover())
+        drone.wait(lambda _: any(event.kind is EventKind.FAILSAFE for event in events), WAIT_S)
+    told = [event for event in events if event.kind is EventKind.FAILSAFE]
+    assert len(told) == 1
+    assert (told[0].seq, told[0].data) == (0, {"step": "hover", "reason": "stalled"})
+
+
+def test_pre_emption_and_return(proxy: ScriptedProxy, drone: Drone) -> None:
+    drone.velocity(forward=1.0)
+    proxy.until_commanded(Velocity(forward=1.0))
+    proxy.take_over("boss")
+    drone.wait(lambda _: drone.authority.state == "preempted", WAIT_S)
+    assert drone.authority == AuthorityStatus("preempted", 0, 16, "boss", 0)
+    with pytest.raises(AuthorityError, match="boss took over"):
+        drone.velocity(forward=1.0)
+    seq = drone.feedback().seq
+    before = len(proxy.commands)
+    drone.wait(lambda feedback: feedback.seq > seq + 8, WAIT_S)
+    assert len(proxy.commands) == before, "nothing is sent without the authority"
+    proxy.give_back(drone.app_id, "me")
+    drone.wait(lambda _: drone.authority.state == "held", WAIT_S)
+    proxy.until(lambda: len(proxy.commands) > before + 3)
+    assert set(proxy.actions()[before:]) == {Idle()}, "the old set-point is not taken up again"
+    assert proxy.commands[-1].lease == drone.authority.lease == 3
+    assert drone.velocity(forward=0.7)
+    assert proxy.until_commanded(Velocity(forward=0.7)).lease == 3
+
+
+def test_pre_emption_whose_event_was_lost_shows_in_feedback(proxy: ScriptedProxy, drone: Drone) -> None:
+    proxy.grant(99, "boss")
+    drone.wait(lambda _: drone.authority.state == "preempted", WAIT_S)
+    proxy.grant(drone.app_id, "me")
+    drone.wait(lambda _: drone.authority.state == "held", WAIT_S)
+
+
+def test_a_lease_lost_by_silence_is_asked_for_again(proxy: ScriptedProxy, drone: Drone) -> None:
+    assert proxy.owner is not None
+    app_id, _, lease = proxy.owner
+    proxy.owner = None
+    proxy.event(EventKind.AUTHORITY_LOST, "", "me", app_id=app_id, lease=lease, reason="silent")
+    drone.wait(lambda _: drone.authority.lease == lease + 1, WAIT_S)
+    assert drone.authority.state == "held"
+
+
+def test_a_failsafe_ends_the_set_point(proxy: ScriptedProxy, drone: Drone) -> None:
+    drone.velocity(forward=1.0)
+    proxy.until_commanded(Velocity(forward=1.0))
+    proxy.more["failsafe"] = Failsafe.HOVER
+    drone.wait(lambda feedback: feedback.failsafe is Failsafe.HOVER, WAIT_S)
+    before = len(proxy.commands)
+    proxy.until(lambda: len(proxy.commands) > before + 3)
+    assert set(proxy.actions()[before + 1 :]) == {Idle()}
+
+
+def test_what_a_listener_commands_in_answer_to_a_failsafe_stays(proxy: ScriptedProxy, drone: Drone) -> None:
+    def answer(feedback: Feedback) -> None:
+        if feedback.failsafe is Failsafe.HOVER and not answered:
+            answered.append(drone.velocity(left=0.5))
+
+    answered: list[bool] = []
+    with drone.on_feedback(answer, inline=True):
+        proxy.more["failsafe"] = Failsafe.HOVER
+        proxy.until(lambda: proxy.actions().count(Velocity(left=0.5)) >= 4)
+    assert len(answered) == 1
+
+
+def test_released_and_requested_again(proxy: ScriptedProxy, drone: Drone) -> None:
+    drone.release_authority()
+    assert drone.authority.state == "none"
+    assert isinstance(proxy.requests[-1], ReleaseAuthority)
+    with pytest.raises(AuthorityError, match="request_authority"):
+        drone.hover()
+    status = drone.request_authority(3)
+    assert (status.state, status.priority) == ("held", 3)
+    assert RequestAuthority(3) in proxy.requests
+    assert drone.request_authority().priority == 3
+    drone.release_authority()
+    drone.release_authority()
+
+
+def test_somebody_else_flies(proxy: ScriptedProxy) -> None:
+    proxy.grant(99, "ada")
+    with pytest.raises(AuthorityError, match=r"ada holds the authority: wait longer.*access=\"observe\"") as error:
+        Drone(proxy.server.dial, app="me", policy=QUICK).open(timeout_s=WAIT_S)
+    assert error.value.code == "busy"
+    with pytest.raises(AuthorityError, match=r"did not give it back within 0\.05 s"):
+        Drone(proxy.server.dial, app="me", policy=QUICK).open(wait_s=0.05, timeout_s=WAIT_S)
+    proxy.until(lambda: isinstance(proxy.requests[-1], ReleaseAuthority), "leaving the line")
+
+
+def test_waiting_in_line(proxy: ScriptedProxy) -> None:
+    proxy.grant(99, "ada")
+    answered = background(
+        lambda: proxy.until(lambda: any(isinstance(request, RequestAuthority) for request in proxy.requests)),
+        lambda: proxy.give_back(1, "me"),
+    )
+    with flown(proxy, wait_s=WAIT_S) as drone:
+        assert drone.authority.state == "held"
+    answered.join(WAIT_S)
+
+
+def test_refused_and_not_answered(proxy: ScriptedProxy, monkeypatch: pytest.MonkeyPatch) -> None:
+    proxy.answers[RequestAuthority] = Refused(Refusal.BUSY, "closed today")
+    with pytest.raises(AuthorityError, match="closed today"):
+        Drone(proxy.server.dial, app="me", policy=QUICK).open(timeout_s=WAIT_S)
+    monkeypatch.setattr("skyloop.client.commands.ANSWER_S", 0.1)
+    proxy.answers[RequestAuthority] = None
+    with pytest.raises(NoAnswerError, match="did not answer the request for the authority"):
+        Drone(proxy.server.dial, app="me", policy=QUICK).open(timeout_s=WAIT_S)
+
+
+def test_an_observer_only_looks_on(proxy: ScriptedProxy) -> None:
+    with flown(proxy, access="observe") as drone:
+        assert drone.authority.state == "none"
+        for call in (drone.hover, drone.emergency_stop, drone.request_authority):
+            with pytest.raises(AuthorityError, match='access="pilot"') as error:
+                call()
+            assert error.value.code == "observer"
+        assert drone.feedback().state is FlightState.LANDED
+
+
+def test_emergency_stop_needs_no_authority(proxy: ScriptedProxy, drone: Drone) -> None:
+    drone.release_authority()
+    assert drone.emergency_stop()
+    assert proxy.until_commanded(EmergencyStop()).lease == 0
+    proxy.until(lambda: proxy.actions().count(EmergencyStop()) >= 4)
+    proxy.state = FlightState.EMERGENCY
+    drone.wait("emergency", WAIT_S)
+    seq = drone.feedback().seq
+    drone.wait(lambda feedback: feedback.seq > seq + 3, WAIT_S)
+    proxy.commands.clear()
+    seq = drone.feedback().seq
+    drone.wait(lambda feedback: feedback.seq > seq + 8, WAIT_S)
+    assert proxy.commands == []
+    assert drone.request_authority().state == "held"
+    assert drone.reset_emergency()

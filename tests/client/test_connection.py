@@ -1,0 +1,367 @@
+"""Links that fail and come back, against a proxy that is played by the test."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from skyloop.client import Drone, LinkStatus, RedialPolicy
+from skyloop.errors import ClosedError, LinkError, NoAnswerError, RefusedError
+from skyloop.messages import (
+    Command,
+    Event,
+    EventKind,
+    GetParameter,
+    Hello,
+    Hover,
+    Idle,
+    LinkState,
+    Ping,
+    Refusal,
+    Refused,
+    RequestAuthority,
+    SetParameter,
+    Takeoff,
+    Velocity,
+    encode,
+)
+from skyloop.transport.base import EVENTS, FEEDBACK, ClientEnd, ClientHandler, video
+from skyloop.transport.memory import Faults
+from tests.client.scripted import QUICK, WAIT_S, ScriptedProxy, flown, scripted
+
+
+@pytest.fixture
+def proxy() -> Iterator[ScriptedProxy]:
+    with scripted() as proxy:
+        yield proxy
+
+
+@pytest.fixture
+def drone(proxy: ScriptedProxy) -> Iterator[Drone]:
+    with flown(proxy) as drone:
+        yield drone
+
+
+class Told:
+    """What a drone's on_link listener heard."""
+
+    def __init__(self, drone: Drone) -> None:
+        self.states: list[LinkState] = []
+        self.reasons: list[str] = []
+        self._came = threading.Condition()
+        drone.on_link(self._add)
+
+    def _add(self, status: LinkStatus) -> None:
+        with self._came:
+            self.states.append(status.application)
+            self.reasons.append(status.reason)
+            self._came.notify_all()
+
+    def until(self, state: LinkState, after: int = 0) -> int:
+        with self._came:
+            assert self._came.wait_for(lambda: state in self.states[after:], WAIT_S), (state, self.states)
+            return after + self.states[after:].index(state) + 1
+
+
+def restarted(proxy: ScriptedProxy) -> None:
+    proxy.stop()
+    proxy.start()
+
+
+def test_a_restarted_proxy_finds_everything_put_back(proxy: ScriptedProxy, drone: Drone) -> None:
+    told = Told(drone)
+    events: list[Event] = []
+    frames: list[int] = []
+    drone.on_event(events.append)
+    drone.add_processor(lambda frame: frames.append(frame.seq))
+    drone.config["limits.tilt"] = 0.2
+    proxy.parameters["limits.tilt"] = 0.35  # as after a restart
+    drone.velocity(forward=1.0)
+    proxy.until_commanded(Velocity(forward=1.0))
+    proxy.stop()
+    at = told.until(LinkState.LOST)
+    assert "stopped" in told.reasons[at - 1]
+    assert drone.authority.state == "none"
+    assert drone.velocity(forward=0.3) is False, "nothing is raised, the packet just did not go"
+    proxy.commands.clear()
+    proxy.requests.clear()
+    started_s = time.monotonic()
+    proxy.start()
+    told.until(LinkState.UP, at)
+    assert time.monotonic() - started_s < 1.0
+    drone.wait(lambda _: drone.authority.state == "held" and proxy.parameters["limits.tilt"] == 0.2, WAIT_S)
+    assert RequestAuthority(16) in proxy.requests
+    assert any(isinstance(request, SetParameter) for request in proxy.requests)
+    for topic in (EVENTS, FEEDBACK, video("front")):
+        assert proxy.server.subscribers(topic) == 1
+    proxy.until(lambda: len(proxy.commands) > 3)
+    assert Velocity(forward=1.0) not in proxy.actions()
+    proxy.frame(1)
+    drone.wait(lambda _: frames == [1], WAIT_S)
+    states = [event.data["state"] for event in events if event.kind is EventKind.APPLICATION_LINK]
+    assert states == ["lost", "up"]
+    assert drone.velocity(forward=0.5)
+
+
+def test_old_set_points_are_not_resumed(proxy: ScriptedProxy, drone: Drone) -> None:
+    drone.velocity(forward=1.0)
+    proxy.until_commanded(Velocity(forward=1.0))
+    told = Told(drone)
+    proxy.stop()
+    proxy.commands.clear()
+    at = told.until(LinkState.LOST)
+    proxy.start()
+    told.until(LinkState.UP, at)
+    proxy.until(lambda: len(proxy.commands) > 3)
+    assert set(proxy.actions()) == {Idle()}
+
+
+def test_what_was_asked_just_before_the_return_goes_out(proxy: ScriptedProxy, drone: Drone) -> None:
+    told = Told(drone)
+    proxy.stop()
+    told.until(LinkState.LOST)
+    assert drone.velocity(forward=0.4) is False
+    assert drone.velocity(forward=0.5) is False
+    proxy.start()
+    command = proxy.until_commanded(Velocity(forward=0.5))
+    assert command.lease == 1
+    assert Velocity(forward=0.4) not in proxy.actions()
+
+
+def test_again_and_again(proxy: ScriptedProxy, drone: Drone) -> None:
+    told, at = Told(drone), 0
+    for _ in range(5):
+        restarted(proxy)
+        at = told.until(LinkState.LOST, at)
+        at = told.until(LinkState.UP, at)
+    assert drone.link.application is LinkState.UP
+
+
+def test_a_silent_proxy_is_degraded_then_lost_then_back(proxy: ScriptedProxy, drone: Drone) -> None:
+    told = Told(drone)
+    proxy.answers[Ping] = None
+    proxy.answers[Hello] = None
+    proxy.beating.clear()
+    at = told.until(LinkState.DEGRADED)
+    at = told.until(LinkState.LOST, at)
+    assert "nothing heard" in told.reasons[at - 1]
+    proxy.answers.clear()
+    proxy.beating.set()
+    told.until(LinkState.UP, at)
+    drone.wait(lambda _: drone.authority.state == "held", WAIT_S)
+
+
+def test_a_proxy_without_feedback_is_pinged_and_asked_again(proxy: ScriptedProxy, drone: Drone) -> None:
+    told = Told(drone)
+    proxy.beating.clear()
+    at = told.until(LinkState.DEGRADED)
+    assert "no feedback" in told.reasons[at - 1]
+    proxy.until(lambda: any(isinstance(request, Ping) for request in proxy.requests))
+    time_out = time.monotonic() + 0.6  # twice what a silent one is given
+    proxy.notifier.wait_for(lambda: time.monotonic() > time_out, 0.7)
+    assert LinkState.LOST not in told.states
+    proxy.beating.set()
+    told.until(LinkState.UP, at)
+
+
+def test_garbage_restarts_the_connection(proxy: ScriptedProxy, drone: Drone) -> None:
+    told = Told(drone)
+    app_id = drone.app_id
+    for _ in range(6):
+        proxy.garbage()
+    at = told.until(LinkState.LOST)
+    assert "malformed" in told.reasons[at - 1]
+    told.until(LinkState.UP, at)
+    assert drone.app_id == app_id + 1
+    assert drone.stats["feedback"].malformed >= 5
+
+
+def test_what_a_proxy_never_sends_is_malformed(proxy: ScriptedProxy, drone: Drone) -> None:
+    proxy.server.publish(EVENTS, encode(Command(1, 1, 1, 0, Hover())))
+    drone.wait(lambda _: drone.stats["feedback"].malformed == 1, WAIT_S)
+    assert drone.link.application in (LinkState.UP, LinkState.DEGRADED)
+
+
+def test_a_camera_that_stops_is_asked_for_again(proxy: ScriptedProxy, drone: Drone) -> None:
+    drone.frame()
+    drone.wait(lambda _: proxy.server.subscribers(video("front")) == 1, WAIT_S)
+    client = next(iter(proxy.server._clients.values()))
+    client.topics.discard(video("front"))  # the proxy forgot
+    drone.wait(lambda _: proxy.server.subscribers(video("front")) == 1, WAIT_S)
+
+
+def test_loss_and_disorder(caplog: pytest.LogCaptureFixture) -> None:
+    faults = Faults(seed=5, drop=0.05, duplicate=0.05, reorder=0.05, corrupt=0.01)
+    with scripted(faults=faults) as proxy, flown(proxy, policy=RedialPolicy(hello_s=0.2)) as drone:
+        seqs: list[int] = []
+        drone.on_feedback(lambda feedback: seqs.append(feedback.seq), inline=True)
+        drone.wait(lambda _: len(seqs) > 100, WAIT_S)
+        assert drone.config["limits.tilt"] == 0.35
+        assert drone.stats["feedback"].lost > 0
+        assert drone.velocity(forward=0.5) or drone.authority.state != "held"
+    assert "Traceback" not in caplog.text
+
+
+def test_nobody_there_at_first() -> None:
+    proxy = ScriptedProxy()
+    with pytest.raises(LinkError, match="nobody serves"):
+        Drone(proxy.server.dial, app="me").open()
+
+
+def test_a_proxy_that_does_not_answer(proxy: ScriptedProxy) -> None:
+    proxy.answers[Hello] = None
+    with pytest.raises(NoAnswerError, match="was reached but did not answer"):
+        Drone(proxy.server.dial, app="me", policy=RedialPolicy(hello_s=0.05)).open(timeout_s=0.05)
+
+
+def test_a_proxy_that_refuses(proxy: ScriptedProxy) -> None:
+    proxy.answers[Hello] = Refused(Refusal.PROTOCOL, "another version")
+    with pytest.raises(RefusedError, match="another version"):
+        Drone(proxy.server.dial, app="me").open()
+
+
+def test_a_proxy_that_knows_nothing_of_its_vehicle(proxy: ScriptedProxy) -> None:
+    proxy.beating.clear()
+    proxy._ended.set()
+    with pytest.raises(NoAnswerError, match="scripted answered, but told nothing"):
+        Drone(proxy.server.dial, app="me").open(timeout_s=0.1)
+
+
+def test_take_off_over_a_lost_link(proxy: ScriptedProxy, drone: Drone) -> None:
+    told = Told(drone)
+    proxy.stop()
+    told.until(LinkState.LOST)
+    with pytest.raises(NoAnswerError, match="and the link is lost"):
+        drone.takeoff(timeout_s=0.05)
+    assert drone.takeoff(wait=False) is False
+    proxy.start()
+    proxy.until_commanded(Takeoff())
+
+
+def test_questions_over_a_lost_link_wait_for_its_return(proxy: ScriptedProxy, drone: Drone) -> None:
+    told = Told(drone)
+    proxy.stop()
+    told.until(LinkState.LOST)
+    got: list[object] = []
+    thread = threading.Thread(target=lambda: got.append(drone.config["limits.tilt"]))
+    thread.start()
+    proxy.start()
+    thread.join(WAIT_S)
+    assert got == [0.35]
+
+
+def test_questions_end_with_the_time_or_the_drone(proxy: ScriptedProxy, drone: Drone) -> None:
+    proxy.answers[GetParameter] = None
+    with pytest.raises(NoAnswerError, match=r"GetParameter.*0\.1 s"):
+        drone._connection.call(lambda: GetParameter("x"), 0.1)
+    ended: list[BaseException] = []
+
+    def ask() -> None:
+        try:
+            drone._connection.call(lambda: GetParameter("x"), WAIT_S)
+        except ClosedError as error:
+            ended.append(error)
+
+    thread = threading.Thread(target=ask)
+    thread.start()
+    proxy.until(lambda: sum(isinstance(request, GetParameter) for request in proxy.requests) >= 2)
+    drone.close()
+    thread.join(WAIT_S)
+    assert len(ended) == 1
+
+
+def test_an_error_of_ours_in_the_link_s_thread_does_not_end_it(
+    proxy: ScriptedProxy, drone: Drone, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    told = Told(drone)
+    failing = iter([True])
+    tick = drone._commands.tick
+
+    def fail_once(now_ns: int) -> int:
+        if next(failing, False):
+            raise RuntimeError("a mistake")
+        return tick(now_ns)
+
+    monkeypatch.setattr(drone._commands, "tick", fail_once)
+    at = told.until(LinkState.LOST)
+    told.until(LinkState.UP, at)
+    assert "a mistake" in caplog.text
+
+
+def test_a_connection_that_ends_during_hello(proxy: ScriptedProxy) -> None:
+    class Ending:
+        def __init__(self, handler: ClientHandler) -> None:
+            self._end = proxy.server.dial(handler)
+            proxy.server.end(self._end, "no room", muted=True)
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(self._end, name)
+
+    with pytest.raises(LinkError, match="no room"):
+        Drone(Ending, app="me").open()  # type: ignore[arg-type]
+
+
+class OtherClock:
+    """An end whose proxy's clock seems to be an hour ahead."""
+
+    same_clock = False
+
+    def __init__(self, end: ClientEnd, handler: ClientHandler) -> None:
+        self._end = end
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._end, name)
+
+
+def test_the_offset_between_clocks(proxy: ScriptedProxy, monkeypatch: pytest.MonkeyPatch) -> None:
+    ahead_ns = 3600 * 10**9
+    real = time.monotonic_ns
+
+    def dial(handler: ClientHandler) -> ClientEnd:
+        return OtherClock(proxy.server.dial(handler), handler)  # type: ignore[return-value]
+
+    class ProxyTime:
+        monotonic_ns = staticmethod(lambda: real() + ahead_ns)
+
+    monkeypatch.setattr("tests.client.scripted.time", ProxyTime)
+    drone = Drone(dial, app="me", policy=QUICK).open()
+    try:
+        assert abs(drone._connection.offset_ns - ahead_ns) < 50_000_000
+        drone.hover()
+        proxy.until(lambda: len(proxy.commands) > 2)
+        assert abs(proxy.commands[-1].sent_ns - ProxyTime.monotonic_ns()) < 2 * 10**9
+        drone.next_feedback()
+        stats = drone.stats["feedback"]
+        assert stats.age_s is not None
+        assert -0.05 < stats.age_s < 1.0
+        drone.feedback(max_age_s=1.0)
+    finally:
+        drone.close()
+
+
+def test_policy() -> None:
+    policy = RedialPolicy()
+    pauses = [policy.pause_s(failures) for failures in range(50)]
+    assert pauses[0] == pytest.approx(0.02)
+    assert pauses == sorted(pauses)
+    assert pauses[-1] == pytest.approx(0.3)
+
+
+def test_closing_from_an_inline_listener(proxy: ScriptedProxy) -> None:
+    closed = threading.Event()
+    with flown(proxy) as drone:
+
+        def close(feedback: object) -> None:
+            if not drone.closed:
+                drone.close()
+                closed.set()
+
+        drone.on_feedback(close, inline=True)
+        assert closed.wait(WAIT_S)
+        assert drone.link.application is LinkState.CLOSED
+        thread = drone._supervisor._thread
+        thread.join(WAIT_S)
+        assert not thread.is_alive()

@@ -1,0 +1,131 @@
+"""Parameters as a mapping."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from skyloop.client import Drone
+from skyloop.client.parameters import plain_value
+from skyloop.errors import AuthorityError, LinkError, ParameterError, UnknownNameError, UsageError
+from skyloop.messages import (
+    Done,
+    EventKind,
+    GetParameter,
+    ListParameters,
+    Refusal,
+    Refused,
+    SetParameter,
+    Value,
+)
+from tests.client.scripted import WAIT_S, ScriptedProxy, flown, scripted
+
+
+@pytest.fixture
+def proxy() -> Iterator[ScriptedProxy]:
+    with scripted() as proxy:
+        yield proxy
+
+
+@pytest.fixture
+def drone(proxy: ScriptedProxy) -> Iterator[Drone]:
+    with flown(proxy) as drone:
+        yield drone
+
+
+def test_reading(drone: Drone) -> None:
+    config = drone.config
+    assert config["limits.tilt"] == 0.35
+    assert config.describe("limits.tilt").unit == "rad"
+    assert list(config) == ["limits.speed", "limits.tilt"]
+    assert config.items() == [("limits.speed", 2.0), ("limits.tilt", 0.35)]
+    assert config.values() == [2.0, 0.35]
+    assert len(config) == 2
+    assert "limits.tilt" in config
+    assert "limits" not in config
+
+
+def test_writing(proxy: ScriptedProxy, drone: Drone) -> None:
+    drone.config["limits.tilt"] = np.float64(0.2)
+    assert proxy.parameters["limits.tilt"] == 0.2
+    assert SetParameter("limits.tilt", 0.2, drone.authority.lease) in proxy.requests
+
+
+def test_unknown_names(drone: Drone) -> None:
+    with pytest.raises(UnknownNameError, match=r"did you mean 'limits\.tilt'"):
+        _ = drone.config["limits.tild"]
+    with pytest.raises(UnknownNameError):
+        drone.config["limits.tild"] = 0.1
+    with pytest.raises(UsageError, match="1 to 128"):
+        _ = drone.config[""]
+
+
+def test_refusals(proxy: ScriptedProxy, drone: Drone) -> None:
+    with pytest.raises(ParameterError, match=r"limits\.tilt: takes a float") as error:
+        drone.config["limits.tilt"] = "much"
+    assert error.value.code == "wrong_type"
+    drone.release_authority()
+    with pytest.raises(AuthorityError, match=r"writing limits\.tilt needs the authority"):
+        drone.config["limits.tilt"] = 0.1
+    assert proxy.parameters["limits.tilt"] == 0.35
+
+
+def test_answers_out_of_place(proxy: ScriptedProxy, drone: Drone) -> None:
+    for kind in (GetParameter, SetParameter, ListParameters):
+        proxy.answers[kind] = Done()
+    with pytest.raises(LinkError, match="with Done"):
+        _ = drone.config["limits.tilt"]
+    with pytest.raises(LinkError, match="with Done"):
+        drone.config["limits.tilt"] = 0.1
+    with pytest.raises(LinkError, match="with Done"):
+        drone.config.items()
+
+
+def test_what_cannot_be_put_back_is_told(proxy: ScriptedProxy, drone: Drone) -> None:
+    drone.config["limits.tilt"] = 0.2
+    proxy.answers[SetParameter] = Refused(Refusal.OUT_OF_RANGE, "too much today")
+    proxy.stop()
+    proxy.start()
+
+    def told() -> bool:
+        return any(event.kind is EventKind.PARAMETER_CHANGED and event.seq == 0 for event in drone.recent_events())
+
+    drone.wait(lambda _: told(), WAIT_S)
+    event = next(event for event in drone.recent_events() if event.kind is EventKind.PARAMETER_CHANGED)
+    assert "too much today" in event.text
+    assert event.data == {"name": "limits.tilt", "reason": "out_of_range"}
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        (True, True),
+        (np.bool_(False), False),
+        (3, 3),
+        (np.int16(3), 3),
+        (0.5, 0.5),
+        (np.float32(0.5), 0.5),
+        ("text", "text"),
+        ([1, 2.5], (1.0, 2.5)),
+        (np.array([1.0, 2.0]), (1.0, 2.0)),
+    ],
+)
+def test_plain_values(given: object, expected: Value) -> None:
+    value = plain_value("x", given)
+    assert value == expected
+    assert type(value) is type(expected)
+
+
+@pytest.mark.parametrize("given", [None, {}, object(), ["a"], 2**63, "x" * 5000, [0.0] * 300, np.zeros((2, 2)), 1j])
+def test_values_that_cannot_travel(given: object) -> None:
+    with pytest.raises(UsageError, match="x can't be"):
+        plain_value("x", given)
+
+
+def test_not_finite_is_for_the_proxy_to_refuse() -> None:
+    value = plain_value("x", math.inf)
+    assert isinstance(value, float)
+    assert math.isinf(value)

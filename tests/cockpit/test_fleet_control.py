@@ -1,0 +1,123 @@
+"""Land all, stop all: from any page of a pilot, whatever is open on it and whoever flies."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+from starlette.websockets import WebSocketDisconnect
+
+from skyloop.cockpit.fleet import Fleet
+from skyloop.messages import EmergencyStop, FlightState, Land, Role
+from tests.cockpit.fake import Node, Nodes, cockpit, open_socket, this_user, until
+from tests.cockpit.test_control import Page, count, page
+from tests.cockpit.testclient import TestClient
+
+
+@pytest.fixture
+def nodes() -> Iterator[tuple[Node, Node]]:
+    nodes = Node("alpha"), Node("beta")
+    yield nodes
+    for node in nodes:
+        node.stop()
+
+
+@contextmanager
+def everybody(client: TestClient) -> Iterator[Page]:
+    with open_socket(client, "control") as socket:
+        yield Page(socket)
+
+
+def test_stop_all_cuts_the_motors_of_drones_that_no_page_shows(nodes: tuple[Node, Node]) -> None:
+    with (
+        cockpit(Fleet(Nodes(*nodes), look_s=0.05)) as client,
+        everybody(client) as pilot,
+        nodes[0].connect("demo", priority=0, on_exit="hover") as demo,
+    ):
+        demo.takeoff()
+        pilot.say("stop_all", n=4)
+        assert pilot.wait("sent", do="stop_all", n=4)["drones"] == ["alpha", "beta"]
+        told = {pilot.wait("each", do="stop_all", state="sent")["drone"] for _ in nodes}
+        assert told == {"alpha", "beta"}
+        until(lambda: all(node.flyer.state is FlightState.EMERGENCY for node in nodes))
+
+
+def test_land_all_lands_what_others_fly_and_gives_control_back(nodes: tuple[Node, Node]) -> None:
+    alpha, beta = nodes
+    with (
+        cockpit(Fleet(Nodes(*nodes), look_s=0.05)) as client,
+        everybody(client) as pilot,
+        alpha.connect("demo", on_exit="hover") as demo,
+        page(client, "beta") as flies,
+    ):
+        demo.takeoff()
+        flies.take(8).take_off()
+        pilot.say("land_all")
+        assert {pilot.wait("each", state="done")["drone"] for _ in nodes} == {"alpha", "beta"}
+        assert [node.flyer.state for node in nodes] == [FlightState.LANDED] * 2
+        demo.wait(lambda feedback: feedback.owner == "demo", 5)
+        assert count(alpha, Land())
+        assert count(beta, Land())
+
+
+def test_each_drone_that_is_not_landed_is_told_with_its_reason(nodes: tuple[Node, Node]) -> None:
+    alpha, beta = nodes
+    with (
+        cockpit(Fleet(Nodes(*nodes), look_s=0.05)) as client,
+        everybody(client) as pilot,
+        alpha.connect("demo", priority=0, on_exit="hover") as demo,
+        beta.connect("other", on_exit="hover") as other,
+    ):
+        demo.takeoff()
+        other.takeoff()
+        pilot.say("land_all")
+        assert "demo" in pilot.wait("each", drone="alpha", state="refused")["why"]
+        pilot.wait("each", drone="beta", state="done")
+
+
+def test_a_landing_of_all_goes_on_without_the_page(nodes: tuple[Node, Node]) -> None:
+    with cockpit(Fleet(Nodes(*nodes), look_s=0.05)) as client, nodes[0].connect("demo", on_exit="hover") as demo:
+        demo.takeoff()
+        with everybody(client) as pilot:
+            pilot.say("land_all")
+            pilot.wait("sent", do="land_all")
+        until(lambda: nodes[0].flyer.state is FlightState.LANDED)
+
+
+def test_old_orders_to_all_are_refused(nodes: tuple[Node, Node]) -> None:
+    with cockpit(Fleet(Nodes(*nodes), look_s=0.05)) as client, everybody(client) as pilot:
+        pilot.say("stop_all", at_s=time.monotonic() - 3.0)
+        assert "3.0 s after" in pilot.wait("refused", do="stop_all")["why"]
+        pilot.say("land_all", at_s=time.monotonic() - 1.0)
+        pilot.wait("refused", do="land_all")
+        pilot.socket.send_text('{"do":"takeoff"}')
+        assert "not understood" in pilot.wait("refused", do="")["why"]
+        pilot.say("ping", n=3)
+        assert pilot.wait("pong", n=3)["now_s"] <= time.monotonic()
+        assert not any(count(node, EmergencyStop()) for node in nodes)
+
+
+def test_a_recording_is_not_landed_or_stopped(node: Node) -> None:
+    played = Node("played", uri="replay:///home/me/flight.mcap")
+    try:
+        with cockpit(Fleet(Nodes(node, played), look_s=0.05)) as client, everybody(client) as pilot:
+            pilot.say("stop_all")
+            assert pilot.wait("sent")["drones"] == ["alpha"]
+            until(lambda: node.flyer.state is FlightState.EMERGENCY)
+            assert not played.flyer.applied
+    finally:
+        played.stop()
+
+
+def test_an_observer_stops_nobody(nodes: tuple[Node, Node]) -> None:
+    with (
+        cockpit(Fleet(Nodes(*nodes)), this_user(Role.OBSERVER)) as client,
+        open_socket(client, "control") as socket,
+    ):
+        socket.send_json({"do": "stop_all", "at_s": time.monotonic()})
+        with pytest.raises(WebSocketDisconnect) as ended:
+            socket.receive_json()
+        assert ended.value.code == 4403
+    assert not any(node.flyer.applied for node in nodes)

@@ -1,0 +1,220 @@
+"""Nothing old is executed: what a page asks for comes in time, or never happens."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from skyloop.cockpit.commands import (
+    AHEAD_S,
+    LATE_S,
+    STOP_LATE_S,
+    Alive,
+    AnyCommand,
+    Fly,
+    GoTo,
+    HoverHere,
+    LandAll,
+    LandHere,
+    Release,
+    Reset,
+    Stop,
+    StopAll,
+    Take,
+    TakeOff,
+    Write,
+    untimely,
+)
+from skyloop.cockpit.control import ControlSession
+from skyloop.cockpit.pilot_connection import PilotConnection
+from skyloop.messages import (
+    EmergencyStop,
+    Event,
+    EventKind,
+    FlightState,
+    Land,
+    Refusal,
+    Takeoff,
+    Value,
+    Velocity,
+)
+from tests.cockpit.fake import Node, until
+from tests.cockpit.test_control import count, page
+from tests.cockpit.testclient import TestClient
+
+NOW_S = 1000.0
+ORDERS: list[tuple[Callable[..., AnyCommand], tuple[object, ...]]] = [
+    (Take, (4,)),
+    (Release, ()),
+    (TakeOff, ()),
+    (HoverHere, ()),
+    (LandHere, ()),
+    (Reset, ()),
+    (Fly, (0.5,)),
+    (GoTo, (1.0, 2.0, 3.0)),
+    (Write, ("limits.tilt", 0.2)),
+]
+
+
+@pytest.mark.parametrize(("kind", "values"), [*ORDERS, (LandAll, ())], ids=lambda one: getattr(one, "__name__", ""))
+def test_an_order_is_refused_when_it_may_be_older_than_half_a_second(
+    kind: Callable[..., AnyCommand], values: tuple[object, ...]
+) -> None:
+    def why(age_s: float, unsure_s: float = 0.0) -> str:
+        return untimely(kind(*values, at_s=NOW_S - age_s, unsure_s=unsure_s), NOW_S)
+
+    assert LATE_S == 0.5
+    assert why(0.0) == why(0.49) == why(0.3, 0.19) == ""
+    assert "0.5 s" in why(0.51)
+    assert "12.0 s after it was asked for" in why(12.0)
+    assert why(0.3, 0.21), "no benefit of the doubt"
+    assert "known to within 0.6 s" in why(0.0, 0.6)
+    assert why(-AHEAD_S) == why(-0.2, 0.2) == ""
+    assert "ahead" in why(-0.2), "from the future: one of the clocks is wrong"
+    assert "ping first" in untimely(kind(*values), NOW_S), "an order says when it was asked for"
+
+
+@pytest.mark.parametrize("kind", [Stop, StopAll])
+def test_an_emergency_stop_may_be_two_seconds_late_and_no_more(kind: type[Stop | StopAll]) -> None:
+    assert STOP_LATE_S == 2.0
+    assert untimely(kind(at_s=NOW_S - 1.9), NOW_S) == ""
+    assert untimely(kind(at_s=NOW_S - 2.1), NOW_S)
+    assert untimely(kind(at_s=NOW_S - 1.9, unsure_s=0.2), NOW_S)
+    assert untimely(kind(), NOW_S)
+
+
+def test_a_take_off_from_before_a_stall_does_not_happen(client: TestClient, node: Node) -> None:
+    with page(client) as pilot:
+        pilot.take().say("takeoff", at_s=time.monotonic() - 8.0, n=7)
+        told = pilot.wait("refused", do="takeoff")
+        assert "8.0 s after it was asked for" in told["why"]
+        assert told["n"] == 7
+        pilot.say("ping")
+        pilot.wait("pong")
+        assert not count(node, Takeoff())
+        assert node.flyer.state is FlightState.LANDED
+        pilot.take_off()
+
+
+def test_motors_are_not_cut_by_keys_that_were_pressed_long_ago(client: TestClient, node: Node) -> None:
+    with page(client) as pilot:
+        pilot.take().take_off()
+        pilot.say("stop", at_s=time.monotonic() - 12.0)
+        assert "12.0 s after" in pilot.wait("refused", do="stop")["why"]
+        pilot.say("ping")
+        pilot.wait("pong")
+        assert not count(node, EmergencyStop())
+        pilot.say("stop", at_s=time.monotonic() - 1.5, n=9)
+        assert pilot.wait("sent", do="stop")["n"] == 9
+        until(lambda: node.flyer.state is FlightState.EMERGENCY)
+
+
+def test_old_sticks_fly_nothing_and_are_no_sign_of_life(client: TestClient, node: Node) -> None:
+    with page(client) as pilot:
+        pilot.take().take_off()
+        pilot.say("fly", forward=0.3)
+        until(lambda: node.flyer.state is FlightState.FLYING)
+        begin_s = time.monotonic()
+        for _ in range(40):  # what an 8 s stall held back comes all at once, and goes on coming
+            pilot.say("fly", left=0.4, at_s=time.monotonic() - 8.0)
+            pilot.say("ping", at_s=time.monotonic() - 8.0, seen_s=time.monotonic() - 8.0)
+            time.sleep(0.02)
+        until(lambda: node.flyer.state is FlightState.HOVERING)
+        assert time.monotonic() - begin_s < 2.0, "the page counts as silent all the same"
+        assert not count(node, Velocity(left=0.4))
+        pilot.wait("refused", do="fly")
+
+
+def test_each_order_is_answered_under_its_number(client: TestClient, node: Node) -> None:
+    with page(client) as pilot:
+        pilot.say("take", priority=4, n=1)
+        assert pilot.wait("sent", do="take")["n"] == 1
+        pilot.wait("authority", mine=True)
+        pilot.say("takeoff", n=2)
+        assert pilot.wait("sent", do="takeoff")["n"] == 2
+        pilot.wait("done", do="takeoff")
+        pilot.say("set", name="limits.tilt", value=0.2, n=3)
+        assert pilot.wait("sent", do="set")["n"] == 3
+        pilot.say("land", n=4)
+        assert pilot.wait("sent", do="land")["n"] == 4
+        assert count(node, Land())
+
+
+def test_what_waited_behind_something_slow_is_too_old_by_then(
+    client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with page(client) as pilot:
+        pilot.take()
+        acquire = PilotConnection.acquire
+
+        def slow(pilot: PilotConnection, *arguments: Any, **options: Any) -> Any:
+            time.sleep(LATE_S + 0.2)
+            return acquire(pilot, *arguments, **options)
+
+        monkeypatch.setattr(PilotConnection, "acquire", slow)
+        pilot.say("take", priority=3)
+        pilot.say("set", name="limits.tilt", value=0.2)
+        assert "after it was asked for" in pilot.wait("refused", do="set")["why"]
+
+
+def test_an_order_that_was_told_as_not_sent_does_not_happen_when_the_link_is_back(
+    client: TestClient, node: Node
+) -> None:
+    with node.connect("watcher", access="observe") as watcher, page(client) as pilot:
+        until(lambda: any("cockpit stop connected" in event.text for event in watcher.recent_events()))
+        node.stop()
+        pilot.say("stop", at_s=time.monotonic() - 1.5)
+        assert "not sent" in pilot.wait("refused", do="stop")["why"]
+        node.restart()
+        watcher.wait(lambda feedback: feedback.state is FlightState.LANDED, 5)
+        for _ in range(20):
+            assert watcher.next_feedback().state is FlightState.LANDED
+        assert not count(node, EmergencyStop())
+
+
+def test_a_pong_tells_the_cockpits_clock(client: TestClient) -> None:
+    with page(client) as pilot:
+        before_s = time.monotonic()
+        pilot.socket.send_json({"do": "ping", "n": 3})
+        told = pilot.wait("pong", n=3)
+        assert before_s <= told["now_s"] <= time.monotonic()
+
+
+def test_a_ping_is_answered_whatever_its_time() -> None:
+    assert untimely(Alive(), NOW_S), "it is no sign of life"
+
+
+def test_a_take_off_that_came_to_nothing_is_not_repeated_for_ever(client: TestClient, node: Node) -> None:
+    with page(client) as pilot:
+        node.flyer.deaf = True  # as if all packets were lost on the way
+        pilot.take().say("takeoff")
+        pilot.wait("sent", do="takeoff")
+        with pilot.staying():
+            until(lambda: count(node, Takeoff()), "it is asked for")
+            time.sleep(1.2)
+            asked = count(node, Takeoff())
+            time.sleep(0.3)
+            assert count(node, Takeoff()) == asked, "and then no more"
+
+
+def test_a_packet_that_was_late_is_no_refusal_of_what_its_repeats_do(
+    client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    on_event = ControlSession._on_event
+
+    def late(session: ControlSession, event: Event) -> None:
+        data: dict[str, Value] = {"reason": Refusal.STALE.value}
+        on_event(
+            session, Event(EventKind.COMMAND_REFUSED, "land refused: it is 0.257 s old", 0, app=session.app, data=data)
+        )
+        on_event(session, event)
+
+    monkeypatch.setattr(ControlSession, "_on_event", late)
+    with page(client) as pilot:
+        pilot.take().take_off()
+        pilot.say("land")
+        pilot.wait("done", do="land")
+        assert not [told for told in pilot.told if told["type"] == "refused"]

@@ -1,0 +1,175 @@
+"""A page in control that is silent is a silent pilot: hover, then landing, as for any program."""
+
+from __future__ import annotations
+
+import time
+from types import SimpleNamespace
+from typing import Any
+
+from skyloop.client.authority import Authority
+from skyloop.client.command_schedule import CommandSchedule
+from skyloop.client.commands import CommandSender
+from skyloop.client.scheduler import Scheduler
+from skyloop.cockpit.control import GONE_S
+from skyloop.messages import Command, EmergencyStop, FlightState, Hover, RequestAuthority, Role, Velocity, decode
+from tests.cockpit.fake import Node, until
+from tests.cockpit.test_control import page
+from tests.cockpit.testclient import TestClient
+
+S = 1_000_000_000
+
+
+class Flown:
+    """A pilot's connection over a link that is always up, on a clock of its own: what it sends and asks."""
+
+    def __init__(self) -> None:
+        self.now_ns = 100 * S
+        self.sent: list[Command] = []
+        self.asked: list[object] = []
+        scheduler = Scheduler()
+        scheduler.clock = lambda: self.now_ns
+        connection: Any = SimpleNamespace(
+            connected=True, offset_ns=0, transmit=self._transmit, poke=lambda: None, ask=self._ask
+        )
+        self.pilot = CommandSender(
+            Role.PILOT,
+            Authority("page"),
+            CommandSchedule(),
+            connection,
+            scheduler,
+            emit=lambda *_, **__: None,
+            changed=lambda: None,
+            granted=lambda _: None,
+        )
+        self.pilot.flown_by_person()
+        self.pilot.connected(3)
+
+    def hold(self, lease: int) -> None:
+        self.pilot._authority.asked(RequestAuthority(8))
+        self.pilot._authority.granted(lease, self.now_ns)
+
+    def goes_on(self, seconds: float, step_s: float = 0.02) -> list[Command]:
+        """What is sent meanwhile."""
+        before = len(self.sent)
+        for _ in range(round(seconds / step_s)):
+            self.now_ns += round(step_s * S)
+            self.pilot.tick(self.now_ns)
+        return self.sent[before:]
+
+    def _transmit(self, packet: bytes) -> bool:
+        command = decode(packet)
+        assert isinstance(command, Command)
+        self.sent.append(command)
+        return True
+
+    def _ask(self, wish: object, *_: object) -> None:
+        self.asked.append(wish)
+
+
+def test_nothing_is_repeated_for_a_page_that_is_not_known_to_be_there() -> None:
+    flown = Flown()
+    flown.hold(5)
+    flown.pilot.present_until(flown.now_ns + 2 * S)
+    flown.pilot.command(Hover())
+    assert len(flown.goes_on(1.9)) > 50, "the lease is kept"
+    flown.goes_on(0.2)
+    assert flown.goes_on(60.0) == [], "silent: to the proxy, too"
+
+
+def test_a_page_that_is_heard_goes_on_and_nothing_from_before_its_silence_does() -> None:
+    flown = Flown()
+    flown.hold(5)
+    for _ in range(10):
+        flown.pilot.present_until(flown.now_ns + 2 * S)
+        assert flown.goes_on(0.15), "pings keep it"
+    flown.pilot.command(Velocity(forward=0.5))
+    assert flown.goes_on(5.0)[-1].sent_ns <= flown.now_ns - 3 * S
+    flown.pilot.present_until(flown.now_ns + 2 * S)
+    again = flown.goes_on(0.5)
+    assert again
+    assert all(type(command.action).__name__ == "Idle" for command in again)
+
+
+def test_an_older_word_takes_nothing_back_from_a_newer_one() -> None:
+    flown = Flown()
+    flown.hold(5)
+    flown.pilot.present_until(flown.now_ns + 2 * S)
+    flown.pilot.present_until(flown.now_ns - 6 * S)
+    assert flown.goes_on(1.5)
+
+
+def test_an_emergency_stop_goes_out_whoever_is_silent() -> None:
+    flown = Flown()
+    flown.hold(5)
+    flown.goes_on(10.0)
+    assert flown.pilot.command(EmergencyStop())
+    assert flown.sent[-1].action == EmergencyStop()
+
+
+def test_control_that_ran_out_is_not_asked_for_again_by_itself() -> None:
+    flown = Flown()
+    flown.hold(5)
+    flown.pilot.disconnected()
+    flown.pilot.connected(4)
+    flown.pilot.present_until(flown.now_ns + 2 * S)
+    flown.goes_on(1.0)
+    assert flown.asked == [], "the connection was lost and is back"
+    flown.hold(6)
+    flown.pilot._authority._lost(None)
+    flown.pilot.present_until(flown.now_ns + 2 * S)
+    flown.goes_on(1.0)
+    assert flown.asked == [], "the lease ended by silence"
+    assert flown.pilot.status.state == "none"
+
+
+def test_a_program_that_flies_itself_is_always_there() -> None:
+    flown = Flown()
+    flown.pilot._authority.renews = True
+    flown.pilot._present_until_ns = None
+    flown.hold(5)
+    assert flown.goes_on(30.0)
+    flown.pilot.disconnected()
+    flown.pilot.connected(4)
+    flown.goes_on(0.1)
+    assert flown.asked
+
+
+def quick(node: Node) -> None:
+    """As a lab may set it, and so that this test is quick."""
+    with node.connect("lab", on_exit="hover") as lab:
+        lab.config["authority.timeout_s"] = 0.3
+        lab.config["failsafe.hover_after_s"] = 0.2
+        lab.config["failsafe.land_after_s"] = 0.6
+
+
+def test_a_page_in_control_that_falls_silent_hovers_then_lands(client: TestClient, node: Node) -> None:
+    quick(node)
+    with page(client) as pilot, node.connect("watcher", access="observe") as watcher:
+        pilot.take()
+        with pilot.staying():
+            pilot.take_off()
+            pilot.say("fly", forward=0.3)
+            until(lambda: node.flyer.state is FlightState.FLYING)
+            until(lambda: node.flyer.state is FlightState.HOVERING)  # nothing more came by the sticks
+            time.sleep(0.6)  # longer than the proxy waits here
+            assert watcher.feedback().lease, "a page that pings keeps control while it hovers"
+        silent_s = time.monotonic()
+        until(lambda: node.flyer.state in (FlightState.LANDING, FlightState.LANDED), "it lands")
+        assert GONE_S + 0.2 < time.monotonic() - silent_s < GONE_S + 2.0
+        told = pilot.wait("authority", mine=False)
+        assert "did not hear this page for 2 s" in told["why"]
+        pilot.say("ping")
+        pilot.say("takeoff")
+        assert "take control first" in pilot.wait("refused", do="takeoff")["why"]
+        assert not watcher.feedback().lease, "it does not come back by itself"
+
+
+def test_a_page_that_pings_and_hears_nothing_is_silent_too(client: TestClient, node: Node) -> None:
+    quick(node)
+    with page(client) as pilot:
+        pilot.take().take_off()
+        heard_s = time.monotonic()
+        while node.flyer.state is not FlightState.LANDED and time.monotonic() - heard_s < GONE_S + 3.0:
+            pilot.say("ping", seen_s=heard_s)  # no pong since
+            time.sleep(0.05)
+        assert node.flyer.state in (FlightState.LANDING, FlightState.LANDED)

@@ -1,0 +1,265 @@
+"""Asking for control before it is taken: pages on both sides, over a real proxy; and what is decided without one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from skyloop.client import AuthorityStatus, Drone
+from skyloop.cockpit.commands import decode_command
+from skyloop.cockpit.takeover import QueuePosition, QueueTracker, TakeoverQuestions
+from skyloop.errors import DecodeError
+from skyloop.messages import Event, EventKind, FlightState
+from tests.cockpit.fake import Node, until
+from tests.cockpit.test_control import Page, page
+from tests.cockpit.testclient import TestClient
+
+S = 1_000_000_000
+
+
+@contextmanager
+def asks(node: Node, app: str = "survey.py", priority: int = 4, **options: Any) -> Iterator[Drone]:
+    """A program that asks for the drone and waits in line."""
+    drone = Drone(node.dial, app=app).open(priority=priority, takeover="ask", stay=True, **options)
+    try:
+        yield drone
+    finally:
+        drone.close()
+
+
+def question(pilot: Page) -> dict[str, Any]:
+    """The only one that the page is asked."""
+    [asked] = pilot.wait("asked")["questions"]
+    return dict(asked)
+
+
+def waits(pilot: Page, **values: Any) -> dict[str, Any]:
+    """What the page is told next of its place in the line, with these values."""
+    while True:
+        line = pilot.wait("authority")["line"] or {}
+        if values.items() <= line.items():
+            return dict(line)
+
+
+# Being asked -----------------------------------------------------------------------------------------------------
+
+
+def test_a_page_that_flies_is_asked_and_hands_over(client: TestClient, node: Node) -> None:
+    with page(client) as pilot:
+        pilot.take(8).take_off()
+        pilot.say("fly", forward=0.3)
+        until(lambda: node.flyer.state is FlightState.FLYING)
+        with asks(node, for_s=60.0) as drone:
+            asked = question(pilot)
+            assert 8.0 < asked.pop("left_s") <= 10.0
+            assert asked == {
+                "id": drone.app_id,
+                "by": "survey.py",
+                "priority": 4,
+                "for_s": 60.0,
+                "declined": False,
+            }
+            pilot.say("answer", id=drone.app_id, grant=True)
+            told = pilot.wait("authority", state="preempted")
+            assert (told["holder"], told["mine"]) == ("survey.py", False)
+            assert {"type": "asked", "questions": []} in pilot.told
+            until(lambda: drone.authority.state == "held")
+            until(lambda: node.flyer.state is FlightState.HOVERING, "it hovers before it changes hands")
+            assert told["line"]["position"] == 1 or waits(pilot, position=1)
+        pilot.wait("authority", mine=True, line=None)  # the program has ended
+
+
+def test_a_page_keeps_it_and_says_why(client: TestClient, node: Node) -> None:
+    with page(client) as pilot:
+        pilot.take(8)
+        with asks(node) as drone:
+            assert not question(pilot)["declined"]
+            pilot.say("answer", id=drone.app_id, grant=False, reason="measuring")
+            assert question(pilot)["declined"]
+            pilot.wait("done", do="answer")
+            until(lambda: any(event.kind is EventKind.AUTHORITY_DECLINED for event in drone.recent_events()))
+            assert drone.recent_events()[-1].data["reason"] == "measuring"
+            assert drone.authority.state == "queued"
+        pilot.wait("asked", questions=[])  # it has left
+        pilot.say("answer", id=drone.app_id, grant=True)
+        assert "nobody asks" in pilot.wait("refused", do="answer")["why"]
+        pilot.say("hover")
+        pilot.wait("done", do="hover")
+
+
+@pytest.mark.parametrize("answers", [True, False])
+def test_a_higher_priority_has_it_when_the_time_is_over(client: TestClient, node: Node, answers: bool) -> None:
+    with page(client) as pilot:
+        pilot.take(8).say("set", name="authority.ask_s", value=0.5)
+        pilot.wait("done", do="set")
+        with asks(node) as drone:
+            assert question(pilot)["left_s"] <= 0.5
+            if answers:
+                pilot.say("answer", id=drone.app_id, grant=False)
+            assert pilot.wait("authority", mine=False)["holder"] == "survey.py"
+            assert {"type": "asked", "questions": []} in pilot.told
+
+
+def test_one_that_is_no_higher_asks_no_more_when_the_time_is_over(client: TestClient, node: Node) -> None:
+    with page(client) as pilot:
+        pilot.take(8).say("set", name="authority.ask_s", value=0.2)
+        pilot.wait("done", do="set")
+        with asks(node, priority=8) as drone:
+            question(pilot)
+            pilot.wait("asked", questions=[])
+            pilot.say("hover")
+            pilot.wait("done", do="hover")
+            assert drone.authority.state == "queued"
+
+
+def test_several_ask_and_the_first_in_line_has_it(client: TestClient, node: Node) -> None:
+    with page(client) as pilot:
+        pilot.take(4)
+        with asks(node, "late.py", priority=10) as late:
+            question(pilot)
+            with asks(node, "early.py", priority=6) as early:
+                assert [one["by"] for one in pilot.wait("asked")["questions"]] == ["early.py", "late.py"]
+                pilot.say("answer", id=late.app_id, grant=True)
+                pilot.wait("authority", holder="early.py")
+                until(lambda: early.authority.state == "held")
+                assert late.authority.state == "queued"
+
+
+def test_only_who_has_control_can_answer(client: TestClient, node: Node) -> None:
+    with node.connect("demo"), page(client) as pilot, asks(node) as drone:
+        pilot.say("answer", id=drone.app_id, grant=True)
+        assert pilot.wait("refused", do="answer")["why"] == "take control first"
+        assert drone.authority.state == "queued"
+
+
+def test_who_releases_is_asked_no_more(client: TestClient, node: Node) -> None:
+    with page(client) as pilot:
+        pilot.take(8)
+        with asks(node) as drone:
+            question(pilot)
+            pilot.say("release")
+            pilot.wait("asked", questions=[])
+            until(lambda: drone.authority.state == "held")
+
+
+# Asking ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_page_asks_first_and_is_given_it(client: TestClient, node: Node) -> None:
+    with node.connect("demo") as demo, page(client) as pilot:
+        demo.on_takeover(lambda request: request.by.startswith("cockpit") and request.priority == 20)
+        pilot.say("take", priority=20, ask=True)  # no higher than the holder's, which would be refused without asking
+        assert pilot.wait("authority", mine=True)["line"] is None
+        until(lambda: demo.authority.state == "preempted")
+        pilot.say("release")
+        until(lambda: demo.authority.state == "held")
+
+
+def test_a_page_waits_in_line_and_leaves_it(client: TestClient, node: Node) -> None:
+    with node.connect("demo") as demo, page(client) as pilot:
+        demo.on_takeover(lambda _: "measuring")
+        pilot.say("take", priority=8, ask=True)
+        line = waits(pilot, declined="measuring", position=1)
+        assert line["asked"]
+        assert 8.0 < line["wait_s"] <= 10.0, "then the higher priority has it"
+        pilot.say("fly", forward=0.3)
+        assert "demo has control" in pilot.wait("refused", do="fly")["why"]
+        pilot.say("release")
+        pilot.wait("authority", state="none", line=None)
+        until(lambda: any(event.kind is EventKind.AUTHORITY_WITHDRAWN for event in demo.recent_events()))
+        assert demo.authority.state == "held"
+
+
+def test_a_page_that_asked_takes_over_when_it_can_wait_no_longer(client: TestClient, node: Node) -> None:
+    with node.connect("demo"), page(client) as pilot:
+        pilot.say("take", priority=8, ask=True)
+        waits(pilot, asked=True, position=1)
+        pilot.take(8)
+
+
+def test_a_page_that_dies_waits_no_more(client: TestClient, node: Node) -> None:
+    with page(client) as first:
+        first.take(8)
+        with page(client) as second:
+            second.say("take", priority=8, ask=True)
+            assert question(first)["by"].startswith("cockpit")
+            waits(second, asked=True)
+        first.wait("asked", questions=[])
+
+
+def test_a_free_drone_is_had_at_once(client: TestClient, node: Node) -> None:
+    with page(client) as pilot:
+        pilot.say("take", priority=8, ask=True)
+        pilot.wait("authority", mine=True)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{"do":"take","priority":4,"ask":1}',
+        '{"do":"answer","id":1}',
+        '{"do":"answer","grant":true}',
+        '{"do":"answer","id":1,"grant":"yes"}',
+        '{"do":"answer","id":1,"grant":false,"reason":"' + "x" * 201 + '"}',
+    ],
+)
+def test_what_makes_no_sense_is_no_order(text: str) -> None:
+    with pytest.raises(DecodeError, match="not understood"):
+        decode_command(text)
+
+
+# Without a proxy -------------------------------------------------------------------------------------------------
+
+
+def asked(by_id: int, at_s: int = 0, **values: Any) -> Event:
+    data = {"app_id": 1, "lease": 5, "by": f"app {by_id}", "by_id": by_id, "by_priority": 4, "within_s": 10.0, **values}
+    return Event(EventKind.AUTHORITY_ASKED, "…", at_s * S, data=data)
+
+
+def withdrawn(by_id: Any, app_id: int = 1) -> Event:
+    return Event(EventKind.AUTHORITY_WITHDRAWN, "…", 0, data={"app_id": app_id, "by_id": by_id})
+
+
+def test_questions_come_and_go() -> None:
+    questions = TakeoverQuestions()
+    assert not questions.on_event(asked(2), 9), "somebody else is asked"
+    assert not questions.on_event(asked("x"), 1)  # type: ignore[arg-type]
+    assert questions.on_event(asked(2), 1)
+    assert questions.on_event(asked(3, at_s=4, by_priority=2), 1)
+    told = questions.to_json(6 * S)["questions"]
+    assert [(one["id"], one["left_s"]) for one in told] == [(3, 8.0), (2, 4.0)]
+    assert not questions.update(5, 6 * S)
+    assert questions.decline(2)
+    assert not questions.decline(7)
+    assert [one["declined"] for one in questions.to_json(6 * S)["questions"]] == [False, True]
+    assert questions.update(5, 10 * S), "the time of one is over"
+    assert questions.find(2) is None
+    assert not questions.on_event(withdrawn(3, app_id=9), 1)
+    assert not questions.on_event(withdrawn([3]), 1)
+    assert questions.on_event(withdrawn(3), 1)
+    assert not questions.on_event(withdrawn(3), 1)
+    questions.on_event(asked(4, at_s=20), 1)
+    assert questions.update(6, 20 * S), "it is held under another lease now"
+    assert questions.to_json(20 * S) == {"type": "asked", "questions": []}
+
+
+def test_a_place_in_line_is_the_same_until_there_is_news() -> None:
+    line = QueueTracker()
+    assert line.update(AuthorityStatus(), 0) is None
+    line.request(ask=True)
+    status = AuthorityStatus("queued", holder="demo", position=2, expected_wait_s=30.0)
+    place = line.update(status, 1 * S)
+    assert place == QueuePosition(2, 31 * S, asked=True, declined=None)
+    assert line.update(status, 9 * S) == place
+    assert place.to_json(11 * S) == {"position": 2, "wait_s": 20.0, "asked": True, "declined": None}
+    line.on_event(Event(EventKind.AUTHORITY_DECLINED, "…", 0, data={"app_id": 8, "reason": "no"}), 1)
+    assert line.update(status, 9 * S) == place, "somebody else was declined"
+    line.on_event(Event(EventKind.AUTHORITY_DECLINED, "…", 0, data={"app_id": 1, "reason": "no"}), 1)
+    assert line.update(status, 9 * S) == QueuePosition(2, 31 * S, asked=True, declined="no")
+    moved = AuthorityStatus("queued", holder="demo", position=1)
+    assert line.update(moved, 12 * S) == QueuePosition(1, None, asked=True, declined="no")
+    assert line.update(AuthorityStatus("held", 3), 13 * S) is None
+    assert line.update(AuthorityStatus("preempted", holder="safety"), 14 * S) == QueuePosition(None, None, False, None)

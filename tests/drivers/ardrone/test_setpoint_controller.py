@@ -1,0 +1,275 @@
+"""What is said of take-off, landing and emergency, tick by tick."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import pytest
+
+from skyloop.drivers.ardrone.setpoints import Condition, SetpointController, StickLimits
+from skyloop.errors import DriverError
+from skyloop.messages import (
+    AnyAction,
+    Attitude,
+    EmergencyStop,
+    Hover,
+    Idle,
+    Land,
+    ResetEmergency,
+    Takeoff,
+    Velocity,
+)
+from skyloop.wire.ardrone.at import Ref
+from skyloop.wire.ardrone.navdata import ControlState, State
+from tests.drivers.ardrone.scripted import ns
+
+GROUND = Condition(State(0), ControlState.LANDED)
+AIR = Condition(State.FLYING, ControlState.HOVERING)
+LANDING = Condition(State.FLYING, ControlState.LANDING)
+EMERGENCY = Condition(State.EMERGENCY, ControlState.DEFAULT)
+PERIOD_S = 0.03
+
+
+@dataclass
+class Cockpit:
+    """A pilot with the time."""
+
+    setpoints: SetpointController = field(default_factory=SetpointController)
+    now_s: float = 1000.0
+
+    def __post_init__(self) -> None:
+        self.setpoints.limits = StickLimits(0.2, 0.7, 1.75)
+
+    def take(self, action: AnyAction) -> AnyAction:
+        return self.setpoints.apply(action, ns(self.now_s))
+
+    def hears(self, condition: Condition) -> None:
+        self.setpoints.on_condition(condition, ns(self.now_s))
+
+    def ref(self) -> Ref | None:
+        """At the next tick; without the fixed bits."""
+        self.now_s += PERIOD_S
+        return next((self._bits(args) for name, args in self.setpoints.messages(ns(self.now_s)) if name == "REF"), None)
+
+    def pcmd(self) -> tuple[object, ...]:
+        self.now_s += PERIOD_S
+        return self.setpoints.messages(ns(self.now_s))[-1][1]
+
+    @staticmethod
+    def _bits(arguments: tuple[object, ...]) -> Ref:
+        bits = arguments[0]
+        assert isinstance(bits, int)
+        assert bits & Ref.FIXED == Ref.FIXED
+        return Ref(bits & ~Ref.FIXED)
+
+
+def at(condition: Condition | None) -> Cockpit:
+    cockpit = Cockpit()
+    if condition is not None:
+        cockpit.hears(condition)
+    return cockpit
+
+
+@pytest.mark.parametrize(
+    ("condition", "ref"),
+    [(None, None), (GROUND, Ref(0)), (AIR, None), (LANDING, None), (EMERGENCY, Ref(0))],
+)
+def test_before_anything_is_decided_the_drone_goes_on(condition: Condition | None, ref: Ref | None) -> None:
+    assert at(condition).ref() == ref
+
+
+def test_a_drone_that_another_program_flies_is_told_nothing_but_that_we_are_there() -> None:
+    cockpit = at(AIR)
+    assert cockpit.setpoints.messages(0) == [("COMWDG", ())], "neither REF nor PCMD, which would stop its sticks"
+    cockpit.setpoints.apply(Hover(), 0)
+    assert {name for name, _ in cockpit.setpoints.messages(0)} == {"REF", "PCMD"}
+    cockpit.setpoints.on_condition(GROUND, 1)
+    cockpit.setpoints.on_condition(AIR, 2)
+    assert cockpit.setpoints.messages(3) == [("COMWDG", ())], "the next flight is not ours because the last one was"
+
+
+def test_takeoff_is_said_until_the_drone_flies_and_as_long_as_it_does() -> None:
+    cockpit = at(GROUND)
+    assert cockpit.take(Takeoff()) == Takeoff()
+    assert [cockpit.ref() for _ in range(5)] == [Ref.TAKEOFF] * 5
+    cockpit.hears(Condition(State.FLYING, ControlState.TAKING_OFF))
+    assert cockpit.ref() == Ref.TAKEOFF
+    cockpit.hears(AIR)
+    assert cockpit.ref() == Ref.TAKEOFF
+    cockpit.hears(LANDING)
+    assert cockpit.ref() == Ref(0), "it lands by itself, and is not talked out of it"
+    cockpit.hears(GROUND)
+    assert cockpit.ref() == Ref(0), "nor made to take off again"
+
+
+def test_hover_and_set_points_do_not_break_a_takeoff_off() -> None:
+    cockpit = at(GROUND)
+    cockpit.take(Takeoff())
+    cockpit.take(Hover())
+    assert cockpit.ref() == Ref.TAKEOFF
+    cockpit.take(Attitude(pitch=0.1))
+    assert cockpit.ref() == Ref.TAKEOFF
+
+
+def test_a_takeoff_has_its_time() -> None:
+    cockpit = at(GROUND)
+    cockpit.take(Takeoff())
+    cockpit.now_s += 4.9
+    assert cockpit.ref() == Ref.TAKEOFF
+    cockpit.now_s += 0.2
+    assert cockpit.ref() == Ref(0)
+    assert ["did not take off" in notice.text for notice in cockpit.setpoints.notices()] == [True]
+
+
+@pytest.mark.parametrize("condition", [AIR, GROUND, None])
+def test_landing_is_said_until_something_else_is_decided(condition: Condition | None) -> None:
+    cockpit = at(condition)
+    assert cockpit.take(Land()) == Land()
+    assert [cockpit.ref() for _ in range(5)] == [Ref(0)] * 5
+
+
+def test_a_landing_of_ours_can_be_broken_off() -> None:
+    cockpit = at(AIR)
+    cockpit.take(Land())
+    cockpit.hears(LANDING)
+    cockpit.take(Hover())
+    assert cockpit.ref() == Ref.TAKEOFF
+    cockpit.hears(AIR)
+    assert cockpit.ref() == Ref.TAKEOFF
+
+
+def test_set_points_are_said_until_the_next_decision() -> None:
+    cockpit = at(AIR)
+    assert cockpit.take(Attitude(pitch=0.1, climb=9.0)) == Attitude(pitch=0.1, climb=0.7)
+    assert cockpit.pcmd() == cockpit.pcmd() == (1, 0.0, -0.5, 1.0, 0.0)
+    assert cockpit.take(Idle()) == Idle()
+    assert cockpit.pcmd() == (1, 0.0, -0.5, 1.0, 0.0)
+    cockpit.take(Hover())
+    assert cockpit.pcmd() == (0, 0.0, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("action", [Land(), Takeoff(), EmergencyStop()])
+def test_what_ends_a_set_point(action: AnyAction) -> None:
+    cockpit = at(AIR)
+    cockpit.take(Attitude(pitch=0.1))
+    cockpit.take(action)
+    assert cockpit.pcmd()[0] == 0
+
+
+def test_a_set_point_does_not_outlive_the_flight() -> None:
+    cockpit = at(AIR)
+    cockpit.take(Attitude(pitch=0.1))
+    cockpit.hears(GROUND)
+    assert cockpit.pcmd()[0] == 0
+
+
+def test_without_limits_it_hovers_and_says_so_once() -> None:
+    cockpit = at(AIR)
+    cockpit.setpoints.limits = None
+    for _ in range(3):
+        assert cockpit.take(Attitude(pitch=0.1)) == Hover()
+    assert cockpit.pcmd()[0] == 0
+    assert len(cockpit.setpoints.notices()) == 1
+
+
+def test_absolute_control() -> None:
+    cockpit = at(AIR)
+    cockpit.setpoints.reference_rad = 0.0
+    cockpit.take(Attitude(pitch=0.1))
+    assert cockpit.pcmd()[0] == 5
+    cockpit.take(Hover())
+    assert cockpit.setpoints.messages(0)[-1][0] == "PCMD", "hovering needs no heading"
+
+
+# Emergency -------------------------------------------------------------------------------------------------------
+
+
+def test_the_emergency_bit_is_let_go_when_the_motors_are_cut() -> None:
+    cockpit = at(AIR)
+    cockpit.take(EmergencyStop())
+    assert [cockpit.ref() for _ in range(4)] == [Ref.EMERGENCY] * 4
+    cockpit.hears(EMERGENCY)
+    assert [cockpit.ref() for _ in range(4)] == [Ref(0)] * 4
+
+
+def test_an_emergency_stop_of_what_is_stopped_resets_nothing() -> None:
+    cockpit = at(EMERGENCY)
+    cockpit.take(EmergencyStop())
+    assert cockpit.ref() == Ref(0)
+
+
+def test_an_emergency_stop_is_said_to_a_drone_that_is_not_heard() -> None:
+    cockpit = at(AIR)
+    cockpit.setpoints.lost()
+    cockpit.take(EmergencyStop())
+    assert {cockpit.ref() for _ in range(100)} == {Ref.EMERGENCY}, "without a second edge, which might reset it"
+
+
+def test_an_emergency_stop_without_effect_gets_a_new_edge() -> None:
+    cockpit = at(AIR)
+    cockpit.take(EmergencyStop())
+    said = []
+    for _ in range(40):
+        said.append(cockpit.ref())
+        cockpit.hears(AIR)
+    assert said.count(Ref(0)) == 2
+    assert said[0] == said[-1] == Ref.EMERGENCY
+
+
+def test_no_second_edge_while_nothing_new_is_heard() -> None:
+    cockpit = at(AIR)
+    cockpit.take(EmergencyStop())
+    assert {cockpit.ref() for _ in range(40)} == {Ref.EMERGENCY}
+
+
+@pytest.mark.parametrize("action", [Hover(), Land(), Attitude(pitch=0.1)])
+def test_nothing_but_a_reset_takes_an_emergency_stop_back(action: AnyAction) -> None:
+    cockpit = at(AIR)
+    cockpit.take(EmergencyStop())
+    cockpit.take(action)
+    assert cockpit.ref() == Ref.EMERGENCY
+
+
+def test_reset_toggles_until_it_shows() -> None:
+    cockpit = at(EMERGENCY)
+    cockpit.take(ResetEmergency())
+    assert cockpit.ref() == Ref.EMERGENCY
+    cockpit.hears(GROUND)
+    assert cockpit.ref() == Ref(0)
+
+
+def test_reset_without_an_emergency_cuts_no_motors() -> None:
+    cockpit = at(GROUND)
+    cockpit.take(ResetEmergency())
+    assert cockpit.ref() == Ref(0)
+
+
+def test_a_reset_is_not_waited_for_after_the_link_was_lost() -> None:
+    cockpit = at(EMERGENCY)
+    cockpit.take(ResetEmergency())
+    cockpit.setpoints.lost()
+    cockpit.hears(EMERGENCY)
+    assert cockpit.ref() == Ref(0)
+
+
+def test_nobody_resets_by_himself() -> None:
+    cockpit = at(AIR)
+    cockpit.take(Attitude(pitch=0.1))
+    for _ in range(50):
+        cockpit.hears(EMERGENCY)
+        assert cockpit.ref() == Ref(0)
+
+
+@pytest.mark.parametrize(
+    ("condition", "action", "says"),
+    [
+        (None, Takeoff(), "not heard"),
+        (EMERGENCY, Takeoff(), "reset it first"),
+        (None, ResetEmergency(), "not heard"),
+        (AIR, Velocity(), "takes no velocity"),
+    ],
+)
+def test_what_cannot_be_done(condition: Condition | None, action: AnyAction, says: str) -> None:
+    cockpit = at(condition)
+    with pytest.raises(DriverError, match=says):
+        cockpit.take(action)

@@ -1,0 +1,133 @@
+"""The ways to a vehicle: a port that listens, one that speaks first, TCP, and a serial line."""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+import sys
+import tty
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+
+import pytest
+
+from skyloop.drivers.mavlink.link import MavlinkConnection, SerialPort, open_connection
+from skyloop.drivers.mavlink.options import Address, ConnectionKind
+from skyloop.errors import MissingExtraError
+from skyloop.transport.testing import wait_until
+
+LOCAL = "127.0.0.1"
+
+
+def came(connection: MavlinkConnection) -> bytes:
+    """All that comes within a while, until something has."""
+    assert select.select([connection], [], [], 5.0)[0], "nothing comes"
+    return b"".join(data for data, _ in connection.receive())
+
+
+@contextmanager
+def by_tcp() -> Iterator[tuple[MavlinkConnection, socket.socket]]:
+    """Our end, and the vehicle's."""
+    with (
+        socket.create_server((LOCAL, 0)) as server,
+        closing(open_connection(Address(ConnectionKind.TCP, LOCAL, server.getsockname()[1]))) as ours,
+        server.accept()[0] as vehicle,
+    ):
+        yield ours, vehicle
+
+
+@pytest.fixture
+def line() -> Iterator[tuple[int, str]]:
+    """A serial line: its far end, and the device at this one."""
+    far, near = os.openpty()
+    tty.setraw(near)
+    yield far, os.ttyname(near)
+    os.close(near)
+    os.close(far)
+
+
+def test_a_port_that_listens_answers_whom_it_heard() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
+        vehicle.bind((LOCAL, 0))
+        ours = open_connection(Address(ConnectionKind.UDP_IN, LOCAL, 0))
+        try:
+            assert ours.receive() == []
+            ours.send(b"to nobody yet", None)
+            with socket.socket(fileno=os.dup(ours.fileno())) as same:
+                port = same.getsockname()[1]
+            vehicle.sendto(b"one", (LOCAL, port))
+            assert select.select([ours], [], [], 5.0)[0]
+            [(data, peer)] = ours.receive()
+            assert (data, peer) == (b"one", vehicle.getsockname())
+            ours.send(b"two", peer)
+            vehicle.settimeout(5.0)
+            assert vehicle.recv(100) == b"two", "what was sent to nobody never came"
+            with pytest.raises(OSError, match="in use"):
+                open_connection(Address(ConnectionKind.UDP_IN, LOCAL, port))
+        finally:
+            ours.close()
+
+
+def test_a_port_that_speaks_first_needs_no_peer() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
+        vehicle.bind((LOCAL, 0))
+        vehicle.settimeout(5.0)
+        ours = open_connection(Address(ConnectionKind.UDP_OUT, LOCAL, vehicle.getsockname()[1]))
+        try:
+            ours.send(b"hello", None)
+            data, peer = vehicle.recvfrom(100)
+            assert data == b"hello"
+            vehicle.sendto(b"who is it", peer)
+            assert came(ours) == b"who is it"
+        finally:
+            ours.close()
+
+
+def test_tcp_brings_bytes_and_says_when_it_ends() -> None:
+    with by_tcp() as (ours, vehicle):
+        assert ours.receive() == [], "nothing yet"
+        ours.send(b"hello", None)
+        assert vehicle.recv(100) == b"hello"
+        vehicle.sendall(b"heartbeat")
+        assert came(ours) == b"heartbeat"
+        vehicle.close()
+        assert select.select([ours], [], [], 5.0)[0]
+        with pytest.raises(ConnectionError, match="the vehicle ended the connection"):
+            ours.receive()
+
+
+def test_tcp_ends_rather_than_send_half_a_frame() -> None:
+    """What follows half a frame would be noise to the vehicle; a whole one that finds no room is merely lost."""
+    with by_tcp() as (ours, _):
+        with pytest.raises(ConnectionError, match="takes nothing any more"):
+            ours.send(bytes(64 << 20), None)
+        # Freed room may take a moment to be known on both sides: here nobody reads, so none is freed.
+        wait_until(lambda: not select.select([], [ours], [], 0.0)[1], "there is no room at all")
+        ours.send(b"lost without a word", None)
+
+
+def test_a_serial_line_carries_bytes_both_ways(line: tuple[int, str]) -> None:
+    pytest.importorskip("serial")
+    far, device = line
+    ours = open_connection(Address(ConnectionKind.SERIAL, device, 57600))
+    try:
+        assert isinstance(ours, SerialPort)
+        assert ours.receive() == []
+        os.write(far, b"heartbeat")
+        assert came(ours) == b"heartbeat"
+        ours.send(b"hello", None)
+        assert os.read(far, 100) == b"hello"
+        with pytest.raises(OSError, match="exclusively lock"):
+            open_connection(Address(ConnectionKind.SERIAL, device, 57600))
+    finally:
+        ours.close()
+
+
+def test_a_serial_line_that_is_not_there_and_one_without_pyserial(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("serial")
+    with pytest.raises(OSError, match="nowhere"):
+        open_connection(Address(ConnectionKind.SERIAL, "/dev/nowhere", 57600))
+    monkeypatch.setitem(sys.modules, "serial", None)
+    with pytest.raises(MissingExtraError, match="mavlink"):
+        open_connection(Address(ConnectionKind.SERIAL, "/dev/nowhere", 57600))

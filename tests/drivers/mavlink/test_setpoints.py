@@ -1,0 +1,658 @@
+"""What the vehicle is told, for what is decided and heard: on a clock that the tests move."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from skyloop.errors import DriverError
+from skyloop.messages import (
+    Attitude,
+    EmergencyStop,
+    FlightState,
+    Hover,
+    Idle,
+    Land,
+    ResetEmergency,
+    Takeoff,
+    Velocity,
+)
+from skyloop.wire.mavlink.axes import angles_of
+from skyloop.wire.mavlink.modes import Landed
+from skyloop.wire.mavlink.texts import chunks_of
+from tests.drivers.mavlink.scripted import ARDUPILOT, PX4, Bench, Vehicle
+
+ARM, MODE, TAKEOFF = 400, 176, 22
+FORCE = 21196.0
+AUTOPILOTS = pytest.mark.parametrize("autopilot", [ARDUPILOT, PX4])
+GUIDED = {ARDUPILOT: "GUIDED", PX4: "OFFBOARD"}
+HOLD = {ARDUPILOT: ("BRAKE", (MODE, 1.0, 17.0, 0.0, 0.0)), PX4: ("AUTO.LOITER", (MODE, 1.0, 4.0, 3.0, 0.0))}
+LAND = {ARDUPILOT: ("LAND", (MODE, 1.0, 9.0, 0.0, 0.0)), PX4: ("AUTO.LAND", (MODE, 1.0, 4.0, 6.0, 0.0))}
+SET_POINT = "SET_POSITION_TARGET_LOCAL_NED"
+
+
+def steering(autopilot: int, action: Velocity | Attitude = Velocity(forward=1.0)) -> Bench:  # noqa: B008  immutable
+    """Flying by set-points."""
+    bench = Bench(Vehicle(autopilot)).flying(GUIDED[autopilot])
+    bench.apply(action)
+    bench.go_on(1.2)
+    bench.said.clear()
+    return bench
+
+
+# Taking off ------------------------------------------------------------------------------------------------------
+
+
+def test_arducopter_is_guided_armed_and_told_a_relative_altitude() -> None:
+    bench = Bench(Vehicle(ARDUPILOT)).found()
+    vehicle = bench.vehicle
+    bench.apply(Takeoff())
+    assert bench.commands() == [(MODE, 1.0, 4.0, 0.0, 0.0)]
+    vehicle.mode = "GUIDED"
+    bench.hear(vehicle.heartbeat())
+    bench.tick()
+    assert bench.commands() == [(ARM, 1.0, 0.0, 0.0, 0.0)]
+    bench.answer(ARM)
+    bench.tick()  # the heartbeat says it a second later
+    assert bench.commands() == [(TAKEOFF, 0.0, 0.0, 0.0, 1.5)]
+    assert bench.session.setpoints is not None
+    bench.answer(TAKEOFF)
+    vehicle.armed, vehicle.status, vehicle.landed = True, 4, Landed.IN_AIR
+    bench.go_on(0.5)
+    vehicle.place = (0.0, 0.0, -0.8)
+    assert bench.apply(Velocity(forward=1.0)) == Idle(), "a set-point would cancel it"
+    bench.go_on(1.0)
+    assert bench.state() is FlightState.TAKING_OFF
+    assert bench.heard_of(SET_POINT) == []
+    vehicle.place = (0.0, 0.0, -1.4)
+    bench.go_on(0.1)
+    assert bench.state() is FlightState.HOVERING
+    assert bench.heard_of(SET_POINT)
+
+
+def test_px4_holds_is_armed_and_told_an_altitude_above_sea_level() -> None:
+    bench = Bench(Vehicle(PX4)).found()
+    vehicle = bench.vehicle
+    vehicle.mode = "OFFBOARD"  # left from a flight before: it can't be armed in it
+    bench.hear(vehicle.heartbeat())
+    bench.apply(Takeoff())
+    assert bench.commands() == [HOLD[PX4][1]]
+    vehicle.mode = "AUTO.LOITER"
+    bench.hear(vehicle.heartbeat())
+    bench.tick()
+    assert bench.commands() == [(ARM, 1.0, 0.0, 0.0, 0.0)]
+    bench.answer(ARM)
+    bench.tick()
+    (said,) = bench.heard_of("COMMAND_LONG")
+    assert (said.command, said.param7) == (TAKEOFF, pytest.approx(489.5))
+    assert math.isnan(said.param4)
+    assert math.isnan(said.param5)
+    assert math.isnan(said.param6)
+    vehicle.armed, vehicle.status, vehicle.mode, vehicle.landed = True, 4, "AUTO.TAKEOFF", Landed.TAKING_OFF
+    vehicle.place = (0.0, 0.0, -1.0)
+    bench.go_on(1.2)
+    assert bench.state() is FlightState.TAKING_OFF
+    vehicle.mode, vehicle.landed = "AUTO.LOITER", Landed.IN_AIR
+    bench.hear(vehicle.heartbeat())
+    bench.commands()
+    bench.go_on(0.1)
+    assert bench.commands() == [(MODE, 1.0, 6.0, 0.0, 0.0)], "set-points flowed meanwhile: it enters at once"
+    vehicle.mode = "OFFBOARD"
+    bench.go_on(0.1)
+    assert bench.state() is FlightState.HOVERING
+
+
+@AUTOPILOTS
+def test_a_refusal_is_told_with_the_vehicles_words_and_tried_again(autopilot: int) -> None:
+    bench = Bench(Vehicle(autopilot)).found()
+    bench.vehicle.mode = {ARDUPILOT: "GUIDED", PX4: "AUTO.LOITER"}[autopilot]
+    bench.hear(bench.vehicle.heartbeat())
+    bench.apply(Takeoff())
+    for chunk in chunks_of("Arm: Gyros inconsistent", 2, 1):
+        bench.hear(chunk)
+    bench.answer(ARM, 4)
+    bench.tick()
+    with pytest.raises(DriverError, match="arming was failed: Arm: Gyros inconsistent"):
+        bench.apply(Takeoff())
+    bench.commands()
+    bench.go_on(2.1)
+    assert [command[0] for command in bench.commands()] == [ARM, ARM]
+
+
+@AUTOPILOTS
+def test_a_take_off_that_nobody_asks_for_any_more_is_given_up(autopilot: int) -> None:
+    """The pilot may be gone: a vehicle that gets ready later must not start then."""
+    bench = Bench(Vehicle(autopilot)).found()
+    bench.apply(Takeoff())
+    bench.go_on(7.0)
+    assert any("did not take off" in text for text in bench.texts)
+    bench.commands()
+    bench.go_on(3.0)
+    assert bench.commands() == []
+
+
+@AUTOPILOTS
+def test_landing_ends_a_take_off_on_the_ground_by_disarming(autopilot: int) -> None:
+    bench = Bench(Vehicle(autopilot)).found()
+    bench.apply(Takeoff())
+    bench.vehicle.armed = True
+    bench.go_on(0.2)
+    bench.apply(Land())
+    bench.commands()
+    bench.go_on(0.6)
+    assert (ARM, 0.0, 0.0, 0.0, 0.0) in bench.commands()
+    bench.vehicle.armed = False
+    bench.go_on(0.3)
+    bench.commands()
+    bench.go_on(1.0)
+    assert bench.commands() == []
+
+
+def test_a_cancelled_climb_goes_on_by_a_place() -> None:
+    bench = Bench(Vehicle(ARDUPILOT)).found()
+    vehicle = bench.vehicle
+    bench.apply(Takeoff())
+    vehicle.armed, vehicle.mode, vehicle.status, vehicle.landed = True, "GUIDED", 4, Landed.IN_AIR
+    vehicle.place = (0.0, 0.0, -0.7)  # somebody's set-point stopped it here
+    bench.go_on(5.0)
+    assert bench.heard_of(SET_POINT) == []
+    bench.go_on(3.0)
+    said = bench.heard_of(SET_POINT)[-1]
+    assert (said.coordinate_frame, said.type_mask, said.z) == (1, 0xDF8, pytest.approx(-1.5, abs=0.01))
+
+
+def test_who_takes_it_over_on_the_way_up_keeps_it() -> None:
+    bench = Bench(Vehicle(PX4)).found()
+    vehicle = bench.vehicle
+    bench.apply(Takeoff())
+    vehicle.armed, vehicle.mode, vehicle.status, vehicle.landed = True, "AUTO.TAKEOFF", 4, Landed.TAKING_OFF
+    bench.answer(ARM)
+    bench.go_on(1.0)
+    vehicle.mode = "POSCTL"
+    bench.go_on(1.0)
+    assert any("went to POSCTL" in text for text in bench.texts)
+    bench.said.clear()
+    bench.go_on(1.0)
+    assert (bench.commands(), bench.heard_of(SET_POINT)) == ([], [])
+
+
+def test_a_climb_that_ends_a_little_low_ends_all_the_same() -> None:
+    bench = Bench(Vehicle(ARDUPILOT)).found()
+    vehicle = bench.vehicle
+    bench.apply(Takeoff())
+    vehicle.armed, vehicle.mode, vehicle.status, vehicle.landed = True, "GUIDED", 4, Landed.IN_AIR
+    vehicle.place = (0.0, 0.0, -1.2)
+    bench.go_on(7.0)
+    assert bench.state() is FlightState.TAKING_OFF
+    bench.go_on(7.0)
+    assert bench.state() is FlightState.HOVERING
+
+
+def test_it_does_not_take_off_unheard() -> None:
+    bench = Bench(Vehicle(ARDUPILOT))
+    with pytest.raises(DriverError, match="not heard"):
+        bench.apply(Takeoff())
+
+
+# Set-points ------------------------------------------------------------------------------------------------------
+
+
+@AUTOPILOTS
+def test_velocity_is_streamed_in_the_bodys_frame(autopilot: int) -> None:
+    bench = steering(autopilot, Velocity(forward=1.0, left=0.5, up=0.2, yaw_rate=0.3))
+    bench.go_on(1.0)
+    said = bench.heard_of(SET_POINT)
+    assert 24 <= len(said) <= 26
+    assert {(each.coordinate_frame, each.type_mask) for each in said} == {(8, 0x5C7)}
+    newest = said[-1]
+    assert (newest.vx, newest.vy, newest.vz) == pytest.approx((1.0, -0.5, -0.2))
+    assert newest.yaw_rate == pytest.approx(-0.3)
+    assert bench.state() is FlightState.FLYING
+
+
+def test_a_new_velocity_goes_out_at_once() -> None:
+    bench = steering(ARDUPILOT)
+    bench.clock.advance(0.01)
+    bench.apply(Velocity(forward=0.4))
+    assert [each.vx for each in bench.heard_of(SET_POINT)] == [pytest.approx(0.4)]
+
+
+def test_px4_gets_set_points_for_a_second_before_it_is_to_follow_them() -> None:
+    bench = Bench(Vehicle(PX4)).flying("AUTO.LOITER")
+    bench.apply(Velocity(forward=1.0))
+    bench.go_on(0.9)
+    assert bench.commands() == []
+    assert len(bench.heard_of(SET_POINT)) >= 20
+    bench.go_on(0.3)
+    assert bench.commands() == [(MODE, 1.0, 6.0, 0.0, 0.0)]
+    bench.go_on(1.2)
+    assert len(bench.commands()) == 2, "accepted or not, until the mode shows"
+
+
+@AUTOPILOTS
+def test_on_the_ground_nothing_comes_of_set_points(autopilot: int) -> None:
+    bench = Bench(Vehicle(autopilot)).found()
+    assert bench.apply(Velocity(up=1.0)) == Idle()
+    assert bench.apply(Hover()) == Hover()
+    bench.go_on(1.5)
+    assert bench.commands() == []
+    assert bench.heard_of(SET_POINT) == []
+
+
+@pytest.mark.parametrize(("climb", "thrust"), [(0.0, 0.5), (1.25, 0.75), (9.0, 1.0), (-0.75, 0.25), (-9.0, 0.0)])
+def test_arducopters_thrust_is_a_climb_rate(climb: float, thrust: float) -> None:
+    bench = steering(ARDUPILOT, Attitude(roll=0.1, pitch=0.2, climb=climb))
+    bench.go_on(0.1)
+    said = bench.heard_of("SET_ATTITUDE_TARGET")[-1]
+    assert said.type_mask == 7
+    assert said.thrust == pytest.approx(thrust)
+    roll, pitch, _ = angles_of(tuple(said.q))
+    assert (roll, pitch) == pytest.approx((0.1, -0.2), abs=1e-5)
+
+
+def test_what_arducopter_can_not_climb_is_not_said_to_be_applied() -> None:
+    bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
+    applied = bench.apply(Attitude(climb=9.0))
+    assert isinstance(applied, Attitude)
+    assert applied.climb == 2.5
+
+
+def test_px4s_thrust_is_a_force_that_holds_the_climb_rate() -> None:
+    bench = steering(PX4, Attitude(climb=0.0))
+    bench.go_on(0.1)
+    assert bench.heard_of("SET_ATTITUDE_TARGET")[-1].thrust == pytest.approx(0.5, abs=0.01)
+    bench.vehicle.velocity = (0.0, 0.0, 0.5)  # it sinks
+    bench.go_on(0.2)
+    first = bench.heard_of("SET_ATTITUDE_TARGET")[-1].thrust
+    bench.go_on(1.0)
+    later = bench.heard_of("SET_ATTITUDE_TARGET")[-1].thrust
+    assert 0.5 < first < later < 0.7
+    bench.apply(Attitude(climb=-0.5))
+    bench.go_on(0.1)
+    assert bench.heard_of("SET_ATTITUDE_TARGET")[-1].thrust < later
+
+
+def test_a_leaning_px4_pushes_harder() -> None:
+    bench = steering(PX4, Attitude(pitch=0.5))
+    bench.go_on(0.1)
+    assert bench.heard_of("SET_ATTITUDE_TARGET")[-1].thrust == pytest.approx(0.5 / math.cos(0.5), abs=0.01)
+
+
+@AUTOPILOTS
+def test_a_yaw_rate_beside_an_attitude_turns_the_heading_that_is_asked_for(autopilot: int) -> None:
+    bench = steering(autopilot, Attitude(yaw_rate=0.5))
+    bench.go_on(3.0)
+    _, _, yaw = angles_of(tuple(bench.heard_of("SET_ATTITUDE_TARGET")[-1].q))
+    assert yaw == pytest.approx(-0.5), "counter-clockwise, and no further ahead than half a radian"
+
+
+# Hovering --------------------------------------------------------------------------------------------------------
+
+
+@AUTOPILOTS
+def test_hovering_stops_and_then_holds_the_place(autopilot: int) -> None:
+    bench = steering(autopilot)
+    bench.vehicle.velocity = (1.0, 0.0, 0.0)
+    bench.go_on(0.1)
+    bench.apply(Hover())
+    bench.go_on(0.3)
+    assert {each.type_mask for each in bench.heard_of(SET_POINT)[1:]} == {0x5C7}
+    bench.vehicle.velocity, bench.vehicle.place = (0.0, 0.0, 0.0), (4.0, 5.0, -3.0)
+    bench.go_on(0.3)
+    said = bench.heard_of(SET_POINT)[-1]
+    assert (said.type_mask, said.x, said.y, said.z) == (0xDF8, 4.0, 5.0, -3.0)
+    assert bench.state() is FlightState.HOVERING
+
+
+@AUTOPILOTS
+def test_with_nobody_at_the_controls_it_holds_by_its_own_mode_and_the_stream_ends(autopilot: int) -> None:
+    bench = steering(autopilot)
+    bench.apply(Hover(), alone=True)
+    mode, order = HOLD[autopilot]
+    bench.go_on(0.4)
+    assert set(bench.commands()) == {order}
+    assert {each.vx for each in bench.heard_of(SET_POINT)} <= {0.0}
+    bench.vehicle.mode = mode
+    bench.go_on(0.3)
+    bench.said.clear()
+    bench.go_on(2.0)
+    assert bench.heard_of(SET_POINT) == []
+    assert bench.commands() == []
+    assert bench.state() is FlightState.HOVERING
+
+
+@AUTOPILOTS
+def test_landing_is_confirmed_by_the_mode_and_not_by_the_acknowledgement(autopilot: int) -> None:
+    bench = steering(autopilot)
+    mode, order = LAND[autopilot]
+    bench.apply(Land(), alone=True)
+    bench.answer(MODE)
+    bench.go_on(1.2)
+    assert bench.commands() == [order] * 3
+    assert bench.heard_of(SET_POINT) == []
+    bench.vehicle.mode = mode
+    bench.go_on(1.0)
+    assert bench.commands() == []
+    assert bench.state() is FlightState.LANDING
+    bench.vehicle.landed = Landed.ON_GROUND
+    bench.go_on(0.1)
+    assert bench.state() is FlightState.LANDED
+
+
+# Others at the controls --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("autopilot", "mode"), [(ARDUPILOT, "LOITER"), (PX4, "POSCTL")])
+def test_somebody_who_takes_the_vehicle_over_keeps_it(autopilot: int, mode: str) -> None:
+    bench = steering(autopilot)
+    bench.vehicle.mode = mode
+    bench.go_on(1.0)
+    bench.said.clear()
+    with pytest.raises(DriverError, match=f"in {mode}, which was not chosen here"):
+        bench.apply(Velocity(forward=1.0))
+    assert bench.apply(Hover(), alone=True) == Idle()
+    assert bench.apply(Land(), alone=True) == Idle()
+    bench.go_on(2.0)
+    assert bench.commands() == []
+    assert bench.heard_of(SET_POINT) == []
+    assert bench.state() is FlightState.FLYING
+    bench.apply(Hover())
+    bench.go_on(1.2)
+    assert bench.commands(), "a fresh decision takes it back"
+
+
+@AUTOPILOTS
+def test_an_order_of_our_own_that_comes_late_is_nobody_elses(autopilot: int) -> None:
+    """A pilot is back while the failsafe's mode is still on its way: it is asked for the mode that follows again."""
+    bench = steering(autopilot)
+    bench.apply(Hover(), alone=True)
+    bench.apply(Velocity(forward=0.5))
+    bench.go_on(0.3)
+    bench.vehicle.mode = HOLD[autopilot][0]
+    bench.commands()
+    bench.go_on(1.5)
+    guided = {ARDUPILOT: (MODE, 1.0, 4.0, 0.0, 0.0), PX4: (MODE, 1.0, 6.0, 0.0, 0.0)}[autopilot]
+    assert set(bench.commands()) == {guided}
+    bench.vehicle.mode = GUIDED[autopilot]
+    bench.go_on(0.3)
+    assert bench.state() is FlightState.FLYING
+    bench.apply(Velocity(forward=0.5))
+
+
+def test_who_only_repeats_a_hover_does_not_take_the_vehicle_back() -> None:
+    bench = steering(PX4)
+    for _ in range(50):
+        bench.apply(Hover())
+        bench.go_on(0.02)
+    bench.vehicle.mode = "POSCTL"
+    refused = 0
+    for _ in range(60):
+        try:
+            bench.apply(Hover())
+        except DriverError:
+            refused += 1
+        bench.go_on(0.02)
+    assert refused > 20
+    assert (MODE, 1.0, 6.0, 0.0, 0.0) not in bench.commands()
+
+
+def test_a_failsafe_that_leaves_a_px4_to_absent_sticks_ends_in_hold() -> None:
+    bench = steering(PX4)
+    bench.vehicle.mode, bench.vehicle.status = "POSCTL", 5
+    bench.go_on(1.0)
+    assert HOLD[PX4][1] in bench.commands(), "without a remote control it would sink"
+    assert bench.heard_of(SET_POINT)[-1].vx == 1.0, "from before it was seen"
+    bench.go_on(1.0)
+    assert bench.heard_of(SET_POINT) == []
+
+
+@AUTOPILOTS
+def test_when_a_lost_link_returns_nothing_old_is_flown(autopilot: int) -> None:
+    bench = steering(autopilot)
+    bench.go_on(3.0, silent=True)
+    bench.said.clear()
+    bench.hear(bench.vehicle.heartbeat())
+    bench.go_on(0.5)
+    assert {each.vx for each in bench.heard_of(SET_POINT)} <= {0.0}
+    assert set(bench.commands()) == {HOLD[autopilot][1]}
+
+
+@AUTOPILOTS
+def test_who_is_found_again_in_the_air_does_not_stand_before_it_says_so(autopilot: int) -> None:
+    """Heartbeat and attitude come first: neither tells of the ground, and a hold given up here would be missed."""
+    bench = steering(autopilot)
+    bench.go_on(4.0, silent=True)
+    bench.said.clear()
+    bench.sink.feedbacks.clear()
+    for _ in range(20):
+        bench.clock.advance(0.02)
+        bench.vehicle.boot_ms += 20
+        bench.hear(bench.vehicle.heartbeat(), bench.vehicle.telemetry()[-1])
+        bench.tick()
+    assert {each.state for each in bench.sink.feedbacks} == {FlightState.UNKNOWN}
+    assert set(bench.commands()) == {HOLD[autopilot][1]}
+    bench.go_on(0.5)
+    assert bench.state() in (FlightState.FLYING, FlightState.HOVERING)
+    assert set(bench.commands()) == {HOLD[autopilot][1]}
+
+
+@AUTOPILOTS
+def test_an_armed_one_that_tells_nothing_of_the_ground(autopilot: int) -> None:
+    bench = Bench(Vehicle(autopilot))
+    bench.vehicle.armed = True
+    bench.hear(bench.vehicle.heartbeat())
+    assert bench.state() is FlightState.UNKNOWN
+    with pytest.raises(DriverError, match="does not tell yet whether it is in the air"):
+        bench.apply(Takeoff())
+    assert bench.apply(Velocity(forward=1.0)) == Idle()
+    bench.go_on(2.0, silent=True)
+    assert bench.heard_of(SET_POINT) == []
+    bench.apply(Land())
+    bench.hear(bench.vehicle.heartbeat())
+    bench.tick()
+    assert LAND[autopilot][1] in bench.commands(), "whoever lands it does not disarm what may fly"
+
+
+@AUTOPILOTS
+@pytest.mark.parametrize("mode", ["sticks", "RTL", "LAND"])
+@pytest.mark.parametrize("action", [Hover(), Land()])
+def test_what_somebody_else_flies_is_neither_held_nor_landed(autopilot: int, mode: str, action: Hover | Land) -> None:
+    """The proxy's ladder asks for it, as for a vehicle that is found in the air."""
+    bench = Bench(Vehicle(autopilot)).flying(other_mode(autopilot, mode))
+    for _ in range(10):
+        assert bench.apply(action, alone=True) == Idle()
+        bench.go_on(0.3)
+    assert bench.commands() == []
+    assert bench.heard_of(SET_POINT) == []
+    assert bench.session.setpoints is not None
+    assert bench.session.setpoints.ownership.others == other_mode(autopilot, mode)
+    assert [text for text in bench.texts if "not from here" in text] != []
+
+
+@AUTOPILOTS
+@pytest.mark.parametrize("mode", ["sticks", "RTL", "LAND"])
+def test_a_mode_that_somebody_chooses_while_the_vehicle_holds_its_place_is_left(autopilot: int, mode: str) -> None:
+    """The ladder held it, and nobody streams: the other one's choice is seen all the same."""
+    bench = steering(autopilot)
+    bench.apply(Hover(), alone=True)
+    bench.vehicle.mode = HOLD[autopilot][0]
+    bench.go_on(1.0)
+    bench.commands()
+    bench.vehicle.mode = other_mode(autopilot, mode)
+    bench.go_on(1.0)
+    assert bench.apply(Hover(), alone=True) == Idle()
+    assert bench.apply(Land(), alone=True) == Idle()
+    bench.go_on(1.0)
+    assert bench.commands() == []
+    assert any("not from here" in text for text in bench.texts)
+
+
+@AUTOPILOTS
+def test_a_mode_that_somebody_chose_while_the_link_was_lost_is_left(autopilot: int) -> None:
+    bench = steering(autopilot)
+    bench.go_on(4.0, silent=True)
+    bench.apply(Hover(), alone=True)
+    bench.vehicle.mode = other_mode(autopilot, "RTL")
+    bench.said.clear()
+    bench.go_on(3.0)
+    assert bench.apply(Hover(), alone=True) == Idle()
+    bench.go_on(1.0)
+    assert bench.commands() == []
+    assert bench.heard_of(SET_POINT) == []
+
+
+@AUTOPILOTS
+@pytest.mark.parametrize("action", [Takeoff(), Hover(), Land()])
+def test_a_repeat_never_takes_the_vehicle_back_and_a_new_order_does(
+    autopilot: int, action: Takeoff | Hover | Land
+) -> None:
+    bench = steering(autopilot)
+    bench.vehicle.mode = other_mode(autopilot, "RTL")
+    bench.go_on(1.0)
+    bench.commands()
+    for _ in range(20):
+        with pytest.raises(DriverError, match="which was not chosen here"):
+            bench.apply(action, new=False)
+        bench.go_on(0.1)
+    assert bench.commands() == []
+    bench.apply(action)
+    bench.go_on(1.2)
+    assert bench.commands() != []
+    assert bench.session.setpoints is not None
+    assert bench.session.setpoints.ownership.others == ""
+
+
+@AUTOPILOTS
+def test_another_stations_landing_during_a_take_off_stays(autopilot: int) -> None:
+    bench = climbing(autopilot)
+    bench.vehicle.mode = other_mode(autopilot, "LAND")
+    bench.go_on(1.0)
+    bench.commands()
+    for hover in (Takeoff(), Hover()):  # a take-off of what flies is a hover to the proxy
+        for _ in range(10):
+            with pytest.raises(DriverError, match="which was not chosen here"):
+                bench.apply(hover, new=False)
+            bench.go_on(0.1)
+    assert bench.commands() == []
+    assert bench.heard_of(SET_POINT) == []
+
+
+def test_who_stops_a_px4_on_its_way_up_keeps_it() -> None:
+    """By the mode for holding the place, which a take-off ends in as well, at its height."""
+    bench = climbing(PX4)
+    bench.vehicle.mode = "AUTO.LOITER"
+    bench.go_on(1.2)
+    assert (MODE, 1.0, 6.0, 0.0, 0.0) not in bench.commands()
+    assert bench.session.setpoints is not None
+    assert bench.session.setpoints.ownership.others == "AUTO.LOITER"
+
+
+@AUTOPILOTS
+def test_a_mode_that_somebody_chooses_before_it_leaves_the_ground_stays(autopilot: int) -> None:
+    bench = Bench(Vehicle(autopilot)).found()
+    vehicle = bench.vehicle
+    vehicle.mode = {ARDUPILOT: "GUIDED", PX4: "AUTO.LOITER"}[autopilot]
+    bench.go_on(0.3)
+    bench.apply(Takeoff())
+    bench.answer(ARM)
+    vehicle.armed, vehicle.status = True, 4
+    bench.go_on(0.5)
+    vehicle.mode = other_mode(autopilot, "sticks")
+    bench.hear(vehicle.heartbeat())
+    bench.commands()
+    bench.go_on(4.0)
+    assert bench.commands() == []
+    assert any("not from here" in text for text in bench.texts)
+
+
+def test_what_others_armed_is_not_disarmed_when_a_take_off_is_given_up() -> None:
+    bench = Bench(Vehicle(ARDUPILOT))
+    bench.vehicle.armed, bench.vehicle.mode = True, "GUIDED"
+    bench.found()
+    bench.apply(Takeoff())
+    bench.go_on(20.0)
+    assert any("did not take off" in text for text in bench.texts)
+    assert (ARM, 0.0, 0.0, 0.0, 0.0) not in bench.commands()
+
+
+def test_a_failsafe_that_hands_a_px4_to_somebody_who_has_a_remote_control_is_left() -> None:
+    bench = steering(PX4)
+    bench.vehicle.remote = True
+    bench.go_on(0.2)
+    bench.vehicle.mode, bench.vehicle.status = "POSCTL", 5
+    bench.go_on(1.5)
+    assert bench.commands() == []
+    assert bench.apply(Land(), alone=True) == Idle()
+
+
+def climbing(autopilot: int) -> Bench:
+    """Taking off to 1.5 m, and 0.4 m high."""
+    bench = Bench(Vehicle(autopilot)).found()
+    vehicle = bench.vehicle
+    vehicle.mode = {ARDUPILOT: "GUIDED", PX4: "AUTO.LOITER"}[autopilot]
+    bench.go_on(0.3)
+    bench.apply(Takeoff())
+    bench.answer(ARM)
+    vehicle.armed, vehicle.status = True, 4
+    bench.go_on(0.3)
+    vehicle.landed, vehicle.place = Landed.IN_AIR, (0.0, 0.0, -0.4)
+    vehicle.mode = {ARDUPILOT: "GUIDED", PX4: "AUTO.TAKEOFF"}[autopilot]
+    bench.go_on(0.5)
+    assert bench.state() is FlightState.TAKING_OFF
+    bench.said.clear()
+    return bench
+
+
+def other_mode(autopilot: int, mode: str) -> str:
+    copter = {"sticks": "LOITER"}
+    px4 = {"sticks": "POSCTL", "RTL": "AUTO.RTL", "LAND": "AUTO.LAND"}
+    return (copter if autopilot == ARDUPILOT else px4).get(mode, mode)
+
+
+# Motors ------------------------------------------------------------------------------------------------------------
+
+
+@AUTOPILOTS
+def test_an_emergency_stop_disarms_by_force_until_it_shows(autopilot: int) -> None:
+    bench = steering(autopilot)
+    bench.apply(EmergencyStop())
+    bench.go_on(0.5)
+    assert set(bench.commands()) == {(ARM, 0.0, FORCE, 0.0, 0.0)}
+    assert bench.state() is FlightState.EMERGENCY
+    with pytest.raises(DriverError, match="still armed"):
+        bench.apply(ResetEmergency())
+    bench.vehicle.armed, bench.vehicle.landed = False, Landed.ON_GROUND
+    bench.go_on(0.3)
+    bench.said.clear()
+    with pytest.raises(DriverError, match="reset it first"):
+        bench.apply(Takeoff())
+    bench.apply(Hover())
+    bench.go_on(1.0)
+    assert bench.commands() == []
+    assert bench.state() is FlightState.EMERGENCY
+    bench.apply(ResetEmergency())
+    bench.go_on(0.1)
+    assert bench.state() is FlightState.LANDED
+
+
+@AUTOPILOTS
+def test_a_stop_that_did_not_succeed_can_be_pressed_again_and_given_up(autopilot: int) -> None:
+    """The autopilot refuses, or the link was lost meanwhile: the vehicle is armed long after the first press."""
+    bench = steering(autopilot)
+    bench.apply(EmergencyStop())
+    bench.go_on(11.0)
+    bench.said.clear()
+    bench.go_on(1.0)
+    assert bench.commands() == [], "what was pressed long ago is not done any more"
+    bench.apply(EmergencyStop())
+    bench.go_on(0.5)
+    assert set(bench.commands()) == {(ARM, 0.0, FORCE, 0.0, 0.0)}
+    with pytest.raises(DriverError, match="still armed"):
+        bench.apply(ResetEmergency())
+    bench.go_on(11.0)
+    bench.apply(ResetEmergency())
+    bench.said.clear()
+    bench.apply(Land())
+    bench.go_on(0.5)
+    assert LAND[autopilot][1] in bench.commands()

@@ -1,0 +1,252 @@
+"""A vehicle that somebody else flies, lands or takes over in flight: an emulated autopilot that two programs command.
+
+The other ground station says its commands on another link. What the proxy said is counted where the autopilot hears it.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from skyloop.client import Drone
+from skyloop.drivers.registry import make_driver
+from skyloop.emulators.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
+from skyloop.errors import RefusedError
+from skyloop.messages import EventKind
+from skyloop.proxy.core.failsafe import FailsafeSettings
+from skyloop.proxy.core.ownership import Whose
+from skyloop.proxy.flight_record import FlightRecord
+from skyloop.proxy.proxy import Proxy
+from skyloop.sim.host import SimHost
+from skyloop.sim.options import SimOptions
+from skyloop.transport.memory import MemoryServer
+from skyloop.transport.testing import wait_until
+from skyloop.wire.mavlink.codec import Codec, Message
+from skyloop.wire.mavlink.codec import dialect as m
+
+WAIT_S = 20.0
+STATION = 250  #: the other one's system id
+STEERING = (m.MAV_CMD_DO_SET_MODE, m.MAV_CMD_COMPONENT_ARM_DISARM, m.MAV_CMD_NAV_TAKEOFF)
+MODES: dict[Kind, dict[str, tuple[int, ...]]] = {
+    Kind.ARDUCOPTER: {"GUIDED": (4,), "LAND": (9,), "RTL": (6,), "LOITER": (5,)},
+    Kind.PX4: {"GUIDED": (4, 3), "LAND": (4, 6), "RTL": (4, 5), "LOITER": (4, 3)},
+}
+KINDS = pytest.mark.parametrize("kind", list(Kind))
+
+pytestmark = pytest.mark.timeout(60)
+
+
+class Scene:
+    """An autopilot, another ground station, and a proxy that may be started and killed."""
+
+    def __init__(self, kind: Kind, note: Path) -> None:
+        world = SimHost(with_multirotors(SimOptions(world="empty", seed=4, wind=0.0, speed=3.0)))
+        self.kind = kind
+        self.firmware = MavlinkFirmware(world, kind=kind, ports=Ports.free(kind), boot_s=0.5)
+        self.note = note
+        self.ours: list[int] = []  #: numbers of the commands by which the proxy steered
+        self.set_points = 0
+        self._codec = Codec(STATION, 190)
+        self._proxies: list[Proxy] = []
+
+    def __enter__(self) -> Scene:
+        self.firmware.start()
+        autopilot = self.firmware.autopilot
+        hear = autopilot.heard
+
+        def heard(port: object, message: Message, now_ns: int) -> None:
+            if message.get_srcSystem() != STATION:
+                if message.get_type() == "COMMAND_LONG" and message.command in STEERING:
+                    self.ours.append(message.command)
+                self.set_points += message.get_type().startswith("SET_")
+            hear(port, message, now_ns)  # type: ignore[arg-type]
+
+        autopilot.heard = heard  # type: ignore[method-assign]
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for proxy in self._proxies:
+            proxy.stop()
+        self.firmware.stop()
+
+    @property
+    def address(self) -> str:
+        return f"{self.firmware.address}?parameters=no&takeoff_altitude=8&altitude=20&climb=3"
+
+    @property
+    def mode(self) -> str:
+        return self.firmware.autopilot.mode
+
+    @property
+    def armed(self) -> bool:
+        return self.firmware.autopilot.armed
+
+    @property
+    def height(self) -> float:
+        return self.firmware.autopilot.flight.place[2]
+
+    def station(self, command: int, *arguments: float) -> None:
+        """The other ground station says this."""
+        padded = (*arguments, *[0.0] * (7 - len(arguments)))
+        frame = self._codec.encode(m.MAVLink_command_long_message(1, 1, command, 0, *padded))
+        (message,) = Codec(1, 1).decode(frame, whole=True)
+        running = self.firmware._started
+        running._loop.post(partial(running._heard, running.autopilot.ports[0], message))
+
+    def station_mode(self, mode: str) -> None:
+        self.station(m.MAV_CMD_DO_SET_MODE, 1.0, *MODES[self.kind][mode])
+
+    def station_flies(self, height_m: float = 6.0) -> None:
+        """It arms and takes off."""
+        wait_until(lambda: self.firmware.autopilot.ready, "it may be armed")
+        self.station_mode("GUIDED")
+        self.station(m.MAV_CMD_COMPONENT_ARM_DISARM, 1.0)
+        altitude = height_m if self.kind is Kind.ARDUCOPTER else 488.0 + height_m
+        nan = float("nan") if self.kind is Kind.PX4 else 0.0
+        self.station(m.MAV_CMD_NAV_TAKEOFF, 0, 0, 0, nan, nan, nan, altitude)
+        wait_until(lambda: self.height > 0.8 * height_m, "it is up")
+
+    def proxy(self) -> Proxy:
+        """One that has little patience, so that a test has not to wait for its ladder for long."""
+        address = self.address
+        self.server = MemoryServer("alpha")
+        proxy = Proxy(make_driver(address), self.server, name="alpha")
+        proxy.keep_record(FlightRecord(self.note, address))
+        self._proxies.append(proxy)
+        proxy.start()
+        proxy.handler.ladder.settings = FailsafeSettings(hover_after_s=0.2, land_after_s=0.6)
+        return proxy
+
+    def die(self, proxy: Proxy) -> None:
+        """Without a word: nothing is told to the vehicle any more."""
+        proxy.handler.leave_hovering = lambda now_ns: None  # type: ignore[method-assign]
+        proxy.stop()
+
+    def drone(self) -> Drone:
+        return Drone(self.server.dial, app="me", on_exit="hover").open()
+
+    def watched(self, proxy: Proxy, samples: int = 60) -> None:
+        """The proxy heard so many more samples: its ladder had time to act in several steps."""
+        after = proxy._counts["feedback.published"] + samples
+        wait_until(lambda: proxy._counts["feedback.published"] >= after, "time passed")
+
+
+@pytest.fixture
+def note(tmp_path: Path) -> Path:
+    return tmp_path / "alpha.flight"
+
+
+def taken_off(scene: Scene) -> Drone:
+    drone = scene.drone()
+    drone.wait(lambda f: bool((f.native or {}).get("mavlink.ready")), timeout_s=WAIT_S)
+    drone.takeoff(timeout_s=WAIT_S)
+    return drone
+
+
+@KINDS
+@pytest.mark.parametrize("mode", ["GUIDED", "LOITER", "RTL"])
+def test_a_proxy_that_is_started_beside_a_flight_of_others_says_nothing_to_it(
+    kind: Kind, mode: str, note: Path
+) -> None:
+    with Scene(kind, note) as scene:
+        scene.station_flies()
+        proxy = scene.proxy()
+        wait_until(lambda: proxy.handler.ownership.others != "", "it is seen whose flight it is")
+        scene.station_mode(mode)
+        scene.watched(proxy)
+        assert scene.ours == []
+        assert scene.set_points == 0
+
+
+@KINDS
+def test_a_landing_that_others_order_during_a_take_off_is_not_undone_and_who_waits_is_told_why(
+    kind: Kind, note: Path
+) -> None:
+    with Scene(kind, note) as scene:
+        proxy = scene.proxy()
+        with scene.drone() as drone:
+            drone.wait(lambda f: bool((f.native or {}).get("mavlink.ready")), timeout_s=WAIT_S)
+            lands = threading.Thread(target=_land_when_up, args=(scene,))
+            lands.start()
+            with pytest.raises(RefusedError, match="LAND, which was not chosen here"):
+                drone.takeoff(timeout_s=WAIT_S)
+            lands.join()
+            at = len(scene.ours)
+            wait_until(lambda: not scene.armed, "it lands as the other one wants")
+            assert scene.ours[at:] == []
+        assert proxy.handler.ownership.whose is not Whose.OURS
+
+
+def _land_when_up(scene: Scene) -> None:
+    deadline = time.monotonic() + WAIT_S
+    while scene.height < 4.0 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    scene.station_mode("LAND")
+
+
+@KINDS
+@pytest.mark.parametrize("mode", ["LAND", "RTL"])
+def test_what_others_order_while_set_points_are_flown_stays_when_the_application_goes_on_or_falls_silent(
+    kind: Kind, mode: str, note: Path
+) -> None:
+    with Scene(kind, note) as scene:
+        proxy = scene.proxy()
+        with taken_off(scene) as drone:
+            for _ in range(20):
+                drone.velocity(forward=0.3)
+                time.sleep(0.02)
+            scene.station_mode(mode)
+            wait_until(lambda: drone.velocity(forward=0.3) and proxy.driver.left_to() != "", "it is seen")
+            scene.ours.clear()
+            refused = threading.Event()
+            drone.on_event(lambda e: refused.set() if e.kind is EventKind.COMMAND_REFUSED else None)
+            wait_until(lambda: drone.velocity(forward=0.3) and refused.is_set(), "set-points are refused")
+            reason = next(e for e in reversed(drone.recent_events()) if e.kind is EventKind.COMMAND_REFUSED)
+            assert "which was not chosen here: hover, take off or land first" in reason.text
+            scene.watched(proxy, 150)  # the set-point decays to hover, and the ladder loses its patience
+            wait_until(lambda: not scene.armed, "it lands")
+        assert scene.ours == []
+
+
+@KINDS
+def test_a_new_order_takes_it_back(kind: Kind, note: Path) -> None:
+    with Scene(kind, note) as scene:
+        proxy = scene.proxy()
+        with taken_off(scene) as drone:
+            scene.station_mode("RTL")
+            wait_until(lambda: proxy.driver.left_to() != "", "it is seen")
+            wait_until(lambda: proxy.handler.ownership.others != "", "it is told")
+            drone.hover()
+            guided = "GUIDED" if kind is Kind.ARDUCOPTER else "OFFBOARD"
+            wait_until(lambda: scene.mode == guided, "it follows again")
+            drone.land(timeout_s=WAIT_S)
+
+
+@KINDS
+@pytest.mark.parametrize("meanwhile", ["nobody", "station"])
+def test_a_killed_proxy_ends_its_own_flight_when_it_is_back_unless_others_took_it(
+    kind: Kind, meanwhile: str, note: Path
+) -> None:
+    with Scene(kind, note) as scene:
+        first = scene.proxy()
+        drone = taken_off(scene)
+        wait_until(note.exists, "the flight is noted")
+        scene.die(first)
+        drone.close()
+        if meanwhile == "station":
+            scene.station_mode("RTL")
+            wait_until(lambda: "RTL" in scene.mode, "it is on its way")
+        note.write_text(scene.address)
+        scene.ours.clear()
+        second = scene.proxy()
+        if meanwhile == "nobody":
+            wait_until(lambda: m.MAV_CMD_DO_SET_MODE in scene.ours, "it is held, and then landed")
+            wait_until(lambda: not scene.armed, "it stands")
+        else:
+            wait_until(lambda: second.handler.ownership.others != "" or not scene.armed, "it is left")
+            wait_until(lambda: not scene.armed, "it is home")
+            assert scene.ours == []

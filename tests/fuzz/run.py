@@ -1,0 +1,46 @@
+"""Fuzzes one target with atheris: ``python -m tests.fuzz.run TARGET FOLDER … [-OPTION=VALUE …]`` (libFuzzer's)."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import pkgutil
+import sys
+
+import atheris
+
+#: What a target runs through, instrumented before it is imported.
+PACKAGES = {
+    "samples": ["skyloop.messages"],
+    "packets": ["skyloop.messages", "skyloop.transport.local.packets", "skyloop.transport.fabric.packets"],
+    "proxy": ["skyloop.messages", "skyloop.proxy"],
+    "ardrone": ["skyloop.wire.ardrone"],
+    "tello": ["skyloop.wire.tello"],
+    "mavlink": ["skyloop.wire.mavlink"],
+    "vrpn": ["skyloop.wire.vrpn", "skyloop.motion_capture.vrpn"],
+    "recording": ["skyloop.logfile", "mcap"],
+    "files": ["skyloop.sim", "skyloop.calibration", "skyloop.proxy.core.zones", "skyloop.drivers.uri", "tomllib"],
+    "page": ["skyloop.cockpit.commands"],
+}
+
+
+def main() -> None:
+    """Runs until libFuzzer's options end it."""
+    name = sys.argv.pop(1)
+    logging.disable()
+    with atheris.instrument_imports(include=PACKAGES[name]):
+        for package in PACKAGES[name]:
+            module = importlib.import_module(package)
+            for info in pkgutil.iter_modules(getattr(module, "__path__", ())):
+                try:
+                    importlib.import_module(f"{package}.{info.name}")
+                except ImportError:
+                    continue  # of an extra that is not here
+    from tests.fuzz.targets import TARGETS
+
+    atheris.Setup(sys.argv, TARGETS[name])
+    atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    main()

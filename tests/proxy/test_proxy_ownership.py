@@ -1,0 +1,246 @@
+"""What others arm, fly, switch or land is observed, told and left alone; and who takes it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from skyloop.errors import DriverError
+from skyloop.messages import (
+    AnyAction,
+    Attitude,
+    EventKind,
+    Failsafe,
+    FlightState,
+    Hover,
+    Land,
+    LinkState,
+    Refusal,
+    ReleaseAuthority,
+    Takeoff,
+    Velocity,
+)
+from skyloop.proxy.flight_record import LIFE_S, FlightRecord
+from skyloop.transport.testing import wait_until
+from tests.proxy.fake import Bench
+from tests.proxy.test_proxy_ladder import messages, steps
+
+
+@pytest.mark.parametrize("state", [FlightState.TAKING_OFF, FlightState.HOVERING, FlightState.FLYING])
+def test_a_proxy_beside_a_vehicle_that_somebody_else_flies_does_nothing(bench: Bench, state: FlightState) -> None:
+    bench.driver.report(state=state)
+    bench.run(20.0)
+    bench.driver.report(battery=0.05)
+    bench.run(1.0)
+    for link in (LinkState.LOST, LinkState.UP):
+        bench.driver.link(link, "")
+        bench.run(1.0)
+    assert not bench.proxy.handler.order_landing(bench.clock())
+    bench.proxy.stop()
+    assert bench.driver.told == []
+    assert bench.published(EventKind.FAILSAFE) == []
+    (told,) = [event.text for event in bench.published(EventKind.VEHICLE_MESSAGE)]
+    assert "left alone until an application" in told
+
+
+def test_who_only_has_the_authority_does_not_take_it(bench: Bench) -> None:
+    bench.driver.report(state=FlightState.FLYING)
+    first = bench.pilot("first")
+    bench.run(1.0)
+    second = bench.pilot("second", priority=3)
+    second.ask(ReleaseAuthority())
+    first.end.close()
+    bench.run(20.0)
+    assert bench.driver.told == []
+
+
+@pytest.mark.parametrize("action", [Hover(), Land(), Takeoff()])
+def test_a_new_order_takes_it_and_is_told(bench: Bench, action: AnyAction) -> None:
+    bench.driver.report(state=FlightState.FLYING)
+    pilot = bench.pilot()
+    pilot.command(action)
+    assert bench.driver.told == [Hover() if isinstance(action, Takeoff) else action]
+    (told,) = messages(pilot, "taken")
+    assert told.startswith("pilot took the vehicle by ")
+    bench.driver.report(state=FlightState.FLYING)
+    bench.run(0.5)
+    assert bench.driver.told[-1] == Hover(), "from here on it is this proxy's to look after"
+
+
+@pytest.mark.parametrize("action", [Velocity(0.5), Attitude(0.1)])
+def test_a_set_point_does_not_take_it_and_is_refused_with_the_reason(bench: Bench, action: AnyAction) -> None:
+    bench.driver.report(state=FlightState.FLYING)
+    pilot = bench.pilot()
+    for _ in range(3):
+        pilot.command(action)
+    assert bench.driver.told == []
+    assert pilot.refusals() == [Refusal.WRONG_STATE]
+    assert "flown by others: hover, take off or land first" in pilot.told(EventKind.COMMAND_REFUSED)[0].text
+    pilot.command(Hover())
+    pilot.command(action)
+    assert bench.driver.told == [Hover(), action]
+
+
+@pytest.mark.parametrize("state", [FlightState.LANDING, FlightState.FLYING, FlightState.HOVERING])
+@pytest.mark.parametrize("action", [Takeoff(), Hover(), Land(), Velocity(0.5)])
+def test_when_others_take_it_in_flight_no_repeat_takes_it_back(
+    bench: Bench, state: FlightState, action: AnyAction
+) -> None:
+    """A take-off in progress, a hover, a landing or a set-point: the library repeats each 32 times a second."""
+    pilot = bench.airborne()
+    pilot.command(action)
+    bench.driver.told.clear()
+    bench.driver.left = "LAND"
+    bench.driver.report(state=state)
+    bench.run(3.0, lambda: pilot.command(action, repeat=True))
+    assert bench.driver.told == []
+    assert set(pilot.refusals()) == {Refusal.WRONG_STATE}
+    assert "in LAND, which was not chosen here" in pilot.told(EventKind.COMMAND_REFUSED)[0].text
+    bench.run(20.0)
+    assert bench.driver.told == [], "nor does the ladder, when the pilot is silent"
+    assert steps(pilot) == []
+
+
+def test_a_set_points_decay_to_hover_is_no_new_order(bench: Bench) -> None:
+    pilot = bench.airborne()
+    pilot.command(Velocity(0.5))
+    bench.driver.told.clear()
+    bench.driver.left = "LAND"
+    bench.driver.report(state=FlightState.LANDING)
+    bench.tick()
+    for _ in range(5):
+        pilot.command(Velocity(0.5))  # a program that has not noticed
+    assert bench.driver.told == []
+    bench.run(2.0, lambda: pilot.command(Hover(), repeat=True))
+    assert bench.driver.told == []
+
+
+def test_a_step_of_the_ladder_ends_when_others_take_the_vehicle(bench: Bench) -> None:
+    pilot = bench.airborne()
+    pilot.command(Velocity(0.5))
+    bench.run(0.6)
+    assert bench.driver.told[-1] == Hover()
+    bench.driver.left = "LOITER"
+    bench.driver.report(state=FlightState.FLYING)
+    count = len(bench.driver.told)
+    bench.run(10.0)
+    assert len(bench.driver.told) == count
+    assert steps(pilot)[-1] == ("none", "others")
+    assert pilot.last_feedback().failsafe is Failsafe.NONE
+
+
+def test_a_vehicle_that_only_the_software_steers_is_let_go() -> None:
+    with Bench(actions={"attitude", "takeoff", "land"}) as bench:
+        pilot = bench.airborne()
+        pilot.command(Velocity(0.3))
+        bench.run(0.1)
+        assert bench.driver.told
+        bench.driver.told.clear()
+        bench.driver.answers = False
+        bench.proxy.handler._executor._driver.left_to = lambda: "STABILIZE"  # type: ignore[method-assign]
+        bench.run(0.02)
+        bench.driver.told.clear()
+        bench.run(2.0)
+        assert bench.driver.told == []
+
+
+def test_a_landing_that_others_chose_goes_on_when_an_application_wants_the_same(bench: Bench) -> None:
+    pilot = bench.airborne()
+    bench.driver.left = "LAND"
+    bench.driver.report(state=FlightState.LANDING)
+    bench.tick()
+    pilot.command(Land())
+    assert bench.driver.told == []
+    assert pilot.refusals() == []
+
+
+def test_the_driver_is_told_which_orders_are_new(bench: Bench) -> None:
+    pilot = bench.airborne()
+    pilot.command(Hover())
+    assert bench.driver.repeats == 0
+    pilot.command(Hover(), repeat=True)
+    pilot.command(Hover(), repeat=True)
+    assert (len(bench.driver.told), bench.driver.repeats) == (3, 2)
+    pilot.command(Hover())
+    assert (len(bench.driver.told), bench.driver.repeats) == (4, 2)
+
+
+def test_a_refusal_of_the_vehicle_is_told_once_in_its_own_words_and_by_its_newest(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reasons = iter(["System not initialised", *["GPS has no fix"] * 100])
+
+    def refuse(_: AnyAction, *, new: bool = True) -> AnyAction:
+        raise DriverError(f"the vehicle does not start yet: {next(reasons)}")
+
+    monkeypatch.setattr(bench.driver, "apply", refuse)
+    pilot = bench.pilot()
+    pilot.command(Takeoff())
+    bench.run(1.1, lambda: pilot.command(Takeoff(), repeat=True))
+    told = [event.text for event in pilot.told(EventKind.COMMAND_REFUSED)]
+    assert told[0] == "pilot: takeoff refused: the vehicle does not start yet: System not initialised"
+    assert "GPS has no fix" in told[1]
+    assert pilot.told(EventKind.DRIVER_ERROR) == []
+
+
+# The note of a flight ----------------------------------------------------------------------------------------------
+
+
+def fly_and_die(path: Path) -> None:
+    """A proxy that begins a flight, and ends without landing."""
+    with Bench() as bench:
+        bench.proxy.keep_record(record := FlightRecord(path, "fake://"))
+        record.start()
+        bench.airborne()
+        wait_until(path.exists, "the flight is noted")
+        bench.run(0.1)
+        record.close()
+
+
+def test_a_proxy_that_was_killed_ends_its_own_flight_when_it_is_back(tmp_path: Path) -> None:
+    path = tmp_path / "alpha.flight"
+    fly_and_die(path)
+    again = Bench()
+    again.proxy.keep_record(FlightRecord(path, "fake://"))
+    with again:
+        again.driver.report(state=FlightState.FLYING)
+        again.run(6.0)
+        assert again.driver.told == [Hover(), Land()]
+        again.driver.report(state=FlightState.LANDED)
+        again.run(1.1)
+        wait_until(lambda: not path.exists(), "the note goes with the flight")
+
+
+@pytest.mark.parametrize("what", ["another vehicle", "old", "damaged", "of the future"])
+def test_a_note_that_may_be_of_another_flight_is_not_believed(tmp_path: Path, what: str) -> None:
+    path = tmp_path / "alpha.flight"
+    fly_and_die(path)
+    at_s = path.stat().st_mtime
+    later_s = {"old": LIFE_S + 5.0, "of the future": -5.0}.get(what, 1.0)
+    if what == "damaged":
+        path.write_bytes(b"\xff\x00")
+    vehicle = "mavlink://udpin:0.0.0.0:1" if what == "another vehicle" else "fake://"
+    assert FlightRecord(path, "fake://", lambda: at_s + 1.0).believed() is (what != "damaged")
+    assert not FlightRecord(path, vehicle, lambda: at_s + later_s).believed()
+
+
+def test_a_note_that_can_not_be_written_stops_nothing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    record = FlightRecord(tmp_path / "missing" / "alpha.flight", "fake://")
+    assert not record.believed()
+    record.start()
+    record.set(True)
+    wait_until(lambda: "can't be written" in caplog.text, "it is told")
+    record.close()
+
+
+def test_a_flight_that_others_took_is_noted_no_more(tmp_path: Path) -> None:
+    path = tmp_path / "alpha.flight"
+    with Bench() as bench:
+        bench.proxy.keep_record(record := FlightRecord(path, "fake://"))
+        record.start()
+        bench.airborne()
+        wait_until(path.exists, "the flight is noted")
+        bench.driver.left = "RTL"
+        bench.run(0.1)
+        wait_until(lambda: not path.exists(), "it is somebody else's")

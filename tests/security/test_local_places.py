@@ -1,0 +1,202 @@
+"""The places of a proxy on its host: nobody who says nothing, or asks for many, keeps a pilot out; and no lock does."""
+
+from __future__ import annotations
+
+import fcntl
+import grp
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from skyloop.errors import LinkError
+from skyloop.messages import EventKind, Hello, Refusal, Refused, Role, Welcome
+from skyloop.proxy.sessions import HELLO_NS
+from skyloop.transport.local import LocalServer, dial, list_names
+from skyloop.transport.local.directory import connect, find_directory
+from skyloop.transport.local.packets import Bye, hello, parse
+from skyloop.transport.local.sockets import Credentials, Socket
+from skyloop.transport.testing import ClientLog, ServerLog, wait_until
+from tests.proxy.fake import WAIT_S, Bench
+
+SERVER = "skyloop.transport.local.server"
+
+
+class Place:
+    """A server, and connections to it that know how to say nothing."""
+
+    def __init__(self, stack: ExitStack) -> None:
+        self.log = ServerLog()
+        self.server = LocalServer("alpha")
+        self.server.start(self.log)
+        stack.callback(self.server.stop)
+        self._stack = stack
+
+    def raw(self, *first: bytes) -> Socket:
+        sock = connect(find_directory().path / "alpha.sock")
+        self._stack.callback(sock.close)
+        sock.settimeout(WAIT_S)
+        for packet in first:
+            sock.send(packet)
+        return sock
+
+    def admitted(self, *, pilot: bool) -> str:
+        """One more application that says who it is; why it can't stay."""
+        before = len(self.log.joined)
+        self.raw(hello())
+        wait_until(lambda: len(self.log.joined) > before, "it joined")
+        return self.server.admit(self.log.joined[-1], pilot=pilot)
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Place]:
+    monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", str(tmp_path / "run"))
+    with ExitStack() as stack:
+        yield Place(stack)
+
+
+def word(sock: Socket) -> str:
+    """Why the server ended a connection."""
+    message = parse(sock.recv(1000))
+    assert isinstance(message, Bye)
+    return message.reason
+
+
+@pytest.mark.parametrize("first", [(), (hello(),)], ids=["nothing", "no Hello"])
+def test_connections_that_say_nothing_keep_nobody_out(
+    place: Place, monkeypatch: pytest.MonkeyPatch, first: tuple[bytes, ...]
+) -> None:
+    monkeypatch.setattr(f"{SERVER}.MAX_CLIENTS", 4)
+    silent = [place.raw(*first) for _ in range(4)]
+    wait_until(lambda: len(place.server._connections) == 4, "all places are taken")
+    wait_until(lambda: len(place.log.joined) == 4 * len(first), "they were let in")
+    pilot, known = ClientLog(), len(place.log.joined)
+    client = dial("alpha")(pilot)
+    wait_until(lambda: len(place.log.joined) == known + 1, "the pilot is in")
+    assert place.server.admit(place.log.joined[-1], pilot=True) == ""
+    assert "its place at local:alpha went to a newer one" in word(silent[0])
+    for _ in range(8):  # whatever goes on, who has said who it is stays
+        place.raw(*first)
+    wait_until(lambda: len(place.server._connections) <= 4, "the others gave way to one another")
+    assert client.send(b"still here")
+    wait_until(lambda: place.log.packets, "it came")
+    assert pilot.closings == []
+    client.close()
+
+
+def test_a_connection_without_its_first_packet_ends(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(f"{SERVER}.HELLO_S", 0.05)
+    silent = place.raw()
+    assert word(silent) == "it did not say hello within 0.05 s"
+    quiet = place.raw(hello())
+    wait_until(lambda: place.log.joined, "the other one is let in")
+    time.sleep(0.1)  # twice that time, in which nothing may happen
+    quiet.send(b"still here")
+    wait_until(lambda: place.log.packets, "it came")
+    wait_until(lambda: len(place.server._connections) == 1, "nothing is left of the first")
+
+
+def test_a_connection_without_its_hello_is_ended_and_told() -> None:
+    with Bench() as bench:
+        eye, silent = bench.join("eye"), bench.stranger()
+        eye.sync()  # it is known by now
+        bench.run(HELLO_NS / 1e9)
+        assert silent.closed_by.empty()
+        bench.run(0.04)
+        assert "no Hello came within 5 s: connect anew" in silent.closed_by.get(timeout=WAIT_S)
+        texts = [event.text for event in eye.told(EventKind.APPLICATION_LINK)]
+        assert any("was ended: no Hello came" in text for text in texts)
+        assert bench.proxy._counts["connections.silent"] == 1
+
+
+def test_one_process_does_not_get_all_places(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(f"{SERVER}.MAX_PER_PROCESS", 3)
+    for _ in range(3):
+        assert place.admitted(pilot=True) == ""
+    assert f"pid {os.getpid()} has 3 connections to local:alpha already" in word(place.raw())
+    code = "import sys; from skyloop.transport.local import directory as d, packets\n"
+    code += "s = d.connect(d.find_directory().path / 'alpha.sock'); s.send(packets.hello()); sys.stdin.read()"
+    other = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE)
+    try:
+        wait_until(lambda: len(place.log.joined) == 4, "another process gets one")
+    finally:
+        other.communicate()
+
+
+def test_one_other_user_does_not_get_all_places(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Members of a group are let in; that they are is shown elsewhere."""
+    monkeypatch.setattr(f"{SERVER}.MAX_PER_USER", 2)
+    monkeypatch.setattr(f"{SERVER}.may_connect", lambda *_: True)
+    pids = iter(range(100, 200))
+    monkeypatch.setattr(f"{SERVER}.credentials", lambda _: Credentials(next(pids), 54321, 54321))
+    for _ in range(2):
+        place.admitted(pilot=True)
+    assert "uid 54321 has 2 connections to local:alpha already" in word(place.raw())
+    monkeypatch.setattr(f"{SERVER}.credentials", lambda _: Credentials(next(pids), os.geteuid(), 0))
+    assert place.admitted(pilot=True) == "", "the proxy's own user is let in"
+
+
+def test_observers_leave_places_for_pilots(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(f"{SERVER}.MAX_CLIENTS", 6)
+    monkeypatch.setattr(f"{SERVER}.PILOT_PLACES", 2)
+    assert [place.admitted(pilot=False) for _ in range(4)] == [""] * 4
+    assert "4 observers; the other 2 places are kept for pilots" in place.admitted(pilot=False)
+    assert place.admitted(pilot=True) == ""
+    assert place.admitted(pilot=True) == ""
+
+
+def test_an_observer_for_whom_there_is_no_place_is_refused() -> None:
+    with Bench() as bench:
+        bench.server.admit = lambda peer, *, pilot: "" if pilot else "full"  # type: ignore[method-assign]
+        app = bench.stranger()
+        answer = app.ask(Hello("eye", Role.OBSERVER))
+        assert isinstance(answer, Refused)
+        assert (answer.code, answer.message) == (Refusal.BUSY, "full")
+        assert isinstance(app.ask(Hello("pilot", Role.PILOT)), Welcome)
+
+
+def test_somebody_elses_lock_holds_nobody_up(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A member of a group can open the directory for reading, and lock it for as long as it likes."""
+    group = grp.getgrgid(os.getegid()).gr_name
+    monkeypatch.setenv("SKYLOOP_GROUP", group)
+    bravo = LocalServer("bravo", group=group)
+    bravo.start(ServerLog())
+    directory = find_directory(group)
+    descriptor = os.open(directory.path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        begin = time.monotonic()
+        assert [proxy.name for proxy in list_names()] == ["alpha", "bravo"]
+        bravo.stop()
+        assert [proxy.name for proxy in list_names()] == ["alpha"]
+        charlie = LocalServer("charlie", group=group)
+        charlie.start(ServerLog())
+        charlie.stop()
+        assert time.monotonic() - begin < 1.0
+    finally:
+        os.close(descriptor)
+    lock = directory.path / ".lock"
+    assert lock.stat().st_mode & 0o777 == 0o600, "only its owner can open it"
+
+
+def test_looking_waits_for_no_lock(place: Place) -> None:
+    """Not even the owner's: what a killed proxy left is then left until the next time."""
+    directory = find_directory()
+    dead = directory.path / "dead.sock"
+    with Socket() as sock:
+        sock.bind(str(dead))
+        sock.listen()
+    with directory.lock():
+        begin = time.monotonic()
+        assert [proxy.name for proxy in list_names()] == ["alpha"]
+        assert time.monotonic() - begin < 1.0
+        assert dead.exists()
+        with pytest.raises(LinkError, match="locked by another process"), directory.lock(timeout_s=0.0):
+            pass
+    assert [proxy.name for proxy in list_names()] == ["alpha"]
+    assert not dead.exists()

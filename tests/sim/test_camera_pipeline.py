@@ -1,0 +1,110 @@
+"""The thread that draws: what is overtaken, what is forgotten, and what it does when drawing fails."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from skyloop.clock import monotonic_ns
+from skyloop.sim.camera import FRONT_CAMERA, CameraModel
+from skyloop.sim.camera_pipeline import Camera, CameraPipeline, Exposure, Shutter, expose
+from skyloop.sim.render import SceneState
+from skyloop.sim.world_file import load_world
+from skyloop.transport.testing import wait_until
+
+MODEL = FRONT_CAMERA.scaled(0.25)
+STATE = SceneState(np.array([[0.0, 0.0, 1.0]]), np.eye(3)[None], ())
+
+
+class Wall:
+    """A screen that remembers."""
+
+    def __init__(self) -> None:
+        self.shown: list[int] = []
+        self.failures: list[Exception] = []
+        self.told = threading.Event()
+
+    def show(self, model: CameraModel, pixels: NDArray[np.uint8], captured_ns: int) -> None:
+        assert pixels.shape == (model.height, model.width, 3)
+        self.shown.append(captured_ns)
+        self.told.set()
+
+    def failed(self, error: Exception) -> None:
+        self.failures.append(error)
+        self.told.set()
+
+
+def camera(screen: Wall) -> Camera:
+    return Camera(MODEL, 0, screen, seed=1, shutter=Shutter())
+
+
+def exposure(of: Camera, captured_ns: int) -> Exposure:
+    return expose(of, STATE, np.zeros(3), captured_ns, speed=1.0)
+
+
+@contextmanager
+def drawing(pipeline: CameraPipeline) -> Iterator[CameraPipeline]:
+    pipeline.start()
+    try:
+        yield pipeline
+    finally:
+        pipeline.stop()
+
+
+def test_only_the_newest_exposure_of_a_camera_is_drawn() -> None:
+    wall, pipeline = Wall(), CameraPipeline(load_world("empty"), 1, "planar", "fast")
+    front, now_ns = camera(wall), monotonic_ns()
+    for late_ns in range(3):
+        pipeline.expose([exposure(front, now_ns - 1_000_000_000 + late_ns)])
+    with drawing(pipeline):
+        wait_until(lambda: wall.shown, "a picture is shown")
+    assert wall.shown == [now_ns - 1_000_000_000 + 2]
+    assert front.dropped == 2
+    assert not wall.failures
+
+
+def test_a_forgotten_camera_is_shown_nothing_more() -> None:
+    gone, stays = Wall(), Wall()
+    left, right = camera(gone), camera(stays)
+    pipeline = CameraPipeline(load_world("empty"), 1, "planar", "fast")
+    pipeline.forget((left,))
+    with drawing(pipeline):
+        pipeline.expose([exposure(left, monotonic_ns()), exposure(right, monotonic_ns())])
+        wait_until(lambda: stays.shown, "the other one is shown")
+    assert not gone.shown
+
+
+def test_a_renderer_that_cannot_be_made_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise RuntimeError("no scene")
+
+    monkeypatch.setattr("skyloop.sim.camera_pipeline.make_renderer", refuse)
+    wall, pipeline = Wall(), CameraPipeline(load_world("empty"), 1, "planar", "fast")
+    pipeline.expose([exposure(camera(wall), monotonic_ns())])
+    with drawing(pipeline):
+        assert wall.told.wait(5.0)
+    assert [str(error) for error in wall.failures] == ["no scene"]
+
+
+def test_a_picture_that_cannot_be_drawn_is_told_and_the_next_one_comes(monkeypatch: pytest.MonkeyPatch) -> None:
+    finish, fail = Camera.finish, [True]
+
+    def sometimes(self: Camera, *arguments: object) -> NDArray[np.uint8]:
+        if fail.pop() if fail else False:
+            raise RuntimeError("spilt ink")
+        return finish(self, *arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Camera, "finish", sometimes)
+    wall, pipeline = Wall(), CameraPipeline(load_world("empty"), 1, "planar", "fast")
+    front = camera(wall)
+    with drawing(pipeline):
+        pipeline.expose([exposure(front, monotonic_ns())])
+        assert wall.told.wait(5.0)
+        assert [str(error) for error in wall.failures] == ["spilt ink"]
+        pipeline.expose([exposure(front, monotonic_ns())])
+        wait_until(lambda: wall.shown, "the next one is shown")

@@ -1,0 +1,43 @@
+"""Errors travel between processes: what a worker raises arrives as it was."""
+
+from __future__ import annotations
+
+import pickle
+
+import pytest
+
+from skyloop.errors import (
+    AuthorityError,
+    MissingExtraError,
+    NoAnswerError,
+    SkyloopError,
+    SwarmError,
+    UnknownNameError,
+)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        UnknownNameError("camera", "frnt", ["front", "bottom"]),
+        MissingExtraError("the network", "network", cause="No module named 'zenoh'"),
+        MissingExtraError("the network", "network"),
+        AuthorityError("ada holds the authority", code="busy"),
+        NoAnswerError("nothing came within 5 s"),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+def test_an_error_arrives_as_it_was(error: SkyloopError) -> None:
+    arrived = pickle.loads(pickle.dumps(error))
+    assert type(arrived) is type(error)
+    assert str(arrived) == str(error)
+    public = {name: value for name, value in vars(error).items() if not name.startswith("_")}
+    assert {name: getattr(arrived, name) for name in public} == public
+
+
+def test_a_swarms_error_arrives_with_those_of_its_drones() -> None:
+    error = SwarmError("take-off", {"one": NoAnswerError("late")}, 3)
+    arrived = pickle.loads(pickle.dumps(error))
+    assert str(arrived) == str(error)
+    assert arrived.total == 3
+    assert str(arrived.errors["one"]) == "late"

@@ -1,0 +1,73 @@
+"""Files are read up to a limit and with one kind of error, and are written whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+import pytest
+
+from skyloop.errors import FileFormatError, UsageError
+from skyloop.files import expand, read_bytes, read_json, read_text, replacing, write
+
+
+def test_a_file_is_replaced_in_one_step(tmp_path: Path) -> None:
+    path = tmp_path / "x.txt"
+    write(path, b"old")
+    path.chmod(0o640)
+    with replacing(path) as part:
+        part.write_bytes(b"new")
+        assert part.suffix == ".txt", "some writers go by it"
+        assert path.read_bytes() == b"old"
+    assert path.read_bytes() == b"new"
+    assert stat.S_IMODE(path.stat().st_mode) == 0o640
+    assert [path.name for path in tmp_path.iterdir()] == ["x.txt"]
+
+
+def test_what_fails_leaves_the_old_file_and_nothing_besides(tmp_path: Path) -> None:
+    path = tmp_path / "x.txt"
+    path.write_bytes(b"old")
+
+    def fail(error: Exception) -> None:
+        with replacing(path) as part:
+            part.write_bytes(b"half")
+            raise error
+
+    with pytest.raises(KeyError):
+        fail(KeyError("x"))
+    with pytest.raises(UsageError, match=r"x\.txt can't be written: No space left on device"):
+        fail(OSError(28, os.strerror(28)))
+    assert path.read_bytes() == b"old"
+    assert [path.name for path in tmp_path.iterdir()] == ["x.txt"]
+    with pytest.raises(UsageError, match="can't be written: No such file"):
+        write(tmp_path / "gone" / "x.txt", b"")
+
+
+def test_a_link_stays_and_a_device_is_written_to(tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "x.txt")
+    write(tmp_path / "link", b"new")
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "x.txt").read_bytes() == b"new"
+    write(Path(os.devnull), b"gone")
+    assert stat.S_ISCHR(Path(os.devnull).stat().st_mode)
+
+
+def test_reading_has_one_kind_of_error(tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    path.write_bytes(b"\xff[1]")
+    with pytest.raises(FileFormatError, match=r"the list .*gone can't be read: No such file"):
+        read_bytes(tmp_path / "gone", "the list", 10)
+    with pytest.raises(FileFormatError, match="is larger than 3 bytes"):
+        read_bytes(path, "the list", 3)
+    with pytest.raises(FileFormatError, match="is not UTF-8"):
+        read_text(path, "the list", 10)
+    for content in (b"\xff[1]", b"[1", b'["x"]', b"[" * 100_000, b"9" * 5000, b""):
+        path.write_bytes(content)
+        with pytest.raises(FileFormatError, match="x is not a list"):
+            read_json(path, list[int], "a list", 1 << 20)
+    path.write_bytes(b"[1]")
+    assert read_json(path, list[int], "a list", 10) == [1]
+    with pytest.raises(FileFormatError):
+        read_bytes("/dev/zero", "the list", 1000)
+    assert str(expand("~nobody-of-this-name/x")) == "~nobody-of-this-name/x"

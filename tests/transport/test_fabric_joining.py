@@ -1,0 +1,58 @@
+"""Who answers an application that wants to join, and is not the proxy that it means."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+pytest.importorskip("zenoh", reason="needs the extra network: pip install 'skyloop[network]'")
+
+from skyloop.errors import LinkError, NoAnswerError
+from skyloop.transport.fabric import layout, packets
+from skyloop.transport.fabric.admission import JoinRequest
+from skyloop.transport.fabric.joining import join
+from skyloop.transport.fabric.session import Session
+
+RUN, OTHER = "1" * 16, "2" * 16
+
+
+class Payload(bytes):
+    def to_string(self) -> str:
+        return self.decode()
+
+
+def answered(payload: bytes) -> Any:
+    return SimpleNamespace(err=None, ok=SimpleNamespace(payload=Payload(payload)))
+
+
+def welcome(run: str) -> Any:
+    return answered(packets.encode_own(packets.Welcome(packets.REVISION, run)))
+
+
+def session(*replies: Any) -> Session:
+    settings = SimpleNamespace(who="anyone", ring=None, tls=None)
+    return cast("Session", SimpleNamespace(settings=settings, zenoh=SimpleNamespace(get=lambda *_, **__: replies)))
+
+
+def test_what_does_not_come_from_the_proxy_that_is_meant_is_passed_over() -> None:
+    strangers = (answered(b"\xc1 nonsense"), answered(bytes(packets.MAX_OWN + 1)), welcome(OTHER))
+    with pytest.raises(NoAnswerError, match="found on the network but did not answer"):
+        join(session(*strangers), "alpha", RUN, layout.new_id())
+    assert join(session(*strangers, welcome(RUN)), "alpha", RUN, layout.new_id()) is not None
+
+
+def test_a_refusal_is_told_with_its_reason() -> None:
+    refused = SimpleNamespace(err=SimpleNamespace(payload=Payload(b"it is full")), ok=None)
+    with pytest.raises(LinkError, match="does not let us in: it is full"):
+        join(session(refused), "alpha", RUN, layout.new_id())
+
+
+def test_somebody_who_answers_in_its_place_is_named_as_that(monkeypatch: pytest.MonkeyPatch) -> None:
+    def accept(_request: JoinRequest, _welcome: packets.Welcome) -> None:
+        raise LinkError("its proof is wrong")
+
+    monkeypatch.setattr(JoinRequest, "accept", accept)
+    with pytest.raises(LinkError, match="who answers as the proxy 'alpha' is not it: its proof is wrong"):
+        join(session(welcome(RUN)), "alpha", RUN, layout.new_id())

@@ -1,0 +1,49 @@
+"""By which key a packet travels, and what is answered where there is no right to it."""
+
+from __future__ import annotations
+
+import pytest
+
+from skyloop.keys import Identity, KeyRole
+from skyloop.messages import (
+    AnyRequest,
+    Command,
+    Hover,
+    Ping,
+    Refusal,
+    Refused,
+    Reply,
+    Request,
+    RequestAuthority,
+    decode,
+    encode,
+)
+from skyloop.transport.fabric.layout import ASK, COMMAND, ORDER, refusal_reply, way_of
+
+OLGA = Identity("olga", KeyRole.OBSERVER)
+HOVER = encode(Command(1, 1, 1, 1, Hover()))
+
+
+@pytest.mark.parametrize(
+    ("body", "way"), [(Ping(1), ASK), (RequestAuthority(3), ORDER)], ids=["a question", "an order"]
+)
+def test_questions_and_orders_go_by_keys_of_their_own(body: AnyRequest, way: str) -> None:
+    assert way_of(encode(Request(1, body))) == way
+
+
+def test_a_command_has_its_own_and_garbage_is_left_to_the_proxy() -> None:
+    assert way_of(HOVER) == COMMAND
+    assert way_of(b"no packet") == ASK
+
+
+def test_an_order_without_the_right_to_it_is_answered_with_whose_keys_these_are() -> None:
+    packet = refusal_reply(encode(Request(7, RequestAuthority(3))), OLGA, "alpha")
+    assert packet is not None
+    answer = decode(packet)
+    assert isinstance(answer, Reply)
+    assert isinstance(answer.body, Refused)
+    assert (answer.id, answer.body.code) == (7, Refusal.OBSERVER)
+    assert "olga" in answer.body.message
+    assert "'alpha'" in answer.body.message
+    assert refusal_reply(HOVER, OLGA, "alpha") is None
+    assert refusal_reply(HOVER[:-1], OLGA, "alpha") is None, "damaged"

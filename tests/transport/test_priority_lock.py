@@ -1,0 +1,66 @@
+"""A lock in the order of arrival, commands first."""
+
+from __future__ import annotations
+
+import threading
+
+from skyloop.messages import Command, Hover, Ping, Request, encode
+from skyloop.transport.priority_lock import PriorityLock, is_command
+from skyloop.transport.testing import wait_until
+
+
+def test_commands_are_in_a_hurry_and_nothing_else_is() -> None:
+    assert is_command(encode(Command(1, 1, 1, 1, Hover())))
+    assert not is_command(encode(Request(1, Ping(1))))
+    assert not is_command(b"")
+
+
+def queue_up(turns: PriorityLock, came: list[str], name: str, *, first: bool = False) -> threading.Thread:
+    """A thread that waits for its turn now."""
+
+    def wait() -> None:
+        with turns.urgent if first else turns:
+            came.append(name)
+
+    before = turns.waiting
+    thread = threading.Thread(target=wait)
+    thread.start()
+    wait_until(lambda: turns.waiting == before + 1, f"{name} waits")
+    return thread
+
+
+def test_those_in_a_hurry_come_first_and_the_others_as_they_came() -> None:
+    turns, came = PriorityLock(), list[str]()
+    with turns:
+        assert turns.held
+        with turns:  # the same thread may take it again
+            threads = [queue_up(turns, came, name) for name in ("one", "two")]
+            threads.append(queue_up(turns, came, "command", first=True))
+        threads.append(queue_up(turns, came, "three"))
+        assert came == []
+    for thread in threads:
+        thread.join()
+    assert came == ["command", "one", "two", "three"]
+    assert not turns.held
+
+
+def test_who_takes_it_again_and_again_lets_each_that_waits_through_first() -> None:
+    """With ``threading.RLock`` the others get it by chance."""
+    turns, came = PriorityLock(), list[str]()
+    ended = threading.Event()
+
+    def take_always() -> None:
+        while not ended.is_set():
+            with turns:
+                came.append("greedy")
+
+    with turns:
+        greedy = threading.Thread(target=take_always)
+        greedy.start()
+        wait_until(lambda: turns.waiting == 1, "it waits")
+        others = [queue_up(turns, came, name) for name in ("one", "two", "three")]
+    for thread in others:
+        thread.join()
+    ended.set()
+    greedy.join()
+    assert came[:4] == ["greedy", "one", "two", "three"]
