@@ -12,6 +12,7 @@ from skyloop.client import Drone, Frame, connect
 from skyloop.control import Controller
 from skyloop.drivers.sim import SimDriver, options_of
 from skyloop.drivers.uri import parse_uri
+from skyloop.errors import NoAnswerError
 from skyloop.messages import Applied, Failsafe, Feedback, FlightState, Velocity
 from skyloop.proxy import Proxy
 from skyloop.sim.host import SimHost
@@ -23,6 +24,7 @@ QUALITY: Final = 70
 _RADIUS_M: Final = 0.5
 _SPEED_M_S: Final = 0.3
 _CONNECTS_WITHIN_S: Final = 30.0
+_ASKS_AGAIN_S: Final = 5.0
 
 
 class Step(NamedTuple):
@@ -75,7 +77,7 @@ def fly(pipe: Pipe, place: str, names: list[str]) -> None:
         for drone in drones:
             drone.takeoff(wait=False)
         for drone in drones:
-            drone.wait("hovering", timeout_s=_CONNECTS_WITHIN_S)
+            _hover(drone)
         controllers = [Circle(drone, delays_ns) for drone in drones]
         threads = [threading.Thread(target=controller.run, daemon=True) for controller in controllers]
         for thread in threads:
@@ -90,6 +92,19 @@ def fly(pipe: Pipe, place: str, names: list[str]) -> None:
             controller.stop()
         for thread in threads:
             thread.join()
+
+
+def _hover(drone: Drone) -> None:
+    """Wait until it hovers, and ask anew meanwhile: what was asked before a link was lost is not sent again."""
+    deadline = time.monotonic() + _CONNECTS_WITHIN_S
+    while True:
+        try:
+            drone.wait("hovering", timeout_s=_ASKS_AGAIN_S)
+            return
+        except NoAnswerError:
+            if time.monotonic() > deadline:
+                raise
+            drone.takeoff(wait=False)
 
 
 def look_on(pipe: Pipe, place: str, names: list[str]) -> None:

@@ -98,11 +98,11 @@ def test_ctrl_c_lands(start: Callable[..., Process], alpha: Process, write: Writ
     process = start("fly", write(GOOD), "--on", "alpha")
     process.until("taking off")
     with skyloop.connect("alpha", access="observe") as drone:
-        drone.wait("flying", timeout_s=10.0)
+        drone.wait("flying", timeout_s=30.0)
         process.signal(number)
         process.until("landing")
         assert process.wait() == 0
-        assert drone.wait("landed", timeout_s=5.0)
+        assert drone.wait("landed", timeout_s=30.0)
     assert "Traceback" not in process.text
 
 
@@ -112,12 +112,12 @@ def test_ctrl_c_while_landing_leaves_it_to_the_proxy(
 ) -> None:
     with skyloop.connect("alpha", access="observe") as drone:
         process = start("fly", write(GOOD), "--on", "alpha")
-        drone.wait("flying", timeout_s=20.0)
+        drone.wait("flying", timeout_s=30.0)
         process.signal(signal.SIGINT)
         process.until("landing")
         process.signal(signal.SIGINT)
         assert process.wait() in (130, 0)  # 0: it had landed before the signal came
-        drone.wait("landed", timeout_s=10.0)
+        drone.wait("landed", timeout_s=30.0)
 
 
 @pytest.mark.process
@@ -133,7 +133,7 @@ def test_without_takeoff_the_controller_is_left_to_do_it(run: Run, alpha: Proces
 def test_who_takes_over_keeps_the_drone(start: Callable[..., Process], alpha: Process, write: Write) -> None:
     process = start("fly", write(GOOD + "    def on_authority(self, status):\n        self.stop()\n"), "--on", "alpha")
     with skyloop.connect("alpha", access="observe") as drone:
-        drone.wait("flying", timeout_s=20.0)
+        drone.wait("flying", timeout_s=30.0)
     with skyloop.connect("alpha", priority=1, name="other") as other:
         process.until("other took over: the drone is left to them")
         assert process.wait() == 0

@@ -101,26 +101,26 @@ def test_an_error_hovers_until_the_file_is_mended(
     start: Callable[..., Process], looker: skyloop.Drone, mine: Path
 ) -> None:
     process = start("fly", str(mine), "--on", "alpha", "--reload")
-    looker.wait("flying", timeout_s=20.0)
+    looker.wait("flying", timeout_s=30.0)
     save(mine, MINE.replace("self.drone.velocity(left=self.SPEED)", "raise RuntimeError('in on_feedback')"))
     process.until("the controller failed: hovering; save the file to go on")
     assert "RuntimeError: in on_feedback" in process.text
-    looker.wait("hovering", timeout_s=20.0)
+    looker.wait("hovering", timeout_s=30.0)
     save(mine, MINE.replace("before.calls", "before.nothing"))
     process.until("no attribute 'nothing'")
     assert looker.feedback().state == "hovering"
     save(mine, MINE)
-    looker.wait("flying", timeout_s=20.0)
+    looker.wait("flying", timeout_s=30.0)
     process.signal(signal.SIGINT)
     assert process.wait() == 0
-    looker.wait("landed", timeout_s=20.0)
+    looker.wait("landed", timeout_s=30.0)
 
 
 @pytest.mark.process
 def test_an_error_in_on_frame_hovers_too(start: Callable[..., Process], tmp_path: Path) -> None:
     path = tmp_path / "mine.py"
     path.write_text(FRAMES)
-    process = start("fly", str(path), "--on", "sim://?world=empty&speed=4&wind=0", "--reload", "--seconds", "3")
+    process = start("fly", str(path), "--on", "sim://?world=empty&speed=4&wind=0", "--reload", "--seconds", "8")
     process.until("RuntimeError: in on_frame")
     process.until("hovering; save the file to go on")
     process.until("landing")
@@ -134,7 +134,7 @@ def test_an_error_in_on_authority_is_told_and_the_drone_left_to_who_took_over(
     path = tmp_path / "mine.py"
     path.write_text(AUTHORITY)
     process = start("fly", str(path), "--on", "alpha", "--reload")
-    looker.wait("flying", timeout_s=20.0)
+    looker.wait("flying", timeout_s=30.0)
     with skyloop.connect("alpha", priority=1, name="other") as other:
         process.until("RuntimeError: in on_authority")
         other.land()

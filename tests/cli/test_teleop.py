@@ -136,10 +136,10 @@ def test_a_flight_by_keys(terminal: Terminal) -> None:
         terminal.press(b"w")
         terminal.until("T takes off")
         terminal.press(b"t")
-        drone.wait("hovering", timeout_s=20.0)
+        drone.wait("hovering", timeout_s=30.0)
         terminal.press(b"w\x1b[D")
         drone.wait(lambda feedback: (feedback.velocity or (0.0,))[0] > 0.05, 20.0)
-        drone.wait("hovering", timeout_s=20.0)  # no key is held any more
+        drone.wait("hovering", timeout_s=30.0)  # no key is held any more
         terminal.press(b"+")
         terminal.until("1 m/s, 1.6 rad/s")
         terminal.press(b"r")
@@ -150,7 +150,7 @@ def test_a_flight_by_keys(terminal: Terminal) -> None:
         drone.wait(lambda feedback: feedback.owner == "skyloop teleop", 20.0)
         terminal.press(b"q")
         assert terminal.wait() == 0
-        assert drone.wait("landed", timeout_s=20.0)
+        assert drone.wait("landed", timeout_s=30.0)
 
 
 @pytest.mark.process
@@ -158,11 +158,11 @@ def test_esc_twice_cuts_the_motors_and_ctrl_c_ends(terminal: Terminal) -> None:
     terminal.until("take off")
     with skyloop.connect("alpha", access="observe") as drone:
         terminal.press(b"t")
-        drone.wait("hovering", timeout_s=20.0)
+        drone.wait("hovering", timeout_s=30.0)
         terminal.press(b"\x1b\x1b")
-        drone.wait("emergency", timeout_s=20.0)
+        drone.wait("emergency", timeout_s=30.0)
         terminal.process.send_signal(signal.SIGINT)
         assert terminal.wait() == 0
     with skyloop.connect("alpha") as pilot:
         pilot.reset_emergency()
-        pilot.wait("landed", timeout_s=20.0)
+        pilot.wait("landed", timeout_s=30.0)

@@ -140,7 +140,7 @@ def test_each_order_is_answered_under_its_number(client: TestClient, node: Node)
         assert pilot.wait("sent", do="set")["n"] == 3
         pilot.say("land", n=4)
         assert pilot.wait("sent", do="land")["n"] == 4
-        assert count(node, Land())
+        until(lambda: count(node, Land()))
 
 
 def test_what_waited_behind_something_slow_is_too_old_by_then(

@@ -166,5 +166,5 @@ def watch_numbers(here: Here, name: str) -> None:
 def numbers(here: Here, name: str, count: int) -> list[int]:
     """Numbers of so many packets of feedback."""
     found: list[int] = here.objects[f"{name} numbers"]
-    eventually(lambda: len(found) >= count, f"{count} samples of feedback came", 10.0)
+    eventually(lambda: len(found) >= count, f"{count} samples of feedback came")
     return list(found)

@@ -38,7 +38,7 @@ def test_the_offset_of_a_clock_set_apart_is_true_to_its_stated_uncertainty(
     app.do(flying.wait_frames, "alpha", 5)
     ages_s = [age_s for _, (_, age_s, _) in app.do(flying.frames, "alpha")]
     assert min(ages_s) >= 0.025 - 0.05, "a frame was on the way for 25 ms, and the clock may be wrong by 13"
-    assert min(ages_s) < 0.5
+    assert min(ages_s) < AHEAD_S / 100, "however busy the machine is, it is not as old as the clocks are apart"
     path.set(Impairments(delay_s=0.001))
     wait_until(lambda: error_and_uncertainty_ns()[1] < uncertainty_ns // 2, "a ping has made the estimate a better one")
     better_ns, uncertainty_ns = error_and_uncertainty_ns()

@@ -58,7 +58,7 @@ class Process:
     def signal(self, number: signal.Signals) -> None:
         os.kill(self.pid, number)
 
-    def wait(self, timeout_s: float = 10.0) -> int:
+    def wait(self, timeout_s: float = 30.0) -> int:
         return self._popen.wait(timeout_s)
 
     def end(self) -> None:
@@ -97,7 +97,7 @@ def proxy(start: Callable[..., Process]) -> Callable[..., Process]:
     return begin
 
 
-def eventually(condition: Callable[[], bool], what: str, timeout_s: float = 5.0) -> float:
+def eventually(condition: Callable[[], bool], what: str, timeout_s: float = 30.0) -> float:
     """Wait in small steps for what nothing signals, never longer than this; how long it took [s]."""
     begin = time.monotonic()
     while not condition():

@@ -22,7 +22,7 @@ def observe(name: str) -> None:
     """Look at everything, and say so."""
     with skyloop.connect(name, name="watcher", access="observe") as drone:
         if drone.capabilities.cameras:
-            drone.next_frame(timeout_s=10.0)
+            drone.next_frame(timeout_s=30.0)
         print("observing", flush=True)
         while True:
             drone.next_feedback(timeout_s=60.0)

@@ -35,7 +35,7 @@ def test_a_slow_processor_gets_new_frames_only_and_the_fast_one_gets_all(proxy: 
 
         slow_one = drone.add_processor(slow, name="slow")
         fast_one = drone.add_processor(lambda frame: seen.append(frame.seq), name="fast")
-        eventually(lambda: len(seen) >= 3 * FPS, "three seconds of video", 10.0)
+        eventually(lambda: len(seen) >= 3 * FPS, "three seconds of video")
         drops = slow_one.dropped
         assert drops > 1.5 * FPS
         assert slow_one.delivered + drops == pytest.approx(fast_one.delivered + fast_one.dropped, abs=2)
@@ -57,7 +57,7 @@ def test_a_stopped_observer_delays_nobody_and_is_served_again(
         frames: list[int] = []
         drone.add_processor(lambda frame: frames.append(frame.seq))
         # 4 s of feedback and video are far more than the buffers of the stopped one can take
-        eventually(lambda: len(frames) > 4 * FPS, "video flows on", 10.0)
+        eventually(lambda: len(frames) > 4 * FPS, "video flows on")
         assert drone.stats["feedback"].lost == 0
         assert statistics.median(ages) < 0.01
         assert drone.feedback().state is FlightState.HOVERING
@@ -84,7 +84,7 @@ def test_a_thousand_connections_leave_nothing_behind(proxy: Callable[..., Proces
         return count(f"/proc/{process.pid}/fd"), count(f"/proc/{process.pid}/task"), maps
 
     with skyloop.connect("alpha", access="observe") as drone:
-        drone.next_frame(timeout_s=5.0)
+        drone.next_frame(timeout_s=30.0)
 
     before, own_before, threads_before = resources(), count("/proc/self/fd"), threading.active_count()
     dialer = dial("alpha")

@@ -82,7 +82,7 @@ def test_a_proxy_on_the_network_says_that_anyone_can_fly_and_is_flown(far: Calla
         drone.takeoff()
         drone.velocity(forward=0.3)
         drone.wait("flying")
-        assert drone.next_frame(timeout_s=20.0).shape == (240, 320, 3)
+        assert drone.next_frame(timeout_s=30.0).shape == (240, 320, 3)
         drone.land()
     alpha.signal(signal.SIGINT)
     assert alpha.wait() == 0
@@ -199,6 +199,6 @@ def test_a_router_joins_those_who_know_only_it(
         drone.takeoff()
         drone.velocity(forward=0.2)
         drone.wait("flying")
-        drone.next_frame(timeout_s=20.0)
+        drone.next_frame(timeout_s=30.0)
     router.signal(signal.SIGTERM)
     assert router.wait() == 0

@@ -47,13 +47,13 @@ def test_a_pilot_killed_in_flight_leaves_a_drone_that_hovers_at_once_and_lands_a
 
         pilot.signal(signal.SIGKILL)
         killed = time.monotonic()
-        observer.wait(lambda feedback: feedback.failsafe is Failsafe.HOVER, timeout_s=2.0)
+        observer.wait(lambda feedback: feedback.failsafe is Failsafe.HOVER, timeout_s=10.0)
         assert time.monotonic() - killed < 0.6
-        observer.wait("hovering", timeout_s=2.0)
+        observer.wait("hovering", timeout_s=30.0)
         assert time.monotonic() - killed < 0.6
-        observer.wait(lambda feedback: feedback.failsafe is Failsafe.LAND, timeout_s=8.0)
+        observer.wait(lambda feedback: feedback.failsafe is Failsafe.LAND, timeout_s=10.0)
         assert 4.5 < time.monotonic() - killed < 6.0
-        observer.wait("landed", timeout_s=15.0)
+        observer.wait("landed", timeout_s=30.0)
 
         kinds = {event.kind for event in events}
         assert {EventKind.APPLICATION_LINK, EventKind.AUTHORITY_LOST, EventKind.FAILSAFE} <= kinds
@@ -78,7 +78,7 @@ def test_one_flies_priority_takes_over_and_no_command_of_an_old_lease_is_ever_ex
         eve.on_command(applied.append)
         bob.takeoff()
         bob.velocity(forward=0.2)
-        eve.wait("flying", timeout_s=3.0)
+        eve.wait("flying", timeout_s=30.0)
         old_lease = bob.authority.lease
         for observer in observers:
             with pytest.raises(AuthorityError, match="observe"):
@@ -104,7 +104,7 @@ def test_one_flies_priority_takes_over_and_no_command_of_an_old_lease_is_ever_ex
         eventually(lambda: bob.authority.state == "held", "bob gets it back")
         assert bob.authority.lease > old_lease
         forge(bob, old_lease, Velocity(forward=3.0))
-        eventually(lambda: count_events(eve, "foreign_lease") >= 2, "the old lease is refused again", 3.0)
+        eventually(lambda: count_events(eve, "foreign_lease") >= 2, "the old lease is refused again")
         bob.velocity(forward=0.1)
         eventually(
             lambda: any(e.lease == bob.authority.lease and e.applied == Velocity(0.1) for e in applied), "bob flies"
@@ -120,16 +120,16 @@ def test_a_pilot_that_hangs_keeps_its_name_on_a_drone_that_fails_safe_until_some
     with skyloop.connect("alpha", access="observe") as observer:
         pilot = start(PILOTS, "fly", "alpha", "4")
         pilot.until("flying")
-        observer.wait("flying", timeout_s=10.0)
+        observer.wait("flying", timeout_s=30.0)
         pilot.signal(signal.SIGSTOP)
-        kept = observer.wait(lambda feedback: not feedback.lease, timeout_s=10.0)
+        kept = observer.wait(lambda feedback: not feedback.lease, timeout_s=30.0)
         assert (kept.owner, kept.owner_priority) == ("doomed", 4)
         assert kept.failsafe is not Failsafe.NONE
         with skyloop.connect("alpha", name="alice", priority=31, on_exit="hover") as alice:  # of lower priority
             assert alice.authority.state == "held"
-            observer.wait(lambda feedback: feedback.owner == "alice", timeout_s=5.0)
+            observer.wait(lambda feedback: feedback.owner == "alice", timeout_s=30.0)
             pilot.signal(signal.SIGCONT)  # it asks for a new lease by itself, with its higher priority
-            observer.wait(lambda feedback: feedback.owner == "doomed", timeout_s=10.0)
+            observer.wait(lambda feedback: feedback.owner == "doomed", timeout_s=30.0)
             eventually(lambda: alice.authority.holder == "doomed", "alice knows")
 
 

@@ -69,7 +69,7 @@ def until_shared(found: Collected, workers: list[Process]) -> None:
     for worker in workers:
         worker.until("marks front  part")
     newest_ns = max((result.captured_ns for result in found.after(0)), default=0)
-    eventually(lambda: found.pids(newest_ns) == {one.pid for one in workers}, "all work", 20.0)
+    eventually(lambda: found.pids(newest_ns) == {one.pid for one in workers}, "all work")
 
 
 @pytest.mark.parametrize(
@@ -84,7 +84,7 @@ def test_a_worker_is_gone_and_the_others_take_its_share(
         until_shared(found, workers)
         begin_ns = drone.feedback().captured_ns
         workers[0].signal(number)
-        eventually(lambda: whole_since(found, begin_ns) is not None, "each frame has a result again", 10.0)
+        eventually(lambda: whole_since(found, begin_ns) is not None, "each frame has a result again")
         whole_ns = whole_since(found, begin_ns)
         assert whole_ns is not None
         took_s = (whole_ns - begin_ns) / 1e9
@@ -94,7 +94,7 @@ def test_a_worker_is_gone_and_the_others_take_its_share(
         if number is signal.SIGSTOP:
             workers[0].signal(signal.SIGCONT)
             newest_ns = drone.feedback().captured_ns
-            eventually(lambda: workers[0].pid in found.pids(newest_ns), "it works again", 10.0)
+            eventually(lambda: workers[0].pid in found.pids(newest_ns), "it works again")
 
 
 def test_workers_outlive_their_proxy(proxy: Callable[..., Process], start: Callable[..., Process]) -> None:
@@ -108,4 +108,4 @@ def test_workers_outlive_their_proxy(proxy: Callable[..., Process], start: Calla
         proxy(uri)
         drone.wait(lambda _: drone.link.application is skyloop.LinkState.UP, 10.0)
         again_ns = drone.feedback().captured_ns
-        eventually(lambda: found.pids(again_ns) == {one.pid for one in workers}, "both work again", 10.0)
+        eventually(lambda: found.pids(again_ns) == {one.pid for one in workers}, "both work again")

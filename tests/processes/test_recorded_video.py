@@ -63,7 +63,7 @@ def test_its_h264_reaches_a_recorder_in_a_process_of_its_own_as_it_was(tmp_path:
         skyloop.connect(f"video://{stream()}?speed=4") as drone,
         skyloop.record(drone, path, min_free_mb=0) as recorder,
     ):
-        drone.wait(lambda feedback: feedback.vehicle_link == "closed", timeout_s=20.0)
+        drone.wait(lambda feedback: feedback.vehicle_link == "closed", timeout_s=30.0)
         closed_s = recorder.status.seconds
         eventually(lambda: recorder.status.seconds > closed_s + 2.0, "what was on the way is written", 30.0)
     recording = Recording.open(path)

@@ -31,17 +31,17 @@ def test_a_killed_and_restarted_proxy_is_back_within_a_second_with_everything_as
 
         first.signal(signal.SIGKILL)
         first.wait()
-        eventually(lambda: any(s.application is LinkState.LOST for _, s in told), "it is told of the loss", 1.0)
+        eventually(lambda: any(s.application is LinkState.LOST for _, s in told), "it is told of the loss")
         assert drone.velocity(forward=0.3) is False  # nothing to do, and nothing raised
         frames.clear()
         proxy("sim://?world=empty&cameras=front")
         ready = time.monotonic()
-        eventually(lambda: drone.link.application is LinkState.UP, "it is up again", 1.0)
+        eventually(lambda: drone.link.application is LinkState.UP, "it is up again")
         assert time.monotonic() - ready < 1.0
-        eventually(lambda: drone.authority.state == "held", "it holds the authority again", 2.0)
+        eventually(lambda: drone.authority.state == "held", "it holds the authority again")
         assert drone.authority.priority == 5
-        eventually(lambda: bool(frames), "pictures come again", 2.0)
-        eventually(lambda: drone.config["limits.tilt"] == pytest.approx(0.21), "its settings are put back", 2.0)
+        eventually(lambda: bool(frames), "pictures come again")
+        eventually(lambda: drone.config["limits.tilt"] == pytest.approx(0.21), "its settings are put back")
         states = [status.application for _, status in told]
         assert states.index(LinkState.LOST) < len(states) - 1 - states[::-1].index(LinkState.UP)
         drone.takeoff()
@@ -52,10 +52,10 @@ def test_a_stopped_proxy_is_told_as_lost_and_recovers_when_it_goes_on(proxy: Cal
     process = proxy()
     with skyloop.connect("alpha") as drone:
         process.signal(signal.SIGSTOP)
-        eventually(lambda: drone.link.application is LinkState.LOST, "silence is a loss", 3.0)
+        eventually(lambda: drone.link.application is LinkState.LOST, "silence is a loss")
         process.signal(signal.SIGCONT)
-        eventually(lambda: drone.link.application is LinkState.UP, "up again", 2.0)
-        eventually(lambda: drone.authority.state == "held", "the authority is back", 4.0)
+        eventually(lambda: drone.link.application is LinkState.UP, "up again")
+        eventually(lambda: drone.authority.state == "held", "the authority is back")
 
 
 def test_a_lost_vehicle_is_told_and_only_fresh_commands_fly_it_again(proxy: Callable[..., Process]) -> None:
@@ -63,16 +63,16 @@ def test_a_lost_vehicle_is_told_and_only_fresh_commands_fly_it_again(proxy: Call
     with skyloop.connect("alpha") as drone:
         drone.takeoff()
         drone.velocity(forward=0.3)
-        drone.wait("flying", timeout_s=2.0)
+        drone.wait("flying", timeout_s=30.0)
         drone.config["sim.link"] = False
-        eventually(lambda: drone.link.vehicle is LinkState.LOST, "the loss of the vehicle is told", 1.0)
+        eventually(lambda: drone.link.vehicle is LinkState.LOST, "the loss of the vehicle is told")
         drone.velocity(forward=0.3)
         eventually(
             lambda: any(e.data.get("reason") == "vehicle_link_lost" for e in drone.recent_events()),
             "commands are refused",
         )
         drone.config["sim.link"] = True
-        eventually(lambda: drone.link.vehicle is LinkState.UP, "it is told that it is back", 1.0)
+        eventually(lambda: drone.link.vehicle is LinkState.UP, "it is told that it is back")
         eventually(lambda: drone.velocity(left=0.2) and drone.feedback().state == "flying", "a fresh command flies it")
         drone.land()
 
@@ -89,7 +89,7 @@ def test_a_private_proxy_ends_with_its_block_and_with_its_parent(start: Callable
     parent.until("up")
     assert len(list_names()) == 1
     parent.signal(signal.SIGKILL)
-    eventually(lambda: not list_names(), "the child is gone with its parent", 5.0)
+    eventually(lambda: not list_names(), "the child is gone with its parent")
     with skyloop.connect("sim://?cameras=none"):
         assert len(list_names()) == 1
     assert not list_names()

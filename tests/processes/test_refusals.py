@@ -50,7 +50,7 @@ def test_garbage_does_not_disturb_the_flight(proxy: Callable[..., Process]) -> N
     with skyloop.connect("alpha") as drone:
         drone.takeoff()
         drone.velocity(forward=0.2)
-        drone.wait("flying", timeout_s=2.0)
+        drone.wait("flying", timeout_s=30.0)
         whole = encode(Command(1, drone.authority.lease, 10**9, 0, Velocity(forward=3.0)))
         hostile = (
             [source.randbytes(source.randrange(1, 200)) for _ in range(10_000)]

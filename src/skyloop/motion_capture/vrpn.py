@@ -183,6 +183,8 @@ class VrpnSource:
                     data = connection.recv(CHUNK)
                 except TimeoutError:
                     continue
+                except ConnectionResetError:  # how a server ends that did not read all that it was sent
+                    data = b""
                 received_ns = monotonic_ns()
                 if not data:
                     raise LinkError("the server ended the connection")
