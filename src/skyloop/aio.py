@@ -176,13 +176,13 @@ class Drone:
 
     # Commands --------------------------------------------------------------------------------------------------
 
-    async def takeoff(self, *, wait: bool = True, timeout_s: float = 15.0) -> bool:
+    async def takeoff(self, *, wait: bool = True, timeout_s: float = 15.0) -> None:
         """Take off, then hover; see :meth:`skyloop.client.Drone.takeoff`."""
-        return await _in_thread(lambda: self.sync.takeoff(wait=wait, timeout_s=timeout_s))
+        await _in_thread(lambda: self.sync.takeoff(wait=wait, timeout_s=timeout_s))
 
-    async def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> bool:
+    async def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> None:
         """Land at the present position; see :meth:`skyloop.client.Drone.land`."""
-        return await _in_thread(lambda: self.sync.land(wait=wait, timeout_s=timeout_s))
+        await _in_thread(lambda: self.sync.land(wait=wait, timeout_s=timeout_s))
 
     def hover(self) -> bool:
         """Stop and hold the position."""

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from skyloop.client import Drone, LinkStatus, RedialPolicy
-from skyloop.errors import ClosedError, LinkError, NoAnswerError, RefusedError
+from skyloop.errors import AuthorityError, ClosedError, LinkError, NoAnswerError, RefusedError
 from skyloop.messages import (
     Command,
     Event,
@@ -18,6 +18,7 @@ from skyloop.messages import (
     Hello,
     Hover,
     Idle,
+    Land,
     LinkState,
     Ping,
     Refusal,
@@ -236,9 +237,43 @@ def test_take_off_over_a_lost_link(proxy: ScriptedProxy, drone: Drone) -> None:
     told.until(LinkState.LOST)
     with pytest.raises(NoAnswerError, match="and the link is lost"):
         drone.takeoff(timeout_s=0.05)
-    assert drone.takeoff(wait=False) is False
     proxy.start()
     proxy.until_commanded(Takeoff())
+
+
+def test_a_take_off_that_is_not_sent_raises_and_is_not_carried_out_later(proxy: ScriptedProxy, drone: Drone) -> None:
+    told = Told(drone)
+    proxy.stop()
+    told.until(LinkState.LOST)
+    assert drone.command(Takeoff()) is False  # it would be sent if the link were back soon
+    with pytest.raises(LinkError, match=r"takeoff was not sent: the link to the proxy is lost \("):
+        drone.takeoff(wait=False)
+    proxy.start()
+    proxy.until(lambda: proxy.actions().count(Idle()) > 3, "the drone commands nothing")
+    assert Takeoff() not in proxy.actions()
+
+
+def test_a_landing_that_is_not_sent_raises_and_is_sent_if_the_link_is_back_soon(
+    proxy: ScriptedProxy, drone: Drone
+) -> None:
+    told = Told(drone)
+    proxy.stop()
+    told.until(LinkState.LOST)
+    with pytest.raises(LinkError, match=r"land was not sent: .* sent if that changes within half a second"):
+        drone.land(wait=False)
+    proxy.start()
+    proxy.until_commanded(Land())
+
+
+def test_a_take_off_before_the_authority_is_confirmed_raises(proxy: ScriptedProxy, drone: Drone) -> None:
+    told = Told(drone)
+    proxy.answers[RequestAuthority] = None
+    proxy.stop()
+    at = told.until(LinkState.LOST)
+    proxy.start()
+    told.until(LinkState.UP, at)
+    with pytest.raises(AuthorityError, match="takeoff was not sent: the proxy has not confirmed the authority yet"):
+        drone.takeoff(wait=False)
 
 
 def test_questions_over_a_lost_link_wait_for_its_return(proxy: ScriptedProxy, drone: Drone) -> None:

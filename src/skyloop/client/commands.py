@@ -27,6 +27,7 @@ from skyloop.messages import (
     Event,
     EventKind,
     Feedback,
+    Land,
     Refused,
     ReleaseAuthority,
     RequestAuthority,
@@ -148,14 +149,20 @@ class CommandSender:
 
     # The application's side ------------------------------------------------------------------------------------
 
-    def command(self, action: AnyAction) -> bool:
+    def command(self, action: AnyAction, *, now: bool = False) -> bool:
         """Make ``action`` the newest set-point.
+
+        Args:
+            action: The action.
+            now: Raise if it can't be sent now. A landing is then kept for when it can, anything else is dropped.
 
         Returns:
             False if it can't be sent now, because the link is down or the authority is still awaited.
 
         Raises:
-            AuthorityError: If another application holds the authority, none was requested, or this one only observes.
+            AuthorityError: If another application holds the authority, none was requested, or this one only observes;
+                with ``now`` also while the authority is still awaited.
+            LinkError: With ``now`` while the link is down.
         """
         now_ns = self._clock()
         stop = type(action) is EmergencyStop
@@ -172,6 +179,10 @@ class CommandSender:
                 raise self._not_ours(action)
             self._schedule.ask(action, now_ns)
             if not may_send or not self._connection.connected:
+                if now:
+                    if type(action) is not Land:  # what was refused now must not be carried out later
+                        self._schedule.clear()
+                    raise self._not_now(action)
                 return False
             if self._schedule.due_ns <= now_ns:
                 return self._send_next(now_ns)
@@ -399,6 +410,15 @@ class CommandSender:
                 code="no_authority",
             )
         return AuthorityError(f"{action.name}: call request_authority() first", code="no_authority")
+
+    def _not_now(self, action: AnyAction) -> LinkError | AuthorityError:
+        later = "; it is sent if that changes within half a second" if type(action) is Land else ""
+        not_sent = f"{action.name} was not sent"
+        if self._connection.connected:
+            text = f"{not_sent}: the proxy has not confirmed the authority yet{later}"
+            return AuthorityError(text, code="no_authority")
+        state, reason = self._connection.state.value, self._connection.reason
+        return LinkError(f"{not_sent}: the link to the proxy is {state}{reason and f' ({reason})'}{later}")
 
 
 def _busy(status: AuthorityStatus, wait_s: float, declined: str) -> str:

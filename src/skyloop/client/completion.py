@@ -22,7 +22,7 @@ class ActionWait:
         self,
         action: AnyAction,
         states: Set[FlightState],
-        send: Callable[[AnyAction], bool],
+        send: Callable[[AnyAction], object],
         closed: Callable[[], bool],
         commands: CommandSender,
         state: ClientState,
@@ -33,7 +33,7 @@ class ActionWait:
         Args:
             action: The action.
             states: Flight states in which it is done.
-            send: Sends it, now and where it is commanded again; returns whether it was handed over.
+            send: Sends it, now and where it is commanded again.
             closed: Whether the drone was closed.
             commands: Tells what became of the command.
             state: Newest feedback and refusal.
@@ -51,7 +51,7 @@ class ActionWait:
         self._connection = connection
         self._asked_ns = state.scheduler.clock()
         self._problem: Exception | None = None
-        self.sent = send(action)  #: whether it was handed over at once
+        send(action)
         self._seq = commands.seq
 
     def wait(self, timeout_s: float, deadline_s: float) -> None:

@@ -110,9 +110,10 @@ class Drone:
     reconnected to for as long as it takes; then everything is restored except old set-points.
 
     Body axes are x forward, y left, z up (REP 103); units are SI and radians. Every command is the full desired state:
-    it is sent at once and repeated at ``rate_hz`` until the next one. Each command returns True if it was handed to the
-    transport now, and False if it could not be because the link is down or the authority is still awaited; it is then
-    sent when both are there, if it is less than half a second old. Every command raises:
+    it is sent at once and repeated at ``rate_hz`` until the next one. Each command but :meth:`takeoff` and :meth:`land`
+    returns True if it was handed to the transport now, and False if it could not be because the link is down or the
+    authority is still awaited; it is then sent when both are there, if it is less than half a second old. Every command
+    raises:
 
     - :class:`AuthorityError` while another application holds the authority or none was requested,
     - :class:`UsageError` for numbers that are not finite,
@@ -401,47 +402,44 @@ class Drone:
         """Time on this process's clock from which a new set-point is sent at once [ns]: 5 ms after the last new one."""
         return self._commands.open_ns
 
-    def takeoff(self, *, wait: bool = True, timeout_s: float = 15.0) -> bool:
+    def takeoff(self, *, wait: bool = True, timeout_s: float = 15.0) -> None:
         """Take off, then hover.
 
         Args:
-            wait: Wait until the vehicle hovers or flies.
+            wait: Wait until the vehicle hovers or flies; else only send the command.
             timeout_s: How long to wait [s].
-
-        Returns:
-            Whether the command was handed to the transport at once.
 
         Raises:
             NoAnswerError: If the vehicle does not hover in time; names its state and, if known, the reason.
             RefusedError: If the proxy refuses to take off in the present state.
             UnsupportedError: If the vehicle can't take off.
+            LinkError: Without ``wait``, if the link is down; the vehicle does not take off later either.
             AuthorityError: If the authority is not held, or another application takes it over meanwhile.
             ClosedError: If the drone is closed.
             UsageError: If called with ``wait`` from an inline callback; nothing is sent.
         """
-        return self._complete(Takeoff(), _UP, wait, timeout_s)
+        self._complete(Takeoff(), _UP, wait, timeout_s)
 
-    def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> bool:
+    def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> None:
         """Land at the present position.
 
         While this waits, a landing that was ended by a failsafe, a lost link or a lost lease is commanded again.
 
         Args:
-            wait: Wait until the vehicle has landed.
+            wait: Wait until the vehicle has landed; else only send the command.
             timeout_s: How long to wait [s].
-
-        Returns:
-            Whether the command was handed to the transport at once.
 
         Raises:
             NoAnswerError: If the vehicle has not landed in time; names its state and, if known, the reason.
             RefusedError: If the proxy refuses to land in the present state.
             UnsupportedError: If the vehicle can't land.
+            LinkError: Without ``wait``, if the link is down; the landing is sent all the same if it is back within half
+                a second.
             AuthorityError: If the authority is not held, or another application takes it over meanwhile.
             ClosedError: If the drone is closed.
             UsageError: If called with ``wait`` from an inline callback; the landing is commanded all the same.
         """
-        return self._complete(Land(), _DOWN, wait, timeout_s)
+        self._complete(Land(), _DOWN, wait, timeout_s)
 
     def hover(self) -> bool:
         """Stop and hold the position. Returns and raises as every command; see :class:`Drone`."""
@@ -1151,19 +1149,20 @@ class Drone:
             return None
         return answer if isinstance(answer, Statistics) else None
 
-    def _command(self, action: AnyAction) -> bool:
+    def _command(self, action: AnyAction, *, now: bool = False) -> bool:
         if self._closed:
             self._check_open()
         welcome = self._state.welcome
         if welcome is not None and not welcome.capabilities.actions:
             why_not = welcome.capabilities.why_not or "the vehicle takes no commands"
             raise UnsupportedError(f"{action.name} is not possible: {why_not}")
-        return self._commands.command(action)
+        return self._commands.command(action, now=now)
 
-    def _complete(self, action: AnyAction, states: Set[FlightState], wait: bool, timeout_s: float) -> bool:
+    def _complete(self, action: AnyAction, states: Set[FlightState], wait: bool, timeout_s: float) -> None:
         """Send the command and, if ``wait``, wait until feedback shows one of ``states``."""
         if not wait:
-            return self._command(action)
+            self._command(action, now=True)
+            return
         if type(action) is not Land:  # a landing is commanded all the same: nothing is safer
             self._check_may_wait()
         deadline_s = time.monotonic() + timeout_s
@@ -1172,7 +1171,6 @@ class Drone:
         )
         self._check_may_wait()
         waiting.wait(timeout_s, deadline_s)
-        return waiting.sent
 
     @contextmanager
     def _closing(self, mailbox: _Closable) -> Iterator[None]:

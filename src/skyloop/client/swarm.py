@@ -169,29 +169,31 @@ class Swarm:
 
     # Commands --------------------------------------------------------------------------------------------------
 
-    def takeoff(self, *, wait: bool = True, timeout_s: float = 15.0) -> dict[str, bool]:
-        """Take off with all active drones at the same time.
+    def takeoff(self, *, wait: bool = True, timeout_s: float = 15.0) -> None:
+        """Take off with all active drones at the same time; see :meth:`Drone.takeoff`.
 
         Args:
             wait: Wait until each hovers.
             timeout_s: How long to wait [s].
 
-        Returns:
-            By name, whether the command was handed to the transport at once.
+        Raises:
+            SwarmError: As ``on_error`` says.
+            ClosedError: If the swarm was closed.
         """
-        return self.each(lambda drone: drone.takeoff(wait=wait, timeout_s=timeout_s), "takeoff")
+        self.each(lambda drone: drone.takeoff(wait=wait, timeout_s=timeout_s), "takeoff")
 
-    def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> dict[str, bool]:
-        """Land all active drones at their present positions, at the same time.
+    def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> None:
+        """Land all active drones at their present positions, at the same time; see :meth:`Drone.land`.
 
         Args:
             wait: Wait until each has landed.
             timeout_s: How long to wait [s].
 
-        Returns:
-            By name, whether the command was handed to the transport at once.
+        Raises:
+            SwarmError: As ``on_error`` says.
+            ClosedError: If the swarm was closed.
         """
-        return self.each(lambda drone: drone.land(wait=wait, timeout_s=timeout_s), "land")
+        self.each(lambda drone: drone.land(wait=wait, timeout_s=timeout_s), "land")
 
     def hover(self) -> dict[str, bool]:
         """Stop and hold the position, with all active drones."""

@@ -43,7 +43,7 @@ from skyloop.cockpit.stream import PageSocket
 from skyloop.cockpit.takeover import QueuePosition, TakeoverDialog
 from skyloop.control.waypoint import Waypoint, lacking, reached, velocity_to
 from skyloop.errors import AuthorityError, DecodeError, LinkError, RefusedError, SkyloopError
-from skyloop.messages import EventKind, FlightState, LinkState, Refusal
+from skyloop.messages import EventKind, FlightState, Land, LinkState, Refusal, Takeoff
 
 if TYPE_CHECKING:
     from skyloop.cockpit.pilot_connection import PilotConnection
@@ -106,9 +106,9 @@ class ControlSession:
             Take: lambda command: self._run_in_turn(command, self._take),
             Release: lambda command: self._run_in_turn(command, self._release),
             Answer: lambda command: self._run_in_turn(command, self._answer),
-            TakeOff: lambda command: self._send_command(command, lambda pilot: pilot.takeoff(wait=False), _UP),
+            TakeOff: lambda command: self._send_command(command, lambda pilot: pilot.command(Takeoff()), _UP),
             HoverHere: lambda command: self._send_command(command, lambda pilot: pilot.hover()),
-            LandHere: lambda command: self._send_command(command, lambda pilot: pilot.land(wait=False), _DOWN),
+            LandHere: lambda command: self._send_command(command, lambda pilot: pilot.command(Land()), _DOWN),
             Reset: lambda command: self._send_command(command, lambda pilot: pilot.reset_emergency()),
             Stop: self._stop_motors,
             Fly: self._fly,

@@ -12,7 +12,7 @@ from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
 from skyloop.cockpit.commands import Alive, LandAll, StopAll, decode_fleet_command, late_s, untimely
 from skyloop.cockpit.stream import PageSocket
 from skyloop.errors import DecodeError, LinkError, SkyloopError
-from skyloop.messages import HIGHEST_PRIORITY, FlightState, LinkState
+from skyloop.messages import HIGHEST_PRIORITY, FlightState, Land, LinkState
 
 if TYPE_CHECKING:
     from skyloop.cockpit.fleet import Fleet
@@ -102,7 +102,7 @@ class FleetSession:
                 raise LinkError(f"there was no connection within {BEGIN_S:g} s")
             await asyncio.to_thread(pilot.acquire, HIGHEST_PRIORITY)
             from_ns = pilot.proxy_now_ns + _SETTLED_NS
-            if not pilot.land(wait=False):
+            if not pilot.command(Land()):
                 raise LinkError(f"the link to the proxy is {pilot.link.application}")
             self._send({"type": "each", **subject, "state": "sent", "why": ""})
             while seconds(monotonic_ns() - begun_ns) < LANDING_S:
