@@ -20,7 +20,7 @@ from skyloop.client.drone import Access
 from skyloop.errors import LinkError, SkyloopError, UnknownNameError
 from skyloop.messages import Encoding, FrameHeader
 from skyloop.messages.video import VideoRequest
-from skyloop.transport.base import ServerEnd
+from skyloop.transport.base import TransportServer
 from skyloop.transport.fabric import FabricServer, FabricSettings
 
 JPEG: Final = VideoOptions(encoding="jpeg", quality=80)
@@ -50,7 +50,7 @@ def settings_of(address: str, *, serves: bool) -> tuple[str, FabricSettings]:
 class Vehicle(ours.Vehicle):
     """The vehicle's end, whose frames are a picture instead of noise."""
 
-    def _server(self, address: str) -> tuple[str, ServerEnd]:
+    def _server(self, address: str) -> tuple[str, TransportServer]:
         name, settings = settings_of(address, serves=True)
         return name, FabricServer(name, settings)
 

@@ -29,7 +29,7 @@ from skyloop.messages import (
     Velocity,
     encode,
 )
-from skyloop.transport.base import EVENTS, FEEDBACK, ClientEnd, ClientHandler, video
+from skyloop.transport.base import EVENTS, FEEDBACK, ClientHandler, TransportClient, video
 from skyloop.transport.memory import Faults
 from tests.client.scripted import QUICK, WAIT_S, ScriptedProxy, flown, scripted
 
@@ -344,7 +344,7 @@ class OtherClock:
 
     same_clock = False
 
-    def __init__(self, end: ClientEnd, handler: ClientHandler) -> None:
+    def __init__(self, end: TransportClient, handler: ClientHandler) -> None:
         self._end = end
 
     def __getattr__(self, name: str) -> object:
@@ -355,7 +355,7 @@ def test_the_offset_between_clocks(proxy: ScriptedProxy, monkeypatch: pytest.Mon
     ahead_ns = 3600 * 10**9
     real = time.monotonic_ns
 
-    def dial(handler: ClientHandler) -> ClientEnd:
+    def dial(handler: ClientHandler) -> TransportClient:
         return OtherClock(proxy.server.dial(handler), handler)  # type: ignore[return-value]
 
     class ProxyTime:

@@ -49,7 +49,7 @@ from skyloop.messages import (
 )
 from skyloop.proxy.proxy import Proxy
 from skyloop.recording.status import RecorderState, Status
-from skyloop.transport.base import ClientEnd, ClientHandler
+from skyloop.transport.base import ClientHandler, TransportClient
 from skyloop.transport.memory import MemoryServer
 from tests.cockpit.testclient import TestClient, WebSocketTestSession
 from tests.integration.fake_vehicle import NEXT
@@ -247,7 +247,7 @@ class Node:
         self._proxy.start()
         self.up = True
 
-    def dial(self, handler: ClientHandler) -> ClientEnd:
+    def dial(self, handler: ClientHandler) -> TransportClient:
         return self._server.dial(handler)
 
     def connect(self, app: str, priority: int = 16, **options: Any) -> Drone:
@@ -306,7 +306,7 @@ def this_user(role: Role = Role.PILOT) -> OpenGate:
 def fake_fleet(drones: Mapping[str, FakeDrone]) -> Fleet:
     """Of drones that are there at once, and for ever."""
 
-    def dial(_: ClientHandler) -> ClientEnd:
+    def dial(_: ClientHandler) -> TransportClient:
         raise LinkError("nobody flies this one")
 
     class Finder:

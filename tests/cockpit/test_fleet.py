@@ -16,14 +16,14 @@ from skyloop.cockpit.fleet import FORGET_S, Fleet, Overview
 from skyloop.cockpit.recordings import Recordings
 from skyloop.errors import LinkError, NoAnswerError
 from skyloop.messages import LinkState
-from skyloop.transport.base import ClientEnd, ClientHandler
+from skyloop.transport.base import ClientHandler, TransportClient
 from skyloop.transport.local import LocalServer
 from skyloop.transport.testing import ServerLog
 from tests.cockpit.fake import FakeDrone, Node, Nodes, cockpit, open_socket, until
 from tests.cockpit.testclient import TestClient
 
 
-def dial(_: ClientHandler) -> ClientEnd:
+def dial(_: ClientHandler) -> TransportClient:
     raise LinkError("nobody is there")
 
 

@@ -30,7 +30,7 @@ from skyloop.cockpit import Access, serve_cockpit
 from skyloop.cockpit.__main__ import main
 from skyloop.cockpit.child import CockpitProcess
 from skyloop.cockpit.server import NICENESS
-from skyloop.cockpit.testing import PageClient, Pages
+from skyloop.cockpit.testing import HeadlessPage, Pages
 from skyloop.errors import LinkError, MissingExtraError, UnknownNameError, UsageError
 from skyloop.messages import FlightState
 
@@ -164,9 +164,9 @@ def test_tokens_on_the_network(tokens: Path) -> None:
             assert refused.value.code == 401
             refused.value.close()
         with pytest.raises(LinkError, match="4401"):
-            asyncio.run(PageClient(here, "alpha").run())
+            asyncio.run(HeadlessPage(here, "alpha").run())
         with pytest.raises(LinkError, match="4404"):
-            asyncio.run(PageClient(here, "alpha", token=OBSERVER).run())
+            asyncio.run(HeadlessPage(here, "alpha", token=OBSERVER).run())
         with pytest.raises(LinkError, match="did not open"), Pages(here, "alpha"):
             pass
 

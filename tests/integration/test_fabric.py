@@ -16,7 +16,7 @@ from skyloop.client.scheduler import Scheduler
 from skyloop.errors import UsageError
 from skyloop.messages import Applied, FlightState, Velocity
 from skyloop.proxy.proxy import Proxy
-from skyloop.transport.base import Dialer, ServerEnd
+from skyloop.transport.base import Dialer, TransportServer
 from skyloop.transport.fabric import FabricServer, FabricSettings, dial
 from skyloop.transport.fabric.config import free_port
 from skyloop.transport.memory import MemoryServer
@@ -29,7 +29,7 @@ WAIT_S = 10.0
 class Node:
     """A proxy with a fake vehicle, and how it is reached."""
 
-    def __init__(self, server: ServerEnd, dialer: Dialer) -> None:
+    def __init__(self, server: TransportServer, dialer: Dialer) -> None:
         self.vehicle = FakeVehicle()
         self.dialer = dialer
         self.proxy = Proxy(self.vehicle, server, name="alpha")

@@ -49,7 +49,16 @@ from skyloop.messages import (
     encode,
 )
 from skyloop.proxy import Proxy
-from skyloop.transport.base import ANNOTATIONS, COMMANDS, EVENTS, FEEDBACK, ClientEnd, Dialer, Pixels, ServerEnd
+from skyloop.transport.base import (
+    ANNOTATIONS,
+    COMMANDS,
+    EVENTS,
+    FEEDBACK,
+    Dialer,
+    Pixels,
+    TransportClient,
+    TransportServer,
+)
 from skyloop.transport.memory import MemoryServer
 
 WAIT_S = 10.0
@@ -154,7 +163,7 @@ class App:
         self.intent = 0
         self._replies: queue.Queue[Reply] = queue.Queue()
         self._ids = 0
-        self.end: ClientEnd = dial(self)
+        self.end: TransportClient = dial(self)
         for topic in (FEEDBACK, EVENTS, COMMANDS, ANNOTATIONS):
             self.end.subscribe(topic)
 
@@ -243,7 +252,7 @@ class Bench:
         self,
         actions: Iterable[str] = ALL,
         parameters: Iterable[Parameter] = (),
-        transport: tuple[ServerEnd, Dialer] | None = None,
+        transport: tuple[TransportServer, Dialer] | None = None,
     ) -> None:
         self.clock = ManualClock(1000 * 10**9)
         if transport is None:

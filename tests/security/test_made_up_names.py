@@ -127,7 +127,7 @@ def test_a_worker_sends_results_of_its_camera_and_of_frames_that_were_captured(b
 
 
 class Readers:
-    """A server end's video; counts what it sends."""
+    """A transport server's video; counts what it sends."""
 
     def __init__(self) -> None:
         self.sent: list[str] = []

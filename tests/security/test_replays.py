@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from skyloop.messages import Command, EmergencyStop, EventKind, Hover, Refusal, Role, Velocity, encode
-from skyloop.transport.base import Dialer, ServerEnd
+from skyloop.transport.base import Dialer, TransportServer
 from skyloop.transport.fabric import FabricServer, FabricSettings
 from skyloop.transport.fabric import dial as fabric_dial
 from skyloop.transport.fabric.config import free_port
@@ -26,16 +26,16 @@ from skyloop.transport.testing import wait_until
 from tests.proxy.fake import App, Bench
 
 
-def memory() -> tuple[ServerEnd, Dialer]:
+def memory() -> tuple[TransportServer, Dialer]:
     server = MemoryServer("bench")
     return server, server.dial
 
 
-def local() -> tuple[ServerEnd, Dialer]:
+def local() -> tuple[TransportServer, Dialer]:
     return LocalServer("bench"), local_dial("bench")
 
 
-def fabric() -> tuple[ServerEnd, Dialer]:
+def fabric() -> tuple[TransportServer, Dialer]:
     place = f"127.0.0.1:{free_port('127.0.0.1')}"
     server = FabricServer("bench", FabricSettings(listen=(place,), multicast=False))
     return server, fabric_dial("bench", FabricSettings(connect=(place,), multicast=False))
@@ -43,7 +43,7 @@ def fabric() -> tuple[ServerEnd, Dialer]:
 
 @pytest.fixture(params=[memory, local, fabric], ids=lambda make: make.__name__)
 def bench(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
-    make: Callable[[], tuple[ServerEnd, Dialer]] = request.param
+    make: Callable[[], tuple[TransportServer, Dialer]] = request.param
     with tempfile.TemporaryDirectory(prefix="skyloop-") as folder:
         monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", str(Path(folder) / "run"))
         with Bench(transport=make()) as bench:

@@ -1,4 +1,4 @@
-"""Several server ends as one keep the contract, and number their applications over all of them."""
+"""Several transport servers as one keep the contract, and number their applications over all of them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import itertools
 import pytest
 
 from skyloop.errors import NameTakenError, UsageError
-from skyloop.transport.base import FEEDBACK, Dialer, ServerEnd, ServerHandler
+from skyloop.transport.base import FEEDBACK, Dialer, ServerHandler, TransportServer
 from skyloop.transport.composite import CompositeServer
 from skyloop.transport.conformance import TransportSuite
 from skyloop.transport.memory import MemoryServer
@@ -17,22 +17,22 @@ from skyloop.transport.testing import ClientLog, ServerLog, wait_until
 class TestCompositeBySecondEnd(TransportSuite):
     """What comes by one end is as if there were no other."""
 
-    def make_server(self) -> ServerEnd:
+    def make_server(self) -> TransportServer:
         self.end = MemoryServer("near")
         return CompositeServer([MemoryServer("nobody comes here"), self.end])
 
-    def dialer(self, server: ServerEnd) -> Dialer:
+    def dialer(self, server: TransportServer) -> Dialer:
         return self.end.dial
 
 
 class TestCompositeByTurns(TransportSuite):
-    """Applications of one server end come by different ways."""
+    """Applications of one transport server come by different ways."""
 
-    def make_server(self) -> ServerEnd:
+    def make_server(self) -> TransportServer:
         self.ends = itertools.cycle(ends := [MemoryServer("one"), MemoryServer("two")])
         return CompositeServer(ends)
 
-    def dialer(self, server: ServerEnd) -> Dialer:
+    def dialer(self, server: TransportServer) -> Dialer:
         return next(self.ends).dial
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 
-from skyloop.transport.base import Dialer, ServerEnd
+from skyloop.transport.base import Dialer, TransportServer
 from skyloop.transport.conformance import TransportSuite
 from skyloop.transport.fabric import FabricServer, FabricSettings, dial
 from skyloop.transport.fabric.client import FabricClient
@@ -16,12 +16,12 @@ _numbers = itertools.count(1)
 
 
 class TestFabric(TransportSuite):
-    def make_server(self) -> ServerEnd:
+    def make_server(self) -> TransportServer:
         self.place = f"127.0.0.1:{free_port('127.0.0.1')}"
         self.name = f"proxy{next(_numbers)}"
         return FabricServer(self.name, FabricSettings(listen=(self.place,), multicast=False))
 
-    def dialer(self, server: ServerEnd) -> Dialer:
+    def dialer(self, server: TransportServer) -> Dialer:
         return dial(self.name, FabricSettings(connect=(self.place,), multicast=False))
 
 

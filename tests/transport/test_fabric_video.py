@@ -1,4 +1,4 @@
-"""The server end's video: what is encoded, for whom, and what a reader that can't keep up is sent."""
+"""The transport server's video: what is encoded, for whom, and what a reader that can't keep up is sent."""
 
 from __future__ import annotations
 

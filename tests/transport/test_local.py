@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 
-from skyloop.transport.base import Dialer, ServerEnd
+from skyloop.transport.base import Dialer, TransportServer
 from skyloop.transport.conformance import TransportSuite
 from skyloop.transport.local import LocalServer, dial
 
@@ -12,8 +12,8 @@ _names = (f"suite-{number}" for number in itertools.count())
 
 
 class TestLocal(TransportSuite):
-    def make_server(self) -> ServerEnd:
+    def make_server(self) -> TransportServer:
         return LocalServer(next(_names))
 
-    def dialer(self, server: ServerEnd) -> Dialer:
+    def dialer(self, server: TransportServer) -> Dialer:
         return dial(server.address.removeprefix("local:"))

@@ -17,7 +17,7 @@ import pytest
 
 from skyloop.messages import encode
 from skyloop.messages.codec import HEADER
-from skyloop.transport.base import MAX_PACKET, MAX_SUBSCRIPTIONS, ClientEnd
+from skyloop.transport.base import MAX_PACKET, MAX_SUBSCRIPTIONS, TransportClient
 from skyloop.transport.local import LocalServer, dial, packets
 from skyloop.transport.local.directory import find_directory
 from skyloop.transport.local.slots import SlotMemory
@@ -116,7 +116,7 @@ def test_subscriptions_are_bounded() -> None:
 
 
 @contextmanager
-def joined(log: ServerLog) -> Iterator[tuple[LocalServer, ClientEnd]]:
+def joined(log: ServerLog) -> Iterator[tuple[LocalServer, TransportClient]]:
     """A server and its one client."""
     server = LocalServer("alpha")
     server.start(log)
@@ -205,7 +205,7 @@ def test_a_server_out_of_descriptors_accepts_when_there_are_some_again() -> None
 
 
 @contextmanager
-def raw_server() -> Iterator[tuple[socket.socket, ClientEnd, ClientLog]]:
+def raw_server() -> Iterator[tuple[socket.socket, TransportClient, ClientLog]]:
     """The bare end of a connection that a client made."""
     listener, _ = find_directory().listen("alpha")
     log = ClientLog()

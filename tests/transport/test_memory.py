@@ -5,17 +5,17 @@ from __future__ import annotations
 import pytest
 
 from skyloop.errors import UsageError
-from skyloop.transport.base import FEEDBACK, Dialer, ServerEnd, video
+from skyloop.transport.base import FEEDBACK, Dialer, TransportServer, video
 from skyloop.transport.conformance import TransportSuite
 from skyloop.transport.memory import DEPTH, Faults, MemoryServer
 from skyloop.transport.testing import FRONT, ClientLog, ServerLog, header, picture, wait_until
 
 
 class TestMemory(TransportSuite):
-    def make_server(self) -> ServerEnd:
+    def make_server(self) -> TransportServer:
         return MemoryServer("test")
 
-    def dialer(self, server: ServerEnd) -> Dialer:
+    def dialer(self, server: TransportServer) -> Dialer:
         assert isinstance(server, MemoryServer)
         return server.dial
 

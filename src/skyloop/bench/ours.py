@@ -12,7 +12,7 @@ from skyloop.client import Drone, Frame, connect
 from skyloop.client.channels import VideoOptions
 from skyloop.messages import Feedback
 from skyloop.proxy import Proxy
-from skyloop.transport.base import ServerEnd
+from skyloop.transport.base import TransportServer
 from skyloop.transport.local import LocalServer
 
 
@@ -34,7 +34,7 @@ class Vehicle:
         self._proxy = Proxy(self._vehicle, server, name=name)
         self._proxy.start()
 
-    def _server(self, address: str) -> tuple[str, ServerEnd]:
+    def _server(self, address: str) -> tuple[str, TransportServer]:
         """What it is called, and where it serves."""
         name = proxy_name(address)
         return name, LocalServer(name)

@@ -1,4 +1,4 @@
-"""The options of commands that serve vehicles to the network, and the server ends that they ask for."""
+"""The options of commands that serve vehicles to the network, and the transport servers that they ask for."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import typer
 from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
-    from skyloop.transport.base import ServerEnd
+    from skyloop.transport.base import TransportServer
     from skyloop.transport.fabric import FabricSettings
 
 NetworkOption = Annotated[
@@ -35,8 +35,8 @@ OPEN: Final = (
     "people you trust can reach, or give each of them a key: skyloop keys --help"
 )
 
-#: Makes the server end of a proxy: of its name and its vehicle's address.
-MakeEnd = Callable[[str, str], "ServerEnd"]
+#: Makes the transport server of a proxy: of its name and its vehicle's address.
+MakeEnd = Callable[[str, str], "TransportServer"]
 
 
 def settings_of(
@@ -63,7 +63,7 @@ def settings_of(
 
 
 def server_ends(settings: FabricSettings | None, group: str | None = None) -> MakeEnd:
-    """Return what makes a proxy's server end: on this host, and with settings on the network too.
+    """Return what makes a proxy's transport server: on this host, and with settings on the network too.
 
     Args:
         settings: How to join the network, None for this host only.

@@ -18,7 +18,7 @@ from skyloop.client.scheduler import Scheduler
 from skyloop.client.swarm import OnError, Swarm, in_parallel
 from skyloop.errors import LinkError, SwarmError, UnknownNameError, UsageError
 from skyloop.messages import DEFAULT_PRIORITY
-from skyloop.transport.base import ClientEnd, ClientHandler, Dialer, check_name
+from skyloop.transport.base import ClientHandler, Dialer, TransportClient, check_name
 
 if TYPE_CHECKING:
     from skyloop.transport.fabric.environment import Network
@@ -196,7 +196,7 @@ def dial_by_name(name: str, network: Network = None, keys: Path | str | None = N
         return far
     near = _local(name)
 
-    def dialer(handler: ClientHandler) -> ClientEnd:
+    def dialer(handler: ClientHandler) -> TransportClient:
         try:
             return near(handler)
         except LinkError:
@@ -219,7 +219,7 @@ def _local(name: str) -> Dialer:
 
 
 def _hinting(near: Dialer) -> Dialer:
-    def dialer(handler: ClientHandler) -> ClientEnd:
+    def dialer(handler: ClientHandler) -> TransportClient:
         try:
             return near(handler)
         except UnknownNameError as error:

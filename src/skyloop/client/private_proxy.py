@@ -15,7 +15,7 @@ from typing import IO, Final
 
 from skyloop.client.scheduler import Scheduler
 from skyloop.errors import LinkError, NoAnswerError, UsageError
-from skyloop.transport.base import ClientEnd, ClientHandler, Dialer
+from skyloop.transport.base import ClientHandler, Dialer, TransportClient
 
 _TAIL: Final = 2000  #: bytes of the child's standard error that an error shows
 _USAGE_ERROR: Final = 2  #: exit code of a child that rejects its address; it prints why in one line
@@ -80,7 +80,7 @@ class PrivateProxy:
         inner = local_dial(self.name)
         served = False
 
-        def dial(handler: ClientHandler) -> ClientEnd:
+        def dial(handler: ClientHandler) -> TransportClient:
             nonlocal served
             while True:
                 try:

@@ -35,7 +35,7 @@ from skyloop.messages import (
     decode,
     encode,
 )
-from skyloop.transport.base import ClientEnd, Dialer, Pixels, video
+from skyloop.transport.base import Dialer, Pixels, TransportClient, video
 
 RETRY_S = 0.3  #: time after which an unanswered request is repeated; all requests are idempotent
 
@@ -187,7 +187,7 @@ class ProxySession:
         self._handler = handler
         self._poke = poke
         self._clock = clock
-        self._end: ClientEnd | None = None
+        self._end: TransportClient | None = None
         self._late_ns = nanoseconds(thresholds.late_s)  # a proxy that is silent for so long is pinged
         self._same_clock = False
         self._quiet = False  # closed by this end: ignore what still arrives

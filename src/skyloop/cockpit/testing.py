@@ -33,7 +33,7 @@ _LENGTH: Final = struct.Struct(">I")
 STARTS_WITHIN_S: Final = 10.0
 
 
-class PageClient:
+class HeadlessPage:
     """One page that shows one drone. Used on one event loop; the counts may be read from any thread."""
 
     def __init__(
@@ -144,9 +144,9 @@ class Pages:
             address: Of the cockpit, as it prints it.
             drone: The drone's name.
             count: How many pages.
-            **options: As of :class:`PageClient`.
+            **options: As of :class:`HeadlessPage`.
         """
-        self.clients = [PageClient(address, drone, **options) for _ in range(count)]
+        self.clients = [HeadlessPage(address, drone, **options) for _ in range(count)]
         self.problem: BaseException | None = None  #: why they ended, if they did
         self._loop: asyncio.AbstractEventLoop | None = None
         self._stop: asyncio.Event | None = None

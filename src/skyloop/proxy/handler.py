@@ -61,7 +61,7 @@ from skyloop.proxy.executor import ActionExecutor
 from skyloop.proxy.parameters import FlightSettings
 from skyloop.proxy.publisher import VehiclePublisher
 from skyloop.proxy.sessions import Session
-from skyloop.transport.base import COMMANDS, ServerEnd
+from skyloop.transport.base import COMMANDS, TransportServer
 
 #: What an echo shows for a command that made the vehicle do nothing new: refused, or held.
 _NOTHING: Final = Idle()
@@ -88,7 +88,7 @@ class CommandHandler:
         publisher: VehiclePublisher,
         events: EventPublisher,
         counters: Counters,
-        server: ServerEnd,
+        server: TransportServer,
         sessions: Mapping[int, Session],
         clock: Clock,
         shared: bool,

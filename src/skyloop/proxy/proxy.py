@@ -63,7 +63,7 @@ from skyloop.proxy.relay import Relay
 from skyloop.proxy.requests import ParameterRequests, RequestDispatcher
 from skyloop.proxy.sessions import HELLO_NS, MAX_MALFORMED, Session
 from skyloop.proxy.workers import ProcessorWorkers
-from skyloop.transport.base import Peer, ServerEnd
+from skyloop.transport.base import Peer, TransportServer
 
 MAX_NAME: Final = 64  #: characters of a proxy's name
 
@@ -71,7 +71,7 @@ _log = logging.getLogger(__name__)
 
 
 class Proxy:
-    """Owns a driver and a transport's server end, from :meth:`start` to :meth:`stop`; also a context manager.
+    """Owns a driver and its transport server, from :meth:`start` to :meth:`stop`; also a context manager.
 
     Args:
         driver: the vehicle's driver, not yet open.
@@ -85,7 +85,13 @@ class Proxy:
     """
 
     def __init__(
-        self, driver: Driver, server_end: ServerEnd, *, name: str, clock: Clock = monotonic_ns, ticker: bool = True
+        self,
+        driver: Driver,
+        server_end: TransportServer,
+        *,
+        name: str,
+        clock: Clock = monotonic_ns,
+        ticker: bool = True,
     ) -> None:
         if not 1 <= len(name) <= MAX_NAME:
             raise UsageError(f"a proxy's name has 1 to {MAX_NAME} characters, and {name!r} has {len(name)}")
@@ -167,7 +173,7 @@ class Proxy:
     # Life cycle ------------------------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Start to serve. Raises what server end and driver raise when they cannot be opened; it is stopped then."""
+        """Start to serve. Raises what transport and driver raise when they cannot be opened; it is stopped then."""
         with self._life_lock:
             if self._started:
                 raise UsageError(f"proxy {self.name} was started before: make another one")

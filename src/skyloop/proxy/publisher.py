@@ -45,7 +45,7 @@ from skyloop.transport.base import (
     FEEDBACK,
     LOGS,
     RESULTS,
-    ServerEnd,
+    TransportServer,
     stream,
     video,
 )
@@ -85,7 +85,7 @@ class VehiclePublisher:
     def __init__(
         self,
         *,
-        server: ServerEnd,
+        server: TransportServer,
         events: EventPublisher,
         counters: Counters,
         clock: Clock,

@@ -12,7 +12,7 @@ from skyloop.proxy.core.events import EventDraft
 from skyloop.proxy.events import Counters, EventPublisher
 from skyloop.proxy.publisher import VehiclePublisher, camera_problem
 from skyloop.proxy.sessions import Session
-from skyloop.transport.base import ANNOTATIONS, LOGS, ServerEnd
+from skyloop.transport.base import ANNOTATIONS, LOGS, TransportServer
 
 MAX_ANNOTATION: Final = 32_768  #: bytes of an annotation's packet
 
@@ -23,7 +23,7 @@ class Relay:
     def __init__(
         self,
         driver: Driver,
-        server: ServerEnd,
+        server: TransportServer,
         publisher: VehiclePublisher,
         events: EventPublisher,
         counters: Counters,

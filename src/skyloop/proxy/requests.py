@@ -34,7 +34,7 @@ from skyloop.proxy.handler import CommandHandler
 from skyloop.proxy.parameters import Parameters
 from skyloop.proxy.publisher import VehiclePublisher
 from skyloop.proxy.sessions import Session
-from skyloop.transport.base import ServerEnd
+from skyloop.transport.base import TransportServer
 
 MAX_PENDING: Final = 16  #: requests of one application that wait for their thread; further ones are refused
 MAX_MESSAGE: Final = 1000  #: characters of a refusal
@@ -58,7 +58,7 @@ class RequestDispatcher:
 
     def __init__(
         self,
-        server: ServerEnd,
+        server: TransportServer,
         counters: Counters,
         *,
         immediate: Mapping[type, Answer],

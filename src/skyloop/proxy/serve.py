@@ -21,7 +21,7 @@ from skyloop.messages import EventKind, LinkState, Severity
 from skyloop.proxy.audit import AuditTrail, audit_path
 from skyloop.proxy.flight_record import FlightRecord, record_path
 from skyloop.proxy.proxy import Proxy
-from skyloop.transport.base import ServerEnd
+from skyloop.transport.base import TransportServer
 
 LAND_WITHIN_S: Final = 20.0  #: how long a signalled proxy waits for its vehicle to land
 _POLL_S: Final = 0.2
@@ -85,7 +85,7 @@ def serve(
     name: str,
     *,
     group: str | None = None,
-    make_end: Callable[[str, str], ServerEnd] | None = None,
+    make_end: Callable[[str, str], TransportServer] | None = None,
     parent_fd: int | None = None,
     land_within_s: float = LAND_WITHIN_S,
     look: Look | None = None,
@@ -93,7 +93,7 @@ def serve(
 ) -> None:
     """Serve a vehicle to this host's applications under a name; blocks. On the main thread.
 
-    ``make_end`` makes another server end, of the name and the vehicle's address: one of the network, or several.
+    ``make_end`` makes another transport server, of the name and the vehicle's address: one of the network, or several.
 
     Writes to standard output a line that begins with ``ready`` when applications can connect and the vehicle is there;
     ``serving`` while it is not, and then, whenever that changes, what is waited for, why it failed last and what to do

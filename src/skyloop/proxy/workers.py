@@ -31,7 +31,7 @@ from skyloop.proxy.core.events import EventDraft
 from skyloop.proxy.events import Counters, EventPublisher
 from skyloop.proxy.publisher import camera_problem
 from skyloop.proxy.sessions import Session
-from skyloop.transport.base import RESULTS, ServerEnd, results
+from skyloop.transport.base import RESULTS, TransportServer, results
 
 #: A worker of which nothing was heard for so long gives up its share: it hangs, or its host does.
 SILENT_S: Final = 1.0
@@ -120,7 +120,11 @@ class ProcessorWorkers:
     """Sends workers their shares, and relays results. Any thread."""
 
     def __init__(
-        self, server: ServerEnd, events: EventPublisher, counters: Counters, cameras: Callable[[], Collection[str]]
+        self,
+        server: TransportServer,
+        events: EventPublisher,
+        counters: Counters,
+        cameras: Callable[[], Collection[str]],
     ) -> None:
         """``cameras()``: the names of those that the vehicle has."""
         self._cameras = cameras

@@ -11,12 +11,12 @@ from skyloop.errors import LinkError, UsageError
 from skyloop.messages import FrameHeader
 from skyloop.stepping.executor import StepExecutor
 from skyloop.transport.base import (
-    ClientEnd,
     ClientHandler,
     Peer,
     Pixels,
-    ServerEnd,
     ServerHandler,
+    TransportClient,
+    TransportServer,
     check_frame,
     check_packet,
     check_topic,
@@ -26,7 +26,7 @@ from skyloop.transport.base import (
 ADDRESS: Final = "this process, in step with one application"
 
 
-class SteppedServer(ServerEnd):
+class SteppedServer(TransportServer):
     """A proxy's end, for one client at a time. Handlers are called on the executor's thread."""
 
     def __init__(self, executor: StepExecutor) -> None:
@@ -35,7 +35,7 @@ class SteppedServer(ServerEnd):
         self._client: SteppedClient | None = None
         self._number = 0
 
-    def dial(self, handler: ClientHandler) -> ClientEnd:
+    def dial(self, handler: ClientHandler) -> TransportClient:
         """Connect a client.
 
         Args:
@@ -124,7 +124,7 @@ class SteppedServer(ServerEnd):
         self._executor.post(notify)
 
 
-class SteppedClient(ClientEnd):
+class SteppedClient(TransportClient):
     """A client's end."""
 
     def __init__(self, server: SteppedServer, executor: StepExecutor, peer: Peer, handler: ClientHandler) -> None:

@@ -1,7 +1,7 @@
 """The contract that every transport keeps.
 
-A transport carries whole packets between one proxy (the *server end*) and any number of applications (*client ends*).
-It knows packets and topics, but not what they mean. An implementation passes the tests of
+A transport carries whole packets between one proxy (the *transport server*) and any number of applications (*transport
+clients*). It knows packets and topics, but not what they mean. An implementation passes the tests of
 :mod:`skyloop.transport.conformance`.
 
 - No call ever blocks on the other end. A packet that does not fit now is not sent, and the caller is told so.
@@ -28,7 +28,7 @@ from skyloop.errors import UsageError
 from skyloop.messages import FrameHeader
 from skyloop.messages.codec import HEADER_SIZE, MAX_BODY
 
-#: What a client end can ask to be sent. ``feedback`` and ``events`` may be left out by an application that needs none.
+#: What a client can ask to be sent. ``feedback`` and ``events`` may be left out by an application that needs none.
 FEEDBACK = "feedback"
 EVENTS = "events"
 COMMANDS = "commands"  #: echoes (Applied) of all commands that the proxy received
@@ -63,9 +63,9 @@ Pixels = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """An application's connection as the server end sees it."""
+    """An application's connection as the transport server sees it."""
 
-    id: int  #: unique in this run of the server end, from 1
+    id: int  #: unique in this run of the transport server, from 1
     address: str  #: for people: process id and user, or host and port
 
 
@@ -73,7 +73,7 @@ NOBODY = Peer(0, "nobody that is connected")
 
 
 class ServerHandler(Protocol):
-    """The callbacks of a server end.
+    """The callbacks of a transport server.
 
     Except for :meth:`topic_problem` they run on the transport's receiving threads, one call at a time.
     """
@@ -132,8 +132,8 @@ class ServerHandler(Protocol):
         """
 
 
-class ServerEnd(ABC):
-    """A proxy's end of a transport.
+class TransportServer(ABC):
+    """A proxy's side of a transport.
 
     Between :meth:`start` and :meth:`stop` all methods may be called from any thread.
     """
@@ -237,7 +237,7 @@ class ServerEnd(ABC):
 
 
 class ClientHandler(Protocol):
-    """The callbacks of a client end.
+    """The callbacks of a transport client.
 
     They run on the transport's receiving thread, one call at a time.
     """
@@ -252,7 +252,7 @@ class ClientHandler(Protocol):
             header: The frame's header.
             pixels: ``header.size`` bytes, shape (size,), dtype uint8, not writeable. They, or any view of them, may be
                 kept for as long as needed: that costs only this application.
-            topic: The topic by which the frame was asked for, where :attr:`ClientEnd.variants` is true.
+            topic: The topic by which the frame was asked for, where :attr:`TransportClient.variants` is true.
         """
 
     def closed(self, reason: str) -> None:
@@ -263,8 +263,8 @@ class ClientHandler(Protocol):
         """
 
 
-class ClientEnd(ABC):
-    """An application's end: one connection, made by a :data:`Dialer` and never reused after it closed."""
+class TransportClient(ABC):
+    """An application's side: one connection, made by a :data:`Dialer` and never reused after it closed."""
 
     @abstractmethod
     def send(self, packet: bytes) -> bool:
@@ -322,7 +322,7 @@ class ClientEnd(ABC):
 
 
 #: Makes a connection and begins to deliver to the handler. Raises :class:`skyloop.errors.LinkError` when it cannot.
-Dialer = Callable[[ClientHandler], ClientEnd]
+Dialer = Callable[[ClientHandler], TransportClient]
 
 
 #: What can be the name of a proxy: one of a socket's file and of one chunk of a network key.

@@ -1,4 +1,4 @@
-"""Several server ends as one, for a proxy that is reached on its host and over the network at the same time."""
+"""Several transport servers as one, for a proxy that is reached on its host and over the network at the same time."""
 
 from __future__ import annotations
 
@@ -8,33 +8,33 @@ from typing import NamedTuple
 
 from skyloop.errors import UsageError
 from skyloop.messages import FrameHeader
-from skyloop.transport.base import Peer, Pixels, ServerEnd, ServerHandler, check_packet
+from skyloop.transport.base import Peer, Pixels, ServerHandler, TransportServer, check_packet
 from skyloop.transport.priority_lock import PriorityLock, is_command
 
 
 class _Member(NamedTuple):
     """The end by which an application came, and its peer at that end."""
 
-    end: ServerEnd
+    end: TransportServer
     peer: Peer
 
 
-class CompositeServer(ServerEnd):
-    """One server end made of several, which numbers its peers over all of them.
+class CompositeServer(TransportServer):
+    """One transport server made of several, which numbers its peers over all of them.
 
     The ends take turns at the handler, so that it gets one call at a time as the contract says: an end that brings a
     command first, the others in the order of their arrival.
 
     Args:
-        ends: The server ends, the nearest first; at least one.
+        ends: The transport servers, the nearest first; at least one.
 
     Raises:
         UsageError: There are no ends.
     """
 
-    def __init__(self, ends: Sequence[ServerEnd]) -> None:
+    def __init__(self, ends: Sequence[TransportServer]) -> None:
         if not ends:
-            raise UsageError("a server end of several needs at least one")
+            raise UsageError("a transport server of several needs at least one")
         self._ends = tuple(ends)
         self.lock = PriorityLock()  #: the thread that holds it may call the handler
         self._members: dict[int, _Member] = {}  # by our number
@@ -48,7 +48,7 @@ class CompositeServer(ServerEnd):
         Args:
             handler: Called by one end at a time, on that end's receiving threads.
         """
-        started: list[ServerEnd] = []
+        started: list[TransportServer] = []
         try:
             for end in self._ends:
                 end.start(_EndHandler(self, end, handler))
@@ -103,7 +103,7 @@ class CompositeServer(ServerEnd):
     def address(self) -> str:
         return ", ".join(end.address for end in self._ends)
 
-    def enter(self, end: ServerEnd, peer: Peer) -> Peer:
+    def enter(self, end: TransportServer, peer: Peer) -> Peer:
         """Give an end's peer a number of this server. The caller holds the lock.
 
         Args:
@@ -126,7 +126,7 @@ class CompositeServer(ServerEnd):
 class _EndHandler:
     """The handler of one end: passes calls on under the composite's lock, with the composite's peers."""
 
-    def __init__(self, whole: CompositeServer, end: ServerEnd, handler: ServerHandler) -> None:
+    def __init__(self, whole: CompositeServer, end: TransportServer, handler: ServerHandler) -> None:
         self._whole = whole
         self._lock = whole.lock
         self._end = end

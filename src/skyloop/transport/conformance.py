@@ -3,10 +3,10 @@
 ::
 
     class TestMyTransport(TransportSuite):
-        def make_server(self) -> ServerEnd:
+        def make_server(self) -> TransportServer:
             return MyServer(...)
 
-        def dialer(self, server: ServerEnd) -> Dialer:
+        def dialer(self, server: TransportServer) -> Dialer:
             return my_dialer(server.address)
 
 Run it with pytest, and once more under load if you can.
@@ -31,7 +31,7 @@ from skyloop.transport.base import (
     Dialer,
     Peer,
     Pixels,
-    ServerEnd,
+    TransportServer,
     video,
 )
 from skyloop.transport.testing import (
@@ -54,12 +54,12 @@ class TransportSuite(ABC):
     """
 
     @abstractmethod
-    def make_server(self) -> ServerEnd:
-        """Return a new server end that is not started."""
+    def make_server(self) -> TransportServer:
+        """Return a new transport server that is not started."""
 
     @abstractmethod
-    def dialer(self, server: ServerEnd) -> Dialer:
-        """Return a dialer that connects to a server end.
+    def dialer(self, server: TransportServer) -> Dialer:
+        """Return a dialer that connects to a transport server.
 
         Args:
             server: An end that :meth:`make_server` returned; it may be not started, or stopped.
@@ -70,7 +70,7 @@ class TransportSuite(ABC):
         """
 
     @contextmanager
-    def serving(self) -> Iterator[tuple[ServerEnd, ServerLog]]:
+    def serving(self) -> Iterator[tuple[TransportServer, ServerLog]]:
         """Yield a started server and the log of its handler; stop the server at the end."""
         server, log = self.make_server(), ServerLog()
         server.start(log)
@@ -80,7 +80,7 @@ class TransportSuite(ABC):
             server.stop()
 
     @contextmanager
-    def connected(self, server: ServerEnd, log: ServerLog, *topics: str, keep: bool = True) -> Iterator[Joined]:
+    def connected(self, server: TransportServer, log: ServerLog, *topics: str, keep: bool = True) -> Iterator[Joined]:
         """Yield a client that has joined and subscribed; close it at the end.
 
         Args:
@@ -282,7 +282,7 @@ class TransportSuite(ABC):
         raises(LinkError, lambda: self.dial_or_link_error(server))
         server.stop()
 
-    def dial_or_link_error(self, server: ServerEnd) -> None:
+    def dial_or_link_error(self, server: TransportServer) -> None:
         """Dial, and turn a ``UsageError`` into a ``LinkError``.
 
         An unknown name is as good an answer as a refused connection.

@@ -21,12 +21,12 @@ from skyloop.faults import FaultInjector, Faults
 from skyloop.messages import FrameHeader
 from skyloop.transport.base import (
     MAX_SUBSCRIPTIONS,
-    ClientEnd,
     ClientHandler,
     Peer,
     Pixels,
-    ServerEnd,
     ServerHandler,
+    TransportClient,
+    TransportServer,
     check_frame,
     check_packet,
     check_topic,
@@ -55,7 +55,7 @@ class _What(Enum):
 _Item = tuple["MemoryClient", _What, str]  # the text of what is malformed
 
 
-class MemoryServer(ServerEnd):
+class MemoryServer(TransportServer):
     """A proxy's end; :meth:`dial` is its :data:`skyloop.transport.base.Dialer`. It may be started again after a stop.
 
     Args:
@@ -80,14 +80,14 @@ class MemoryServer(ServerEnd):
             handler: Called on the client's own receiving thread.
 
         Returns:
-            The connected client end.
+            The connected transport client.
 
         Raises:
             LinkError: The server is not started.
         """
         with self._lock:
             if self._thread is None:
-                raise LinkError(f"nobody serves {self.address}: start the server end first")
+                raise LinkError(f"nobody serves {self.address}: start the transport server first")
             client = MemoryClient(self, Peer(next(self._ids), "this process"), handler, self._faults)
             self._clients[client.peer.id] = client
             self._inbox.put((client, _What.JOINED, ""))
@@ -195,7 +195,7 @@ class MemoryServer(ServerEnd):
                 self.end(client, f"the server's handler failed: {error!r}", muted=True)
 
 
-class MemoryClient(ClientEnd):
+class MemoryClient(TransportClient):
     """An application's end, made by :meth:`MemoryServer.dial`."""
 
     def __init__(self, server: MemoryServer, peer: Peer, handler: ClientHandler, faults: Faults) -> None:

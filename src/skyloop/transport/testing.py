@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from skyloop.messages import Encoding, FrameHeader
-from skyloop.transport.base import ClientEnd, Peer, Pixels
+from skyloop.transport.base import Peer, Pixels, TransportClient
 
 PATIENCE_S: Final = 15.0
 FRONT: Final = "front"
@@ -154,9 +154,9 @@ def picture(head: FrameHeader) -> Pixels:
 
 
 class Joined:
-    """A client end that has joined, with its log and its :class:`Peer` at the server."""
+    """A transport client that has joined, with its log and its :class:`Peer` at the server."""
 
-    def __init__(self, client: ClientEnd, log: ClientLog, peer: Peer) -> None:
+    def __init__(self, client: TransportClient, log: ClientLog, peer: Peer) -> None:
         self.client = client
         self.log = log
         self.peer = peer

@@ -10,7 +10,15 @@ from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any, Final
 
 from skyloop.errors import DecodeError, LinkError, NoAnswerError, UnknownNameError
-from skyloop.transport.base import MAX_PACKET, ClientEnd, ClientHandler, Dialer, check_name, check_packet, check_topic
+from skyloop.transport.base import (
+    MAX_PACKET,
+    ClientHandler,
+    Dialer,
+    TransportClient,
+    check_name,
+    check_packet,
+    check_topic,
+)
 from skyloop.transport.fabric import layout, packets
 from skyloop.transport.fabric.admission import Admission
 from skyloop.transport.fabric.config import Part
@@ -99,7 +107,7 @@ _Item = tuple[Subscription | None, bytes, int]
 _WAKE: Final[_Item] = (None, b"", 0)
 
 
-class FabricClient(ClientEnd):
+class FabricClient(TransportClient):
     """An application's end, made by the dialer that :func:`dial` returns.
 
     Args:

@@ -1,4 +1,4 @@
-"""The applications' connections at the server end, and the thread that sends to single applications.
+"""The applications' connections at the transport server, and the thread that sends to single applications.
 
 Whoever answers an application only queues the answer here, and nothing that the thread does waits for an application.
 One that acknowledges nothing costs what is kept for it, and that is bounded.
@@ -24,7 +24,7 @@ _log = logging.getLogger(__name__)
 
 
 class ServerConnection:
-    """An application at the server end. Its lock guards what is sent to it, and its topics.
+    """An application at the transport server. Its lock guards what is sent to it, and its topics.
 
     Args:
         peer: As the handler knows it.

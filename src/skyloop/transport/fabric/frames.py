@@ -1,4 +1,4 @@
-"""The server end's video: each subscribed variant of a frame is encoded once, and sent no faster than readers take it.
+"""The server's video: each subscribed variant of a frame is encoded once, and sent no faster than readers take it.
 
 A reader has at most :data:`WINDOW` frames on the way. While it has as many, further ones pass it by, and the newest of
 them is sent as soon as it has taken one: a slow link shows fewer frames, never old ones.
@@ -91,7 +91,7 @@ class Variant:
 
 
 class FramePublisher:
-    """All cameras of a server end. Thread-safe; nothing is copied, encoded or sent under its lock.
+    """All cameras of a transport server. Thread-safe; nothing is copied, encoded or sent under its lock.
 
     Args:
         send: Sends one encoded frame; called on the camera's thread.

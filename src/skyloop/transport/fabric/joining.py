@@ -25,12 +25,12 @@ MAX_CANDIDATES: Final = 4  #: with keys: so many proxies of one name are asked u
 
 
 class ProxyWatch:
-    """Watches which server ends with one name are alive.
+    """Watches which transport servers with one name are alive.
 
     Args:
         session: The Zenoh session.
         name: The proxy's name.
-        on_gone: Called with the run of a server end that goes away, on one of Zenoh's threads.
+        on_gone: Called with the run of a transport server that goes away, on one of Zenoh's threads.
     """
 
     def __init__(self, session: Session, name: str, on_gone: Callable[[str], None]) -> None:

@@ -70,7 +70,7 @@ def new_id() -> str:
 
 
 def alive(name: str, run: str) -> str:
-    """Return the key of a server end's liveliness token."""
+    """Return the key of a transport server's liveliness token."""
     return f"{ROOT}/{name}/alive/{run}"
 
 
@@ -140,7 +140,7 @@ def parse_sender(key: str) -> Sender:
 
 
 def parse_alive(key: str) -> tuple[str, str]:
-    """Return NAME and RUN of a server end's token.
+    """Return NAME and RUN of a transport server's token.
 
     Raises:
         DecodeError: It is not the key of such a token.

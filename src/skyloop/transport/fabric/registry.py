@@ -38,7 +38,7 @@ Item = tuple[ServerConnection, bytes | bool]
 
 
 class ConnectionRegistry:
-    """The connections of one server end.
+    """The connections of one transport server.
 
     Thread-safe, but for :meth:`check`, which belongs to the thread that calls the handler.
 

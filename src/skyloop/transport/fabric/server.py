@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from skyloop.errors import DecodeError, NameTakenError, UsageError
 from skyloop.messages import FrameHeader
-from skyloop.transport.base import Peer, Pixels, ServerEnd, ServerHandler, check_frame, check_name, check_packet
+from skyloop.transport.base import Peer, Pixels, ServerHandler, TransportServer, check_frame, check_name, check_packet
 from skyloop.transport.fabric import discovery, layout, packets
 from skyloop.transport.fabric.config import Part
 from skyloop.transport.fabric.connection import Sender, ServerConnection
@@ -34,14 +34,14 @@ if TYPE_CHECKING:
 #: Packets of one application that wait for the handler, and as many commands. Further packets are not acknowledged, so
 #: that they are sent again; further commands are dropped, as newer ones follow.
 MAX_WAITING: Final = 64
-FAREWELL_S: Final = 0.5  #: how long a server end that stops waits for its applications to hear why
+FAREWELL_S: Final = 0.5  #: how long a transport server that stops waits for its applications to hear why
 _POLL_S: Final = 0.5
 _REFUSED: Final = b""  # in place of a packet that was
 _UPWARD: Final = (layout.ASK, layout.ORDER, layout.COMMAND)
 _log = logging.getLogger(__name__)
 
 
-class FabricServer(ServerEnd):
+class FabricServer(TransportServer):
     """A proxy's end, found on the network by its name. It can be started once.
 
     :meth:`start` raises :class:`NameTakenError` where a proxy that can be reached has the name, and :class:`LinkError`

@@ -12,7 +12,7 @@ from typing import Final
 
 from skyloop.errors import DecodeError, LinkError, UnknownNameError
 from skyloop.messages.codec import HEADER_SIZE, MAX_BODY
-from skyloop.transport.base import MAX_PACKET, ClientEnd, ClientHandler, Dialer, check_packet, check_topic
+from skyloop.transport.base import MAX_PACKET, ClientHandler, Dialer, TransportClient, check_packet, check_topic
 from skyloop.transport.local import packets
 from skyloop.transport.local.directory import connect, find_directory
 from skyloop.transport.local.packets import OWN
@@ -47,7 +47,7 @@ def make_dialer(name: str, group: str | None) -> Dialer:
     return dialer
 
 
-class LocalClient(ClientEnd):
+class LocalClient(TransportClient):
     """An application's end, made by the dialer that :func:`skyloop.transport.local.dial` returns.
 
     Args:

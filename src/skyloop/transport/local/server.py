@@ -20,8 +20,8 @@ from skyloop.transport.base import (
     MAX_SUBSCRIPTIONS,
     Peer,
     Pixels,
-    ServerEnd,
     ServerHandler,
+    TransportServer,
     check_frame,
     check_name,
     check_packet,
@@ -48,7 +48,7 @@ _VIDEO: Final = video("")
 _log = logging.getLogger(__name__)
 
 
-class LocalServer(ServerEnd):
+class LocalServer(TransportServer):
     """A proxy's end, found on this host by its name. It can be started once.
 
     :meth:`start` raises :class:`NameTakenError` where a running proxy has the name, :class:`LinkError` where the
