@@ -198,3 +198,14 @@ def test_the_place_beside_a_leader() -> None:
         station(Feedback(captured_ns=0), (1.0, 0.0, 0.0))
     with pytest.raises(UsageError, match=r"shape \(n, 3\)"):
         station(leader, (1.0, 0.0))
+
+
+def test_with_all_drones_set_aside_there_is_nobody_to_fly() -> None:
+    with flying(row(), on_error="continue") as drones:
+        with pytest.raises(SwarmError):
+            drones.fail("a test", {name: NoAnswerError("it is tired") for name in NAMES})
+        formation = Formation(drones)
+        with pytest.raises(UsageError, match=r"no drone of this swarm is active \(a: it is tired; .*readmit"):
+            formation.fly_to([(0.0, 0.0, 1.0)])
+        with pytest.raises(UsageError, match="no drone of this swarm is active"):
+            formation.hold(0.1)

@@ -137,3 +137,13 @@ def test_a_fix_of_feedback_has_its_velocity_in_world_axes() -> None:
 def test_settings_that_make_no_sense(wrong: dict[str, float]) -> None:
     with pytest.raises(UsageError, match=next(iter(wrong))):
         PathSettings(**wrong)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "allowed"),
+    [({"lead_s": -1.0}, "a finite number, 0 or more"), ({"near_m": 0.0}, "a finite number above 0")],
+)
+def test_what_is_allowed_is_said_as_it_is(wrong: dict[str, float], allowed: str) -> None:
+    with pytest.raises(UsageError, match=f"must be {allowed}"):
+        PathSettings(**wrong)  # type: ignore[arg-type]
+    assert PathSettings(velocity_gain=0.0, yaw_gain=0.0, lead_s=0.0).lead_s == 0.0

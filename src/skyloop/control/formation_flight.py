@@ -87,7 +87,8 @@ class Formation:
             Where each drone is at the end, and how close they came to each other.
 
         Raises:
-            UsageError: A drone can't be flown by its position, or two would come closer than ``apart_m``.
+            UsageError: A drone can't be flown by its position, two would come closer than ``apart_m``, or no drone is
+                active.
             SwarmError: A drone failed, and the swarm's ``on_error`` does not say to continue.
         """
         if not (math.isfinite(speed_m_s) and speed_m_s > 0.0):
@@ -121,7 +122,7 @@ class Formation:
             seconds: How long.
 
         Raises:
-            UsageError: A drone can't be flown by its position.
+            UsageError: A drone can't be flown by its position, or none is active.
             SwarmError: A drone failed, and the swarm's ``on_error`` does not say to continue.
         """
         here = {name: np.array(sample.position) for name, sample in self._ready().items()}
@@ -153,7 +154,7 @@ class Formation:
 
         Raises:
             UnknownNameError: The swarm has no drone of such a name.
-            UsageError: The leader is among the followers, or a drone can't be flown by its position.
+            UsageError: The leader is among the followers, a drone can't be flown by its position, or none is active.
             SwarmError: A drone failed. If the leader failed and the swarm's ``on_error`` is ``"continue"``, the
                 followers hover and this call returns.
         """
@@ -189,6 +190,9 @@ class Formation:
         """Return the newest feedback of each drone; raise UsageError naming those that can't be flown by position."""
         self._closest_m = math.inf
         found = self._look()
+        if not found:
+            aside = "; ".join(f"{name}: {error}" for name, error in self.drones.errors.items())
+            raise UsageError(f"no drone of this swarm is active ({aside}): take them back with readmit()")
         problems = [f"{name}: {lacking(sample)}" for name, sample in found.items() if lacking(sample)]
         problems += [
             f"{name}: it is {sample.state.value}, take off first"

@@ -84,7 +84,11 @@ class ImageServoLaw:
             wanted: Where the level camera is to see the points, (n, 2) in the plane at z = 1.
             depth_m: How far the points are from the camera then.
             settings: None are the defaults.
+
+        Raises:
+            UsageError: The camera does not say how it is mounted.
         """
+        mounting_rotation(camera)  # raises now, and not in flight
         s = self.settings = settings or ServoSettings()
         self.phase = ServoPhase.SEARCHING
         self.error = math.inf  #: root mean square of the points' distances from where they are wanted, plane at z = 1
@@ -108,21 +112,22 @@ class ImageServoLaw:
         self._flown = None if feedback.velocity is None else np.asarray(feedback.velocity)
 
     def see(self, points: Array, at_capture: Feedback, captured_ns: int) -> None:
-        """Update with the points of a frame. Ignored while the attitude is not known.
+        """Update with the points of a frame.
 
-        The depth of all points is estimated from how large they look.
+        Ignored, as if nothing was seen, while the attitude is not known, and where the vehicle is tilted so far that a
+        level camera would not see the points. The depth of all points is estimated from how large they look.
 
         Args:
             points: As the camera saw them, (n, 2) in the plane at z = 1.
             at_capture: Feedback with the attitude at the capture.
             captured_ns: Capture of the frame.
-
-        Raises:
-            UsageError: The vehicle is tilted so far that a level camera would not see the points.
         """
         if at_capture.roll is None or at_capture.pitch is None:
             return
-        level = levelled(points, self._camera, at_capture.roll, at_capture.pitch)
+        try:
+            level = levelled(points, self._camera, at_capture.roll, at_capture.pitch)
+        except UsageError:
+            return
         self.error = math.sqrt(float(((level - self._wanted) ** 2).sum(axis=1).mean()))
         # The mean of the depths now and at the goal keeps large motions straight (their equation 14).
         now_m = self._depth_m * _size(self._wanted) / max(1e-6, _size(level))

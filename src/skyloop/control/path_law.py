@@ -56,8 +56,9 @@ class PathSettings:
     def __post_init__(self) -> None:
         for name in ("velocity_gain", "yaw_gain", "lead_s", "leash_m", "near_m", "near_rad"):
             value = getattr(self, name)
+            allowed = "a finite number, 0 or more" if name in _MAY_BE_ZERO else "a finite number above 0"
             if not 0.0 <= value < math.inf or (value == 0.0 and name not in _MAY_BE_ZERO):
-                raise UsageError(f"{name} is {value!r} and must be a finite number above 0")
+                raise UsageError(f"{name} is {value!r} and must be {allowed}")
 
 
 class PathLaw:

@@ -1,0 +1,45 @@
+"""The law of image-based servoing by itself: what it does with views that it can't use."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from skyloop.clock import nanoseconds
+from skyloop.control.image_servo import ImageServoLaw, ServoPhase
+from skyloop.errors import UsageError
+from skyloop.messages import CameraInfo, Feedback, FlightState
+
+FORWARD = CameraInfo("front", 320, 240, 15.0, rotation=(0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0))
+WANTED = np.array([[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]])
+
+
+def tilted(at_s: float, pitch: float) -> Feedback:
+    return Feedback(captured_ns=nanoseconds(at_s), state=FlightState.FLYING, roll=0.0, pitch=pitch, yaw=0.0)
+
+
+def phase_at(law: ImageServoLaw, at_s: float) -> ServoPhase:
+    law.step(nanoseconds(at_s))
+    return law.phase
+
+
+def test_a_view_by_a_vehicle_that_is_tilted_too_far_is_as_good_as_none() -> None:
+    law = ImageServoLaw(FORWARD, WANTED, 1.5)
+    law.see(WANTED + 0.05, tilted(0.0, 0.0), 0)
+    assert phase_at(law, 0.1) is ServoPhase.SERVOING
+    error = law.error
+    law.see(WANTED, tilted(0.5, math.pi / 2), nanoseconds(0.5))  # it looks straight down
+    for at_s in np.arange(0.5, 2.0, 0.1):
+        held = law.step(nanoseconds(float(at_s)))
+    assert phase_at(law, 2.0) is ServoPhase.HOLDING
+    assert law.error == error
+    assert (held.forward, held.left, held.up, held.yaw_rate) == pytest.approx((0.0, 0.0, 0.0, 0.0), abs=1e-6)
+    law.see(WANTED + 0.05, tilted(2.0, 0.0), nanoseconds(2.0))
+    assert phase_at(law, 2.0) is ServoPhase.SERVOING
+
+
+def test_a_camera_that_does_not_say_how_it_is_mounted_is_refused_before_the_flight() -> None:
+    with pytest.raises(UsageError, match="mounted"):
+        ImageServoLaw(CameraInfo("front", 320, 240, 15.0), WANTED, 1.5)
