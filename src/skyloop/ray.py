@@ -10,6 +10,7 @@ import os
 import sys
 import threading
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Final, Self
@@ -107,7 +108,8 @@ def process(
         max_age_s: Frames older than this when their turn comes are left out [s]; None: none are.
         max_fps: Most frames a second for each worker; None: all.
         stuck_s: A call of ``process`` that takes longer gives the worker's share to the others [s].
-        **options: For Ray's actors: ``num_cpus``, ``num_gpus``, ``resources``, …
+        **options: For Ray's actors: ``num_cpus``, ``num_gpus``, ``resources``, … A ``runtime_env`` is merged with
+            the variables of the environment by which an actor finds the proxy, and goes before them.
 
     Raises:
         MissingExtraError: If Ray is not installed.
@@ -125,8 +127,7 @@ def process(
     module = sys.modules[code.kind.__module__]
     if module.__name__.startswith("skyloop_user_"):  # loaded from a file: can't be imported on another host
         ray.cloudpickle.register_pickle_by_value(module)
-    variables = {key: os.environ[key] for key in _ENVIRONMENT if key in os.environ}
-    options = {"max_restarts": -1, "runtime_env": {"env_vars": variables}, **options}
+    options = {"max_restarts": -1, **options, "runtime_env": _runtime_env(options.get("runtime_env"))}
     actor = ray.remote(_Actor).options(**options)
     order = _Order(code.kind, drone, settings)
     found = Workers([actor.remote(order) for _ in range(workers)])
@@ -136,6 +137,18 @@ def process(
         found.stop()
         raise
     return found
+
+
+def _runtime_env(wanted: Any) -> dict[str, Any]:
+    """Return the user's ``runtime_env`` with the variables by which an actor finds the proxy."""
+    wanted = {} if wanted is None else wanted
+    variables = wanted.get("env_vars") or {} if isinstance(wanted, Mapping) else None
+    if not isinstance(variables, Mapping):
+        raise UsageError(
+            f"runtime_env is {wanted!r} and must be a dict as Ray takes it, with a dict of env_vars if any"
+        )
+    ours = {key: os.environ[key] for key in _ENVIRONMENT if key in os.environ}
+    return {**wanted, "env_vars": {**ours, **variables}}
 
 
 def _await_start(workers: Workers) -> None:
@@ -180,6 +193,8 @@ class _Actor:
             worker.run(math.inf)
         except SkyloopError as error:
             self._trouble = str(error)
+        except BaseException as error:  # noqa: BLE001  (nobody else hears of it: the status says that it has ended)
+            self._trouble = f"its thread raised {error!r}"
 
     def status(self) -> tuple[Status | None, str]:
         """The worker's statistics, and why it has ended, if it has."""

@@ -278,6 +278,20 @@ def test_all_must_be_as_wanted_at_the_same_time(field: Field) -> None:
         assert len(looks) > 6
 
 
+def test_one_that_is_closed_while_all_are_waited_for_has_failed(field: Field, monkeypatch: pytest.MonkeyPatch) -> None:
+    with swarming(field) as drones:
+        bravo = drones["bravo"]
+        read = bravo.feedback
+
+        def feedback() -> skyloop.Feedback:
+            bravo.close()  # by another thread, when it was as wanted already
+            return read()
+
+        monkeypatch.setattr(bravo, "feedback", feedback)
+        assert set(drones.wait_all("landed", 5.0)) == {"alpha", "charlie"}
+        assert isinstance(drones.errors["bravo"], ClosedError)
+
+
 def test_one_that_is_taken_over_comes_back_by_itself(field: Field) -> None:
     with field.swarm() as drones:
         drones.takeoff()

@@ -211,3 +211,34 @@ def test_no_room_for_the_actors(ray: FakeRay, monkeypatch: pytest.MonkeyPatch) -
 def test_a_number_of_workers_that_cannot_be(ray: FakeRay, workers: Any) -> None:
     with pytest.raises(UsageError, match="must be at least 1"):
         skyloop.ray.process(TARGET, drone="alpha", workers=workers)
+
+
+def test_a_worker_whose_thread_raises_anything_else_is_told(ray: FakeRay, monkeypatch: pytest.MonkeyPatch) -> None:
+    workers = skyloop.ray.process(TARGET, drone="alpha")
+    actor = workers.actors[0].actor
+    for error in (RuntimeError("no memory"), SystemExit(3)):
+        monkeypatch.setattr(actor._worker, "run", lambda seconds, error=error: (_ for _ in ()).throw(error))
+        actor._run(actor._worker)
+        with pytest.raises(LinkError, match=f"its thread raised {type(error).__name__}"):
+            workers.statuses()
+
+
+def test_a_users_environment_is_kept_beside_ours(ray: FakeRay, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", "/run/somewhere")
+    monkeypatch.setenv("SKYLOOP_GROUP", "lab")
+    wanted = {"pip": ["torch"], "env_vars": {"MODEL": "large", "SKYLOOP_GROUP": "other"}}
+    skyloop.ray.process(TARGET, drone="alpha", runtime_env=wanted)
+    found = ray.options["runtime_env"]
+    assert found["pip"] == ["torch"]
+    assert found["env_vars"]["SKYLOOP_RUNTIME_DIR"] == "/run/somewhere"
+    assert found["env_vars"]["MODEL"] == "large"
+    assert found["env_vars"]["SKYLOOP_GROUP"] == "other"
+    assert wanted == {"pip": ["torch"], "env_vars": {"MODEL": "large", "SKYLOOP_GROUP": "other"}}
+    skyloop.ray.process(TARGET, drone="alpha", runtime_env=None)
+    assert ray.options["runtime_env"]["env_vars"]["SKYLOOP_GROUP"] == "lab"
+
+
+@pytest.mark.parametrize("wrong", ["torch", {"env_vars": ["MODEL"]}])
+def test_an_environment_that_is_none_is_refused(ray: FakeRay, wrong: Any) -> None:
+    with pytest.raises(UsageError, match=r"runtime_env is .* must be a dict"):
+        skyloop.ray.process(TARGET, drone="alpha", runtime_env=wrong)

@@ -378,10 +378,12 @@ class Swarm:
             waiting = {name: drone for name, drone in drones.items() if name not in errors}
             met, missed = _try_all(waiting, lambda drone: _wait(drone, predicate, what, deadline, timeout_s))
             errors |= missed
-            if last or all(_is(waiting[name], predicate) for name in met):
+            now, missed = _try_all({name: waiting[name] for name in met}, lambda drone: _is(drone, predicate))
+            errors |= missed
+            if last or all(now.values()):
                 break
         self.fail(f"waiting for {what}", errors)
-        return met
+        return {name: feedback for name, feedback in met.items() if name not in errors}
 
     def ticks(self, rate_hz: float = 20.0, seconds: float | None = None) -> Iterator[Tick]:
         """Yield at a steady rate on absolute deadlines, for a loop that commands all drones.
