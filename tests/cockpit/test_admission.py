@@ -170,6 +170,7 @@ class Speaker(asyncio.Protocol):
 
 def test_a_system_without_room_is_waited_for(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
     """No descriptor is left: it is tried again after a while, a stranger's is given up, and little is said."""
+    monkeypatch.setattr(logging.getLogger(listening.__name__), "filters", [])  # a cockpit that ran here limits repeats
     admission = Admission()
     ended = []
     idle = Connection("b", lambda: ended.append("idle"))
@@ -265,6 +266,19 @@ def test_a_message_that_a_stranger_can_cause_is_told_once_in_a_while() -> None:
     told = record(9)
     assert limit.filter(told)
     assert told.getMessage() == "bad: 9 (4 more such messages)"
+
+
+def test_messages_are_limited_however_many_different_ones_there_were() -> None:
+    limit = RepeatLimit(10.0, ManualClock())
+
+    def told(text: str) -> bool:
+        return limit.filter(logging.LogRecord("a", logging.WARNING, "", 0, text, (), None))
+
+    assert all(told(f"bad {number}") for number in range(1000))
+    assert told("a new one")
+    assert not told("a new one")
+    assert not told("bad 999")
+    assert len(limit._told) <= 256
 
 
 # In the application ------------------------------------------------------------------------------------------------

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import tempfile
+import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -11,7 +13,7 @@ import pytest
 pytest.importorskip("zenoh", reason="needs Zenoh: pip install 'skyloop[network]'")
 
 import skyloop
-from skyloop.cockpit.discovery import LocalFinder, NetworkFinder
+from skyloop.cockpit.discovery import Found, LocalFinder, NetworkFinder
 from skyloop.transport.composite import CompositeServer
 from skyloop.transport.fabric import FabricServer, FabricSettings
 from skyloop.transport.fabric.config import free_port
@@ -71,3 +73,31 @@ def test_a_swarm_by_pattern_over_the_network(monkeypatch: pytest.MonkeyPatch, tm
             assert sorted(drones.names) == ["far1", "far2"]
     finally:
         process.end()
+
+
+def test_two_searches_at_once_share_a_session(monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[object] = []
+    both = threading.Barrier(2)
+
+    def acquire(*_: object) -> object:
+        with suppress(threading.BrokenBarrierError):
+            both.wait(0.3)  # until the other thread opens one too
+        opened.append(object())
+        return opened[-1]
+
+    released: list[object] = []
+    monkeypatch.setattr("skyloop.transport.fabric.session.acquire", acquire)
+    monkeypatch.setattr("skyloop.transport.fabric.session.release", released.append)
+    monkeypatch.setattr("skyloop.transport.fabric.discovery.runs", lambda session: [("bravo", "run")])
+    finder = NetworkFinder(LocalFinder(), FabricSettings(multicast=False))
+    found: list[Found] = []
+    threads = [threading.Thread(target=lambda: found.extend(finder())) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    finder.close()
+    finder.close()
+    assert len(opened) == 1
+    assert released == opened
+    assert found[0] is found[1]

@@ -74,6 +74,8 @@ def test_who_may_tell_and_what() -> None:
     with skyloop.connect("sim://?cameras=none") as drone:
         with pytest.raises(UsageError, match="three and four finite numbers"):
             drone.tell_pose((0.0, 0.0, float("nan")), (0.0, 0.0, 0.0, 1.0))
+        with pytest.raises(UsageError, match=r"attitude_std_rad is -0\.1 and must be 0 or more"):
+            drone.tell_pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), attitude_std_rad=-0.1)
         told: list[str] = []
         with drone.on_event(lambda event: told.append(event.text), inline=True):
             assert drone.tell_pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))

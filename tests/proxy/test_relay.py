@@ -52,6 +52,7 @@ def test_an_observers_pose_is_refused(bench: Bench, taken: list[ExternalPose]) -
     [
         (VehiclePose(1, (math.nan, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)), "finite"),
         (VehiclePose(1, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 2.0)), "length 1"),
+        (VehiclePose(1, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), -1.0), "position_std_m is -1.0"),
     ],
 )
 def test_what_is_no_pose_is_refused(bench: Bench, taken: list[ExternalPose], pose: VehiclePose, said: str) -> None:

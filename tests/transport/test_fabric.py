@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import itertools
 
-from skyloop.transport.base import Dialer, TransportServer
+from skyloop.messages import LogEntry, encode
+from skyloop.transport.base import FEEDBACK, Dialer, TransportServer
 from skyloop.transport.conformance import TransportSuite
-from skyloop.transport.fabric import FabricServer, FabricSettings, dial
+from skyloop.transport.fabric import FabricServer, FabricSettings, dial, layout
 from skyloop.transport.fabric.client import FabricClient
 from skyloop.transport.fabric.config import free_port
+from skyloop.transport.fabric.delivery import Outgoing
 from skyloop.transport.fabric.session import Session
 from skyloop.transport.testing import ClientLog, ServerLog, wait_until
 
@@ -51,3 +53,24 @@ def test_after_an_end_that_nobody_announced_another_session_is_used() -> None:
             server.stop()
 
     serve_once(serve_once(None))
+
+
+def test_a_subscription_arrives_where_much_waits_before_it() -> None:
+    settings = FabricSettings(listen=(f"127.0.0.1:{free_port('127.0.0.1')}",), multicast=False)
+    server = FabricServer("alpha", settings)
+    server.start(ServerLog())
+    try:
+        client = dial("alpha", FabricSettings(connect=settings.listen, multicast=False))(log := ClientLog())
+        assert isinstance(client, FabricClient)
+        with client._lock:
+            while client._outgoing.put(encode(LogEntry("app", "height", 0, number=1.0)), layout.ASK):
+                pass
+        client.subscribe(FEEDBACK)
+        wait_until(lambda: server.subscribers(FEEDBACK) == 1, "the proxy knows of it")
+        client._outgoing = Outgoing(depth=0)
+        client.subscribe(FEEDBACK, False)
+        wait_until(lambda: bool(log.closings), "a connection that can't tell the proxy has ended")
+        assert "can't be told about 'feedback'" in log.closings[0]
+        client.close()
+    finally:
+        server.stop()

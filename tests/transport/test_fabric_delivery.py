@@ -89,6 +89,17 @@ def test_what_is_kept_is_bounded_in_packets_and_in_bytes() -> None:
     assert len(outgoing.due(0.0)) == 4
 
 
+def test_the_transports_own_packets_find_room_where_others_do_not() -> None:
+    outgoing = Outgoing()
+    while outgoing.put(b"x"):
+        pass
+    assert sum(outgoing.put(b"own", own=True) for _ in range(2 * DEPTH)) == DEPTH
+    outgoing = Outgoing(most_bytes=10)
+    assert outgoing.put(bytes(10))
+    assert not outgoing.put(b"x")
+    assert outgoing.put(b"own", own=True)
+
+
 def test_what_comes_far_too_early_is_not_kept() -> None:
     incoming = Incoming()
     for number in range(2, 10_000):

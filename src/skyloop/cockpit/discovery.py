@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 from collections.abc import Collection
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, Protocol
@@ -81,7 +82,7 @@ class LocalFinder:
 
 
 class NetworkFinder:
-    """Finds the proxies of this host, and those of the network under other names.
+    """Finds the proxies of this host, and those of the network under other names. Any thread.
 
     It opens one session with the first search and keeps it, so that further ones cost little.
     """
@@ -97,6 +98,7 @@ class NetworkFinder:
         self._local = local
         self._settings = settings
         self._wanted = wanted
+        self._lock = threading.Lock()  # guards what follows: several threads may search
         self._session: Session | None = None
         self._known: dict[str, Found] = {}
 
@@ -117,25 +119,29 @@ class NetworkFinder:
     def close(self) -> None:
         from skyloop.transport.fabric.session import release
 
-        session, self._session = self._session, None
+        with self._lock:
+            session, self._session = self._session, None
         if session is not None:
             release(session)
 
     def _open(self) -> Session:
         from skyloop.transport.fabric.config import Part
-        from skyloop.transport.fabric.session import acquire
+        from skyloop.transport.fabric.session import acquire, release
 
-        current = self._settings.current()
-        if self._session is not None and current is not self._settings:
-            self.close()  # the lab's roster has changed: who was revoked is not to be found any more
-        self._settings = current
-        if self._session is None:
-            self._session = acquire(current, Part.APP)
-        return self._session
+        with self._lock:
+            current = self._settings.current()
+            if self._session is not None and current is not self._settings:
+                release(self._session)  # the lab's roster has changed: who was revoked is not to be found any more
+                self._session = None
+            self._settings = current
+            if self._session is None:
+                self._session = acquire(current, Part.APP)
+            return self._session
 
     def _found(self, name: str) -> Found:
         from skyloop.transport.fabric import dial
 
-        if name not in self._known:
-            self._known[name] = Found(name, "network", dial(name, self._settings))
-        return self._known[name]
+        with self._lock:
+            if name not in self._known:
+                self._known[name] = Found(name, "network", dial(name, self._settings))
+            return self._known[name]

@@ -152,7 +152,8 @@ def limit_messages() -> None:
 class RepeatLimit(logging.Filter):
     """A log filter that lets each message through once in ``every_s`` [s], with the count of those left out.
 
-    Messages count as equal if they differ in their values only.
+    Messages count as equal if they differ in their values only. Of more than 256 different ones, the one that was let
+    through longest ago is forgotten.
 
     Args:
         every_s: The time [s].
@@ -174,8 +175,10 @@ class RepeatLimit(logging.Filter):
             return False
         if left_out:
             record.msg = f"{record.msg} ({left_out} more such messages)"
-        if len(self._told) < _MAX_MESSAGES:
-            self._told[key] = now_ns, 0
+        self._told.pop(key, None)  # so that they stand in the order in which they were let through
+        if len(self._told) >= _MAX_MESSAGES:
+            del self._told[next(iter(self._told))]
+        self._told[key] = now_ns, 0
         return True
 
 

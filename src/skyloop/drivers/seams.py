@@ -17,11 +17,12 @@ class ExternalPose:
         position: Of the body's origin in world axes, x east, y north, z up [m].
         quaternion: (w, x, y, z), rotates body axes (x forward, y left, z up) to world axes.
         captured_ns: When it was measured, on this host's monotonic clock.
-        position_std_m: Standard deviation of the position [m], None if it is not known.
-        attitude_std_rad: Standard deviation of the orientation [rad], None if it is not known.
+        position_std_m: Standard deviation of the position [m], 0 or more; None if it is not known.
+        attitude_std_rad: Standard deviation of the orientation [rad], 0 or more; None if it is not known.
 
     Raises:
-        UsageError: A number is not finite, or the quaternion's length differs from 1 by more than 0.001.
+        UsageError: A number is not finite, a standard deviation is negative, or the quaternion's length differs from 1
+            by more than 0.001.
     """
 
     position: Vector
@@ -36,6 +37,10 @@ class ExternalPose:
             raise UsageError(f"a pose has three and four finite numbers, not {self.position!r} and {self.quaternion!r}")
         if abs(math.hypot(*self.quaternion) - 1.0) > 1e-3:
             raise UsageError(f"a quaternion of a rotation has the length 1, not {math.hypot(*self.quaternion):.4g}")
+        for name in ("position_std_m", "attitude_std_rad"):
+            value = getattr(self, name)
+            if value is not None and value < 0.0:
+                raise UsageError(f"{name} is {value!r} and must be 0 or more, or None where it is not known")
 
 
 @dataclass(frozen=True, slots=True)

@@ -242,6 +242,9 @@ def test_poses_are_checked() -> None:
         ExternalPose((0.0, 0.0, 0.0), (2.0, 0.0, 0.0, 0.0), 0)
     with pytest.raises(UsageError, match="finite"):
         ExternalPose((float("nan"), 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0)
+    for wrong in ({"position_std_m": -0.1}, {"attitude_std_rad": -0.1}):
+        with pytest.raises(UsageError, match=f"{next(iter(wrong))} is -0.1 and must be 0 or more"):
+            ExternalPose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0, **wrong)
     nobody = f"mavlink://udpin:127.0.0.1:{Ports.free(Kind.PX4).remote}"
     with opened(nobody) as (driver, _), pytest.raises(DriverError, match="not heard"):
         driver.external_pose(ExternalPose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0))

@@ -209,12 +209,14 @@ class FabricClient(TransportClient):
                     topic, bytes.fromhex(self._run), self._admission.topics, self._enqueue_published, self._reject
                 )
                 self._subscriptions[topic] = wanted, wanted.declare(self._session, self._name, self._id)
-            self._keep(layout.ASK, packets.subscribe(topic, on))
+            told = self._keep(layout.ASK, packets.subscribe(topic, on), own=True)
             declared: list[Any] = []
             if not on:
                 unwanted, declared = self._subscriptions.pop(topic)
                 unwanted.end()
         undeclare(declared)
+        if not told:  # the next connection subscribes anew; this one would wait for what never comes
+            self._end(f"the proxy does not take what is sent to it, and can't be told about {topic!r}")
 
     def close(self) -> None:
         self._end("closed by the application")
@@ -255,10 +257,10 @@ class FabricClient(TransportClient):
             return False
         return True
 
-    def _keep(self, way: str, packet: bytes) -> bool:
+    def _keep(self, way: str, packet: bytes, *, own: bool = False) -> bool:
         """Send a packet, repeatedly until it is acknowledged; return False if there is no room for it. Locked."""
         waits = self._outgoing.under_way
-        if not self._outgoing.put(packet, way):
+        if not self._outgoing.put(packet, way, own=own):
             return False
         self._send_due()
         if not waits:
@@ -381,7 +383,7 @@ class FabricClient(TransportClient):
             if self._ended:
                 return
             self._reason = self._reason or reason
-            if not self._keep(layout.ASK, packets.bye(reason)):  # after all that was sent before
+            if not self._keep(layout.ASK, packets.bye(reason), own=True):  # after all that was sent before
                 self._put(layout.ASK, packets.bye(reason), 0)
             self._ended = True
         self._inbox.put(None)

@@ -57,17 +57,22 @@ class Outgoing:
             0.0  # when the other end last took something, or when the first packet of an idle time was sent
         )
 
-    def put(self, packet: bytes, way: str = "") -> bool:
+    def put(self, packet: bytes, way: str = "", *, own: bool = False) -> bool:
         """Keep one more packet.
 
         Args:
             packet: The packet.
             way: By which key it is sent, for the sender.
+            own: One of the transport's own small packets: there is room for it where others find none.
 
         Returns:
             False if there is no room for it.
         """
-        if len(self._kept) >= self._depth or (self._kept and self._bytes + len(packet) > self._most):
+        if own:
+            full = len(self._kept) >= 2 * self._depth
+        else:
+            full = len(self._kept) >= self._depth or bool(self._kept and self._bytes + len(packet) > self._most)
+        if full:
             return False
         self._kept.append(_Packet(self._next, packet, way))
         self._bytes += len(packet)
