@@ -31,7 +31,7 @@ def observe(pipe: Pipe, proxy: str) -> None:
         listening = Listening(heard.heard)
         with connect(proxy, access="observe", name="observer") as drone:
             drone.on_feedback(listening.feedback, inline=True)
-            drone.add_processor(listening.frame, camera=CAMERA, inline=True)
+            drone.on_frame(listening.frame, camera=CAMERA, inline=True)
             pipe.send("connected")
             pipe.recv()
         pipe.send(heard.arrivals)

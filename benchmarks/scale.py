@@ -329,7 +329,7 @@ def observe(pipe: Pipe, address: str, video: bool) -> None:
         with over_network.connect(address, "observe") as drone:
             drone.on_feedback(listening.feedback, inline=True)
             if video:
-                drone.add_processor(listening.frame, camera=CAMERA, inline=True, **over_network.JPEG)
+                drone.on_frame(listening.frame, camera=CAMERA, inline=True, **over_network.JPEG)
             pipe.send("connected")
             pipe.recv()
         pipe.send(heard.arrivals)

@@ -28,6 +28,6 @@ class Application(ours.Application):
             until = time.monotonic() + SLOW_S
             mean = np.zeros(frame.shape, np.float32)
             while time.monotonic() < until:  # what image processing does: long work on arrays
-                mean += 0.1 * (frame.image - mean)
+                mean += 0.1 * (frame - mean)
 
-        self._drone.add_processor(slow, camera=CAMERA)
+        self._drone.on_frame(slow, camera=CAMERA)

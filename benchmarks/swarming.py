@@ -128,7 +128,7 @@ def look_on(pipe: Pipe, place: str, names: list[str]) -> None:
         for name in names:
             drone = opened.enter_context(_connect(name, place, observe=True))
             drone.on_feedback(took, inline=True)
-            drone.add_processor(saw, encoding="jpeg", quality=QUALITY)
+            drone.on_frame(saw, encoding="jpeg", quality=QUALITY)
         pipe.send("looking")
         while pipe.recv() is not None:
             pipe.send((list(delays_ns), len(frames)))

@@ -370,24 +370,24 @@ class Drone:
         """Call ``function`` with results, on the event loop; see :meth:`skyloop.client.Drone.on_result`."""
         return Listener(self.sync.on_result(_on_loop(function), processor, max_age_s=max_age_s))
 
-    def add_processor(
+    def on_frame(
         self, function: Callable[[client.Frame], object], camera: str | None = None, **options: Any
-    ) -> client.Processor[Any]:
-        """Call ``function`` with frames, on a thread of its own, as processing images would block the event loop.
+    ) -> client.Listener[Any]:
+        """Call ``function`` with the newest frame, on a thread of its own: work on images would block the event loop.
 
         Args:
             function: A plain function.
             camera: Name of the camera; None: the vehicle's first.
-            **options: As for :meth:`skyloop.client.Drone.add_processor`.
+            **options: As for :meth:`skyloop.client.Drone.on_frame`.
 
         Raises:
             UsageError: If it is a coroutine function.
         """
         if inspect.iscoroutinefunction(function):
             raise UsageError(
-                "a processor is a plain function, which runs on its own thread; else iterate over frames()"
+                "on_frame takes a plain function, which runs on a thread of its own; else iterate over frames()"
             )
-        return self.sync.add_processor(function, camera, **options)
+        return self.sync.on_frame(function, camera, **options)
 
     def annotate(self, frame: client.Frame, shapes: Iterable[Shape], source: str | None = None) -> bool:
         """Publish shapes drawn over a frame; see :meth:`skyloop.client.Drone.annotate`."""

@@ -244,11 +244,11 @@ def test_processors_are_plain_functions(proxy: ScriptedProxy) -> None:
     async def listen() -> None:
         async with aio.connect("me") as drone:
             seen = threading.Event()
-            drone.add_processor(lambda frame: seen.set())
+            drone.on_frame(lambda frame: seen.set())
             proxy.frame(1)
             assert await asyncio.to_thread(seen.wait, WAIT_S)
             with pytest.raises(UsageError, match="plain function"):
-                drone.add_processor(think)
+                drone.on_frame(think)
             await drone.close()
 
     run(listen())

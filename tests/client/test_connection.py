@@ -77,7 +77,7 @@ def test_a_restarted_proxy_finds_everything_put_back(proxy: ScriptedProxy, drone
     events: list[Event] = []
     frames: list[int] = []
     drone.on_event(events.append)
-    drone.add_processor(lambda frame: frames.append(frame.seq))
+    drone.on_frame(lambda frame: frames.append(frame.seq))
     drone.config["limits.tilt"] = 0.2
     proxy.parameters["limits.tilt"] = 0.35  # as after a restart
     drone.velocity(forward=1.0)

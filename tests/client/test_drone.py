@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skyloop.client import Drone, Frame, LinkStatus
+from skyloop.client import Drone, Frame, LinkStatus, Listener
 from skyloop.errors import ClosedError, NoAnswerError, UnknownNameError, UsageError
 from skyloop.messages import (
     Annotation,
@@ -96,7 +96,7 @@ def test_an_unknown_camera(drone: Drone) -> None:
     with pytest.raises(UnknownNameError):
         drone.next_frame("left")
     with pytest.raises(UnknownNameError):
-        drone.add_processor(lambda frame: None, "left")
+        drone.on_frame(lambda frame: None, "left")
 
 
 def test_frames_as_an_iterator(proxy: ScriptedProxy, drone: Drone) -> None:
@@ -165,14 +165,14 @@ def test_processors_each_at_their_own_pace(proxy: ScriptedProxy, drone: Drone) -
         entered.set()
         go_on.wait(WAIT_S)
 
-    thinker = drone.add_processor(think, name="thinker")
+    thinker = drone.on_frame(think)
     shown = threading.Semaphore(0)
 
     def watch(frame: Frame) -> None:
         quick.append(frame.seq)
         shown.release()
 
-    watcher = drone.add_processor(watch, depth=20)
+    watcher = drone.on_frame(watch, depth=20)
     proxy.frame(1)
     assert entered.wait(WAIT_S)
     assert shown.acquire(timeout=WAIT_S)
@@ -189,13 +189,25 @@ def test_processors_each_at_their_own_pace(proxy: ScriptedProxy, drone: Drone) -
     thinker.cancel()
     watcher.cancel()
     with pytest.raises(UsageError, match="depth"):
-        drone.add_processor(think, depth=0)
+        drone.on_frame(think, depth=0)
+
+
+def test_callbacks_with_frames_are_listeners_like_the_others(proxy: ScriptedProxy, drone: Drone) -> None:
+    events: list[Event] = []
+    drone.on_event(events.append, inline=True)
+    raising = drone.on_frame(lambda frame: 1 // 0, "bottom", inline=True)
+    assert isinstance(raising, Listener)
+    with pytest.raises(UsageError, match="'frame' can't be called"):
+        drone.on_frame("frame")  # type: ignore[arg-type]
+    proxy.frame(1, "bottom")
+    drone.wait(lambda _: raising.errors == 1, WAIT_S)
+    assert [event.data["where"] for event in events if event.kind is EventKind.CALLBACK_ERROR] == ["frames of bottom"]
 
 
 def test_frames_that_cannot_be_understood(proxy: ScriptedProxy, drone: Drone) -> None:
     pytest.importorskip("cv2")
     got: list[int] = []
-    with drone.add_processor(lambda frame: got.append(frame.seq), inline=True):
+    with drone.on_frame(lambda frame: got.append(frame.seq), inline=True):
         proxy.frame(1, encoding=Encoding.JPEG)
         proxy.frame(2)
         drone.wait(lambda _: got == [2], WAIT_S)
@@ -204,7 +216,7 @@ def test_frames_that_cannot_be_understood(proxy: ScriptedProxy, drone: Drone) ->
 
 def test_a_repeated_or_overtaken_frame_is_not_shown_again(proxy: ScriptedProxy, drone: Drone) -> None:
     got: list[int] = []
-    with drone.add_processor(lambda frame: got.append(frame.seq), inline=True):
+    with drone.on_frame(lambda frame: got.append(frame.seq), inline=True):
         for seq in (1, 2, 2, 1, 5):
             proxy.frame(seq)
         drone.wait(lambda _: 5 in got, WAIT_S)

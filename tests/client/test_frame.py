@@ -49,7 +49,10 @@ def test_a_frame_is_the_received_memory_and_knows_its_origin() -> None:
     assert frame.intrinsics is K
     assert frame.header.encoding is Encoding.BGR8
     assert frame.age_s == pytest.approx((4500 + 500 - 1000) / 1e9)
-    assert type(frame.image) is np.ndarray
+    plain = np.asarray(frame)
+    assert type(plain) is np.ndarray
+    assert np.shares_memory(plain, frame)
+    assert not plain.flags.writeable
     assert frame.feedback is None
     assert frame.feedback_reach_s is None
 

@@ -24,7 +24,7 @@ def test_fifty_drones_leave_no_thread_and_no_descriptor() -> None:
         before_threads, before_descriptors = set(threading.enumerate()), descriptors()
         for number in range(50):
             drone = Drone(proxy.server.dial, app=f"app {number}", policy=QUICK).open()
-            drone.add_processor(lambda frame: None)
+            drone.on_frame(lambda frame: None)
             drone.on_feedback(lambda feedback: None)
             drone.on_event(lambda event: None)
             drone.frame()

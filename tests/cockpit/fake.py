@@ -120,7 +120,7 @@ class FakeDrone:
     def close(self) -> None:
         self.closed = True
 
-    def add_processor(self, function: Callable[[Frame], None], camera: str, name: str) -> Listening:
+    def on_frame(self, function: Callable[[Frame], None], camera: str) -> Listening:
         return Listening(self.processors[camera], function)
 
     # What a test does ------------------------------------------------------------------------------------------

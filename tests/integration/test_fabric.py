@@ -92,7 +92,7 @@ def test_frames_come_as_jpeg_from_afar_and_raw_from_near(node: Node) -> None:
         assert frame.shape == (24, 32, 3)
         far = not isinstance(node.proxy.server, MemoryServer)
         assert frame.header.encoding == ("jpeg" if far else "bgr8")
-        assert np.allclose(frame.image, frame.image[0, 0], atol=4)
+        assert np.allclose(frame, frame[0, 0], atol=4)
         assert "video/front" in drone.stats
 
 
@@ -100,7 +100,7 @@ def test_raw_frames_are_the_same_to_the_bit(node: Node) -> None:
     with node.connected() as drone:
         for frame in take(drone.frames(encoding="raw"), 5):
             assert frame.header.encoding == "bgr8"
-            assert (frame.image == frame.image[0, 0, 0]).all()
+            assert (frame == frame[0, 0, 0]).all()
 
 
 def test_smaller_frames(node: Node) -> None:
@@ -109,7 +109,7 @@ def test_smaller_frames(node: Node) -> None:
             (frame,) = take(drone.frames(encoding=encoding, scale=0.5), 1)
             assert frame.shape == (12, 16, 3)
             assert (frame.header.width, frame.header.height) == (16, 12)
-            assert np.allclose(frame.image, frame.image[0, 0], atol=4)
+            assert np.allclose(frame, frame[0, 0], atol=4)
 
 
 def test_fewer_frames(node: Node) -> None:
@@ -122,7 +122,7 @@ def test_workers_share_the_frames(node: Node) -> None:
     with node.connected() as drone:
         numbers: list[list[int]] = [[], [], []]
         workers = [
-            drone.add_processor(lambda frame, k=k: numbers[k].append(frame.seq), part=(k, 3), depth=8)  # type: ignore[misc]
+            drone.on_frame(lambda frame, k=k: numbers[k].append(frame.seq), part=(k, 3), depth=8)  # type: ignore[misc]
             for k in range(3)
         ]
         drone.wait(lambda _: all(len(mine) >= 5 for mine in numbers), WAIT_S)

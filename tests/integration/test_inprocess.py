@@ -216,7 +216,7 @@ def test_a_restarted_proxy(node: Node, drone: Drone) -> None:
     states: list[LinkState] = []
     frames: list[int] = []
     drone.on_link(lambda status: states.append(status.application))
-    drone.add_processor(lambda frame: frames.append(frame.seq))
+    drone.on_frame(lambda frame: frames.append(frame.seq))
     drone.config["limits.tilt"] = 0.2
     drone.takeoff()
     drone.velocity(forward=0.5)
@@ -350,7 +350,7 @@ def test_annotations_reach_the_others(node: Node, drone: Drone) -> None:
 
 
 def test_unsubscribed_cameras_cost_nothing(node: Node, drone: Drone) -> None:
-    with drone.add_processor(lambda frame: None):
+    with drone.on_frame(lambda frame: None):
         drone.wait(lambda _: node.server.subscribers(video("front")) == 1, WAIT_S)
     drone.wait(lambda _: node.server.subscribers(video("front")) == 0, WAIT_S)
 

@@ -98,7 +98,7 @@ def links(here: Here, name: str) -> list[tuple[int, str]]:
 def watch_frames(here: Here, name: str, /, **options: Any) -> None:
     """Write down the shape, the age [s] and the time of capture [ns] of each frame."""
     write = here.tell(f"{name} frame")
-    here.drones[name].add_processor(lambda frame: write((frame.shape, frame.age_s, frame.captured_ns)), **options)
+    here.drones[name].on_frame(lambda frame: write((frame.shape, frame.age_s, frame.captured_ns)), **options)
 
 
 def frames(here: Here, name: str) -> list[tuple[int, tuple[tuple[int, ...], float, int]]]:

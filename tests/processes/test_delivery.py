@@ -33,8 +33,8 @@ def test_a_slow_processor_gets_new_frames_only_and_the_fast_one_gets_all(proxy: 
             behind.append(newest.seq - frame.seq if newest is not None else 0)
             time.sleep(0.2)
 
-        slow_one = drone.add_processor(slow, name="slow")
-        fast_one = drone.add_processor(lambda frame: seen.append(frame.seq), name="fast")
+        slow_one = drone.on_frame(slow)
+        fast_one = drone.on_frame(lambda frame: seen.append(frame.seq))
         eventually(lambda: len(seen) >= 3 * FPS, "three seconds of video")
         drops = slow_one.dropped
         assert drops > 1.5 * FPS
@@ -55,7 +55,7 @@ def test_a_stopped_observer_delays_nobody_and_is_served_again(
         ages: list[float] = []
         listener = drone.on_feedback(lambda f: ages.append((time.monotonic_ns() - f.published_ns) / 1e9), inline=True)
         frames: list[int] = []
-        drone.add_processor(lambda frame: frames.append(frame.seq))
+        drone.on_frame(lambda frame: frames.append(frame.seq))
         # 4 s of feedback and video are far more than the buffers of the stopped one can take
         eventually(lambda: len(frames) > 4 * FPS, "video flows on")
         assert drone.stats["feedback"].lost == 0

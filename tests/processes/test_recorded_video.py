@@ -44,7 +44,7 @@ def test_all_frames_reach_a_processor_and_a_controller_in_order() -> None:
         with pytest.raises(UnsupportedError, match="record"):
             drone.takeoff()
         processed: list[int] = []
-        processor = drone.add_processor(lambda frame: processed.append(frame.seq))
+        processor = drone.on_frame(lambda frame: processed.append(frame.seq))
         controller = Look(drone)
         controller.run(seconds=20)
         eventually(lambda: len(processed) + processor.dropped >= FRAMES, "the processor is through as well", 30.0)

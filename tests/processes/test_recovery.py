@@ -25,7 +25,7 @@ def test_a_killed_and_restarted_proxy_is_back_within_a_second_with_everything_as
         told: list[tuple[float, LinkStatus]] = []
         drone.on_link(lambda status: told.append((time.monotonic(), status)))
         frames: list[int] = []
-        drone.add_processor(lambda frame: frames.append(frame.seq))
+        drone.on_frame(lambda frame: frames.append(frame.seq))
         drone.config["limits.tilt"] = 0.21
         eventually(lambda: bool(frames), "pictures come")
 

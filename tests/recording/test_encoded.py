@@ -184,7 +184,7 @@ def test_pictures_are_those_of_the_decoder(kept: Path) -> None:
 def replayed(path: Path, query: str) -> list[tuple[int, NDArray[np.uint8]]]:
     seen = []
     with skyloop.connect(f"replay://{path}?speed=max{query}", on_exit="hover") as drone:
-        drone.add_processor(lambda frame: seen.append((frame.captured_ns, np.array(frame))), inline=True)
+        drone.on_frame(lambda frame: seen.append((frame.captured_ns, np.array(frame))), inline=True)
         drone.wait(lambda feedback: feedback.vehicle_link is LinkState.CLOSED, timeout_s=1e3)
     return seen
 
@@ -292,7 +292,7 @@ def test_an_emulated_drone_is_recorded_as_it_sends_and_as_its_frames_show(emulat
         assert [camera.stream for camera in drone.capabilities.cameras] == ["h264", "h264"]
         with skyloop.record(drone, path, min_free_mb=0) as recorder:
             files.until(lambda: len(files.of(path, VIDEO)) > 20, "pictures that nobody looks at", WAIT_S)
-            with drone.add_processor(lambda frame: live.update({frame.captured_ns: np.array(frame)}), inline=True):
+            with drone.on_frame(lambda frame: live.update({frame.captured_ns: np.array(frame)}), inline=True):
                 files.until(lambda: len(live) > 20, "frames", WAIT_S)
             at_ns = max(live)
             files.until(

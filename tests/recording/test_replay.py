@@ -147,7 +147,7 @@ def test_listeners_and_processors_are_in_step_too(flight: Path) -> None:
             except UsageError as error:
                 waits.append(error)
 
-        drone.add_processor(process)
+        drone.on_frame(process)
         drone.on_event(events.append)
         Steering(drone).run()
     assert seen == list(range(1, 21))

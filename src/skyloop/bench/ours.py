@@ -82,7 +82,7 @@ class Application:
         listening = Listening(heard)
         self._drone.on_feedback(listening.feedback, inline=True)
         if self.looks:
-            self._drone.add_processor(listening.frame, camera=CAMERA, inline=True, **self.video)
+            self._drone.on_frame(listening.frame, camera=CAMERA, inline=True, **self.video)
 
     def _connect(self, address: str) -> Drone:
         return connect(proxy_name(address), name="bench", on_exit="hover")

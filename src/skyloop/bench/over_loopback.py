@@ -37,4 +37,4 @@ class Application(NearApplication):
         self._drone = connect(proxy_name(address), name="bench", on_exit="hover", network=place)
         listening = Listening(heard)
         self._drone.on_feedback(listening.feedback, inline=True)
-        self._drone.add_processor(listening.frame, camera=CAMERA, inline=True, encoding="raw")
+        self._drone.on_frame(listening.frame, camera=CAMERA, inline=True, encoding="raw")

@@ -1,7 +1,7 @@
 """The application's side: :func:`connect` returns a :class:`Drone`."""
 
 from skyloop.client.authority import AuthorityState, AuthorityStatus, TakeoverRequest
-from skyloop.client.channels import Listener, Processor
+from skyloop.client.channels import Listener
 from skyloop.client.connect import connect, swarm
 from skyloop.client.connection import RedialPolicy
 from skyloop.client.drone import Drone
@@ -28,7 +28,6 @@ __all__ = [
     "LinkStatus",
     "Listener",
     "Logbook",
-    "Processor",
     "RedialPolicy",
     "Result",
     "Stats",

@@ -336,7 +336,3 @@ class Listener(Generic[T]):
         self._next_report_s = now_s + _REPORT_EVERY_S
         _log.error("%s raised %r (%d times so far)", self.name, error, self.errors, exc_info=error)
         self._report(self.name, error)
-
-
-#: A listener to frames, with its own thread, its own mailbox of the newest frame, and its own count of drops.
-Processor = Listener

@@ -23,7 +23,7 @@ from skyloop.client.authority import (
     answering,
     authority_wish,
 )
-from skyloop.client.channels import Channel, Listener, Processor, VideoChannel, VideoOptions
+from skyloop.client.channels import Channel, Listener, VideoChannel, VideoOptions
 from skyloop.client.command_schedule import CommandSchedule
 from skyloop.client.commands import CommandSender, checked, number
 from skyloop.client.completion import ActionWait
@@ -764,22 +764,20 @@ class Drone:
         """
         return self._listen(self._state.on_log, function, "log", depth=EVENT_DEPTH, inline=inline)
 
-    def add_processor(
+    def on_frame(
         self,
         function: Callable[[Frame], object],
         camera: str | None = None,
         *,
-        name: str | None = None,
         depth: int = 1,
         inline: bool = False,
         **how: Unpack[VideoOptions],
-    ) -> Processor[Arrival]:
-        """Call ``function`` with frames.
+    ) -> Listener[Arrival]:
+        """Call ``function`` with the newest frame of a camera.
 
         Args:
             function: Called on a thread of its own with the newest ``depth`` frames that it has not seen.
             camera: Name of the camera; None: the vehicle's first.
-            name: For threads and error messages; None: the function's.
             depth: How many frames may wait, at least 1; older ones are dropped and counted.
             inline: Call it on the receiving thread instead, with every frame. It must be quick and must not wait.
             **how: As for :meth:`frames`.
@@ -795,15 +793,15 @@ class Drone:
         """
         if depth < 1:
             raise UsageError(f"depth is {depth!r} and must be at least 1 frame")
+        self._check_listener(function)
         channel = self.channel(camera, **how)
 
-        def process(arrival: Arrival) -> None:
+        def call(arrival: Arrival) -> None:
             frame = channel.picture(arrival)
             if frame is not None:
                 function(frame)
 
-        label = name or getattr(function, "__name__", "processor")
-        return self._listen(channel, process, f"processor {label}", depth=depth, inline=inline)
+        return self._listen(channel, call, f"frames of {channel.camera.name}", depth=depth, inline=inline)
 
     def inbox(
         self,

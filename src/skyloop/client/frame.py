@@ -29,16 +29,17 @@ else:
 _CHANNELS: Final = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
 _ATTRIBUTES: Final = frozenset(
     {"camera", "seq", "captured_ns", "published_ns", "received_ns", "intrinsics", "header", "age_s"}
-    | {"feedback", "feedback_reach_s", "image"}
+    | {"feedback", "feedback_reach_s"}
 )
 
 
 class Frame(_Base):
     """An image as a read-only BGR array of shape (height, width, 3) and dtype uint8; draw on ``frame.copy()``.
 
-    Where possible it is the memory that the transport received, without a copy. Slices, copies and results of
-    arithmetic are plain arrays or lack the attributes below. Times are in ns: ``captured_ns`` (middle of the exposure)
-    and ``published_ns`` on the proxy's clock, ``received_ns`` on this host's.
+    It is the array: NumPy and OpenCV take it as it is. Where a plain one is needed ``numpy.asarray(frame)`` gives the
+    same memory without the attributes below. Where possible it is the memory that the transport received, without a
+    copy. Slices, copies and results of arithmetic are plain arrays or lack the attributes below. Times are in ns:
+    ``captured_ns`` (middle of the exposure) and ``published_ns`` on the proxy's clock, ``received_ns`` on this host's.
     """
 
     _arrival: Arrival
@@ -79,11 +80,6 @@ class Frame(_Base):
         return self._arrival.header.intrinsics
 
     @property
-    def image(self) -> NDArray[np.uint8]:
-        """The same pixels as a plain read-only array, without a copy."""
-        return self.view(np.ndarray)
-
-    @property
     def age_s(self) -> float:
         """Time since the capture [s]."""
         return self._arrival.age_s
@@ -108,7 +104,7 @@ class Frame(_Base):
         Args:
             order: Memory layout, as for :meth:`numpy.ndarray.copy`.
         """
-        return self.image.copy(order)
+        return self.view(np.ndarray).copy(order)
 
     def __array_wrap__(self, array: Any, context: Any = None, return_scalar: bool = False) -> Any:
         """Return results of arithmetic as plain arrays or numbers."""

@@ -105,7 +105,7 @@ class CameraFeed:
         self._drone = drone
         self._clock = clock
         self._since_ns = 0  # since when a page wants frames
-        self._processor: _Cancellable | None = None
+        self._listener: _Cancellable | None = None
         self._wakes: set[Wake] = set()
         self._serial = 0
         self._jpeg: tuple[int, asyncio.Future[bytes]] | None = None
@@ -120,26 +120,24 @@ class CameraFeed:
     def subscribe(self, wake: Wake) -> None:
         """Call ``wake`` on the loop for each newer frame; the first subscriber subscribes to the camera."""
         self._wakes.add(wake)
-        if self._processor is None:
+        if self._listener is None:
             loop = asyncio.get_running_loop()
             self._since_ns = self._clock()
-            self._processor = self._drone.add_processor(
-                lambda frame: call_soon(loop, self._put, frame), camera=self.camera, name="cockpit"
-            )
+            self._listener = self._drone.on_frame(lambda frame: call_soon(loop, self._put, frame), camera=self.camera)
         elif self.newest is not None:
             wake()
 
     def unsubscribe(self, wake: Wake) -> None:
         """Call ``wake`` no longer; after the last one the camera is no longer subscribed to."""
         self._wakes.discard(wake)
-        if not self._wakes and self._processor is not None:
-            self._processor.cancel()
-            self._processor = self.newest = self._jpeg = None
+        if not self._wakes and self._listener is not None:
+            self._listener.cancel()
+            self._listener = self.newest = self._jpeg = None
 
     @property
     def age_s(self) -> float | None:
         """Age of the newest frame [s], or how long one was waited for in vain; None while no page wants any."""
-        if self._processor is None:
+        if self._listener is None:
             return None
         return seconds(self._clock() - self._since_ns) if self.newest is None else self.newest.frame.age_s
 
@@ -153,13 +151,13 @@ class CameraFeed:
 
     def close(self) -> None:
         """Unsubscribe from the camera, and end the thread."""
-        if self._processor is not None:
-            self._processor.cancel()
-            self._processor = None
+        if self._listener is not None:
+            self._listener.cancel()
+            self._listener = None
         self._pool.shutdown(wait=False, cancel_futures=True)
 
     def _put(self, frame: Frame) -> None:
-        if self._processor is None:  # cancelled while this was on its way
+        if self._listener is None:  # cancelled while this was on its way
             return
         self._serial += 1
         self.newest = NumberedFrame(self._serial, frame)
@@ -346,7 +344,7 @@ def to_jpeg(frame: Frame) -> bytes:
     """
     import cv2
 
-    done, data = cv2.imencode(".jpg", frame.image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    done, data = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if not done:
         raise ValueError(f"frame {frame.seq} of {frame.camera} could not be made a JPEG")
     return bytes(data.data)

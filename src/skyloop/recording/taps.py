@@ -325,7 +325,7 @@ class Video:
             elif raw is not None and header.encoding is not Encoding.JPEG:
                 image = to_bgr(header, raw)
             else:
-                image = arrival.frame().image
+                image = np.asarray(arrival.frame())
             self._done(arrival, self._encode(header, image), self._format)
         except Exception as error:  # noqa: BLE001  (one frame is lost; if the thread ended, all would be)
             self._failed += 1

@@ -95,7 +95,7 @@ class DelayLog:
         self._ended = threading.Event()
         self._listeners = (
             drone.on_feedback(self._feedback, inline=True),
-            drone.add_processor(self._frame, camera=camera, inline=True),
+            drone.on_frame(self._frame, camera=camera, inline=True),
         )
         self._thread = threading.Thread(target=self._run, name="paper-delays", daemon=True)
 
