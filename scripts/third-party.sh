@@ -25,6 +25,10 @@ environment ray 'ray, skyloop' --editable '.[sim,ray]' & jobs+=($!)
 environment ros2 'rclpy, skyloop' ros-rclpy ros-rmw-fastrtps-cpp ros-sensor-msgs --editable . & jobs+=($!)
 [[ -e .third-party/node_modules/ar-drone/package.json ]] ||
   npm install --silent --no-audit --no-fund --prefix .third-party ar-drone@0.3.3 & jobs+=($!)
+# Not the newest OpenCV, whose 5 changed shapes and dtypes of ArUco's results: to be put before the installed one.
+[[ -e .third-party/opencv4/cv2 ]] ||
+  "${PYTHON:-python3}" -m pip install --quiet --disable-pip-version-check --no-deps --target .third-party/opencv4 \
+    'opencv-python-headless>=4.10,<5' & jobs+=($!)
 for job in "${jobs[@]}"; do
   wait "$job"
 done

@@ -14,7 +14,7 @@ from starlette.websockets import WebSocketDisconnect
 
 from skyloop.client import AuthorityStatus, Drone
 from skyloop.cockpit.commands import decode_command
-from skyloop.cockpit.control import SILENT_S
+from skyloop.cockpit.control_session import SILENT_S
 from skyloop.cockpit.fleet import Fleet
 from skyloop.control import Controller
 from skyloop.control.follow import FollowMarker

@@ -28,7 +28,7 @@ from skyloop.cockpit.commands import (
     Write,
     untimely,
 )
-from skyloop.cockpit.control import ControlSession
+from skyloop.cockpit.control_session import ControlSession
 from skyloop.cockpit.pilot_connection import PilotConnection
 from skyloop.messages import (
     EmergencyStop,

@@ -10,7 +10,7 @@ from skyloop.client.authority import Authority
 from skyloop.client.command_schedule import CommandSchedule
 from skyloop.client.commands import CommandSender
 from skyloop.client.scheduler import Scheduler
-from skyloop.cockpit.control import GONE_S
+from skyloop.cockpit.control_session import GONE_S
 from skyloop.messages import Command, EmergencyStop, FlightState, Hover, RequestAuthority, Role, Velocity, decode
 from tests.cockpit.fake import Node, until
 from tests.cockpit.test_control import page

@@ -18,7 +18,7 @@ from skyloop.proxy.requests import MAX_PENDING
 from skyloop.proxy.sessions import MAX_MALFORMED
 from skyloop.sim.world_file import shipped_worlds
 from skyloop.transport.base import MAX_PACKET, MAX_SUBSCRIPTIONS
-from skyloop.transport.local.frames import MAX_LEASES
+from skyloop.transport.local.frame_exchange import MAX_LEASES
 from skyloop.transport.local.server import MAX_CLIENTS
 from tests.docs.pages import ROOT, rows, section
 

@@ -19,7 +19,7 @@ PACKAGES = {
     "mavlink": ["skyloop.wire.mavlink"],
     "vrpn": ["skyloop.wire.vrpn", "skyloop.motion_capture.vrpn"],
     "recording": ["skyloop.logfile", "mcap"],
-    "files": ["skyloop.sim", "skyloop.calibration", "skyloop.proxy.core.zones", "skyloop.drivers.uri", "tomllib"],
+    "files": ["skyloop.sim", "skyloop.calibration", "skyloop.proxy.core.safety", "skyloop.drivers.uri", "tomllib"],
     "page": ["skyloop.cockpit.commands"],
 }
 

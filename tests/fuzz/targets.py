@@ -147,7 +147,7 @@ def files(data: bytes) -> None:
     """Files that people edit: worlds, calibrations, zones, tables of keys and of tokens."""
     from skyloop.calibration import load_calibration
     from skyloop.drivers.uri import parse_uri
-    from skyloop.proxy.core.zones import parse_zones
+    from skyloop.proxy.core.safety import parse_zones
     from skyloop.sim.world_file import load_world
 
     kind, data = data[:1], data[1:]

@@ -15,7 +15,7 @@ from skyloop import messages
 from skyloop.messages import annotation, codec, command, config, encoded
 from skyloop.transport.base import MAX_PACKET, MAX_SUBSCRIPTIONS, MAX_TOPIC
 from skyloop.transport.local import packets
-from skyloop.transport.local.frames import MAX_LEASES
+from skyloop.transport.local.frame_exchange import MAX_LEASES
 
 PAGE = (Path(__file__).parents[2] / "docs" / "wire-format.md").read_text()
 SECTIONS = re.compile(r"^### (\w+)(?: — (kind|tag) (\d+))?\n(.*?)(?=^##|\Z)", re.MULTILINE | re.DOTALL)

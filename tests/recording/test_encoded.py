@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 import skyloop
 from skyloop.client import Drone
 from skyloop.drivers.base import Driver, Sink
+from skyloop.drivers.pave_decoder import PaveDecoder
 from skyloop.drivers.registry import make_driver
-from skyloop.drivers.video.decoder import PaveDecoder
 from skyloop.emulators.ardrone import ArdroneFirmware, Ports
 from skyloop.emulators.ardrone.settings import with_ardrones
 from skyloop.errors import FileFormatError, MissingExtraError, UnknownNameError, UsageError

@@ -12,7 +12,7 @@ import pytest
 
 from skyloop.messages import Encoding, FrameHeader
 from skyloop.transport.local import packets
-from skyloop.transport.local.frames import MAX_LEASES, FrameExchange
+from skyloop.transport.local.frame_exchange import MAX_LEASES, FrameExchange
 from skyloop.transport.testing import header, picture
 
 

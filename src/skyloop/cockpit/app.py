@@ -31,7 +31,7 @@ from starlette.websockets import WebSocket
 from skyloop.cockpit.access import Gate
 from skyloop.cockpit.admission import Admission
 from skyloop.cockpit.api import Api
-from skyloop.cockpit.control import ControlSession
+from skyloop.cockpit.control_session import ControlSession
 from skyloop.cockpit.fleet import Fleet, Overview
 from skyloop.cockpit.fleet_control import FleetSession
 from skyloop.cockpit.recordings import Recordings

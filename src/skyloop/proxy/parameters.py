@@ -21,7 +21,7 @@ from skyloop.messages.codec import MAX_BODY
 from skyloop.proxy.core.autopilot import AutopilotSettings
 from skyloop.proxy.core.failsafe import FailsafeSettings
 from skyloop.proxy.core.limits import Limits
-from skyloop.proxy.core.zones import BOX, FAR_M, ZONES, Safety, check_written, safety_of
+from skyloop.proxy.core.safety import BOX, FAR_M, ZONES, Safety, check_written, safety_of
 
 MAX_TEXT: Final = 1024  #: characters of a text value
 MAX_PARAMETER: Final = 8192  #: bytes of one encoded parameter: a driver's larger one is left out

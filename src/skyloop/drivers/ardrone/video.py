@@ -285,7 +285,7 @@ class PaveVideo:
 
     def __init__(self) -> None:
         try:
-            from skyloop.drivers.video.decoder import PaveDecoder
+            from skyloop.drivers.pave_decoder import PaveDecoder
         except MissingExtraError as error:
             raise MissingExtraError("the video of an AR.Drone 2", error.extra, cause=str(error.__cause__)) from error
         self._decoder = PaveDecoder()

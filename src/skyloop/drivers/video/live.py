@@ -16,7 +16,7 @@ from skyloop.clock import Clock, nanoseconds
 from skyloop.drivers.backlog import Coded
 from skyloop.drivers.live_clock import LiveClock
 from skyloop.drivers.live_video import Decoded
-from skyloop.drivers.video.decoder import av, limit_memory
+from skyloop.drivers.pave_decoder import av, limit_memory
 from skyloop.errors import UnsupportedError
 
 if TYPE_CHECKING:

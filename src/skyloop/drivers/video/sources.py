@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
-from skyloop.drivers.video.decoder import PaveDecoder, av, limit_memory
+from skyloop.drivers.pave_decoder import PaveDecoder, av, limit_memory
 from skyloop.errors import DriverError, FileFormatError, UsageError
 from skyloop.messages.encoded import H264
 from skyloop.wire.ardrone.pave import Codec, PaveFrame, PaveParser

@@ -32,7 +32,7 @@ from skyloop.proxy.core.authority import Authority
 from skyloop.proxy.core.failsafe import REASONS, FailsafeLadder
 from skyloop.proxy.core.limits import Ceiling, Clamp, Limits
 from skyloop.proxy.core.ownership import Ownership, Whose
-from skyloop.proxy.core.zones import Safety
+from skyloop.proxy.core.safety import Safety
 
 MAX_AHEAD_S: Final = 0.05  #: how far in the future a command's time may lie: the error of the clocks' offset
 _MAX_AHEAD_NS: Final = nanoseconds(MAX_AHEAD_S)

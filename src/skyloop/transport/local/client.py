@@ -16,7 +16,7 @@ from skyloop.transport.base import MAX_PACKET, ClientHandler, Dialer, TransportC
 from skyloop.transport.local import packets
 from skyloop.transport.local.directory import connect, find_directory
 from skyloop.transport.local.packets import OWN
-from skyloop.transport.local.slots import Leases
+from skyloop.transport.local.slot_memory import Leases
 from skyloop.transport.local.sockets import SEND_FLAGS, Socket, credentials, set_timeout
 
 _MAX_RECEIVED: Final = HEADER_SIZE + MAX_BODY + 256  # a frame's packet has a few bytes more than its header's

@@ -31,9 +31,9 @@ from skyloop.transport.base import (
 from skyloop.transport.local import packets
 from skyloop.transport.local.connection import ServerConnection
 from skyloop.transport.local.directory import find_directory
-from skyloop.transport.local.frames import FrameExchange
+from skyloop.transport.local.frame_exchange import FrameExchange
 from skyloop.transport.local.packets import OWN
-from skyloop.transport.local.slots import check_support
+from skyloop.transport.local.slot_memory import check_support
 from skyloop.transport.local.sockets import Credentials, Socket, credentials, may_connect, user_name
 from skyloop.transport.priority_lock import PriorityLock, is_command
 

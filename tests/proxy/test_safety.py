@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from skyloop.clock import NS_PER_S
 from skyloop.errors import ParameterError
 from skyloop.messages import AnyAction, Attitude, EventKind, Feedback, Hover, Refused, SetParameter, Value, Velocity
-from skyloop.proxy.core.zones import BOX, MARGIN_M, ZONES, Box, Cylinder, Safety, check_written, parse_zones, safety_of
+from skyloop.proxy.core.safety import BOX, MARGIN_M, ZONES, Box, Cylinder, Safety, check_written, parse_zones, safety_of
 from skyloop.stepping.rehearsal import Radio, rehearse
 from tests.proxy.fake import Bench
 
@@ -84,7 +84,7 @@ def test_outside_it_may_only_come_back() -> None:
     assert clamp(ROOM, Velocity(-1.0, 0.2), corner)[0] == Velocity(left=-0.5)
 
 
-def test_zones_are_gone_round() -> None:
+def test_safety_are_gone_round() -> None:
     allowed, limits = clamp(PILLAR, Velocity(2.0), at(1.3, 0.0))
     assert allowed.forward == pytest.approx(PILLAR.allowed_speed(0.2, 0.3))
     assert limits == [ZONES]
@@ -153,7 +153,7 @@ def test_an_obedient_vehicle_never_leaves_the_box_nor_enters_the_zone(
             assert math.hypot(x - 1.4, y) > 0.499
 
 
-def test_zones_as_they_are_written() -> None:
+def test_safety_as_they_are_written() -> None:
     assert parse_zones("") == parse_zones(" ; ") == ()
     assert parse_zones("cylinder 1 2 0.5 0 3; box 3,3,2 1 1 0") == (
         Cylinder(1.0, 2.0, 0.5, 0.0, 3.0),
@@ -174,7 +174,7 @@ def test_zones_as_they_are_written() -> None:
         ("cylinder 0 0 1 0 1;" * 33, "at most 32"),
     ],
 )
-def test_zones_that_make_no_sense(text: str, why: str) -> None:
+def test_safety_that_make_no_sense(text: str, why: str) -> None:
     with pytest.raises(ParameterError, match=why):
         parse_zones(text)
 

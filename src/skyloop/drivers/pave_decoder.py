@@ -1,4 +1,4 @@
-"""Decodes the frames of a PaVE stream with PyAV, which only this module of the drivers imports at its top."""
+"""Decodes the frames of a PaVE stream, live or from a file, with PyAV; to be imported only where video is wanted."""
 
 from __future__ import annotations
 

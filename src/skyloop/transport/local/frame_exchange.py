@@ -18,7 +18,7 @@ import numpy as np
 from skyloop.messages import FrameHeader, encode
 from skyloop.transport.base import Pixels
 from skyloop.transport.local import packets
-from skyloop.transport.local.slots import SlotMemory
+from skyloop.transport.local.slot_memory import SlotMemory
 
 MAX_LEASES: Final = 4  #: frames of one camera that one client may have: on the way, or in use
 _Newest = tuple[SlotMemory, bytes]
