@@ -181,7 +181,7 @@ def test_a_private_proxy_that_cannot_start() -> None:
 
 @pytest.mark.process
 def test_a_private_proxy_that_takes_too_long_and_does_not_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(private_proxy, "_GRACE_S", 0.2)
+    monkeypatch.setattr(private_proxy, "GRACE_S", 0.2)
     code = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('x', flush=True); time.sleep(60)"
     proxy = PrivateProxy("fake://", [sys.executable, "-c", code])
     try:

@@ -191,7 +191,7 @@ def test_what_a_library_prints_in_the_recorders_process_does_not_end_its_news(mo
     process._bell = Notifier()
     process._trouble = None
     process._status = Status(state=RecorderState.RECORDING, path="f.mcap")
-    monkeypatch.setattr(process, "_how_it_ended", lambda: "ended with exit code 1")
+    child.ending, child.said = "ended with exit code 1", ""
     process._listen()
     assert process.status.state is RecorderState.FAILED
     assert [one.text.split(";")[0] for one in news] == ["heard", "the recorder's process ended with exit code 1"]

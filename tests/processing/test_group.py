@@ -71,7 +71,7 @@ def test_it_is_over_when_all_are_or_one_can_never_work(tmp_path: Path, codes: tu
 
 
 def test_a_child_that_does_not_end_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("skyloop.processing.group._GRACE_S", 0.05)
+    monkeypatch.setattr("skyloop.processing.group.GRACE_S", 0.05)
     deaf = "import signal, time\nsignal.signal(signal.SIGTERM, signal.SIG_IGN)\n"
     stubborn = f"{deaf}print({LINE!r}, flush=True)\ntime.sleep(60)"
     with Group(command(stubborn), 1, print) as group:

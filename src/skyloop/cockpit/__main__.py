@@ -6,11 +6,11 @@ It prints the page's address as the first line.
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 import threading
 from pathlib import Path
 
+from skyloop.child_process import on_parent_end
 from skyloop.client.connect import network_settings
 from skyloop.cockpit.server import RECORDINGS, serve_cockpit
 from skyloop.errors import SkyloopError
@@ -33,8 +33,7 @@ def main(arguments: list[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     stop = threading.Event()
     if given.parent_fd is not None:
-        watcher = threading.Thread(target=_wait_for_end, args=(given.parent_fd, stop), name="parent", daemon=True)
-        watcher.start()
+        on_parent_end(stop.set, given.parent_fd)
     try:
         serve_cockpit(
             given.names,
@@ -50,16 +49,6 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         pass
     return 0
-
-
-def _wait_for_end(descriptor: int, stop: threading.Event) -> None:
-    """Wait for the end of file that a pipe gives when its writing end is gone, however its owner ended."""
-    try:
-        while os.read(descriptor, 64):
-            pass
-    except OSError as error:
-        print(f"cockpit: descriptor {descriptor} of the parent can't be read: {error}", file=sys.stderr)
-    stop.set()
 
 
 if __name__ == "__main__":

@@ -5,26 +5,23 @@ from __future__ import annotations
 import json
 import os
 import select
-import subprocess
 import sys
-import tempfile
 import time
 import urllib.request
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from skyloop.child_process import ChildProcess
 from skyloop.errors import LinkError
 
-_END_S = 4.0  # to end by itself, before it is told to
 _ASK_S = 2.0
 
 
 class CockpitProcess:
     """Runs ``python -m skyloop.cockpit [NAME]`` as a child process.
 
-    The child ends with :meth:`close`, and with this process however that ends. It has a session of its own: Ctrl-C in
-    the terminal is for the parent.
+    The child ends with :meth:`close`, and with this process, however that ends. Ctrl-C is for the parent.
     """
 
     def __init__(self, name: str | None = None, port: int = 0, recordings: Path | None = None) -> None:
@@ -35,34 +32,12 @@ class CockpitProcess:
             port: The port on loopback; 0 takes a free one.
             recordings: The folder for recordings.
         """
-        self._said = tempfile.TemporaryFile()  # noqa: SIM115  (closed by close())
-        reading, self._alive = os.pipe()
         names = [] if name is None else [name]
         folder = [] if recordings is None else ["--recordings", str(recordings)]
-        try:
-            self._process = subprocess.Popen(
-                [
-                    *(sys.executable, "-m", "skyloop.cockpit", *names, *folder),
-                    *("--port", str(port), "--parent-fd", str(reading)),
-                ],
-                pass_fds=(reading,),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=self._said,
-                start_new_session=True,
-            )
-        except BaseException:
-            os.close(self._alive)
-            self._said.close()
-            raise
-        finally:
-            os.close(reading)
+        command = [sys.executable, "-m", "skyloop.cockpit", *names, *folder]
+        self._process = ChildProcess([*command, "--port", str(port), "--parent-fd", "0"])
+        self.pid = self._process.pid  #: the child's process id
         self._address: str | None = None
-
-    @property
-    def pid(self) -> int:
-        """The child's process id."""
-        return self._process.pid
 
     def address(self, timeout_s: float = 15.0) -> str:
         """Wait until the page is served.
@@ -76,7 +51,6 @@ class CockpitProcess:
         Raises:
             LinkError: It was not served in time, or the child ended; with the last line of its errors.
         """
-        assert self._process.stdout is not None
         deadline = time.monotonic() + timeout_s
         line = b""
         while self._address is None:
@@ -104,29 +78,14 @@ class CockpitProcess:
 
     def close(self) -> None:
         """End the child and wait for it. Idempotent."""
-        if self._alive < 0:
-            return
-        os.close(self._alive)
-        self._alive = -1
-        for harder in (self._process.terminate, self._process.kill):
-            try:
-                self._process.wait(_END_S)
-            except subprocess.TimeoutExpired:
-                harder()
-        self._process.wait()
-        if self._process.stdout is not None:
-            self._process.stdout.close()
-        self._said.close()
+        self._process.close()
 
     def _complaint(self) -> str:
         """Return the last line that the child wrote to its standard error, if it has ended."""
-        try:
-            code = self._process.wait(0.5)
-        except subprocess.TimeoutExpired:
+        code = self._process.wait(0.5)
+        if code is None:
             return "no answer in time"
-        self._said.seek(0)
-        lines = self._said.read().decode(errors="replace").strip().splitlines()
-        return lines[-1] if lines else f"it ended with exit code {code}"
+        return self._process.last_words.rpartition("\n")[2] or f"it ended with exit code {code}"
 
     def __enter__(self) -> Self:
         return self

@@ -12,11 +12,12 @@ import asyncio
 import os
 import sys
 import tempfile
-import threading
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Final
 
+from skyloop.child_process import on_parent_end
 from skyloop.errors import LinkError, RefusedError, SkyloopError, UsageError
 from skyloop.messages import Refusal
 
@@ -108,7 +109,7 @@ def main(arguments: Sequence[str]) -> int:
         The exit code: 0, or 2 with a line of explanation.
     """
     os.nice(NICENESS)
-    threading.Thread(target=_end_with_parent, name="parent", daemon=True).start()
+    on_parent_end(partial(os._exit, 1))
     from skyloop.logfile.reader import Recording
     from skyloop.recording.review.report import write_report
 
@@ -120,12 +121,6 @@ def main(arguments: Sequence[str]) -> int:
         print(error, file=sys.stderr)
         return 2
     return 0
-
-
-def _end_with_parent() -> None:
-    while os.read(sys.stdin.fileno(), 64):
-        pass
-    os._exit(1)
 
 
 if __name__ == "__main__":

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable
-from typing import IO, BinaryIO, Final, cast
+from typing import BinaryIO, Final, cast
 
 import msgspec
 
+from skyloop.child_process import ChildProcess
 from skyloop.errors import LinkError, MissingExtraError
 from skyloop.motion_capture.address import System
 from skyloop.motion_capture.worker import MISSING, RawFrame, read
@@ -19,7 +18,6 @@ from skyloop.motion_capture.worker import MISSING, RawFrame, read
 AGAIN_S: Final = 0.5  #: pause before a child that ended is restarted
 SILENT_S: Final = 3.0  #: a child that sends nothing for so long is killed: its system may have been restarted
 FIRST_S: Final = 10.0  #: the same before its first frame
-_TAIL: Final = 2000  #: bytes of a child's standard error that an error shows
 
 
 class ChildSource:
@@ -48,7 +46,7 @@ class ChildSource:
         self._take = take
         self._trouble = trouble
         self._command = command
-        self._child: subprocess.Popen[bytes] | None = None
+        self._child: ChildProcess | None = None
         self._heard_s = 0.0
         self._ended = threading.Event()
         self._first = threading.Event()
@@ -91,9 +89,7 @@ class ChildSource:
 
     def _run(self) -> None:
         while not self._ended.is_set():
-            with tempfile.TemporaryFile() as messages:
-                code = self._listen(messages)
-                self._said = _tail(messages)
+            code = self._listen()
             if code == MISSING:
                 cause = self._said.removeprefix(": ")
                 self._failed = MissingExtraError(f"{self._system.kind} motion capture", "mocap", cause=cause)
@@ -103,19 +99,11 @@ class ChildSource:
                 self._trouble(f"{self._system.address} is not heard{self._said}; trying again")
             self._ended.wait(AGAIN_S)
 
-    def _listen(self, messages: IO[bytes]) -> int:
+    def _listen(self) -> int | None:
         """Run one child from its start to its end; return its exit code."""
         settings = msgspec.json.encode(self._system.configuration).decode()
         self._heard_s = time.monotonic() + FIRST_S - SILENT_S
-        child = subprocess.Popen(
-            [*self._command, self._system.kind, settings],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=messages,
-            start_new_session=True,
-        )
-        self._child = child
-        assert child.stdout is not None
+        child = self._child = ChildProcess([*self._command, self._system.kind, settings])
         if self._ended.is_set():  # closed between two children
             child.kill()
         try:
@@ -127,8 +115,9 @@ class ChildSource:
             self._trouble(f"{self._system.address}: {error}")
         finally:
             child.kill()
-            child.stdout.close()
-        return child.wait()
+            child.close()
+            self._said = f": {child.last_words}" if child.last_words else ""
+        return child.code
 
     def _watch(self) -> None:
         """Kill a child that has fallen silent: the native code would wait for ever."""
@@ -137,13 +126,5 @@ class ChildSource:
                 self._kill()
 
     def _kill(self) -> None:
-        child = self._child
-        if child is not None and child.poll() is None:
-            child.kill()
-
-
-def _tail(messages: IO[bytes]) -> str:
-    size = messages.seek(0, 2)
-    messages.seek(max(0, size - _TAIL))
-    text = messages.read().decode(errors="replace").strip()
-    return f": {text}" if text else ""
+        if self._child is not None:
+            self._child.kill()

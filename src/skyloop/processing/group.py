@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import subprocess
 import sys
 import threading
 import time
@@ -14,10 +13,10 @@ from typing import Final, Self
 
 import msgspec
 
+from skyloop.child_process import GRACE_S, ChildProcess, on_parent_end
 from skyloop.processing.status import Status, together
 
 _PAUSE_S: Final = 1.0  #: time before a worker that died is restarted
-_GRACE_S: Final = 4.0  #: time for a child to end by itself, before a signal
 USAGE_ERROR: Final = 2  #: exit code of a child that can't work at all; it prints why
 
 
@@ -31,44 +30,35 @@ class Child:
             command: Its command line; it prints a :class:`Status` as JSON on a line of standard output now and then.
         """
         self.status: Status | None = None
-        # A session of its own: Ctrl-C in the terminal reaches only the parent, which then ends the children.
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True)
+        self._process = ChildProcess(command, keep_errors=False)
+        self.pid = self._process.pid  #: process id
         self._thread = threading.Thread(target=self._listen, name="skyloop-worker", daemon=True)
         self._thread.start()
 
     @property
-    def pid(self) -> int:
-        """Process id."""
-        return self._process.pid
-
-    @property
     def code(self) -> int | None:
         """Exit code, negative for a signal; None while it runs."""
-        return self._process.poll()
+        return self._process.code
+
+    @property
+    def ending(self) -> str:
+        """How it ended, for people."""
+        return self._process.ending
 
     def part(self) -> None:
         """Ask it to end, by closing its standard input. Does not wait."""
-        assert self._process.stdin is not None
-        with contextlib.suppress(OSError):
-            self._process.stdin.close()
+        self._process.part()
 
     def end(self) -> None:
         """End it and wait; after 4 s it is terminated, after another 4 s killed."""
-        self.part()
-        for harder in (self._process.terminate, self._process.kill):
-            try:
-                self._process.wait(_GRACE_S)
-            except subprocess.TimeoutExpired:
-                harder()
-        self._process.wait()
+        self._process.end(GRACE_S, GRACE_S)
         self._thread.join()
+        self._process.close()
 
     def _listen(self) -> None:
-        assert self._process.stdout is not None
-        with self._process.stdout as lines:
-            for text in lines:
-                with contextlib.suppress(msgspec.DecodeError):  # the user's code may print there too
-                    self.status = msgspec.json.decode(text, type=Status)
+        for text in self._process.stdout:
+            with contextlib.suppress(msgspec.DecodeError):  # the user's code may print there too
+                self.status = msgspec.json.decode(text, type=Status)
 
 
 class Group:
@@ -118,10 +108,7 @@ class Group:
         return 0 if all(code == 0 for code in codes) else None
 
     def _bury(self, number: int, child: Child) -> None:
-        code = child.code
-        assert code is not None
-        how = f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
-        self._tell(f"worker {number + 1} {how}: the others have its share until it is started anew")
+        self._tell(f"worker {number + 1} {child.ending}: the others have its share until it is started anew")
         child.end()
         self._children[number] = None
         self._due_s[number] = time.monotonic() + self._pause_s
@@ -149,15 +136,12 @@ def end_with_parent(stop: Callable[[], None]) -> None:
     ``stop`` runs on a thread of its own.
     """
 
-    def watch() -> None:
-        with contextlib.suppress(OSError):
-            while os.read(0, 64):
-                pass
+    def end() -> None:
         stop()
-        time.sleep(_GRACE_S / 2)
+        time.sleep(GRACE_S / 2)
         os._exit(1)  # the user's code hangs, and the parent can't end this process any more
 
-    threading.Thread(target=watch, name="skyloop-parent", daemon=True).start()
+    on_parent_end(end)
 
 
 def child_command(arguments: Sequence[str]) -> list[str]:

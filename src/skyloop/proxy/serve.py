@@ -14,6 +14,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
+from skyloop.child_process import on_parent_end
 from skyloop.clock import monotonic_ns, nanoseconds
 from skyloop.drivers.registry import make_driver
 from skyloop.errors import UsageError
@@ -148,8 +149,7 @@ def run(
         for proxy in proxies:
             proxy.start()
         if parent_fd is not None:
-            watching = partial(_await_parent, parent_fd, shutdown)
-            threading.Thread(target=watching, name="skyloop-parent", daemon=True).start()
+            on_parent_end(partial(shutdown.request, "its parent process ended", hurry=True), parent_fd)
         lines = [_announced(proxy) for proxy in proxies]
         # Looks up now and then: the kernel may hand a signal to any thread, and that does not wake this one.
         while not shutdown.requested.wait(_POLL_S):
@@ -210,15 +210,6 @@ def _check_descriptor(descriptor: int) -> None:
         os.fstat(descriptor)
     except OSError:
         raise UsageError(f"file descriptor {descriptor} is not open: give the reading end of a pipe") from None
-
-
-def _await_parent(descriptor: int, shutdown: _Shutdown) -> None:
-    try:
-        while os.read(descriptor, 64):
-            pass
-    except OSError:  # closed under us: as good as gone
-        pass
-    shutdown.request("its parent process ended", hurry=True)
 
 
 def _announced(proxy: Proxy) -> LinkLines:

@@ -6,17 +6,16 @@ import contextlib
 import logging
 import os
 import signal
-import subprocess
 import sys
-import tempfile
 import threading
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO, Final
+from typing import Final
 
 import msgspec
 
+from skyloop.child_process import ChildProcess, on_parent_end
 from skyloop.client import connect
 from skyloop.client.mailbox import Notifier
 from skyloop.errors import LinkError, MissingExtraError, NoAnswerError, SkyloopError, UsageError
@@ -30,7 +29,6 @@ _END_S: Final = 15.0  # to write what was received, before the child is terminat
 _HARDER_S: Final = 3.0
 _TELL_S: Final = 0.25
 _NICE: Final = 5  # the flight comes first
-_TAIL: Final = 2000
 _log = logging.getLogger(__name__)
 
 
@@ -65,7 +63,7 @@ def run_child(order: Order) -> int:
     """
     stop = threading.Event()
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
-    threading.Thread(target=_watch_parent, args=(stop,), name="parent", daemon=True).start()
+    on_parent_end(stop.set)
     if hasattr(os, "nice"):
         os.nice(_NICE)
     news: deque[News] = deque()  # sent by this thread, so that a parent that does not read never blocks the writing
@@ -86,14 +84,6 @@ def run_child(order: Order) -> int:
     return 0
 
 
-def _watch_parent(stop: threading.Event) -> None:
-    """Set ``stop`` when standard input ends: the parent holds its other end, so it ends with the parent."""
-    with contextlib.suppress(OSError):
-        while os.read(0, 64):
-            pass
-    stop.set()
-
-
 def _report(engine: Engine, news: deque[News]) -> None:
     while news:
         _say(Line(news=news.popleft()))
@@ -110,10 +100,7 @@ def _say(line: Line) -> None:
 
 
 class RecorderProcess:
-    """A child process that records; it ends with :meth:`stop`, and with this process, however that ends.
-
-    It has its own session, so that Ctrl-C in the terminal reaches only the application.
-    """
+    """A child process that records; it ends with :meth:`stop`, and with this process, however that ends."""
 
     def __init__(self, order: Order, hear: Callable[[News], None] = lambda _: None) -> None:
         """Start the child, and wait until it records.
@@ -132,18 +119,7 @@ class RecorderProcess:
         self._trouble: Line | None = None
         self._bell = Notifier()
         self._ended = False
-        self._complaints: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115  (closed by stop())
-        try:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", "skyloop.recording", msgspec.json.encode(order).decode()],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=self._complaints,
-                start_new_session=True,
-            )
-        except BaseException:
-            self._complaints.close()
-            raise
+        self._process = ChildProcess([sys.executable, "-m", "skyloop.recording", msgspec.json.encode(order).decode()])
         self._thread = threading.Thread(target=self._listen, name="skyloop-recorder", daemon=True)
         self._thread.start()
         try:
@@ -170,20 +146,9 @@ class RecorderProcess:
 
         A child that does not end in time is terminated, then killed.
         """
-        process = self._process
-        if process.stdin is not None and not process.stdin.closed:
-            with contextlib.suppress(OSError):
-                process.stdin.close()
-        wait_s = _END_S
-        for harder in (process.terminate, process.kill):
-            try:
-                process.wait(wait_s)
-            except subprocess.TimeoutExpired:
-                harder()
-                wait_s = _HARDER_S
-        process.wait()
+        self._process.end(_END_S, _HARDER_S)
         self._thread.join()
-        self._complaints.close()
+        self._process.close()
 
     def _wait_for_start(self) -> None:
         def decided() -> bool:
@@ -197,14 +162,12 @@ class RecorderProcess:
             raise LinkError(f"the recorder's process {self._how_it_ended()}")
 
     def _listen(self) -> None:
-        assert self._process.stdout is not None
-        with self._process.stdout as lines:
-            for text in lines:
-                try:
-                    self._take(msgspec.json.decode(text, type=Line))
-                except Exception as error:  # noqa: BLE001  (a library may print anything, a callback raise anything)
-                    _log.warning("the recorder's process: %r: %r", text[:200], error)
-                self._bell.notify()
+        for text in self._process.stdout:
+            try:
+                self._take(msgspec.json.decode(text, type=Line))
+            except Exception as error:  # noqa: BLE001  (a library may print anything, a callback raise anything)
+                _log.warning("the recorder's process: %r: %r", text[:200], error)
+            self._bell.notify()
         self._process.wait()
         self._ended = True
         if self._trouble is None and self._status.state not in (RecorderState.CLOSED, RecorderState.FAILED):
@@ -223,12 +186,7 @@ class RecorderProcess:
             self._trouble = line
 
     def _how_it_ended(self) -> str:
-        code = self._process.returncode
-        how = f"was killed by signal {-code}" if code is not None and code < 0 else f"ended with exit code {code}"
-        self._complaints.seek(0, os.SEEK_END)
-        self._complaints.seek(max(0, self._complaints.tell() - _TAIL))
-        said = self._complaints.read().decode(errors="replace").strip()
-        return f"{how}; it said:\n{said}" if said else how
+        return f"{self._process.ending}{self._process.said}"
 
 
 def check_installed() -> None:
