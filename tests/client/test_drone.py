@@ -28,6 +28,7 @@ from skyloop.messages import (
     Statistics,
     Takeoff,
     Text,
+    VehiclePose,
 )
 from skyloop.transport.base import ANNOTATIONS, COMMANDS, video
 from tests.client.scripted import WAIT_S, ScriptedProxy, background, flown, scripted
@@ -202,6 +203,17 @@ def test_callbacks_with_frames_are_listeners_like_the_others(proxy: ScriptedProx
     proxy.frame(1, "bottom")
     drone.wait(lambda _: raising.errors == 1, WAIT_S)
     assert [event.data["where"] for event in events if event.kind is EventKind.CALLBACK_ERROR] == ["frames of bottom"]
+
+
+def test_a_pose_from_outside_goes_to_the_proxy_as_it_is(proxy: ScriptedProxy, drone: Drone) -> None:
+    quaternion = (0.1, 0.3, 0.5, 0.8062257748298549)
+    assert drone.send_external_pose((1.0, 2.0, 3.0), quaternion, at_ns=7, position_std_m=0.01)
+    proxy.until(lambda: bool(proxy.others))
+    assert proxy.others == [VehiclePose(7, (1.0, 2.0, 3.0), quaternion, 0.01)]
+    with pytest.raises(UsageError, match=r"quaternion must have 4 finite numbers \(x, y, z, w\), got \(0, 0, 1\)"):
+        drone.send_external_pose((1.0, 2.0, 3.0), (0, 0, 1))  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match=r"must have length 1, got 0\.5"):
+        drone.send_external_pose((1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 0.5))
 
 
 def test_frames_that_cannot_be_understood(proxy: ScriptedProxy, drone: Drone) -> None:

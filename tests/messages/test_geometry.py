@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from skyloop.messages import Feedback
-from skyloop.messages.geometry import euler_from_rotation, rotation_from_euler, wrap_angle
+from skyloop.messages.geometry import euler_from_rotation, quaternion_from_euler, rotation_from_euler, wrap_angle
 
 angles = st.floats(-math.pi + 1e-6, math.pi - 1e-6)
 pitches = st.floats(-math.pi / 2 + 1e-3, math.pi / 2 - 1e-3)
@@ -34,6 +35,12 @@ def test_there_and_back(roll: float, pitch: float, yaw: float) -> None:
     assert rotation @ rotation.T == pytest.approx(np.eye(3), abs=1e-12)
     assert np.linalg.det(rotation) == pytest.approx(1.0)
     assert euler_from_rotation(rotation) == pytest.approx((roll, pitch, yaw), abs=1e-6)
+
+
+@given(angles, pitches, angles)
+def test_a_quaternion_is_scipys(roll: float, pitch: float, yaw: float) -> None:
+    rotation = Rotation.from_quat(quaternion_from_euler(roll, pitch, yaw))  # x, y, z, w
+    assert rotation.as_matrix() == pytest.approx(rotation_from_euler(roll, pitch, yaw), abs=1e-9)
 
 
 @given(st.floats(-100, 100))

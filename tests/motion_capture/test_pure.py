@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from skyloop.errors import UnknownNameError, UsageError
+from skyloop.messages.geometry import quaternion_from_euler
 from skyloop.motion_capture import BodyPose, TrackState, calibrate, parse_system
-from skyloop.motion_capture.calibration import mean_quaternion, quaternion_of
+from skyloop.motion_capture.calibration import mean_quaternion
 from skyloop.motion_capture.pose import Quaternion, Vector, matrix, multiply, plausible, z_up
 from skyloop.motion_capture.tracking import Track
 from skyloop.motion_capture.worker import LENGTH, RawFrame, read, write
@@ -82,7 +83,7 @@ def test_y_up_becomes_z_up_and_what_stands_keeps_standing() -> None:
 
 @given(angles, st.floats(-1.5, 1.5), angles)
 def test_quaternions_agree_with_scipy(roll: float, pitch: float, yaw: float) -> None:
-    ours = quaternion_of(roll, pitch, yaw)
+    ours = quaternion_from_euler(roll, pitch, yaw)
     theirs = Rotation.from_euler("ZYX", [yaw, pitch, roll])
     assert np.allclose(matrix(ours), theirs.as_matrix(), atol=1e-9)
     pose = BodyPose("a", 0, (1.0, 2.0, 3.0), ours)
@@ -153,7 +154,7 @@ def at_rest(turn: Quaternion, *, noise_m: float = 0.0002, noise_rad: float = 0.0
     rng = np.random.default_rng(5)
     poses = []
     for n in range(count):
-        shake = quaternion_of(*rng.normal(0.0, noise_rad, 3).tolist())
+        shake = quaternion_from_euler(*rng.normal(0.0, noise_rad, 3).tolist())
         x, y, z = (np.array([1.0, 2.0, 0.1]) + rng.normal(0.0, noise_m, 3)).tolist()
         sign = 1.0 if n % 2 else -1.0  # both signs are one turn
         a, b, c, d = multiply(turn, shake)
@@ -165,18 +166,18 @@ def at_rest(turn: Quaternion, *, noise_m: float = 0.0002, noise_rad: float = 0.0
 def test_a_calibration_finds_the_drones_attitude_whatever_the_bodys_axes(
     a: float, b: float, c: float, roll: float, pitch: float, heading: float
 ) -> None:
-    poses = at_rest(quaternion_of(a, b, c), count=40)
+    poses = at_rest(quaternion_from_euler(a, b, c), count=40)
     found = calibrate(poses, roll=roll, pitch=pitch, yaw=heading + 0.5, heading=heading)
     drone = found.apply(poses[0])
-    wanted = Rotation.from_quat(quaternion_of(roll, pitch, heading))
+    wanted = Rotation.from_quat(quaternion_from_euler(roll, pitch, heading))
     assert (wanted.inv() * drone.rotation).magnitude() < 0.01
     assert found.yaw_offset == pytest.approx(0.5)
     assert found.poses == 40
 
 
 def test_the_mean_turn_is_that_of_the_middle() -> None:
-    mean = mean_quaternion([pose.quaternion for pose in at_rest(quaternion_of(0.1, 0.2, 0.3))])
-    apart = Rotation.from_quat(mean).inv() * Rotation.from_quat(quaternion_of(0.1, 0.2, 0.3))
+    mean = mean_quaternion([pose.quaternion for pose in at_rest(quaternion_from_euler(0.1, 0.2, 0.3))])
+    apart = Rotation.from_quat(mean).inv() * Rotation.from_quat(quaternion_from_euler(0.1, 0.2, 0.3))
     assert apart.magnitude() < 0.0005
 
 

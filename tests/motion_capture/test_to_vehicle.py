@@ -72,16 +72,18 @@ def test_an_autopilot_without_gps_flies_by_them() -> None:
 
 def test_who_may_tell_and_what() -> None:
     with skyloop.connect("sim://?cameras=none") as drone:
-        with pytest.raises(UsageError, match="three and four finite numbers"):
-            drone.tell_pose((0.0, 0.0, float("nan")), (0.0, 0.0, 0.0, 1.0))
+        with pytest.raises(UsageError, match=r"position must have 3 finite numbers \(x, y, z\), got \(0"):
+            drone.send_external_pose((0.0, 0.0, float("nan")), (0.0, 0.0, 0.0, 1.0))
         with pytest.raises(UsageError, match=r"attitude_std_rad is -0\.1 and must be 0 or more"):
-            drone.tell_pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), attitude_std_rad=-0.1)
+            drone.send_external_pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), attitude_std_rad=-0.1)
+        with pytest.raises(UsageError, match=r"quaternion must have 4 finite numbers \(x, y, z, w\), got \(0, 0, 1\)"):
+            drone.send_external_pose((0.0, 0.0, 0.0), (0, 0, 1))  # type: ignore[arg-type]
         told: list[str] = []
         with drone.on_event(lambda event: told.append(event.text), inline=True):
-            assert drone.tell_pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+            assert drone.send_external_pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
             wait_until(lambda: any("sim:// takes no poses from outside" in text for text in told), "it was told")
         with (
             skyloop.connect(drone.name, access="observe") as onlooker,
             pytest.raises(AuthorityError, match="this application observes"),
         ):
-            onlooker.tell_pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+            onlooker.send_external_pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))

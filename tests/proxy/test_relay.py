@@ -11,7 +11,7 @@ from skyloop.errors import DriverError
 from skyloop.messages import EventKind, GetStatistics, Role, Statistics, VehiclePose, encode
 from tests.proxy.fake import App, Bench
 
-POSE = VehiclePose(3_000, (1.0, 2.0, 3.0), (0.0, 0.0, 0.6, 0.8), 0.001, 0.01)
+POSE = VehiclePose(3_000, (1.0, 2.0, 3.0), (0.1, 0.3, 0.5, 0.8062257748298549), 0.001, 0.01)
 
 
 @pytest.fixture
@@ -31,7 +31,7 @@ def test_a_pilots_pose_reaches_the_driver_without_the_authority(bench: Bench, ta
     app = bench.join("mocap")
     assert app.end.send(encode(POSE))
     app.sync()
-    assert taken == [ExternalPose((1.0, 2.0, 3.0), (0.8, 0.0, 0.0, 0.6), 3_000, 0.001, 0.01)]
+    assert taken == [ExternalPose((1.0, 2.0, 3.0), (0.1, 0.3, 0.5, 0.8062257748298549), 3_000, 0.001, 0.01)]
     assert refusals(app) == []
     counts = app.ask(GetStatistics())
     assert isinstance(counts, Statistics)

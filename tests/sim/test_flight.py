@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from skyloop.errors import UsageError
 from skyloop.messages import (
@@ -370,11 +371,12 @@ def test_poses_are_those_of_the_truth() -> None:
     assert rotations.shape == (3, 3, 3)
     for drone in range(3):
         truth = simulation.truth(drone)
-        w, x, y, z = truth.quaternion
+        x, y, z, w = truth.quaternion
         assert positions[drone] == pytest.approx(truth.position_m)
         assert rotations[drone].T @ rotations[drone] == pytest.approx(np.eye(3))
         assert rotations[drone][2, 2] == pytest.approx(1 - 2 * (x * x + y * y))
         assert rotations[drone][1, 0] == pytest.approx(2 * (x * y + w * z))
+        assert Rotation.from_quat(truth.quaternion).as_matrix() == pytest.approx(rotations[drone])
 
 
 def test_a_flying_drone_can_be_put_elsewhere_and_holds_that_place() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Set
 from contextlib import contextmanager
@@ -85,6 +84,7 @@ from skyloop.messages import (
     encode,
 )
 from skyloop.messages.annotation import Shape
+from skyloop.messages.pose import check_pose
 from skyloop.messages.result import MAX_CODE
 from skyloop.messages.video import DEFAULT_QUALITY, VideoEncoding, VideoRequest
 from skyloop.transport.base import EVENTS, FEEDBACK, Dialer
@@ -497,7 +497,7 @@ class Drone:
         """Leave the emergency state, on the ground."""
         return self._command(ResetEmergency())
 
-    def tell_pose(
+    def send_external_pose(
         self,
         position: Vector,
         quaternion: tuple[float, float, float, float],
@@ -523,17 +523,13 @@ class Drone:
 
         Raises:
             AuthorityError: If this application only observes.
-            UsageError: If a number is missing or not finite, a standard deviation is negative, or ``at_ns`` is out of
-                range.
+            UsageError: If a number is missing or not finite, a standard deviation is negative, the quaternion's length
+                differs from 1 by more than 0.001, or ``at_ns`` is out of range.
         """
         if self._role is not Role.PILOT:
-            raise AuthorityError('tell_pose: this application observes; connect with access="pilot"', code="observer")
-        numbers = (*position, *quaternion, position_std_m or 0.0, attitude_std_rad or 0.0)
-        if len(position) != 3 or len(quaternion) != 4 or not all(map(math.isfinite, numbers)):
-            raise UsageError(f"a pose has three and four finite numbers, not {position!r} and {quaternion!r}")
-        for name, value in (("position_std_m", position_std_m), ("attitude_std_rad", attitude_std_rad)):
-            if value is not None and value < 0.0:
-                raise UsageError(f"{name} is {value!r} and must be 0 or more, or None where it is not known")
+            text = 'send_external_pose: this application observes; connect with access="pilot"'
+            raise AuthorityError(text, code="observer")
+        check_pose(position, quaternion, position_std_m, attitude_std_rad)
         known_ns = self.now_ns if at_ns is None else checked_time(at_ns)
         pose = VehiclePose(known_ns, position, quaternion, position_std_m, attitude_std_rad)
         return self._connection.transmit(encode(pose))

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
-from skyloop.errors import UsageError
 from skyloop.messages import Vector
+from skyloop.messages.pose import check_pose
 
 
 @dataclass(frozen=True, slots=True)
@@ -15,7 +14,7 @@ class ExternalPose:
 
     Args:
         position: Of the body's origin in world axes, x east, y north, z up [m].
-        quaternion: (w, x, y, z), rotates body axes (x forward, y left, z up) to world axes.
+        quaternion: (x, y, z, w), rotates body axes (x forward, y left, z up) to world axes.
         captured_ns: When it was measured, on this host's monotonic clock.
         position_std_m: Standard deviation of the position [m], 0 or more; None if it is not known.
         attitude_std_rad: Standard deviation of the orientation [rad], 0 or more; None if it is not known.
@@ -32,15 +31,7 @@ class ExternalPose:
     attitude_std_rad: float | None = None
 
     def __post_init__(self) -> None:
-        numbers = (*self.position, *self.quaternion, self.position_std_m or 0.0, self.attitude_std_rad or 0.0)
-        if len(self.position) != 3 or len(self.quaternion) != 4 or not all(map(math.isfinite, numbers)):
-            raise UsageError(f"a pose has three and four finite numbers, not {self.position!r} and {self.quaternion!r}")
-        if abs(math.hypot(*self.quaternion) - 1.0) > 1e-3:
-            raise UsageError(f"a quaternion of a rotation has the length 1, not {math.hypot(*self.quaternion):.4g}")
-        for name in ("position_std_m", "attitude_std_rad"):
-            value = getattr(self, name)
-            if value is not None and value < 0.0:
-                raise UsageError(f"{name} is {value!r} and must be 0 or more, or None where it is not known")
+        check_pose(self.position, self.quaternion, self.position_std_m, self.attitude_std_rad)
 
 
 @dataclass(frozen=True, slots=True)

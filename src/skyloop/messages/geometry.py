@@ -32,7 +32,7 @@ def rotation_from_euler(roll: float, pitch: float, yaw: float) -> NDArray[np.flo
 
 
 def quaternion_from_euler(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
-    """Return the rotation of :func:`rotation_from_euler` as a unit quaternion (w, x, y, z).
+    """Return the rotation of :func:`rotation_from_euler` as a unit quaternion (x, y, z, w), as in SciPy and ROS.
 
     Args:
         roll: About x, right side down positive [rad].
@@ -43,10 +43,10 @@ def quaternion_from_euler(roll: float, pitch: float, yaw: float) -> tuple[float,
     cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
     cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
     return (
-        cr * cp * cy + sr * sp * sy,
         sr * cp * cy - cr * sp * sy,
         cr * sp * cy + sr * cp * sy,
         cr * cp * sy - sr * sp * cy,
+        cr * cp * cy + sr * sp * sy,
     )
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.errors import UsageError
+from skyloop.messages.geometry import quaternion_from_euler
 from skyloop.motion_capture.pose import BodyPose, Quaternion, multiply
 
 REST_S: Final = 2.0
@@ -77,26 +78,9 @@ def calibrate(
             f"the poses are spread by {spread_m * 1e3:.1f} mm and {math.degrees(spread_rad):.2f}°, at most "
             f"{max_spread_m * 1e3:.1f} mm and {math.degrees(max_spread_rad):.2f}° are allowed: let it stand still"
         )
-    stands = quaternion_of(roll, pitch, heading)
+    stands = quaternion_from_euler(roll, pitch, heading)
     offset = None if yaw is None else math.remainder(yaw - heading, math.tau)
     return Calibration(multiply(conjugate(mean), stands), spread_m, spread_rad, len(poses), offset)
-
-
-def quaternion_of(roll: float, pitch: float, yaw: float) -> Quaternion:
-    """Return the rotation about the body's x, then y, then z axis (ROS REP 103; pitch positive with the nose down).
-
-    Args:
-        roll: [rad]
-        pitch: [rad]
-        yaw: [rad]
-
-    Returns:
-        x, y, z, w.
-    """
-    x: Quaternion = (math.sin(roll / 2), 0.0, 0.0, math.cos(roll / 2))
-    y: Quaternion = (0.0, math.sin(pitch / 2), 0.0, math.cos(pitch / 2))
-    z: Quaternion = (0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
-    return multiply(z, multiply(y, x))
 
 
 def conjugate(quaternion: Quaternion) -> Quaternion:

@@ -261,7 +261,8 @@ class MotionCapture:
         Args:
             drone: Its proxy's name must be one of ``bodies``.
             max_hz: Greatest rate of the logged poses, 1 to 1000.
-            to_vehicle: Whether to send the poses to the vehicle too (:meth:`Drone.tell_pose`), which may fly by them.
+            to_vehicle: Whether to send the poses to the vehicle too (:meth:`Drone.send_external_pose`), which may fly
+                by them.
 
         Returns:
             A context manager; poses are logged within its block.
@@ -421,7 +422,7 @@ class Linked:
         values = (*pose.position, *pose.quaternion, *(pose.velocity or ()))
         at_ns = pose.captured_ns + self._drone.clock_offset_ns
         if self._to_vehicle:  # first, as the vehicle flies by it
-            self._drone.tell_pose(pose.position, pose.quaternion, at_ns=at_ns)
+            self._drone.send_external_pose(pose.position, pose.quaternion, at_ns=at_ns)
         self._drone.log.array(MOCAP, values, at_ns=at_ns)
 
     def _event(self, event: TrackEvent) -> None:

@@ -7,7 +7,7 @@ from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 from skyloop.errors import UnsupportedError
-from skyloop.motion_capture.calibration import quaternion_of
+from skyloop.messages.geometry import quaternion_from_euler
 from skyloop.motion_capture.worker import RawFrame
 
 if TYPE_CHECKING:
@@ -78,4 +78,4 @@ def true_pose(
         )
     except (KeyError, TypeError, ValueError):
         return None
-    return (x, y, z), quaternion_of(roll, pitch, yaw)
+    return (x, y, z), quaternion_from_euler(roll, pitch, yaw)

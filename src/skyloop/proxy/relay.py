@@ -59,10 +59,11 @@ class Relay:
         if session.role is not Role.PILOT:
             self._refuse_pose(session, Refusal.OBSERVER, "observers tell a vehicle nothing: connect as a pilot")
             return
-        x, y, z, w = pose.quaternion
         try:
             self._driver.external_pose(
-                ExternalPose(pose.position, (w, x, y, z), pose.captured_ns, pose.position_std_m, pose.attitude_std_rad)
+                ExternalPose(
+                    pose.position, pose.quaternion, pose.captured_ns, pose.position_std_m, pose.attitude_std_rad
+                )
             )
         except UsageError as error:
             self._refuse_pose(session, Refusal.NON_FINITE, str(error))

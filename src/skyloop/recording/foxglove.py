@@ -5,7 +5,6 @@ Pure. Needs the extra ``record``. Times are Unix ns; frames are named as in :mod
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
@@ -14,6 +13,7 @@ from skyloop.logfile.layout import WORLD, optical_frame
 from skyloop.messages import Annotation, CameraInfo, Feedback, Intrinsics, Points, Polyline, Severity
 from skyloop.messages.annotation import Colour, Point, Shape, Text
 from skyloop.messages.encoded import H264
+from skyloop.messages.geometry import quaternion_from_euler
 
 try:
     from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
@@ -161,15 +161,8 @@ def pose(feedback: Feedback) -> Pose | None:
 
 def quaternion(roll: float, pitch: float, yaw: float) -> Quaternion:
     """Return the quaternion of the rotation Rz(yaw) · Ry(pitch) · Rx(roll), angles in rad."""
-    cr, sr = math.cos(roll / 2), math.sin(roll / 2)
-    cp, sp = math.cos(pitch / 2), math.sin(pitch / 2)
-    cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
-    return Quaternion(
-        x=cy * cp * sr - sy * sp * cr,
-        y=cy * sp * cr + sy * cp * sr,
-        z=sy * cp * cr - cy * sp * sr,
-        w=cy * cp * cr + sy * sp * sr,
-    )
+    x, y, z, w = quaternion_from_euler(roll, pitch, yaw)
+    return Quaternion(x=x, y=y, z=z, w=w)
 
 
 def pose_of(values: Sequence[float]) -> Pose:

@@ -41,7 +41,7 @@ class VehicleTruth:
     roll_rad: float
     pitch_rad: float
     yaw_rad: float
-    quaternion: tuple[float, float, float, float]  #: w, x, y, z, world from body
+    quaternion: tuple[float, float, float, float]  #: x, y, z, w, world from body
     angular_velocity_rad_s: Vec3  #: about the body's axes
     thrust: float  #: of the weight, before ground effect
     wind_m_s: Vec3

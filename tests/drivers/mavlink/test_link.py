@@ -225,7 +225,7 @@ def test_poses_from_outside_make_it_fly_without_gps(kind: Kind, pose: str) -> No
         def capture() -> None:
             while not stop.wait(0.02):
                 captured_ns = sink.newest.captured_ns if sink.newest is not None else 0
-                driver.external_pose(ExternalPose((0.0, 0.0, 0.1), (1.0, 0.0, 0.0, 0.0), captured_ns, 0.001, 0.01))
+                driver.external_pose(ExternalPose((0.0, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0), captured_ns, 0.001, 0.01))
 
         thread = threading.Thread(target=capture)
         thread.start()
@@ -239,22 +239,22 @@ def test_poses_from_outside_make_it_fly_without_gps(kind: Kind, pose: str) -> No
 
 def test_poses_are_checked() -> None:
     with pytest.raises(UsageError, match="length 1"):
-        ExternalPose((0.0, 0.0, 0.0), (2.0, 0.0, 0.0, 0.0), 0)
+        ExternalPose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 2.0), 0)
     with pytest.raises(UsageError, match="finite"):
-        ExternalPose((float("nan"), 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0)
+        ExternalPose((float("nan"), 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), 0)
     for wrong in ({"position_std_m": -0.1}, {"attitude_std_rad": -0.1}):
         with pytest.raises(UsageError, match=f"{next(iter(wrong))} is -0.1 and must be 0 or more"):
-            ExternalPose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0, **wrong)
+            ExternalPose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), 0, **wrong)
     nobody = f"mavlink://udpin:127.0.0.1:{Ports.free(Kind.PX4).remote}"
     with opened(nobody) as (driver, _), pytest.raises(DriverError, match="not heard"):
-        driver.external_pose(ExternalPose((0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0))
+        driver.external_pose(ExternalPose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), 0))
 
 
 def test_a_vehicle_that_takes_no_poses_says_so() -> None:
     from skyloop.drivers.registry import make_driver
 
     with pytest.raises(UnsupportedError, match="sim://"):
-        make_driver("sim://?cameras=none").external_pose(ExternalPose((0.0,) * 3, (1.0, 0.0, 0.0, 0.0), 0))
+        make_driver("sim://?cameras=none").external_pose(ExternalPose((0.0,) * 3, (0.0, 0.0, 0.0, 1.0), 0))
 
 
 def test_a_camera_beside_the_autopilot_shows_its_newest_picture() -> None:

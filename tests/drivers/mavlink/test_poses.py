@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 
 import pytest
+from scipy.spatial.transform import Rotation
 
 from skyloop.drivers.mavlink.microservices import pose_message
 from skyloop.drivers.mavlink.options import PoseMessage
 from skyloop.drivers.seams import ExternalPose
 from skyloop.messages.geometry import quaternion_from_euler
-from skyloop.wire.mavlink.axes import angles_of
+from skyloop.wire.mavlink.axes import angles_of, from_wire
 
 #: 1 m east, 2 m north, 3 m up; left turned 30° from east, nose down 10°, right side down 5°.
 POSE = ExternalPose(
@@ -28,11 +29,22 @@ def test_as_odometry() -> None:
     assert message.time_usec == 1_234_567
     assert (message.frame_id, message.child_frame_id) == (1, 12)
     assert (message.x, message.y, message.z) == (2.0, 1.0, -3.0)
-    assert angles_of(tuple(message.q)) == pytest.approx(ANGLES)
+    assert angles_of(from_wire(message.q)) == pytest.approx(ANGLES)
     assert message.pose_covariance[:8] == pytest.approx([1e-4, 0, 0, 0, 0, 0, 1e-4, 0])
     assert message.pose_covariance[20] == pytest.approx(4e-4)
     assert math.isnan(message.vx)
     assert math.isnan(message.velocity_covariance[0])
+
+
+def test_the_quaternion_is_turned_into_mavlinks_axes_and_order() -> None:
+    x, y, z, w = Rotation.from_euler("ZYX", ANGLES[::-1]).as_quat()
+    assert len({round(abs(each), 3) for each in (x, y, z, w)}) == 4, "no order looks like another"
+    assert pose_message(POSE, PoseMessage.ODOMETRY).q == pytest.approx([w, x, y, z])
+
+
+def test_the_poses_quaternion_is_scipys() -> None:
+    turned = Rotation.from_quat(POSE.quaternion).as_euler("ZYX", degrees=True)
+    assert turned == pytest.approx((30, 10, 5))
 
 
 def test_as_a_vision_estimate_of_unknown_accuracy() -> None:

@@ -18,7 +18,7 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
-from skyloop.wire.mavlink.axes import angles_of
+from skyloop.wire.mavlink.axes import angles_of, from_wire
 from skyloop.wire.mavlink.modes import Landed
 from skyloop.wire.mavlink.texts import chunks_of
 from tests.drivers.mavlink.scripted import ARDUPILOT, PX4, Bench, Vehicle
@@ -247,7 +247,7 @@ def test_arducopters_thrust_is_a_climb_rate(climb: float, thrust: float) -> None
     said = bench.heard_of("SET_ATTITUDE_TARGET")[-1]
     assert said.type_mask == 7
     assert said.thrust == pytest.approx(thrust)
-    roll, pitch, _ = angles_of(tuple(said.q))
+    roll, pitch, _ = angles_of(from_wire(said.q))
     assert (roll, pitch) == pytest.approx((0.1, -0.2), abs=1e-5)
 
 
@@ -283,7 +283,7 @@ def test_a_leaning_px4_pushes_harder() -> None:
 def test_a_yaw_rate_beside_an_attitude_turns_the_heading_that_is_asked_for(autopilot: int) -> None:
     bench = steering(autopilot, Attitude(yaw_rate=0.5))
     bench.go_on(3.0)
-    _, _, yaw = angles_of(tuple(bench.heard_of("SET_ATTITUDE_TARGET")[-1].q))
+    _, _, yaw = angles_of(from_wire(bench.heard_of("SET_ATTITUDE_TARGET")[-1].q))
     assert yaw == pytest.approx(-0.5), "counter-clockwise, and no further ahead than half a radian"
 
 

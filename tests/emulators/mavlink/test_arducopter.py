@@ -9,6 +9,7 @@ import pytest
 from skyloop.emulators.mavlink import Kind
 from skyloop.emulators.mavlink.places import geodetic
 from skyloop.messages.geometry import quaternion_from_euler, wrap_angle
+from skyloop.wire.mavlink.axes import to_wire
 from skyloop.wire.mavlink.codec import Codec, Message
 from skyloop.wire.mavlink.codec import dialect as m
 from tests.emulators.mavlink.rig import HOME_M, Rig
@@ -19,7 +20,7 @@ def rig() -> Rig:
 
 
 def attitude(roll: float = 0.0, pitch: float = 0.0, thrust: float = 0.5, scale: float = 1.0) -> Message:
-    q = [each * scale for each in quaternion_from_euler(roll, pitch, 0.0)]
+    q = [each * scale for each in to_wire(quaternion_from_euler(roll, pitch, 0.0))]
     return m.MAVLink_set_attitude_target_message(0, 1, 1, 7, q, 0, 0, 0, thrust)
 
 
@@ -186,7 +187,9 @@ def test_thrust_is_a_climb_rate(thrust: float, climb: float) -> None:
     "bad",
     [
         attitude(pitch=-0.2, scale=1.1),
-        m.MAVLink_set_attitude_target_message(0, 1, 1, 7 | 64, list(quaternion_from_euler(0, -0.2, 0)), 0, 0, 0, 0.5),
+        m.MAVLink_set_attitude_target_message(
+            0, 1, 1, 7 | 64, to_wire(quaternion_from_euler(0, -0.2, 0)), 0, 0, 0, 0.5
+        ),
     ],
 )
 def test_an_attitude_without_thrust_or_unit_length_is_a_stop(bad: Message) -> None:

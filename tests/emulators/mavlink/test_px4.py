@@ -8,6 +8,7 @@ import pytest
 
 from skyloop.emulators.mavlink import Kind
 from skyloop.messages.geometry import quaternion_from_euler
+from skyloop.wire.mavlink.axes import to_wire
 from skyloop.wire.mavlink.codec import Message
 from skyloop.wire.mavlink.codec import dialect as m
 from tests.emulators.mavlink.rig import HOME_M, Rig
@@ -18,7 +19,9 @@ def rig() -> Rig:
 
 
 def attitude(thrust: float, roll: float = 0.0) -> Message:
-    return m.MAVLink_set_attitude_target_message(0, 1, 1, 7, list(quaternion_from_euler(roll, 0, 0)), 0, 0, 0, thrust)
+    return m.MAVLink_set_attitude_target_message(
+        0, 1, 1, 7, to_wire(quaternion_from_euler(roll, 0, 0)), 0, 0, 0, thrust
+    )
 
 
 def flying() -> Rig:

@@ -108,6 +108,12 @@ def test_angles_come_back_from_their_quaternion(roll: float, pitch: float, yaw: 
         assert abs(math.remainder(one - other, math.tau)) < 1e-6
 
 
+def test_quaternions_have_w_first_in_messages_only() -> None:
+    ours = (0.1, 0.2, 0.3, 0.9)
+    assert axes.to_wire(ours) == [0.9, 0.1, 0.2, 0.3]
+    assert axes.from_wire([0.9, 0.1, 0.2, 0.3]) == ours
+
+
 @given(ANGLES)
 def test_headings_turn_both_ways(yaw: float) -> None:
     assert abs(math.remainder(axes.yaw_between(axes.yaw_between(yaw)) - yaw, math.tau)) < 1e-9

@@ -11,7 +11,7 @@ from skyloop.drivers.mavlink.microservices import ACCEPTED, CommandSender, Vehic
 from skyloop.drivers.mavlink.telemetry import VehicleState
 from skyloop.messages import Attitude, Velocity
 from skyloop.messages.geometry import quaternion_from_euler, wrap_angle
-from skyloop.wire.mavlink.axes import Vector, flip
+from skyloop.wire.mavlink.axes import Vector, flip, to_wire
 from skyloop.wire.mavlink.codec import Message
 from skyloop.wire.mavlink.codec import dialect as m
 from skyloop.wire.mavlink.modes import Landed
@@ -117,7 +117,7 @@ class AttitudeSetpoint:
         climbing = None if vehicle.velocity is None else -vehicle.velocity[2]
         tilt = math.hypot(action.roll, action.pitch)
         thrust = self._thrust.thrust(action.climb, climbing, tilt, step_s)
-        q = list(quaternion_from_euler(action.roll, -action.pitch, yaw))
+        q = to_wire(quaternion_from_euler(action.roll, -action.pitch, yaw))
         return m.MAVLink_set_attitude_target_message(0, *target, ATTITUDE_AND_THRUST, q, 0, 0, 0, thrust)
 
     def _turned(self, heading: float | None, yaw_rate: float, step_s: float) -> float:

@@ -16,7 +16,7 @@ from skyloop.drivers.notices import Notice
 from skyloop.drivers.seams import ExternalPose
 from skyloop.messages import EventKind, Severity
 from skyloop.messages.geometry import quaternion_from_euler
-from skyloop.wire.mavlink.axes import Quaternion, angles_of, swap, yaw_between
+from skyloop.wire.mavlink.axes import angles_of, swap, to_wire, yaw_between
 from skyloop.wire.mavlink.codec import Message
 from skyloop.wire.mavlink.codec import dialect as m
 from skyloop.wire.mavlink.modes import Autopilot
@@ -318,11 +318,11 @@ def pose_message(pose: ExternalPose, kind: PoseMessage) -> Message:
     covariance = _covariance(pose)
     if kind is PoseMessage.VISION:
         return m.MAVLink_vision_position_estimate_message(pose.captured_ns // 1000, *position, *angles, covariance, 0)
-    q: Quaternion = quaternion_from_euler(*angles)
+    q = to_wire(quaternion_from_euler(*angles))
     unknown = [_NAN] * 21
     estimator = m.MAV_ESTIMATOR_TYPE_MOCAP
     return m.MAVLink_odometry_message(
-        pose.captured_ns // 1000, WORLD, BODY, *position, list(q), *[_NAN] * 6, covariance, unknown, 0, estimator, 100
+        pose.captured_ns // 1000, WORLD, BODY, *position, q, *[_NAN] * 6, covariance, unknown, 0, estimator, 100
     )
 
 

@@ -8,7 +8,7 @@ from typing import Final
 
 from skyloop.emulators.mavlink.flight import USUAL, FlightControl, Speeds
 from skyloop.emulators.mavlink.places import on_earth, place_of
-from skyloop.wire.mavlink.axes import Quaternion, Vector, angles_of, flip, swap, yaw_between
+from skyloop.wire.mavlink.axes import Vector, angles_of, flip, from_wire, swap, yaw_between
 from skyloop.wire.mavlink.codec import Message
 
 WORLD: Final = 1  #: MAV_FRAME_LOCAL_NED
@@ -114,7 +114,7 @@ class AttitudeTarget:
 def attitude_target_of(message: Message) -> AttitudeTarget:
     """Return the target of ``SET_ATTITUDE_TARGET``."""
     mask = message.type_mask
-    q: Quaternion = (message.q[0], message.q[1], message.q[2], message.q[3])
+    q = from_wire(message.q)
     roll, pitch, yaw = angles_of(q)
     return AttitudeTarget(
         attitude=None if mask & _NO_ATTITUDE else (roll, -pitch, yaw_between(yaw)),

@@ -12,7 +12,7 @@ from skyloop.messages import FlightState
 from skyloop.messages.geometry import quaternion_from_euler
 from skyloop.sim.host import Report
 from skyloop.sim.parameters import GRAVITY_M_S2
-from skyloop.wire.mavlink.axes import Vector, flip, swap, yaw_between
+from skyloop.wire.mavlink.axes import Vector, flip, swap, to_wire, yaw_between
 from skyloop.wire.mavlink.codec import Message
 from skyloop.wire.mavlink.codec import dialect as m
 from skyloop.wire.mavlink.modes import Landed
@@ -77,7 +77,7 @@ def _attitude(a: AutopilotState) -> Message:
 
 def _quaternion(a: AutopilotState) -> Message:
     rates = flip(*a.report.believed.angular_velocity_rad_s)
-    return m.MAVLink_attitude_quaternion_message(a.boot_ms, *quaternion_from_euler(*_angles(a)), *rates)
+    return m.MAVLink_attitude_quaternion_message(a.boot_ms, *to_wire(quaternion_from_euler(*_angles(a))), *rates)
 
 
 def _local(a: AutopilotState) -> Message | None:

@@ -1,7 +1,8 @@
 """MAVLink's axes and ours.
 
 World: north, east, down there; east, north, up here. Body: forward, right, down there;
-forward, left, up here. Yaw: clockwise from north there; counter-clockwise from east here. Pure.
+forward, left, up here. Yaw: clockwise from north there; counter-clockwise from east here. Quaternions: w, x, y, z in
+messages, x, y, z, w in all code. Pure.
 
 ``flip`` and ``swap`` are their own inverses, and so is :func:`yaw_between`.
 """
@@ -9,11 +10,12 @@ forward, left, up here. Yaw: clockwise from north there; counter-clockwise from 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from skyloop.messages.geometry import wrap_angle
 
 Vector = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]  #: w, x, y, z
+Quaternion = tuple[float, float, float, float]  #: x, y, z, w
 
 
 def flip(x: float, y: float, z: float) -> Vector:
@@ -31,9 +33,21 @@ def yaw_between(yaw: float) -> float:
     return wrap_angle(math.pi / 2 - yaw)
 
 
-def angles_of(q: Quaternion) -> Vector:
-    """Roll, pitch and yaw of a unit quaternion."""
+def to_wire(q: Quaternion) -> list[float]:
+    """A quaternion (x, y, z, w) as the field ``q`` of a message: w, x, y, z."""
+    x, y, z, w = q
+    return [w, x, y, z]
+
+
+def from_wire(q: Sequence[float]) -> Quaternion:
+    """The field ``q`` of a message (w, x, y, z) as x, y, z, w."""
     w, x, y, z = q
+    return x, y, z, w
+
+
+def angles_of(q: Quaternion) -> Vector:
+    """Roll, pitch and yaw of a unit quaternion (x, y, z, w)."""
+    x, y, z, w = q
     return (
         math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
         math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x)))),
