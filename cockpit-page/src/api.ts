@@ -1,11 +1,11 @@
-// Questions and orders over HTTP.
+// Requests over HTTP.
 
 export class Refused extends Error {}
 
 async function answered(response: Response): Promise<unknown> {
-  const told = (await response.text()) || "{}";
+  const text = (await response.text()) || "{}";
   const isJson = response.headers.get("content-type")?.startsWith("application/json") ?? false;
-  const values = isJson ? (JSON.parse(told) as { error?: string }) : { error: told };
+  const values = isJson ? (JSON.parse(text) as { error?: string }) : { error: text };
   if (!response.ok) throw new Refused(values.error ?? `refused (${response.status})`);
   return values;
 }
@@ -26,4 +26,4 @@ export const get = async <T>(path: string): Promise<T> => (await ask(path, {})) 
 export const post = async <T>(path: string, values: object = {}): Promise<T> =>
   (await ask(path, { method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify(values) })) as T;
 
-export const told = (error: unknown): string => (error instanceof Error ? error.message : String(error));
+export const errorText = (error: unknown): string => (error instanceof Error ? error.message : String(error));

@@ -1,7 +1,7 @@
 // The cockpit's clock, as this page knows it. Pure.
 //
-// A pong tells the cockpit's time between a ping and its answer: that gives the offset of the two clocks, right to half
-// of the time there and back. Any other message with a time tells that it is at least so late there.
+// A pong has the cockpit's time between a ping and its answer: that gives the offset of the two clocks, right to half
+// of the time there and back. Any other message with a time shows that it is at least that late there.
 
 /** Clocks of two machines run apart by at most so much [s/s]. */
 const DRIFT = 2e-4;
@@ -30,11 +30,11 @@ export class ServerClock {
     const jumped = known !== null && Math.abs(known.offset_s - sample.offset_s) > known.unsure_s + sample.unsure_s;
     if (jumped) this.reset(); // one of the machines slept
     if (jumped || known === null || sample.unsure_s <= known.unsure_s) this.best = sample;
-    this.told(received_ms, now_s);
+    this.received(received_ms, now_s);
   }
 
-  /** The cockpit said so at `now_s`: it is no earlier there by now. */
-  told(received_ms: number, now_s: number): void {
+  /** A message that the cockpit sent at `now_s` has arrived: it is no earlier there by now. */
+  received(received_ms: number, now_s: number): void {
     const offset_s = now_s - received_ms / 1000;
     if (this.floor === null || offset_s >= this.lowest(this.floor, received_ms)) this.floor = { offset_s, at_ms: received_ms };
   }
@@ -45,7 +45,7 @@ export class ServerClock {
     return known && { at_s: ms / 1000 + known.offset_s, unsure_s: known.unsure_s };
   }
 
-  /** How old what the cockpit said at `now_s` is at least; null while no time was told. */
+  /** Least age of what the cockpit sent at `now_s`; null while no time is known. */
   age_s(now_s: number, ms: number): number | null {
     return this.floor && Math.max(0, ms / 1000 + this.lowest(this.floor, ms) - now_s);
   }

@@ -27,13 +27,13 @@ export class Deck {
   }
 
   show(name: string): void {
-    const news = name !== this.shown;
+    const changes = name !== this.shown;
     this.shown = name;
     memory.set(`deck-${this.name}`, name);
     this.leaves.forEach((leaf, place) => {
       leaf.element.hidden = leaf.name !== name;
       setAttribute(this.buttons[place] as Element, "aria-pressed", String(leaf.name === name));
-      if (news && leaf.name === name) leaf.opened?.();
+      if (changes && leaf.name === name) leaf.opened?.();
     });
   }
 }

@@ -15,7 +15,7 @@ export class Events {
   private readonly severity = h("select", { "aria-label": "Severity", onchange: () => this.filter() }, h("option", { value: "" }, "All"), h("option", { value: "warning" }, "Warnings"), h("option", { value: "error" }, "Errors"));
   private readonly none = h("p", { class: "empty" }, "No events");
   private readonly shown: { event: DroneEvent; row: HTMLElement }[] = [];
-  private heard = 0;
+  private newest = 0;
 
   constructor() {
     this.element = h("div", { class: "filling" }, h("div", { class: "filters" }, this.words, this.severity), this.list, this.none);
@@ -23,9 +23,9 @@ export class Events {
 
   /** Returns those that are new. */
   add(events: readonly DroneEvent[]): DroneEvent[] {
-    const fresh = events.filter((event) => event.n > this.heard);
+    const fresh = events.filter((event) => event.n > this.newest);
     for (const event of fresh) {
-      this.heard = event.n;
+      this.newest = event.n;
       const row = rowOf(event);
       this.list.prepend(row);
       this.shown.push({ event, row });
@@ -35,9 +35,9 @@ export class Events {
     return fresh;
   }
 
-  /** The cockpit was started anew and numbers them from 1. */
+  /** The cockpit was restarted and numbers them from 1. */
   restart(): void {
-    this.heard = 0;
+    this.newest = 0;
     this.shown.length = 0;
     this.list.replaceChildren();
   }

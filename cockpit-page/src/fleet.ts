@@ -37,12 +37,12 @@ class Card {
     const [application, vehicle] = [row.links.application, row.links.vehicle];
     setTone(this.hops[0] as Element, over ? "quiet" : (LINKS[application] ?? "quiet"));
     setTone(this.hops[1] as Element, over ? "quiet" : (LINKS[vehicle] ?? "quiet"));
-    const told = `link to the proxy ${application}, to the vehicle ${vehicle}`;
-    setAttribute(this.linked, "title", told);
+    const links = `link to the proxy ${application}, to the vehicle ${vehicle}`;
+    setAttribute(this.linked, "title", links);
     setHidden(this.recording, !row.recording);
     setText(this.alarms, over ? "" : row.alarms.join(" · "));
     setHidden(this.alarms, over || row.alarms.length === 0);
-    setAttribute(this.main, "aria-label", `Open ${row.name}: ${this.state.textContent}, ${this.owner.textContent}, ${told}`);
+    setAttribute(this.main, "aria-label", `Open ${row.name}: ${this.state.textContent}, ${this.owner.textContent}, ${links}`);
     setAttribute(this.element, "data-open", String(open));
     setAttribute(this.beside, "aria-pressed", String(open));
     setAttribute(this.beside, "aria-label", open ? `Close ${row.name}` : `Show ${row.name} beside the others`);

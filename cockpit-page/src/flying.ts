@@ -6,7 +6,7 @@ import type { Sticks } from "./model.js";
 import { type Pilot, STEER_MS } from "./pilot.js";
 import { CENTRED, isCentred, merge, PACES, type Pace, ramp, scale } from "./sticks.js";
 
-/** Whom the keys fly, and what else they do. */
+/** Which drone the keys fly, and what else they do. */
 export interface Cabin {
   /** Of all drones that are open here. */
   pilots(): Pilot[];
@@ -14,7 +14,7 @@ export interface Cabin {
   selected(): Pilot | null;
   /** A deed by key or gamepad, for the selected drone. */
   act(deed: Deed): void;
-  /** The emergency stop is held by keys or gamepad: of the drone that is seen, or of all; null: it was let go. */
+  /** The emergency stop is held by keys or gamepad: of the drone that is seen, or of all; null: released. */
   hold(which: "one" | "all" | null): void;
   /** Escape: close what is open. Whether anything was. */
   escape(): boolean;
@@ -103,7 +103,7 @@ export class Flying {
     const selected = this.cabin.selected();
     const reading = this.pad.read(connected());
     const focused = document.hasFocus() && !document.hidden;
-    // What is not heard is not flown, and goes on only after keys and sticks were let go.
+    // A drone without data is not flown; it is flown again only after keys and sticks were released.
     const mine = (selected?.mine ?? false) && (selected?.isLive ?? false);
     if (this.held && !mine) this.keys.clear();
     // Sticks that are pushed when control begins, or another drone is selected, must come back to the centre first.

@@ -31,7 +31,7 @@ export class Help {
       h("header", {}, h("h2", {}, "Keys and gamepad"), h("button", { type: "button", class: "bare", "aria-label": "Close", onclick: () => this.element.close() }, "×")),
       h("div", { class: "help-columns" }, table("Keyboard", KEY_MAP), table("Gamepad", GAMEPAD_MAP)),
       this.pad,
-      h("p", { class: "note" }, "They fly the drone that is marked, while you have control of it. It hovers when keys and sticks are let go, when this page loses the focus or its connection, and when the gamepad goes away. The emergency stop needs no control: it is held for 0.8 s, and works while you type, too."),
+      h("p", { class: "note" }, "They fly the drone that is marked, while you have control of it. It hovers when keys and sticks are released, when this page loses the focus or its connection, and when the gamepad goes away. The emergency stop needs no control: it is held for 0.8 s, and works while you type, too."),
       h("div", { class: "pace" }, h("span", {}, "Pace"), paces),
     );
   }

@@ -1,10 +1,10 @@
-// What plots and maps remember: every number that was told, and where the drone went. Pure.
+// What plots and maps remember: every number received, and where the drone flew. Pure.
 
 export const KEPT_S = 120;
 /** Shares of the present rate and more: the arrays never move. */
 const CAPACITY = 4096;
 
-/** Numbers by name against one time axis; the oldest are overwritten. What was not told is NaN. */
+/** Numbers by name against one time axis; the oldest are overwritten. What is missing is NaN. */
 export class History {
   readonly names = new Set<string>();
   private readonly times = new Float64Array(CAPACITY).fill(Number.NaN);

@@ -1,4 +1,4 @@
-// The emergency stop's gesture: press and hold. Nobody does that by chance, and who means it sees it count.
+// The emergency stop's gesture: press and hold. It is hardly done by accident, and the countdown shows.
 
 import { h, setAttribute, setText } from "./dom.js";
 
@@ -72,12 +72,12 @@ export class Countdown {
     requestAnimationFrame(this.round);
   }
 
-  /** Nothing is done, and whoever let go too early reads how it is done. */
+  /** Released too early: nothing is done, and the hint says how to do it. */
   release(): void {
     if (!this.hold.isHeld) return;
     this.end();
     this.element.hidden = false;
-    setText(this.how, `Not done: it was let go. Press and hold for ${HOLD_MS / 1000} s`);
+    setText(this.how, `Not done: released too early. Press and hold for ${HOLD_MS / 1000} s`);
     setText(this.left, "");
     this.bar.style.setProperty("width", "0");
     this.hint = setTimeout(() => (this.element.hidden = true), HINT_MS);
@@ -102,7 +102,7 @@ export class Countdown {
     const share = this.hold.share(now_ms) ?? 0;
     this.element.hidden = false;
     setText(this.what, held.what);
-    setText(this.how, "Keep holding, let go to cancel");
+    setText(this.how, "Keep holding, release to cancel");
     setText(this.left, `${(((1 - share) * HOLD_MS) / 1000).toFixed(1)} s`);
     this.bar.style.setProperty("width", `${share * 100}%`);
     if (!this.hold.isDone(now_ms)) return;

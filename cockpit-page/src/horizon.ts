@@ -8,7 +8,7 @@ import type { State } from "./model.js";
 const PITCH = 3.1; // units of the drawing per degree
 const [LEFT, RIGHT, TOP, BOTTOM] = [56, 264, 6, 186];
 const [MID_X, MID_Y] = [(LEFT + RIGHT) / 2, (TOP + BOTTOM) / 2];
-const SAID_MS = 2000;
+const DESCRIBED_MS = 2000;
 
 /** A scale that moves behind a mark. Its few labels are used again and again. */
 class Tape {
@@ -81,7 +81,7 @@ export class Horizon {
   private readonly speed: Tape;
   private readonly altitude: Tape;
   private readonly heading: Tape;
-  private said_ms = Number.NEGATIVE_INFINITY;
+  private described_ms = Number.NEGATIVE_INFINITY;
 
   constructor() {
     const glass = unique("glass");
@@ -119,14 +119,14 @@ export class Horizon {
     this.speed.show(state?.speed, figure(state?.speed, 1));
     this.altitude.show(state?.altitude, figure(state?.altitude, 2));
     this.heading.show(yaw === null ? null : heading(yaw), headingText(yaw));
-    this.say(roll, pitch, yaw);
+    this.describe(roll, pitch, yaw);
   }
 
-  /** For screen readers, as often as somebody may ask. */
-  private say(roll: number | null, pitch: number | null, yaw: number | null): void {
+  /** For screen readers, at a bounded rate. */
+  private describe(roll: number | null, pitch: number | null, yaw: number | null): void {
     const now = performance.now();
-    if (now - this.said_ms < SAID_MS) return;
-    this.said_ms = now;
+    if (now - this.described_ms < DESCRIBED_MS) return;
+    this.described_ms = now;
     const tilt =
       roll === null || pitch === null
         ? "attitude not known"

@@ -83,19 +83,19 @@ export class Instruments {
 /** The command that was applied last, in words. */
 export function commandText(state: State | null): string {
   const applied = state?.set_points;
-  if (!applied) return "No command heard yet";
+  if (!applied) return "No command yet";
   const values = Object.entries(applied.values).filter(([, value]) => value !== null && value !== 0);
   const shown = values.map(([name, value]) => `${words(name)} ${figure(value, 2)}`).join(", ");
   const age_s = applied.age_s ?? 0;
   return `Applied: ${words(applied.action)}${shown ? ` · ${shown}` : ""}${age_s > 1 ? ` · ${duration(age_s)} ago` : ""}`;
 }
 
-/** Who has control, in words, when the newest news is too old to be sure. */
+/** Who has control, in words, when the newest state is too old to be sure. */
 export function oldHolderText(mine: boolean): { who: string; more: string; tone: Tone } {
   return { who: "Not known", more: mine ? "you had control" : "who has control", tone: "quiet" };
 }
 
-/** Who has control, in words; `authority` is what this page's own line says, where there is one. */
+/** Who has control, in words; `authority` is the state of this page's own connection, where there is one. */
 export function holderText(state: State | null, authority: Authority | null): { who: string; more: string; tone: Tone } {
   if (authority?.mine) return { who: "You", more: `have control, priority ${authority.priority ?? "–"}`, tone: "busy" };
   const { holder = null, priority = null } = authority?.holder ? authority : (state?.authority ?? {});

@@ -1,10 +1,10 @@
 // Who asks: a session that is there, or a token that is asked for once.
 
-import { get, post, told } from "./api.js";
+import { get, post, errorText } from "./api.js";
 import { h, setText } from "./dom.js";
 import type { Session } from "./model.js";
 
-/** Resolves when somebody is known. What is needed until then is shown in `place`. */
+/** Resolves when the user is logged in. What is needed until then is shown in `place`. */
 export async function session(place: HTMLElement): Promise<Session> {
   for (;;) {
     try {
@@ -15,7 +15,7 @@ export async function session(place: HTMLElement): Promise<Session> {
         await new Promise((later) => setTimeout(later, 3000));
       } else await ask(place);
     } catch (error) {
-      place.replaceChildren(h("main", { class: "gate" }, h("h1", {}, "Skyloop cockpit"), h("p", { role: "alert" }, told(error))));
+      place.replaceChildren(h("main", { class: "gate" }, h("h1", {}, "Skyloop cockpit"), h("p", { role: "alert" }, errorText(error))));
       await new Promise((later) => setTimeout(later, 1000));
     }
   }
@@ -34,7 +34,7 @@ async function ask(place: HTMLElement): Promise<void> {
         await post("/api/login", { token: token.value });
         done();
       } catch (error) {
-        setText(problem, told(error));
+        setText(problem, errorText(error));
         token.select();
       }
     });

@@ -32,7 +32,7 @@ class Page {
   private readonly main = h("main", { id: "panes", tabindex: -1, "aria-label": "Opened drones" });
   private readonly empty = h("p", { class: "empty nobody" }, "No drone is opened. Choose one of the list.");
   private readonly lostAge = h("span", { "aria-hidden": "true" });
-  private readonly lost = h("div", { class: "banner lost", role: "alert", "data-tone": "bad", hidden: true }, "This page does not hear the cockpit: what it shows is old. Trying again…", this.lostAge);
+  private readonly lost = h("div", { class: "banner lost", role: "alert", "data-tone": "bad", hidden: true }, "No answer from the cockpit: what is shown is old. Reconnecting…", this.lostAge);
   private readonly countdown = new Countdown();
   private readonly safety: Safety | null;
   private readonly clock = new ServerClock();
@@ -56,7 +56,7 @@ class Page {
     const bar = h("header", { class: "bar" }, brand, h("span", { class: "spring" }), person, leave, this.help.chip, theme, this.safety?.element ?? null);
     const recordings = new RecordingList(() => [...this.panes.keys()], (name) => this.open(name, true), who.role === "pilot");
     this.main.append(this.empty);
-    root.replaceChildren(bar, this.lost, this.safety?.told ?? "", h("div", { class: "deckhouse" }, this.fleet.element, this.main, recordings.element), this.help.element, this.countdown.element);
+    root.replaceChildren(bar, this.lost, this.safety?.message ?? "", h("div", { class: "deckhouse" }, this.fleet.element, this.main, recordings.element), this.help.element, this.countdown.element);
     this.flying = new Flying({
       pilots: () => [...this.panes.values()].flatMap((pane) => pane.pilot ?? []),
       selected: () => this.selected?.pilot ?? null,
@@ -70,7 +70,7 @@ class Page {
       message: (data) => this.see(JSON.parse(data as string) as { now_s: number; drones: DroneRow[] }),
       state: (open, code) => this.linked(open, code),
     });
-    // All of them at once, and no faster than the news comes: painting is what costs most.
+    // All of them at once, and no faster than states arrive: painting is what costs most.
     let drawn_ms = 0;
     const draw = (now_ms: number): void => {
       requestAnimationFrame(draw);
@@ -88,7 +88,7 @@ class Page {
 
   private see({ now_s, drones: rows }: { now_s: number; drones: DroneRow[] }): void {
     const now_ms = performance.now();
-    this.clock.told(now_ms, now_s);
+    this.clock.received(now_ms, now_s);
     this.listed_ms = now_ms - (this.clock.age_s(now_s, now_ms) ?? 0) * 1000;
     this.rows = rows;
     this.safety?.know(rows);
@@ -116,7 +116,7 @@ class Page {
       this.close(name);
       return;
     }
-    // What this page flies stays open: to look at something else is no reason to let go of it.
+    // What this page flies stays open: to look at something else is no reason to close it.
     if (alone) for (const [other, pane] of [...this.panes]) if (other !== name && !pane.pilot?.mine) this.drop(other, pane);
     if (!this.panes.has(name)) {
       const pane = new Pane(name, this.who.role === "pilot", {

@@ -17,7 +17,7 @@ interface Ink {
 export class MapView {
   readonly element: HTMLElement;
   private readonly canvas = h("canvas", { class: "map", role: "img", "aria-label": "Map from above" });
-  private readonly told = h("p", { class: "note" });
+  private readonly note = h("p", { class: "note" });
   private readonly inputs = ["x", "y", "z"].map((name) => h("input", { type: "number", step: "0.1", "aria-label": `Waypoint ${name} in metres`, placeholder: name }));
   private readonly go = h("button", { type: "submit", class: "small" }, "Fly there");
   private readonly follow = h("button", { type: "button", class: "small", "aria-pressed": "true", onclick: () => this.refit() }, "Fit");
@@ -36,7 +36,7 @@ export class MapView {
     const zoom = (sign: string, factor: number): HTMLElement => h("button", { type: "button", class: "small", "aria-label": factor > 1 ? "Zoom in" : "Zoom out", onclick: () => this.zoom(factor) }, sign);
     const form = (this.form = h("form", { class: "waypoint", "aria-label": "Waypoint", onsubmit: (event: Event) => this.submit(event) }, ...this.inputs, this.go));
     const buttons = h("div", { class: "map-buttons" }, zoom("+", 1.4), zoom("−", 1 / 1.4), this.follow);
-    this.element = h("div", { class: "filling mapping" }, h("div", { class: "map-box" }, this.canvas, buttons), form, this.told);
+    this.element = h("div", { class: "filling mapping" }, h("div", { class: "map-box" }, this.canvas, buttons), form, this.note);
     this.canvas.addEventListener("pointerdown", (event) => this.press(event));
     this.canvas.addEventListener("pointermove", (event) => this.move(event));
     this.canvas.addEventListener("pointerup", (event) => this.lift(event));
@@ -61,7 +61,7 @@ export class MapView {
     this.can = can;
     this.canvas.classList.toggle("clickable", can);
     setDisabled(this.go, !can);
-    setText(this.told, can ? "Click on the map to fly there, at the present height." : why);
+    setText(this.note, can ? "Click on the map to fly there, at the present height." : why);
   }
 
   draw(now_ms: number): void {

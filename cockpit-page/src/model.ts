@@ -1,4 +1,4 @@
-// What the cockpit's server says and is told: docs/cockpit.md. SI units and radians; what is not known is null.
+// What the cockpit's server sends and receives: docs/cockpit.md. SI units and radians; what is not known is null.
 
 export type Vector = [number, number, number];
 
@@ -125,13 +125,13 @@ export interface Authority {
   /** How this page lost the control that it had; null if it did not. */
   why: string | null;
   /** Where this page waits; null while it does not. */
-  line: Line | null;
+  line: QueuePosition | null;
 }
 
-export interface Line {
+export interface QueuePosition {
   /** 1 is next. */
   position: number | null;
-  /** Expected, as it was told. */
+  /** Expected when it was sent. */
   wait_s: number | null;
   /** The one who has control was asked first, */
   asked: boolean;
@@ -146,13 +146,13 @@ export interface Question {
   priority: number;
   /** For how long it is wanted. */
   for_s: number | null;
-  /** Of the time to ask, as it was told; then a higher priority has it. */
+  /** Left of the time to answer when it was sent; then a higher priority has it. */
   left_s: number;
   /** By this page. */
   declined: boolean;
 }
 
-export type Told =
+export type PilotMessage =
   | Authority
   | { type: "asked"; questions: Question[] }
   | { type: "done"; do: string; name?: string; value?: Value }
@@ -167,7 +167,7 @@ export interface Sticks {
   yaw_rate: number;
 }
 
-export type Order =
+export type Command =
   | { do: "take"; priority: number; ask: boolean }
   | { do: "answer"; id: number; grant: boolean; reason: string }
   | { do: "release" | "takeoff" | "hover" | "land" | "stop" | "reset" }

@@ -1,9 +1,10 @@
 // One drone, opened: everything that is seen of it and done with it.
 
-import { post, told as problemOf } from "./api.js";
+import { errorText, post } from "./api.js";
 import { Battery } from "./battery.js";
 import { Channels } from "./channels.js";
 import { ServerClock } from "./clock.js";
+import { STALE_MS } from "./commands.js";
 import { Deck } from "./deck.js";
 import { h, setAttribute, setHidden, setText, setTone, type Tone } from "./dom.js";
 import { Events } from "./events.js";
@@ -14,7 +15,6 @@ import { Instruments } from "./instruments.js";
 import type { Deed } from "./keys.js";
 import { MapView } from "./map.js";
 import type { DroneRow, State, Sticks, Vehicle } from "./model.js";
-import { STALE_MS } from "./orders.js";
 import { Parameters } from "./parameters.js";
 import { Pilot } from "./pilot.js";
 import { Plots } from "./plots.js";
@@ -49,7 +49,7 @@ export class Pane {
   private state: State | null = null;
   private connected = false;
   private absent = "";
-  private news = false;
+  private dirty = false;
   private readonly clock = new ServerClock();
   /** When the newest that is known of the drone was true, and when the cockpit answered last, on this page's clock. */
   private fresh_ms: number | null = null;
@@ -105,7 +105,7 @@ export class Pane {
     };
     this.element = this.build();
     this.socket = new LastingSocket(`${base}/telemetry`, {
-      message: (data) => this.hear(JSON.parse(data as string) as Vehicle | State),
+      message: (data) => this.onMessage(JSON.parse(data as string) as Vehicle | State),
       state: (open, code) => this.linked(open, code),
     });
     this.pilot = pilots ? new Pilot((handlers) => new LastingSocket(`${base}/control`, handlers), this.clock, this.listener()) : null;
@@ -144,8 +144,8 @@ export class Pane {
   act(deed: Deed | "reset"): void {
     this.host.select(this.name);
     if (deed === "help") this.host.help();
-    else if (this.isRecording) this.say("a recording: nothing flies here", "quiet");
-    else if (this.pilot === null) this.say("you may watch, not fly", "warn");
+    else if (this.isRecording) this.notify("a recording: nothing flies here", "quiet");
+    else if (this.pilot === null) this.notify("you may watch, not fly", "warn");
     else if (deed === "question") this.strip.question.focus();
     else if (deed === "take") this.pilot.take(this.strip.wanted, this.strip.asks);
     else if (deed === "release") this.pilot.release();
@@ -154,7 +154,7 @@ export class Pane {
 
   tick(now_ms: number): void {
     this.age(now_ms);
-    if (this.news) this.update();
+    if (this.dirty) this.update();
     this.strip.count(this.pilot);
     this.stage.update(now_ms);
     if (this.decks.space.shown === "Map") this.map.draw(now_ms);
@@ -183,15 +183,15 @@ export class Pane {
   private listener(): ConstructorParameters<typeof Pilot>[2] {
     return {
       changed: () => this.update(),
-      refused: (order, why) => {
-        if (order === "set" && this.parameters.refused(why)) return;
-        if (order === "fly" && this.isOld) return; // the whole pane tells
-        this.say(order ? `${words(order)}: ${why}` : why, "warn");
+      refused: (command, why) => {
+        if (command === "set" && this.parameters.refused(why)) return;
+        if (command === "fly" && this.isOld) return; // the whole pane shows that
+        this.notify(command ? `${words(command)}: ${why}` : why, "warn");
       },
-      done: (order, name, value) => {
-        if (order === "set" && name !== undefined && value !== undefined) this.parameters.done(name, value);
-        if (order === "stop") this.say("emergency stop sent", "bad");
-        if (order === "goto") this.say("the waypoint is reached", "ok");
+      done: (command, name, value) => {
+        if (command === "set" && name !== undefined && value !== undefined) this.parameters.done(name, value);
+        if (command === "stop") this.notify("emergency stop sent", "bad");
+        if (command === "goto") this.notify("the waypoint is reached", "ok");
       },
     };
   }
@@ -203,35 +203,35 @@ export class Pane {
     this.update();
   }
 
-  private hear(told: Vehicle | State): void {
-    if (told.type === "vehicle") {
-      this.vehicle = told;
-      this.stage.cameras(told.cameras);
-      setHidden(this.endReplay, this.pilot === null || !told.uri.startsWith("replay:"));
+  private onMessage(message: Vehicle | State): void {
+    if (message.type === "vehicle") {
+      this.vehicle = message;
+      this.stage.cameras(message.cameras);
+      setHidden(this.endReplay, this.pilot === null || !message.uri.startsWith("replay:"));
       setAttribute(this.element, "data-recording", String(this.isRecording));
       this.map.watchOnly(this.isRecording);
     } else {
-      this.state = told;
+      this.state = message;
       this.absent = "";
-      this.dated(told);
-      this.history.add(now_s(), told.values);
-      const place = told.position ?? told.truth?.position;
+      this.dated(message);
+      this.history.add(now_s(), message.values);
+      const place = message.position ?? message.truth?.position;
       if (place) this.trail.add(now_s(), place);
-      this.events.add(told.events);
+      this.events.add(message.events);
     }
-    this.news = true; // shown with the next tick
+    this.dirty = true; // shown with the next tick
   }
 
-  /** From when the news is: it may have been long on its way, and old when it was sent. */
+  /** When the state was true: it may have been long on its way, and old when it was sent. */
   private dated(state: State): void {
     const now_ms = performance.now();
-    this.clock.told(now_ms, state.now_s);
+    this.clock.received(now_ms, state.now_s);
     if (state.links.application === "lost") return;
     const feedback_s = this.isRecording ? 0 : (state.feedback?.age_s ?? 0); // what was recorded is old anyhow
     this.fresh_ms = now_ms - ((this.clock.age_s(state.now_s, now_ms) ?? 0) + feedback_s) * 1000;
   }
 
-  /** Tell how old it is, if it is. */
+  /** Show how old it is, if it is. */
   private age(now_ms: number): void {
     const answer_ms = this.pilot?.age_ms(now_ms) ?? null;
     if (answer_ms !== null) this.answered_ms = now_ms - answer_ms;
@@ -246,11 +246,11 @@ export class Pane {
     if (isOld === this.isOld) return;
     this.isOld = isOld;
     setHidden(this.old, !isOld);
-    this.news = true;
+    this.dirty = true;
   }
 
   private update(): void {
-    this.news = false;
+    this.dirty = false;
     const { state, vehicle, pilot, isOld, isRecording: recording } = this;
     // What came before the link broke is not known any more; what is merely old is shown in grey.
     const live = this.connected && state?.links.application !== "lost" ? state : null;
@@ -270,16 +270,16 @@ export class Pane {
     const nowhere = recording ? "A recording: nothing flies here." : isOld ? "What is shown is old." : !placed ? "Position not known." : !mine ? "Take control to fly to a place." : "It must be in the air to fly to a place.";
     this.map.allow(mine && placed && inAir, nowhere);
     this.parameters.allow(mine, recording ? "As they were recorded." : "Take control to change them.");
-    const told = over ? [] : !this.connected ? [this.absent || `no news of ${this.name} from the cockpit: what is shown is old`] : (state?.alarms ?? []);
-    setText(this.alarms, told.join(" · "));
-    setHidden(this.alarms, told.length === 0);
+    const shown = over ? [] : !this.connected ? [this.absent || `no data about ${this.name} from the cockpit: what is shown is old`] : (state?.alarms ?? []);
+    setText(this.alarms, shown.join(" · "));
+    setHidden(this.alarms, shown.length === 0);
     setAttribute(this.element, "data-lost", String(!live || isOld));
     setAttribute(this.element, "data-old", String(isOld || (!live && !over)));
     setAttribute(this.element, "data-mine", String(mine));
     this.host.aimed(this.name);
   }
 
-  private say(text: string, tone: Tone): void {
+  private notify(text: string, tone: Tone): void {
     setTone(this.notice, tone);
     setText(this.notice, text);
     this.noticed_ms = performance.now();
@@ -290,7 +290,7 @@ export class Pane {
       await post(`/api/replays/${encodeURIComponent(this.name)}/stop`);
       this.host.close(this.name);
     } catch (error) {
-      this.say(problemOf(error), "warn");
+      this.notify(errorText(error), "warn");
     }
   }
 
@@ -315,7 +315,7 @@ export class Pane {
       this.scene = new SceneView(() => this.world());
       this.space.append(this.scene.element);
     } catch (error) {
-      this.space.replaceChildren(h("p", { class: "empty" }, `No 3-D view here: ${problemOf(error)}`));
+      this.space.replaceChildren(h("p", { class: "empty" }, `No 3-D view here: ${errorText(error)}`));
     }
   }
 }

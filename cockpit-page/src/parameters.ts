@@ -1,6 +1,6 @@
-// Parameters: read when somebody looks, written with the drone's own answer beside them.
+// Parameters: read when they are shown, written with the drone's own answer beside them.
 
-import { get, told } from "./api.js";
+import { get, errorText } from "./api.js";
 import { h, setDisabled, setHidden, setText, setTone } from "./dom.js";
 import type { Parameter, Value } from "./model.js";
 import { parse, rangeText, valueText } from "./values.js";
@@ -48,7 +48,7 @@ export class Parameters {
       if (!parameters.length) this.list.append(h("p", { class: "empty" }, "No parameters"));
       this.filter();
     } catch (error) {
-      this.list.replaceChildren(h("p", { class: "empty" }, `Not read: ${told(error)}`));
+      this.list.replaceChildren(h("p", { class: "empty" }, `Not read: ${errorText(error)}`));
     }
   }
 
@@ -59,7 +59,7 @@ export class Parameters {
     if (!row) return;
     row.parameter.value = value;
     row.editor.value = valueText(value);
-    this.say(row, "ok", "written");
+    this.answer(row, "ok", "written");
     this.enable(row);
   }
 
@@ -68,7 +68,7 @@ export class Parameters {
     const row = this.writing === null ? undefined : this.rows.get(this.writing);
     this.writing = null;
     if (!row) return false;
-    this.say(row, "bad", why);
+    this.answer(row, "bad", why);
     row.editor.setAttribute("aria-invalid", "true");
     return true;
   }
@@ -101,16 +101,16 @@ export class Parameters {
     const parsed = parse(row.parameter, row.editor.value);
     row.editor.removeAttribute("aria-invalid");
     if ("problem" in parsed) {
-      this.say(row, "bad", parsed.problem);
+      this.answer(row, "bad", parsed.problem);
       row.editor.setAttribute("aria-invalid", "true");
       return;
     }
-    this.say(row, "busy", "…");
+    this.answer(row, "busy", "…");
     this.writing = row.parameter.name;
     this.write(row.parameter.name, parsed.value);
   }
 
-  private say(row: Row, tone: "ok" | "bad" | "busy", text: string): void {
+  private answer(row: Row, tone: "ok" | "bad" | "busy", text: string): void {
     setTone(row.answer, tone);
     setText(row.answer, text);
   }

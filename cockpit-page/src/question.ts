@@ -1,7 +1,7 @@
-// Somebody asks for the control that this page has: who, for how long, until when, and what the person answers.
+// A request for the control that this page has: who asks, for how long, until when, and what the person answers.
 //
 // It does not take the focus, which may be on a button that flies: a key goes there. Nor can it be answered in its
-// first moment: whoever was about to press something else there has not read it.
+// first moment: a press that was meant for something else is no answer.
 
 import { h, setAttribute, setDisabled, setHidden, setText, unique } from "./dom.js";
 import { lasting } from "./format.js";
@@ -22,21 +22,21 @@ export const pending = (questions: readonly Question[], own: number | null): Que
 export function explained(question: Question, own: number | null, more: number): string {
   const others = more > 0 ? [`${more} more ${more === 1 ? "asks" : "ask"} for it.`] : [];
   if (question.declined) return ["You keep it for now; the higher priority has it when the time is over.", ...others].join(" ");
-  const length = question.for_s === null ? "Wanted for a time that is not said." : `Wanted for ${lasting(question.for_s)}.`;
+  const length = question.for_s === null ? "Wanted for an unspecified time." : `Wanted for ${lasting(question.for_s)}.`;
   const end = wins(question, own) ? "That is higher than yours: it has control when the time is over." : "That is no higher than yours: you keep control unless you hand it over.";
   return [`Priority ${question.priority}, yours ${own ?? "–"}. ${end}`, length, ...others].join(" ");
 }
 
 export class QuestionPanel {
   readonly element: HTMLElement;
-  /** Says it to who does not see it. */
+  /** For screen readers. */
   readonly voice = h("p", { class: "unseen", "aria-live": "assertive", "aria-atomic": "true" });
   private readonly title = h("h3", { id: unique("asks") });
   private readonly text = h("p", { id: unique("asks-text"), class: "asks-text" });
   private readonly left = h("b", {});
   private readonly reason = h("input", { type: "text", maxlength: MOST_REASON, placeholder: "Reason, if you like", "aria-label": "Reason to keep it, if you like", autocomplete: "off", enterkeyhint: "send" });
   private readonly keep = h("button", { type: "submit" }, "Keep it");
-  private readonly handOver = h("button", { type: "button", class: "primary", onclick: () => this.say(true) }, "Hand over");
+  private readonly handOver = h("button", { type: "button", class: "primary", onclick: () => this.reply(true) }, "Hand over");
   private shown: Question | null = null;
   private since_ms = 0;
 
@@ -59,7 +59,7 @@ export class QuestionPanel {
   update(pilot: Pilot | null, now_ms: number): void {
     const own = pilot?.authority.priority ?? null;
     const asked = pilot?.mine ? pending(pilot.questions, own) : [];
-    // The one that is read stays until it is over, whoever else asks meanwhile.
+    // The one that is read stays until it is over, whatever other requests come meanwhile.
     const question = asked.find((one) => one.id === this.shown?.id) ?? asked[0] ?? null;
     if (question?.id !== this.shown?.id) {
       this.since_ms = now_ms;
@@ -97,10 +97,10 @@ export class QuestionPanel {
 
   private submit(event: Event): void {
     event.preventDefault();
-    if (!this.keep.disabled) this.say(false);
+    if (!this.keep.disabled) this.reply(false);
   }
 
-  private say(grant: boolean): void {
+  private reply(grant: boolean): void {
     if (this.shown) this.answer(this.shown.id, grant, grant ? "" : this.reason.value.trim());
   }
 }

@@ -1,6 +1,6 @@
 // Recordings: those that run, and those of the past.
 
-import { get, post, told } from "./api.js";
+import { get, post, errorText } from "./api.js";
 import { h, setDisabled, setHidden, setText } from "./dom.js";
 import { bytes, clock, count } from "./format.js";
 import type { PastRecording, Recordings, RunningRecording } from "./model.js";
@@ -45,7 +45,7 @@ export class RecordingList {
     try {
       this.show(await get<Recordings>("/api/recordings"));
     } catch {
-      // told elsewhere: the page has lost the cockpit
+      // shown elsewhere: the page has lost the cockpit
     }
   }
 
@@ -88,7 +88,7 @@ export class RecordingList {
       await work();
       setText(this.note, "");
     } catch (error) {
-      setText(this.note, told(error));
+      setText(this.note, errorText(error));
     }
     await this.load();
   }

@@ -1,10 +1,10 @@
 // What is always there: the motors of the drone that is seen, land all, stop all; and what became of that.
 
 import type { ServerClock } from "./clock.js";
+import { type Answer, CommandSender, type CommandSocket, type Result } from "./commands.js";
 import { h, setAttribute, setDisabled, setHidden, setText, setTone } from "./dom.js";
 import { type Countdown, type Deadly, holdButton } from "./hold.js";
 import type { DroneRow } from "./model.js";
-import { type Answer, OrderLine, type Line, type Result } from "./orders.js";
 import { STEER_MS } from "./pilot.js";
 import type { Handlers } from "./socket.js";
 
@@ -27,7 +27,7 @@ interface Each extends Answer {
 
 export const WORDS: Readonly<Record<Deed, string>> = { land_all: "Land all", stop_all: "Stop all" };
 
-/** What became of an order to all drones, in words, the worst first. Pure. */
+/** The outcome of a command to all drones, in words, the worst first. Pure. */
 export function outcome(deed: Deed, drones: readonly string[], each: ReadonlyMap<string, { state: string; why: string }>): { text: string; bad: boolean } {
   const of = (state: string): string[] => drones.filter((name) => (each.get(name)?.state ?? "pending") === state);
   const failed = of("refused").map((name) => `${name}: ${each.get(name)?.why}`);
@@ -44,18 +44,18 @@ export function outcome(deed: Deed, drones: readonly string[], each: ReadonlyMap
 export class Safety {
   readonly element: HTMLElement;
   /** What became of it; below the bar. */
-  readonly told = h("p", { class: "banner safety-told", role: "status", hidden: true });
+  readonly message = h("p", { class: "banner safety-message", role: "status", hidden: true });
   private readonly name = h("span", { class: "stop-name" });
   private readonly fate = h("span", { class: "fate" });
   private readonly own: HTMLButtonElement;
   private readonly all: Record<Deed, { button: HTMLButtonElement; fate: HTMLElement }>;
-  private readonly line: OrderLine;
+  private readonly commands: CommandSender;
   private target: Target | null = null;
   private asked: { deed: Deed; drones: readonly string[]; each: Map<string, { state: string; why: string }>; since_ms: number } | null = null;
   private flying = 0;
 
   constructor(
-    connect: (handlers: Handlers) => Line,
+    connect: (handlers: Handlers) => CommandSocket,
     clock: ServerClock,
     private readonly countdown: Countdown,
   ) {
@@ -66,13 +66,13 @@ export class Safety {
     };
     this.all = { land_all: button("land_all", "land-all", ""), stop_all: button("stop_all", "stop", "Control+Shift+Enter") };
     this.element = h("div", { class: "safety", role: "group", "aria-label": "Emergency: press and hold" }, this.own, this.all.land_all.button, this.all.stop_all.button);
-    this.line = new OrderLine(
+    this.commands = new CommandSender(
       connect,
       clock,
-      { linked: () => this.show(), told: (message) => this.hear(message), refused: (order, why) => this.refused(order as Deed, why), changed: () => this.show() },
+      { linked: () => this.show(), received: (message) => this.onMessage(message), refused: (command, why) => this.refused(command as Deed, why), changed: () => this.show() },
       () => performance.now(),
     );
-    setInterval(() => this.line.tick(WATCH_MS), STEER_MS);
+    setInterval(() => this.commands.tick(WATCH_MS), STEER_MS);
   }
 
   /** Which drone is stopped by its own button, by keys and by the gamepad; null: none that flies is seen. */
@@ -94,7 +94,7 @@ export class Safety {
     else {
       const meant = which === "one" ? this.one() : this.every("stop_all");
       if (meant) this.countdown.press(meant);
-      else this.say("No drone that flies is opened and seen here: hold Stop all, or open one", true);
+      else this.notify("No drone that flies is opened and seen here: hold Stop all, or open one", true);
     }
   }
 
@@ -105,39 +105,39 @@ export class Safety {
 
   private every(deed: Deed): Deadly {
     const count = this.flying;
-    const whom = count === 1 ? "the only drone" : `all ${count} drones`;
-    return { what: deed === "land_all" ? `Land ${whom}` : `Motors of ${whom} off`, act: () => this.order(deed) };
+    const which = count === 1 ? "the only drone" : `all ${count} drones`;
+    return { what: deed === "land_all" ? `Land ${which}` : `Motors of ${which} off`, act: () => this.send(deed) };
   }
 
-  private order(deed: Deed): void {
+  private send(deed: Deed): void {
     this.asked = { deed, drones: [], each: new Map(), since_ms: performance.now() };
-    this.line.order({ do: deed });
-    if (this.line.result(deed)?.fate === "pending") this.say(`${WORDS[deed]} · pending`, false);
+    this.commands.send({ do: deed });
+    if (this.commands.result(deed)?.fate === "pending") this.notify(`${WORDS[deed]} · pending`, false);
   }
 
-  private hear(message: Answer): void {
+  private onMessage(message: Answer): void {
     const { asked } = this;
     if (!asked || message.do !== asked.deed) return;
     if (message.type === "sent") asked.drones = (message as Answer & { drones?: string[] }).drones ?? [];
     else if (message.type === "each") asked.each.set((message as Each).drone, { state: (message as Each).state, why: message.why ?? "" });
     else return;
     const { text, bad } = outcome(asked.deed, asked.drones, asked.each);
-    this.say(text, bad);
+    this.notify(text, bad);
   }
 
   private refused(deed: Deed, why: string): void {
-    if (deed in WORDS) this.say(`${WORDS[deed]} · ${why}`, true);
+    if (deed in WORDS) this.notify(`${WORDS[deed]} · ${why}`, true);
   }
 
-  private say(text: string, bad: boolean): void {
-    setTone(this.told, bad ? "bad" : "busy");
-    setText(this.told, text);
-    setHidden(this.told, false);
-    const said_ms = performance.now();
-    this.told_ms = said_ms;
-    setTimeout(() => this.told_ms === said_ms && setHidden(this.told, true), SHOWN_MS);
+  private notify(text: string, bad: boolean): void {
+    setTone(this.message, bad ? "bad" : "busy");
+    setText(this.message, text);
+    setHidden(this.message, false);
+    const now_ms = performance.now();
+    this.shown_ms = now_ms;
+    setTimeout(() => this.shown_ms === now_ms && setHidden(this.message, true), SHOWN_MS);
   }
-  private told_ms = 0;
+  private shown_ms = 0;
 
   private show(): void {
     if (!this.all) return; // while it is made
@@ -150,7 +150,7 @@ export class Safety {
       const { button, fate } = this.all[deed];
       setDisabled(button, this.flying === 0);
       setAttribute(button, "aria-label", `${deed === "land_all" ? "Land all drones" : "Stop all: motors of all drones off"}, press and hold`);
-      showFate(button, fate, this.line.result(deed));
+      showFate(button, fate, this.commands.result(deed));
     }
   }
 }

@@ -1,4 +1,4 @@
-// The 3-D view. Loaded when somebody first wants to see it. World axes: x east, y north, z up [m].
+// The 3-D view. Loaded when it is first shown. World axes: x east, y north, z up [m].
 
 import {
   AmbientLight,
@@ -45,7 +45,7 @@ export class SceneView {
   private drawn_ms = 0;
 
   /** Throws where there is no WebGL. */
-  constructor(private readonly told: () => Scene) {
+  constructor(private readonly current: () => Scene) {
     this.camera.up.set(0, 0, 1);
     this.camera.position.set(-4, -5, 4);
     this.controls = new OrbitControls(this.camera, this.renderer.domElement);
@@ -80,7 +80,7 @@ export class SceneView {
     const density = Math.min(2, window.devicePixelRatio || 1);
     if (this.renderer.domElement.width !== Math.floor(width * density)) this.resize(width, height, density);
     else if (this.renderer.domElement.height !== Math.floor(height * density)) this.resize(width, height, density);
-    this.arrange(this.told());
+    this.arrange(this.current());
     this.controls.update();
     this.renderer.render(this.scene, this.camera);
   }

@@ -63,7 +63,7 @@ export function scale(sticks: Sticks, pace: Pace): Sticks {
   };
 }
 
-/** A stick that was already pushed when control began counts for nothing until it has been let go. */
+/** A stick that was already pushed when control began counts for nothing until it has been released. */
 export class Latch {
   private open = false;
 

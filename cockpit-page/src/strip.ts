@@ -12,7 +12,7 @@ import { showFate } from "./safety.js";
 
 const USUAL_PRIORITY = 8; // before the controllers' usual 16
 
-/** A button with its key beside it, and on it what became of its order. */
+/** A button with its key beside it, and on it the outcome of its command. */
 function keyed(name: string, key: string, kind: string, act: () => void): HTMLButtonElement {
   const keys = key ? h("kbd", { "aria-hidden": "true" }, key) : null;
   return h("button", { type: "button", class: kind, onclick: act, ...(key ? { "aria-keyshortcuts": key } : {}) }, h("span", {}, name), keys, h("span", { class: "fate", role: "status" }));
@@ -48,7 +48,7 @@ export class Strip {
   private readonly why = h("p", { class: "note" });
   private readonly endedText = h("span", {});
   private readonly ended: HTMLElement;
-  private readonly orders: readonly [string, HTMLButtonElement][];
+  private readonly buttons: readonly [string, HTMLButtonElement][];
 
   constructor(
     drone: string,
@@ -69,7 +69,7 @@ export class Strip {
     this.reset = keyed("Reset emergency", "", "", () => act("reset"));
     this.stop = holdButton(stop.countdown, stop.deadly, { class: "stop", "aria-label": `Motors off, ${drone}: press and hold`, title: "Press and hold" }, h("span", {}, "Motors off"), h("span", { class: "stop-name" }, drone), h("span", { class: "fate" }));
     this.ended = h("p", { class: "ended", role: "alert", "data-tone": "bad", hidden: true }, this.endedText, h("button", { type: "button", class: "small", onclick: stop.understood }, "Understood"));
-    this.orders = [["take", this.take], ["release", this.release], ["takeoff", this.takeOff], ["hover", this.hover], ["land", this.land], ["reset", this.reset], ["stop", this.stop]];
+    this.buttons = [["take", this.take], ["release", this.release], ["takeoff", this.takeOff], ["hover", this.hover], ["land", this.land], ["reset", this.reset], ["stop", this.stop]];
     this.element = h("div", { class: "strip", role: "group", "aria-label": "Flying" }, this.question.voice, this.question.element, this.ended, this.waiting, this.holder, h("span", { class: "taking" }, this.priority, this.ask, this.take, this.release), h("span", { class: "deeds" }, this.takeOff, this.hover, this.land, this.reset), this.why, this.stop);
   }
 
@@ -84,7 +84,7 @@ export class Strip {
     return this.ask.getAttribute("aria-pressed") === "true";
   }
 
-  /** `pilot` is null for who may only look; `old`: what was heard last is no news. A recording has no flight controls. */
+  /** `pilot` is null for an observer; `old`: the newest state is out of date. A recording has no flight controls. */
   update(vehicle: Vehicle | null, state: State | null, pilot: Pilot | null, old: boolean, recording: boolean): void {
     setHidden(this.element, recording);
     const { who, more, tone } = old ? oldHolderText(pilot?.mine ?? false) : holderText(state, pilot?.authority ?? null);
@@ -115,7 +115,7 @@ export class Strip {
     setAttribute(this.element, "data-mine", String(mine && !old));
     setText(this.endedText, pilot?.ended ? `You lost control. ${pilot.ended[0]?.toUpperCase()}${pilot.ended.slice(1)}.` : "");
     setHidden(this.ended, !this.endedText.textContent);
-    for (const [what, button] of this.orders) showFate(button, button.lastElementChild as HTMLElement, pilot?.result(what) ?? null);
+    for (const [what, button] of this.buttons) showFate(button, button.lastElementChild as HTMLElement, pilot?.result(what) ?? null);
   }
 
   /** What runs out, as of now. */

@@ -1,4 +1,4 @@
-// Dark or light: as the system says, until somebody chooses.
+// Dark or light: as the system is set, until the user chooses.
 
 import { h, memory, svg } from "./dom.js";
 

@@ -6,7 +6,7 @@ import { CENTRED, deadBand } from "./sticks.js";
 
 type Push = (x: number, y: number) => void;
 
-/** One stick: pushes from −1 to 1, right and up positive; back to the centre when it is let go. */
+/** One stick: pushes from −1 to 1, right and up positive; back to the centre when it is released. */
 function stick(label: string, push: Push): HTMLElement {
   const knob = h("i", { class: "knob" });
   const pad = h("div", { class: "thumb", role: "img", "aria-label": label }, knob, h("span", {}, label));
@@ -35,15 +35,15 @@ export class Thumbs {
   private sticks: Sticks = { ...CENTRED };
 
   constructor(push: (sticks: Sticks) => void) {
-    const tell = (news: Partial<Sticks>): void => {
-      this.sticks = { ...this.sticks, ...news };
+    const update = (change: Partial<Sticks>): void => {
+      this.sticks = { ...this.sticks, ...change };
       push(this.sticks);
     };
     this.element = h(
       "div",
       { class: "thumbs" },
-      stick("up · turn", (x, y) => tell({ up: deadBand(y), yaw_rate: deadBand(-x) + 0 })),
-      stick("forward · side", (x, y) => tell({ forward: deadBand(y), left: deadBand(-x) + 0 })),
+      stick("up · turn", (x, y) => update({ up: deadBand(y), yaw_rate: deadBand(-x) + 0 })),
+      stick("forward · side", (x, y) => update({ forward: deadBand(y), left: deadBand(-x) + 0 })),
     );
   }
 }

@@ -9,7 +9,7 @@ export function valueText(value: Value | null): string {
   return String(value);
 }
 
-/** What was written, as the parameter's type; words that say what is wrong instead. Ranges are the drone's own affair. */
+/** What was written, as the parameter's type; or what is wrong, in words. Ranges are the drone's own affair. */
 export function parse(parameter: Pick<Parameter, "type">, text: string): { value: Value } | { problem: string } {
   const written = text.trim();
   if (parameter.type === "text") return { value: text };

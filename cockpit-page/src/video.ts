@@ -1,4 +1,4 @@
-// One camera: shows the newest frame, tells how old it is, and draws what was published about it.
+// One camera: shows the newest frame, its age, and draws what was published about it.
 
 import { fit, h, setAttribute, setHidden, setText, setTone } from "./dom.js";
 import { contain, draw } from "./drawing.js";
@@ -58,7 +58,7 @@ export class VideoView {
     return this.shown && this.shown.age_s + (now_ms - this.shown.received_ms) / 1000;
   }
 
-  /** Tell age and rate. */
+  /** Show age and rate. */
   update(now_ms: number): void {
     const age_s = this.age_s(now_ms);
     while (this.arrivals[0] !== undefined && this.arrivals[0] < now_ms - RATE_MS) this.arrivals.shift();
@@ -94,7 +94,7 @@ export class VideoView {
     this.socket = null;
     if (document.hidden) return;
     const socket = new LastingSocket(`/ws/drones/${encodeURIComponent(this.drone)}/video/${encodeURIComponent(this.camera.name)}`, {
-      message: (data) => this.hear(data),
+      message: (data) => this.onMessage(data),
     });
     this.socket = socket;
     this.frames = new NewestFrame(
@@ -104,7 +104,7 @@ export class VideoView {
     );
   }
 
-  private hear(data: string | ArrayBuffer): void {
+  private onMessage(data: string | ArrayBuffer): void {
     if (typeof data === "string") {
       const drawing = JSON.parse(data) as Drawing;
       this.drawings.set(drawing.source, drawing);

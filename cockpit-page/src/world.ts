@@ -15,7 +15,7 @@ export interface Body {
 export interface Scene {
   /** The drone of this pane; null while its position is not known. */
   own: Body | null;
-  /** Where it really is, as the simulator or motion capture tells. */
+  /** Where it really is, as the simulator or motion capture reports it. */
   truth: Body | null;
   others: Body[];
   targets: Body[];

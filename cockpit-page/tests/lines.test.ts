@@ -19,8 +19,8 @@ test("a frame's message is taken apart", () => {
   new DataView(message.buffer).setUint32(0, text.length);
   message.set(text, 4);
   message.set([0xff, 0xd8], 4 + text.length);
-  const { head: told, jpeg } = unpack(message.buffer);
-  assert.equal(told.ack, 7);
+  const { head: parsed, jpeg } = unpack(message.buffer);
+  assert.equal(parsed.ack, 7);
   assert.deepEqual([...jpeg], [0xff, 0xd8]);
   assert.throws(() => unpack(message.buffer.slice(0, 10)), RangeError);
 });
@@ -86,8 +86,8 @@ class FakeWire implements Wire {
   }
 }
 
-function lasting(): { socket: LastingSocket; wires: FakeWire[]; pauses: number[]; later: () => void; states: boolean[]; heard: unknown[] } {
-  const [wires, pauses, states, heard]: [FakeWire[], number[], boolean[], unknown[]] = [[], [], [], []];
+function lasting(): { socket: LastingSocket; wires: FakeWire[]; pauses: number[]; later: () => void; states: boolean[]; received: unknown[] } {
+  const [wires, pauses, states, received]: [FakeWire[], number[], boolean[], unknown[]] = [[], [], [], []];
   let act: () => void = () => undefined;
   const around = {
     connect: () => {
@@ -102,8 +102,8 @@ function lasting(): { socket: LastingSocket; wires: FakeWire[]; pauses: number[]
       act = () => undefined;
     },
   };
-  const socket = new LastingSocket("/ws", { message: (data) => heard.push(data), state: (open) => states.push(open) }, around);
-  return { socket, wires, pauses, later: () => act(), states, heard };
+  const socket = new LastingSocket("/ws", { message: (data) => received.push(data), state: (open) => states.push(open) }, around);
+  return { socket, wires, pauses, later: () => act(), states, received };
 }
 
 test("a socket comes back, with longer and longer pauses, and short ones again after it was open", () => {
@@ -124,7 +124,7 @@ test("a socket comes back, with longer and longer pauses, and short ones again a
 });
 
 test("nothing is sent or kept while it is not open; closed is closed", () => {
-  const { socket, wires, later, heard } = lasting();
+  const { socket, wires, later, received } = lasting();
   assert.equal(socket.send({ do: "stop" }), false);
   wires[0]?.open();
   assert.equal(socket.send({ do: "stop" }), true);
@@ -134,15 +134,15 @@ test("nothing is sent or kept while it is not open; closed is closed", () => {
   wires[0]?.end();
   later();
   assert.equal(wires.length, 1);
-  assert.deepEqual(heard, []);
+  assert.deepEqual(received, []);
 });
 
 type Sent = Record<string, unknown>;
 interface Flown {
   pilot: Pilot;
   sent: Sent[];
-  told: string[];
-  hear: (message: object) => void;
+  reported: string[];
+  receive: (message: object) => void;
   link: (open: boolean) => void;
   at: (ms: number) => void;
   /** The cockpit answers the newest ping, at once. */
@@ -153,7 +153,7 @@ interface Flown {
 
 /** A page's pilot, and a cockpit whose clock is 1000 s ahead. */
 function flown(): Flown {
-  const [sent, told]: [Sent[], string[]] = [[], []];
+  const [sent, reported]: [Sent[], string[]] = [[], []];
   let [now_ms, open] = [0, false];
   let handlers: Handlers | null = null;
   const pilot = new Pilot(
@@ -162,17 +162,17 @@ function flown(): Flown {
       return { get isOpen() { return open; }, send: (message) => open && sent.push(message as Sent) > 0, close: () => undefined };
     },
     new ServerClock(),
-    { changed: () => undefined, refused: (order, why) => told.push(`${order}: ${why}`), done: (order) => told.push(`done ${order}`) },
+    { changed: () => undefined, refused: (command, why) => reported.push(`${command}: ${why}`), done: (command) => reported.push(`done ${command}`) },
     () => now_ms,
   );
-  const hear = (message: object): void => handlers?.message(JSON.stringify(message));
-  const pong = (): void => hear({ type: "pong", n: sent.findLast((message) => message["do"] === "ping")?.["n"], now_s: 1000 + now_ms / 1000 });
+  const receive = (message: object): void => handlers?.message(JSON.stringify(message));
+  const pong = (): void => receive({ type: "pong", n: sent.findLast((message) => message["do"] === "ping")?.["n"], now_s: 1000 + now_ms / 1000 });
   const link = (up: boolean): void => {
     open = up;
     handlers?.state?.(up, 0, "");
   };
   return {
-    pilot, sent, told, hear, link, pong,
+    pilot, sent, reported, receive, link, pong,
     at: (ms) => {
       now_ms = ms;
     },
@@ -188,11 +188,11 @@ const doings = (sent: Record<string, unknown>[]): unknown[] => sent.map((message
 const FORWARD = { ...CENTRED, forward: 0.5 };
 
 test("sticks fly only with the authority, and hover once when they are let go", () => {
-  const { pilot, sent, hear, live } = flown();
+  const { pilot, sent, receive, live } = flown();
   live();
   pilot.steer(FORWARD);
   assert.deepEqual(doings(sent), []);
-  hear(held(true));
+  receive(held(true));
   pilot.steer(FORWARD);
   pilot.steer(FORWARD);
   pilot.steer(CENTRED);
@@ -201,9 +201,9 @@ test("sticks fly only with the authority, and hover once when they are let go", 
 });
 
 test("a page that loses the focus hovers what it has under way, and nothing else", () => {
-  const { pilot, sent, hear, live } = flown();
+  const { pilot, sent, receive, live } = flown();
   live();
-  hear(held(true));
+  receive(held(true));
   pilot.rest();
   assert.deepEqual(doings(sent), []);
   pilot.steer(FORWARD);
@@ -212,15 +212,15 @@ test("a page that loses the focus hovers what it has under way, and nothing else
   pilot.rest();
   assert.deepEqual(doings(sent), ["fly", "hover", "goto", "hover"]);
   pilot.goTo(1, 2, 3);
-  hear({ type: "done", do: "goto" });
+  receive({ type: "done", do: "goto" });
   pilot.rest();
   assert.deepEqual(doings(sent).slice(4), ["goto"], "there already");
 });
 
 test("while it holds control it tells that it is there and what it hears, and measures how long that takes", () => {
-  const { pilot, sent, hear, live, at } = flown();
+  const { pilot, sent, receive, live, at } = flown();
   live();
-  hear(held(true));
+  receive(held(true));
   for (let ms = 0; ms <= 1000; ms += 50) {
     at(ms);
     pilot.steer(CENTRED);
@@ -228,50 +228,50 @@ test("while it holds control it tells that it is there and what it hears, and me
   const pings = sent.filter((message) => message["do"] === "ping");
   assert.ok(pings.length >= 6, `${pings.length} pings in a second: the cockpit waits 0.5 s`);
   at(1004);
-  hear({ type: "pong", n: pings.at(-1)?.["n"], now_s: 1001 });
+  receive({ type: "pong", n: pings.at(-1)?.["n"], now_s: 1001 });
   assert.ok(pilot.round_trip_s !== null && pilot.round_trip_s <= 0.154 && pilot.round_trip_s >= 0.004);
   at(1200);
   pilot.steer(CENTRED);
-  assert.equal(sent.at(-1)?.["seen_s"], 1001, "when the newest pong that it heard was sent");
+  assert.equal(sent.at(-1)?.["seen_s"], 1001, "when the newest pong that it received was sent");
   assert.ok(Math.abs((sent.at(-1)?.["at_s"] as number) - 1001.2) < 0.1);
 });
 
-test("each order carries when it was asked for, on the cockpit's clock, and is pending until the cockpit has it", () => {
-  const { pilot, sent, hear, live, at } = flown();
+test("each command carries the time of its press, on the cockpit's clock, and is pending until the cockpit has it", () => {
+  const { pilot, sent, receive, live, at } = flown();
   live();
   at(300);
-  hear(held(true));
+  receive(held(true));
   pilot.act("takeoff");
-  const order = sent.at(-1) as Sent;
-  assert.equal(order["do"], "takeoff");
-  assert.ok(Math.abs((order["at_s"] as number) - 1000.3) < 0.01);
-  assert.ok((order["unsure_s"] as number) < 0.02);
+  const command = sent.at(-1) as Sent;
+  assert.equal(command["do"], "takeoff");
+  assert.ok(Math.abs((command["at_s"] as number) - 1000.3) < 0.01);
+  assert.ok((command["unsure_s"] as number) < 0.02);
   assert.equal(pilot.result("takeoff")?.fate, "pending");
-  hear({ type: "sent", do: "takeoff", n: (order["n"] as number) - 1 });
+  receive({ type: "sent", do: "takeoff", n: (command["n"] as number) - 1 });
   assert.equal(pilot.result("takeoff")?.fate, "pending", "that was another one");
-  hear({ type: "sent", do: "takeoff", n: order["n"] });
+  receive({ type: "sent", do: "takeoff", n: command["n"] });
   assert.equal(pilot.result("takeoff")?.fate, "sent");
-  hear({ type: "refused", do: "takeoff", n: 0, why: "battery low" });
+  receive({ type: "refused", do: "takeoff", n: 0, why: "battery low" });
   assert.deepEqual(pilot.result("takeoff"), { ...pilot.result("takeoff"), fate: "refused", why: "battery low" });
 });
 
 test("a page that has no answer for a second sends nothing, and says so on the control", () => {
-  const { pilot, sent, told, hear, live, at } = flown();
+  const { pilot, sent, reported, receive, live, at } = flown();
   live();
-  hear(held(true));
+  receive(held(true));
   at(1500);
   const before = sent.length;
   pilot.act("takeoff");
   pilot.steer(FORWARD);
   assert.deepEqual(doings(sent.slice(before)), []);
   assert.equal(pilot.result("takeoff")?.fate, "not sent");
-  assert.match(told.at(-1) ?? "", /no answer from the cockpit for 1\.5 s/);
+  assert.match(reported.at(-1) ?? "", /no answer from the cockpit for 1\.5 s/);
 });
 
-test("what left and was never answered is told as that, not as sent", () => {
-  const { pilot, hear, live, at } = flown();
+test("what left and was never answered is shown as that, not as sent", () => {
+  const { pilot, receive, live, at } = flown();
   live();
-  hear(held(true));
+  receive(held(true));
   pilot.act("land");
   for (let ms = 0; ms <= 2000; ms += 50) {
     at(ms);
@@ -281,58 +281,58 @@ test("what left and was never answered is told as that, not as sent", () => {
 });
 
 test("an emergency stop needs no control, stays pending for two seconds, and goes when the link is back by then", () => {
-  const { pilot, sent, live, at, hear } = flown();
+  const { pilot, sent, live, at, receive } = flown();
   pilot.act("stop");
   assert.equal(pilot.result("stop")?.fate, "pending");
   at(1500);
   live();
-  const order = sent.at(-1) as Sent;
-  assert.equal(order["do"], "stop");
-  assert.ok(Math.abs((order["at_s"] as number) - 1000) < 0.01, "it says when it was pressed, not when it was sent");
-  hear({ type: "sent", do: "stop", n: order["n"] });
+  const command = sent.at(-1) as Sent;
+  assert.equal(command["do"], "stop");
+  assert.ok(Math.abs((command["at_s"] as number) - 1000) < 0.01, "it says when it was pressed, not when it was sent");
+  receive({ type: "sent", do: "stop", n: command["n"] });
   assert.equal(pilot.result("stop")?.fate, "sent");
 });
 
-test("an emergency stop that did not go within two seconds never goes, and is told as not sent", () => {
-  const { pilot, sent, told, live, at } = flown();
+test("an emergency stop that did not go within two seconds never goes, and is shown as not sent", () => {
+  const { pilot, sent, reported, live, at } = flown();
   pilot.act("stop");
   at(2100);
   pilot.steer(CENTRED);
   assert.equal(pilot.result("stop")?.fate, "not sent");
-  assert.match(told.at(-1) ?? "", /stop: not sent/);
+  assert.match(reported.at(-1) ?? "", /stop: not sent/);
   live();
   pilot.steer(CENTRED);
   assert.deepEqual(doings(sent), []);
 });
 
 test("how control was lost stays to be read until control is taken again or it was understood", () => {
-  const { pilot, hear, live, link } = flown();
+  const { pilot, receive, live, link } = flown();
   live();
-  hear(held(true));
-  hear({ ...held(false), why: "the link to the proxy of alpha is down: nobody has control" });
+  receive(held(true));
+  receive({ ...held(false), why: "the link to the proxy of alpha is down: nobody has control" });
   assert.match(pilot.ended, /nobody has control/);
-  hear(held(false));
+  receive(held(false));
   assert.match(pilot.ended, /nobody has control/, "still to be read");
   pilot.understood();
   assert.equal(pilot.ended, "");
-  hear(held(true));
+  receive(held(true));
   link(false);
   assert.match(pilot.ended, /connection to the cockpit broke/);
   live();
-  hear(held(true));
+  receive(held(true));
   assert.equal(pilot.ended, "");
 });
 
-test("who loses control is told to whom; after a broken connection nothing is flown on", () => {
-  const { pilot, sent, hear, link, live } = flown();
+test("who loses control learns who has it; after a broken connection nothing is flown on", () => {
+  const { pilot, sent, receive, link, live } = flown();
   live();
   pilot.take(8, false);
-  hear(held(true));
+  receive(held(true));
   pilot.steer(FORWARD);
-  hear({ ...held(false, "follow.py"), why: "follow.py has control now" });
+  receive({ ...held(false, "follow.py"), why: "follow.py has control now" });
   assert.match(pilot.ended, /follow\.py has control/);
   pilot.steer(FORWARD);
-  hear(held(true));
+  receive(held(true));
   pilot.steer(FORWARD);
   link(false);
   assert.equal(pilot.mine, false);
@@ -344,13 +344,13 @@ test("who loses control is told to whom; after a broken connection nothing is fl
 const asks = (id: number, more: Partial<Question> = {}): Question => ({ id, by: `app ${id}`, priority: 4, for_s: null, left_s: 10, declined: false, ...more });
 
 test("who has control is asked for it, and answers; the time runs out here too", () => {
-  const { pilot, sent, hear, link, live, at, pong } = flown();
+  const { pilot, sent, receive, link, live, at, pong } = flown();
   live();
-  hear(held(true));
+  receive(held(true));
   at(1000);
   pilot.steer(CENTRED);
   pong();
-  hear({ type: "asked", questions: [asks(3)] });
+  receive({ type: "asked", questions: [asks(3)] });
   assert.equal(pilot.questions.length, 1);
   at(5000);
   assert.equal(pilot.left_s(pilot.questions[0] as Question), 6);
@@ -360,35 +360,35 @@ test("who has control is asked for it, and answers; the time runs out here too",
   pong();
   pilot.answer(3, false, "landing");
   pilot.answer(3, true, "");
-  const orders = (what: string): Sent[] => sent.filter((message) => message["do"] === what).map(({ n: _, at_s: __, unsure_s: ___, ...order }) => order);
-  assert.deepEqual(orders("answer"), [
+  const commands = (what: string): Sent[] => sent.filter((message) => message["do"] === what).map(({ n: _, at_s: __, unsure_s: ___, ...command }) => command);
+  assert.deepEqual(commands("answer"), [
     { do: "answer", id: 3, grant: false, reason: "landing" },
     { do: "answer", id: 3, grant: true, reason: "" },
   ]);
-  hear(held(false, "app 3"));
+  receive(held(false, "app 3"));
   assert.deepEqual(pilot.questions, [], "who has no control is asked nothing");
-  hear(held(true));
-  hear({ type: "asked", questions: [asks(4)] });
+  receive(held(true));
+  receive({ type: "asked", questions: [asks(4)] });
   link(false);
   assert.deepEqual(pilot.questions, []);
 });
 
 test("who asks first waits, and sees for how long", () => {
-  const { pilot, sent, hear, live, at, pong } = flown();
+  const { pilot, sent, receive, live, at, pong } = flown();
   live();
   pilot.take(8, true);
   assert.deepEqual([sent.at(-1)?.["do"], sent.at(-1)?.["priority"], sent.at(-1)?.["ask"]], ["take", 8, true]);
   assert.equal(pilot.wait_s, null);
-  hear({ ...held(false, "follow.py"), state: "queued", line: { position: 1, wait_s: 9, asked: true, declined: null } });
+  receive({ ...held(false, "follow.py"), state: "queued", line: { position: 1, wait_s: 9, asked: true, declined: null } });
   at(4000);
   assert.ok(pilot.waits);
   assert.equal(pilot.wait_s, 5);
-  hear({ ...held(false, "follow.py"), state: "queued", line: { position: 1, wait_s: null, asked: true, declined: "" } });
+  receive({ ...held(false, "follow.py"), state: "queued", line: { position: 1, wait_s: null, asked: true, declined: "" } });
   assert.equal(pilot.wait_s, null, "not known");
   pilot.steer(CENTRED);
   pong();
   pilot.release();
-  hear(held(false, "follow.py"));
+  receive(held(false, "follow.py"));
   assert.equal(pilot.wait_s, null);
   assert.equal(pilot.ended, "", "control that was never had is not lost");
 });

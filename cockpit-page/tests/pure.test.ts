@@ -9,7 +9,7 @@ import { GamepadReader, type Pad } from "../src/gamepad.js";
 import { History, Trail } from "../src/history.js";
 import { Hold, HOLD_MS } from "../src/hold.js";
 import { type Press, Keys, stopKeys } from "../src/keys.js";
-import type { Authority, DroneRow, Line, Question, Sticks } from "../src/model.js";
+import type { Authority, DroneRow, QueuePosition, Question, Sticks } from "../src/model.js";
 import { grouped } from "../src/plots.js";
 import { explained, pending, wins } from "../src/question.js";
 import { lacking } from "../src/recordings.js";
@@ -102,7 +102,7 @@ test("what is held counts, once, and starts anew when it was let go", () => {
   assert.ok(!hold.isDone(6000 + HOLD_MS), "once");
 });
 
-test("what became of an order to all drones, the worst first", () => {
+test("what became of a command to all drones, the worst first", () => {
   const each = new Map([["a", { state: "sent", why: "" }], ["b", { state: "refused", why: "link lost" }]]);
   assert.deepEqual(outcome("stop_all", ["a", "b", "c"], each), { text: "Stop all · NOT stopped: b: link lost · pending: c · sent: a", bad: true });
   each.set("b", { state: "done", why: "" });
@@ -110,7 +110,7 @@ test("what became of an order to all drones, the worst first", () => {
   assert.match(outcome("land_all", [], new Map()).text, /no drone/);
 });
 
-test("the cockpit's clock: to half of the time there and back, and what is told late is old", () => {
+test("the cockpit's clock: to half of the time there and back, and what arrives late is old", () => {
   const clock = new ServerClock();
   assert.equal(clock.at(0), null);
   assert.equal(clock.age_s(5, 0), null);
@@ -120,9 +120,9 @@ test("the cockpit's clock: to half of the time there and back, and what is told 
   clock.pong(3000, 11_000, 60.9); // answered after a stall: known no better by that
   const later = clock.at(11_000);
   assert.ok(later && Math.abs(later.at_s - 61) < 1e-6 && later.unsure_s < 0.06);
-  clock.told(12_000, 61.99);
+  clock.received(12_000, 61.99);
   near(clock.age_s(61.99, 12_000) as number, 0);
-  clock.told(13_000, 55); // seven seconds in some buffer
+  clock.received(13_000, 55); // seven seconds in some buffer
   assert.ok((clock.age_s(55, 13_000) as number) > 7.9);
   assert.ok((clock.age_s(61.99, 12_000 + 3_600_000) as number) > 3598, "an hour later it is an hour old");
 });
@@ -138,7 +138,7 @@ test("a clock that jumps, as after sleep, is measured anew", () => {
 
 test("who observes knows how old news is without asking anything", () => {
   const clock = new ServerClock();
-  for (let ms = 0; ms < 5000; ms += 55) clock.told(ms + 5, 100 + ms / 1000);
+  for (let ms = 0; ms < 5000; ms += 55) clock.received(ms + 5, 100 + ms / 1000);
   assert.ok((clock.age_s(105, 5010) as number) < 0.02);
   assert.ok((clock.age_s(105, 8000) as number) > 2.9);
 });
@@ -151,7 +151,7 @@ const pad = (axes: number[], pressed: number[] = []): Pad => ({
   buttons: Array.from({ length: 17 }, (_, number) => ({ pressed: pressed.includes(number) })),
 });
 
-test("gamepad: sticks after they were centred, buttons once, and told when it goes away", () => {
+test("gamepad: sticks after they were centred, buttons once, and reported when it goes away", () => {
   const reader = new GamepadReader();
   assert.ok(isCentred(reader.read(pad([0, -1, 0, 0])).sticks), "pushed from the start");
   assert.ok(isCentred(reader.read(pad([0.05, -0.1, 0, 0.02])).sticks), "dead band");
@@ -277,14 +277,14 @@ test("a question for control says what becomes of it", () => {
   assert.ok(wins(asks(), 8));
   assert.ok(!wins(asks({ priority: 8 }), 8));
   assert.equal(explained(asks(), 8, 0), "Priority 4, yours 8. That is higher than yours: it has control when the time is over. Wanted for 2 min.");
-  assert.match(explained(asks({ priority: 16, for_s: null }), 8, 2), /you keep control unless.*not said\. 2 more ask for it\.$/);
+  assert.match(explained(asks({ priority: 16, for_s: null }), 8, 2), /you keep control unless.*unspecified time\. 2 more ask for it\.$/);
   assert.match(explained(asks({ declined: true }), 8, 0), /^You keep it for now; the higher priority/);
   const [kept, keptFromLower] = [asks({ declined: true }), asks({ id: 4, declined: true, priority: 16 })];
   assert.deepEqual(pending([kept, keptFromLower], 8), [kept], "nothing more comes of one that is no higher");
 });
 
 test("the place in the line, with what was answered", () => {
-  const waits = (line: Partial<Line>, state: Authority["state"] = "queued"): string =>
+  const waits = (line: Partial<QueuePosition>, state: Authority["state"] = "queued"): string =>
     lineText({ type: "authority", state, holder: "follow.py", priority: 16, mine: false, why: null, line: { position: 2, wait_s: null, asked: false, declined: null, ...line } });
   assert.equal(waits({}), "You are number 2 in line");
   assert.equal(waits({ position: null }, "preempted"), "You wait in line");

@@ -114,7 +114,7 @@ def test_keyboard_flight(deck: Deck) -> None:
         )
         page.wait_for_text(".command", "forward 0.80")
         page.page.keyboard.up("w")
-        page.until(lambda: drone.feedback().state is FlightState.HOVERING, "it hovers when the key is let go")
+        page.until(lambda: drone.feedback().state is FlightState.HOVERING, "it hovers when the key is released")
         after = drone.feedback().position
         assert before is not None
         assert after is not None

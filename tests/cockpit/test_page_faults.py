@@ -103,7 +103,7 @@ def test_an_emergency_stop_held_in_a_stall_is_pending_for_two_seconds_and_never_
                 page.until(lambda: stop.get_attribute("data-fate") == "pending", "it is shown as pending")
             pressed_s = time.monotonic()
             page.until(lambda: stop.get_attribute("data-fate") in ("no answer", "not sent"), "it is given up")
-            assert 1.0 < time.monotonic() - pressed_s < 8.0
+            assert 1.0 < time.monotonic() - pressed_s < 4.0
         page.until(lambda: page.pane.get_attribute("data-old") == "false", "the cockpit is heard again")
         page.until(lambda: stop.get_attribute("data-fate") == "refused", "it was refused")
         for _ in range(20):
@@ -123,7 +123,7 @@ def test_a_page_whose_cockpit_is_stopped_is_grey_and_tells_the_age_in_seconds(de
     with stopped(cockpit.pid):
         stopped_s = time.monotonic()
         page.until(lambda: page.pane.get_attribute("data-old") == "true", "it is grey")
-        assert time.monotonic() - stopped_s < 6.0
+        assert time.monotonic() - stopped_s < 2.0
         page.until(lambda: float(page.says(".old b").split()[0]) > 2.0, "the age counts")
         assert "was hovering" in page.says(".pill")
         assert "Not known" in page.says(".holder")
@@ -133,7 +133,7 @@ def test_a_page_whose_cockpit_is_stopped_is_grey_and_tells_the_age_in_seconds(de
             style = page.pane.locator(part).first.evaluate("part => getComputedStyle(part).filter")
             assert "grayscale(1)" in style, part
         page.page.locator('.fleet[data-old="true"]').wait_for()
-        page.until(lambda: "does not hear the cockpit" in page.page.locator(".banner.lost").inner_text(), "on top too")
+        page.until(lambda: "No answer from the cockpit" in page.page.locator(".banner.lost").inner_text(), "on top too")
         with observe("grey") as drone:
             page.until(lambda: drone.feedback().owner_id == 0 or not drone.feedback().lease, "control ran out")
     page.until(lambda: page.pane.get_attribute("data-old") == "false", "it is heard again")
@@ -223,7 +223,7 @@ def test_the_emergency_stop_is_held_shown_as_it_counts_and_names_the_drone(deck:
         with page.holding("Control", "Enter"):
             counting.wait_for()
             assert "Motors of left off" in counting.inner_text()
-        page.until(lambda: "let go" in counting.inner_text(), "it says that nothing was done")
+        page.until(lambda: "released too early" in counting.inner_text(), "it says that nothing was done")
         assert {left.feedback().state, right.feedback().state} == {FlightState.HOVERING}
         # While somebody writes, and with the list of keys over it.
         page.press("?")
@@ -268,10 +268,12 @@ def test_land_all_and_stop_all_are_there_with_nothing_opened(deck: Deck) -> None
         two.takeoff()
         page.page.get_by_role("button", name="Land all").focus()
         with page.holding(" "):
-            page.until(lambda: "Land all" in page.page.locator(".safety-told").inner_text(), "it is told")
+            page.until(lambda: "Land all" in page.page.locator(".safety-message").inner_text(), "it is told")
         for drone in (one, two):
             drone.wait("landed", 15)
-        page.until(lambda: "landed: one, two" in page.page.locator(".safety-told").inner_text(), "with what came of it")
+        page.until(
+            lambda: "landed: one, two" in page.page.locator(".safety-message").inner_text(), "with what came of it"
+        )
         one.wait(lambda feedback: feedback.owner == "a", 5)
         two.wait(lambda feedback: feedback.owner == "b", 5)
         one.takeoff()
@@ -298,6 +300,6 @@ def test_a_recording_has_no_flight_controls_and_ends_neutrally(deck: Deck) -> No
     assert not replay.locator(".alarms").is_visible()
     assert not replay.locator(".old").is_visible()
     with page.holding("Control", "Enter"), observe("taped") as drone:
-        page.until(lambda: "No drone" in page.page.locator(".safety-told").inner_text(), "it is told")
+        page.until(lambda: "No drone" in page.page.locator(".safety-message").inner_text(), "it is told")
         assert drone.next_feedback().state is FlightState.LANDED
     assert page.problems == []

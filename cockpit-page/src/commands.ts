@@ -1,12 +1,12 @@
-// Orders on their way: each carries when it was asked for, and what became of it is known until it no longer matters.
+// Commands on their way: each carries the time of the press, and its outcome is kept for as long as it matters.
 //
-// The cockpit does nothing that may be older than 0.5 s. So an order that can't be sent now is never sent, except an
+// The cockpit does nothing that may be older than 0.5 s. So a command that can't be sent now is never sent, except an
 // emergency stop: that one is tried for two seconds, while the page shows it as pending.
 
 import type { ServerClock } from "./clock.js";
 import type { Handlers } from "./socket.js";
 
-/** An order that is older is not done [ms]. */
+/** A command that is older is not executed [ms]. */
 export const LATE_MS = 500;
 /** Nor is an emergency stop that is older than this. */
 export const STOP_LATE_MS = 2000;
@@ -19,24 +19,24 @@ const FAILED_SHOWN_MS = 8000;
 const STOPS: ReadonlySet<string> = new Set(["stop", "stop_all"]);
 
 /** As much of a socket as is used. */
-export interface Line {
+export interface CommandSocket {
   readonly isOpen: boolean;
   send(message: object): boolean;
   close(): void;
 }
 
 /** `sent`: the cockpit passed it on. `refused`: by the cockpit or the drone, with a reason. `not sent`: it never left, or
- *  came too late to count. `no answer`: it left in time, and nobody said what became of it. */
+ *  came too late to count. `no answer`: it left in time, and nothing came back. */
 export type Fate = "pending" | "sent" | "refused" | "not sent" | "no answer";
 
-/** What became of the newest order of its kind. */
+/** The outcome of the newest command of its kind. */
 export interface Result {
   fate: Fate;
   why: string;
 }
 
 interface Pending {
-  order: { do: string };
+  command: { do: string };
   n: number;
   pressed_ms: number;
   /** It went over the connection that is open now. */
@@ -53,21 +53,21 @@ export interface Answer {
   now_s?: number;
 }
 
-export interface OrderListener {
+export interface CommandListener {
   /** The connection is there, or gone. */
   linked(open: boolean): void;
-  /** What else the cockpit says. */
-  told(message: Answer): void;
-  /** An order will not be done: by the cockpit's words, or by this page's. */
-  refused(order: string, why: string): void;
-  /** What became of an order is known, or is no longer shown. */
+  /** Any other message of the cockpit. */
+  received(message: Answer): void;
+  /** A command will not be executed: refused by the cockpit, or given up by this page. */
+  refused(command: string, why: string): void;
+  /** The outcome of a command is known, or is no longer shown. */
   changed(): void;
 }
 
-export class OrderLine {
+export class CommandSender {
   /** There and back to the cockpit [s]; null while not known. */
   round_trip_s: number | null = null;
-  private readonly line: Line;
+  private readonly socket: CommandSocket;
   private number = 0;
   private pinged_ms = Number.NEGATIVE_INFINITY;
   private answered_s: number | null = null;
@@ -77,12 +77,12 @@ export class OrderLine {
   private readonly results = new Map<string, Result & { since_ms: number }>();
 
   constructor(
-    connect: (handlers: Handlers) => Line,
+    connect: (handlers: Handlers) => CommandSocket,
     readonly clock: ServerClock,
-    private readonly listener: OrderListener,
+    private readonly listener: CommandListener,
     private readonly now_ms: () => number,
   ) {
-    this.line = connect({ message: (data) => this.hear(data), state: (open) => this.linked(open) });
+    this.socket = connect({ message: (data) => this.onMessage(data), state: (open) => this.linked(open) });
   }
 
   /** How old the newest answer is [ms]; null before the first one of this connection. */
@@ -94,33 +94,33 @@ export class OrderLine {
   /** What is sent now is known to arrive in time, as far as can be known. */
   get isLive(): boolean {
     const age_ms = this.age_ms();
-    return this.line.isOpen && age_ms !== null && age_ms <= STALE_MS;
+    return this.socket.isOpen && age_ms !== null && age_ms <= STALE_MS;
   }
 
-  /** What became of the newest order of this kind; null if that does not matter any more. */
+  /** The outcome of the newest command of this kind; null if that does not matter any more. */
   result(what: string): Result | null {
     return this.results.get(what) ?? null;
   }
 
-  /** Whether it is on its way; if not, that was told. */
-  order(order: { do: string }): boolean {
+  /** Send a command. False if it can't be sent; the listener has been called then. */
+  send(command: { do: string }): boolean {
     const now_ms = this.now_ms();
     this.number += 1;
-    const pending: Pending = { order, n: this.number, pressed_ms: now_ms, on_its_way: false, went: false };
-    const stop = STOPS.has(order.do);
+    const pending: Pending = { command, n: this.number, pressed_ms: now_ms, on_its_way: false, went: false };
+    const stop = STOPS.has(command.do);
     if (!stop && !this.isLive) {
-      this.end(order.do, "not sent", this.unheard(now_ms));
+      this.end(command.do, "not sent", this.silence(now_ms));
       return false;
     }
-    this.pending.set(order.do, pending);
-    this.show(order.do, "pending", "");
+    this.pending.set(command.do, pending);
+    this.show(command.do, "pending", "");
     return this.transmit(pending) || stop;
   }
 
   /** Sticks: what does not go now is forgotten. */
-  steer(order: { do: string }): boolean {
+  steer(command: { do: string }): boolean {
     const stamp = this.isLive ? this.clock.at(this.now_ms()) : null;
-    return stamp !== null && this.line.send({ ...order, ...stamp });
+    return stamp !== null && this.socket.send({ ...command, ...stamp });
   }
 
   /** Called many times a second; `pause_ms` between two pings. */
@@ -131,8 +131,8 @@ export class OrderLine {
       const late_ms = this.late_ms(pending);
       const age_ms = now_ms - pending.pressed_ms;
       if (!pending.on_its_way && age_ms < late_ms) this.transmit(pending);
-      if (age_ms >= late_ms && !pending.went) this.end(pending.order.do, "not sent", this.unheard(now_ms));
-      else if (age_ms >= late_ms + (STOPS.has(pending.order.do) ? 0 : ANSWER_MS)) this.end(pending.order.do, "no answer", `${this.unheard(now_ms)}; it is not done any more if it has not been by now`);
+      if (age_ms >= late_ms && !pending.went) this.end(pending.command.do, "not sent", this.silence(now_ms));
+      else if (age_ms >= late_ms + (STOPS.has(pending.command.do) ? 0 : ANSWER_MS)) this.end(pending.command.do, "no answer", `${this.silence(now_ms)}; it won't be executed if it has not been by now`);
     }
     for (const [what, { fate, since_ms }] of [...this.results]) {
       const shown_ms = fate === "sent" ? SENT_SHOWN_MS : FAILED_SHOWN_MS;
@@ -144,21 +144,21 @@ export class OrderLine {
   }
 
   close(): void {
-    this.line.close();
+    this.socket.close();
   }
 
-  private late_ms = (pending: Pending): number => (STOPS.has(pending.order.do) ? STOP_LATE_MS : LATE_MS);
+  private late_ms = (pending: Pending): number => (STOPS.has(pending.command.do) ? STOP_LATE_MS : LATE_MS);
 
-  private unheard(now_ms: number): string {
+  private silence(now_ms: number): string {
     const age_ms = this.age_ms(now_ms);
-    if (!this.line.isOpen || age_ms === null) return "this page has no connection to the cockpit";
+    if (!this.socket.isOpen || age_ms === null) return "this page has no connection to the cockpit";
     return `no answer from the cockpit for ${(age_ms / 1000).toFixed(1)} s`;
   }
 
   private transmit(pending: Pending): boolean {
     const stamp = this.clock.at(pending.pressed_ms);
-    if (stamp === null || !this.line.isOpen) return false;
-    pending.on_its_way = this.line.send({ ...pending.order, n: pending.n, ...stamp });
+    if (stamp === null || !this.socket.isOpen) return false;
+    pending.on_its_way = this.socket.send({ ...pending.command, n: pending.n, ...stamp });
     pending.went ||= pending.on_its_way;
     return pending.on_its_way;
   }
@@ -166,9 +166,9 @@ export class OrderLine {
   private ping(now_ms: number): void {
     this.pinged_ms = now_ms;
     this.number += 1;
-    if (this.pings.size >= 60) this.pings.clear(); // no answers: an old one says nothing any more
+    if (this.pings.size >= 60) this.pings.clear(); // no answers: an old one is meaningless by now
     const seen = this.answered_s === null ? {} : { seen_s: this.answered_s };
-    if (this.line.send({ do: "ping", n: this.number, ...seen, ...this.clock.at(now_ms) })) this.pings.set(this.number, now_ms);
+    if (this.socket.send({ do: "ping", n: this.number, ...seen, ...this.clock.at(now_ms) })) this.pings.set(this.number, now_ms);
   }
 
   private linked(open: boolean): void {
@@ -180,41 +180,41 @@ export class OrderLine {
     if (open) this.ping(this.now_ms());
   }
 
-  private hear(data: string | ArrayBuffer): void {
+  private onMessage(data: string | ArrayBuffer): void {
     if (typeof data !== "string") return;
-    const told = JSON.parse(data) as Answer;
-    if (told.type === "pong") this.pong(told);
+    const message = JSON.parse(data) as Answer;
+    if (message.type === "pong") this.pong(message);
     else {
-      if (told.type === "sent") this.settle(told, "sent");
-      if (told.type === "refused") {
-        this.settle(told, "refused");
-        this.listener.refused(told.do ?? "", told.why ?? "");
+      if (message.type === "sent") this.settle(message, "sent");
+      if (message.type === "refused") {
+        this.settle(message, "refused");
+        this.listener.refused(message.do ?? "", message.why ?? "");
       }
-      this.listener.told(told);
+      this.listener.received(message);
     }
   }
 
-  private pong(told: Answer): void {
-    const sent_ms = this.pings.get(told.n ?? -1);
-    this.pings.delete(told.n ?? -1);
-    if (sent_ms === undefined || told.now_s === undefined) return;
+  private pong(answer: Answer): void {
+    const sent_ms = this.pings.get(answer.n ?? -1);
+    this.pings.delete(answer.n ?? -1);
+    if (sent_ms === undefined || answer.now_s === undefined) return;
     const now_ms = this.now_ms();
     const first = this.answered_s === null;
-    this.clock.pong(sent_ms, now_ms, told.now_s);
+    this.clock.pong(sent_ms, now_ms, answer.now_s);
     this.round_trip_s = (now_ms - sent_ms) / 1000;
-    this.answered_s = told.now_s;
+    this.answered_s = answer.now_s;
     if (first) this.tick(Number.POSITIVE_INFINITY); // an emergency stop may wait for it
     if (first) this.listener.changed();
   }
 
-  /** The cockpit's answer to an order: it may also come after this page has given up on it. */
-  private settle(told: Answer, fate: Fate): void {
-    const what = told.do ?? "";
+  /** The cockpit's answer to a command: it may also arrive after this page has given up on it. */
+  private settle(answer: Answer, fate: Fate): void {
+    const what = answer.do ?? "";
     const pending = this.pending.get(what);
-    if (told.n && told.n !== (pending?.n ?? this.settled.get(what))) return; // of an earlier one
+    if (answer.n && answer.n !== (pending?.n ?? this.settled.get(what))) return; // of an earlier one
     this.pending.delete(what);
     if (pending) this.settled.set(what, pending.n);
-    this.show(what, fate, told.why ?? "");
+    this.show(what, fate, answer.why ?? "");
   }
 
   /** This page gives up on it. */
