@@ -45,7 +45,7 @@ def test_a_child_ends_when_its_input_does_and_its_last_words_stay_known() -> Non
         child.close()
         child.close()
         assert child.ending == "ended with exit code 1"
-        assert child.said.startswith("; it said:\nxxx")
+        assert child.said.startswith("; its output:\nxxx")
         assert child.last_words.endswith("no vehicle")
         assert len(child.last_words) <= 2000
 

@@ -49,7 +49,7 @@ def test_a_position_from_elsewhere_goes_first() -> None:
 
 
 def test_what_is_not_known_is_said() -> None:
-    with pytest.raises(UsageError, match="does not tell its position"):
+    with pytest.raises(UsageError, match="does not report its position"):
         body_in_world(Feedback(captured_ns=0, roll=0.0, pitch=0.0, yaw=0.0))
     with pytest.raises(UsageError, match="attitude"):
         body_in_world(Feedback(captured_ns=0, position=(0.0, 0.0, 0.0)))

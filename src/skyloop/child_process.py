@@ -72,7 +72,7 @@ class ChildProcess:
     def said(self) -> str:
         """Its last words as the end of a message; empty for none."""
         text = self.last_words
-        return f"; it said:\n{text}" if text else ""
+        return f"; its output:\n{text}" if text else ""
 
     def part(self) -> None:
         """Ask it to end, by closing its standard input. Does not wait. Idempotent."""

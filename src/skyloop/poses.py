@@ -53,7 +53,7 @@ def body_in_world(feedback: Feedback, position: ArrayLike | None = None) -> Rigi
     """
     place = feedback.position if position is None else position
     if place is None:
-        raise UsageError("the vehicle does not tell its position: give the one that you know")
+        raise UsageError("the vehicle does not report its position: give the one that you know")
     return transform(place, _rotation(feedback))
 
 
@@ -86,7 +86,7 @@ def mounting_rotation(camera: CameraInfo) -> NDArray[np.float64]:
     Raises :class:`UsageError` if the camera does not say how it is mounted.
     """
     if camera.rotation is None:
-        raise UsageError(f"camera {camera.name!r} does not tell how it is mounted: give its CameraInfo a rotation")
+        raise UsageError(f"camera {camera.name!r} does not say how it is mounted: give its CameraInfo a rotation")
     return np.asarray(camera.rotation, dtype=np.float64).reshape(3, 3)
 
 

@@ -32,7 +32,7 @@ def flown(start: Start, *arguments: str) -> None:
 
 
 def test_nobody_has_flown_yet(run: Run) -> None:
-    assert run("audit").out.startswith("Nobody has flown yet")
+    assert run("audit").out.startswith("The audit trail has no flights yet")
     ended = run("audit", "alpha")
     assert ended.code == 2
     assert "no named proxy of this user has run yet" in ended.err
@@ -64,8 +64,8 @@ def test_a_file_of_ones_own(start: Start, run: Run, tmp_path: Path) -> None:
     ended = run("audit", "--file", str(path))
     assert "alice" in ended.out
     assert "1 line can't be understood" in ended.err
-    assert run("audit", "bravo", "--file", str(path)).out.startswith("Nobody has flown yet")
-    assert run("audit").out.startswith("Nobody has flown yet")
+    assert run("audit", "bravo", "--file", str(path)).out.startswith("The audit trail has no flights yet")
+    assert run("audit").out.startswith("The audit trail has no flights yet")
 
 
 def test_a_file_that_can_not_be_used(run: Run, tmp_path: Path) -> None:

@@ -195,7 +195,7 @@ def test_a_wrong_target_is_told_in_one_line(run: Run, alpha: Process, write: Wri
 def test_a_wrong_file_is_told_before_anything_is_connected(run: Run, write: Write) -> None:
     assert run("fly", "none.py", "--on", "nobody").err.startswith("skyloop: there is no file none.py")
     assert run("fly", write("x = 1"), "--on", "nobody").code == 2
-    assert "say which with --class" in run("fly", write(GOOD + GOOD.replace("Good", "Better"))).err
+    assert "choose one with --class" in run("fly", write(GOOD + GOOD.replace("Good", "Better"))).err
     assert "did you mean 'Good'" in run("fly", write(GOOD), "--class", "Goof").err
 
 

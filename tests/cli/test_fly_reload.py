@@ -84,7 +84,7 @@ def test_a_saved_file_takes_over_without_a_command_being_missed(
         process.until("reloaded Mine")
         looker.wait(lambda _: 0.2 in speeds(seen), 20.0)
         save(mine, "def (")
-        process.until("the one before it goes on")
+        process.until("the one before keeps flying")
         now = len(seen)
         looker.wait(lambda _: len(seen) > now + 10, 20.0)
         process.signal(signal.SIGINT)

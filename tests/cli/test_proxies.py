@@ -255,7 +255,7 @@ def test_the_address_of_a_simulation_is_put_together_from_its_options() -> None:
 
 @pytest.mark.parametrize(
     ("others", "said"),
-    [(["cameras"], "has no value"), (["seed=3"], "say --seed 3"), (["wind=0", "wind=1"], "given twice")],
+    [(["cameras"], "has no value"), (["seed=3"], "give --seed 3"), (["wind=0", "wind=1"], "given twice")],
 )
 def test_an_option_that_is_none_is_answered_with_what_is(others: list[str], said: str) -> None:
     with pytest.raises(UsageError, match=said):

@@ -84,7 +84,7 @@ def test_ports_count_from_a_base() -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--lose", "0.1"), "--lose is for --firmware: say --firmware ardrone2 as well"),
+        (("--lose", "0.1"), "--lose is for --firmware: give --firmware ardrone2 as well"),
         (("--bind", "0.0.0.0"), "--bind is for --firmware"),
         (("--firmware", "ardrone2", "--name", "mine"), "--name is the proxy's"),
         (("--firmware", "ardrone2", "--option", "cameras=front"), "--option cameras can't be chosen with --firmware"),

@@ -291,7 +291,7 @@ def test_no_place_without_a_position() -> None:
     try:
         with cockpit(Fleet(Nodes(blind))) as client, page(client) as pilot:
             pilot.take().say("goto", x=1, y=1, z=1)
-            assert "does not tell its position" in pilot.wait("refused", do="goto")["why"]
+            assert "does not report its position" in pilot.wait("refused", do="goto")["why"]
     finally:
         blind.stop()
 

@@ -69,7 +69,7 @@ def test_an_order_is_refused_when_it_may_be_older_than_half_a_second(
     assert LATE_S == 0.5
     assert why(0.0) == why(0.49) == why(0.3, 0.19) == ""
     assert "0.5 s" in why(0.51)
-    assert "12.0 s after it was asked for" in why(12.0)
+    assert "12.0 s after it was requested" in why(12.0)
     assert why(0.3, 0.21), "no benefit of the doubt"
     assert "known to within 0.6 s" in why(0.0, 0.6)
     assert why(-AHEAD_S) == why(-0.2, 0.2) == ""
@@ -90,7 +90,7 @@ def test_a_take_off_from_before_a_stall_does_not_happen(client: TestClient, node
     with page(client) as pilot:
         pilot.take().say("takeoff", at_s=time.monotonic() - 8.0, n=7)
         told = pilot.wait("refused", do="takeoff")
-        assert "8.0 s after it was asked for" in told["why"]
+        assert "8.0 s after it was requested" in told["why"]
         assert told["n"] == 7
         pilot.say("ping")
         pilot.wait("pong")
@@ -123,7 +123,7 @@ def test_old_sticks_fly_nothing_and_are_no_sign_of_life(client: TestClient, node
             pilot.say("ping", at_s=time.monotonic() - 8.0, seen_s=time.monotonic() - 8.0)
             time.sleep(0.02)
         until(lambda: node.flyer.state is FlightState.HOVERING)
-        assert time.monotonic() - begin_s < 5.0, "the page counts as silent all the same"
+        assert time.monotonic() - begin_s < 2.0, "the page counts as silent all the same"
         assert not count(node, Velocity(left=0.4))
         pilot.wait("refused", do="fly")
 
@@ -157,7 +157,7 @@ def test_what_waited_behind_something_slow_is_too_old_by_then(
         monkeypatch.setattr(PilotConnection, "acquire", slow)
         pilot.say("take", priority=3)
         pilot.say("set", name="limits.tilt", value=0.2)
-        assert "after it was asked for" in pilot.wait("refused", do="set")["why"]
+        assert "after it was requested" in pilot.wait("refused", do="set")["why"]
 
 
 def test_an_order_that_was_told_as_not_sent_does_not_happen_when_the_link_is_back(

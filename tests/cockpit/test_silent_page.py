@@ -157,7 +157,7 @@ def test_a_page_in_control_that_falls_silent_hovers_then_lands(client: TestClien
         until(lambda: node.flyer.state in (FlightState.LANDING, FlightState.LANDED), "it lands")
         assert GONE_S + 0.2 < time.monotonic() - silent_s < GONE_S + 2.0
         told = pilot.wait("authority", mine=False)
-        assert "did not hear this page for 2 s" in told["why"]
+        assert "received nothing from this page for 2 s" in told["why"]
         pilot.say("ping")
         pilot.say("takeoff")
         assert "take control first" in pilot.wait("refused", do="takeoff")["why"]

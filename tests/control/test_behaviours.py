@@ -97,12 +97,12 @@ def test_pictures_that_stop_make_it_hover_and_say_so() -> None:
         drone.config["camera.front.fps"] = 0.1
         pilot.run(seconds=4.0)
         assert pilot.blind
-        assert ("gates: no pictures come: hovering", Severity.WARNING) in told
+        assert ("gates: no frames arrive: hovering", Severity.WARNING) in told
         assert drone.feedback().state == "hovering"
         drone.config["camera.front.fps"] = 15.0
         pilot.run(seconds=12.0)
         assert not pilot.blind
-        assert ("gates: pictures come again", Severity.INFO) in told
+        assert ("gates: frames arrive again", Severity.INFO) in told
 
 
 def test_what_makes_no_sense_is_refused() -> None:

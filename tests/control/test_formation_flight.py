@@ -11,8 +11,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from skyloop.client import Swarm
-from skyloop.client.drone import open_drone
+from skyloop.client import Drone, Swarm
 from skyloop.control.formation import line, placed
 from skyloop.control.formation_flight import Formation, station
 from skyloop.control.waypoint import WaypointSettings
@@ -81,7 +80,7 @@ def flying(movers: dict[str, Mover], *, on_error: str = "raise") -> Iterator[Swa
     for proxy in proxies:
         proxy.start()
     drones = Swarm(
-        {name: open_drone(servers[name].dial, app="test") for name in movers},
+        {name: Drone(servers[name].dial, app="test").open() for name in movers},
         on_error=on_error,  # type: ignore[arg-type]
     )
     try:
@@ -134,7 +133,7 @@ def test_drones_that_do_not_know_where_they_are_or_stand_on_the_ground() -> None
     with flying(movers) as drones:
         drones["c"].land()
         with pytest.raises(
-            UsageError, match="b: the vehicle does not tell its position; c: it is landed, take off first"
+            UsageError, match="b: the vehicle does not report its position; c: it is landed, take off first"
         ):
             Formation(drones).hold(1.0)
 
@@ -195,7 +194,7 @@ def test_the_place_beside_a_leader() -> None:
     leader = Feedback(captured_ns=0, position=(1.0, 2.0, 3.0), yaw=math.pi / 2)
     assert np.allclose(station(leader, (1.0, 0.5, 0.2)), (0.5, 3.0, 3.2))
     assert np.allclose(station(leader, (1.0, 0.5, 0.2), turn=False), (2.0, 2.5, 3.2))
-    with pytest.raises(UsageError, match="does not tell its position"):
+    with pytest.raises(UsageError, match="does not report its position"):
         station(Feedback(captured_ns=0), (1.0, 0.0, 0.0))
     with pytest.raises(UsageError, match=r"shape \(n, 3\)"):
         station(leader, (1.0, 0.0))

@@ -80,7 +80,7 @@ def test_what_makes_no_sense() -> None:
     with pytest.raises(UsageError, match="0 or more"):
         filtered.update(np.zeros(2), -0.1, 0)
     filtered.update(np.zeros(2), 0.0, 0)
-    with pytest.raises(UsageError, match="says nothing"):
+    with pytest.raises(UsageError, match="adds no information"):
         filtered.update(np.zeros(2), 0.0, 0)
     for wrong in ({"dimensions": 0}, {"intensity_m2_s3": -1.0}, {"speed_m_s": math.inf}, {"gate": 0.0}):
         with pytest.raises(UsageError, match=next(iter(wrong))):

@@ -44,7 +44,7 @@ def test_the_only_controller_is_taken(write: Write) -> None:
 
 def test_one_of_several_is_taken_by_name(write: Write) -> None:
     assert load_controller(write(TWO), "Two").__name__ == "Two"
-    with pytest.raises(UsageError, match=r"several controllers \(One, Two\): say which with --class"):
+    with pytest.raises(UsageError, match=r"several controllers \(One, Two\): choose one with --class"):
         load_controller(write(TWO))
     with pytest.raises(UnknownNameError, match="did you mean 'Two'"):
         load_controller(write(TWO), "Too")

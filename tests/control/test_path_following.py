@@ -159,7 +159,7 @@ def test_the_same_place_twice_is_no_way() -> None:
 
 def test_what_it_cannot_do_is_said() -> None:
     with rehearse("sim://?world=empty&cameras=none") as drone:
-        with pytest.raises(UsageError, match="does not tell its position; give it a source"):
+        with pytest.raises(UsageError, match="does not report its position; give it a source"):
             FollowPath(drone, Circle((0, 0, 1), 0.5)).run(seconds=1.0)
         with pytest.raises(UsageError, match="no waypoint"):
             Waypoints(drone, [])

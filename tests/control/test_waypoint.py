@@ -95,9 +95,9 @@ def test_what_is_not_known_is_told() -> None:
     assert lacking(at()) == ""
     for blind in (at(position=None), at(yaw=None)):
         assert lacking(blind)
-        with pytest.raises(UsageError, match="does not tell its"):
+        with pytest.raises(UsageError, match="does not report its"):
             velocity_to(Waypoint(1, 1, 1), blind)
-        with pytest.raises(UsageError, match="does not tell its"):
+        with pytest.raises(UsageError, match="does not report its"):
             reached(Waypoint(1, 1, 1), blind)
 
 

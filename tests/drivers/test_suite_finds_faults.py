@@ -164,7 +164,7 @@ FAULTS: list[tuple[type[Driver], str, str]] = [
     (SocketInConstructor, "test_constructor_does_no_io", "opened a descriptor"),
     (TakesAnyOption, "test_unknown_option_is_refused", "must raise UsageError"),
     (UnknownAction, "test_capabilities_before_open", "loop_the_loop"),
-    (NeverUp, "test_feedback", "not told UP"),
+    (NeverUp, "test_feedback", "not reported UP"),
     (Degrees, "test_feedback", "yaw is 90, outside"),
     (NotANumber, "test_feedback", "must be finite"),
     (FromTheFuture, "test_feedback", "in the future"),

@@ -13,7 +13,6 @@ from pathlib import Path
 import pytest
 
 from skyloop.client import Drone
-from skyloop.client.drone import open_drone
 from skyloop.drivers.registry import make_driver
 from skyloop.emulators.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
 from skyloop.errors import RefusedError
@@ -128,7 +127,7 @@ class Scene:
         proxy.stop()
 
     def drone(self) -> Drone:
-        return open_drone(self.server.dial, app="me", on_exit="hover")
+        return Drone(self.server.dial, app="me", on_exit="hover").open()
 
     def watched(self, proxy: Proxy, samples: int = 60) -> None:
         """The proxy heard so many more samples: its ladder had time to act in several steps."""

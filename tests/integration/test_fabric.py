@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from skyloop.client import Drone, Frame
-from skyloop.client.drone import open_drone
 from skyloop.client.scheduler import Scheduler
 from skyloop.errors import UsageError
 from skyloop.messages import Applied, FlightState, Velocity
@@ -37,7 +36,7 @@ class Node:
 
     @contextmanager
     def connected(self, **options: Any) -> Iterator[Drone]:
-        with open_drone(self.dialer, app="me", **options) as drone:
+        with Drone(self.dialer, app="me", **options).open() as drone:
             yield drone
 
 

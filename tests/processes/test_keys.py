@@ -117,7 +117,7 @@ def test_through_a_router_with_keys(
     stolen = Path(shutil.copytree(lab.folder("olga"), tmp_path / "stolen"))
     with skyloop.connect("alpha", network=place, keys=stolen, access="observe") as olga:
         lab.revoke("olga")
-        hub.until("begins anew without olga")
+        hub.until("reconnecting without olga")
         eventually(lambda: olga.link.application == "lost", "olga is shut out")
     with skyloop.connect("alpha", network=place, keys=lab.folder("jane"), access="observe") as jane:
         assert jane.feedback() is not None

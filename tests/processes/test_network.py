@@ -77,8 +77,8 @@ def test_a_proxy_on_the_network_says_that_anyone_can_fly_and_is_flown(far: Calla
     assert (row.name, row.transport, row.host, row.pid) == ("alpha", "fabric", os.uname().nodename, alpha.pid)
     assert (row.vehicle, row.state, row.owner, row.problem) == ("sim", "landed", None, "")
     with skyloop.connect("alpha", network=place) as drone:
-        assert f"(pid {alpha.pid})" in drone._core.connection._session.address  # type: ignore[union-attr]
-        assert drone._core.reach is None, "a process that was not told of the network does not find it"
+        assert f"(pid {alpha.pid})" in drone._connection._session.address  # type: ignore[union-attr]
+        assert drone.reach is None, "a process that was not told of the network does not find it"
         drone.takeoff()
         drone.velocity(forward=0.3)
         drone.wait("flying")
@@ -104,7 +104,7 @@ def test_a_killed_proxy_is_told_and_found_again_with_everything_as_it_was(
         far()
         eventually(lambda: drone.link.application is LinkState.UP, "it is up again", SOON_S)
         eventually(lambda: drone.authority.state == "held", "it holds the authority again", SOON_S)
-        eventually(lambda: bool(frames), "pictures come again", SOON_S)
+        eventually(lambda: bool(frames), "frames arrive again", SOON_S)
 
 
 PILOT = """
@@ -172,7 +172,7 @@ def test_a_stopped_proxy_is_lost_and_recovers_when_it_goes_on(far: Callable[...,
 
 
 def test_options_of_the_network_need_the_network(far: Callable[..., Process]) -> None:
-    wrong = far("--listen", "127.0.0.1:0", until="--listen is for the network: say --network as well")
+    wrong = far("--listen", "127.0.0.1:0", until="--listen is for the network: give --network as well")
     assert wrong.wait() == 2
 
 

@@ -48,11 +48,11 @@ def test_a_pilot_killed_in_flight_leaves_a_drone_that_hovers_at_once_and_lands_a
         pilot.signal(signal.SIGKILL)
         killed = time.monotonic()
         observer.wait(lambda feedback: feedback.failsafe is Failsafe.HOVER, timeout_s=10.0)
-        assert time.monotonic() - killed < 2.5
+        assert time.monotonic() - killed < 0.6
         observer.wait("hovering", timeout_s=30.0)
-        assert time.monotonic() - killed < 2.5
+        assert time.monotonic() - killed < 0.6
         observer.wait(lambda feedback: feedback.failsafe is Failsafe.LAND, timeout_s=10.0)
-        assert 4.5 < time.monotonic() - killed < 8.0
+        assert 4.5 < time.monotonic() - killed < 6.0
         observer.wait("landed", timeout_s=30.0)
 
         kinds = {event.kind for event in events}
@@ -135,10 +135,10 @@ def test_a_pilot_that_hangs_keeps_its_name_on_a_drone_that_fails_safe_until_some
 
 def forge(drone: skyloop.Drone, lease: int, action: Velocity | Land) -> None:
     """Send a command under another lease over this application's own connection."""
-    pilot = drone._core.commands
+    pilot = drone._commands
     packet = encode(Command(pilot.seq + 1, lease, pilot._schedule.intent, time.monotonic_ns(), action))
     pilot._seq += 1
-    assert drone._core.connection.transmit(packet)
+    assert drone._connection.transmit(packet)
 
 
 def count_events(drone: skyloop.Drone, reason: str) -> int:

@@ -53,7 +53,7 @@ def test_a_class_without_a_file_has_a_mark_by_what_it_does() -> None:
 def test_one_of_several_is_named(folder: Path) -> None:
     (folder / "two.py").write_text(GOOD + GOOD.replace("Detector", "Finder"))
     assert load_processor("two.py:Finder").name == "finder"
-    with pytest.raises(UsageError, match=r"several processors \(Detector, Finder\): say which with two.py:CLASS"):
+    with pytest.raises(UsageError, match=r"several processors \(Detector, Finder\): choose one with two.py:CLASS"):
         load_processor("two.py")
     with pytest.raises(UnknownNameError, match="'Findr'; did you mean 'Finder'"):
         load_processor("two.py:Findr")

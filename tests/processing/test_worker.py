@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from skyloop.client import Drone, Frame, Result
-from skyloop.client.drone import open_drone
 from skyloop.errors import NameTakenError, UsageError
 from skyloop.messages import Annotation, LogEntry, Polyline, Severity
 from skyloop.processing import Output, Settings, Worker
@@ -31,7 +30,7 @@ def node() -> Iterator[Node]:
 
 @contextmanager
 def observer(node: Node, app: str) -> Iterator[Drone]:
-    with open_drone(node.server.dial, app=app, access="observe", policy=QUICK) as drone:
+    with Drone(node.server.dial, app=app, access="observe", policy=QUICK).open() as drone:
         yield drone
 
 

@@ -95,7 +95,7 @@ def test_a_flight_of_an_earlier_run_is_ours_if_it_is_found_in_the_air_and_no_lat
     assert seen(ownership, UNKNOWN) is Whose.NOBODYS
     changed = ownership.observe(FLYING, True, "", T0)
     assert changed is not None
-    assert "started anew" in changed.why
+    assert "restarted" in changed.why
     assert ownership.ours
 
     landed_meanwhile = Ownership()

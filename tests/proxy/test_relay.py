@@ -74,11 +74,11 @@ def test_a_vehicle_that_takes_none_is_told_of(bench: Bench) -> None:
 
 def test_a_driver_that_fails_is_told_of(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(pose: ExternalPose) -> None:
-        raise DriverError("the vehicle is not heard")
+        raise DriverError("no data from the vehicle")
 
     monkeypatch.setattr(bench.driver, "external_pose", fail)
     app = bench.join("mocap")
     assert app.end.send(encode(POSE))
     [(reason, text)] = refusals(app)
     assert reason == "driver_failed"
-    assert "not heard" in text
+    assert "no data from" in text

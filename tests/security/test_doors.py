@@ -227,7 +227,7 @@ def test_commands_of_a_connection_that_never_was_are_refused_and_told(rig: Rig) 
     kim.close()
     event = rig.bench.published(EventKind.COMMAND_REFUSED)[before]
     assert (event.app, event.data["reason"]) == (None, Refusal.PROTOCOL)
-    assert "nobody that is connected" in event.text
+    assert "applications that are not connected" in event.text
     assert rig.bench.driver.told == told
 
 

@@ -79,7 +79,7 @@ def test_connections_that_say_nothing_keep_nobody_out(
     client = dial("alpha")(pilot)
     wait_until(lambda: len(place.log.joined) == known + 1, "the pilot is in")
     assert place.server.admit(place.log.joined[-1], pilot=True) == ""
-    assert "its place at local:alpha went to a newer one" in word(silent[0])
+    assert "its place at local:alpha was given to a newer connection" in word(silent[0])
     for _ in range(8):  # whatever goes on, who has said who it is stays
         place.raw(*first)
     wait_until(lambda: len(place.server._connections) <= 4, "the others gave way to one another")
@@ -92,7 +92,7 @@ def test_connections_that_say_nothing_keep_nobody_out(
 def test_a_connection_without_its_first_packet_ends(place: Place, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(f"{SERVER}.HELLO_S", 0.05)
     silent = place.raw()
-    assert word(silent) == "it did not say hello within 0.05 s"
+    assert word(silent) == "it sent no Hello within 0.05 s"
     quiet = place.raw(hello())
     wait_until(lambda: place.log.joined, "the other one is let in")
     time.sleep(0.1)  # twice that time, in which nothing may happen
@@ -108,7 +108,7 @@ def test_a_connection_without_its_hello_is_ended_and_told() -> None:
         bench.run(HELLO_NS / 1e9)
         assert silent.closed_by.empty()
         bench.run(0.04)
-        assert "no Hello came within 5 s: connect anew" in silent.closed_by.get(timeout=WAIT_S)
+        assert "no Hello came within 5 s: connect again" in silent.closed_by.get(timeout=WAIT_S)
         texts = [event.text for event in eye.told(EventKind.APPLICATION_LINK)]
         assert any("was ended: no Hello came" in text for text in texts)
         assert bench.proxy._counts["connections.silent"] == 1
@@ -177,7 +177,7 @@ def test_somebody_elses_lock_holds_nobody_up(place: Place, monkeypatch: pytest.M
         charlie = LocalServer("charlie", group=group)
         charlie.start(ServerLog())
         charlie.stop()
-        assert time.monotonic() - begin < 5.0
+        assert time.monotonic() - begin < 1.0
     finally:
         os.close(descriptor)
     lock = directory.path / ".lock"
@@ -194,7 +194,7 @@ def test_looking_waits_for_no_lock(place: Place) -> None:
     with directory.lock():
         begin = time.monotonic()
         assert [proxy.name for proxy in list_names()] == ["alpha"]
-        assert time.monotonic() - begin < 5.0
+        assert time.monotonic() - begin < 1.0
         assert dead.exists()
         with pytest.raises(LinkError, match="locked by another process"), directory.lock(timeout_s=0.0):
             pass

@@ -61,7 +61,7 @@ class Worker:
             LinkError: The process has ended.
         """
         if not self.pipe.poll(timeout_s):
-            raise NoAnswerError(f"the measuring process of {self._what} said nothing for {timeout_s:g} s")
+            raise NoAnswerError(f"the measuring process of {self._what} did not answer for {timeout_s:g} s")
         try:
             answer = self.pipe.recv()
         except (EOFError, ConnectionResetError):

@@ -44,7 +44,7 @@ def audit(
     if json:
         typer.echo(msgspec.json.encode(rows).decode())
     elif not rows:
-        typer.echo("Nobody has flown yet, as far as the audit trail tells.")
+        typer.echo("The audit trail has no flights yet.")
     else:
         for line in lines(rows):
             typer.echo(line)
@@ -64,7 +64,7 @@ def lines(rows: Sequence[Tenure]) -> list[str]:
             _local(row.begin),
             _local(row.end) if row.end is not None else ("?" if row.how else "now"),
             str(row.takeoffs),
-            row.how or "it goes on",
+            row.how or "in progress",
         )
         for row in rows
     ]

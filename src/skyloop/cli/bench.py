@@ -98,7 +98,7 @@ def duration_s(seconds: float | None, minutes: float | None) -> float:
         UsageError: Both options are given.
     """
     if seconds is not None and minutes is not None:
-        raise UsageError("--seconds and --minutes say the same: give one of them")
+        raise UsageError("--seconds and --minutes exclude each other: give one of them")
     if minutes is not None:
         return max(LEAST_S, minutes * 60.0)
     return 30.0 if seconds is None else seconds

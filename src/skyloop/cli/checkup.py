@@ -36,7 +36,7 @@ def examine_vehicle(address: str) -> Iterator[Finding]:
             yield _unreachable(sink)
             return
         if sink.link_state is LinkState.DEGRADED:
-            yield Finding("vehicle", Health.GOOD, f"it is heard: {sink.links[-1][1] or 'being read'}")
+            yield Finding("vehicle", Health.GOOD, f"it answers: {sink.links[-1][1] or 'being read'}")
         if sink.wait(lambda: sink.link_state is LinkState.UP, PATIENCE_S):
             sink.wait(lambda: sink.newest is not None and sink.newest.battery is not None, FEEDBACK_S)
         else:

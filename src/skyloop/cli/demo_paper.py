@@ -74,7 +74,7 @@ def paper(
     results = _evaluated(console, folder, machine, flight.load)
     console.print(f"report [bold]{folder / 'report.html'}[/], recording {RECORDING}, figures results.json")
     if results.tracking is None:
-        console.print("[bold red]it was never on its way[/]")
+        console.print("[bold red]it never started its path[/]")
         raise typer.Exit(1)
 
 

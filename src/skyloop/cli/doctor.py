@@ -166,7 +166,7 @@ def _proxies() -> Iterator[Finding]:
         yield Finding("proxies", Health.GOOD, "none is running", "to start one: skyloop proxy sim:// --name alpha")
     for row in rows:
         if row.problem:
-            advice = "stopped (Ctrl-Z)? it goes on with: kill -CONT PID; else end it and start it anew"
+            advice = "stopped (Ctrl-Z)? continue it with: kill -CONT PID; otherwise end it and start it again"
             if row.pid is not None:
                 advice = advice.replace("PID", str(row.pid))
             yield Finding(f"proxy {row.name}", Health.BAD, row.problem, advice)

@@ -78,7 +78,7 @@ class Flight:
                 self._say(str(summary))
                 return True
             if not self._take(reloader, make):
-                self._say("the saved file is not flown: the one before it goes on")
+                self._say("the saved file is not flown: the one before keeps flying")
 
     def _await_mended(self, reloader: Reloader, make: Make, deadline: float) -> bool:
         """Hover until a file was saved that can be flown; False if the time is over or the drone gone before."""

@@ -39,7 +39,7 @@ def fly(
     wait: Annotated[float, typer.Option(metavar="S", min=0.0, help="How long to wait in line for the authority")] = 0.0,
     takeoff: Annotated[bool, typer.Option(help="Take off first, or leave that to the controller")] = True,
     reload: Annotated[
-        bool, typer.Option("--reload", help="Fly the file anew when it is saved; after an error hover until then")
+        bool, typer.Option("--reload", help="Reload the file when it is saved; after an error hover until then")
     ] = False,
 ) -> None:
     """Take off, run a controller, land. Ctrl-C lands too, and so does an error in the controller without --reload."""

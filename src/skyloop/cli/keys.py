@@ -74,7 +74,7 @@ def show(
 ) -> None:
     """List all identities: role, drones, end. --dir may also be the folder of an identity, to see its copy of the list.
 
-    What ends within a week, or has ended, is told to standard error besides.
+    Keys that expire within a week, or have expired, are listed on standard error as well.
     """
     from skyloop.keys.credentials import expiry_notice, read_public
 

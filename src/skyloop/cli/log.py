@@ -241,7 +241,7 @@ def _channels(names: list[str] | None) -> list[Channel] | None:
 def _refuse(given: dict[str, bool], to: Form) -> None:
     for option, is_given in given.items():
         if is_given:
-            raise UsageError(f"{option} says nothing about {to.value}: leave it out, or choose another --to")
+            raise UsageError(f"{option} has no effect on {to.value}: leave it out, or choose another --to")
 
 
 @contextmanager

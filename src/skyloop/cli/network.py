@@ -55,7 +55,7 @@ def settings_of(
         given = {"--listen": listen, "--connect": connect, "--keys": keys, "--no-multicast": not multicast}
         for option, value in given.items():
             if value:
-                raise UsageError(f"{option} is for the network: say --network as well")
+                raise UsageError(f"{option} is for the network: give --network as well")
         return None
     from skyloop.transport.fabric.environment import settings
 

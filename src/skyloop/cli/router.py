@@ -63,7 +63,7 @@ def router(
             typer.echo(f"skyloop: {news}", err=True)
         out = session.shut_out()
         if out:
-            typer.echo(f"skyloop: begins anew without {', '.join(sorted(out))}", err=True)
+            typer.echo(f"skyloop: reconnecting without {', '.join(sorted(out))}", err=True)
             session = renewed(session)
             chosen = session.settings
     release(session, linger=False)

@@ -114,7 +114,7 @@ def sim(
     if firmware is None:
         given = [word for word, value in settings.items() if value is not None]
         if given:
-            raise UsageError(f"{given[0]} is for --firmware: say --firmware {Firmware.ARDRONE2} as well")
+            raise UsageError(f"{given[0]} is for --firmware: give --firmware {Firmware.ARDRONE2} as well")
         network_settings = settings_of(network, listen, connect, multicast, keys)
         settle(options)
         names = [name] if drones == 1 else [f"{name}{number}" for number in range(1, drones + 1)]
@@ -122,7 +122,7 @@ def sim(
         _serve_proxies(uri, options, names, server_ends(network_settings), key_news(network_settings))
         return
     if network:
-        raise UsageError("--network is for proxies, and with --firmware there is none: say --bind ADDRESS instead")
+        raise UsageError("--network is for proxies, and with --firmware there is none: give --bind ADDRESS instead")
     _refuse_for_firmware(name, uri)
     from skyloop.emulators.ardrone import Faults
 
@@ -165,7 +165,7 @@ def address(world: str, seed: int, speed: float, others: list[str]) -> str:
         if not equals:
             raise UsageError(f"--option {text!r} has no value: it looks like --option cameras=front")
         if key in OWN_OPTIONS:
-            raise UsageError(f"--option {text!r}: say --{key} {value}")
+            raise UsageError(f"--option {text!r}: give --{key} {value} instead")
         if key in settings:
             raise UsageError(f"--option {key} is given twice")
         settings[key] = value

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from skyloop.client import Drone
     from skyloop.cockpit.child import CockpitProcess
 
-ADVICE = "wait in line with --wait SECONDS, take over with a higher --priority, or look on: skyloop watch"
+ADVICE = "wait in line with --wait SECONDS, take over with a higher --priority, or observe: skyloop watch"
 PERIOD_S: Final = 0.05  #: how often a moved stick is sent anew; sooner at each press
 REFRESH_S: Final = 0.125
 EVENTS_SHOWN: Final = 3
@@ -149,4 +149,4 @@ class Teleop:
 def _page(drone: Drone) -> CockpitProcess:
     from skyloop.cockpit.child import CockpitProcess
 
-    return CockpitProcess(drone._core.reach)
+    return CockpitProcess(drone.reach)

@@ -428,7 +428,7 @@ def _busy(status: AuthorityStatus, wait_s: float, declined: str) -> str:
     said = f"; {declined}" if declined else ""
     return (
         f"{status.holder or 'another application'} holds the authority{waited}{words}{said}: wait longer (wait_s), ask "
-        'with a higher priority (a lower number, 0 is the highest), or look on with access="observe"'
+        'with a higher priority (a lower number, 0 is the highest), or connect with access="observe"'
     )
 
 

@@ -290,7 +290,7 @@ class ConnectionSupervisor:
         try:
             return self._step()
         except Exception:  # noqa: BLE001  (whatever goes wrong, the link has to come back)
-            _log.exception("the link's thread failed; it connects anew")
+            _log.exception("the connection's thread failed; reconnecting")
             self._drop(LinkError("an error in the link"), "an error in the link")
             return self._policy.cap_s
 

@@ -73,7 +73,7 @@ class LinkMonitor:
         received, missing, malformed = self._window(now_ns)
         silent_ns = now_ns - self.heard_ns
         if silent_ns > self._silent_ns:
-            return Verdict(LinkState.LOST, f"nothing heard for {silent_ns / 1e9:.1f} s", restart=True)
+            return Verdict(LinkState.LOST, f"no data for {silent_ns / 1e9:.1f} s", restart=True)
         if malformed >= self._limits.malformed:
             return Verdict(LinkState.LOST, f"{malformed} malformed packets within a second", restart=True)
         if not self.feedback_ns:

@@ -150,12 +150,12 @@ def untimely(command: Command, now_s: float) -> str:
         now_s: The cockpit's clock [s].
     """
     if command.at_s is None:
-        return "it does not say when it was asked for (at_s): send a ping first, its pong tells the cockpit's clock"
+        return "it has no time (at_s): send a ping first, its pong has the cockpit's clock"
     age_s, limit_s = now_s - command.at_s, late_s(command)
     if command.unsure_s > limit_s:
-        return f"nobody knows how old it is: the page's clock is known to within {command.unsure_s:.1f} s only"
+        return f"its age is not known: the page's clock is known to within {command.unsure_s:.1f} s only"
     if age_s + command.unsure_s > limit_s:
-        return f"it came {age_s:.1f} s after it was asked for, and only up to {limit_s:g} s is it done"
+        return f"it arrived {age_s:.1f} s after it was requested, and at most {limit_s:g} s are allowed"
     if age_s < -command.unsure_s - AHEAD_S:
         return f"its time is {-age_s:.1f} s ahead of the cockpit's clock: ping again"
     return ""

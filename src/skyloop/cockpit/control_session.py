@@ -438,7 +438,7 @@ class ControlSession:
         if ended == "link":
             return f"the link to the proxy of {name} was lost: {now}, and what {name} flew meanwhile is not known"
         if ended == "silent":
-            return f"the cockpit did not hear this page for {GONE_S:g} s, so its control ran out: {now}"
+            return f"the cockpit received nothing from this page for {GONE_S:g} s, so its control ran out: {now}"
         return f"{now} now"
 
     def _on_event(self, event: Event) -> None:

@@ -124,7 +124,7 @@ def foreign(kind: str, method: str, headers: Iterable[tuple[bytes, bytes]], name
         return "what another page links to, or loads, is refused: open the cockpit's own page"
     if not given["origin"]:
         must = kind == "websocket" or method not in _READING
-        return "a WebSocket, and a request that changes something, must tell its origin" if must else ""
+        return "a WebSocket, or a request that changes something, must have an Origin header" if must else ""
     if given["origin"] != [f"{names.scheme}://{given['host'][0]}"]:
         return "requests from other pages are refused"
     return ""

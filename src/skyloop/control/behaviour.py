@@ -87,7 +87,7 @@ class Behaviour(Controller):
         if feedback.captured_ns - self._frame_ns > nanoseconds(BLIND_S):
             if not self.blind:
                 self.blind = True
-                self.tell("no pictures come: hovering", Severity.WARNING)
+                self.tell("no frames arrive: hovering", Severity.WARNING)
             self.drone.hover()
 
     def on_frame(self, frame: Frame) -> None:
@@ -97,7 +97,7 @@ class Behaviour(Controller):
         self._frame_ns = frame.captured_ns
         if self.blind:
             self.blind = False
-            self.tell("pictures come again")
+            self.tell("frames arrive again")
         shapes = self.look(frame)
         wanted = self._law.step(frame.captured_ns + nanoseconds(frame.age_s))
         self._tell_phase()

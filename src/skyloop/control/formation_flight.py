@@ -274,7 +274,7 @@ def station(leader: Feedback, offset: ArrayLike, *, turn: bool = True) -> NDArra
     """
     problem = lacking(leader)
     if problem or leader.position is None or leader.yaw is None:
-        raise UsageError(f"nobody can keep a place beside it: {problem}")
+        raise UsageError(f"no place relative to the leader can be kept: {problem}")
     relative = _offset(offset)
     turned = rotation_from_euler(0.0, 0.0, leader.yaw) @ relative if turn else relative
     return np.asarray(leader.position + turned, dtype=np.float64)

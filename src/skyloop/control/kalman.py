@@ -129,7 +129,7 @@ class ConstantVelocityFilter:
             distance = math.sqrt(float(innovation @ np.linalg.solve(spread, innovation)))
         except np.linalg.LinAlgError:
             raise UsageError(
-                "a measurement without any deviation, of a point that is known exactly, says nothing"
+                "a measurement without deviation, of a point that is known exactly, adds no information"
             ) from None
         if distance > self._gate:
             self.refused += 1

@@ -85,7 +85,7 @@ def _choose(
     if not likely:
         raise FileFormatError(f"{file} has no controller: write a class derived from skyloop.Controller")
     if len(likely) > 1:
-        raise UsageError(f"{file} has several controllers ({', '.join(sorted(likely))}): say which with --class NAME")
+        raise UsageError(f"{file} has several controllers ({', '.join(sorted(likely))}): choose one with --class NAME")
     return next(iter(likely.values()))
 
 

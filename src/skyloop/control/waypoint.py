@@ -63,8 +63,8 @@ class WaypointSettings:
 def lacking(feedback: Feedback) -> str:
     """Return why a vehicle can't be flown to a position, or an empty string if it can."""
     if feedback.position is None:
-        return "the vehicle does not tell its position"
-    return "the vehicle does not tell its yaw" if feedback.yaw is None else ""
+        return "the vehicle does not report its position"
+    return "the vehicle does not report its yaw" if feedback.yaw is None else ""
 
 
 def velocity_to(goal: Waypoint, feedback: Feedback, settings: WaypointSettings | None = None) -> Velocity:

@@ -146,7 +146,7 @@ class DriverSuite:
         driver.open(sink)
         try:
             up = sink.wait(lambda: sink.link_state is LinkState.UP, self.connect_timeout_s)
-            assert up, f"the link was not told UP within {self.connect_timeout_s} s; told: {sink.links}"
+            assert up, f"the link was not reported UP within {self.connect_timeout_s} s; reported: {sink.links}"
             yield driver, sink
         finally:
             driver.close()
@@ -221,7 +221,7 @@ class DriverSuite:
             driver.open(sink)
             up = sink.wait(lambda s=sink: s.link_state is LinkState.UP, self.connect_timeout_s)  # type: ignore[misc]
             driver.close()
-            assert up, f"the link was not told UP; told: {sink.links}"
+            assert up, f"the link was not reported UP; reported: {sink.links}"
 
     def test_gives_threads_and_descriptors_back(self) -> None:
         """Opening and closing leaves no threads or descriptors behind."""
@@ -299,12 +299,12 @@ class DriverSuite:
             self.vehicle_disappears()
             try:
                 lost = sink.wait(lambda: sink.link_state is LinkState.LOST, self.lost_timeout_s)
-                assert lost, f"the link was not told LOST; told: {sink.links}"
+                assert lost, f"the link was not reported LOST; reported: {sink.links}"
                 assert sink.links[-1][1], "LOST needs a reason"
             finally:
                 self.vehicle_appears()
             found = sink.wait(lambda: sink.link_state is LinkState.UP, self.connect_timeout_s)
-            assert found, f"the link was not told UP again; told: {sink.links}"
+            assert found, f"the link was not reported UP again; reported: {sink.links}"
 
     # What it is commanded -----------------------------------------------------------------------------------------
 

@@ -132,7 +132,7 @@ class Agreement:
         try:
             shared = self._private.exchange(X25519PublicKey.from_public_bytes(share))
         except ValueError as error:
-            raise LinkError(f"the other end's share is of no use: {error}") from None
+            raise LinkError(f"the other end's key share is invalid: {error}") from None
         salt = sha256(claim).digest()
         secrets = HKDF(SHA256(), 2 * SECRET_BYTES, salt, _PURPOSE.encode()).derive(shared)
         return Agreed(identity, expires, secrets[:SECRET_BYTES], secrets[SECRET_BYTES:])

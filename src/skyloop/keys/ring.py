@@ -94,7 +94,7 @@ class KeyRing:
             return []
         gone = f"; revoked or changed: {', '.join(sorted(self.shut_out))}" if self.shut_out else ""
         number = renewed.roster.number
-        return [f"the lab's roster has changed (number {number}){gone}; all of it counts when this is started anew"]
+        return [f"the lab's roster has changed (number {number}){gone}; restart this program to apply all of it"]
 
 
 def _stamp(credentials: Credentials) -> tuple[int, int, int]:

@@ -108,7 +108,7 @@ def decode(content: bytes, authority: Authority, path: Path) -> Roster:
         raise FileFormatError(f"{path} is no roster, or it is damaged: {error}") from None
     body = bytes(file.roster)
     if not authority.signed(_PURPOSE + body, signature):
-        raise UsageError(f"the roster {path} was changed, or is not signed by {authority.name}: copy it anew")
+        raise UsageError(f"the roster {path} was changed, or is not signed by {authority.name}: copy it again")
     try:
         roster = msgspec.json.decode(body, type=Roster)
     except msgspec.MsgspecError as error:

@@ -65,5 +65,5 @@ class Feedback(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
         from skyloop.messages.geometry import rotation_from_euler
 
         if self.roll is None or self.pitch is None or self.yaw is None:
-            raise ValueError("the vehicle has not told its attitude yet")
+            raise ValueError("the vehicle has not reported its attitude yet")
         return rotation_from_euler(self.roll, self.pitch, self.yaw)

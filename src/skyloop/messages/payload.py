@@ -55,8 +55,8 @@ def pack(value: Any) -> bytes:
         raise UsageError(f"a result can't be sent: {error}; {_WHAT}") from None
     if len(data) > MAX_PAYLOAD:
         raise UsageError(
-            f"a result of {len(data)} bytes can't be sent, at most {MAX_PAYLOAD} can: send what was found in a "
-            "picture, not the picture"
+            f"a result of {len(data)} bytes can't be sent, at most {MAX_PAYLOAD} can: send what was found in an "
+            "image, not the image"
         )
     return data
 

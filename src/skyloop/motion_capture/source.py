@@ -96,7 +96,7 @@ class ChildSource:
                 self._first.set()
                 return
             if not self._ended.is_set():
-                self._trouble(f"{self._system.address} is not heard{self._said}; trying again")
+                self._trouble(f"no data from {self._system.address}{self._said}; trying again")
             self._ended.wait(AGAIN_S)
 
     def _listen(self) -> int | None:

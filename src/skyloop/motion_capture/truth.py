@@ -49,7 +49,7 @@ class TruthSource:
                     connect(name, access="observe", name="skyloop mocap", timeout_s=timeout_s)
                 )
                 if true_pose(drone.feedback()) is None:
-                    raise UnsupportedError(f"{name} tells no true pose: start it with truth=1, as sim://?truth=1")
+                    raise UnsupportedError(f"{name} reports no true pose: start it with truth=1, as sim://?truth=1")
                 opening.enter_context(drone.on_feedback(self._taking(name, drone), inline=True))
             self._open = opening.pop_all()
 

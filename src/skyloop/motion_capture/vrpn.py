@@ -165,7 +165,7 @@ class VrpnSource:
             except (OSError, UnicodeError, LinkError, DecodeError) as error:
                 self._failure = f": {error}"
                 if not self._ended.is_set():
-                    self._trouble(f"{self._system.address} is not heard{self._failure}; trying again")
+                    self._trouble(f"no data from {self._system.address}{self._failure}; trying again")
             self._ended.wait(AGAIN_S)
 
     def _receive(self) -> None:

@@ -108,7 +108,7 @@ class Group:
         return 0 if all(code == 0 for code in codes) else None
 
     def _bury(self, number: int, child: Child) -> None:
-        self._tell(f"worker {number + 1} {child.ending}: the others have its share until it is started anew")
+        self._tell(f"worker {number + 1} {child.ending}: the others have its share until it is restarted")
         child.end()
         self._children[number] = None
         self._due_s[number] = time.monotonic() + self._pause_s

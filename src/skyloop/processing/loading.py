@@ -110,7 +110,7 @@ def _choose(module: ModuleType, class_name: str, place: str) -> type[Any]:
     if not own:
         raise FileFormatError(f"{place} has no processor: write {_WANTED}")
     if len(own) > 1:
-        raise UsageError(f"{place} has several processors ({', '.join(sorted(own))}): say which with {place}:CLASS")
+        raise UsageError(f"{place} has several processors ({', '.join(sorted(own))}): choose one with {place}:CLASS")
     return next(iter(own.values()))
 
 

@@ -68,7 +68,7 @@ class Worker:
 
         Raises:
             NameTakenError: If another application runs other code under this name.
-            SkyloopError: Whatever else :meth:`skyloop.client.core.DroneCore.join_processor` raises.
+            SkyloopError: Whatever else :meth:`skyloop.client.Drone.join_processor` raises.
         """
         self.settings = settings
         self._drone = drone
@@ -80,7 +80,7 @@ class Worker:
         self._busy_since_s: float | None = None
         self._told_s = -math.inf
         self._told_refused = False
-        self.membership = drone._core.join_processor(
+        self.membership = drone.join_processor(
             settings.name, code=settings.code, camera=settings.camera, shared=settings.shared
         )
         self.membership.ready = self._ready
@@ -169,7 +169,7 @@ class Worker:
         self._tally.refused += 1
         if not self._told_refused:  # further results are most likely of the same type
             self._told_refused = True
-            self._say(f"{self.settings.name}: {error}. Further ones are counted and not told.")
+            self._say(f"{self.settings.name}: {error}. Further ones are counted and not reported.")
 
     def _failed(self, error: Exception) -> None:
         self._tally.errors += 1

@@ -47,7 +47,7 @@ OWN: Final[tuple[Parameter, ...]] = (
     _own("autopilot.velocity_i", 0.05, "rad/m", 0.0, 1.0, "Integral gain of the software velocity loop"),
     _own("autopilot.velocity_p", 0.15, "rad s/m", 0.0, 1.0, "Proportional gain of the software velocity loop"),
     _own("battery.land", 0.1, "", 0.0, 1.0, "Charge below which the vehicle lands and takes no set-points; 0: never"),
-    _own("battery.warn", 0.2, "", 0.0, 1.0, "Charge below which a low battery is told; 0: never"),
+    _own("battery.warn", 0.2, "", 0.0, 1.0, "Charge below which a low battery is reported; 0: never"),
     _own("command.max_age_s", 0.25, "s", 0.01, 10.0, "Older commands are refused as stale"),
     _own(
         "failsafe.hover_after_s", 0.5, "s", 0.05, 3600.0, "A flying vehicle hovers when nobody commanded it for so long"

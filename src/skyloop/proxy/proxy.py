@@ -338,7 +338,7 @@ class Proxy:
         )
         if session.malformed(now_ns):
             session.ended = True
-            why = f"more than {MAX_MALFORMED} malformed packets within a second (last: {reason[:200]}): connect anew"
+            why = f"more than {MAX_MALFORMED} malformed packets within a second (last: {reason[:200]}): connect again"
             self.server.disconnect(session.peer, why)
 
     # Time ------------------------------------------------------------------------------------------------------
@@ -359,7 +359,7 @@ class Proxy:
                 self._counts["connections.silent"] += 1
                 why = f"no Hello came within {seconds(HELLO_NS):g} s"
                 self.events.publish_repeated(("silent",), partial(_silent, session, why))
-                self.server.disconnect(session.peer, f"{why}: connect anew")
+                self.server.disconnect(session.peer, f"{why}: connect again")
 
     def _run(self) -> None:
         period_ns = nanoseconds(PERIOD_S)

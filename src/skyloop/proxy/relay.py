@@ -38,7 +38,7 @@ class Relay:
         """Pass an annotation on to its subscribers; returns why it is malformed, empty if it is not."""
         unknown = camera_problem(annotation.camera, self._cameras)
         if unknown:
-            return f"an annotation on no picture: {unknown}"
+            return f"an annotation of no known frame: {unknown}"
         if len(packet) > MAX_ANNOTATION:
             return f"an annotation has {len(packet)} bytes, at most {MAX_ANNOTATION} are relayed"
         return self._publish(session, ANNOTATIONS, packet)
@@ -57,7 +57,7 @@ class Relay:
     def pose(self, session: Session, pose: VehiclePose) -> None:
         """Pass a pose of the vehicle on to its driver. Refusals are published once a second at most."""
         if session.role is not Role.PILOT:
-            self._refuse_pose(session, Refusal.OBSERVER, "observers tell a vehicle nothing: connect as a pilot")
+            self._refuse_pose(session, Refusal.OBSERVER, "observers can't send poses: connect as a pilot")
             return
         try:
             self._driver.external_pose(

@@ -69,7 +69,7 @@ class Peer:
     address: str  #: for people: process id and user, or host and port
 
 
-NOBODY = Peer(0, "nobody that is connected")
+NOBODY = Peer(0, "an unknown application")
 
 
 class ServerHandler(Protocol):

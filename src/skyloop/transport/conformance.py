@@ -176,7 +176,7 @@ class TransportSuite(ABC):
         ):
             assert server.publish(FEEDBACK, b"1") == 0
             assert server.publish("nobody", b"x") == 0
-            wait_until(lambda: one.log.packets, "it came, and is no news for who subscribes now")
+            wait_until(lambda: one.log.packets, "it arrived before the subscription, and is not sent again")
             two.client.subscribe(FEEDBACK)
             wait_until(lambda: server.subscribers(FEEDBACK) == 2, "both are subscribed")
             assert server.publish(FEEDBACK, b"2") == 0
@@ -298,7 +298,7 @@ class TransportSuite(ABC):
             app.client.close()
             assert len(app.log.closings) == 1, "closed() is called before close() returns"
             app.client.close()
-            wait_until(lambda: log.left, "the server was told")
+            wait_until(lambda: log.left, "the server was notified")
             assert log.from_peer(app.peer) == [b"last words"]
             assert [peer for peer, _ in log.left] == [app.peer]
             assert log.left[0][1]
@@ -318,7 +318,7 @@ class TransportSuite(ABC):
             self.connected(server, log) as other,
         ):
             server.disconnect(app.peer, "because of this")
-            wait_until(lambda: app.log.closings and log.left, "both ends were told")
+            wait_until(lambda: app.log.closings and log.left, "both ends were notified")
             assert log.left == [(app.peer, "because of this")]
             assert app.log.closings == ["because of this"]
             assert other.client.send(b"still here")
@@ -330,7 +330,7 @@ class TransportSuite(ABC):
                 assert server.send(one.peer, b"goodbye")
                 server.stop()
                 server.stop()
-                wait_until(lambda: one.log.closings and two.log.closings, "both were told")
+                wait_until(lambda: one.log.closings and two.log.closings, "both were notified")
                 assert one.log.packets == [b"goodbye"], "what was sent before still comes"
                 assert one.log.closings[0]
                 assert not one.client.send(b"x")
@@ -345,7 +345,7 @@ class TransportSuite(ABC):
         with self.serving() as (server, log), self.connected(server, log) as bad, self.connected(server, log) as good:
             log.on_packet = fail
             assert bad.client.send(b"bad")
-            wait_until(lambda: bad.log.closings and log.left, "both ends were told")
+            wait_until(lambda: bad.log.closings and log.left, "both ends were notified")
             assert "on purpose" in log.left[0][1]
             assert good.client.send(b"good")
             wait_until(lambda: log.from_peer(good.peer) == [b"good"], "the other one is undisturbed")
@@ -362,7 +362,7 @@ class TransportSuite(ABC):
         ):
             bad.log.on_packet = fail
             assert server.publish(FEEDBACK, b"x") == 0
-            wait_until(lambda: bad.log.closings and log.left, "both ends were told")
+            wait_until(lambda: bad.log.closings and log.left, "both ends were notified")
             assert "on purpose" in bad.log.closings[0]
             wait_until(lambda: server.subscribers(FEEDBACK) == 1, "it is gone")
             assert server.publish(FEEDBACK, b"y") == 0
@@ -372,10 +372,10 @@ class TransportSuite(ABC):
         with self.serving() as (server, log), self.connected(server, log) as app, self.connected(server, log) as other:
             app.log.on_packet = lambda _: app.client.close()
             assert server.send(app.peer, b"x")
-            wait_until(lambda: app.log.closings and log.left, "both ends were told")
+            wait_until(lambda: app.log.closings and log.left, "both ends were notified")
             log.on_packet = lambda _, __: server.stop()
             assert other.client.send(b"x")
-            wait_until(lambda: other.log.closings and len(log.left) == 2, "all were told")
+            wait_until(lambda: other.log.closings and len(log.left) == 2, "all were notified")
 
     def test_coming_and_going_leaves_nothing_behind(self) -> None:
         with self.serving() as (server, log):

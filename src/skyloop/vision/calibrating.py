@@ -149,10 +149,10 @@ def _fit(views: Sequence[BoardView], width: int, height: int, model: Model) -> _
     except cv.error as error:
         reason = str(error).strip().splitlines()[-1][:200]
         raise UsageError(
-            f"these views don't tell the camera's {model} model; show the board tilted more: {reason}"
+            f"these views don't determine the camera's {model} model; show the board tilted more: {reason}"
         ) from error
     if not (np.isfinite(found.matrix).all() and np.isfinite(found.distortion).all() and np.isfinite(found.rms)):
-        raise UsageError(f"these views don't tell the camera's {model} model: show the board tilted more")
+        raise UsageError(f"these views don't determine the camera's {model} model: show the board tilted more")
     return found
 
 

@@ -40,7 +40,7 @@ class ColourMask:
         self._cv = opencv("finding a colour")
         hue, saturation, _ = self._cv.cvtColor(np.array([[colour[::-1]]], np.uint8), self._cv.COLOR_BGR2HSV)[0, 0]
         if saturation < _LEAST_SATURATION:
-            raise UsageError(f"colour {colour!r} is too grey to be told from what is around")
+            raise UsageError(f"colour {colour!r} is too grey to be distinguished from its surroundings")
         self._hue, self._saturation = int(hue), int(saturation * _SATURATION)
 
     def of(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -207,11 +207,11 @@ def test_calibration_in_the_air() -> None:
     ("name", "value", "condition", "says"),
     [
         ("ardrone.flat_trim", True, AIR, "land first"),
-        ("ardrone.flat_trim", True, None, "not heard"),
+        ("ardrone.flat_trim", True, None, "no data from"),
         ("ardrone.calibrate_magnetometer", True, GROUND, "take off first"),
         ("ardrone.flight_animation", "wave", GROUND, "take off first"),
         ("ardrone.flight_animation", "wave", Condition(State.EMERGENCY), "take off first"),
-        ("leds.animation", "fire", None, "not heard"),
+        ("leds.animation", "fire", None, "no data from"),
     ],
 )
 def test_what_the_state_forbids(name: str, value: Value, condition: Condition | None, says: str) -> None:

@@ -263,9 +263,9 @@ def test_nobody_resets_by_himself() -> None:
 @pytest.mark.parametrize(
     ("condition", "action", "says"),
     [
-        (None, Takeoff(), "not heard"),
+        (None, Takeoff(), "no data from"),
         (EMERGENCY, Takeoff(), "reset it first"),
-        (None, ResetEmergency(), "not heard"),
+        (None, ResetEmergency(), "no data from"),
         (AIR, Velocity(), "takes no velocity"),
     ],
 )

@@ -79,7 +79,7 @@ def test_a_value_that_is_not_taken_is_told() -> None:
     exchange.poll(0)
     exchange.poll(S)
     assert ended[0] is not None
-    assert "keeps 1" in ended[0]
+    assert "reported is 1" in ended[0]
     exchange.write("ONE", 6, 5 * S, ended.append)
     exchange.fail_writes("it is gone")
     assert ended[1] == "it is gone"
@@ -130,7 +130,7 @@ def test_a_limit_that_makes_no_sense_is_refused(value: float) -> None:
 
 @pytest.mark.parametrize("number", [16_777_217, -16_777_217, 2_147_483_647, 33_554_433])
 def test_a_whole_number_that_the_vehicle_would_hear_as_another_is_refused_with_the_reason(number: int) -> None:
-    with pytest.raises(ParameterError, match=f"would hear -?[0-9]+ instead of {number}"):
+    with pytest.raises(ParameterError, match=f"would receive -?[0-9]+ instead of {number}"):
         check_exact("mavlink.brd_options", number, bytewise=False)
     assert check_exact("mavlink.brd_options", number, bytewise=True) == number
 

@@ -191,7 +191,7 @@ def test_a_drone_that_is_not_there_is_told_and_looked_for() -> None:
     assert [state for state, _ in rig.sink.links] == [LinkState.CONNECTING, LinkState.LOST]
     assert "no state from drone, UDP port 8889" in rig.sink.links[-1][1]
     assert 4 <= rig.said.count("command") <= 6
-    with pytest.raises(DriverError, match="not heard"):
+    with pytest.raises(DriverError, match="no data from"):
         rig.do(Takeoff())
     rig.on = True
     rig.ready()
@@ -263,7 +263,7 @@ def test_a_drone_that_does_not_hear_us_is_told() -> None:
     rig.run(0.1)
     rig.deaf = True
     rig.until(lambda: rig.sink.link_state is LinkState.DEGRADED, 15.0)
-    assert rig.sink.links[-1][1] == "the drone tells its state, and answers no command"
+    assert rig.sink.links[-1][1] == "the drone sends its state, but answers no command"
     rig.deaf = False
     rig.until(lambda: rig.sink.link_state is LinkState.UP, 3.0)
 

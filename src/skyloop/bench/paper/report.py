@@ -32,7 +32,7 @@ PICTURES: Final = {
 #: From what to what each delay is.
 MEANING: Final = {
     "command": "drone.velocity() has checked its numbers, and encodes → the driver has carried it out",
-    "feedback": "the proxy publishes what the driver told → the controller's receiving thread has it",
+    "feedback": "the proxy publishes what the driver reported → the controller's receiving thread has it",
     "video": "the proxy publishes the driver's picture → the controller's receiving thread has the array",
 }
 
@@ -143,9 +143,7 @@ def _page(results: Experiment) -> Page:
     if results.tracking is not None:
         off = Line("off", np.array(results.way.off_at_s), np.array(results.way.off_m))
         page.chart("Off the path", "m, from where it should have been", [off], limits([off], least_span=0.2, zero=True))
-    page.add(
-        "<footer>Delays are in ms where nothing else is said. The paper's means: Mellado-Bataller et al., IAS-12, "
-    )
+    page.add("<footer>Delays are in ms unless stated otherwise. The paper's means: Mellado-Bataller et al., IAS-12, ")
     page.add("2013, Table 1, on one host. flight.mcap beside this page holds all that it is made from.</footer>")
     return page
 

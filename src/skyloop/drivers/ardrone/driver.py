@@ -139,14 +139,14 @@ class ArdroneDriver(Driver):
             raise ParameterError(f"{entry.parameter.name}: {failure}", code=Refusal.DRIVER_FAILED)
         with link.lock:
             session = link.session
-            told = session.configurator.values.get(entry.key, "")
+            reported = session.configurator.values.get(entry.key, "")
             session.read_limits()
-            accepted = taken(entry, text, told)
+            accepted = taken(entry, text, reported)
             if accepted:
-                session.remembered[entry.key] = told
+                session.remembered[entry.key] = reported
         if not accepted:
-            raise ParameterError(f"the drone keeps {entry.key} at {told}, it did not take {text}")
-        return entry.from_text(told)
+            raise ParameterError(f"the drone kept {entry.key} at {reported} and did not accept {text}")
+        return entry.from_text(reported)
 
     def _entries(self) -> dict[str, Entry]:
         link = self._link

@@ -341,7 +341,7 @@ _HEADING: Final = _number(
 def _flight_animations(version: int | None) -> Parameter:
     known = FLIGHT_ANIMATIONS[:FIRST_FLIP] if version == 1 else FLIGHT_ANIMATIONS
     names = tuple(name for name, _ in known)
-    return _choice("ardrone.flight_animation", names, "flies this animation (ANIM, said once); in flight only")
+    return _choice("ardrone.flight_animation", names, "flies this animation (ANIM, sent once); in flight only")
 
 
 class Commands:
@@ -428,7 +428,7 @@ class Commands:
     def _condition(self) -> Condition:
         condition = self._setpoints.condition
         if condition is None:
-            raise _refused("the drone is not heard")
+            raise _refused("no data from the drone")
         return condition
 
 

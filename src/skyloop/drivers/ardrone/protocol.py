@@ -184,9 +184,9 @@ class ArdroneSession(VehicleSession):
         if not self.ready:
             return
         if state & State.BOOTSTRAP:
-            self._lose("the drone was started anew", now_ns)
+            self._lose("the drone rebooted", now_ns)
         elif state & ~self._state & State.COMMUNICATION_LOST:
-            self._lose("the drone says that it lost its link to us", now_ns)
+            self._lose("the drone reports that it lost its link to us", now_ns)
 
     def _publish(self, navdata: Navdata, demo: Demo, now_ns: int) -> None:
         captured_ns = self._clock.captured_ns(navdata, now_ns)
@@ -295,7 +295,7 @@ class ArdroneSession(VehicleSession):
         self.ready = True
         self.read_limits()
         if self.setpoints.limits is None:
-            text = "the drone's configuration tells no limits: it takes no set-points"
+            text = "the drone's configuration has no limits: set-points are refused"
             self._notice(Notice(EventKind.DRIVER_ERROR, text, Severity.ERROR, {"where": "configuration"}))
         self._set_link_state(LinkState.UP)
 

@@ -209,14 +209,14 @@ class SetpointController:
 
     def _release_motors(self, now_ns: int) -> None:
         if self.condition is None:
-            raise DriverError("the drone is not heard: whether there is an emergency to reset can't be known")
+            raise DriverError("no data from the drone: whether there is an emergency to reset is not known")
         self._decision, self._stick, self._landing_is_ours = Decision.LAND, None, False
         if self.condition.emergency and self._toggle is not False:
             self._toggle, self._toggle_ns = False, now_ns
 
     def _take_off(self, now_ns: int) -> None:
         if self.condition is None:
-            raise DriverError("the drone is not heard: it does not take off blindly")
+            raise DriverError("no data from the drone: take-off is refused until the link is up")
         if self.condition.emergency or self._toggle is not None:
             raise DriverError("the drone is in emergency: reset it first")
         if self._decision is not Decision.TAKE_OFF:

@@ -260,9 +260,9 @@ def _finite(value: Any) -> bool:
 
 #: Bit, its name in events' data, what it means while it is set.
 _CONDITIONS: Final = (
-    (State.COMMUNICATION_LOST, "communication_lost", "the drone says that it lost its link to us", Severity.WARNING),
+    (State.COMMUNICATION_LOST, "communication_lost", "the drone reports that it lost its link to us", Severity.WARNING),
     (State.BATTERY_LOW, "battery_low", "the drone's battery is low", Severity.WARNING),
-    (State.ULTRASOUND_DEAF, "ultrasound", "the drone's ultrasound hears nothing", Severity.WARNING),
+    (State.ULTRASOUND_DEAF, "ultrasound", "the drone's ultrasound receives no echo", Severity.WARNING),
     (State.MOTORS_PROBLEM, "motors", "the drone has a problem with its motors", Severity.ERROR),
     (State.SOFTWARE_FAULT, "software", "the drone detected a fault of its software", Severity.ERROR),
     (State.ANGLES_OUT_OF_RANGE, "angles", "the drone tilted too far", Severity.WARNING),

@@ -267,7 +267,7 @@ class ArduCopterProfile(AutopilotProfile):
         listens = values.get("MAV_GCS_SYSID", values.get("SYSID_MYGCS"))
         if listens is not None and listens != own_system:
             detail = (
-                f"it counts heartbeats of system {listens:g} and we are system {own_system}: our loss is not noticed"
+                f"it monitors heartbeats of system {listens:g}, this is system {own_system}: it won't detect our loss"
             )
             remarks.append(Remark("ground station", False, detail, f"give the address ?own_sysid={listens:g}"))
         return remarks

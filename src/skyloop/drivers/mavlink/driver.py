@@ -113,7 +113,7 @@ class MavlinkDriver(Driver):
         """Send the pose as ``ODOMETRY``, or as what ``?pose=`` says."""
         link = self._opened()
         if not link.session.is_heard:
-            raise DriverError("the vehicle is not heard: it can't be told where it is")
+            raise DriverError("no data from the vehicle: an external pose can't be sent until the link is up")
         link.send(pose_message(pose, self.options.pose))
 
     def checkup(self) -> list[Remark]:

@@ -158,7 +158,7 @@ class TcpClient:
         except BlockingIOError:
             return
         if sent < len(data):
-            raise ConnectionError("the vehicle takes nothing any more")
+            raise ConnectionError("the vehicle no longer reads what is sent")
 
     def close(self) -> None:
         """Close the connection."""

@@ -84,9 +84,9 @@ class VehicleSelector:
             return []
         self._told.add(found)
         where = f" at {found.peer[0]}:{found.peer[1]}" if found.peer is not None else ""
-        text = f"another vehicle is heard, system {found.system}{where}: it is left alone"
+        text = f"another vehicle answers, system {found.system}{where}: it is ignored"
         if self.chosen is not None and found.system == self.chosen.system:
-            text += "; two with one id are told apart by ?peer=HOST:PORT"
+            text += "; ?peer=HOST:PORT distinguishes two with one id"
         else:
             text += f"; ?sysid={found.system} chooses it"
         return [

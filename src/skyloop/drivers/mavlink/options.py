@@ -237,7 +237,7 @@ def _camera(uri: VehicleUri) -> CameraOptions | None:
     if source is None:
         given = sorted(name for name in uri.options if name.startswith("camera_"))
         if given:
-            raise UsageError(f"{uri}: {given[0]} is for a camera: say camera=rtsp://… as well")
+            raise UsageError(f"{uri}: {given[0]} is for a camera: give camera=rtsp://… as well")
         return None
     if not source:
         raise UsageError(f"{uri}: camera is empty; it looks like camera=rtsp://192.168.1.10/live or camera=/dev/video0")

@@ -77,7 +77,7 @@ class FlightOwnership:
         if isinstance(action, Velocity | Attitude) or not decided:
             raise DriverError(
                 f"the vehicle is in {self.left_to}, which was not chosen here: "
-                "hover, take off or land first, which takes it"
+                "hover, take off or land first to take it over"
             )
         self._repeated = None
 

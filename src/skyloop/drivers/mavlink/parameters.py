@@ -134,8 +134,8 @@ class ParameterExchange:
         for write in list(self._writes):
             if now_ns >= write.deadline_ns:
                 self._writes.remove(write)
-                told = self.reported[write.name].value
-                write.done(f"the vehicle does not confirm it, and keeps {told:g} as far as is known")
+                reported = self.reported[write.name].value
+                write.done(f"the vehicle did not confirm it; the last value that it reported is {reported:g}")
             elif write.said_ns is None or now_ns - write.said_ns >= WRITE_NS:
                 write.said_ns = now_ns
                 kind = self.reported[write.name].kind
@@ -184,9 +184,7 @@ PARAMETER_INFO: Final = {
     "FENCE_ALT_MAX": ParameterInfo("m", 10, 1000, "ceiling of the fence"),
     "FENCE_ENABLE": ParameterInfo("", 0, 1, "whether the fence works"),
     "FS_EKF_ACTION": ParameterInfo("", 0, 3, "what happens when it does not know where it is"),
-    "FS_GCS_ENABLE": ParameterInfo(
-        "", 0, 8, "what happens when no ground station is heard: 0 nothing, 5 land, 7 brake"
-    ),
+    "FS_GCS_ENABLE": ParameterInfo("", 0, 8, "on loss of a ground station's heartbeat: 0 nothing, 5 land, 7 brake"),
     "FS_GCS_TIMEOUT": ParameterInfo("s", 2, 120, "silence of the ground station that is a failure"),
     "FS_THR_ENABLE": ParameterInfo("", 0, 7, "what happens when the remote control is lost"),
     "GUID_OPTIONS": ParameterInfo("", 0, None, "bit 3: thrust is thrust, and no climb rate"),
@@ -213,7 +211,7 @@ PARAMETER_INFO: Final = {
     "MPC_XY_VEL_MAX": ParameterInfo("m/s", 0, 20, "greatest horizontal speed"),
     "MPC_Z_VEL_MAX_DN": ParameterInfo("m/s", 0.5, 4, "greatest speed of descent"),
     "MPC_Z_VEL_MAX_UP": ParameterInfo("m/s", 0.5, 8, "greatest speed of climb"),
-    "NAV_DLL_ACT": ParameterInfo("", 0, 6, "what happens when no ground station is heard: 0 nothing, 1 hold, 3 land"),
+    "NAV_DLL_ACT": ParameterInfo("", 0, 6, "on loss of a ground station's heartbeat: 0 nothing, 1 hold, 3 land"),
     "NAV_RCL_ACT": ParameterInfo("", 1, 6, "what happens when the remote control is lost"),
 }
 
@@ -291,11 +289,11 @@ def check_exact(name: str, number: int, *, bytewise: bool) -> int:
     """
     if bytewise:
         return number
-    heard = struct.unpack("<f", struct.pack("<f", number))[0]
-    if heard != number:
+    received = struct.unpack("<f", struct.pack("<f", number))[0]
+    if received != number:
         raise ParameterError(
-            f"{name}: the vehicle carries whole numbers in single precision and would hear {heard:.0f} instead of "
-            f"{number}: beyond ±{EXACT} only some can be written; set it in a ground station",
+            f"{name}: the vehicle carries whole numbers in single precision and would receive {received:.0f} "
+            f"instead of {number}: beyond ±{EXACT} only some can be written; set it in a ground station",
             code=Refusal.OUT_OF_RANGE,
         )
     return number

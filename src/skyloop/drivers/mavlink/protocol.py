@@ -78,7 +78,7 @@ class MavlinkSession(VehicleSession):
         self._beaten_ns = -HEARTBEAT_NS
         self._old = False  # it speaks MAVLink 1
         self._signed = 0
-        self._unsupported_reason = "it is not heard"
+        self._unsupported_reason = "no data from it"
         self._set_link_state(LinkState.CONNECTING, f"waiting for a heartbeat on {options.address}")
 
     @property
@@ -185,7 +185,7 @@ class MavlinkSession(VehicleSession):
             captured_ns = self.clock.captured_ns(message.time_boot_ms, now_ns)
             if self.clock.restarted:
                 self.parameters.complete = False
-                self._lose("the vehicle was started anew", now_ns)
+                self._lose("the vehicle rebooted", now_ns)
                 return
             self._publish(captured_ns, now_ns)
         elif kind == "COMMAND_ACK":
@@ -331,7 +331,7 @@ class MavlinkSession(VehicleSession):
         found = profile_of(heartbeat.autopilot)
         self._unsupported_reason = unsupported_reason(heartbeat)
         if self._unsupported_reason:
-            text = f"the vehicle is heard and can't be flown: {self._unsupported_reason}"
+            text = f"the vehicle answers but can't be flown: {self._unsupported_reason}"
             self._notice(Notice(EventKind.DRIVER_ERROR, text, Severity.ERROR, {"where": "autopilot"}))
         self.autopilot = found
         if found is None:

@@ -162,7 +162,7 @@ class SetpointController:
 
     def _release_motors(self, action: ResetEmergency, vehicle: VehicleState | None, now_ns: int) -> AnyAction:
         if vehicle is None:
-            raise DriverError("the vehicle is not heard: whether it lies still can't be known")
+            raise DriverError("no data from the vehicle: whether it is at rest is not known")
         if vehicle.armed and now_ns - self._cut_ns < CUT_FOR_NS:
             raise DriverError("the motors are still armed: there is nothing to reset yet")
         self.stopped = False
@@ -170,7 +170,7 @@ class SetpointController:
 
     def _take_off(self, vehicle: VehicleState | None, now_ns: int) -> None:
         if vehicle is None:
-            raise DriverError("the vehicle is not heard: it does not take off blindly")
+            raise DriverError("no data from the vehicle: take-off is refused until the link is up")
         if self.stopped:
             raise DriverError("the motors were stopped in an emergency: reset it first")
         if self.goal is Goal.TAKE_OFF and self._takeoff is not None:
@@ -178,7 +178,7 @@ class SetpointController:
             if self._takeoff.refused and not self._takeoff.started:
                 raise DriverError(f"the vehicle does not start yet, it is tried again: {self._takeoff.refused}")
         elif vehicle.airborne is None:
-            raise DriverError("the vehicle is armed, and does not tell yet whether it is in the air")
+            raise DriverError("the vehicle is armed and has not reported yet whether it is in the air")
         elif not vehicle.airborne:
             self._end()
             self.goal, self._takeoff = Goal.TAKE_OFF, TakeoffSequence(self._autopilot, self.takeoff_m, now_ns)
@@ -206,7 +206,7 @@ class SetpointController:
 
     def _steer(self, action: Velocity | Attitude, vehicle: VehicleState | None, now_ns: int) -> AnyAction:
         if vehicle is None:
-            raise DriverError("the vehicle is not heard: it takes no set-points")
+            raise DriverError("no data from the vehicle: set-points are refused until the link is up")
         if self.stopped or vehicle.airborne is False or self.goal is Goal.TAKE_OFF:
             return Idle()  # a set-point would cancel a take-off
         if vehicle.airborne is None and self.goal is not Goal.FOLLOW:
@@ -376,7 +376,7 @@ class SetpointController:
             Whether it is still ours to hold and to land.
         """
         why = "its own failsafe" if vehicle.failsafe else "not from here"
-        self._notify(f"the vehicle went to {vehicle.mode} ({why}): it is not steered any more", reason="mode")
+        self._notify(f"the vehicle went to {vehicle.mode} ({why}): set-points are no longer sent", reason="mode")
         self._end()
         ours = self.ownership.leave(vehicle)
         if ours:

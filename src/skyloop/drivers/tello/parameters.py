@@ -142,7 +142,7 @@ def flip_parameter(value: str) -> Parameter:
         value,
         default=NO_FLIP,
         choices=(NO_FLIP, *FLIPS),
-        description="flips this way (said once); in flight only",
+        description="flips in this direction (sent once); in flight only",
     )
 
 

@@ -328,7 +328,7 @@ class TelloSession(VehicleSession):
             self._deaf += 1
             if self._deaf >= DEAF:
                 self.ready = False
-                self._set_link_state(LinkState.DEGRADED, "the drone tells its state, and answers no command")
+                self._set_link_state(LinkState.DEGRADED, "the drone sends its state, but answers no command")
             return
         self._deaf = 0
         if reply.isdecimal():
@@ -373,7 +373,7 @@ class TelloSession(VehicleSession):
         if self._heard_ns is None:
             return
         if reply is None:
-            self._set_link_state(LinkState.DEGRADED, "the drone tells its state, and answers no command")
+            self._set_link_state(LinkState.DEGRADED, "the drone sends its state, but answers no command")
             return
         self.sdk = _SDK.get(reply, Sdk.V1_3 if is_error(reply) else Sdk.V3_0)
         self.ready, self._deaf = True, 0

@@ -198,7 +198,7 @@ class SetpointController:
 
     def _take_off(self, now_ns: int) -> None:
         if not self.heard:
-            raise DriverError("the drone is not heard: it does not take off blindly")
+            raise DriverError("no data from the drone: take-off is refused until the link is up")
         if self.watch.in_air:
             self._remain(LEVEL, now_ns)
         else:
@@ -208,7 +208,7 @@ class SetpointController:
         self._decide(Decision.STAY, now_ns)
         self._stick = LEVEL
         if not self._stopped:
-            text = "the drone was told to cut its motors; reset the emergency when it lies safely"
+            text = "the drone was commanded to cut its motors; reset the emergency when it is safe on the ground"
             self._notices.append(Notice(EventKind.EMERGENCY, text, Severity.ERROR, {"reason": "user"}))
         self._stopped, self._stop_done = True, False
         self._stops, self._stop_ns = 0, now_ns
@@ -217,7 +217,7 @@ class SetpointController:
         if not self._stopped:
             return
         if not self.heard:
-            raise DriverError("the drone is not heard: whether it lies on the ground can't be known")
+            raise DriverError("no data from the drone: whether it is on the ground is not known")
         if not self._stop_done and self.watch.motors(now_ns):
             raise DriverError("the motors still run: the stop has not shown yet")
         self._stopped, self._stop_done = False, True

@@ -133,7 +133,7 @@ class ContainerStream:
         if context is None:
             raise ConnectionError("what comes is in a codec that is not known here")
         if not (context.width and context.height):
-            raise ConnectionError("what comes does not tell the size of its pictures: it is damaged, or no video")
+            raise ConnectionError("the stream has no picture size: it is damaged, or no video")
         limit_memory(context)
         return context, self._container.demux(videos[0])
 

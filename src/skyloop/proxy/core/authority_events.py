@@ -53,7 +53,7 @@ def _queued(effect: authority.Queued, context: EventContext) -> EventDraft:
 def _lost(effect: authority.Lost, context: EventContext) -> EventDraft:
     text = f"{context.name(effect.app_id)} lost the authority: {effect.reason}"
     if effect.reason == "silent" and not context.holder:
-        text += "; the name stays on it until somebody asks"
+        text += "; it is still listed as the holder until another application asks"
     data: dict[str, Value] = {"lease": effect.lease, "reason": effect.reason, "by": context.holder}
     return EventDraft(EventKind.AUTHORITY_LOST, text, data=data)
 
@@ -92,7 +92,7 @@ def _withdrawn(effect: authority.Withdrawn, context: EventContext) -> EventDraft
 
 
 def _expired(effect: authority.Expired, context: EventContext) -> EventDraft:
-    text = f"the time of {context.name(effect.app_id)} is over: the authority goes to whoever asks next"
+    text = f"the time of {context.name(effect.app_id)} is over: the next application that asks gets the authority"
     return EventDraft(EventKind.AUTHORITY_EXPIRED, text, data={"lease": effect.lease})
 
 

@@ -223,7 +223,7 @@ class CommandChecks:
         """What forbids a command of the holder, whatever the policy of the flight state is."""
         kind = type(command.action)
         if not sequence.fresh(command):
-            return Refusal.NOT_FRESH, "it repeats what was asked for before a failsafe or a new lease: ask anew"
+            return Refusal.NOT_FRESH, "it repeats a command from before a failsafe or a new lease: send a new one"
         if link is not LinkState.UP and link is not LinkState.DEGRADED:
             return Refusal.VEHICLE_LINK_LOST, f"the link to the vehicle is {link.value}"
         if kind not in self._supported:
@@ -232,9 +232,9 @@ class CommandChecks:
         if self._ownership.whose is Whose.OTHERS:
             others = self._ownership.others
             if kind in _SET_POINTS:
-                return Refusal.WRONG_STATE, f"{others}: hover, take off or land first, which takes it"
+                return Refusal.WRONG_STATE, f"{others}: hover, take off or land first to take it over"
             if not new and kind in _TAKING:
-                return Refusal.WRONG_STATE, f"{others}, and repeating an order does not take it back: ask anew"
+                return Refusal.WRONG_STATE, f"{others}, and a repeated command does not take it back: send a new one"
         if self._ladder.barred and kind is not Land:
             return Refusal.WRONG_STATE, f"only landing is possible: {REASONS[self._ladder.barred]}"
         if STATE_POLICIES[kind][state] is StatePolicy.HOVER and Hover not in self._supported:

@@ -107,5 +107,5 @@ class Ownership:
         if before is not Whose.NOBODYS or self.left_to or not self._shared:
             return ""  # the driver told who took it, or the flight is over, or it can't be anybody else's
         if self.whose is Whose.OURS:
-            return "the vehicle is on a flight that this proxy began before it was started anew"
+            return "the vehicle is on a flight that this proxy began before it was restarted"
         return "the vehicle is flown by others: it is left alone until an application takes off, hovers or lands it"

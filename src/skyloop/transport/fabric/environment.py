@@ -52,7 +52,7 @@ def _choose(network: Network, keys: Path | str | None) -> FabricSettings | None:
         wish = MULTICAST if wish else ""
     if wish.strip().lower() in _OFF:
         if keys is not None and network is None:
-            raise UsageError(f"keys are for the network: say network=True as well, or set {NETWORK_VARIABLE}")
+            raise UsageError(f"keys are for the network: give network=True as well, or set {NETWORK_VARIABLE}")
         return None
     words = [word.strip() for word in wish.split(",") if word.strip()]
     connect = tuple(word for word in words if word.lower() not in _ON)

@@ -254,7 +254,7 @@ class ConnectionRegistry:
         self._check_keys()
         commands, self._stray_commands = self._stray_commands, 0
         if commands:
-            handler.refused(NOBODY, f"{commands} commands or orders came from nobody that is connected")
+            handler.refused(NOBODY, f"{commands} commands or requests came from applications that are not connected")
         away, self._away = self._away, ""
         if away:
             handler.refused(NOBODY, away)

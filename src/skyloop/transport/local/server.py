@@ -227,7 +227,7 @@ class LocalServer(TransportServer):
             if not silent:
                 return f"{self.address} has {MAX_CLIENTS} connections already, and takes no more"
             oldest = min(silent, key=lambda connection: connection.peer.id)
-            oldest.hang_up(f"its place at {self.address} went to a newer one: it had not said who it is")
+            oldest.hang_up(f"its place at {self.address} was given to a newer connection: it had sent no Hello")
             return ""
 
     # --- the receiving threads ---
@@ -252,7 +252,7 @@ class LocalServer(TransportServer):
             except ConnectionResetError:
                 continue  # what was sent before it still comes, and then the end
             except BlockingIOError:
-                return f"it did not say hello within {HELLO_S:g} s"
+                return f"it sent no Hello within {HELLO_S:g} s"
             except OSError as error:
                 return f"receiving failed: {error}"
             if packet == packets.WAKE and connection.joined:
@@ -271,7 +271,7 @@ class LocalServer(TransportServer):
     def _welcome(self, handler: ServerHandler, connection: ServerConnection, packet: bytes) -> None:
         """Handle a connection's first packet. A process that only asks who listens here sends none."""
         if packet != packets.hello():
-            connection.hang_up(f"it did not say hello as revision {packets.REVISION} of the local transport does")
+            connection.hang_up(f"its Hello is not that of revision {packets.REVISION} of the local transport")
             return
         connection.limit_silence(0.0)
         connection.joined = True
