@@ -3,15 +3,18 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
 from skyloop.errors import FileFormatError, UnknownNameError, UsageError
 from skyloop.sim import Simulation, load_world, parse_world, shipped_worlds
+from skyloop.sim.toml_file import _explained
 from skyloop.sim.world import BoardTarget, FacePose, Gate, PlatformTarget, RingWalkPath, TargetState
 
 ROOM = "[room]\nsize = [8, 6, 3]\n"
 BOX = "[[box]]\nstands_at = [1, 1]\nsize = [1, 1, 1]\n"
+FACE = "[[panel]]\nsize = [1, 1]\ntexture = 'door'\n"
 BOARD = "[[target]]\nname = 'b'\nid = 1\nmarker_size = 0.2\n"
 
 
@@ -117,7 +120,34 @@ BAD = [
         ROOM + BOARD + "path = { kind = 'waypoints', points = [[0,0,1],[1,0,1]], speed = 1 }\nyaw = { mode = 'on' }\n",
         r"\[target 'b'.yaw\], key 'mode'",
     ),
+    ("box = [3]\n" + ROOM, r"key 'box': 3 .a whole number. given, but it must be tables written \[\[box\]\]"),
+    (ROOM + "[[box]]\nsize = [1, 1, 1]\n", "'position': missing; .* or 'stands_at' a list of 2"),
+    (ROOM + BOX + "position = [1, 1, 1]\n", "'position': give it or 'stands_at', and not both"),
+    (ROOM + "[[box]]\nstands_at = [1, {}]\nsize = [1, 1, 1]\n", r"\[box #1\], key 'stands_at': {} .a table. given"),
+    (ROOM + FACE + "on = 'north'\n", "'at': missing; it must be a list of 2 numbers"),
+    (ROOM + FACE + "on = 'north'\nat = [0, 1]\nyaw_deg = 3\n", "'yaw_deg': unknown beside 'on'"),
+    (ROOM + FACE + "at = [0, 1]\n", "'at': unknown without 'on'"),
+    (ROOM + FACE, "'position': missing; .* or 'on' and 'at' given"),
+    (ROOM + "[[spawn]]\nposition = [0, 0, 0]\nyaw_deg = 400\n", "'yaw_deg': 400 .* a number from -360 to 360"),
+    (ROOM + BOARD + "path = { speed = 1, radius = 1 }\n", "'kind': missing; it must be one of waypoints, circle"),
+    (ROOM + BOARD + "path = { knd = 'circle' }\n", "there is 'knd'; did you mean 'kind'"),
+    (ROOM + BOARD + "path = 3\n", r"\[target 'b'\], key 'path': 3 .* a table \[target 'b'.path\]"),
+    (ROOM + BOARD + "size = [1, 1, 1]\npath = { kind = 'circle' }\n", "'size': unknown key"),
+    (
+        ROOM + BOARD + "path = { kind = 'ring_walk', radius = [0, 1], height = [1, 2], speed = [1, 2] }\n",
+        "'radius': 0 .* a finite number of at least 0.1",
+    ),
+    (f"wind = {{ mean = [0, 0, {1 << 70}] }}\n" + ROOM, "'mean': a number of more than 64 bits"),
 ]
+
+
+def test_an_error_that_can_not_be_explained_is_passed_on() -> None:
+    found = _explained("Something else", {"room": 1}, "mine.toml", Untold)
+    assert str(found) == "mine.toml: Something else"
+
+
+class Untold(msgspec.Struct):
+    room: int
 
 
 @pytest.mark.parametrize(("text", "message"), BAD)

@@ -1,0 +1,211 @@
+"""TOML files read into msgspec structs. An error says where in the file, what was given, and what is allowed."""
+
+from __future__ import annotations
+
+import difflib
+import re
+import reprlib
+import sys
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Final, TypeVar
+
+import msgspec
+from msgspec import inspect
+
+from skyloop.errors import FileFormatError
+
+T = TypeVar("T")
+
+MAX_BYTES: Final = 1 << 18  #: of a file; the largest world that is shipped takes 5 kB
+#: Parts of a key: a parser goes through all of them for each key below, which takes minutes for some ten thousand.
+MAX_DEPTH: Final = 16
+MAX_WHOLE: Final = (1 << 63) - 1  #: as TOML has it; larger ones are neither told nor computed with
+_SHOWN: Final = 80  #: characters of a wrong value in a message
+# Nothing in it is tried twice, and it begins where a part does: it is as fast for what it does not find.
+_PART = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_DEEP_KEY = re.compile(rf"(?<![A-Za-z0-9_-]){_PART}(?:[ \t]*+\.[ \t]*+{_PART}){{{MAX_DEPTH},}}+")
+_WHERE = re.compile(r" - at `\$((?:\.\w+|\[\d+\])+)`$")  # how msgspec ends an error
+_STEP = re.compile(r"\.(\w+)|\[(\d+)\]")
+_KINDS = {bool: "a boolean", int: "a whole number", float: "a number", str: "a text", list: "a list", dict: "a table"}
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A table of a file, for errors about it."""
+
+    source: str  #: the file's name
+    table: str = ""  #: as a person finds it there; empty for what belongs to none
+
+    def under(self, key: str) -> Place:
+        """Return the place of a table in this one."""
+        return Place(self.source, f"{self.table}.{key}" if self.table else key)
+
+    def item(self, key: str, number: int, name: object) -> Place:
+        """Return the place of one of several tables: by its name, or by its number, from 1."""
+        place = self.under(key).table
+        return Place(self.source, f"{place} {name!r}" if isinstance(name, str) and name else f"{place} #{number}")
+
+    def error(self, key: str, problem: str) -> FileFormatError:
+        """Return the error to raise about a key of the table."""
+        where = [self.source, f"[{self.table}]"] if self.table else [self.source]
+        return FileFormatError(f"{', '.join(where)}, key {key!r}: {problem}")
+
+    def wrong(self, key: str, value: object, wanted: str) -> FileFormatError:
+        """Return the error to raise about a value that is another than wanted."""
+        kind = _KINDS.get(type(value), type(value).__name__)
+        return self.error(key, f"{_shown(value)} ({kind}) given, but it must be {wanted}")
+
+
+def parse_toml(text: str, source: str) -> dict[str, Any]:
+    """Parse TOML.
+
+    Args:
+        text: The file's text.
+        source: The file's name, for messages.
+
+    Raises:
+        FileFormatError: It is not TOML.
+    """
+    if _DEEP_KEY.search(text):
+        raise FileFormatError(f"{source}: a key of more than {MAX_DEPTH} parts with dots between them")
+    try:
+        values: dict[str, Any] = msgspec.toml.decode(text)
+    except (msgspec.DecodeError, ValueError, RecursionError) as error:  # numbers and lists that are too large, besides
+        raise FileFormatError(f"{source}: not valid TOML: {error}") from None
+    return values
+
+
+def read_tables(values: Mapping[str, Any], source: str, kind: type[T]) -> T:
+    """Convert what was parsed to a struct.
+
+    Args:
+        values: From :func:`parse_toml`.
+        source: The file's name, for messages.
+        kind: A :class:`msgspec.Struct`, with tables and lists of tables as fields, that forbids unknown keys.
+
+    Raises:
+        FileFormatError: A key is missing or unknown, or a value is of another kind or out of its range.
+    """
+    try:
+        return msgspec.convert(values, kind)
+    except msgspec.ValidationError as error:
+        raise _explained(str(error), values, source, kind) from None
+
+
+def _explained(message: str, values: Any, source: str, kind: type[Any]) -> FileFormatError:
+    """Return msgspec's error with what was given and what was meant: it tells only where, and what it expected."""
+    place, key, value, info = Place(source), "", values, inspect.type_info(kind)
+    found = _WHERE.search(message)
+    for name, number in _STEP.findall(found.group(1)) if found else ():
+        if name:
+            place = place.under(key) if key else place
+            key, info, value = name, _fields(info, value)[name][0], value[name]
+        else:
+            index, several = int(number), _plain(info)
+            info = several.item_types[index] if isinstance(several, inspect.TupleType) else several.item_type
+            value = value[index]
+            if _tables(info) and not isinstance(value, dict):
+                return place.wrong(key, value, _wanted(several, place.under(key)))
+            if _tables(info):
+                place, key = place.item(key, index + 1, value.get("name")), ""
+    if isinstance(value, dict) and _tables(info):
+        return _wrong_key(place.under(key) if key else place, value, _fields(info, value), message)
+    choices = _choices(info)
+    if isinstance(value, str) and choices:
+        return place.error(key, f"{value!r} is not known here; {_hint(value, choices)}")
+    return place.wrong(key, value, _wanted(info, place.under(key)))
+
+
+def _wrong_key(
+    place: Place, table: dict[str, Any], fields: dict[str, tuple[inspect.Type, bool]], message: str
+) -> FileFormatError:
+    """Return the error about a key that is unknown or missing, or about both where one is the other misspelt."""
+    unknown = [key for key in table if key not in fields]
+    missing = [key for key, (_, required) in fields.items() if required and key not in table]
+    for key in missing:
+        wanted = f"missing; it must be {_wanted(fields[key][0], place.under(key))}"
+        for near in difflib.get_close_matches(key, unknown, n=1, cutoff=0.6):
+            return place.error(key, f"{wanted} (there is {near!r}; did you mean {key!r}?)")
+        if "missing" in message:
+            return place.error(key, wanted)
+    if unknown:
+        return place.error(unknown[0], "unknown key; " + _hint(unknown[0], fields))
+    return FileFormatError(f"{place.source}: {message}")
+
+
+def _plain(info: inspect.Type) -> Any:
+    """Return what a type is besides optional and described."""
+    if isinstance(info, inspect.Metadata):
+        return _plain(info.type)
+    if isinstance(info, inspect.UnionType):
+        known = [each for each in info.types if not isinstance(each, inspect.NoneType)]
+        return _plain(known[0]) if len(known) == 1 else info
+    return info
+
+
+def _tables(info: inspect.Type) -> list[inspect.StructType]:
+    """Return the kinds of table that a value may be."""
+    plain = _plain(info)
+    kinds = plain.types if isinstance(plain, inspect.UnionType) else [plain]
+    return [kind for kind in kinds if isinstance(kind, inspect.StructType)]
+
+
+def _fields(info: inspect.Type, table: dict[str, Any]) -> dict[str, tuple[inspect.Type, bool]]:
+    """Return type and whether it is required of each key of a table; of several kinds the one that it says it is."""
+    kinds = _tables(info)
+    tag = kinds[0].tag_field
+    fields: dict[str, tuple[inspect.Type, bool]] = {}
+    if tag is not None:
+        fields[tag] = inspect.LiteralType(tuple(str(kind.tag) for kind in kinds)), True
+    for kind in kinds:
+        if tag is None or kind.tag == table.get(tag):
+            fields |= {field.encode_name: (field.type, field.required) for field in kind.fields}
+    return fields
+
+
+def _choices(info: inspect.Type) -> tuple[str, ...]:
+    plain = _plain(info)
+    return tuple(map(str, plain.values)) if isinstance(plain, inspect.LiteralType) else ()
+
+
+def _wanted(info: inspect.Type, place: Place) -> str:
+    """Return in words what a value must be; ``place`` is its own."""
+    if isinstance(info, inspect.Metadata) and info.extra_json_schema:
+        return str(info.extra_json_schema["description"])
+    plain = _plain(info)
+    if isinstance(plain, inspect.BoolType):
+        return "true or false"
+    if isinstance(plain, inspect.StrType):
+        return "a text that is not empty" if plain.min_length else "a text"
+    if isinstance(plain, inspect.FloatType):
+        return _range(plain.ge, plain.le)
+    if isinstance(plain, inspect.TupleType):
+        return f"a list of {len(plain.item_types)} numbers"
+    if isinstance(plain, inspect.ListType):
+        if _tables(plain.item_type):
+            return f"tables written [[{place.table}]]"
+        return f"a list of at least {plain.min_length} lists of {len(_plain(plain.item_type).item_types)} numbers"
+    return "one of " + ", ".join(_choices(info)) if _choices(info) else f"a table [{place.table}]"
+
+
+def _range(low: float | None, high: float | None) -> str:
+    """Return what a number between these bounds is, where the largest number that there is stands for none."""
+    least, most = (bound is not None and abs(bound) < sys.float_info.max for bound in (low, high))
+    if least and most:
+        return f"a number from {low:g} to {high:g}"
+    return f"a finite number of at least {low:g}" if least else "a finite number"
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, int) and not -MAX_WHOLE <= value <= MAX_WHOLE:
+        return "a number of more than 64 bits"
+    return reprlib.repr(value) if isinstance(value, list | dict) else f"{value!r:.{_SHOWN}}"
+
+
+def _hint(name: str, known: Iterable[str]) -> str:
+    choices = sorted(set(known))
+    near = difflib.get_close_matches(name, choices, n=2, cutoff=0.5)
+    if near:
+        return "did you mean " + " or ".join(repr(n) for n in near) + "?"
+    return "known: " + ", ".join(choices)
