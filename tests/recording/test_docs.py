@@ -25,7 +25,7 @@ def names(cell: str) -> list[str]:
 def test_the_options_are_those_of_the_function_and_the_command() -> None:
     from typer.main import get_command
 
-    table = rows(section(PAGE, "## How it records").partition("### What is left out")[0])
+    table = rows(section(PAGE, "## How it records").partition("### Data loss")[0])
     parameters = inspect.signature(skyloop.record).parameters
     listed = [name for row in table for name in names(row[0])]
     assert sorted(names(table[0][3])) == sorted([*CHOICES, "video.CAMERA"])
@@ -58,7 +58,7 @@ def test_the_topics_are_those_of_the_layout() -> None:
 
 
 def test_the_largest_picture_of_h264_is_that_of_the_wire() -> None:
-    assert f"more than {MAX_ENCODED:,} bytes".replace(",", " ") in section(PAGE, "### H.264 as it came")
+    assert f"more than {MAX_ENCODED:,} bytes".replace(",", " ") in section(PAGE, "### H.264 passthrough")
 
 
 def test_the_metadata_are_those_of_the_layout() -> None:
