@@ -365,7 +365,7 @@ def test_closing_ends_the_thread(flight: Path) -> None:
 
 def test_the_page_lists_the_options_and_what_is_added_to_the_telemetry(flight: Path) -> None:
     text = section("docs/replay.md", "## `replay://`")
-    options, _, rest = text.partition("What the vehicle told")
+    options, _, rest = text.partition("The vehicle's data is published again")
     assert {row[0].strip("`") for row in rows(options)} == KNOWN
     with played(flight) as (_, sink):
         assert sink.wait(lambda: sink.link_state is LinkState.CLOSED, WAIT_S)
