@@ -16,7 +16,7 @@ from skyloop.bench.waypoints import Setpoint
 from skyloop.client import Drone
 from skyloop.client import connect as connect_by_name
 from skyloop.client.channels import VideoOptions
-from skyloop.client.drone import Access
+from skyloop.client.core import Access
 from skyloop.errors import LinkError, SkyloopError, UnknownNameError
 from skyloop.messages import Encoding, FrameHeader
 from skyloop.messages.video import VideoRequest

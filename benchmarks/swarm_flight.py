@@ -109,13 +109,13 @@ def fly(*targets: Target, seconds: float, land_after_s: float = LAND_AFTER_S) ->
     """
     with swarm(*targets, access="observe") as watchers:
         # Over each proxy's name, so that the watcher and the pilot of an address share its private proxy.
-        reach = {name: drone.reach or drone.name for name, drone in watchers.items()}
+        reach = {name: drone._core.reach or drone.name for name, drone in watchers.items()}
         pilots = swarm(reach, on_error="raise", on_exit="land")
         try:
             pilots.each(lambda drone: drone.config.__setitem__("failsafe.land_after_s", land_after_s), "configuring")
             flown = _fly(pilots, seconds)
         except BaseException:
-            pilots.leave()
+            pilots._leave()
             raise
         let_go_s = _let_go(pilots)
         return _judge(watchers, flown, let_go_s)

@@ -284,11 +284,11 @@ class Drone:
         Raises:
             NoAnswerError: If no frame comes within ``timeout_s``.
         """
-        channel = self.sync.channel(camera, **how)
+        channel = self.sync._core.channel(camera, **how)
         notifier = _LoopNotifier()
         came = notifier.came
         mailbox: Mailbox[Arrival] = Mailbox(notifier=notifier)
-        with self.sync._closing(mailbox), channel.into(mailbox):
+        with self.sync._core.closing(mailbox), channel.into(mailbox):
             while not self.sync.closed:
                 try:
                     await asyncio.wait_for(came.wait(), timeout_s)
@@ -325,7 +325,7 @@ class Drone:
         notifier = _LoopNotifier()
         came, loop = notifier.came, notifier.loop
         mailbox = ResultMailbox(checked_age(max_age_s), notifier)
-        with self.sync._closing(mailbox), self.sync.result_channel(processor).into(mailbox):
+        with self.sync._core.closing(mailbox), self.sync._core.result_channel(processor).into(mailbox):
             deadline = loop.time() + timeout_s
             while not self.sync.closed:
                 try:

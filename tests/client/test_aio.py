@@ -12,6 +12,7 @@ import pytest
 
 import skyloop.client
 from skyloop import aio
+from skyloop.client.drone import open_drone
 from skyloop.errors import ClosedError, NoAnswerError, UsageError
 from skyloop.messages import Encoding, EventKind, FlightState, Hover, Land, Takeoff
 from skyloop.transport.base import results
@@ -24,7 +25,7 @@ def proxy(monkeypatch: pytest.MonkeyPatch) -> Iterator[ScriptedProxy]:
     with scripted() as proxy:
 
         def connect(target: str, **options: Any) -> skyloop.client.Drone:
-            return skyloop.client.Drone(proxy.server.dial, app=target, policy=QUICK, **options).open()
+            return open_drone(proxy.server.dial, app=target, policy=QUICK, **options)
 
         monkeypatch.setattr("skyloop.client.connect", connect)
         yield proxy

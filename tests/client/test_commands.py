@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from skyloop.client import AuthorityStatus, Drone
+from skyloop.client.drone import open_drone
 from skyloop.errors import AuthorityError, ClosedError, NoAnswerError, RefusedError, UnsupportedError, UsageError
 from skyloop.messages import (
     Attitude,
@@ -321,10 +322,10 @@ def test_released_and_requested_again(proxy: ScriptedProxy, drone: Drone) -> Non
 def test_somebody_else_flies(proxy: ScriptedProxy) -> None:
     proxy.grant(99, "ada")
     with pytest.raises(AuthorityError, match=r"ada holds the authority: wait longer.*access=\"observe\"") as error:
-        Drone(proxy.server.dial, app="me", policy=QUICK).open(timeout_s=WAIT_S)
+        open_drone(proxy.server.dial, app="me", policy=QUICK, timeout_s=WAIT_S)
     assert error.value.code == "busy"
     with pytest.raises(AuthorityError, match=r"did not give it back within 0\.05 s"):
-        Drone(proxy.server.dial, app="me", policy=QUICK).open(wait_s=0.05, timeout_s=WAIT_S)
+        open_drone(proxy.server.dial, app="me", policy=QUICK, wait_s=0.05, timeout_s=WAIT_S)
     proxy.until(lambda: isinstance(proxy.requests[-1], ReleaseAuthority), "leaving the line")
 
 
@@ -342,11 +343,11 @@ def test_waiting_in_line(proxy: ScriptedProxy) -> None:
 def test_refused_and_not_answered(proxy: ScriptedProxy, monkeypatch: pytest.MonkeyPatch) -> None:
     proxy.answers[RequestAuthority] = Refused(Refusal.BUSY, "closed today")
     with pytest.raises(AuthorityError, match="closed today"):
-        Drone(proxy.server.dial, app="me", policy=QUICK).open(timeout_s=WAIT_S)
+        open_drone(proxy.server.dial, app="me", policy=QUICK, timeout_s=WAIT_S)
     monkeypatch.setattr("skyloop.client.commands.ANSWER_S", 0.1)
     proxy.answers[RequestAuthority] = None
     with pytest.raises(NoAnswerError, match="did not answer the request for the authority"):
-        Drone(proxy.server.dial, app="me", policy=QUICK).open(timeout_s=WAIT_S)
+        open_drone(proxy.server.dial, app="me", policy=QUICK, timeout_s=WAIT_S)
 
 
 def test_an_observer_only_looks_on(proxy: ScriptedProxy) -> None:

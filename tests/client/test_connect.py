@@ -17,6 +17,7 @@ import pytest
 import skyloop
 from skyloop.client import private_proxy
 from skyloop.client.connect import _script_name, connect
+from skyloop.client.drone import open_drone
 from skyloop.client.private_proxy import PrivateProxy
 from skyloop.errors import LinkError, NoAnswerError, UnknownNameError, UsageError
 from skyloop.messages import FlightState, LinkState
@@ -134,7 +135,7 @@ def test_a_collector_of_frames_never_starves(alpha: ScriptedProxy) -> None:
 def test_a_private_proxy_ends_with_the_drone() -> None:
     proxy = PrivateProxy("fake://", command(CHILD))
     assert proxy.name.startswith(f"fake-{os.getpid()}-")
-    drone = skyloop.Drone(proxy.dialer(time.monotonic() + 20.0), app="me", on_close=proxy.close).open(timeout_s=20.0)
+    drone = open_drone(proxy.dialer(time.monotonic() + 20.0), app="me", on_close=proxy.close, timeout_s=20.0)
     assert drone.name == "scripted"
     assert alive(proxy.pid)
     drone.close()
@@ -154,7 +155,7 @@ def test_by_address(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.process
 def test_a_private_proxy_that_dies_is_told_with_what_it_said() -> None:
     proxy = PrivateProxy("fake://", command(CHILD))
-    drone = skyloop.Drone(proxy.dialer(time.monotonic() + 20.0), app="me", on_close=proxy.close).open(timeout_s=20.0)
+    drone = open_drone(proxy.dialer(time.monotonic() + 20.0), app="me", on_close=proxy.close, timeout_s=20.0)
     try:
         os.kill(proxy.pid, signal.SIGKILL)
         deadline = time.monotonic() + 10.0
@@ -174,7 +175,7 @@ def test_a_private_proxy_that_cannot_start() -> None:
     proxy = PrivateProxy("fake://", [sys.executable, "-c", code])
     try:
         with pytest.raises(LinkError, match=r"(?s)ended with exit code 1; its output:\nno such vehicle: unobtainium"):
-            skyloop.Drone(proxy.dialer(time.monotonic() + 20.0), app="me").open()
+            open_drone(proxy.dialer(time.monotonic() + 20.0), app="me")
     finally:
         proxy.close()
 
@@ -188,7 +189,7 @@ def test_a_private_proxy_that_takes_too_long_and_does_not_end(monkeypatch: pytes
         assert proxy._process.stdout is not None
         select.select([proxy._process.stdout], [], [], 10.0)
         with pytest.raises(NoAnswerError, match="did not start in time"):
-            skyloop.Drone(proxy.dialer(time.monotonic() + 0.1), app="me").open(timeout_s=0.1)
+            open_drone(proxy.dialer(time.monotonic() + 0.1), app="me", timeout_s=0.1)
     finally:
         proxy.close()
     assert not alive(proxy.pid)

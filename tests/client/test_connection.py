@@ -9,6 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from skyloop.client import Drone, LinkStatus, RedialPolicy
+from skyloop.client.drone import open_drone
 from skyloop.errors import AuthorityError, ClosedError, LinkError, NoAnswerError, RefusedError
 from skyloop.messages import (
     Command,
@@ -209,26 +210,26 @@ def test_loss_and_disorder(caplog: pytest.LogCaptureFixture) -> None:
 def test_nobody_there_at_first() -> None:
     proxy = ScriptedProxy()
     with pytest.raises(LinkError, match="nobody serves"):
-        Drone(proxy.server.dial, app="me").open()
+        open_drone(proxy.server.dial, app="me")
 
 
 def test_a_proxy_that_does_not_answer(proxy: ScriptedProxy) -> None:
     proxy.answers[Hello] = None
     with pytest.raises(NoAnswerError, match="was reached but did not answer"):
-        Drone(proxy.server.dial, app="me", policy=RedialPolicy(hello_s=0.05)).open(timeout_s=0.05)
+        open_drone(proxy.server.dial, app="me", policy=RedialPolicy(hello_s=0.05), timeout_s=0.05)
 
 
 def test_a_proxy_that_refuses(proxy: ScriptedProxy) -> None:
     proxy.answers[Hello] = Refused(Refusal.PROTOCOL, "another version")
     with pytest.raises(RefusedError, match="another version"):
-        Drone(proxy.server.dial, app="me").open()
+        open_drone(proxy.server.dial, app="me")
 
 
 def test_a_proxy_that_knows_nothing_of_its_vehicle(proxy: ScriptedProxy) -> None:
     proxy.beating.clear()
     proxy._ended.set()
     with pytest.raises(NoAnswerError, match="scripted answered, but reported no vehicle state"):
-        Drone(proxy.server.dial, app="me").open(timeout_s=0.1)
+        open_drone(proxy.server.dial, app="me", timeout_s=0.1)
 
 
 def test_take_off_over_a_lost_link(proxy: ScriptedProxy, drone: Drone) -> None:
@@ -291,12 +292,12 @@ def test_questions_over_a_lost_link_wait_for_its_return(proxy: ScriptedProxy, dr
 def test_questions_end_with_the_time_or_the_drone(proxy: ScriptedProxy, drone: Drone) -> None:
     proxy.answers[GetParameter] = None
     with pytest.raises(NoAnswerError, match=r"GetParameter.*0\.1 s"):
-        drone._connection.call(lambda: GetParameter("x"), 0.1)
+        drone._core.connection.call(lambda: GetParameter("x"), 0.1)
     ended: list[BaseException] = []
 
     def ask() -> None:
         try:
-            drone._connection.call(lambda: GetParameter("x"), WAIT_S)
+            drone._core.connection.call(lambda: GetParameter("x"), WAIT_S)
         except ClosedError as error:
             ended.append(error)
 
@@ -313,14 +314,14 @@ def test_an_error_of_ours_in_the_link_s_thread_does_not_end_it(
 ) -> None:
     told = Told(drone)
     failing = iter([True])
-    tick = drone._commands.tick
+    tick = drone._core.commands.tick
 
     def fail_once(now_ns: int) -> int:
         if next(failing, False):
             raise RuntimeError("a mistake")
         return tick(now_ns)
 
-    monkeypatch.setattr(drone._commands, "tick", fail_once)
+    monkeypatch.setattr(drone._core.commands, "tick", fail_once)
     at = told.until(LinkState.LOST)
     told.until(LinkState.UP, at)
     assert "a mistake" in caplog.text
@@ -336,7 +337,7 @@ def test_a_connection_that_ends_during_hello(proxy: ScriptedProxy) -> None:
             return getattr(self._end, name)
 
     with pytest.raises(LinkError, match="no room"):
-        Drone(Ending, app="me").open()  # type: ignore[arg-type]
+        open_drone(Ending, app="me")  # type: ignore[arg-type]
 
 
 class OtherClock:
@@ -362,9 +363,9 @@ def test_the_offset_between_clocks(proxy: ScriptedProxy, monkeypatch: pytest.Mon
         monotonic_ns = staticmethod(lambda: real() + ahead_ns)
 
     monkeypatch.setattr("tests.client.scripted.time", ProxyTime)
-    drone = Drone(dial, app="me", policy=QUICK).open()
+    drone = open_drone(dial, app="me", policy=QUICK)
     try:
-        assert abs(drone._connection.offset_ns - ahead_ns) < 50_000_000
+        assert abs(drone._core.connection.offset_ns - ahead_ns) < 50_000_000
         drone.hover()
         proxy.until(lambda: len(proxy.commands) > 2)
         assert abs(proxy.commands[-1].sent_ns - ProxyTime.monotonic_ns()) < 2 * 10**9
@@ -397,6 +398,6 @@ def test_closing_from_an_inline_listener(proxy: ScriptedProxy) -> None:
         drone.on_feedback(close, inline=True)
         assert closed.wait(WAIT_S)
         assert drone.link.application is LinkState.CLOSED
-        thread = drone._supervisor._thread
+        thread = drone._core.supervisor._thread
         thread.join(WAIT_S)
         assert not thread.is_alive()

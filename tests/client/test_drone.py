@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from skyloop.client import Drone, Frame, LinkStatus, Listener
+from skyloop.client.core import DroneCore
 from skyloop.errors import ClosedError, NoAnswerError, UnknownNameError, UsageError
 from skyloop.messages import (
     Annotation,
@@ -424,12 +425,12 @@ def test_the_end_of_the_block_hovers_if_asked_to(proxy: ScriptedProxy) -> None:
 def test_an_error_in_the_block_comes_out_and_a_landing_that_fails_is_logged(
     proxy: ScriptedProxy, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def no_landing() -> bool:
+    def no_landing(*_: object) -> bool:
         raise NoAnswerError("it did not land")
 
     with flown(proxy) as drone:
         drone.command(Hover())
-        monkeypatch.setattr(drone, "land", no_landing)
+        monkeypatch.setattr(drone._core, "complete", no_landing)
         with pytest.raises(RuntimeError, match="mine"), drone:
             raise RuntimeError("mine")
     assert "it did not land" in caplog.text
@@ -444,4 +445,4 @@ def test_a_landed_drone_is_just_left(proxy: ScriptedProxy) -> None:
 @pytest.mark.parametrize("options", [{"access": "fly"}, {"on_exit": "crash"}, {"app": ""}, {"app": "x" * 65}])
 def test_unusable_options(proxy: ScriptedProxy, options: dict[str, str]) -> None:
     with pytest.raises(UsageError):
-        Drone(proxy.server.dial, **{"app": "me", **options})  # type: ignore[arg-type]
+        DroneCore(proxy.server.dial, **{"app": "me", **options})  # type: ignore[arg-type]

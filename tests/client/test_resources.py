@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from skyloop.client import Drone
+from skyloop.client.drone import open_drone
 from skyloop.errors import AuthorityError
 from tests.client.scripted import QUICK, scripted
 
@@ -23,7 +23,7 @@ def test_fifty_drones_leave_no_thread_and_no_descriptor() -> None:
         gc.collect()  # what earlier tests left must not go meanwhile
         before_threads, before_descriptors = set(threading.enumerate()), descriptors()
         for number in range(50):
-            drone = Drone(proxy.server.dial, app=f"app {number}", policy=QUICK).open()
+            drone = open_drone(proxy.server.dial, app=f"app {number}", policy=QUICK)
             drone.on_frame(lambda frame: None)
             drone.on_feedback(lambda feedback: None)
             drone.on_event(lambda event: None)
@@ -41,13 +41,13 @@ def test_a_connect_that_fails_leaves_nothing() -> None:
         before = set(threading.enumerate())
         for _ in range(5):
             with pytest.raises(AuthorityError):
-                Drone(proxy.server.dial, app="me", policy=QUICK).open()
+                open_drone(proxy.server.dial, app="me", policy=QUICK)
         assert set(threading.enumerate()) - before == set()
 
 
 def test_a_closed_drone_is_garbage() -> None:
     with scripted() as proxy:
-        drone = Drone(proxy.server.dial, app="me", policy=QUICK).open()
+        drone = open_drone(proxy.server.dial, app="me", policy=QUICK)
         drone.on_feedback(lambda feedback: None)
         drone.close()
         gone = weakref.ref(drone)

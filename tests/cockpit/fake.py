@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from skyloop.client import Drone
+from skyloop.client.drone import open_drone
 from skyloop.client.feedback_history import FeedbackHistory
 from skyloop.client.frame import Arrival, Frame
 from skyloop.client.statistics import ChannelStats, Distribution
@@ -251,7 +252,7 @@ class Node:
         return self._server.dial(handler)
 
     def connect(self, app: str, priority: int = 16, **options: Any) -> Drone:
-        return Drone(self.dial, app=app, **options).open(priority=priority)
+        return open_drone(self.dial, app=app, **options, priority=priority)
 
     def stop(self) -> None:
         if self.up:

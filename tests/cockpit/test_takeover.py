@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from skyloop.client import AuthorityStatus, Drone
+from skyloop.client.drone import open_drone
 from skyloop.cockpit.commands import decode_command
 from skyloop.cockpit.takeover import QueuePosition, QueueTracker, TakeoverQuestions
 from skyloop.errors import DecodeError
@@ -23,7 +24,7 @@ S = 1_000_000_000
 @contextmanager
 def asks(node: Node, app: str = "survey.py", priority: int = 4, **options: Any) -> Iterator[Drone]:
     """A program that asks for the drone and waits in line."""
-    drone = Drone(node.dial, app=app).open(priority=priority, takeover="ask", stay=True, **options)
+    drone = open_drone(node.dial, app=app, priority=priority, takeover="ask", stay=True, **options)
     try:
         yield drone
     finally:

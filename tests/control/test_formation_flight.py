@@ -11,7 +11,8 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from skyloop.client import Drone, Swarm
+from skyloop.client import Swarm
+from skyloop.client.drone import open_drone
 from skyloop.control.formation import line, placed
 from skyloop.control.formation_flight import Formation, station
 from skyloop.control.waypoint import WaypointSettings
@@ -80,7 +81,7 @@ def flying(movers: dict[str, Mover], *, on_error: str = "raise") -> Iterator[Swa
     for proxy in proxies:
         proxy.start()
     drones = Swarm(
-        {name: Drone(servers[name].dial, app="test").open() for name in movers},
+        {name: open_drone(servers[name].dial, app="test") for name in movers},
         on_error=on_error,  # type: ignore[arg-type]
     )
     try:

@@ -13,6 +13,7 @@ import pytest
 import skyloop
 from skyloop.cli import record as command
 from skyloop.client import Drone
+from skyloop.client.drone import open_drone
 from skyloop.client.mailbox import Notifier
 from skyloop.errors import SkyloopError
 from skyloop.logfile.layout import ClockPair, DroneRecord
@@ -107,7 +108,7 @@ class Rig:
         self.other = self.connect(stack, "other", access="observe")
 
     def connect(self, stack: Any, app: str, **options: Any) -> Drone:
-        drone = Drone(self.server.dial, app=app, **options).open(timeout_s=WAIT_S)
+        drone = open_drone(self.server.dial, app=app, **options, timeout_s=WAIT_S)
         stack.callback(drone.close)
         return drone
 
@@ -206,7 +207,7 @@ def test_feedback_is_recorded_beside_samples_that_make_no_sense(rig: Rig, tmp_pa
             log_entry(text="late", at_ns=2**64 - 1),
             log_entry(name="mocap", values=[float("nan")] * 7, shape=[7]),
         ):
-            assert rig.other._connection.transmit(packet)
+            assert rig.other._core.connection.transmit(packet)
         files.until(lambda: rig.proxy._counts["packets.malformed"] == 3, "all three are counted")
         assert rig.other.log.text("the last word")
         files.until(lambda: len(files.of(path, "/alpha/logs")) >= 1, "what comes after them is recorded")

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import skyloop
-from skyloop.client import Drone
+from skyloop.client.drone import open_drone
 from skyloop.clock import clock_identity
 from skyloop.proxy import Proxy, proxy
 from skyloop.transport.memory import MemoryServer
@@ -67,7 +67,7 @@ def test_one_clock_is_not_measured(monkeypatch: pytest.MonkeyPatch) -> None:
         server = MemoryServer("alpha")
         with ExitStack() as stack:
             stack.enter_context(Proxy(FakeVehicle(), server, name="alpha"))
-            drone = Drone(server.dial, app="me", access="observe").open(timeout_s=10.0)
+            drone = open_drone(server.dial, app="me", access="observe", timeout_s=10.0)
             stack.callback(drone.close)
             assert (drone.clock_uncertainty_ns == 0) is same
             assert (drone.clock_offset_ns == 0) is same

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from skyloop.client import Drone
+from skyloop.client.drone import open_drone
 from skyloop.drivers.registry import make_driver
 from skyloop.emulators.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
 from skyloop.errors import RefusedError
@@ -127,7 +128,7 @@ class Scene:
         proxy.stop()
 
     def drone(self) -> Drone:
-        return Drone(self.server.dial, app="me", on_exit="hover").open()
+        return open_drone(self.server.dial, app="me", on_exit="hover")
 
     def watched(self, proxy: Proxy, samples: int = 60) -> None:
         """The proxy heard so many more samples: its ladder had time to act in several steps."""

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from skyloop.client import Drone, Frame
+from skyloop.client.drone import open_drone
 from skyloop.client.scheduler import Scheduler
 from skyloop.errors import UsageError
 from skyloop.messages import Applied, FlightState, Velocity
@@ -36,7 +37,7 @@ class Node:
 
     @contextmanager
     def connected(self, **options: Any) -> Iterator[Drone]:
-        with Drone(self.dialer, app="me", **options).open() as drone:
+        with open_drone(self.dialer, app="me", **options) as drone:
             yield drone
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from skyloop.client import Drone, Frame
+from skyloop.client.drone import open_drone
 from skyloop.control import Controller
 from skyloop.errors import AuthorityError, ParameterError, UnknownNameError, UnsupportedError
 from skyloop.messages import (
@@ -65,7 +66,7 @@ def node() -> Iterator[Node]:
 def connected(
     node: Node, app: str = "me", *, priority: int = 16, wait_s: float = 0.0, **options: Any
 ) -> Iterator[Drone]:
-    with Drone(node.server.dial, app=app, **options).open(priority=priority, wait_s=wait_s) as drone:
+    with open_drone(node.server.dial, app=app, **options, priority=priority, wait_s=wait_s) as drone:
         yield drone
 
 
@@ -265,13 +266,13 @@ def test_a_pilot_whose_link_is_cut_leaves_a_hovering_then_landing_vehicle(node: 
     steps: list[Failsafe] = []
     with connected(node, "eye", access="observe") as eye:
         eye.on_feedback(lambda feedback: steps.append(feedback.failsafe), inline=True)
-        pilot = Drone(node.server.dial, app="pilot").open()
+        pilot = open_drone(node.server.dial, app="pilot")
         pilot.config["failsafe.hover_after_s"] = 0.1
         pilot.config["failsafe.land_after_s"] = 0.4
         pilot.takeoff()
         pilot.velocity(forward=0.5)
         pilot.wait("flying", WAIT_S)
-        pilot._supervisor.close()  # as if it were killed
+        pilot._core.supervisor.close()  # as if it were killed
         eye.wait("landed", WAIT_S)
         pilot.close()
     order = [step for number, step in enumerate(steps) if number == 0 or step is not steps[number - 1]]
@@ -317,7 +318,7 @@ def test_forged_commands_change_nothing(node: Node, drone: Drone) -> None:
 def test_statistics_of_all_channels(node: Node, drone: Drone) -> None:
     drone.takeoff()
     drone.frame()
-    drone.wait(lambda _: drone._state.channels["front"].counter.count > 10, WAIT_S)
+    drone.wait(lambda _: drone._core.state.channels["front"].counter.count > 10, WAIT_S)
     stats = drone.stats
     for name in ("command", "feedback", "video/front"):
         delay = stats[name].delay_s

@@ -14,6 +14,7 @@ from skyloop import aio
 from skyloop.client import AuthorityStatus, Drone
 from skyloop.client.authority import TakeoverRequest, authority_wish
 from skyloop.client.commands import _busy
+from skyloop.client.drone import open_drone
 from skyloop.errors import AuthorityError, UsageError
 from skyloop.messages import Event, EventKind
 from skyloop.proxy.proxy import Proxy
@@ -33,7 +34,7 @@ class Shared:
     def joined(self, app: str, *, priority: int = 16, **options: Any) -> Iterator[Drone]:
         """A pilot, or an observer; gives everything back at the end without landing."""
         access = options.pop("access", "pilot")
-        drone = Drone(self.server.dial, app=app, access=access).open(priority=priority, **options)
+        drone = open_drone(self.server.dial, app=app, access=access, priority=priority, **options)
         try:
             yield drone
         finally:
@@ -61,6 +62,7 @@ def test_a_holder_that_grants_hands_over_and_has_it_back_later(shared: Shared) -
 
     with shared.joined("alice") as alice:
         alice.on_takeover(grant)
+        before = alice.authority.lease
         with shared.joined("bob", priority=4, takeover="ask", for_s=20.0, wait_s=WAIT_S) as bob:
             assert bob.authority.state == "held"
             assert bob.authority.until_ns is not None
@@ -71,7 +73,7 @@ def test_a_holder_that_grants_hands_over_and_has_it_back_later(shared: Shared) -
             with pytest.raises(AuthorityError, match="bob"):
                 alice.hover()
         held(alice)
-        assert alice.authority.lease > request.lease
+        assert alice.authority.lease > before
 
 
 def test_a_holder_that_declines_keeps_it_and_who_asked_is_told_why(shared: Shared) -> None:
@@ -79,7 +81,7 @@ def test_a_holder_that_declines_keeps_it_and_who_asked_is_told_why(shared: Share
         assert (bob.authority.state, bob.authority.holder, bob.authority.position) == ("queued", "alice", 1)
         alice.on_takeover(lambda _: "landing")
         bob.request_authority(takeover="ask", stay=True)
-        known = bob._commands._authority
+        known = bob._core.commands._authority
         wait_until(lambda: known.declined.endswith("alice does not hand the authority over to bob yet: landing"), "no")
         assert alice.authority.state == "held"
         assert bob.authority.state == "queued"
@@ -126,7 +128,7 @@ def test_a_line_with_expected_waits_moves_up(shared: Shared) -> None:
         assert carol.authority.expected_wait_s == pytest.approx(30.0, abs=10.0)
         line = r"bob holds the authority \(number 2 in line, expected wait \d+ s\)"
         with pytest.raises(AuthorityError, match=line):
-            Drone(shared.server.dial, app="dave").open()
+            open_drone(shared.server.dial, app="dave")
 
 
 def test_whose_time_is_over_is_relieved_and_does_not_ask_again(shared: Shared) -> None:
@@ -147,11 +149,11 @@ def test_whose_time_is_over_is_relieved_and_does_not_ask_again(shared: Shared) -
 def test_a_pilot_that_was_silent_finds_its_name_there_and_gets_a_new_lease(shared: Shared) -> None:
     with shared.joined("alice") as alice, shared.joined("eve", access="observe") as eve:
         lease = alice.authority.lease
-        transmit = alice._connection.transmit
-        alice._connection.transmit = lambda packet: True  # nothing leaves it any more
+        transmit = alice._core.connection.transmit
+        alice._core.connection.transmit = lambda packet: True  # nothing leaves it any more
         kept = eve.wait(lambda feedback: not feedback.lease, WAIT_S)
         assert kept.owner == "alice"
-        alice._connection.transmit = transmit
+        alice._core.connection.transmit = transmit
         held(alice)
         wait_until(lambda: alice.authority.lease > lease, "a new lease")
         assert alice.hover()
@@ -159,7 +161,7 @@ def test_a_pilot_that_was_silent_finds_its_name_there_and_gets_a_new_lease(share
 
 def test_with_asyncio(shared: Shared) -> None:
     async def fly() -> None:
-        alice = aio.Drone(Drone(shared.server.dial, app="alice").open())
+        alice = aio.Drone(open_drone(shared.server.dial, app="alice"))
         asked: list[str] = []
 
         async def answer(request: TakeoverRequest) -> bool:
@@ -168,7 +170,7 @@ def test_with_asyncio(shared: Shared) -> None:
             return True
 
         alice.on_takeover(answer)
-        bob = aio.Drone(Drone(shared.server.dial, app="bob").open(stay=True))
+        bob = aio.Drone(open_drone(shared.server.dial, app="bob", stay=True))
         await bob.request_authority(4, takeover="ask", wait_s=WAIT_S)
         assert bob.authority.state == "held"
         assert asked == ["bob"]

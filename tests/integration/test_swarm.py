@@ -16,6 +16,7 @@ import skyloop
 from skyloop.client import Drone, Swarm
 from skyloop.client.connect import choose
 from skyloop.client.connection import RedialPolicy
+from skyloop.client.drone import open_drone
 from skyloop.client.link_monitor import Thresholds
 from skyloop.client.swarm import in_parallel
 from skyloop.errors import (
@@ -64,7 +65,7 @@ class Field:
 
     def connect(self, name: str, *, priority: int = 16, **options: Any) -> Drone:
         options.setdefault("app", "test")
-        return Drone(self.servers[name].dial, policy=QUICK, **options).open(priority=priority)
+        return open_drone(self.servers[name].dial, policy=QUICK, **options, priority=priority)
 
     def swarm(self, **options: Any) -> Swarm:
         return Swarm({name: self.connect(name) for name in self.vehicles}, **options)
@@ -130,7 +131,7 @@ def test_commands_go_to_all_and_all_land_at_the_end(field: Field) -> None:
     assert field.states() == {FlightState.LANDED}
     with pytest.raises(ClosedError):
         drones.hover()
-    assert drones.leave() == {}
+    assert drones._leave() == {}
 
 
 def test_it_is_a_collection_of_drones(field: Field) -> None:
@@ -346,7 +347,7 @@ def test_set_points_leave_at_one_tick_and_the_spread_is_measured(field: Field) -
         for count in range(5):
             sent = drones.send({name: Velocity(0.1 * count, 0.01 * n) for n, name in enumerate(NAMES)})
             assert sent == dict.fromkeys(NAMES, True)
-            assert max(drone.open_ns for drone in drones) <= time.monotonic_ns() + 5_000_000
+            assert max(drone._core.commands.open_ns for drone in drones) <= time.monotonic_ns() + 5_000_000
         spread = drones.spread
         assert before is None
         assert spread is not None

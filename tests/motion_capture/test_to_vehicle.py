@@ -37,10 +37,10 @@ def seeing(name: str) -> Iterator[MotionCapture]:
         for number in itertools.count():
             if ended.wait(0.02):
                 return
-            capture.take(RawFrame(monotonic_ns(), {"body": ((0.0, 1e-6 * (number % 7), 0.1), (0.0, 0.0, 0.0, 1.0))}))
+            capture._take(RawFrame(monotonic_ns(), {"body": ((0.0, 1e-6 * (number % 7), 0.1), (0.0, 0.0, 0.0, 1.0))}))
 
     thread = threading.Thread(target=see)
-    with capture.open():
+    with capture._open():
         thread.start()
         try:
             yield capture

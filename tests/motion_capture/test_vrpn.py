@@ -138,7 +138,7 @@ def test_a_server_that_invents_sensors_costs_no_memory() -> None:
     selection = SensorSelection(["Rig"])
     taken = MotionCapture(parse_system("vrpn://h"), {"alpha": "Rig"}, client.VrpnSource)
     for sensor in range(3 * client.MAX_SENSORS):
-        taken.take(RawFrame(sensor, selection.select([report("Rig", sensor)], sensor)))
+        taken._take(RawFrame(sensor, selection.select([report("Rig", sensor)], sensor)))
     assert len(selection._reported["Rig"][1]) == client.MAX_SENSORS
     assert len(taken.unknown) == MAX_UNKNOWN
     assert len(selection.refused["Rig"]) < 400

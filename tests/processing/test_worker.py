@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from skyloop.client import Drone, Frame, Result
+from skyloop.client.drone import open_drone
 from skyloop.errors import NameTakenError, UsageError
 from skyloop.messages import Annotation, LogEntry, Polyline, Severity
 from skyloop.processing import Output, Settings, Worker
@@ -30,7 +31,7 @@ def node() -> Iterator[Node]:
 
 @contextmanager
 def observer(node: Node, app: str) -> Iterator[Drone]:
-    with Drone(node.server.dial, app=app, access="observe", policy=QUICK).open() as drone:
+    with open_drone(node.server.dial, app=app, access="observe", policy=QUICK) as drone:
         yield drone
 
 

@@ -17,7 +17,7 @@ import pytest
 from numpy.typing import NDArray
 
 import skyloop
-from skyloop.client import Drone
+from skyloop.client.drone import open_drone
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.pave_decoder import PaveDecoder
 from skyloop.drivers.registry import make_driver
@@ -69,7 +69,7 @@ def record_stream(path: Path, **options: Any) -> skyloop.recording.Recorder:
     """Plays the drone's eight seconds, twenty times as fast, to a recorder and to nobody else."""
     server = MemoryServer("alpha")
     with Proxy(make_driver(f"video://{stream()}?speed=20"), server, name="alpha"):
-        drone = Drone(server.dial, app="me").open(timeout_s=WAIT_S)
+        drone = open_drone(server.dial, app="me", timeout_s=WAIT_S)
         with drone, skyloop.record(drone, path, min_free_mb=0, **options) as recorder:
             drone.wait(lambda feedback: feedback.vehicle_link is LinkState.CLOSED, timeout_s=WAIT_S)
     return recorder
@@ -148,7 +148,7 @@ def test_frames_are_recorded_while_the_stream_that_was_announced_does_not_come(
 ) -> None:
     monkeypatch.setattr(taps, "_STREAM_GONE_NS", 200_000_000)
     server, vehicle, path = MemoryServer("alpha"), Announcing(), tmp_path / "flight.mcap"
-    with Proxy(vehicle, server, name="alpha"), Drone(server.dial, app="me").open(timeout_s=WAIT_S) as drone:
+    with Proxy(vehicle, server, name="alpha"), open_drone(server.dial, app="me", timeout_s=WAIT_S) as drone:
         with skyloop.record(drone, path, min_free_mb=0, channels=["video"]) as recorder:
             files.until(lambda: len(files.of(path, IMAGE)) > 2, "frames")
             vehicle.encoded.set()
@@ -288,7 +288,7 @@ def emulated() -> Iterator[Driver]:
 def test_an_emulated_drone_is_recorded_as_it_sends_and_as_its_frames_show(emulated: Driver, tmp_path: Path) -> None:
     server, path = MemoryServer("alpha"), tmp_path / "flight.mcap"
     live: dict[int, NDArray[np.uint8]] = {}
-    with Proxy(emulated, server, name="alpha"), Drone(server.dial, app="me").open(timeout_s=WAIT_S) as drone:
+    with Proxy(emulated, server, name="alpha"), open_drone(server.dial, app="me", timeout_s=WAIT_S) as drone:
         assert [camera.stream for camera in drone.capabilities.cameras] == ["h264", "h264"]
         with skyloop.record(drone, path, min_free_mb=0) as recorder:
             files.until(lambda: len(files.of(path, VIDEO)) > 20, "pictures that nobody looks at", WAIT_S)

@@ -15,6 +15,7 @@ import pytest
 
 import skyloop
 from skyloop.client import Drone
+from skyloop.client.drone import open_drone
 from skyloop.drivers.base import Sink
 from skyloop.errors import MissingExtraError, SkyloopError, UnknownNameError, UsageError
 from skyloop.logfile import layout
@@ -102,7 +103,7 @@ def fly() -> Iterator[Fly]:
         def one(name: str = "alpha", encoding: Encoding = Encoding.BGR8) -> Drone:
             server = MemoryServer(name)
             stack.enter_context(Proxy(Vehicle(encoding), server, name=name))
-            drone = Drone(server.dial, app="me").open(timeout_s=WAIT_S)
+            drone = open_drone(server.dial, app="me", timeout_s=WAIT_S)
             stack.callback(drone.close)
             return drone
 
@@ -122,7 +123,7 @@ def test_everything_is_in_the_file(fly: Fly, tmp_path: Path) -> None:
         drone.velocity(forward=0.25)
         frame = drone.next_frame(timeout_s=WAIT_S)
         assert drone.annotate(frame, [Polyline(((1.0, 1.0), (5.0, 5.0)))], source="tracker")
-        membership = drone.join_processor("detector", code="Detector 1")
+        membership = drone._core.join_processor("detector", code="Detector 1")
         assert membership.publish(frame, {"score": 0.5})
         assert drone.log.text("found it", severity="warning")
         assert drone.log.numbers(error=0.25, gain=2)

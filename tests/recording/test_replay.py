@@ -14,6 +14,7 @@ import pytest
 
 import skyloop
 from skyloop.client import Drone
+from skyloop.client.drone import open_drone
 from skyloop.clock import NS_PER_S
 from skyloop.drivers.registry import make_driver
 from skyloop.drivers.replay import ReplayDriver
@@ -188,15 +189,15 @@ def test_it_is_of_one_application_alone(flight: Path) -> None:
     dial = way.dialer(0.0)
     try:
         with (
-            Drone(dial, app="first", scheduler=way.scheduler, on_exit="hover").open(),
+            open_drone(dial, app="first", scheduler=way.scheduler, on_exit="hover"),
             pytest.raises(LinkError, match="in step with one application, and that one is connected"),
         ):
-            Drone(dial, app="second").open(timeout_s=0.5)
+            open_drone(dial, app="second", timeout_s=0.5)
     finally:
         way.close()
         way.close()
     with pytest.raises(LinkError, match="ended"):
-        Drone(dial, app="late").open(timeout_s=0.5)
+        open_drone(dial, app="late", timeout_s=0.5)
 
 
 def test_other_speeds_take_the_ordinary_way(flight: Path) -> None:
@@ -327,8 +328,8 @@ def served(flight: Path) -> Iterator[MemoryServer]:
 
 def test_a_replay_is_a_vehicle_like_any_other(served: MemoryServer) -> None:
     with (
-        Drone(served.dial, app="me", on_exit="hover").open() as drone,
-        Drone(served.dial, app="eye", access="observe").open() as eye,
+        open_drone(served.dial, app="me", on_exit="hover") as drone,
+        open_drone(served.dial, app="eye", access="observe") as eye,
     ):
         echoes: list[Applied] = []
         events: list[Event] = []

@@ -149,4 +149,4 @@ class Teleop:
 def _page(drone: Drone) -> CockpitProcess:
     from skyloop.cockpit.child import CockpitProcess
 
-    return CockpitProcess(drone.reach)
+    return CockpitProcess(drone._core.reach)

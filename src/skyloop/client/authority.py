@@ -199,8 +199,15 @@ class TakeoverRequest:
     priority: int  #: 0 is the highest
     within_s: float  #: after this time it wins if its priority is strictly higher
     for_s: float | None  #: for how long it wants the authority; None: open
+
+
+@dataclass(frozen=True, slots=True)
+class TakeoverQuery:
+    """A request as it came, with what an answer needs."""
+
+    request: TakeoverRequest
     lease: int  #: the lease that is to be given up
-    by_id: int = 0  #: number of that application in this run of the proxy
+    by_id: int  #: number of the application that asks, in this run of the proxy
 
 
 def authority_wish(priority: int, for_s: float | None = None, takeover: TakeoverWay = "now") -> RequestAuthority:
@@ -242,17 +249,17 @@ def answering(
         raise UsageError(f"{function!r:.80} can't be called: a function with one argument is needed")
 
     def on_event(event: Event) -> None:
-        request = takeover_request(event, app_id())
-        if request is None:
+        query = takeover_query(event, app_id())
+        if query is None:
             return
-        said = function(request)
+        said = function(query.request)
         if said is not None:
-            answer(request.lease, request.by_id, said is True, said if isinstance(said, str) else "")
+            answer(query.lease, query.by_id, said is True, said if isinstance(said, str) else "")
 
     return on_event
 
 
-def takeover_request(event: Event, app_id: int) -> TakeoverRequest | None:
+def takeover_query(event: Event, app_id: int) -> TakeoverQuery | None:
     """Return the request that an event makes of the application ``app_id``; None if it makes none of it."""
     data = event.data
     if event.kind is not EventKind.AUTHORITY_ASKED or data.get("app_id") != app_id:
@@ -261,14 +268,13 @@ def takeover_request(event: Event, app_id: int) -> TakeoverRequest | None:
     if not isinstance(lease, int) or not isinstance(by_id, int):
         return None
     priority = data.get("by_priority")
-    return TakeoverRequest(
+    request = TakeoverRequest(
         str(data.get("by", "")),
         priority if isinstance(priority, int) else LOWEST_PRIORITY,
         _number(data.get("within_s")) or 0.0,
         _number(data.get("for_s")),
-        lease,
-        by_id,
     )
+    return TakeoverQuery(request, lease, by_id)
 
 
 def _number(value: Value | None) -> float | None:

@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
 
 from skyloop.client.authority import TakeoverWay, authority_wish
-from skyloop.client.drone import Access, Drone, OnExit
+from skyloop.client.core import Access, DroneCore, OnExit
+from skyloop.client.drone import Drone
 from skyloop.client.scheduler import Scheduler
-from skyloop.client.swarm import OnError, Swarm, in_parallel
+from skyloop.client.swarm import OnError, Swarm, check_policy, in_parallel
 from skyloop.errors import LinkError, SwarmError, UnknownNameError, UsageError
 from skyloop.messages import DEFAULT_PRIORITY
 from skyloop.transport.base import ClientHandler, Dialer, TransportClient, check_name
@@ -101,7 +102,7 @@ def connect(
             None,
         )
     try:
-        drone = Drone(
+        core = DroneCore(
             dial,
             app=app,
             access=access,
@@ -117,7 +118,8 @@ def connect(
             end()
         raise
     left_s = deadline - time.monotonic()
-    return drone.open(priority=priority, wait_s=wait_s, timeout_s=left_s, for_s=for_s, takeover=takeover, stay=stay)
+    core.open(priority=priority, wait_s=wait_s, timeout_s=left_s, for_s=for_s, takeover=takeover, stay=stay)
+    return Drone(core)
 
 
 def _connector(uri: str) -> Connector:
@@ -256,7 +258,7 @@ def swarm(*targets: Target, on_error: OnError = "continue", missing: Missing = "
     """
     if missing not in ("raise", "skip"):
         raise UsageError(f'missing is {missing!r} and must be "raise" or "skip"')
-    Swarm.check_policy(on_error)
+    check_policy(on_error)
     chosen = choose(targets, lambda: running_names(options.get("network"), options.get("keys")))
 
     def join(target: str) -> Callable[[], Drone]:
@@ -264,7 +266,7 @@ def swarm(*targets: Target, on_error: OnError = "continue", missing: Missing = "
 
     drones, errors = in_parallel({name: join(target) for name, target in chosen.items()})
     if errors and (missing == "raise" or not drones):
-        in_parallel({name: drone.leave for name, drone in drones.items()})
+        in_parallel({name: drone._core.leave for name, drone in drones.items()})
         raise SwarmError("connecting", errors, len(chosen))
     return Swarm(drones, on_error=on_error, missing=errors)
 

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator, Set
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from types import TracebackType
-from typing import Any, Final, Literal, Protocol, Self, TypeVar, Unpack
+from typing import Any, Final, Self, TypeVar, Unpack
 
 import msgspec
 import numpy as np
 
 from skyloop.client.authority import (
-    Authority,
     AuthorityStatus,
     TakeoverAnswer,
     TakeoverRequest,
@@ -22,40 +20,31 @@ from skyloop.client.authority import (
     answering,
     authority_wish,
 )
-from skyloop.client.channels import Channel, Listener, VideoChannel, VideoOptions
-from skyloop.client.command_schedule import CommandSchedule
-from skyloop.client.commands import CommandSender, checked, number
-from skyloop.client.completion import ActionWait
-from skyloop.client.connection import ConnectionSupervisor, ProxyConnection, RedialPolicy
+from skyloop.client.channels import Channel, Listener, VideoOptions
+from skyloop.client.commands import checked, number
+from skyloop.client.core import DOWN, UP, DroneCore, DroneOptions
 from skyloop.client.frame import Arrival, Frame
-from skyloop.client.logbook import Logbook, checked_time
+from skyloop.client.logbook import checked_time
 from skyloop.client.mailbox import Mailbox
-from skyloop.client.parameters import Config
 from skyloop.client.results import (
     Result,
-    ResultChannel,
     ResultListener,
     ResultMailbox,
     checked_age,
-    checked_name,
     is_old,
     silence,
 )
-from skyloop.client.scheduler import Scheduler
 from skyloop.client.statistics import ChannelStats, Distribution
-from skyloop.client.telemetry import ClientState, LinkStatus, Mailboxes, Receiver, Wanted, as_predicate
-from skyloop.client.worker import Membership
+from skyloop.client.telemetry import LinkStatus, Wanted, as_predicate
 from skyloop.errors import (
     AuthorityError,
     ClosedError,
     LinkError,
     NoAnswerError,
-    SkyloopError,
-    UnknownNameError,
-    UnsupportedError,
     UsageError,
 )
 from skyloop.messages import (
+    DEFAULT_PRIORITY,
     Annotation,
     AnyAction,
     Applied,
@@ -65,9 +54,7 @@ from skyloop.messages import (
     Event,
     EventKind,
     Feedback,
-    FlightState,
     GetStatistics,
-    Hello,
     Hover,
     Idle,
     Land,
@@ -85,21 +72,11 @@ from skyloop.messages import (
 )
 from skyloop.messages.annotation import Shape
 from skyloop.messages.pose import check_pose
-from skyloop.messages.result import MAX_CODE
-from skyloop.messages.video import DEFAULT_QUALITY, VideoEncoding, VideoRequest
-from skyloop.transport.base import EVENTS, FEEDBACK, Dialer
+from skyloop.transport.base import Dialer
 
 T = TypeVar("T")
-Access = Literal["pilot", "observe"]
-OnExit = Literal["land", "hover"]
 EVENT_DEPTH: Final = 256  #: how many events, log entries and the like wait for a slow callback
-_UP: Final = frozenset({FlightState.HOVERING, FlightState.FLYING})
-_DOWN: Final = frozenset({FlightState.LANDED})
 _log = logging.getLogger("skyloop")
-
-
-class _Closable(Protocol):
-    def close(self) -> None: ...
 
 
 class Drone:
@@ -124,134 +101,20 @@ class Drone:
     unread one (:meth:`next_feedback`, :meth:`next_frame`), or all that come (:meth:`frames`, :meth:`on_feedback`).
     """
 
-    def __init__(
-        self,
-        dial: Dialer,
-        *,
-        app: str,
-        access: Access = "pilot",
-        rate_hz: float = 32.0,
-        stall_s: float = 1.0,
-        on_exit: OnExit = "land",
-        policy: RedialPolicy | None = None,
-        scheduler: Scheduler | None = None,
-        on_close: Callable[[], None] | None = None,
-        reach: str | None = None,
-    ) -> None:
-        """Prepare a drone without connecting; :meth:`open` connects.
-
-        Args:
-            dial: Makes a connection to the proxy each time one is needed.
-            app: Name of this application, 1 to 64 characters.
-            access: ``"pilot"`` may command, ``"observe"`` only reads.
-            rate_hz: Rate at which commands are repeated, 1 to 200 Hz.
-            stall_s: Time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never.
-            on_exit: What an airborne vehicle does at the end of the block, ``"land"`` or ``"hover"``.
-            policy: When to reconnect and when a link counts as lost.
-            scheduler: Source of the time and of waiting; None: real time.
-            on_close: Called at the end of :meth:`close`, on the closing thread.
-            reach: Name or address under which another process reaches the same vehicle; None if none can.
-
-        Raises:
-            UsageError: If ``access``, ``on_exit``, ``app``, ``rate_hz`` or ``stall_s`` is out of range.
-        """
-        if access not in ("pilot", "observe"):
-            raise UsageError(f'access is {access!r} and must be "pilot" or "observe"')
-        if on_exit not in ("land", "hover"):
-            raise UsageError(f'on_exit is {on_exit!r} and must be "land" or "hover"')
-        if not 1 <= len(app) <= 64:
-            raise UsageError(f"an application's name has 1 to 64 characters, not {len(app)}: {app!r:.80}")
-        role = Role.PILOT if access == "pilot" else Role.OBSERVER
-        scheduler = scheduler or Scheduler()
-        self._app = app
-        self._role = role
-        self._on_exit = on_exit
-        self._on_close = on_close
-        self._closed = False
-        self._listeners: list[Listener[Any]] = []
-        self._to_close: list[_Closable] = []  # what ends with the drone
+    def __init__(self, core: DroneCore) -> None:
+        """Show what ``core`` is made of to an application; :func:`skyloop.connect` does it."""
+        self._core = core
+        self._state = core.state
+        self.config = core.config
+        self.log = core.log
         self._read: Feedback | None = None  # the last sample that feedback() or next_feedback() returned
-        #: Name or address under which another process reaches the same vehicle; None if none can.
-        self.reach = reach
-        # Each part uses those before it; the receiver handles what arrives in every session.
-        connection = self._connection = ProxyConnection(scheduler.clock)
-        authority = Authority(app)
-        state = self._state = ClientState(app, connection, scheduler)
-        self.config = Config(connection, authority, state.emit)
-        self.log = Logbook(connection, app)
-        self._commands = CommandSender(
-            role,
-            authority,
-            CommandSchedule(rate_hz=rate_hz, stall_s=stall_s),
-            connection,
-            scheduler,
-            emit=state.emit,
-            changed=state.notifier.notify,
-            granted=self.config.granted,
-        )
-        self._supervisor = ConnectionSupervisor(
-            connection,
-            Receiver(app, state, connection, self._commands, self.config),
-            dial,
-            Hello(app, role),
-            policy=policy,
-            clock=scheduler.clock,
-            begin=scheduler.begin,
-        )
-        for topic in (EVENTS, FEEDBACK):
-            connection.subscribe(topic)
-
-    def open(
-        self,
-        *,
-        priority: int = 16,
-        wait_s: float = 0.0,
-        timeout_s: float = 5.0,
-        for_s: float | None = None,
-        takeover: TakeoverWay = "now",
-        stay: bool = False,
-    ) -> Self:
-        """Connect, then wait for feedback and, as a pilot, for the authority.
-
-        :func:`skyloop.connect` calls it. Closes the drone if anything fails.
-
-        Args:
-            priority: Of the request for the authority, 0 (highest) to 31.
-            wait_s: How long to wait in the queue for the authority [s].
-            timeout_s: Time for the proxy to answer and to send its first feedback [s].
-            for_s: See :meth:`request_authority`.
-            takeover: See :meth:`request_authority`.
-            stay: See :meth:`request_authority`.
-
-        Returns:
-            The drone itself.
-
-        Raises:
-            NoAnswerError: If no answer or no feedback comes in time.
-            RefusedError: If the proxy refuses the connection.
-            AuthorityError: If the authority can't be had.
-            LinkError: If the proxy can't be reached.
-        """
-        try:
-            deadline = time.monotonic() + timeout_s
-            self._supervisor.start(timeout_s)
-            left_s = max(0.1, deadline - time.monotonic())
-            if not self._state.notifier.wait_for(self._known, left_s):
-                raise NoAnswerError(f"{self.name} answered, but reported no vehicle state within {timeout_s:g} s")
-            if self._role is Role.PILOT:
-                self.request_authority(priority, wait_s=wait_s, for_s=for_s, takeover=takeover, stay=stay)
-            self._state.scheduler.opened()
-        except BaseException:
-            self.close()
-            raise
-        return self
 
     # Properties --------------------------------------------------------------------------------------------------
 
     @property
     def name(self) -> str:
         """Name of the proxy; empty before the first connection."""
-        return "" if self._state.welcome is None else self._state.welcome.proxy
+        return self._core.name
 
     @property
     def uri(self) -> str:
@@ -267,22 +130,22 @@ class Drone:
     @property
     def clock_offset_ns(self) -> int:
         """Estimate of the proxy's clock minus this process's clock [ns]."""
-        return self._connection.offset_ns
+        return self._core.connection.offset_ns
 
     @property
     def now_ns(self) -> int:
         """Estimate of the time on the proxy's clock [ns]; in a stepped replay, the time of the recorded flight."""
-        return self._connection.now_ns
+        return self._core.connection.now_ns
 
     @property
     def clock_uncertainty_ns(self) -> int:
         """Largest error of :attr:`clock_offset_ns` [ns], and so of each age and delay; 0 where both share one clock."""
-        return self._connection.uncertainty_ns
+        return self._core.connection.uncertainty_ns
 
     @property
     def app_id(self) -> int:
         """Number of this application in this run of the proxy."""
-        return self._commands.app_id
+        return self._core.commands.app_id
 
     @property
     def link(self) -> LinkStatus:
@@ -291,12 +154,12 @@ class Drone:
         ``reason`` is that of the last change or, while the proxy is lost, why the last attempt to reconnect failed.
         """
         status = self._state.status
-        return replace(status, reason=self._connection.reason) if status.application is LinkState.LOST else status
+        return replace(status, reason=self._core.connection.reason) if status.application is LinkState.LOST else status
 
     @property
     def closed(self) -> bool:
         """Whether :meth:`close` was called."""
-        return self._closed
+        return self._core.closed
 
     @property
     def stats(self) -> dict[str, ChannelStats]:
@@ -305,10 +168,10 @@ class Drone:
         The delay of ``command`` comes from the echoes of this application's commands while :meth:`on_command` has a
         callback. Otherwise the proxy is asked for the delay over all pilots, which waits up to 0.2 s.
         """
-        found = self._state.stats(self._commands.sends)
+        found = self._state.stats(self._core.commands.sends)
         uncertainty_s = self.clock_uncertainty_ns / 1e9
         found = {name: replace(stats, uncertainty_s=uncertainty_s) for name, stats in found.items()}
-        if found["command"].delay_s is None and self._connection.connected and not self._connection.receiving:
+        if found["command"].delay_s is None and self._core.connection.connected and not self._core.connection.receiving:
             found["command"] = _with_delay(found["command"], self._proxy_statistics())
         return found
 
@@ -331,14 +194,14 @@ class Drone:
             UsageError: If ``function`` can't be called.
             ClosedError: If the drone was closed.
         """
-        return self.on_event(answering(function, lambda: self.app_id, self._commands.answer))
+        return self.on_event(answering(function, lambda: self.app_id, self._core.commands.answer))
 
     # Authority and commands --------------------------------------------------------------------------------------
 
     @property
     def authority(self) -> AuthorityStatus:
         """Current state of this application's authority."""
-        return self._commands.status
+        return self._core.commands.status
 
     def request_authority(
         self,
@@ -373,9 +236,9 @@ class Drone:
             UsageError: If ``priority``, ``for_s`` or ``takeover`` is out of range.
             ClosedError: If the drone was closed.
         """
-        self._check_open()
-        wish = authority_wish(self._commands.status.priority if priority is None else priority, for_s, takeover)
-        return self._commands.request(wish, wait_s, stay=stay)
+        self._core.check_open()
+        wish = authority_wish(self._core.commands.status.priority if priority is None else priority, for_s, takeover)
+        return self._core.commands.request(wish, wait_s, stay=stay)
 
     def release_authority(self) -> None:
         """Release the authority, or leave the queue, and wait until the proxy has confirmed it.
@@ -386,8 +249,8 @@ class Drone:
             NoAnswerError: If the proxy does not answer.
             ClosedError: If the drone was closed.
         """
-        self._check_open()
-        self._commands.release()
+        self._core.check_open()
+        self._core.commands.release()
 
     def command(self, action: AnyAction) -> bool:
         """Make ``action`` the newest set-point.
@@ -395,12 +258,7 @@ class Drone:
         Returns:
             Whether it was handed to the transport now; see :class:`Drone` for this and for what is raised.
         """
-        return self._command(checked(action))
-
-    @property
-    def open_ns(self) -> int:
-        """Time on this process's clock from which a new set-point is sent at once [ns]: 5 ms after the last new one."""
-        return self._commands.open_ns
+        return self._core.command(checked(action))
 
     def takeoff(self, *, wait: bool = True, timeout_s: float = 15.0) -> None:
         """Take off, then hover.
@@ -418,7 +276,7 @@ class Drone:
             ClosedError: If the drone is closed.
             UsageError: If called with ``wait`` from an inline callback; nothing is sent.
         """
-        self._complete(Takeoff(), _UP, wait, timeout_s)
+        self._core.complete(Takeoff(), UP, wait, timeout_s)
 
     def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> None:
         """Land at the present position.
@@ -439,15 +297,15 @@ class Drone:
             ClosedError: If the drone is closed.
             UsageError: If called with ``wait`` from an inline callback; the landing is commanded all the same.
         """
-        self._complete(Land(), _DOWN, wait, timeout_s)
+        self._core.complete(Land(), DOWN, wait, timeout_s)
 
     def hover(self) -> bool:
         """Stop and hold the position. Returns and raises as every command; see :class:`Drone`."""
-        return self._command(Hover())
+        return self._core.command(Hover())
 
     def idle(self) -> bool:
         """Ask for nothing: keep the authority and leave the vehicle as it is."""
-        return self._command(Idle())
+        return self._core.command(Idle())
 
     def velocity(self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, yaw_rate: float = 0.0) -> bool:
         """Fly with a velocity in the levelled body axes, which turn with the yaw but not with roll and pitch.
@@ -461,7 +319,7 @@ class Drone:
         Returns:
             Whether it was handed to the transport now; see :class:`Drone` for this and for what is raised.
         """
-        return self._command(
+        return self._core.command(
             Velocity(number("forward", forward), number("left", left), number("up", up), number("yaw_rate", yaw_rate))
         )
 
@@ -477,7 +335,7 @@ class Drone:
         Returns:
             Whether it was handed to the transport now; see :class:`Drone` for this and for what is raised.
         """
-        return self._command(
+        return self._core.command(
             Attitude(number("roll", roll), number("pitch", pitch), number("climb", climb), number("yaw_rate", yaw_rate))
         )
 
@@ -491,11 +349,11 @@ class Drone:
             UnsupportedError: If the vehicle takes no commands.
             ClosedError: If the drone was closed.
         """
-        return self._command(EmergencyStop())
+        return self._core.command(EmergencyStop())
 
     def reset_emergency(self) -> bool:
         """Leave the emergency state, on the ground."""
-        return self._command(ResetEmergency())
+        return self._core.command(ResetEmergency())
 
     def send_external_pose(
         self,
@@ -526,13 +384,13 @@ class Drone:
             UsageError: If a number is missing or not finite, a standard deviation is negative, the quaternion's length
                 differs from 1 by more than 0.001, or ``at_ns`` is out of range.
         """
-        if self._role is not Role.PILOT:
+        if self._core.role is not Role.PILOT:
             text = 'send_external_pose: this application observes; connect with access="pilot"'
             raise AuthorityError(text, code="observer")
         check_pose(position, quaternion, position_std_m, attitude_std_rad)
         known_ns = self.now_ns if at_ns is None else checked_time(at_ns)
         pose = VehiclePose(known_ns, position, quaternion, position_std_m, attitude_std_rad)
-        return self._connection.transmit(encode(pose))
+        return self._core.connection.transmit(encode(pose))
 
     # Reading ---------------------------------------------------------------------------------------------------
 
@@ -546,7 +404,7 @@ class Drone:
             NoAnswerError: If no feedback has come yet, or the newest is older than ``max_age_s``.
             ClosedError: If the drone was closed.
         """
-        self._check_open()
+        self._core.check_open()
         newest = self._state.newest
         if newest is None:
             raise NoAnswerError("no feedback has come yet")
@@ -572,11 +430,12 @@ class Drone:
             ClosedError: If the drone is closed.
             UsageError: If called from an inline callback.
         """
-        self._check_open()
-        self._check_may_wait()
+        self._core.check_open()
+        self._core.check_may_wait()
         state = self._state
-        if not state.notifier.wait_for(lambda: state.newest is not self._read or self._closed, timeout_s):
-            raise NoAnswerError(f"no feedback came within {timeout_s:g} s: the link is {self._connection.state.value}")
+        if not state.notifier.wait_for(lambda: state.newest is not self._read or self._core.closed, timeout_s):
+            link = self._core.connection.state.value
+            raise NoAnswerError(f"no feedback came within {timeout_s:g} s: the link is {link}")
         return self.feedback()
 
     def frame(self, camera: str | None = None, *, max_age_s: float | None = None) -> Frame | None:
@@ -596,7 +455,7 @@ class Drone:
             UnsupportedError: If the vehicle has no camera.
             ClosedError: If the drone was closed.
         """
-        channel = self.channel(camera)
+        channel = self._core.channel(camera)
         channel.keep()
         arrival = channel.newest
         if arrival is None or (max_age_s is not None and arrival.age_s > max_age_s):
@@ -619,12 +478,12 @@ class Drone:
             ClosedError: If the drone is closed.
             UsageError: If called from an inline callback.
         """
-        channel = self.channel(camera)
+        channel = self._core.channel(camera)
         channel.keep()
-        self._check_may_wait()
+        self._core.check_may_wait()
         deadline = time.monotonic() + timeout_s
-        while channel.notifier.wait_for(lambda: channel.unread or self._closed, deadline - time.monotonic()):
-            self._check_open()
+        while channel.notifier.wait_for(lambda: channel.unread or self._core.closed, deadline - time.monotonic()):
+            self._core.check_open()
             frame = channel.read()
             if frame is not None:
                 return frame
@@ -656,11 +515,11 @@ class Drone:
             UsageError: If an option is out of range, or from an inline callback.
             ClosedError: If the drone was closed before.
         """
-        channel = self.channel(camera, **how)
+        channel = self._core.channel(camera, **how)
         mailbox: Mailbox[Arrival] = Mailbox(notifier=self._state.scheduler.notifier())
-        self._check_may_wait()
-        with self._closing(mailbox), channel.into(mailbox):
-            while not self._closed:
+        self._core.check_may_wait()
+        with self._core.closing(mailbox), channel.into(mailbox):
+            while not self._core.closed:
                 arrival = mailbox.wait(timeout_s)
                 if arrival is not None:
                     frame = channel.picture(arrival)
@@ -686,8 +545,8 @@ class Drone:
             ClosedError: If the drone is closed.
             UsageError: If called from an inline callback.
         """
-        self._check_open()
-        self._check_may_wait()
+        self._core.check_open()
+        self._core.check_may_wait()
         wanted, what = as_predicate(state)
         met: list[Feedback] = []
 
@@ -695,7 +554,7 @@ class Drone:
             newest = self._state.newest
             if newest is not None and wanted(newest):
                 met.append(newest)
-            return bool(met) or self._closed
+            return bool(met) or self._core.closed
 
         if not self._state.notifier.wait_for(look, timeout_s):
             newest = self._state.newest
@@ -790,7 +649,7 @@ class Drone:
         if depth < 1:
             raise UsageError(f"depth is {depth!r} and must be at least 1 frame")
         self._check_listener(function)
-        channel = self.channel(camera, **how)
+        channel = self._core.channel(camera, **how)
 
         def call(arrival: Arrival) -> None:
             frame = channel.picture(arrival)
@@ -798,44 +657,6 @@ class Drone:
                 function(frame)
 
         return self._listen(channel, call, f"frames of {channel.camera.name}", depth=depth, inline=inline)
-
-    def inbox(
-        self,
-        *,
-        feedback: bool = True,
-        frames: bool = True,
-        camera: str | None = None,
-        results: bool = False,
-        processors: Iterable[str] | None = None,
-        max_age_s: float | None = None,
-    ) -> Mailboxes:
-        """Return mailboxes of the newest feedback, frame and results, for one thread that waits for all of them.
-
-        Controllers run on them. They fill while they are open as a context manager.
-
-        Args:
-            feedback: Whether feedback is wanted.
-            frames: Whether frames are wanted.
-            camera: Name of the camera; None: the vehicle's first.
-            results: Whether results of processors are wanted.
-            processors: Names of the processors whose results are wanted; None: all.
-            max_age_s: Oldest age of a result that is accepted [s]; None: any.
-
-        Raises:
-            UsageError: If ``max_age_s`` or the name of a processor is unusable.
-            UnknownNameError: If the vehicle has no camera of this name.
-            UnsupportedError: If frames are wanted and the vehicle has no camera.
-        """
-        channels = self._state.results
-        named = None if processors is None else [checked_name(one) for one in processors]
-        wanted = [channels.everything] if named is None else [channels.channel(one) for one in named]
-        return Mailboxes(
-            self._state.scheduler,
-            feedback=self._state.on_feedback if feedback else None,
-            frames=self.channel(camera) if frames else None,
-            results=wanted if results else [],
-            max_age_s=checked_age(max_age_s),
-        )
 
     def annotate(self, frame: Frame, shapes: Iterable[Shape], source: str | None = None) -> bool:
         """Publish shapes drawn over a frame, for the cockpit and for recordings.
@@ -854,13 +675,13 @@ class Drone:
                 within 0 to 255.
         """
         height, width = frame.shape[:2]
-        fields = (source or self._app, frame.camera, frame.captured_ns, width, height, tuple(shapes))
+        fields = (source or self._core.app, frame.camera, frame.captured_ns, width, height, tuple(shapes))
         try:
             annotation = msgspec.convert(msgspec.to_builtins(fields, enc_hook=_from_numpy), Annotation)
             packet = encode(annotation)
         except (msgspec.ValidationError, TypeError, ValueError) as error:
             raise UsageError(f"this can't be drawn on a frame: {error}") from None
-        return self._connection.transmit(packet)
+        return self._core.connection.transmit(packet)
 
     def tell(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: str) -> None:
         """Emit an event of this application's own (number 0), which only its own callbacks get.
@@ -872,51 +693,6 @@ class Drone:
             **data: Details, by name.
         """
         self._state.emit(kind, text, severity, **data)
-
-    def channel(
-        self,
-        camera: str | None = None,
-        *,
-        encoding: VideoEncoding | None = None,
-        quality: int | None = None,
-        max_fps: float | None = None,
-        scale: float = 1.0,
-        part: tuple[int, int] | None = None,
-    ) -> VideoChannel:
-        """Return the channel of a camera whose frames come as requested; see :meth:`frames` for the options.
-
-        Args:
-            camera: Name of the camera; None: the vehicle's first.
-            encoding: ``"jpeg"`` or ``"raw"``; None: ``"jpeg"``.
-            quality: Of JPEG, 1 to 100; None: 80.
-            max_fps: Most frames a second; None: all.
-            scale: Factor for width and height, above 0 and up to 1.
-            part: (k, n): only every n-th frame, from k; None: all.
-
-        Raises:
-            UnknownNameError: If the vehicle has no camera of this name.
-            UnsupportedError: If the vehicle has no camera.
-            UsageError: If an option is out of range, or ``quality`` is given for raw frames.
-            ClosedError: If the drone was closed.
-        """
-        self._check_open()
-        channels = self._state.channels
-        if not channels:
-            raise UnsupportedError("no camera: this vehicle gives no pictures")
-        channel = next(iter(channels.values())) if camera is None else channels.get(camera)
-        if channel is None:
-            raise UnknownNameError("camera", str(camera), channels)
-        if encoding == "raw" and quality is not None:
-            raise UsageError(f'quality={quality!r} is of encoding="jpeg", and the encoding is "raw"')
-        request = VideoRequest(
-            channel.camera.name,
-            encoding="jpeg" if encoding is None else encoding,
-            quality=DEFAULT_QUALITY if quality is None else quality,
-            max_fps=max_fps,
-            scale=scale,
-            part=part,
-        )
-        return channel if request == channel.request else self._state.video(channel.camera, request)
 
     # Results of processors ---------------------------------------------------------------------------------------
 
@@ -937,7 +713,7 @@ class Drone:
             ClosedError: If the drone was closed.
         """
         checked_age(max_age_s)
-        channel = self.result_channel(processor)
+        channel = self._core.result_channel(processor)
         channel.keep()
         newest = channel.newest
         return None if newest is None or is_old(newest, max_age_s) else newest
@@ -959,10 +735,10 @@ class Drone:
             ClosedError: If the drone was closed before.
         """
         mailbox = ResultMailbox(checked_age(max_age_s), self._state.scheduler.notifier())
-        channel = self.result_channel(processor)
-        self._check_may_wait()
-        with self._closing(mailbox), channel.into(mailbox):
-            while not self._closed:
+        channel = self._core.result_channel(processor)
+        self._core.check_may_wait()
+        with self._core.closing(mailbox), channel.into(mailbox):
+            while not self._core.closed:
                 result = mailbox.wait(timeout_s)
                 if result is not None:
                     yield result
@@ -998,60 +774,19 @@ class Drone:
         if depth is not None and depth < 1:
             raise UsageError(f"depth is {depth!r} and must be at least 1 result")
         self._check_listener(function)
-        channel = self._state.results.everything if processor is None else self.result_channel(processor)
+        channel = self._state.results.everything if processor is None else self._core.result_channel(processor)
         listener = ResultListener(
             function,
             channel,
-            self._report,
+            self._core.report,
             name="results" if processor is None else f"results of {processor}",
             depth=depth or (EVENT_DEPTH if processor is None else 1),
             inline=inline or self._state.scheduler.in_step,
-            on_cancel=self._cancelled,
+            on_cancel=self._core.cancelled,
             max_age_s=checked_age(max_age_s),
         )
-        self._listeners.append(listener)
+        self._core.listeners.append(listener)
         return listener
-
-    def join_processor(
-        self, name: str, *, code: str, camera: str | None = None, shared: bool = True, timeout_s: float = 5.0
-    ) -> Membership:
-        """Become a worker of a processor, as ``skyloop process`` does, for programs with a loop of their own.
-
-        The membership ends with the drone.
-
-        Args:
-            name: Name of the processor.
-            code: Identifies the code that runs, the same for all workers of a name; at most 128 characters.
-            camera: Name of the camera; None: the vehicle's first.
-            shared: Each frame goes to one of the workers; if False, each worker gets all.
-            timeout_s: How long to wait for the proxy's answer [s].
-
-        Raises:
-            NameTakenError: If another application runs other code under this name.
-            RefusedError: If the proxy refuses for another reason.
-            NoAnswerError: If the proxy does not answer in time.
-            UsageError: If ``name`` or ``code`` is unusable, or from an inline callback.
-            UnknownNameError: If the vehicle has no camera of this name.
-        """
-        self._check_may_wait()
-        if not isinstance(code, str) or len(code) > MAX_CODE:
-            raise UsageError(f"code is {code!r:.80} and must be a text of at most {MAX_CODE} characters")
-        membership = Membership(
-            self._connection, self._state, checked_name(name), code, self.channel(camera).camera.name, shared=shared
-        )
-        membership.start(timeout_s)
-        self._to_close.append(membership)  # ends with the drone
-        return membership
-
-    def result_channel(self, processor: str) -> ResultChannel:
-        """Return the channel of a processor's results, whether or not such a processor runs.
-
-        Raises:
-            UsageError: If ``processor`` can't be a name.
-            ClosedError: If the drone was closed.
-        """
-        self._check_open()
-        return self._state.results.channel(checked_name(processor))
 
     # The end ---------------------------------------------------------------------------------------------------
 
@@ -1060,124 +795,30 @@ class Drone:
 
         Does not land. Idempotent. Threads that wait for this drone get :class:`ClosedError`.
         """
-        if self._closed:
-            return
-        self._closed = True
-        try:
-            if self._connection.connected:
-                self._commands.release(wait=not self._connection.receiving)
-        except LinkError:
-            pass  # the link is lost already, and the authority with it
-        finally:
-            self._supervisor.close()
-            for listener in list(self._listeners):
-                listener.cancel()
-            for one in list(self._to_close):
-                one.close()
-            self._state.wake_all()
-            if self._on_close is not None:
-                self._on_close()
+        self._core.close()
 
     def __enter__(self) -> Self:
-        self._check_open()
+        self._core.check_open()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        problem = self.leave()
+        problem = self._core.leave()
         if problem is not None:
             _log.warning("%s could not be left as it should: %s", self.name, problem)
 
-    def leave(self) -> SkyloopError | None:
-        """Do what the end of a block does: land what this application flies, or hover (see ``on_exit``), and close.
-
-        Waits until the vehicle has landed. Idempotent.
-
-        Returns:
-            What went wrong; None if nothing did.
-        """
-        problem = None
-        try:
-            if not self._closed and self._flies():
-                self._end_flight()
-        except SkyloopError as error:
-            problem = error
-        finally:
-            self.close()
-        return problem
-
     def __repr__(self) -> str:
-        return f"<Drone {self.name or '?'} ({self._connection.state.value}, authority {self.authority.state})>"
+        return f"<Drone {self.name or '?'} ({self._core.connection.state.value}, authority {self.authority.state})>"
 
     # Inside ------------------------------------------------------------------------------------------------------
 
-    def _check_open(self) -> None:
-        if self._closed:
-            raise ClosedError("this drone was closed: connect again")
-
-    def _check_may_wait(self) -> None:
-        if self._connection.receiving:
-            raise UsageError("an inline listener can't wait for what it would itself have to receive")
-
-    def _known(self) -> bool:
-        """Whether feedback has come and the link's state was judged."""
-        return self._state.newest is not None and self._state.status.application is not LinkState.CONNECTING
-
-    def _flies(self) -> bool:
-        """Whether this application has the vehicle in the air, or has just commanded a take-off."""
-        newest = self._state.newest
-        if self._state.status.vehicle is LinkState.CLOSED:
-            return False  # a recording that has ended: nothing to land
-        airborne = newest is not None and newest.state.airborne
-        if newest is not None and newest.others:
-            return False  # flown by others too: not ours to land or to stop
-        return self._commands.status.state == "held" and (airborne or self._commands.wants_flight)
-
-    def _end_flight(self) -> None:
-        if self._on_exit == "land":
-            self.land()
-        else:
-            self.hover()
-
     def _proxy_statistics(self) -> Statistics | None:
         try:
-            answer = self._connection.call(GetStatistics, 0.2)
+            answer = self._core.connection.call(GetStatistics, 0.2)
         except LinkError:
             return None
         return answer if isinstance(answer, Statistics) else None
-
-    def _command(self, action: AnyAction, *, now: bool = False) -> bool:
-        if self._closed:
-            self._check_open()
-        welcome = self._state.welcome
-        if welcome is not None and not welcome.capabilities.actions:
-            why_not = welcome.capabilities.why_not or "the vehicle takes no commands"
-            raise UnsupportedError(f"{action.name} is not possible: {why_not}")
-        return self._commands.command(action, now=now)
-
-    def _complete(self, action: AnyAction, states: Set[FlightState], wait: bool, timeout_s: float) -> None:
-        """Send the command and, if ``wait``, wait until feedback shows one of ``states``."""
-        if not wait:
-            self._command(action, now=True)
-            return
-        if type(action) is not Land:  # a landing is commanded all the same: nothing is safer
-            self._check_may_wait()
-        deadline_s = time.monotonic() + timeout_s
-        waiting = ActionWait(
-            action, states, self._command, lambda: self._closed, self._commands, self._state, self._connection
-        )
-        self._check_may_wait()
-        waiting.wait(timeout_s, deadline_s)
-
-    @contextmanager
-    def _closing(self, mailbox: _Closable) -> Iterator[None]:
-        """Close ``mailbox``, which wakes its consumer, if the drone is closed within the block."""
-        self._to_close.append(mailbox)
-        try:
-            yield
-        finally:
-            self._to_close.remove(mailbox)
 
     def _listen(
         self,
@@ -1191,23 +832,48 @@ class Drone:
         self._check_listener(function)
         inline = inline or self._state.scheduler.in_step
         listener = Listener(
-            function, channel, self._report, name=name, depth=depth, inline=inline, on_cancel=self._cancelled
+            function, channel, self._core.report, name=name, depth=depth, inline=inline, on_cancel=self._core.cancelled
         )
-        self._listeners.append(listener)
+        self._core.listeners.append(listener)
         return listener
 
     def _check_listener(self, function: Callable[[Any], object]) -> None:
-        self._check_open()
+        self._core.check_open()
         if not callable(function):
             raise UsageError(f"{function!r:.80} can't be called: a function with one argument is needed")
 
-    def _cancelled(self, listener: Listener[Any]) -> None:
-        if listener in self._listeners:
-            self._listeners.remove(listener)
 
-    def _report(self, where: str, error: Exception) -> None:
-        text = f"{where} raised {type(error).__name__}: {error}"
-        self._state.emit(EventKind.CALLBACK_ERROR, text, Severity.ERROR, where=where)
+def open_drone(
+    dial: Dialer,
+    *,
+    app: str,
+    priority: int = DEFAULT_PRIORITY,
+    wait_s: float = 0.0,
+    timeout_s: float = 5.0,
+    for_s: float | None = None,
+    takeover: TakeoverWay = "now",
+    stay: bool = False,
+    **options: Unpack[DroneOptions],
+) -> Drone:
+    """Connect by a dialer; applications call :func:`skyloop.connect`.
+
+    Args:
+        dial: Makes a connection to the proxy each time one is needed.
+        app: Name of this application, 1 to 64 characters.
+        priority: See :meth:`DroneCore.open`.
+        wait_s: See :meth:`DroneCore.open`.
+        timeout_s: See :meth:`DroneCore.open`.
+        for_s: See :meth:`DroneCore.open`.
+        takeover: See :meth:`DroneCore.open`.
+        stay: See :meth:`DroneCore.open`.
+        **options: As for :class:`DroneCore`.
+
+    Raises:
+        SkyloopError: As :class:`DroneCore` and :meth:`DroneCore.open`.
+    """
+    core = DroneCore(dial, app=app, **options)
+    core.open(priority=priority, wait_s=wait_s, timeout_s=timeout_s, for_s=for_s, takeover=takeover, stay=stay)
+    return Drone(core)
 
 
 def _from_numpy(value: Any) -> Any:

@@ -33,6 +33,46 @@ MAX_NUMBERS = 256
 _NEED_AUTHORITY = frozenset({Refusal.NO_AUTHORITY, Refusal.FOREIGN_LEASE, Refusal.OBSERVER})
 
 
+class Restorer:
+    """Writes parameters once more that the application wrote before the proxy was lost."""
+
+    def __init__(self, connection: ProxyConnection, emit: Emit) -> None:
+        self._connection = connection
+        self._emit = emit
+        self._lock = threading.Lock()
+        self._written: dict[str, Value] = {}
+        self._restore = False  #: the connection on which they were written was lost
+
+    def written(self, name: str, value: Value) -> None:
+        """Note what the application has written."""
+        with self._lock:
+            self._written[name] = value
+
+    def disconnected(self) -> None:
+        """Note that the proxy may have lost what was written."""
+        self._restore = True
+
+    def granted(self, lease: int) -> None:
+        """Write once more what a lost connection may have undone, now that the authority is held. Does not wait."""
+        if not self._restore:
+            return
+        self._restore = False
+        with self._lock:
+            written = dict(self._written)
+        for name, value in written.items():
+            self._connection.ask(SetParameter(name, value, lease), self._restored(name, value), ANSWER_S)
+
+    def _restored(self, name: str, value: Value) -> Callable[[AnyReply | LinkError], None]:
+        def done(answer: AnyReply | LinkError) -> None:
+            if isinstance(answer, LinkError):
+                self._restore = True  # lost again: retried with the next grant
+            elif isinstance(answer, Refused):
+                text = f"{name} could not be set to {value!r} again: {answer.message}"
+                self._emit(EventKind.PARAMETER_CHANGED, text, name=name, reason=answer.code.value)
+
+        return done
+
+
 class Config(Mapping[str, Value]):
     """Parameters as a mapping from name to value, each access one request to the proxy.
 
@@ -41,13 +81,10 @@ class Config(Mapping[str, Value]):
     method waits for the proxy's answer and raises :class:`NoAnswerError` if there is none within 2 s.
     """
 
-    def __init__(self, connection: ProxyConnection, authority: Authority, emit: Emit) -> None:
+    def __init__(self, connection: ProxyConnection, authority: Authority, restorer: Restorer) -> None:
         self._connection = connection
         self._authority = authority
-        self._emit = emit
-        self._lock = threading.Lock()
-        self._written: dict[str, Value] = {}
-        self._restore = False  #: the connection on which they were written was lost
+        self._restorer = restorer
 
     def __getitem__(self, name: str) -> Value:
         """Return the present value.
@@ -70,8 +107,7 @@ class Config(Mapping[str, Value]):
         answer = self._call(name, lambda: SetParameter(_name(name), plain, self._authority.status.lease))
         if not isinstance(answer, ParameterValue):
             raise LinkError(f"the proxy answered the writing of {name} with {type(answer).__name__}")
-        with self._lock:
-            self._written[name] = plain
+        self._restorer.written(name, plain)
 
     def describe(self, name: str) -> Parameter:
         """Return all that is known of a parameter: type, unit, range, default, value, description.
@@ -112,32 +148,6 @@ class Config(Mapping[str, Value]):
     def values(self) -> list[Value]:  # type: ignore[override]
         """Return the values of all parameters, sorted by name."""
         return [parameter.value for parameter in self.parameters()]
-
-    # For the drone ---------------------------------------------------------------------------------------------
-
-    def disconnected(self) -> None:
-        """Note that the proxy may have lost what was written."""
-        self._restore = True
-
-    def granted(self, lease: int) -> None:
-        """Write once more what a lost connection may have undone, now that the authority is held. Does not wait."""
-        if not self._restore:
-            return
-        self._restore = False
-        with self._lock:
-            written = dict(self._written)
-        for name, value in written.items():
-            self._connection.ask(SetParameter(name, value, lease), self._restored(name, value), ANSWER_S)
-
-    def _restored(self, name: str, value: Value) -> Callable[[AnyReply | LinkError], None]:
-        def done(answer: AnyReply | LinkError) -> None:
-            if isinstance(answer, LinkError):
-                self._restore = True  # lost again: retried with the next grant
-            elif isinstance(answer, Refused):
-                text = f"{name} could not be set to {value!r} again: {answer.message}"
-                self._emit(EventKind.PARAMETER_CHANGED, text, name=name, reason=answer.code.value)
-
-        return done
 
     def _call(self, name: str, body: Callable[[], AnyRequest]) -> AnyReply:
         answer = self._connection.call(body, ANSWER_S)

@@ -49,6 +49,16 @@ class Tick:
     late_s: float  #: how much later than it was due
 
 
+def check_policy(on_error: str) -> None:
+    """Check an ``on_error``.
+
+    Raises:
+        UsageError: If it is unknown.
+    """
+    if on_error not in get_args(OnError):
+        raise UsageError(f"on_error is {on_error!r} and must be one of {', '.join(map(repr, get_args(OnError)))}")
+
+
 class Swarm:
     """Drones by name, in a fixed order; made by :func:`skyloop.swarm`. A context manager, for one thread at a time.
 
@@ -87,7 +97,7 @@ class Swarm:
         Raises:
             UsageError: If there is no drone, or ``on_error`` is unknown.
         """
-        self.check_policy(on_error)
+        check_policy(on_error)
         if not drones:
             raise UsageError("a swarm needs at least one drone")
         self.on_error = on_error
@@ -96,16 +106,6 @@ class Swarm:
         self._aside: dict[str, Exception] = {}
         self._closed = False
         self._spreads_ns = array("q")
-
-    @staticmethod
-    def check_policy(on_error: str) -> None:
-        """Check an ``on_error``.
-
-        Raises:
-            UsageError: If it is unknown.
-        """
-        if on_error not in get_args(OnError):
-            raise UsageError(f"on_error is {on_error!r} and must be one of {', '.join(map(repr, get_args(OnError)))}")
 
     # Who is in it ----------------------------------------------------------------------------------------------
 
@@ -450,7 +450,7 @@ class Swarm:
 
     # The end ---------------------------------------------------------------------------------------------------
 
-    def leave(self) -> dict[str, Exception]:
+    def _leave(self) -> dict[str, Exception]:
         """Do what the end of the block does: land all that fly, at the same time, and close.
 
         Idempotent.
@@ -461,7 +461,7 @@ class Swarm:
         if self._closed:
             return {}
         self._closed = True
-        left, errors = in_parallel({name: drone.leave for name, drone in self._drones.items()})
+        left, errors = in_parallel({name: drone._core.leave for name, drone in self._drones.items()})
         return errors | {name: problem for name, problem in left.items() if problem is not None}
 
     def close(self) -> None:
@@ -477,7 +477,7 @@ class Swarm:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         aside = self._still_aside()
-        errors = aside | self.leave()
+        errors = aside | self._leave()
         if not errors:
             return
         report = SwarmError("the flight", errors, len(self))
@@ -515,7 +515,7 @@ def _try_all(items: Mapping[str, T], function: Callable[[T], R]) -> tuple[dict[s
 
 def _wait_open(drones: Mapping[str, Drone]) -> None:
     """Wait, a few milliseconds at most, until every drone sends a new set-point at once, so that none leaves later."""
-    open_ns = max((drone.open_ns for drone in drones.values()), default=0)
+    open_ns = max((drone._core.commands.open_ns for drone in drones.values()), default=0)
     time.sleep(max(0, open_ns - time.monotonic_ns()) / 1e9)
 
 

@@ -15,7 +15,7 @@ from skyloop.client.connection import ProxyConnection
 from skyloop.client.feedback_history import FeedbackHistory
 from skyloop.client.frame import Arrival, Frame
 from skyloop.client.mailbox import Mailbox
-from skyloop.client.parameters import Config
+from skyloop.client.parameters import Restorer
 from skyloop.client.results import Result, ResultChannels, ResultMailbox
 from skyloop.client.scheduler import Scheduler
 from skyloop.client.statistics import ChannelCounter, ChannelStats
@@ -231,13 +231,13 @@ class Receiver:
     """
 
     def __init__(
-        self, name: str, state: ClientState, connection: ProxyConnection, commands: CommandSender, parameters: Config
+        self, name: str, state: ClientState, connection: ProxyConnection, commands: CommandSender, restorer: Restorer
     ) -> None:
         self._name = name
         self._state = state
         self._connection = connection
         self._commands = commands
-        self._parameters = parameters
+        self._restorer = restorer
         self._clock = state.scheduler.clock
 
     def connected(self, welcome: Welcome) -> None:
@@ -257,7 +257,7 @@ class Receiver:
 
     def disconnected(self, reason: str) -> None:  # noqa: ARG002  (link_changed publishes it)
         """Drop the authority and the set-point; ``reason`` is published by :meth:`link_changed`."""
-        self._parameters.disconnected()
+        self._restorer.disconnected()
         self._commands.disconnected()
 
     def link_changed(self, state: LinkState, reason: str) -> None:

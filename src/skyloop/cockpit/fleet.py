@@ -40,9 +40,9 @@ def observe(found: Found) -> Drone:
     Raises:
         SkyloopError: It can't be connected to within :data:`CONNECT_S`.
     """
-    from skyloop.client import Drone
+    from skyloop.client.drone import open_drone
 
-    return Drone(found.dial, app="cockpit", access="observe").open(timeout_s=CONNECT_S)
+    return open_drone(found.dial, app="cockpit", access="observe", timeout_s=CONNECT_S)
 
 
 class Fleet:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Self
 
 from skyloop.client import AuthorityStatus, Drone
 from skyloop.client.commands import ANSWER_S
+from skyloop.client.core import DroneCore
 from skyloop.clock import monotonic_ns
 from skyloop.errors import LinkError, RefusedError
 from skyloop.messages import AnswerTakeover, FlightState, LinkState, Refused
+from skyloop.transport.base import Dialer
 
 
 class PilotConnection(Drone):
@@ -17,29 +19,39 @@ class PilotConnection(Drone):
     Without the authority it can stop the motors in an emergency, and nothing else.
     """
 
-    _armed = False
+    @classmethod
+    def open(cls, dial: Dialer, app: str, timeout_s: float) -> Self:
+        """Connect, without the authority.
+
+        Args:
+            dial: Makes a connection to the proxy each time one is needed.
+            app: The name under which it connects.
+            timeout_s: Time for the proxy to answer [s].
+
+        Raises:
+            SkyloopError: It can't be opened.
+        """
+        core = DroneCore(dial, app=app, on_exit="hover")
+        core.open(timeout_s=timeout_s, acquire=False)
+        return cls(core)
 
     def set_flown_by_person(self) -> None:
         """Hold nothing on its own, only while the page is known to be there, as a person flies by it."""
-        self._commands.flown_by_person()
+        self._core.commands.flown_by_person()
 
     def present_until(self, until_ns: int) -> None:
         """Count the page as present until then, on this process's monotonic clock; afterwards this pilot is silent."""
-        self._commands.present_until(until_ns)
+        self._core.commands.present_until(until_ns)
 
     @property
     def is_silent(self) -> bool:
         """Whether the page was not known to be there for too long."""
-        return not self._commands.is_present(monotonic_ns())
+        return not self._core.commands.is_present(monotonic_ns())
 
     @property
     def is_linked(self) -> bool:
         """Whether there is a connection to the proxy now."""
         return self.link.application in (LinkState.UP, LinkState.DEGRADED)
-
-    def request_authority(self, priority: int | None = None, **options: Any) -> AuthorityStatus:
-        """Do as :class:`skyloop.Drone` does, but nothing until :meth:`acquire` was called."""
-        return super().request_authority(priority, **options) if self._armed else self.authority
 
     def acquire(self, priority: int, *, ask: bool = False) -> AuthorityStatus:
         """Ask for the authority now.
@@ -51,7 +63,6 @@ class PilotConnection(Drone):
         Raises:
             AuthorityError: Another application has it; the message names which.
         """
-        self._armed = True
         return self.request_authority(priority, takeover="ask" if ask else "now", stay=ask)
 
     def answer_takeover(self, lease: int, app_id: int, grant: bool, reason: str) -> None:
@@ -67,7 +78,7 @@ class PilotConnection(Drone):
             RefusedError: The authority is not held any more.
             LinkError: The proxy does not answer.
         """
-        reply = self._connection.call(lambda: AnswerTakeover(lease, app_id, grant, reason), ANSWER_S)
+        reply = self._core.connection.call(lambda: AnswerTakeover(lease, app_id, grant, reason), ANSWER_S)
         if isinstance(reply, Refused):
             raise RefusedError(reply.message, code=reply.code.value)
 

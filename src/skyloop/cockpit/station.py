@@ -74,9 +74,7 @@ class Station:
         from skyloop.cockpit.pilot_connection import PilotConnection
 
         def connect() -> PilotConnection:
-            pilot = PilotConnection(self.found.dial, app=app, on_exit="hover")
-            pilot.open(timeout_s=PILOT_S)
-            return pilot
+            return PilotConnection.open(self.found.dial, app, PILOT_S)
 
         pilot = await asyncio.to_thread(connect)
         self.pilots.add(pilot)

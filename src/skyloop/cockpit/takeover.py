@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from skyloop.client import AuthorityStatus
-from skyloop.client.authority import TakeoverRequest, takeover_request
+from skyloop.client.authority import TakeoverQuery, takeover_query
 from skyloop.clock import monotonic_ns, nanoseconds, seconds
 from skyloop.errors import RefusedError
 from skyloop.messages import Event, EventKind
@@ -28,17 +28,17 @@ Json = dict[str, Any]
 class TakeoverQuestion:
     """Somebody asks for the authority that this page holds."""
 
-    request: TakeoverRequest
+    query: TakeoverQuery
     until_ns: int  #: when the time to ask is over, on the proxy's clock
     declined: bool = False  #: by this page; who is of higher priority gets it all the same when the time is over
 
     def to_json(self, now_ns: int) -> Json:
         """Return it as JSON values; ``now_ns`` is the proxy's clock."""
         return {
-            "id": self.request.by_id,
-            "by": self.request.by,
-            "priority": self.request.priority,
-            "for_s": self.request.for_s,
+            "id": self.query.by_id,
+            "by": self.query.request.by,
+            "priority": self.query.request.priority,
+            "for_s": self.query.request.for_s,
             "left_s": max(0.0, seconds(self.until_ns - now_ns)),
             "declined": self.declined,
         }
@@ -62,10 +62,10 @@ class TakeoverQuestions:
         if event.kind is EventKind.AUTHORITY_WITHDRAWN and event.data.get("app_id") == app_id:
             by_id = event.data.get("by_id")
             return isinstance(by_id, int) and self._open.pop(by_id, None) is not None
-        request = takeover_request(event, app_id)
-        if request is None:
+        query = takeover_query(event, app_id)
+        if query is None:
             return False
-        self._open[request.by_id] = TakeoverQuestion(request, event.at_ns + nanoseconds(request.within_s))
+        self._open[query.by_id] = TakeoverQuestion(query, event.at_ns + nanoseconds(query.request.within_s))
         return True
 
     def decline(self, by_id: int) -> bool:
@@ -78,13 +78,13 @@ class TakeoverQuestions:
 
     def update(self, lease: int, now_ns: int) -> bool:
         """Drop the questions of another lease, and those whose time is over."""
-        left = {by_id: one for by_id, one in self._open.items() if one.request.lease == lease and now_ns < one.until_ns}
+        left = {by_id: one for by_id, one in self._open.items() if one.query.lease == lease and now_ns < one.until_ns}
         changed, self._open = len(left) != len(self._open), left
         return changed
 
     def to_json(self, now_ns: int) -> Json:
         """Return the message to the page; who would get the authority first comes first."""
-        ordered = sorted(self._open.values(), key=lambda one: (one.request.priority, one.until_ns))
+        ordered = sorted(self._open.values(), key=lambda one: (one.query.request.priority, one.until_ns))
         return {"type": "asked", "questions": [one.to_json(now_ns) for one in ordered]}
 
 
@@ -182,7 +182,7 @@ class TakeoverDialog:
         question = self._questions.find(command.id)
         if question is None:
             raise RefusedError("nobody asks for control any more")
-        lease = question.request.lease
+        lease = question.query.lease
         await asyncio.to_thread(pilot.answer_takeover, lease, command.id, command.grant, command.reason)
         if not command.grant and self._questions.decline(command.id):
             self._send(self._questions.to_json(pilot.proxy_now_ns))

@@ -142,7 +142,7 @@ class Controller:
         wants_frames = own.on_frame is not Controller.on_frame
         wants_results = own.on_result is not Controller.on_result
         wants_feedback = own.on_feedback is not Controller.on_feedback or not (wants_frames or wants_results)
-        inbox = self.drone.inbox(
+        inbox = self.drone._core.inbox(
             feedback=wants_feedback,
             frames=wants_frames,
             camera=self.camera,

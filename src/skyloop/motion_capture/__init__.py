@@ -47,7 +47,7 @@ def mocap(address: str, bodies: Mapping[str, str], *, timeout_s: float = 10.0) -
         UnsupportedError: A simulated drone does not report its true pose.
     """
     system = parse_system(address)
-    return MotionCapture(system, bodies, _source).open(timeout_s)
+    return MotionCapture(system, bodies, _source)._open(timeout_s)
 
 
 def _source(

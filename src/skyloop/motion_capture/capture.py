@@ -114,12 +114,12 @@ class MotionCapture:
         self._event_listeners: list[OnEvent] = []
         self._changed = threading.Condition()
         self._ended = threading.Event()
-        self._source = make(system, self._names, self.take, self._trouble)
+        self._source = make(system, self._names, self._take, self._trouble)
         self._watch = threading.Thread(target=self._look_on, name="skyloop-mocap-watch", daemon=True)
 
     # Life cycle ------------------------------------------------------------------------------------------------
 
-    def open(self, timeout_s: float = 5.0) -> Self:
+    def _open(self, timeout_s: float = 5.0) -> Self:
         """Connect, and wait for the first frame.
 
         Args:
@@ -212,8 +212,8 @@ class MotionCapture:
         Raises:
             UsageError: The function can't be called.
         """
-        self.listen(pose=function)
-        return Registration(lambda: self.listen_no_more(pose=function))
+        self._listen(pose=function)
+        return Registration(lambda: self._listen_no_more(pose=function))
 
     def on_event(self, function: OnEvent) -> Registration:
         """Call a function whenever a body is found or lost, or the system has trouble.
@@ -227,11 +227,11 @@ class MotionCapture:
         Raises:
             UsageError: The function can't be called.
         """
-        self.listen(event=function)
-        return Registration(lambda: self.listen_no_more(event=function))
+        self._listen(event=function)
+        return Registration(lambda: self._listen_no_more(event=function))
 
-    def listen(self, pose: OnPose | None = None, event: OnEvent | None = None) -> None:
-        """Add callbacks as :meth:`on_pose` and :meth:`on_event` do, until :meth:`listen_no_more`.
+    def _listen(self, pose: OnPose | None = None, event: OnEvent | None = None) -> None:
+        """Add callbacks as :meth:`on_pose` and :meth:`on_event` do, until :meth:`_listen_no_more`.
 
         Raises:
             UsageError: A function can't be called.
@@ -244,7 +244,7 @@ class MotionCapture:
         if event is not None:
             self._event_listeners.append(event)
 
-    def listen_no_more(self, pose: OnPose | None = None, event: OnEvent | None = None) -> None:
+    def _listen_no_more(self, pose: OnPose | None = None, event: OnEvent | None = None) -> None:
         """Remove callbacks. Idempotent."""
         if pose in self._pose_listeners:
             self._pose_listeners.remove(pose)
@@ -317,7 +317,7 @@ class MotionCapture:
 
     # What the source calls -------------------------------------------------------------------------------------
 
-    def take(self, frame: RawFrame) -> None:
+    def _take(self, frame: RawFrame) -> None:
         """Handle a frame of the system."""
         captured_ns = frame.received_ns - self.latency_ns
         for theirs, (position, quaternion) in frame.bodies.items():
@@ -402,7 +402,7 @@ class Linked:
         self._due_ns = 0
 
     def __enter__(self) -> Self:
-        self._capture.listen(self._pose, self._event)
+        self._capture._listen(self._pose, self._event)
         return self
 
     def __exit__(
@@ -412,7 +412,7 @@ class Linked:
 
     def close(self) -> None:
         """Stop logging. Idempotent."""
-        self._capture.listen_no_more(self._pose, self._event)
+        self._capture._listen_no_more(self._pose, self._event)
 
     def _pose(self, pose: BodyPose) -> None:
         if pose.body != self._drone.name or pose.captured_ns < self._due_ns:

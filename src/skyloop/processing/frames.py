@@ -36,7 +36,7 @@ class Frames:
         self._membership = membership
         self._came = came
         self._how: dict[str, Any] = {} if max_fps is None else {"max_fps": max_fps}
-        self._usual = drone.channel(membership.camera)
+        self._usual = drone._core.channel(membership.camera)
         self._channel: VideoChannel | None = None  # subscribed now
         self._buffer: Mailbox[Arrival] = Mailbox()
         self._sink = self._arrived
@@ -71,7 +71,7 @@ class Frames:
 
     def _follow(self, share: ProcessorShare) -> None:
         part = (share.part, share.parts)
-        self._turn_to(self._drone.channel(share.camera, part=part, **self._how) if share.parts else None)
+        self._turn_to(self._drone._core.channel(share.camera, part=part, **self._how) if share.parts else None)
 
     def _turn_to(self, channel: VideoChannel | None) -> None:
         with self._lock:

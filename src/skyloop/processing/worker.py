@@ -68,7 +68,7 @@ class Worker:
 
         Raises:
             NameTakenError: If another application runs other code under this name.
-            SkyloopError: Whatever else :meth:`skyloop.client.Drone.join_processor` raises.
+            SkyloopError: Whatever else :meth:`skyloop.client.core.DroneCore.join_processor` raises.
         """
         self.settings = settings
         self._drone = drone
@@ -80,7 +80,7 @@ class Worker:
         self._busy_since_s: float | None = None
         self._told_s = -math.inf
         self._told_refused = False
-        self.membership = drone.join_processor(
+        self.membership = drone._core.join_processor(
             settings.name, code=settings.code, camera=settings.camera, shared=settings.shared
         )
         self.membership.ready = self._ready

@@ -193,7 +193,7 @@ class Stream:
         self.newest_ns = 0  #: arrival of the newest decodable frame, or the start
         self._put = put
         self._channel = f"{VIDEO}.{camera}"
-        self._topic = drone.channel(camera).stream
+        self._topic = drone._core.channel(camera).stream
         self._chain = Chain()
         self._begun = False
         self._sink = self._arrived
@@ -242,10 +242,10 @@ class Video:
         self.channel = f"{VIDEO}.{camera}"
         self.gaps = Gaps()
         self._put = put
-        self._topic = drone.channel(camera)
+        self._topic = drone._core.channel(camera)
         self._encode = encoder(options)
         self._format = "png" if options.encoding == "png" else "jpeg"
-        self._stream = Stream(put, drone, camera) if options.keeps_stream(drone.channel(camera).camera) else None
+        self._stream = Stream(put, drone, camera) if options.keeps_stream(drone._core.channel(camera).camera) else None
         self._lock = threading.Lock()  # guards the subscription to frames
         self._listening = self._ended = False
         self._failed = 0

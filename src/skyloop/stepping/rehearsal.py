@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.client import Drone
+from skyloop.client.drone import open_drone
 from skyloop.clock import NS_PER_S, ManualClock, nanoseconds
 from skyloop.drivers.base import Sink
 from skyloop.drivers.sim import SimDriver, options_of
@@ -92,7 +93,7 @@ def rehearse(uri: str = "sim://?position=1&cameras=none", *, radio: Radio | None
         scheduler = StepScheduler(clock, executor, proxy, lambda: driver, _BEGIN_NS)
         proxy.start()
         try:
-            with Drone(server.dial, app="rehearsal", scheduler=scheduler).open(timeout_s=_CONNECT_S) as drone:
+            with open_drone(server.dial, app="rehearsal", scheduler=scheduler, timeout_s=_CONNECT_S) as drone:
                 yield drone
         finally:
             proxy.stop()

@@ -1,0 +1,443 @@
+"""What a drone is made of, and what Skyloop's own packages do with it; applications use :class:`Drone`."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Set
+from contextlib import contextmanager
+from typing import Any, Final, Literal, Protocol, TypedDict
+
+from skyloop.client.authority import Authority, TakeoverWay, authority_wish
+from skyloop.client.channels import Listener, VideoChannel
+from skyloop.client.command_schedule import CommandSchedule
+from skyloop.client.commands import CommandSender
+from skyloop.client.completion import ActionWait
+from skyloop.client.connection import ConnectionSupervisor, ProxyConnection, RedialPolicy
+from skyloop.client.logbook import Logbook
+from skyloop.client.parameters import Config, Restorer
+from skyloop.client.results import ResultChannel, checked_age, checked_name
+from skyloop.client.scheduler import Scheduler
+from skyloop.client.telemetry import ClientState, Mailboxes, Receiver
+from skyloop.client.worker import Membership
+from skyloop.errors import (
+    ClosedError,
+    LinkError,
+    NoAnswerError,
+    SkyloopError,
+    UnknownNameError,
+    UnsupportedError,
+    UsageError,
+)
+from skyloop.messages import (
+    DEFAULT_PRIORITY,
+    AnyAction,
+    EventKind,
+    FlightState,
+    Hello,
+    Hover,
+    Land,
+    LinkState,
+    Role,
+    Severity,
+)
+from skyloop.messages.result import MAX_CODE
+from skyloop.messages.video import DEFAULT_QUALITY, VideoEncoding, VideoRequest
+from skyloop.transport.base import EVENTS, FEEDBACK, Dialer
+
+Access = Literal["pilot", "observe"]
+OnExit = Literal["land", "hover"]
+UP: Final = frozenset({FlightState.HOVERING, FlightState.FLYING})
+DOWN: Final = frozenset({FlightState.LANDED})
+LANDING_S: Final = 20.0  #: how long a landing is waited for
+
+
+class Closable(Protocol):
+    """What ends with the drone."""
+
+    def close(self) -> None: ...
+
+
+class DroneOptions(TypedDict, total=False):
+    """Options of a :class:`DroneCore`, as it documents them."""
+
+    access: Access
+    rate_hz: float
+    stall_s: float
+    on_exit: OnExit
+    policy: RedialPolicy | None
+    scheduler: Scheduler | None
+    on_close: Callable[[], None] | None
+    reach: str | None
+
+
+class DroneCore:
+    """The parts of one drone, wired, with its beginning and its end. May be used from any thread.
+
+    It is ``drone._core`` for Skyloop's other packages, and may change with any version.
+    """
+
+    def __init__(
+        self,
+        dial: Dialer,
+        *,
+        app: str,
+        access: Access = "pilot",
+        rate_hz: float = 32.0,
+        stall_s: float = 1.0,
+        on_exit: OnExit = "land",
+        policy: RedialPolicy | None = None,
+        scheduler: Scheduler | None = None,
+        on_close: Callable[[], None] | None = None,
+        reach: str | None = None,
+    ) -> None:
+        """Prepare a drone without connecting; :meth:`open` connects.
+
+        Args:
+            dial: Makes a connection to the proxy each time one is needed.
+            app: Name of this application, 1 to 64 characters.
+            access: ``"pilot"`` may command, ``"observe"`` only reads.
+            rate_hz: Rate at which commands are repeated, 1 to 200 Hz.
+            stall_s: Time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never.
+            on_exit: What an airborne vehicle does at the end of the block, ``"land"`` or ``"hover"``.
+            policy: When to reconnect and when a link counts as lost.
+            scheduler: Source of the time and of waiting; None: real time.
+            on_close: Called at the end of :meth:`close`, on the closing thread.
+            reach: Name or address under which another process reaches the same vehicle; None if none can.
+
+        Raises:
+            UsageError: If ``access``, ``on_exit``, ``app``, ``rate_hz`` or ``stall_s`` is out of range.
+        """
+        if access not in ("pilot", "observe"):
+            raise UsageError(f'access is {access!r} and must be "pilot" or "observe"')
+        if on_exit not in ("land", "hover"):
+            raise UsageError(f'on_exit is {on_exit!r} and must be "land" or "hover"')
+        if not 1 <= len(app) <= 64:
+            raise UsageError(f"an application's name has 1 to 64 characters, not {len(app)}: {app!r:.80}")
+        scheduler = scheduler or Scheduler()
+        self.app = app
+        self.role = Role.PILOT if access == "pilot" else Role.OBSERVER
+        self.closed = False
+        self.reach = reach
+        self.listeners: list[Listener[Any]] = []
+        self._on_exit = on_exit
+        self._on_close = on_close
+        self._to_close: list[Closable] = []  # what ends with the drone
+        # Each part uses those before it; the receiver handles what arrives in every session.
+        connection = self.connection = ProxyConnection(scheduler.clock)
+        authority = Authority(app)
+        state = self.state = ClientState(app, connection, scheduler)
+        restorer = Restorer(connection, state.emit)
+        self.config = Config(connection, authority, restorer)
+        self.log = Logbook(connection, app)
+        self.commands = CommandSender(
+            self.role,
+            authority,
+            CommandSchedule(rate_hz=rate_hz, stall_s=stall_s),
+            connection,
+            scheduler,
+            emit=state.emit,
+            changed=state.notifier.notify,
+            granted=restorer.granted,
+        )
+        self.supervisor = ConnectionSupervisor(
+            connection,
+            Receiver(app, state, connection, self.commands, restorer),
+            dial,
+            Hello(app, self.role),
+            policy=policy,
+            clock=scheduler.clock,
+            begin=scheduler.begin,
+        )
+        for topic in (EVENTS, FEEDBACK):
+            connection.subscribe(topic)
+
+    # Beginning and end -------------------------------------------------------------------------------------------
+
+    @property
+    def name(self) -> str:
+        """Name of the proxy; empty before the first connection."""
+        return "" if self.state.welcome is None else self.state.welcome.proxy
+
+    def open(
+        self,
+        *,
+        priority: int = DEFAULT_PRIORITY,
+        wait_s: float = 0.0,
+        timeout_s: float = 5.0,
+        for_s: float | None = None,
+        takeover: TakeoverWay = "now",
+        stay: bool = False,
+        acquire: bool = True,
+    ) -> None:
+        """Connect, then wait for feedback and, as a pilot, for the authority. Closes the drone if anything fails.
+
+        Args:
+            priority: Of the request for the authority, 0 (highest) to 31.
+            wait_s: How long to wait in the queue for the authority [s].
+            timeout_s: Time for the proxy to answer and to send its first feedback [s].
+            for_s: See :meth:`Drone.request_authority`.
+            takeover: See :meth:`Drone.request_authority`.
+            stay: See :meth:`Drone.request_authority`.
+            acquire: Whether a pilot asks for the authority now; if False it does so when it wants.
+
+        Raises:
+            NoAnswerError: If no answer or no feedback comes in time.
+            RefusedError: If the proxy refuses the connection.
+            AuthorityError: If the authority can't be had.
+            LinkError: If the proxy can't be reached.
+        """
+        try:
+            deadline = time.monotonic() + timeout_s
+            self.supervisor.start(timeout_s)
+            left_s = max(0.1, deadline - time.monotonic())
+            if not self.state.notifier.wait_for(self._known, left_s):
+                raise NoAnswerError(f"{self.name} answered, but reported no vehicle state within {timeout_s:g} s")
+            if acquire and self.role is Role.PILOT:
+                self.check_open()
+                self.commands.request(authority_wish(priority, for_s, takeover), wait_s, stay=stay)
+            self.state.scheduler.opened()
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Release the authority, then end the connection, all threads and a private proxy. Does not land. Idempotent.
+
+        Threads that wait for this drone get :class:`ClosedError`.
+        """
+        if self.closed:
+            return
+        self.closed = True
+        try:
+            if self.connection.connected:
+                self.commands.release(wait=not self.connection.receiving)
+        except LinkError:
+            pass  # the link is lost already, and the authority with it
+        finally:
+            self.supervisor.close()
+            for listener in list(self.listeners):
+                listener.cancel()
+            for one in list(self._to_close):
+                one.close()
+            self.state.wake_all()
+            if self._on_close is not None:
+                self._on_close()
+
+    def leave(self) -> SkyloopError | None:
+        """Do what the end of a block does: land what this application flies, or hover (see ``on_exit``), and close.
+
+        Waits until the vehicle has landed. Idempotent.
+
+        Returns:
+            What went wrong; None if nothing did.
+        """
+        problem = None
+        try:
+            if not self.closed and self._flies():
+                if self._on_exit == "land":
+                    self.complete(Land(), DOWN, True, LANDING_S)
+                else:
+                    self.command(Hover())
+        except SkyloopError as error:
+            problem = error
+        finally:
+            self.close()
+        return problem
+
+    @contextmanager
+    def closing(self, mailbox: Closable) -> Iterator[None]:
+        """Close ``mailbox``, which wakes its consumer, if the drone is closed within the block."""
+        self._to_close.append(mailbox)
+        try:
+            yield
+        finally:
+            self._to_close.remove(mailbox)
+
+    def check_open(self) -> None:
+        """Raise :class:`ClosedError` after :meth:`close`."""
+        if self.closed:
+            raise ClosedError("this drone was closed: connect again")
+
+    def check_may_wait(self) -> None:
+        """Raise :class:`UsageError` on the receiving thread."""
+        if self.connection.receiving:
+            raise UsageError("an inline listener can't wait for what it would itself have to receive")
+
+    def _known(self) -> bool:
+        """Whether feedback has come and the link's state was judged."""
+        return self.state.newest is not None and self.state.status.application is not LinkState.CONNECTING
+
+    def _flies(self) -> bool:
+        """Whether this application has the vehicle in the air, or has just commanded a take-off."""
+        newest = self.state.newest
+        if self.state.status.vehicle is LinkState.CLOSED:
+            return False  # a recording that has ended: nothing to land
+        airborne = newest is not None and newest.state.airborne
+        if newest is not None and newest.others:
+            return False  # flown by others too: not ours to land or to stop
+        return self.commands.status.state == "held" and (airborne or self.commands.wants_flight)
+
+    # Commands ----------------------------------------------------------------------------------------------------
+
+    def command(self, action: AnyAction, *, now: bool = False) -> bool:
+        """Make ``action``, whose numbers were checked, the newest set-point; see :class:`Drone`.
+
+        Args:
+            action: The action.
+            now: See :meth:`CommandSender.command`.
+        """
+        if self.closed:
+            self.check_open()
+        welcome = self.state.welcome
+        if welcome is not None and not welcome.capabilities.actions:
+            why_not = welcome.capabilities.why_not or "the vehicle takes no commands"
+            raise UnsupportedError(f"{action.name} is not possible: {why_not}")
+        return self.commands.command(action, now=now)
+
+    def complete(self, action: AnyAction, states: Set[FlightState], wait: bool, timeout_s: float) -> None:
+        """Send the command and, if ``wait``, wait until feedback shows one of ``states``; see :meth:`Drone.land`."""
+        if not wait:
+            self.command(action, now=True)
+            return
+        if type(action) is not Land:  # a landing is commanded all the same: nothing is safer
+            self.check_may_wait()
+        deadline_s = time.monotonic() + timeout_s
+        waiting = ActionWait(
+            action, states, self.command, lambda: self.closed, self.commands, self.state, self.connection
+        )
+        self.check_may_wait()
+        waiting.wait(timeout_s, deadline_s)
+
+    # Consumers -----------------------------------------------------------------------------------------------------
+
+    def channel(
+        self,
+        camera: str | None = None,
+        *,
+        encoding: VideoEncoding | None = None,
+        quality: int | None = None,
+        max_fps: float | None = None,
+        scale: float = 1.0,
+        part: tuple[int, int] | None = None,
+    ) -> VideoChannel:
+        """Return the channel of a camera whose frames come as requested; see :meth:`Drone.frames` for the options.
+
+        Args:
+            camera: Name of the camera; None: the vehicle's first.
+            encoding: ``"jpeg"`` or ``"raw"``; None: ``"jpeg"``.
+            quality: Of JPEG, 1 to 100; None: 80.
+            max_fps: Most frames a second; None: all.
+            scale: Factor for width and height, above 0 and up to 1.
+            part: (k, n): only every n-th frame, from k; None: all.
+
+        Raises:
+            UnknownNameError: If the vehicle has no camera of this name.
+            UnsupportedError: If the vehicle has no camera.
+            UsageError: If an option is out of range, or ``quality`` is given for raw frames.
+            ClosedError: If the drone was closed.
+        """
+        self.check_open()
+        channels = self.state.channels
+        if not channels:
+            raise UnsupportedError("no camera: this vehicle gives no pictures")
+        channel = next(iter(channels.values())) if camera is None else channels.get(camera)
+        if channel is None:
+            raise UnknownNameError("camera", str(camera), channels)
+        if encoding == "raw" and quality is not None:
+            raise UsageError(f'quality={quality!r} is of encoding="jpeg", and the encoding is "raw"')
+        request = VideoRequest(
+            channel.camera.name,
+            encoding="jpeg" if encoding is None else encoding,
+            quality=DEFAULT_QUALITY if quality is None else quality,
+            max_fps=max_fps,
+            scale=scale,
+            part=part,
+        )
+        return channel if request == channel.request else self.state.video(channel.camera, request)
+
+    def result_channel(self, processor: str) -> ResultChannel:
+        """Return the channel of a processor's results, whether or not such a processor runs.
+
+        Raises:
+            UsageError: If ``processor`` can't be a name.
+            ClosedError: If the drone was closed.
+        """
+        self.check_open()
+        return self.state.results.channel(checked_name(processor))
+
+    def inbox(
+        self,
+        *,
+        feedback: bool = True,
+        frames: bool = True,
+        camera: str | None = None,
+        results: bool = False,
+        processors: Iterable[str] | None = None,
+        max_age_s: float | None = None,
+    ) -> Mailboxes:
+        """Return mailboxes of the newest feedback, frame and results, for one thread that waits for all of them.
+
+        Controllers run on them. They fill while they are open as a context manager.
+
+        Args:
+            feedback: Whether feedback is wanted.
+            frames: Whether frames are wanted.
+            camera: Name of the camera; None: the vehicle's first.
+            results: Whether results of processors are wanted.
+            processors: Names of the processors whose results are wanted; None: all.
+            max_age_s: Oldest age of a result that is accepted [s]; None: any.
+
+        Raises:
+            UsageError: If ``max_age_s`` or the name of a processor is unusable.
+            UnknownNameError: If the vehicle has no camera of this name.
+            UnsupportedError: If frames are wanted and the vehicle has no camera.
+        """
+        channels = self.state.results
+        named = None if processors is None else [checked_name(one) for one in processors]
+        wanted = [channels.everything] if named is None else [channels.channel(one) for one in named]
+        return Mailboxes(
+            self.state.scheduler,
+            feedback=self.state.on_feedback if feedback else None,
+            frames=self.channel(camera) if frames else None,
+            results=wanted if results else [],
+            max_age_s=checked_age(max_age_s),
+        )
+
+    def join_processor(
+        self, name: str, *, code: str, camera: str | None = None, shared: bool = True, timeout_s: float = 5.0
+    ) -> Membership:
+        """Become a worker of a processor, as ``skyloop process`` does. The membership ends with the drone.
+
+        Args:
+            name: Name of the processor.
+            code: Identifies the code that runs, the same for all workers of a name; at most 128 characters.
+            camera: Name of the camera; None: the vehicle's first.
+            shared: Each frame goes to one of the workers; if False, each worker gets all.
+            timeout_s: How long to wait for the proxy's answer [s].
+
+        Raises:
+            NameTakenError: If another application runs other code under this name.
+            RefusedError: If the proxy refuses for another reason.
+            NoAnswerError: If the proxy does not answer in time.
+            UsageError: If ``name`` or ``code`` is unusable, or from an inline callback.
+            UnknownNameError: If the vehicle has no camera of this name.
+        """
+        self.check_may_wait()
+        if not isinstance(code, str) or len(code) > MAX_CODE:
+            raise UsageError(f"code is {code!r:.80} and must be a text of at most {MAX_CODE} characters")
+        membership = Membership(
+            self.connection, self.state, checked_name(name), code, self.channel(camera).camera.name, shared=shared
+        )
+        membership.start(timeout_s)
+        self._to_close.append(membership)  # ends with the drone
+        return membership
+
+    def cancelled(self, listener: Listener[Any]) -> None:
+        """Forget a listener, which was cancelled."""
+        if listener in self.listeners:
+            self.listeners.remove(listener)
+
+    def report(self, where: str, error: Exception) -> None:
+        """Emit an event that a callback of the application raised an exception."""
+        text = f"{where} raised {type(error).__name__}: {error}"
+        self.state.emit(EventKind.CALLBACK_ERROR, text, Severity.ERROR, where=where)
