@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 import skyloop
 from skyloop.control.follow import FollowMarker
 from skyloop.control.follow_law import Mode
-from skyloop.messages import Annotation
+from skyloop.messages import Annotation, Takeoff
 from skyloop.sim import STEP_S, Simulation, load_world
 from skyloop.sim.camera import CameraModel, CameraPose
 from skyloop.sim.render import PlanarRenderer, Quality, Scene, SceneState
@@ -148,7 +148,7 @@ def world() -> None:
     gates = load_world("gates", 0)
     simulation = Simulation(gates, 3, seed=0)
     for drone in range(3):
-        simulation.command(drone, skyloop.Takeoff())
+        simulation.command(drone, Takeoff())
     simulation.step(round(4.0 / STEP_S))
     for drone, (forward, left, up) in enumerate(((1.35, -0.1, 0.05), (0.75, 0.1, 0.2), (0.75, 0.1, 0.0))):
         simulation.command(drone, skyloop.Velocity(forward=forward, left=left, up=up))

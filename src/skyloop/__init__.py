@@ -8,230 +8,52 @@
         drone.takeoff()
         drone.velocity(forward=0.3)
 
-Every name is imported when it is first used, so that ``import skyloop`` loads nothing heavy.
+The names are those of the stub beside this file, ``__init__.pyi``, which type checkers read too. Each is imported when
+it is first used, so that ``import skyloop`` loads nothing heavy. More is in the packages: ``skyloop.messages``,
+``skyloop.errors``, ``skyloop.control``, ``skyloop.vision``, ….
 """
 
 from __future__ import annotations
 
+import re
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
-if TYPE_CHECKING:
-    from skyloop import aio
-    from skyloop.client import (
-        AuthorityStatus,
-        ChannelStats,
-        Distribution,
-        Drone,
-        Frame,
-        LinkStatus,
-        Listener,
-        Logbook,
-        Result,
-        Swarm,
-        TakeoverRequest,
-        connect,
-        swarm,
-    )
-    from skyloop.control import Controller, RunSummary
-    from skyloop.errors import (
-        AuthorityError,
-        ClosedError,
-        DecodeError,
-        DriverError,
-        FileFormatError,
-        LinkError,
-        MissingExtraError,
-        NameTakenError,
-        NoAnswerError,
-        ParameterError,
-        RefusedError,
-        SkyloopError,
-        SwarmError,
-        UnknownNameError,
-        UnsupportedError,
-        UsageError,
-    )
-    from skyloop.messages import (
-        Annotation,
-        Applied,
-        Attitude,
-        CameraInfo,
-        Capabilities,
-        Command,
-        EmergencyStop,
-        Event,
-        EventKind,
-        Failsafe,
-        Feedback,
-        FlightState,
-        Hover,
-        Idle,
-        Intrinsics,
-        Land,
-        LinkState,
-        LogEntry,
-        Parameter,
-        Points,
-        Polyline,
-        Severity,
-        Takeoff,
-        Text,
-        Velocity,
-    )
-    from skyloop.motion_capture import MotionCapture, mocap
-    from skyloop.recording import Recorder, record
+_STUB = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
+#: Where each name is imported from.
+_HOMES = {name: home for home, name in re.findall(r"^from (\S+) import (\w+) as \2$", _STUB, re.MULTILINE)}
+#: Where names may be that are not offered here, those first that load least.
+_ELSEWHERE = ("errors", "messages", "client", "control", "recording", "motion_capture")
 
-_HOMES = {
-    "skyloop.client": (
-        "AuthorityStatus",
-        "ChannelStats",
-        "Distribution",
-        "Drone",
-        "Frame",
-        "LinkStatus",
-        "Listener",
-        "Logbook",
-        "Result",
-        "Swarm",
-        "TakeoverRequest",
-        "connect",
-        "swarm",
-    ),
-    "skyloop.control": ("Controller", "RunSummary"),
-    "skyloop.errors": (
-        "AuthorityError",
-        "ClosedError",
-        "DecodeError",
-        "DriverError",
-        "FileFormatError",
-        "LinkError",
-        "MissingExtraError",
-        "NameTakenError",
-        "NoAnswerError",
-        "ParameterError",
-        "RefusedError",
-        "SkyloopError",
-        "SwarmError",
-        "UnknownNameError",
-        "UnsupportedError",
-        "UsageError",
-    ),
-    "skyloop.messages": (
-        "Annotation",
-        "Applied",
-        "Attitude",
-        "CameraInfo",
-        "Capabilities",
-        "Command",
-        "EmergencyStop",
-        "Event",
-        "EventKind",
-        "Failsafe",
-        "Feedback",
-        "FlightState",
-        "Hover",
-        "Idle",
-        "Intrinsics",
-        "Land",
-        "LinkState",
-        "LogEntry",
-        "Parameter",
-        "Points",
-        "Polyline",
-        "Severity",
-        "Takeoff",
-        "Text",
-        "Velocity",
-    ),
-    "skyloop.motion_capture": ("MotionCapture", "mocap"),
-    "skyloop.recording": ("Recorder", "record"),
-}
-_HOME = {name: home for home, names in _HOMES.items() for name in names}
-
-__all__ = [
-    "__version__",
-    "aio",
-    "Annotation",
-    "Applied",
-    "Attitude",
-    "AuthorityError",
-    "AuthorityStatus",
-    "CameraInfo",
-    "Capabilities",
-    "ChannelStats",
-    "ClosedError",
-    "Command",
-    "Controller",
-    "DecodeError",
-    "Distribution",
-    "DriverError",
-    "Drone",
-    "EmergencyStop",
-    "Event",
-    "EventKind",
-    "Failsafe",
-    "Feedback",
-    "FileFormatError",
-    "FlightState",
-    "Frame",
-    "Hover",
-    "Idle",
-    "Intrinsics",
-    "Land",
-    "LinkError",
-    "LinkState",
-    "LinkStatus",
-    "Listener",
-    "LogEntry",
-    "Logbook",
-    "MissingExtraError",
-    "MotionCapture",
-    "NameTakenError",
-    "NoAnswerError",
-    "Parameter",
-    "ParameterError",
-    "Points",
-    "Polyline",
-    "Recorder",
-    "RefusedError",
-    "Result",
-    "RunSummary",
-    "Severity",
-    "SkyloopError",
-    "Swarm",
-    "SwarmError",
-    "Takeoff",
-    "TakeoverRequest",
-    "Text",
-    "UnknownNameError",
-    "UnsupportedError",
-    "UsageError",
-    "Velocity",
-    "connect",
-    "mocap",
-    "record",
-    "swarm",
-]
-
-__version__: str
+__all__ = sorted(["__version__", *_HOMES])  # noqa: PLE0605  (made of the stub)
 
 
 def __getattr__(name: str) -> Any:
-    if name in _HOME:
-        value = getattr(import_module(_HOME[name]), name)
-    elif name == "aio":
-        value = import_module("skyloop.aio")
-    elif name == "__version__":
+    if name == "__version__":
         value = _version()
+    elif name not in _HOMES:
+        raise AttributeError(f"module 'skyloop' has no attribute {name!r}{_hint(name)}")
+    elif _HOMES[name] == __name__:
+        value = import_module(f"{__name__}.{name}")
     else:
-        raise AttributeError(f"module 'skyloop' has no attribute {name!r}")
+        value = getattr(import_module(_HOMES[name]), name)
     globals()[name] = value
     return value
 
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
+
+
+def _hint(name: str) -> str:
+    """Where the class of this name is, for an error; empty if it is nowhere."""
+    if not name[:1].isupper():
+        return ""
+    for package in _ELSEWHERE:
+        if hasattr(import_module(f"{__name__}.{package}"), name):
+            return f": it is in skyloop.{package} (from skyloop.{package} import {name})"
+    return ""
 
 
 def _version() -> str:

@@ -12,6 +12,7 @@ import pytest
 
 import skyloop
 from skyloop.client import Drone, Result
+from skyloop.messages import LinkState
 from tests.processes.conftest import Process, eventually
 
 pytestmark = pytest.mark.process
@@ -106,6 +107,6 @@ def test_workers_outlive_their_proxy(proxy: Callable[..., Process], start: Calla
         first.signal(signal.SIGKILL)
         first.wait()
         proxy(uri)
-        drone.wait(lambda _: drone.link.application is skyloop.LinkState.UP, 10.0)
+        drone.wait(lambda _: drone.link.application is LinkState.UP, 10.0)
         again_ns = drone.feedback().captured_ns
         eventually(lambda: found.pids(again_ns) == {one.pid for one in workers}, "both work again")
