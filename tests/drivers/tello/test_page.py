@@ -34,7 +34,7 @@ def test_times() -> None:
         f"{ENTER_NS / 1e9:g} s",
     ):
         assert words in text
-    assert f"`wifi?` every {ALIVE_NS / 1e9:g} s" in section("docs/tello.md", "### What is said to the drone")
+    assert f"`wifi?` every {ALIVE_NS / 1e9:g} s" in section("docs/tello.md", "### Commands sent to the drone")
 
 
 def test_what_a_full_stick_is() -> None:
