@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import re
 import tomllib
+from types import ModuleType
 
 import pytest
 
 from skyloop.cockpit.server import _LARGEST_MESSAGE
+from skyloop.drivers.ardrone import options as ardrone_options
+from skyloop.drivers.mavlink import options as mavlink_options
+from skyloop.drivers.replay import options as replay_options
 from skyloop.drivers.sim import options as sim_options
+from skyloop.drivers.tello import options as tello_options
+from skyloop.drivers.uri import parse_uri
 from skyloop.drivers.video import options as video_options
 from skyloop.messages import Action, FlightState, Hover, Land, ResetEmergency, Takeoff, Velocity
 from skyloop.proxy.core.command_checks import STATE_POLICIES, StatePolicy
@@ -58,12 +64,30 @@ def test_what_is_done_in_which_flight_state() -> None:
     assert seen == set(FlightState)
 
 
-@pytest.mark.parametrize(
-    ("heading", "known"), [("### `sim://`", sim_options.KNOWN), ("### `video://`", video_options.KNOWN)]
-)
-def test_the_options_of_addresses(heading: str, known: set[str]) -> None:
-    table = rows(section("docs/drivers.md", heading))
-    assert sorted(name for row in table for name in names(row[0])) == sorted(known)
+ADDRESSES = [
+    ("docs/drivers.md", "### `sim://`", sim_options, "sim://"),
+    ("docs/drivers.md", "### `video://`", video_options, "video:///dev/video0"),
+    ("docs/ardrone.md", "### `ardrone://`", ardrone_options, "ardrone://192.168.1.1"),
+    ("docs/tello.md", "### `tello://`", tello_options, "tello://192.168.10.1"),
+    ("docs/mavlink.md", "### `mavlink://`", mavlink_options, "mavlink://udpin:127.0.0.1:14540?camera=/dev/video0"),
+    ("docs/replay.md", "## `replay://`", replay_options, "replay:///home/me/flight.mcap"),
+]
+
+
+@pytest.mark.parametrize(("page", "heading", "options", "address"), ADDRESSES)
+def test_the_options_of_addresses(page: str, heading: str, options: ModuleType, address: str) -> None:
+    table = rows(section(page, heading))
+    told = [name for row in table for name in names(row[0]) if "://" not in name]
+    assert sorted(told) == sorted(options.KNOWN)
+    plain = options.options_of(parse_uri(address))
+    held = 0
+    for row in table:
+        for name, default in zip(names(row[0]), row[1].split(", "), strict=False):
+            if re.fullmatch(r"`[^` ]+`|[0-9.]+", default):  # the others are described in words
+                uri = parse_uri(f"{address}{'&' if '?' in address else '?'}{name}={default.strip('`')}")
+                assert options.options_of(uri) == plain, f"{page}: {name} is not {default} by default"
+                held += 1
+    assert held > 2
 
 
 def test_the_worlds_that_come_with_it() -> None:

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from skyloop.drivers.seams import ExternalPose
+from skyloop.drivers.base import ExternalPose
 from skyloop.errors import DriverError
 from skyloop.messages import EventKind, GetStatistics, Role, Statistics, VehiclePose, encode
 from tests.proxy.fake import App, Bench

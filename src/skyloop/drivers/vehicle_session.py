@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar, Final, TypeAlias
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.drivers.base import Sink
 from skyloop.drivers.link_trouble import LinkTrouble, trouble_of
-from skyloop.drivers.notices import Notice
-from skyloop.messages import AnyAction, LinkState
+from skyloop.messages import AnyAction, EventKind, LinkState, Severity, Value
 
 RETELL_NS: Final = nanoseconds(2.0)  #: least time between two reasons that are reported while nothing is heard
 
@@ -25,6 +24,28 @@ class LinkTimeouts:
     degraded_ns: int
     lost_ns: int
     first_word_ns: int  #: since opening; a vehicle that was never heard by then is reported as lost
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """An event that a session has for the sink, with the arguments of :meth:`skyloop.drivers.base.Sink.event`."""
+
+    kind: EventKind
+    text: str
+    severity: Severity = Severity.INFO
+    data: dict[str, Value] = field(default_factory=dict)
+
+
+def message(text: str, reason: str, severity: Severity = Severity.INFO, **data: Value) -> Notice:
+    """Return a message of the vehicle itself.
+
+    Args:
+        text: For people.
+        reason: One word for programs, in the event's data.
+        severity: For people and for filters.
+        **data: More for programs.
+    """
+    return Notice(EventKind.VEHICLE_MESSAGE, text, severity, {"reason": reason, **data})
 
 
 class VehicleSession(ABC):

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from skyloop.drivers.base import Driver
-from skyloop.drivers.seams import ExternalPose
+from skyloop.drivers.base import Driver, ExternalPose
 from skyloop.errors import UnsupportedError, UsageError
 from skyloop.messages import Annotation, EventKind, Refusal, Role, VehiclePose
 from skyloop.proxy.core.events import EventDraft

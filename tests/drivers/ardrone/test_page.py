@@ -24,7 +24,7 @@ def names(cell: str) -> list[str]:
 
 def test_options() -> None:
     table = rows(section("docs/ardrone.md", "### `ardrone://`"))
-    assert sorted(name for row in table for name in names(row[0])) == sorted(options._KNOWN)
+    assert sorted(name for row in table for name in names(row[0])) == sorted(options.KNOWN)
 
 
 def test_common_parameters() -> None:

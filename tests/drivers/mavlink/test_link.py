@@ -12,10 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from skyloop.drivers.base import Driver
+from skyloop.drivers.base import Driver, ExternalPose
 from skyloop.drivers.mavlink import MavlinkDriver
 from skyloop.drivers.recording_sink import RecordingSink
-from skyloop.drivers.seams import ExternalPose
 from skyloop.drivers.uri import parse_uri
 from skyloop.emulators.mavlink import Faults, Kind, MavlinkFirmware, Ports, with_multirotors
 from skyloop.errors import DriverError, UnsupportedError, UsageError

@@ -7,9 +7,9 @@ import math
 import pytest
 from scipy.spatial.transform import Rotation
 
+from skyloop.drivers.base import ExternalPose
 from skyloop.drivers.mavlink.microservices import pose_message
 from skyloop.drivers.mavlink.options import PoseMessage
-from skyloop.drivers.seams import ExternalPose
 from skyloop.messages.geometry import quaternion_from_euler
 from skyloop.wire.mavlink.axes import angles_of, from_wire
 

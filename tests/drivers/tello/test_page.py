@@ -17,7 +17,7 @@ def names(cell: str) -> list[str]:
 
 def test_options() -> None:
     table = rows(section("docs/tello.md", "### `tello://`"))
-    assert sorted(name for row in table for name in names(row[0])) == sorted(options._KNOWN)
+    assert sorted(name for row in table for name in names(row[0])) == sorted(options.KNOWN)
 
 
 def test_parameters() -> None:

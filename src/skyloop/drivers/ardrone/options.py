@@ -19,7 +19,7 @@ _Meaning = TypeVar("_Meaning")
 _VERSIONS: Final = {"auto": None, "1": 1, "2": 2}
 _MODES: Final = {"demo": False, "full": True}
 _HOST: Final = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?\Z")
-_KNOWN: Final = {
+KNOWN: Final = {
     *("version", "navdata", "navdata_options", "rate", "video", "ids"),
     *("navdata_port", "video_port", "at_port", "control_port"),
     *INTRINSICS_OPTIONS,
@@ -47,7 +47,7 @@ def options_of(uri: VehicleUri) -> ArdroneOptions:
         UnknownNameError: It has an unknown option, or an option has an unknown word as its value.
         UsageError: It names no host, or an option's value makes no sense.
     """
-    reject_unknown_options(uri, _KNOWN)
+    reject_unknown_options(uri, KNOWN)
     if not uri.place:
         raise UsageError(f"{uri} names no host: it looks like ardrone://192.168.1.1")
     if not _HOST.match(uri.place):

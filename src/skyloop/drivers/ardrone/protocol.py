@@ -20,8 +20,7 @@ from skyloop.drivers.ardrone.telemetry import (
     feedback_of,
     native_of,
 )
-from skyloop.drivers.notices import Notice, message
-from skyloop.drivers.vehicle_session import LinkTimeouts, VehicleSession
+from skyloop.drivers.vehicle_session import LinkTimeouts, Notice, VehicleSession, message
 from skyloop.messages import AnyAction, EventKind, LinkState, Severity, Value
 from skyloop.wire.ardrone.at import AtMessage, format_command
 from skyloop.wire.ardrone.navdata import Navdata, State

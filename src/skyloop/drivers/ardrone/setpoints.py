@@ -15,7 +15,7 @@ from enum import Enum, auto
 from typing import Final
 
 from skyloop.clock import nanoseconds
-from skyloop.drivers.notices import Notice
+from skyloop.drivers.vehicle_session import Notice
 from skyloop.errors import DecodeError, DriverError
 from skyloop.messages import (
     AnyAction,

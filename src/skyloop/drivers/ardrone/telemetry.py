@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.drivers.live_clock import LiveClock
-from skyloop.drivers.notices import Notice
+from skyloop.drivers.vehicle_session import Notice
 from skyloop.errors import DecodeError
 from skyloop.messages import EventKind, Feedback, FlightState, Severity, Value
 from skyloop.messages.geometry import wrap_angle

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from skyloop.clock import monotonic_ns
-from skyloop.drivers.base import Driver, Sink
+from skyloop.drivers.base import Driver, ExternalPose, Remark, Sink
 from skyloop.drivers.mavlink.link import MavlinkLink
 from skyloop.drivers.mavlink.microservices import pose_message
 from skyloop.drivers.mavlink.options import options_of
@@ -19,7 +19,6 @@ from skyloop.drivers.mavlink.parameters import (
 )
 from skyloop.drivers.mavlink.protocol import MavlinkSession
 from skyloop.drivers.mavlink.video import CameraReceiver, camera_info, check_source
-from skyloop.drivers.seams import ExternalPose, Remark
 from skyloop.drivers.uri import VehicleUri
 from skyloop.drivers.vehicle_session import SinkCallback
 from skyloop.errors import DriverError, ParameterError

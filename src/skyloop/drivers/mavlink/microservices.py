@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from typing import Final
 
 from skyloop.clock import nanoseconds, seconds
+from skyloop.drivers.base import ExternalPose
 from skyloop.drivers.live_clock import LiveClock
 from skyloop.drivers.mavlink.options import Peer, PoseMessage
 from skyloop.drivers.mavlink.telemetry import Telemetry
-from skyloop.drivers.notices import Notice
-from skyloop.drivers.seams import ExternalPose
+from skyloop.drivers.vehicle_session import Notice
 from skyloop.messages import EventKind, Severity
 from skyloop.messages.geometry import quaternion_from_euler
 from skyloop.wire.mavlink.axes import angles_of, swap, to_wire, yaw_between

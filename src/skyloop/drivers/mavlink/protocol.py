@@ -21,8 +21,7 @@ from skyloop.drivers.mavlink.options import ConnectionKind, MavlinkOptions, Peer
 from skyloop.drivers.mavlink.parameters import ParameterExchange
 from skyloop.drivers.mavlink.setpoints import SetpointController
 from skyloop.drivers.mavlink.telemetry import HealthMonitor, Telemetry, VehicleState, feedback_of
-from skyloop.drivers.notices import Notice
-from skyloop.drivers.vehicle_session import LinkTimeouts, VehicleSession
+from skyloop.drivers.vehicle_session import LinkTimeouts, Notice, VehicleSession
 from skyloop.errors import DriverError
 from skyloop.messages import AnyAction, EventKind, FlightState, LinkState, Severity, Value
 from skyloop.wire.mavlink.codec import Codec, Message

@@ -25,7 +25,7 @@ from skyloop.drivers.mavlink.manoeuvres import (
 from skyloop.drivers.mavlink.microservices import CommandSender, VehicleCommand
 from skyloop.drivers.mavlink.ownership import FlightOwnership
 from skyloop.drivers.mavlink.telemetry import VehicleState
-from skyloop.drivers.notices import Notice
+from skyloop.drivers.vehicle_session import Notice
 from skyloop.errors import DriverError
 from skyloop.messages import (
     AnyAction,

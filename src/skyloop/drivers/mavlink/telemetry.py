@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from skyloop.clock import nanoseconds, seconds
-from skyloop.drivers.notices import Notice
+from skyloop.drivers.vehicle_session import Notice
 from skyloop.messages import EventKind, Feedback, FlightState, Severity, Value
 from skyloop.wire.mavlink.axes import Vector, flip, swap, turned, yaw_between
 from skyloop.wire.mavlink.codec import Message

@@ -17,7 +17,7 @@ from skyloop.wire.tello.commands import PORT, STATE_PORT, VIDEO_PORT
 _HOST: Final = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,252}[A-Za-z0-9])?\Z")
 _INTERFACE: Final = re.compile(r"[A-Za-z0-9_.:@-]{1,15}\Z")
 _LEAST_PORT: Final = 1025  # that the Tello's command takes
-_KNOWN: Final = {
+KNOWN: Final = {
     *("local", "interface", "port", "state_port", "video_port", "video", "pads", "velocity_axes"),
     *INTRINSICS_OPTIONS,
 }
@@ -58,7 +58,7 @@ def options_of(uri: VehicleUri) -> TelloOptions:
         UnknownNameError: It has an unknown option, or unknown ``velocity_axes``.
         UsageError: It names no host, or an option's value makes no sense.
     """
-    reject_unknown_options(uri, _KNOWN)
+    reject_unknown_options(uri, KNOWN)
     if not uri.place:
         raise UsageError(f"{uri} names no host: it looks like tello://192.168.10.1")
     if not _HOST.match(uri.place):

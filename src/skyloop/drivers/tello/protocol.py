@@ -8,11 +8,10 @@ from dataclasses import dataclass
 from typing import Final
 
 from skyloop.clock import nanoseconds
-from skyloop.drivers.notices import Notice, message
 from skyloop.drivers.tello.options import TelloOptions
 from skyloop.drivers.tello.setpoints import SetpointController
 from skyloop.drivers.tello.telemetry import Health, feedback_of, native_of
-from skyloop.drivers.vehicle_session import LinkTimeouts, VehicleSession
+from skyloop.drivers.vehicle_session import LinkTimeouts, Notice, VehicleSession, message
 from skyloop.errors import DecodeError
 from skyloop.messages import AnyAction, LinkState, Severity, Value
 from skyloop.wire.tello.commands import ENTER, Sdk, decoded, ports

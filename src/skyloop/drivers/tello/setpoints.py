@@ -10,8 +10,8 @@ from enum import Enum, auto
 from typing import Final
 
 from skyloop.clock import nanoseconds
-from skyloop.drivers.notices import Notice, message
 from skyloop.drivers.tello.telemetry import FlightWatch
+from skyloop.drivers.vehicle_session import Notice, message
 from skyloop.errors import DriverError
 from skyloop.messages import (
     AnyAction,

@@ -11,8 +11,8 @@ import math
 from typing import Final
 
 from skyloop.clock import nanoseconds
-from skyloop.drivers.notices import Notice, message
 from skyloop.drivers.tello.options import VelocityAxes
+from skyloop.drivers.vehicle_session import Notice, message
 from skyloop.messages import Feedback, FlightState, Severity, Value
 from skyloop.messages.geometry import wrap_angle
 from skyloop.wire.tello.state import GROUND_CM, Pad, State, Vector
