@@ -278,7 +278,7 @@ def test_messages_are_limited_however_many_different_ones_there_were() -> None:
     assert told("a new one")
     assert not told("a new one")
     assert not told("bad 999")
-    assert len(limit._told) <= 256
+    assert len(limit._logged) <= 256
 
 
 # In the application ------------------------------------------------------------------------------------------------

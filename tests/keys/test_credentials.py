@@ -15,7 +15,7 @@ from cryptography.hazmat.primitives.asymmetric import ed25519
 
 from skyloop.errors import FileFormatError, UsageError
 from skyloop.keys import Lab, load
-from skyloop.keys.credentials import expiry_notice
+from skyloop.keys.credentials import expiry_warning
 from skyloop.keys.identity import make_identity
 from tests.keys.conftest import NOW
 
@@ -172,7 +172,7 @@ def test_a_roster_of_another_format_is_told(lab: Lab, jane: Path) -> None:
     ],
 )
 def test_an_end_is_told_a_week_before(left: timedelta, words: str) -> None:
-    text = expiry_notice("it", NOW + left, NOW)
+    text = expiry_warning("it", NOW + left, NOW)
     assert bool(text) is bool(words)
     assert words in text
 

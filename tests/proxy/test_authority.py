@@ -107,7 +107,7 @@ def test_a_silent_holder_loses_the_lease_exactly_at_the_time_out() -> None:
     authority.request(1, 16, True, 10 * S)
     authority.request(2, 20, True, 10 * S)
     assert authority.update(12 * S - 1) == []
-    authority.heard_ns = 11 * S
+    authority.last_command_ns = 11 * S
     assert authority.update(13 * S - 1) == []
     assert authority.update(13 * S) == [Lost(1, 1, "silent"), Granted(2, 20, 2)]
     assert authority.position(1) == 0  # silent ones do not wait on
@@ -364,7 +364,7 @@ def step(authority: Authority, what: str, app: int, priority: int, now: int, ter
         holder = authority.holder.app_id if authority.holder is not None else 0
         return authority.answer(holder, authority.lease, app, what == "grant", "", now)
     if what == "heard":
-        authority.heard_ns = now
+        authority.last_command_ns = now
         return []
     return authority.update(now)
 

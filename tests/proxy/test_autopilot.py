@@ -243,9 +243,9 @@ def test_an_attitude_on_the_ground_is_no_flight() -> None:
 
 def test_a_vehicle_first_seen_in_the_air_is_flying() -> None:
     autopilot = Autopilot(ATTITUDE)
-    autopilot.notice(Feedback(captured_ns=0, altitude=0.1))
+    autopilot.on_first_feedback(Feedback(captured_ns=0, altitude=0.1))
     assert autopilot.state(FlightState.UNKNOWN) is FlightState.LANDED
-    autopilot.notice(Feedback(captured_ns=0, altitude=1.0))
+    autopilot.on_first_feedback(Feedback(captured_ns=0, altitude=1.0))
     assert autopilot.state(FlightState.UNKNOWN) is FlightState.FLYING
 
 

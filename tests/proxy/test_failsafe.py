@@ -71,13 +71,13 @@ def test_a_fresh_command_ends_a_step() -> None:
     ladder = FailsafeLadder()
     taken(ladder, T0 + S, FLYING)
     assert ladder.fresh_command() == [StepChange(Failsafe.NONE, "fresh command")]
-    assert taken(ladder, T0 + S, replace(FLYING, heard_ns=T0 + S)) == []
+    assert taken(ladder, T0 + S, replace(FLYING, last_command_ns=T0 + S)) == []
 
 
 def test_being_heard_without_a_fresh_command_keeps_the_step_but_does_not_land() -> None:
     ladder = FailsafeLadder()
     taken(ladder, T0 + S, FLYING)
-    heard = replace(FLYING, state=FlightState.HOVERING, heard_ns=T0 + 60 * S)
+    heard = replace(FLYING, state=FlightState.HOVERING, last_command_ns=T0 + 60 * S)
     assert taken(ladder, T0 + 60 * S, heard) == []
     assert ladder.step is Failsafe.HOVER
 
@@ -197,7 +197,7 @@ views = st.builds(
     FailsafeInputs,
     state=st.sampled_from(list(FlightState)),
     airborne=st.booleans(),
-    heard_ns=st.integers(0, 8 * S),
+    last_command_ns=st.integers(0, 8 * S),
     pilot=st.sampled_from(["held", "released", "silent", "gone", "none"]),
     link_up=st.booleans(),
     battery=st.none() | st.floats(0, 1),

@@ -159,7 +159,7 @@ def test_a_silent_holder_keeps_its_name_on_the_vehicle_which_fails_safe(bench: B
     bench.run(2.1)
     (lost,) = bob.told(EventKind.AUTHORITY_LOST)
     assert (lost.app, lost.data["reason"], lost.data["by"]) == ("alice", "silent", "")
-    assert "until somebody asks" in lost.text
+    assert "until another application asks" in lost.text
     feedback = bob.last_feedback()
     assert (feedback.owner, feedback.owner_id, feedback.owner_priority) == ("alice", alice.app_id, 4)
     assert (feedback.lease, feedback.failsafe) == (0, "hover")

@@ -16,7 +16,7 @@ from skyloop.errors import FileFormatError, UnknownNameError, UsageError
 from skyloop.logfile.layout import Channel, image_topic
 from skyloop.logfile.pictures import Picture, decode_image
 from skyloop.logfile.reader import Item, Recording
-from skyloop.logfile.times import Course, told_ns
+from skyloop.logfile.times import Course, reported_ns
 from skyloop.messages import Encoding, Feedback, LogEntry, Parameter, ParameterType
 from tests.recording.flights import HEIGHT, UNIX_NS, WIDTH, Plan, picture_at, write_flight
 
@@ -215,7 +215,7 @@ def feedback(ms: int) -> Feedback:
 def test_a_course_never_goes_back_and_is_not_led_astray() -> None:
     course = Course()
     parameter = Parameter("a", ParameterType.FLOAT, 1.0)
-    assert told_ns(parameter) is None
+    assert reported_ns(parameter) is None
     assert course.follow(parameter) == 0
     steps = [feedback(1000), feedback(1020), feedback(1010), feedback(10**9), feedback(1040)]
     assert [course.follow(step) // 1_000_000 for step in steps] == [1000, 1020, 1020, 1020, 1040]

@@ -76,7 +76,7 @@ def show(
 
     Keys that expire within a week, or have expired, are listed on standard error as well.
     """
-    from skyloop.keys.credentials import expiry_notice, read_public
+    from skyloop.keys.credentials import expiry_warning, read_public
 
     authority, roster = read_public(_place(directory))
     now = datetime.now(UTC)
@@ -91,7 +91,7 @@ def show(
     ends = [("the lab's authority", authority.expires)]
     ends += [(f"the key of {entry.name}", entry.expires_at) for entry in roster.entries if not entry.revoked]
     for what, end in ends:
-        if notice := expiry_notice(what, end, now):
+        if notice := expiry_warning(what, end, now):
             typer.echo(f"skyloop: {notice}", err=True)
 
 

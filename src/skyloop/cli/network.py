@@ -81,7 +81,7 @@ def server_ends(settings: FabricSettings | None, group: str | None = None) -> Ma
     )
 
 
-def key_news(settings: FabricSettings | None) -> Callable[[], list[str]] | None:
+def key_changes(settings: FabricSettings | None) -> Callable[[], list[str]] | None:
     """Return what reports on the keys, for :func:`skyloop.proxy.serve.serve`; None without keys."""
     return None if settings is None or settings.ring is None else settings.ring.poll
 

@@ -13,7 +13,7 @@ from skyloop.cli.network import (
     ListenOption,
     MulticastOption,
     NetworkOption,
-    key_news,
+    key_changes,
     server_ends,
     settings_of,
     warn_if_open,
@@ -52,4 +52,4 @@ def proxy(
         settle(options_of(vehicle))
     warn_if_open(settings, [name])
     make_end = server_ends(settings, group)
-    serve(uri, name, make_end=make_end, parent_fd=parent_fd, look=key_news(settings), audit=audit)
+    serve(uri, name, make_end=make_end, parent_fd=parent_fd, look=key_changes(settings), audit=audit)

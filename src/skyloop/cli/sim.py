@@ -18,7 +18,7 @@ from skyloop.cli.network import (
     MakeEnd,
     MulticastOption,
     NetworkOption,
-    key_news,
+    key_changes,
     server_ends,
     settings_of,
     warn_if_open,
@@ -119,7 +119,7 @@ def sim(
         settle(options)
         names = [name] if drones == 1 else [f"{name}{number}" for number in range(1, drones + 1)]
         warn_if_open(network_settings, names)
-        _serve_proxies(uri, options, names, server_ends(network_settings), key_news(network_settings))
+        _serve_proxies(uri, options, names, server_ends(network_settings), key_changes(network_settings))
         return
     if network:
         raise UsageError("--network is for proxies, and with --firmware there is none: give --bind ADDRESS instead")

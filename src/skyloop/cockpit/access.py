@@ -4,7 +4,7 @@
 gate           lets in
 =============  ====================================================================================================
 ``OpenGate``   programs of this user (and of the superuser) on this machine, all in one role; loopback only
-``TokenGate``  who once told a token of the file of tokens, and has the cookie that was given for it, or sends the
+``TokenGate``  who once sent a token of the file of tokens, and has the cookie that was given for it, or sends the
                token with each request (``Authorization: Bearer …``)
 ``CertificateGate``  whose TLS certificate is signed by the given authority; its OU names the role, its CN the person
 =============  ====================================================================================================
@@ -39,10 +39,10 @@ CERTIFICATE: Final = "peer_certificate"  #: where the server puts it, in the con
 
 FIRST_S: Final = 0.25  #: after the first wrong token of an address; each further one doubles it
 LONGEST_S: Final = 16.0  #: shorter than :data:`skyloop.cockpit.admission.ANSWER_S`, or nobody would get the answer
-FORGET_S: Final = 600.0  #: an address from which no wrong token came for so long begins anew
+FORGET_S: Final = 600.0  #: an address from which no wrong token came for this long starts over
 MAX_ADDRESSES: Final = 1024  #: kept in mind; the one that has been quiet for longest is forgotten first
 FREE_IN_ALL: Final = 20  #: wrong tokens a minute from everywhere that cost nothing besides
-EACH_IN_ALL_S: Final = 0.1  #: that each further one a minute adds, whoever sends it
+EACH_IN_ALL_S: Final = 0.1  #: that each further one a minute adds, from any address
 MOST_IN_ALL_S: Final = 4.0
 _MINUTE_NS: Final = nanoseconds(60.0)
 
@@ -119,7 +119,7 @@ class Person:
 class Gate(Protocol):
     """Decides who sent a request."""
 
-    #: Whether a person can be let in by telling a token.
+    #: Whether a person can log in with a token.
     takes_tokens: bool
     #: What somebody who is not let in should know.
     hint: str
@@ -160,7 +160,7 @@ class Token:
 
 
 class TokenGate:
-    """Lets in by a token, told once for a session's cookie or with each request. On the event loop."""
+    """Lets in by a token, sent once for a session's cookie or with each request. On the event loop."""
 
     takes_tokens = True
     hint = "log in with a token"
@@ -285,7 +285,7 @@ def _token(line: str, where: str) -> Token:
 
 
 def _hash(value: str) -> bytes:
-    """Hash a cookie: looking up a hash takes a time that tells nothing of the cookie."""
+    """Hash a cookie: looking up a hash takes a time that reveals nothing of the cookie."""
     return hashlib.sha256(value.encode()).digest()
 
 
@@ -294,7 +294,7 @@ def _header(scope: Scope, wanted: bytes) -> str | None:
     return values[0].decode("latin-1") if len(values) == 1 else None
 
 
-def tells_token(scope: Scope) -> bool:
+def has_token(scope: Scope) -> bool:
     """Return whether a token comes with this request."""
     return any(name.lower() == b"authorization" for name, _ in scope["headers"])
 

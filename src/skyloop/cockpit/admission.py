@@ -1,4 +1,4 @@
-"""How many connections may be open, and for how long one may say nothing. Times are arguments.
+"""How many connections may be open, and for how long one may be silent. Times are arguments.
 
 A connection is *anonymous* until a request of a person who may come in was read from it. Anonymous connections have few
 places, and the newest always has one: the oldest of the address that has most gives up its own. So a flood of strangers
@@ -66,7 +66,7 @@ class AdmissionCounts:
     """Counts since the start."""
 
     displaced: int = 0  #: anonymous connections that gave their place up to a newer one
-    timed_out: int = 0  #: connections that said nothing for too long
+    timed_out: int = 0  #: connections that were silent for too long
     refused: int = 0  #: requests of people who had too many connections
 
 
@@ -143,7 +143,7 @@ class Admission:
             self._anonymous.pop(connection.address, None)
 
     def end_overdue(self, now_ns: int) -> None:
-        """End the connections that have said nothing for too long."""
+        """End the connections that were silent for too long."""
         everybody = [*self._known, *(one for connections in self._anonymous.values() for one in connections)]
         for connection in everybody:
             if connection.deadline_ns is not None and now_ns >= connection.deadline_ns:

@@ -15,7 +15,7 @@ Priority = Annotated[int, msgspec.Meta(ge=HIGHEST_PRIORITY, le=LOWEST_PRIORITY)]
 LATE_S: Final = 0.5  #: a command that may be older is refused: the person no longer expects it to happen
 #: An emergency stop may be this late: as long as the page shows it as pending.
 STOP_LATE_S: Final = 2.0
-AHEAD_S: Final = 0.05  #: what clocks may differ by beyond what the page said; as for commands of programs
+AHEAD_S: Final = 0.05  #: what clocks may differ by beyond what the page stated; as for commands of programs
 
 
 class Command(msgspec.Struct, frozen=True, tag_field="do", forbid_unknown_fields=True, kw_only=True):

@@ -158,7 +158,7 @@ class ControlSession:
         if ping.seen_s is not None and self._pilot is not None:
             ago_s = min(
                 GONE_S, max(0.0, seconds(now_ns) - ping.seen_s)
-            )  # never more than it is, whatever the page says
+            )  # never more than it is, whatever the page sends
             self._pilot.present_until(now_ns + nanoseconds(GONE_S - ago_s))
         self._send({"type": "pong", "n": ping.n, "now_s": seconds(now_ns)})
 
@@ -449,7 +449,7 @@ class ControlSession:
         self._takeover.on_event(event, pilot)
         ours = event.kind is EventKind.COMMAND_REFUSED and event.app == self.app
         if not ours or self._refused_command == self._commands or event.data.get("reason") in _OF_ONE_PACKET:
-            return  # its repeats are refused too, which is no news
+            return  # its repeats are refused too: nothing new
         self._refused_command = self._commands
         self._awaited = None
         self._refuse(self._last_command, event.text)

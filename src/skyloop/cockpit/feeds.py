@@ -221,7 +221,7 @@ class EventFeed:
         self._waking = False  # pages are about to be woken
         self._listeners: list[_Cancellable] = [
             drone.on_annotation(self._draw),
-            drone.on_event(lambda event: call_soon(loop, self._tell, event)),
+            drone.on_event(lambda event: call_soon(loop, self._on_event, event)),
         ]
 
     def subscribe(self, wake: Wake) -> None:
@@ -253,7 +253,7 @@ class EventFeed:
         for wake in self._wakes:
             wake()
 
-    def _tell(self, event: Event) -> None:
+    def _on_event(self, event: Event) -> None:
         self.events.append((self._next, event))
         self._next += 1
 
@@ -307,8 +307,8 @@ class LogFeed:
         Returns:
             A row each of x, y, z [m] and perhaps yaw [rad], in world axes; empty if there is none.
         """
-        told = self._waypoints
-        return told[1] if told is not None and seconds(self._clock() - told[0]) <= KEPT_S else ()
+        newest = self._waypoints
+        return newest[1] if newest is not None and seconds(self._clock() - newest[0]) <= KEPT_S else ()
 
     def mocap(self) -> tuple[float, ...] | None:
         """Return the pose that motion capture has given last.
@@ -316,8 +316,8 @@ class LogFeed:
         Returns:
             x, y, z [m], quaternion x, y, z, w; None if it is older than :data:`MOCAP_S`.
         """
-        told = self._mocap
-        return told[1] if told is not None and seconds(self._clock() - told[0]) <= MOCAP_S else None
+        newest = self._mocap
+        return newest[1] if newest is not None and seconds(self._clock() - newest[0]) <= MOCAP_S else None
 
     def _command(self, applied: Applied) -> None:
         self.applied = applied

@@ -22,7 +22,7 @@ from skyloop.cockpit.admission import HEADER_S, Admission, Connection, Places
 BACKLOG: Final = 1024  #: connections that the kernel keeps until they are taken; a dropped one is tried again after 1 s
 AT_ONCE: Final = 16  #: connections accepted before open ones have their turn
 PAUSE_S: Final = 0.1  #: after the system had no room for a connection
-SWEEP_S: Final = 0.5  #: how often connections that have said nothing for too long are ended
+SWEEP_S: Final = 0.5  #: how often connections that were silent for too long are ended
 _NO_ROOM: Final = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 
 _MAX_MESSAGES: Final = 256  # kept in mind by a limit; they are the program's own, so there are fewer
@@ -164,21 +164,21 @@ class RepeatLimit(logging.Filter):
         super().__init__()
         self._every_ns = round(every_s * 1e9)
         self._clock = clock
-        self._told: dict[str, tuple[int, int]] = {}  # by the message without its values: when, and how many since
+        self._logged: dict[str, tuple[int, int]] = {}  # by the message without its values: when, and how many since
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Return whether to log a record."""
         key, now_ns = f"{record.name} {record.msg}", self._clock()
-        told_ns, left_out = self._told.get(key, (None, 0))
-        if told_ns is not None and now_ns - told_ns < self._every_ns:
-            self._told[key] = told_ns, left_out + 1
+        logged_ns, left_out = self._logged.get(key, (None, 0))
+        if logged_ns is not None and now_ns - logged_ns < self._every_ns:
+            self._logged[key] = logged_ns, left_out + 1
             return False
         if left_out:
             record.msg = f"{record.msg} ({left_out} more such messages)"
-        self._told.pop(key, None)  # so that they stand in the order in which they were let through
-        if len(self._told) >= _MAX_MESSAGES:
-            del self._told[next(iter(self._told))]
-        self._told[key] = now_ns, 0
+        self._logged.pop(key, None)  # so that they stand in the order in which they were let through
+        if len(self._logged) >= _MAX_MESSAGES:
+            del self._logged[next(iter(self._logged))]
+        self._logged[key] = now_ns, 0
         return True
 
 

@@ -14,7 +14,7 @@ from skyloop.transport.base import Dialer
 
 
 class PilotConnection(Drone):
-    """A pilot's connection that asks for the authority when it is told to, and not when it is opened.
+    """A pilot's connection that asks for the authority when ``request`` is called, and not when it is opened.
 
     Without the authority it can stop the motors in an emergency, and nothing else.
     """

@@ -128,7 +128,7 @@ class Recordings:
             recorder = await asyncio.to_thread(start)
             number = str(next(self._numbers))
             self._running[number] = Running(tuple(drones), recorder)
-            return self._told(number)
+            return self._entry(number)
 
     async def stop(self, number: str) -> Json:
         """Stop a recording, and wait until its file is closed.
@@ -144,14 +144,14 @@ class Recordings:
         """
         if number not in self._running:
             raise UnknownNameError("running recording", number, self._running)
-        told = self._told(number)
+        told = self._entry(number)
         running = self._running.pop(number)
         await asyncio.to_thread(running.recorder.close)
         return {**told, **_progress(running.recorder.status)}
 
     async def listing(self) -> Json:
         """Return the running recordings, and those in the folder, the newest first."""
-        running = [self._told(number) for number in self._running]
+        running = [self._entry(number) for number in self._running]
         async with self._looking:  # many who ask at one time cost as much as one
             past = await asyncio.to_thread(self._past)
         return {"folder": str(self.folder), "running": running, "past": past}
@@ -207,7 +207,7 @@ class Recordings:
 
     # Inside ----------------------------------------------------------------------------------------------------
 
-    def _told(self, number: str) -> Json:
+    def _entry(self, number: str) -> Json:
         running = self._running[number]
         return {"id": number, "drones": list(running.drones), **_progress(running.recorder.status)}
 

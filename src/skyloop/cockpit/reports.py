@@ -59,7 +59,7 @@ class Reports:
 
         Raises:
             RefusedError: Too many requests wait already.
-            UsageError: The child failed; with what it says.
+            UsageError: The child failed; with its message.
             LinkError: It takes more than :data:`REPORT_S`.
         """
         if self._wanted > MAX_WAITING:
@@ -86,7 +86,7 @@ class Reports:
             assert child.stderr is not None
             try:
                 async with asyncio.timeout(REPORT_S):
-                    said = await child.stderr.read(_TAKEN)
+                    errors = await child.stderr.read(_TAKEN)
                     while await child.stderr.read(_TAKEN):
                         pass
                     await child.wait()
@@ -97,7 +97,7 @@ class Reports:
                     child.kill()
                     await asyncio.shield(child.wait())
             if child.returncode or not target.exists():
-                lines = said.decode(errors="replace").strip().splitlines()
+                lines = errors.decode(errors="replace").strip().splitlines()
                 raise UsageError(lines[-1] if lines else f"no report of {file.name} could be made")
             return await asyncio.to_thread(target.read_text, encoding="utf-8")
 

@@ -3,7 +3,7 @@
 A page from elsewhere can make a browser send requests here. Three things stop it: the ``Host`` header must be this
 server's own (or a foreign name was made to point at it: DNS rebinding); the ``Origin``, which browsers add to every
 WebSocket and to every request that changes something, and which pages can't forge, must be this page's (for a link,
-which has none, ``Sec-Fetch-Site`` tells where it stood: it may lead to the page, and to nothing else); and the
+which has none, ``Sec-Fetch-Site`` shows where it stood: it may lead to the page, and to nothing else); and the
 page may load nothing but its own files and can't be framed (Content-Security-Policy).
 
 Then the person's role decides (:mod:`skyloop.cockpit.access`). What a route needs is decided here for all of them: by
@@ -21,13 +21,13 @@ from typing import Final
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from skyloop.cockpit.access import Gate, Person, TokenGate, tells_token
+from skyloop.cockpit.access import Gate, Person, TokenGate, has_token
 from skyloop.errors import UsageError
 from skyloop.messages import Role
 
 LOG_IN: Final = 4401  #: close code of a WebSocket: nobody known, log in
 NOT_ALLOWED: Final = 4403  #: close code: this needs a pilot
-ADMIT: Final = "admit"  #: in the connection's state: asked with the person, it tells why there is no place; or nothing
+ADMIT: Final = "admit"  #: in the connection's state: called with the person, it returns why there is no place
 _FOREIGN: Final = 1008  # close code: another page
 _LATER: Final = 1013  # close code: no place now
 
@@ -172,7 +172,7 @@ class Guard:
         role = needed(kind, method, scope["path"])
         person = self._gate.person(scope)
         reason = admit(person)
-        if person is None and isinstance(self._gate, TokenGate) and tells_token(scope):
+        if person is None and isinstance(self._gate, TokenGate) and has_token(scope):
             if not await gone_within(receive, self._gate.wrong_token_s(scope)):
                 await _refuse(kind, _connected, send, 401, LOG_IN, "this token is not known here")
         elif reason:
@@ -223,7 +223,7 @@ async def gone_within(receive: Receive, within_s: float) -> bool:
 
 
 async def _connected() -> Message:
-    """Return the first message of a WebSocket anew, as it was received already."""
+    """Return the first message of a WebSocket again: it was received already."""
     return {"type": "websocket.connect"}
 
 
@@ -239,7 +239,7 @@ async def _refuse(kind: str, receive: Receive, send: Send, status: int, code: in
         await send({"type": "http.response.body", "body": reason.encode()})
         return
     await receive()
-    if code != _FOREIGN:  # our own page is told why; a browser hides that of a socket that was not opened
+    if code != _FOREIGN:  # our own page gets the reason; a browser hides that of a socket that was not opened
         await send({"type": "websocket.accept"})
     await send({"type": "websocket.close", "code": code, "reason": reason})
 
@@ -257,8 +257,8 @@ def _protected(send: Send, policy: str) -> Send:
     async def sending(message: Message) -> None:
         if message["type"] == "http.response.start":
             own = list(message.get("headers", []))
-            told = {name.lower() for name, _ in own}
-            message = {**message, "headers": own + [pair for pair in protecting if pair[0] not in told]}
+            given_names = {name.lower() for name, _ in own}
+            message = {**message, "headers": own + [pair for pair in protecting if pair[0] not in given_names]}
         await send(message)
 
     return sending

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from skyloop.transport.fabric import FabricSettings
 
 NICENESS = 10  #: of the serving thread and of those that it starts: programs that fly come first
-RECORDINGS = Path("recordings")  #: where recordings go if nothing else is said
+RECORDINGS = Path("recordings")  #: where recordings go by default
 _LARGEST_MESSAGE = 4096  # bytes from a page
 _LOOK_S = 0.05  # how often it is asked whether to end
 _PING_S = 10.0  # a connection whose other end does not answer for this long is ended
@@ -43,7 +43,7 @@ class Access:
     ``host``: the address to listen on; one that is not of this machine's loopback needs ``token_file`` or
     ``client_ca``. ``token_file``: lines of ``ROLE TOKEN [NAME]``. ``tls_cert``, ``tls_key``: PEM files of the server's
     certificate and key, for TLS. ``client_ca``: PEM file of the authority that signed the certificates of those who
-    may come in; their OU is the role. ``role``: of everybody, where neither tokens nor certificates tell it.
+    may come in; their OU is the role. ``role``: of everybody, where neither tokens nor certificates decide it.
     ``hostnames``: names by which browsers reach this machine, where they don't use its address.
 
     Raises:
@@ -123,7 +123,7 @@ def serve_cockpit(
         finder = _finder(names, network)
         try:
             _check_names(names, finder)
-            _serve(finder, names, access, gate, tls, recordings, listening, on_ready or _tell, stop)
+            _serve(finder, names, access, gate, tls, recordings, listening, on_ready or _announce, stop)
         finally:
             finder.close()
     finally:
@@ -152,7 +152,7 @@ def _gate(access: Access, port: int) -> Gate:
     if access.client_ca is not None:
         return CertificateGate()
     if access.token_file is not None:
-        # Browsers don't tell cookies of one port from those of another.
+        # Browsers don't distinguish cookies by port.
         return TokenGate(read_tokens(access.token_file), f"skyloop-cockpit-{port}")
     return OpenGate(access.role)
 
@@ -224,7 +224,7 @@ def http_protocol(server: uvicorn.Server, admission: Admission, clock: Clock = m
 
     Args:
         server: The server.
-        admission: Is told how far each connection has come.
+        admission: Is notified how far each connection has come.
         clock: The monotonic clock [ns].
     """
     from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -235,7 +235,7 @@ def http_protocol(server: uvicorn.Server, admission: Admission, clock: Clock = m
     class Protocol(H11Protocol):
         """uvicorn's protocol, which also reports to the application and to the admission.
 
-        The application is told the certificate of the other end, which uvicorn keeps to itself; the admission how far a
+        The application gets the certificate of the other end, which uvicorn keeps to itself; the admission how far a
         connection has come.
         """
 
@@ -315,5 +315,5 @@ async def _run(
         await listening  # what ended it
 
 
-def _tell(page: str) -> None:
+def _announce(page: str) -> None:
     print(f"cockpit: {page}", flush=True)

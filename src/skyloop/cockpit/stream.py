@@ -208,7 +208,7 @@ class TelemetrySender(BroadcastSender):
         super().__init__(socket, station.broadcast)
         self._station = station
         self._vehicle: dict[str, Any] | None = None
-        self._told = 0  # number of the last event
+        self._last_event = 0  # number of the last event
 
     async def _send(self) -> None:
         view = self._station.view
@@ -216,8 +216,8 @@ class TelemetrySender(BroadcastSender):
         if vehicle != self._vehicle:
             self._vehicle = vehicle
             await self._socket.send_text(encode_json(vehicle).decode())
-        fresh = self._station.event_feed.events_after(self._told)
-        self._told = fresh[-1][0] if fresh else self._told
+        fresh = self._station.event_feed.events_after(self._last_event)
+        self._last_event = fresh[-1][0] if fresh else self._last_event
         events = encode_json(view.events(fresh))
         await self._socket.send_text((self._broadcast.message + b',"events":' + events + b"}").decode())
 

@@ -109,11 +109,11 @@ class QueueTracker:
     def __init__(self) -> None:
         self._asked = False
         self._declined: str | None = None
-        self._known: tuple[int, float | None] | None = None  # what the status said last
+        self._known: tuple[int, float | None] | None = None  # what the newest status had
         self._until_ns: int | None = None
 
     def request(self, *, ask: bool) -> None:
-        """Begin anew, as the page asks for the authority."""
+        """Start over, as the page asks for the authority."""
         self._asked, self._declined, self._known = ask, None, None
 
     def on_event(self, event: Event, app_id: int) -> None:
@@ -156,7 +156,7 @@ class TakeoverDialog:
         self._queue = QueueTracker()
 
     def request(self, *, ask: bool) -> None:
-        """Begin anew, as the page asks for the authority."""
+        """Start over, as the page asks for the authority."""
         self._queue.request(ask=ask)
 
     def on_event(self, event: Event, pilot: PilotConnection) -> None:

@@ -189,7 +189,7 @@ class TelemetryView:
         return seconds(self._clock() + self._station.drone.clock_offset_ns - captured_ns)
 
     def _refresh_channels(self) -> None:
-        """Start to read the statistics anew if they are old, without waiting."""
+        """Start to read the statistics again if they are old, without waiting."""
         now_ns = self._clock()
         old = self._channels_ns is None or seconds(now_ns - self._channels_ns) >= _CHANNELS_S
         if self._channels_task is None and old:

@@ -104,9 +104,9 @@ class HeadlessPage:
 
     async def _listen(self, socket: ClientConnection) -> None:
         async for message in socket:
-            told = json.loads(message)
-            if told["type"] == "state":
-                self.state = told
+            content = json.loads(message)
+            if content["type"] == "state":
+                self.state = content
                 self.states += 1
         raise LinkError("telemetry ended")
 

@@ -214,7 +214,7 @@ def alarms(
         battery_low: Charge below which the battery is low, 0 to 1.
     """
     if link.application in _BROKEN:
-        # Nothing else is known any more: what came before is no news.
+        # Nothing else is known any more: what came before is out of date.
         return [_because("link to the proxy lost", link.reason)]
     if link.vehicle is LinkState.CLOSED:
         return []  # a recording that is over, as every recording is some time: nothing is wrong

@@ -64,7 +64,7 @@ class Behaviour(Controller):
         self._law = law
         self._mounting = camera_info(drone, camera)
         self._frame_ns: int | None = None  # capture of the newest frame
-        self._told: StrEnum | None = None
+        self._reported: StrEnum | None = None
 
     @property
     def phase(self) -> StrEnum:
@@ -100,7 +100,7 @@ class Behaviour(Controller):
             self.tell("frames arrive again")
         shapes = self.look(frame)
         wanted = self._law.step(frame.captured_ns + nanoseconds(frame.age_s))
-        self._tell_phase()
+        self._report_phase()
         if not self.done:
             self.steer(wanted)
         with suppress(UsageError):  # a shape that can't be drawn must not end the flight
@@ -137,11 +137,11 @@ class Behaviour(Controller):
         """
         self.drone.tell(EventKind.VEHICLE_MESSAGE, f"{self.name}: {text}", severity)
 
-    def _tell_phase(self) -> None:
+    def _report_phase(self) -> None:
         phase = self.phase
-        if phase is not self._told:
-            lost = phase in self.losses and self._told is not None
-            self._told = phase
+        if phase is not self._reported:
+            lost = phase in self.losses and self._reported is not None
+            self._reported = phase
             self.tell(phase.value, Severity.WARNING if lost else Severity.INFO)
 
 

@@ -67,7 +67,7 @@ class LowPass(Generic[Signal]):
         return self.value
 
     def reset(self, value: Signal | None = None) -> None:
-        """Start anew from a value; None starts from the next sample."""
+        """Restart from a value; None starts from the next sample."""
         self.value = value
 
 

@@ -40,7 +40,7 @@ class Formation:
     """Flies the active drones of a swarm in formation, on the calling thread.
 
     Each drone must be airborne and report position and yaw. Drones that fail on the way are handled as ``on_error`` of
-    the swarm says.
+    the swarm decides.
 
     Attributes:
         drones: The swarm.
@@ -292,8 +292,8 @@ def _offset(offset: ArrayLike) -> NDArray[np.float64]:
 
 
 def _positions(samples: Mapping[str, Feedback]) -> Places:
-    told = [sample.position or (math.nan, math.nan, math.nan) for sample in samples.values()]
-    return places(np.array(told).reshape(-1, 3))
+    positions = [sample.position or (math.nan, math.nan, math.nan) for sample in samples.values()]
+    return places(np.array(positions).reshape(-1, 3))
 
 
 def _waypoint(place: NDArray[np.float64], yaw: float | None) -> Waypoint:

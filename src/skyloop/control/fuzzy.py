@@ -66,7 +66,7 @@ def triangles(peaks: Mapping[str, float]) -> dict[str, Trapezoid]:
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """If every variable is what ``when`` says, the output is ``then``."""
+    """If every variable is as in ``when``, the output is ``then``."""
 
     when: Mapping[str, str]  #: term by variable; a variable that is not named may have any value
     then: float

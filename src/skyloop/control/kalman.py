@@ -83,7 +83,7 @@ class ConstantVelocityFilter:
         return self._estimate
 
     def start(self, position: Array, deviation_m: float | Array, at_ns: int) -> Estimate:
-        """Start anew at a measured position, with velocity 0.
+        """Restart at a measured position, with velocity 0.
 
         Args:
             position: As in :meth:`update`.

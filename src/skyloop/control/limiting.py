@@ -78,7 +78,7 @@ class SetpointLimiter:
         return Velocity(forward=forward, left=left, up=up, yaw_rate=yaw_rate)
 
     def reset(self, last: Velocity | None = None) -> None:
-        """Start anew from a set-point; None lets the next one be anything."""
+        """Restart from a set-point; None lets the next one be anything."""
         self._last = None if last is None else np.array([last.forward, last.left, last.up, last.yaw_rate])
 
 

@@ -150,7 +150,7 @@ class Pid:
         self._output = output
 
     def reset(self, output: float = 0.0, *, set_point: float = 0.0, measured: float | None = None) -> None:
-        """Start anew with the integral term for which ``output`` is the next output, so that taking over is no jump.
+        """Restart with the integral term for which ``output`` is the next output, so that taking over is no jump.
 
         Without an integral gain the next output is what error and derivative give.
 

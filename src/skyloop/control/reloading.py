@@ -37,7 +37,7 @@ class Reloader:
         self._class_name = class_name
         self._look_s = look_s
         self._seen = self._stamps()
-        self._news: deque[type[Controller] | SkyloopError] = deque(maxlen=1)
+        self._loaded: deque[type[Controller] | SkyloopError] = deque(maxlen=1)
         self._saved_at = 0.0
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name="skyloop-reloader", daemon=True)
@@ -55,7 +55,7 @@ class Reloader:
     @property
     def waiting(self) -> bool:
         """Whether :meth:`take` has something to return."""
-        return bool(self._news)
+        return bool(self._loaded)
 
     @property
     def age_s(self) -> float:
@@ -64,7 +64,7 @@ class Reloader:
 
     def take(self) -> type[Controller] | SkyloopError | None:
         """Return the new class, or the error why the saved file can't be loaded; None if nothing was saved since."""
-        return self._news.popleft() if self._news else None
+        return self._loaded.popleft() if self._loaded else None
 
     def look(self) -> None:
         """Poll the files once, and load them if they changed."""
@@ -76,9 +76,9 @@ class Reloader:
             found = again
         self._seen = found
         try:
-            self._news.append(self._load())
+            self._loaded.append(self._load())
         except SkyloopError as error:
-            self._news.append(error)
+            self._loaded.append(error)
         self._seen = {**self._stamps(), **found}  # modules that the new version imports are watched too
 
     def _settled(self) -> dict[Path, Stamp]:
@@ -90,7 +90,7 @@ class Reloader:
             self.look()
 
     def _load(self) -> type[Controller]:
-        """Load the file and its neighbours anew; restore the modules that were loaded before if that fails."""
+        """Load the file and its neighbours again; restore the modules that were loaded before if that fails."""
         before = self._neighbours()
         for name in before:
             sys.modules.pop(name, None)

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 class SpiralSearch:
-    """Flies an expanding square around its start; at its greatest size it returns to the start and begins anew."""
+    """Flies an expanding square around its start; at its greatest size it returns to the start and starts over."""
 
     def __init__(self, lane_m: float = 1.1, speed_m_s: float = 0.7, largest_m: float = 4.4) -> None:
         """Initialise the search.

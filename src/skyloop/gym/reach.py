@@ -78,7 +78,7 @@ class Reaching:
         return rewards, failed, self.age >= self.steps, distances
 
     def observe(self) -> Observation:
-        """What the drones are told, shape (n, 10)."""
+        """The observation, shape (n, 10)."""
         places, velocities, angles = self._arena().state()
         ahead = self.goals - places
         sine, cosine = np.sin(angles[:, 2]), np.cos(angles[:, 2])
@@ -101,8 +101,8 @@ class Reaching:
         return self.arena
 
 
-def _told(distances: Floats) -> dict[str, NDArray[Any]]:
-    """What a step's ``info`` tells of each drone."""
+def _info(distances: Floats) -> dict[str, NDArray[Any]]:
+    """What a step's ``info`` holds of each drone."""
     return {"distance_m": distances, "is_success": distances < NEAR_M}
 
 
@@ -139,8 +139,8 @@ class ReachEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         rewards, failed, over, distances = self._task.step(np.asarray(action, dtype=float).reshape(1, 4))
-        told = {name: values[0].item() for name, values in _told(distances).items()}
-        return self._task.observe()[0], float(rewards[0]), bool(failed[0]), bool(over[0] and not failed[0]), told
+        info = {name: values[0].item() for name, values in _info(distances).items()}
+        return self._task.observe()[0], float(rewards[0]), bool(failed[0]), bool(over[0] and not failed[0]), info
 
     def render(self) -> NDArray[np.uint8] | None:
         """RGB, shape (240, 320, 3), uint8, or None without a render mode."""
@@ -155,7 +155,7 @@ class ReachEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 class ReachVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
     """Many drones in one simulation, which is many times faster than as many simulations.
 
-    As :class:`ReachEnv`, with a leading axis; an episode that ended begins anew with the step after
+    As :class:`ReachEnv`, with a leading axis; an episode that ended starts over with the step after
     (``AutoresetMode.NEXT_STEP``).
     """
 
@@ -192,4 +192,4 @@ class ReachVectorEnv(VectorEnv[Observation, NDArray[np.float32], NDArray[Any]]):
         rewards[again], failed[again], over[again] = 0.0, False, False
         over &= ~failed
         self._ended = failed | over
-        return self._task.observe(), rewards, failed, over, _told(distances)
+        return self._task.observe(), rewards, failed, over, _info(distances)

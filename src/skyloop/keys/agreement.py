@@ -1,8 +1,8 @@
 """The two ends of a connection prove to each other who they are, and agree on secrets that nobody between them knows.
 
-The certificates of a link tell who is at the other end of that *link*: a router, where there is one. So the two ends of
+The certificates of a link show who is at the other end of that *link*: a router, where there is one. So the two ends of
 a connection show theirs to each other as well, in an exchange as in SIGMA (Krawczyk, CRYPTO 2003) and TLS 1.3: each
-signs a fresh X25519 share together with the terms of the connection, and the proxy also all that the application said.
+signs a fresh X25519 share together with the terms of the connection, and the proxy also all that the application sent.
 The secrets are derived from both shares and the transcript (HKDF-SHA256), so recorded messages open nothing, and a key
 that is lost later opens nothing that was recorded before.
 """

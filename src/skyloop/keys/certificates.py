@@ -80,7 +80,7 @@ def certificate_pem(certificate: x509.Certificate) -> bytes:
 
 
 def make_authority(days: int, now: datetime) -> Authority:
-    """Make a new lab's authority. Its name ends in random digits, so that labs can be told apart.
+    """Make a new lab's authority. Its name ends in random digits, so that labs can be distinguished.
 
     Args:
         days: How long it is valid.

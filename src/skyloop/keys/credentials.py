@@ -94,7 +94,7 @@ class Credentials:
         """
         now = now or datetime.now(UTC)
         dates = {f"the key of {self.name}": self.expires, "the lab's authority": self.authority.expires}
-        return {what: text for what, end in dates.items() if (text := expiry_notice(what, end, now))}
+        return {what: text for what, end in dates.items() if (text := expiry_warning(what, end, now))}
 
     def renewed(self) -> Credentials | None:
         """Return these credentials with a newer roster, if the folder has one by now; None if not.
@@ -147,7 +147,7 @@ def read_public(directory: Path) -> tuple[Authority, Roster]:
     return authority, _read_roster(directory, authority)
 
 
-def expiry_notice(what: str, end: datetime, now: datetime) -> str:
+def expiry_warning(what: str, end: datetime, now: datetime) -> str:
     """Return a sentence for people if the end is less than a week away, or past; empty if not.
 
     Args:

@@ -66,8 +66,8 @@ class KeyRing:
         """
         now = now or datetime.now(UTC)
         with self._lock:
-            news, self._pending = [*self._pending, *self._read()], []
-            return [*self._ending(now), *news]
+            changes, self._pending = [*self._pending, *self._read()], []
+            return [*self._ending(now), *changes]
 
     def _ending(self, now: datetime) -> list[str]:
         ends = self.credentials.ends(now)

@@ -1,6 +1,6 @@
 """The roster: every identity of a lab, signed by its authority.
 
-Zenoh's access control knows subjects by their common names, so whoever enforces it must know all names beforehand. The
+Zenoh's access control knows subjects by their common names, so all names must be known where it is enforced. The
 roster is a file of two parts: the list itself, and the signature of exactly those bytes. Its number grows with each
 change, and the highest one is in force.
 """

@@ -73,10 +73,10 @@ class Series:
 
 @dataclass(slots=True)
 class Recording:
-    """An MCAP file that Skyloop recorded. Opening scans it once; each iteration reads it anew.
+    """An MCAP file that Skyloop recorded. Opening scans it once; each iteration reads it again.
 
-    A file that was cut off is read as far as it goes, and ``cut`` says where it ends. What can't be read in its middle
-    is left out, and ``damaged`` says where.
+    A file that was cut off is read as far as it goes, and ``cut`` holds where it ends. What can't be read in its middle
+    is left out, and ``damaged`` holds where.
     """
 
     path: Path

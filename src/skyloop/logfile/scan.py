@@ -215,7 +215,7 @@ class _Scanner:
                 break
             frame = file.read(_FRAME.size)
             if len(frame) < _FRAME.size:
-                found.cut = "it has no end: whoever wrote it was stopped" if not frame else "it ends within a record"
+                found.cut = "it has no end: its writer was stopped" if not frame else "it ends within a record"
                 break
             opcode, length = _FRAME.unpack(frame)
             if length > _LONGEST or opcode == 0:

@@ -15,7 +15,7 @@ _BACK_NS: Final = 10 * NS_PER_S  #: a sample's time is ignored if it is farther 
 _AHEAD_NS: Final = 3600 * NS_PER_S  #: or farther ahead of it
 
 
-def told_ns(value: Any) -> int | None:
+def reported_ns(value: Any) -> int | None:
     """Return when the proxy received or published a sample; None for one without a time."""
     if isinstance(value, Feedback):
         return value.published_ns or value.captured_ns
@@ -48,7 +48,7 @@ class Course:
 
     def follow(self, value: Any) -> int:
         """Return the time of the next sample, in the order of the file."""
-        own_ns = told_ns(value)
+        own_ns = reported_ns(value)
         if own_ns is None:
             return self.newest_ns
         if self.first_ns is None:

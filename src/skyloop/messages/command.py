@@ -13,7 +13,7 @@ from skyloop.messages.numbers import Count, TimeNs
 
 
 class Action(msgspec.Struct, frozen=True, array_like=True):
-    """Base of the things that a vehicle can be told to do."""
+    """Base of the commands for a vehicle."""
 
     @property
     def name(self) -> str:

@@ -144,7 +144,7 @@ class Welcome(msgspec.Struct, frozen=True, array_like=True, tag=1):
     uri: str  #: of the vehicle
     now_ns: TimeNs  #: the proxy's clock
     capabilities: Capabilities
-    clock: ClockName = ""  #: which monotonic clock it reads, on its host; empty: not told
+    clock: ClockName = ""  #: which monotonic clock it reads, on its host; empty: not known
 
 
 class AuthorityGranted(msgspec.Struct, frozen=True, array_like=True, tag=2):
@@ -160,7 +160,7 @@ class AuthorityQueued(msgspec.Struct, frozen=True, array_like=True, tag=3):
     position: Count  #: 1 is next
     holder: str
     holder_priority: Priority
-    wait_s: float | None = None  #: expected, by what the others said for how long they want it; nil: not known
+    wait_s: float | None = None  #: expected, by how long the others stated that they want it; nil: not known
     asked: bool = False  #: the holder is being asked to hand it over
 
 
@@ -186,7 +186,7 @@ class Pong(msgspec.Struct, frozen=True, array_like=True, tag=6):
 
 
 class Done(msgspec.Struct, frozen=True, array_like=True, tag=7):
-    """It was done; there is nothing else to say."""
+    """It was done; there is nothing else to report."""
 
 
 class Refused(msgspec.Struct, frozen=True, array_like=True, tag=8):

@@ -10,7 +10,7 @@ from skyloop.messages.frame import Intrinsics, Name, Pixels
 from skyloop.messages.numbers import Count, TimeNs
 
 H264: Final = "h264"  #: the one codec that is recorded as it comes
-#: Bytes of a picture that fit a packet, with all that is told beside it.
+#: Bytes of a picture that fit a packet, with all that is sent beside it.
 MAX_ENCODED: Final = 59_000
 
 
@@ -54,5 +54,5 @@ class Chain:
         return whole
 
     def restart(self) -> None:
-        """Begin anew: the next picture does not continue what came before."""
+        """Restart: the next picture does not continue what came before."""
         self._last = None

@@ -1,4 +1,4 @@
-"""Events: the thin stream that says what happened and why."""
+"""Events: the thin stream of what happened and why."""
 
 from __future__ import annotations
 

@@ -41,7 +41,7 @@ class FrameHeader(msgspec.Struct, frozen=True, array_like=True):
 
     camera: Name
     seq: Count  #: grows by one with each frame that this camera gave, dropped ones included
-    captured_ns: TimeNs  #: middle of the exposure as near as the vehicle tells it, on the proxy's clock
+    captured_ns: TimeNs  #: middle of the exposure as near as the vehicle reports it, on the proxy's clock
     published_ns: TimeNs  #: when the proxy had it
     width: Pixels
     height: Pixels

@@ -6,7 +6,7 @@ from enum import StrEnum
 
 
 class FlightState(StrEnum):
-    """What the vehicle is doing, as the vehicle (or the software autopilot for it) says."""
+    """What the vehicle is doing, as the vehicle (or the software autopilot for it) reports."""
 
     UNKNOWN = "unknown"  #: nothing received yet
     LANDED = "landed"
@@ -75,7 +75,7 @@ class Severity(StrEnum):
 
 
 class EventKind(StrEnum):
-    """What an event tells. ``Event.data`` holds the particulars named here."""
+    """What happened. ``Event.data`` holds the particulars named here."""
 
     APPLICATION_LINK = "application_link"  #: hop application–proxy changed; data: state, reason
     VEHICLE_LINK = "vehicle_link"  #: hop proxy–vehicle changed, or why it is so; data: state, reason, remedy
@@ -84,7 +84,7 @@ class EventKind(StrEnum):
     AUTHORITY_LOST = "authority_lost"  #: data: app_id, lease, reason (released, silent, gone, expired), by (app name)
     AUTHORITY_PREEMPTED = "authority_preempted"  #: data: app_id, lease, by, by_id, by_priority, granted
     AUTHORITY_ASKED = "authority_asked"  #: the holder is asked for it; data: app_id, lease, by, by_id, by_priority …
-    AUTHORITY_DECLINED = "authority_declined"  #: and said no; data: app_id (who asked), by (the holder), reason
+    AUTHORITY_DECLINED = "authority_declined"  #: and declined; data: app_id (who asked), by (the holder), reason
     AUTHORITY_WITHDRAWN = "authority_withdrawn"  #: and asks no more; data: app_id (the holder), lease, by, by_id
     AUTHORITY_EXPIRED = "authority_expired"  #: the holder's time is over, and nobody waits; data: app_id, lease
     FAILSAFE = "failsafe"  #: a step of the ladder was taken or left; data: step, reason

@@ -13,7 +13,7 @@ from skyloop.messages.frame import Name
 from skyloop.messages.numbers import Count, TimeNs
 
 MAX_PAYLOAD: Final = 32_768  #: bytes of a result's value, packed
-MAX_CODE: Final = 128  #: characters of what tells the code of a processor
+MAX_CODE: Final = 128  #: characters of what identifies the code of a processor
 MAX_PARTS: Final = 1024  #: of a camera's frames, of which each worker takes one
 PROCESSOR_NAME: Final = r"^[A-Za-z0-9_.-]{1,64}$"
 ProcessorName = Annotated[str, msgspec.Meta(pattern=PROCESSOR_NAME, min_length=1, max_length=64)]
@@ -39,7 +39,7 @@ class ProcessorShare(msgspec.Struct, frozen=True, array_like=True):
     processor: ProcessorName
     camera: Name
     part: Count  #: from 0
-    #: 0: no frame, for it said that it can take none; 1: every frame
+    #: 0: no frame, for it stated that it can take none; 1: every frame
     parts: Annotated[int, msgspec.Meta(ge=0, le=MAX_PARTS)]
     workers: Count  #: of this processor and camera, those that can take none included
 

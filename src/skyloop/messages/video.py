@@ -51,7 +51,7 @@ class VideoRequest:
         if self.part is not None and not _is_part(self.part):
             raise UsageError(f"part is {self.part!r} and must be (k, n) with 0 <= k < n <= {MAX_PARTS}")
         if self.encoding == "raw" and self.quality != DEFAULT_QUALITY:
-            object.__setattr__(self, "quality", DEFAULT_QUALITY)  # it says nothing, so it tells no two requests apart
+            object.__setattr__(self, "quality", DEFAULT_QUALITY)  # it means nothing: equal requests stay equal
         if self.part == (0, 1):
             object.__setattr__(self, "part", None)
 
@@ -124,7 +124,7 @@ class FrameFilter:
 
     def _in_time(self, captured_ns: int) -> bool:
         period_ns, due_ns = self._period_ns, self._due_ns
-        # A time long before the last one is of another run of the camera, and starts the count anew.
+        # A time long before the last one is of another run of the camera, and restarts the count.
         if due_ns is None or captured_ns < due_ns - 2 * period_ns or captured_ns >= due_ns + period_ns:
             self._due_ns = captured_ns + period_ns
             return True

@@ -12,7 +12,7 @@ from skyloop.errors import UnknownNameError, UsageError
 #: VRPN has a client of its own here.
 SYSTEMS: Final = {
     "vicon": ("vicon", "z"),
-    "optitrack": ("optitrack", "y"),  # Motive streams with y up unless told otherwise
+    "optitrack": ("optitrack", "y"),  # Motive streams with y up by default
     "qualisys": ("qualisys", "z"),
     "vrpn": ("vrpn", "z"),
 }

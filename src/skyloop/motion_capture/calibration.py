@@ -1,8 +1,8 @@
 """Rotation between a tracked body's axes, as a motion capture system defines them, and the drone's. Pure.
 
 As MAVwork did it: the drone stands still for two seconds, the poses are averaged, and the calibration is refused when
-they are spread too much. At rest the drone's own roll and pitch tell how it stands; its heading is taken from the way
-it is put down: nose along the world's x axis, or as ``heading`` says.
+they are spread too much. At rest the drone's own roll and pitch show how it stands; its heading is taken from the way
+it is put down: nose along the world's x axis, or as given by ``heading``.
 """
 
 from __future__ import annotations

@@ -83,7 +83,7 @@ class MotionCapture:
     Attributes:
         system: The system.
         bodies: Names of drones to the system's names of their bodies.
-        latency_ns: Age of a pose on arrival, as the address says.
+        latency_ns: Age of a pose on arrival, as given in the address.
         unknown: Bodies that the system sees but ``bodies`` does not name.
     """
 
@@ -108,7 +108,7 @@ class MotionCapture:
         self.unknown: set[str] = set()  #: bodies that the system sees but ``bodies`` does not name
         self._names = {theirs: ours for ours, theirs in bodies.items()}
         self._tracks = {name: Track(name, may_freeze=system.kind == "sim") for name in bodies}
-        self._told = dict.fromkeys(bodies, TrackState.WAITING)
+        self._reported = dict.fromkeys(bodies, TrackState.WAITING)
         self._calibrations: dict[str, Calibration] = {}
         self._pose_listeners: list[OnPose] = []
         self._event_listeners: list[OnEvent] = []
@@ -341,7 +341,7 @@ class MotionCapture:
             _call(self._pose_listeners, pose)
 
     def _trouble(self, text: str) -> None:
-        self._tell("", TrackState.LOST, text)
+        self._publish_event("", TrackState.LOST, text)
 
     def _look_on(self) -> None:
         while not self._ended.wait(LOOK_S):
@@ -353,15 +353,15 @@ class MotionCapture:
     def _report(self, track: Track) -> None:
         """Emit an event once for each change of a body's state."""
         with self._changed:
-            before, state = self._told[track.body], track.state
-            self._told[track.body] = state
+            before, state = self._reported[track.body], track.state
+            self._reported[track.body] = state
         if state is TrackState.LOST and before is not state:
-            self._tell(track.body, state, f"{track.body} is not tracked any more")
+            self._publish_event(track.body, state, f"{track.body} is not tracked any more")
         elif state is TrackState.TRACKED and before is not state:
             again = "again" if before is TrackState.LOST else "now"
-            self._tell(track.body, state, f"{track.body} is tracked {again}")
+            self._publish_event(track.body, state, f"{track.body} is tracked {again}")
 
-    def _tell(self, body: str, state: TrackState, text: str) -> None:
+    def _publish_event(self, body: str, state: TrackState, text: str) -> None:
         _log.log(logging.WARNING if state is TrackState.LOST else logging.INFO, "motion capture: %s", text)
         _call(self._event_listeners, TrackEvent(monotonic_ns(), body, state, text))
 

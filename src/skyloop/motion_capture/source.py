@@ -47,11 +47,11 @@ class ChildSource:
         self._trouble = trouble
         self._command = command
         self._child: ChildProcess | None = None
-        self._heard_s = 0.0
+        self._received_s = 0.0
         self._ended = threading.Event()
         self._first = threading.Event()
         self._failed: Exception | None = None
-        self._said = ""  # the end of the last child's standard error
+        self._last_words = ""  # the end of the last child's standard error
         self._reader = threading.Thread(target=self._run, name="skyloop-mocap", daemon=True)
         self._guard = threading.Thread(target=self._watch, name="skyloop-mocap-guard", daemon=True)
 
@@ -73,9 +73,9 @@ class ChildSource:
         self._reader.start()
         self._guard.start()
         if not self._first.wait(timeout_s) or self._failed is not None:
-            failed, said = self._failed, self._said
+            failed, last_words = self._failed, self._last_words
             self.close()
-            raise failed or LinkError(f"{self._system.address} sent no frame within {timeout_s:g} s{said}")
+            raise failed or LinkError(f"{self._system.address} sent no frame within {timeout_s:g} s{last_words}")
 
     def close(self) -> None:
         """End the child. Idempotent."""
@@ -91,24 +91,24 @@ class ChildSource:
         while not self._ended.is_set():
             code = self._listen()
             if code == MISSING:
-                cause = self._said.removeprefix(": ")
+                cause = self._last_words.removeprefix(": ")
                 self._failed = MissingExtraError(f"{self._system.kind} motion capture", "mocap", cause=cause)
                 self._first.set()
                 return
             if not self._ended.is_set():
-                self._trouble(f"no data from {self._system.address}{self._said}; trying again")
+                self._trouble(f"no data from {self._system.address}{self._last_words}; trying again")
             self._ended.wait(AGAIN_S)
 
     def _listen(self) -> int | None:
         """Run one child from its start to its end; return its exit code."""
         settings = msgspec.json.encode(self._system.configuration).decode()
-        self._heard_s = time.monotonic() + FIRST_S - SILENT_S
+        self._received_s = time.monotonic() + FIRST_S - SILENT_S
         child = self._child = ChildProcess([*self._command, self._system.kind, settings])
         if self._ended.is_set():  # closed between two children
             child.kill()
         try:
             while (frame := read(cast(BinaryIO, child.stdout))) is not None:
-                self._heard_s = time.monotonic()
+                self._received_s = time.monotonic()
                 self._first.set()
                 self._take(frame)
         except msgspec.DecodeError as error:
@@ -116,13 +116,13 @@ class ChildSource:
         finally:
             child.kill()
             child.close()
-            self._said = f": {child.last_words}" if child.last_words else ""
+            self._last_words = f": {child.last_words}" if child.last_words else ""
         return child.code
 
     def _watch(self) -> None:
         """Kill a child that has fallen silent: the native code would wait for ever."""
         while not self._ended.wait(AGAIN_S):
-            if time.monotonic() - self._heard_s > SILENT_S:
+            if time.monotonic() - self._received_s > SILENT_S:
                 self._kill()
 
     def _kill(self) -> None:

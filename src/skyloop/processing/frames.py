@@ -18,7 +18,7 @@ from skyloop.messages import ProcessorShare
 class Frames:
     """The newest frame of a worker's share that it has not taken yet. A context manager: subscribed while open.
 
-    Only frames of the share are requested, anew whenever it changes, so that no others travel over a network.
+    Only frames of the share are requested, again whenever it changes, so that no others travel over a network.
     """
 
     def __init__(

@@ -76,7 +76,7 @@ class Group:
             pause_s: Time before a child that died is restarted [s].
         """
         self._command = tuple(command)
-        self._tell = tell
+        self._report = tell
         self._pause_s = pause_s
         self._children: list[Child | None] = [Child(self._command) for _ in range(count)]
         self._due_s = [0.0] * count
@@ -108,7 +108,7 @@ class Group:
         return 0 if all(code == 0 for code in codes) else None
 
     def _bury(self, number: int, child: Child) -> None:
-        self._tell(f"worker {number + 1} {child.ending}: the others have its share until it is restarted")
+        self._report(f"worker {number + 1} {child.ending}: the others have its share until it is restarted")
         child.end()
         self._children[number] = None
         self._due_s[number] = time.monotonic() + self._pause_s

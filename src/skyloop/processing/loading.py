@@ -1,4 +1,4 @@
-"""Loads the user's processor from a module or a file, with errors that say where and what is wrong."""
+"""Loads the user's processor from a module or a file, with errors that name the place and the problem."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _DIGITS: Final = 16  #: of the hash of the code
 
 @dataclass(frozen=True, slots=True)
 class Code:
-    """The class of a processor, and a mark that tells it from other code of the same name."""
+    """The class of a processor, and a mark that distinguishes it from other code of the same name."""
 
     kind: type[Any]
     mark: str  #: name of the class and a hash of the file that defines it

@@ -21,7 +21,7 @@ from skyloop.processing.output import Output
 from skyloop.processing.status import Status, Tally
 
 _LOOK_S: Final = 0.1  #: how often run() checks whether to end while no frame comes
-_TELL_EVERY_S: Final = 1.0  #: exceptions of the user's code are reported at most this often
+_REPORT_EVERY_S: Final = 1.0  #: exceptions of the user's code are reported at most this often
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,13 +73,13 @@ class Worker:
         self.settings = settings
         self._drone = drone
         self._process = processor.process
-        self._tell = tell
+        self._report = tell
         self._clock = time.monotonic_ns
         self._tally = Tally(self._clock)
         self._stopped = threading.Event()
         self._busy_since_s: float | None = None
-        self._told_s = -math.inf
-        self._told_refused = False
+        self._reported_s = -math.inf
+        self._reported_refusal = False
         self.membership = drone._core.join_processor(
             settings.name, code=settings.code, camera=settings.camera, shared=settings.shared
         )
@@ -167,20 +167,20 @@ class Worker:
 
     def _refused(self, error: UsageError) -> None:
         self._tally.refused += 1
-        if not self._told_refused:  # further results are most likely of the same type
-            self._told_refused = True
-            self._say(f"{self.settings.name}: {error}. Further ones are counted and not reported.")
+        if not self._reported_refusal:  # further results are most likely of the same type
+            self._reported_refusal = True
+            self._emit(f"{self.settings.name}: {error}. Further ones are counted and not reported.")
 
     def _failed(self, error: Exception) -> None:
         self._tally.errors += 1
         now_s = time.monotonic()
-        if now_s - self._told_s < _TELL_EVERY_S:
+        if now_s - self._reported_s < _REPORT_EVERY_S:
             return
-        self._told_s = now_s
+        self._reported_s = now_s
         inner = error.__traceback__.tb_next if error.__traceback__ is not None else None  # without our own line
         lines = "".join(traceback.format_exception(type(error), error, inner))
-        self._say(f"{self.settings.name} failed ({self._tally.errors} times so far):\n{lines.rstrip()}")
+        self._emit(f"{self.settings.name} failed ({self._tally.errors} times so far):\n{lines.rstrip()}")
 
-    def _say(self, text: str) -> None:
-        self._tell(text)
+    def _emit(self, text: str) -> None:
+        self._report(text)
         self._drone.log.text(text[-MAX_TEXT:], name=self.settings.name, severity=Severity.ERROR)

@@ -49,7 +49,7 @@ class Tenure(msgspec.Struct, frozen=True):
     priority: int
     begin: datetime
     end: datetime | None  #: None: it goes on, or the proxy was killed
-    how: str  #: how it ended; empty: it goes on, as far as the file tells
+    how: str  #: how it ended; empty: not ended, as far as the file shows
     takeoffs: int = 0
 
 
@@ -126,7 +126,7 @@ def read(path: Path) -> tuple[list[Entry], int]:
 
 
 def audit_folder() -> Path:
-    """Where the files are unless somebody says otherwise: in the user's directory of state."""
+    """Where the files are by default: in the user's state directory."""
     import platformdirs
 
     return Path(platformdirs.user_state_dir("skyloop", appauthor=False)) / FOLDER
@@ -158,7 +158,7 @@ class AuditTrail:
         self._queue.put(Entry(self._wall(), self._proxy, self._run, "begin", how=uri))
 
     def note(self, event: Event) -> None:
-        """An event was told. Any thread."""
+        """Take an event. Any thread."""
         entry = entry_of(event, self._wall(), self._proxy, self._run)
         if entry is not None:
             self._queue.put(entry)
@@ -180,6 +180,6 @@ class AuditTrail:
             os.write(self._file, line)  # one call, so that lines of several writers do not mix
             self._failed = False
         except OSError as error:
-            if not self._failed:  # a full disk is told once, and the flight goes on
+            if not self._failed:  # a full disk is logged once, and the flight goes on
                 _log.error("the audit trail %s can't be written: %s", self.path, error)
             self._failed = True

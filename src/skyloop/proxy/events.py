@@ -1,4 +1,4 @@
-"""What the proxy reports about itself: numbered events for everybody, and counters for whoever asks."""
+"""What the proxy reports about itself: numbered events for all clients, and counters on request."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class EventPublisher:
                 missed, self._missed = self._missed, 0
                 text = f"{missed} events could not be handed over to applications that are too slow"
                 self._number(EventKind.SAMPLES_LOST, text, Severity.WARNING, None, {"count": missed})
-                self._missed = 0  # that this one was not handed over either is no news
+                self._missed = 0  # that this one was not handed over either needs no event
 
     def _number(self, kind: EventKind, text: str, severity: Severity, app: str | None, data: dict[str, Value]) -> None:
         self._seq += 1

@@ -30,7 +30,7 @@ class ActionExecutor:
 
     Args:
         driver: the vehicle's driver.
-        capabilities: what it told about the vehicle.
+        capabilities: what it reported about the vehicle.
         autopilot: the software autopilot; None for a vehicle that it adds nothing to.
         publisher: what the vehicle reported, and where the driver's failures are reported.
     """
@@ -48,7 +48,7 @@ class ActionExecutor:
         self._driver = driver
         self._vehicle = publisher
         self._in_force: AnyAction = Idle()
-        self._noticed = False
+        self._had_feedback = False
 
     @property
     def state(self) -> FlightState:
@@ -109,9 +109,9 @@ class ActionExecutor:
         if self.autopilot is None:
             return None
         feedback = self._vehicle.feedback_now
-        if not self._noticed and feedback is not None and feedback.altitude is not None:
-            self._noticed = True
-            self.autopilot.notice(feedback)
+        if not self._had_feedback and feedback is not None and feedback.altitude is not None:
+            self._had_feedback = True
+            self.autopilot.on_first_feedback(feedback)
         action = self.autopilot.step(now_ns, feedback)
         if action is None:
             return None

@@ -55,10 +55,10 @@ class FlightRecord:
         try:
             age_s = self._wall() - self.path.stat().st_mtime
             with self.path.open(encoding="utf-8") as file:
-                said = file.read(MAX_BYTES)
+                content = file.read(MAX_BYTES)
         except (OSError, ValueError):
             return False
-        return said == self._vehicle and -1.0 <= age_s <= LIFE_S  # a clock is no better than that
+        return content == self._vehicle and -1.0 <= age_s <= LIFE_S  # a clock is no better than that
 
     def start(self) -> None:
         """Start to write."""

@@ -118,8 +118,8 @@ class CommandHandler:
     # From the proxy: what decides takes the lock -----------------------------------------------------------------
 
     def begin(self, now_ns: int) -> None:
-        """Begin the run, before the server starts. A flight of an earlier run waits for its pilot, as if just heard."""
-        self.authority.heard_ns = now_ns
+        """Begin the run, before the server starts. A flight of an earlier run waits for its pilot."""
+        self.authority.last_command_ns = now_ns
 
     def configure(self, settings: FlightSettings) -> None:
         """Let new values of the parameters take effect."""
@@ -148,7 +148,7 @@ class CommandHandler:
             self._publish(COMMANDS, encode(echo))
 
     def request_authority(self, session: Session, request: RequestAuthority, now_ns: int) -> AnyReply:
-        """Give the authority, or a position in the queue, or say who holds it."""
+        """Give the authority, or a position in the queue, or return who holds it."""
         if session.role is not Role.PILOT:
             return Refused(Refusal.OBSERVER, "observers get no authority: connect as a pilot")
         term_ns = None if request.for_s is None else nanoseconds(request.for_s)
@@ -349,7 +349,7 @@ class CommandHandler:
         ended = [effect for effect in effects if isinstance(effect, (Lost, Preempted))]
         for effect in ended:
             self._publish_authority(effect, now_ns)
-        self._update_failsafe(now_ns)  # which hovers, before anybody hears that it has the authority
+        self._update_failsafe(now_ns)  # which hovers, before anybody learns that it has the authority
         for effect in effects:
             if effect not in ended:
                 self._publish_authority(effect, now_ns)
@@ -420,8 +420,8 @@ class CommandHandler:
         self._stamp()
         if changed.whose is Whose.OTHERS:
             executor.stop_autopilot()
-        elif changed.why:  # found on a flight that is ours: its pilot may come back, as if just heard
-            self.authority.heard_ns = max(self.authority.heard_ns, now_ns)
+        elif changed.why:  # found on a flight that is ours: its pilot may come back, as if a command had just come
+            self.authority.last_command_ns = max(self.authority.last_command_ns, now_ns)
         if changed.why and executor.supported:  # a recording that is played flies by itself, and nobody wonders
             self._events.publish_draft(ownership_event(changed))
 
@@ -433,7 +433,7 @@ class CommandHandler:
         inputs = FailsafeInputs(
             state=self._executor.state,
             airborne=self._executor.airborne,
-            heard_ns=self.authority.heard_ns,
+            last_command_ns=self.authority.last_command_ns,
             pilot=self._pilot,
             link_up=self._vehicle.link_up,
             battery=feedback.battery if feedback is not None else None,

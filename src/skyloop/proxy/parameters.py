@@ -169,7 +169,7 @@ class Parameters:
         self.left_out: tuple[str, ...] = ()  #: driver's parameters that are too large to be sent
 
     def refresh(self) -> None:
-        """Read the driver's parameters anew. Raises whatever the driver raises."""
+        """Read the driver's parameters again. Raises whatever the driver raises."""
         read = {parameter.name: parameter for parameter in self._read_driver()}
         large = tuple(name for name, parameter in read.items() if len(_encoded(parameter)) > MAX_PARAMETER)
         with self._lock:

@@ -393,7 +393,7 @@ class Proxy:
         return Statistics(self._counters.snapshot(applications=applications, **self.server.counters))
 
     def _refresh_parameters(self) -> None:
-        """Read the driver's parameters anew, now that its vehicle has come. On the driver's thread."""
+        """Read the driver's parameters again, now that its vehicle has come. On the driver's thread."""
         self._requests.call_later(self._parameter_requests.read_driver)
 
 

@@ -77,7 +77,7 @@ class VehiclePublisher:
         events: where events are published.
         counters: the proxy's counters.
         clock: the proxy's clock [ns].
-        capabilities: what the driver told about the vehicle: its cameras.
+        capabilities: what the driver reported about the vehicle: its cameras.
         state_of: the flight state, given the one that the driver reported; the software autopilot may know better.
         on_link_up: called on the driver's thread when the vehicle's link has come up.
     """
@@ -94,7 +94,7 @@ class VehiclePublisher:
         on_link_up: Callable[[], None],
     ) -> None:
         self.feedback_now: Feedback | None = None  #: the newest sample as it was published
-        self.reported_state = FlightState.UNKNOWN  #: as the driver said it, before the software autopilot
+        self.reported_state = FlightState.UNKNOWN  #: as the driver reported it, before the software autopilot
         self.link_state = LinkState.CONNECTING
         self.link_reason = ""  #: what is waited for, and what failed last
         self.link_remedy = ""  #: what a person can do about it
@@ -325,7 +325,7 @@ class VehiclePublisher:
             self._on_link_up()
 
     def event(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: Value) -> None:
-        """Something happened, from the driver. Driver errors that go on are told once a second."""
+        """Something happened, from the driver. Repeated driver errors are published once a second."""
         if kind is EventKind.DRIVER_ERROR:
             self._events.publish_repeated(("driver", text), lambda: EventDraft(kind, text, severity, data=dict(data)))
         else:
@@ -337,7 +337,7 @@ class VehiclePublisher:
         self._fail(where, f"driver failed in {where}: {error!r}")
 
     def driver_refused(self, where: str, error: BaseException) -> str:
-        """A command made the driver raise: the words for whoever sent it. What is no driver's error is told besides."""
+        """A command made the driver raise. Return the text for its sender; an unexpected error is published as well."""
         if isinstance(error, SkyloopError):  # the vehicle's own reason
             self._counts["driver.errors"] += 1
             return str(error)

@@ -174,7 +174,7 @@ class ParameterRequests:
         return ParameterValue(self._parameters.get(request.name))
 
     def page(self, _session: Session, request: ListParameters, _now_ns: int) -> AnyReply:
-        """Read the driver's parameters anew and answer with a page of all."""
+        """Read the driver's parameters again and answer with a page of all."""
         self.read_driver()
         return self._parameters.page(request.first)
 

@@ -26,7 +26,7 @@ from skyloop.transport.base import TransportServer
 
 LAND_WITHIN_S: Final = 20.0  #: how long a signalled proxy waits for its vehicle to land
 _POLL_S: Final = 0.2
-GRACE_NS: Final = nanoseconds(1.0)  #: most vehicles answer within this; until then nothing is said about waiting
+GRACE_NS: Final = nanoseconds(1.0)  #: most vehicles answer within this; until then nothing is printed about waiting
 _THERE: Final = (LinkState.UP, LinkState.DEGRADED)
 _log = logging.getLogger(__name__)
 
@@ -35,7 +35,7 @@ Look = Callable[[], Sequence[str]]
 
 
 class LinkLines:
-    """Lines about one proxy's vehicle link for whoever started it: one when the link, or the reason, has changed."""
+    """Lines about one proxy's vehicle link for the terminal: one when the link, or the reason, has changed."""
 
     def __init__(self, name: str, where: str, now_ns: int) -> None:
         """``where``: what is served and at which address."""
@@ -102,7 +102,7 @@ def serve(
     SIGTERM, landing first for at most ``land_within_s`` [s] if the vehicle flies; a second signal ends at once. With
     ``parent_fd``, the reading end of a pipe: ends at once when that reads end of file, which the death of the parent
     causes, and leaves SIGINT to the parent, as a terminal sends it to both. ``look`` is called some times a second:
-    what it says of the keys is logged, and told to all as an event.
+    what it returns about the keys is logged, and published as an event.
 
     Raises :class:`UsageError` (also for a name or address that makes no sense, or a name that is taken) and
     :class:`skyloop.errors.DriverError`.
@@ -155,7 +155,7 @@ def run(
         while not shutdown.requested.wait(_POLL_S):
             for change in look() if look is not None else ():
                 _publish_keys(proxies, change)
-            if parent_fd is None:  # a parent is told by the proxy's events, and may not read what is written here
+            if parent_fd is None:  # a parent gets the proxy's events, and may not read what is written here
                 for proxy, link in zip(proxies, lines, strict=True):
                     _announce_link(proxy, link)
         _land(proxies, shutdown, land_within_s)

@@ -37,7 +37,7 @@ class Session:
         self.peer = peer
         self.joined_ns = joined_ns
         self.app_id = peer.id
-        self.name = f"application {peer.id}"  #: until Hello tells it
+        self.name = f"application {peer.id}"  #: until Hello has it
         self.role: Role | None = None
         self.sequence = CommandSequence()
         self.episodes = Episodes()

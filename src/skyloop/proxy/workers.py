@@ -33,7 +33,7 @@ from skyloop.proxy.publisher import camera_problem
 from skyloop.proxy.sessions import Session
 from skyloop.transport.base import RESULTS, TransportServer, results
 
-#: A worker of which nothing was heard for so long gives up its share: it hangs, or its host does.
+#: A worker that sent nothing for this long loses its share: it hangs, or its host does.
 SILENT_S: Final = 1.0
 #: How far in the future a result's frame may lie, by the error of its camera's clock.
 MAX_AHEAD_S: Final = 1.0
@@ -47,7 +47,7 @@ class Worker:
     """One application as a worker of one processor."""
 
     asked: JoinProcessor
-    heard_ns: int
+    received_ns: int
     silent: bool = False
 
     @property
@@ -88,10 +88,10 @@ class WorkerRoster:
         return None
 
     def mark_silent(self, now_ns: int) -> list[tuple[int, JoinProcessor]]:
-        """Mark and return those that were not heard for too long and were not marked before."""
+        """Mark and return those that were silent for too long and were not marked before."""
         found = []
         for (app_id, _), worker in self._workers.items():
-            if not worker.silent and now_ns - worker.heard_ns > nanoseconds(SILENT_S):
+            if not worker.silent and now_ns - worker.received_ns > nanoseconds(SILENT_S):
                 worker.silent = True
                 found.append((app_id, worker.asked))
         return found

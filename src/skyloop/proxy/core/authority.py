@@ -3,7 +3,7 @@
 Priority 0 is the highest, 31 the lowest. At any time at most one application *holds* the authority, under a lease
 whose number was never used before in this run. A strictly higher priority takes over at once, or after the holder was
 asked; a pre-empted pilot waits in the queue at the position that its priority and first arrival give it. A holder that
-said for how long it wants the authority loses it when that time is over and somebody waits. The rules in words are in
+stated how long it wants the authority loses it when that time is over and somebody waits. The rules in words are in
 ``docs/proxy.md``.
 """
 
@@ -123,7 +123,7 @@ class Authority:
         self.ask_ns = nanoseconds(ask_s)  #: how long a holder that is asked may wait before the higher priority wins
         self.holder: QueueEntry | None = None
         self.lease = 0  #: the lease in force; 0 for none
-        self.heard_ns = 0  #: when the holder sent its last valid command, or got the lease
+        self.last_command_ns = 0  #: when the holder sent its last valid command, or got the lease
         self.until_ns: int | None = None  #: when the holder's time is over
         self.silent: QueueEntry | None = (
             None  #: who lost the lease by silence and keeps the name on it until somebody asks
@@ -136,7 +136,7 @@ class Authority:
 
     @property
     def owner(self) -> QueueEntry | None:
-        """Whose name is on it: the holder's, or that of one who lost the lease by silence and whom nobody followed."""
+        """Whose name is on it: the holder's, or that of one who lost the lease by silence and has no successor."""
         return self.holder or self.silent
 
     @property
@@ -191,7 +191,7 @@ class Authority:
             self._change_term(term_ns, now_ns)
             if not (self._waiting and self._is_over(now_ns)):
                 return self._settle(now_ns)
-            effects.append(self._relieve())  # and asks anew, as everybody else does
+            effects.append(self._relieve())  # and asks again, as everybody else does
         entry, asked_before = self._dequeue(app_id, priority, term_ns, ask, now_ns)
         if queue or self._may_be_taken(entry, now_ns):
             insort(self._waiting, entry)
@@ -243,7 +243,7 @@ class Authority:
         holder = self.holder
         if holder is None:
             return []
-        if now_ns - self.heard_ns >= self.timeout_ns:
+        if now_ns - self.last_command_ns >= self.timeout_ns:
             effects = self._drop(holder.app_id, "silent", now_ns)
             if self.holder is None:
                 self.silent = holder
@@ -349,14 +349,14 @@ class Authority:
     def _grant(self, now_ns: int) -> Granted:
         first = self._waiting.pop(0)
         self._last_lease += 1
-        self.holder, self.lease, self.heard_ns = replace(first, asks_until_ns=None), self._last_lease, now_ns
+        self.holder, self.lease, self.last_command_ns = replace(first, asks_until_ns=None), self._last_lease, now_ns
         self.until_ns = None if first.term_ns is None else now_ns + first.term_ns
         self._expiry_reported = False
         self.silent = None
         return Granted(first.app_id, first.priority, self.lease, self.until_ns)
 
     def _moved(self, now_ns: int) -> list[Effect]:
-        """Report whoever's position in the queue has changed."""
+        """Report each position in the queue that has changed."""
         positions = {entry.app_id: position for position, entry in enumerate(self._waiting, 1)}
         moved: list[Effect] = [
             Queued(entry.app_id, entry.priority, positions[entry.app_id], self.wait_ns(entry.app_id, now_ns))

@@ -89,18 +89,18 @@ class Autopilot:
         self._lowest = math.inf
         self._lowest_ns = 0
 
-    def state(self, told: FlightState) -> FlightState:
-        """The flight state, given what the driver ``told``: the vehicle's own word where it has the notion."""
-        if told is FlightState.EMERGENCY or (self.mode is Mode.LAND and told is FlightState.LANDED):
-            return told
+    def state(self, reported: FlightState) -> FlightState:
+        """The flight state, given what the driver ``reported``: the vehicle's own state where it has one."""
+        if reported is FlightState.EMERGENCY or (self.mode is Mode.LAND and reported is FlightState.LANDED):
+            return reported
         if self._owns_state or self.mode in (Mode.TAKEOFF, Mode.LAND):
             return self._state
-        if told is FlightState.FLYING and self.mode is Mode.HOVER:
+        if reported is FlightState.FLYING and self.mode is Mode.HOVER:
             return FlightState.HOVERING
-        return told
+        return reported
 
-    def notice(self, feedback: Feedback) -> None:
-        """The first thing heard from the vehicle: a proxy may have been restarted under a flying one."""
+    def on_first_feedback(self, feedback: Feedback) -> None:
+        """The vehicle's first feedback: a proxy may have been restarted under a flying one."""
         if self.mode is Mode.OFF and (feedback.altitude or 0.0) > AIRBORNE_ALTITUDE:
             self._state = FlightState.FLYING
 
@@ -129,7 +129,7 @@ class Autopilot:
             self._state = FlightState.HOVERING if action_name == "hover" else FlightState.FLYING
 
     def step(self, now_ns: int, feedback: Feedback | None) -> Attitude | Velocity | None:
-        """What to tell the vehicle now; None while off. To be called every :data:`PERIOD_S`."""
+        """What to send to the vehicle now; None while off. To be called every :data:`PERIOD_S`."""
         if self.mode is Mode.OFF:
             return None
         known = feedback if feedback is not None and now_ns - feedback.captured_ns <= STALE_NS else None

@@ -1,8 +1,8 @@
 """The checks that a command passes before it reaches the vehicle. Pure: the time is an argument.
 
-In this order: sequence, age, lease, finite numbers (these four, :meth:`CommandChecks.receive`, say whether the holder
-was *heard*), then freshness, the vehicle's link, support, whose the flight is, the flight state, limits, safety box and
-zones (:meth:`CommandChecks.decide`). The rules in words are in ``docs/proxy.md``.
+In this order: sequence, age, lease, finite numbers (these four, :meth:`CommandChecks.receive`, decide whether it is a
+sign of life of the holder), then freshness, the vehicle's link, support, whose the flight is, the flight state, limits,
+safety box and zones (:meth:`CommandChecks.decide`). The rules in words are in ``docs/proxy.md``.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class CommandSequence:
     def receive(self, command: Command, now_ns: int, max_age_ns: int, lease: int, holds: bool) -> Refusal | None:
         """Check sequence, age, lease and numbers, and remember the sequence and the intent.
 
-        ``lease`` is the one in force (0 for none), ``holds`` whether the sender holds it. None: the holder was heard.
+        ``lease`` is the one in force (0 for none), ``holds`` whether the sender holds it. None: it is a sign of life.
         """
         if command.seq <= self.seq:
             return Refusal.OUT_OF_SEQUENCE
@@ -101,7 +101,7 @@ def _row(**policies: StatePolicy) -> dict[FlightState, StatePolicy]:
 _APPLY, _HOLD, _HOVER, _REFUSE = StatePolicy.APPLY, StatePolicy.HOLD, StatePolicy.HOVER, StatePolicy.REFUSE
 _SET_POINT: Final = _row(landed=_REFUSE, taking_off=_HOLD, landing=_HOLD, emergency=_REFUSE, other=_APPLY)
 
-#: In a state that is not known everything is passed on: some vehicles never tell.
+#: In a state that is not known everything is passed on: some vehicles never report it.
 STATE_POLICIES: Final[dict[type[Action], dict[FlightState, StatePolicy]]] = {
     Idle: _row(other=_HOLD),
     Takeoff: _row(landed=_APPLY, unknown=_APPLY, taking_off=_HOLD, emergency=_REFUSE, other=_HOVER),
@@ -114,7 +114,7 @@ STATE_POLICIES: Final[dict[type[Action], dict[FlightState, StatePolicy]]] = {
 
 
 class Decision(NamedTuple):
-    """What becomes of a command whose sender was heard."""
+    """What becomes of a command that the first checks let through."""
 
     action: AnyAction | None = None  #: what the vehicle must do; None: nothing new
     refusal: Refusal | None = None
@@ -129,7 +129,7 @@ class CommandChecks:
     """Decides what becomes of the commands for one vehicle.
 
     Args:
-        authority: who holds the lease; :meth:`receive` notes when its holder was heard.
+        authority: who holds the lease; :meth:`receive` notes when its holder's last command came.
         ladder: the failsafe ladder.
         ownership: whose the flight is.
         supported: the actions that the vehicle or the software autopilot can do.
@@ -156,13 +156,13 @@ class CommandChecks:
         self._ceiling = Ceiling()
 
     def receive(self, command: Command, sequence: CommandSequence, app_id: int, now_ns: int) -> Refusal | None:
-        """Check sequence, age, lease and numbers. None: the holder was heard, which keeps its lease."""
+        """Check sequence, age, lease and numbers. None: they passed, which keeps the holder's lease."""
         authority = self._authority
         holder = authority.holder
         holds = holder is not None and holder.app_id == app_id
         refusal = sequence.receive(command, now_ns, self.max_age_ns, authority.lease, holds)
         if refusal is None:
-            authority.heard_ns = now_ns
+            authority.last_command_ns = now_ns
         return refusal
 
     def explain(self, refusal: Refusal, command: Command, sequence: CommandSequence, now_ns: int) -> str:

@@ -54,7 +54,7 @@ class FailsafeInputs:
 
     state: FlightState
     airborne: bool
-    heard_ns: int  #: when the last valid command came, or the authority was granted
+    last_command_ns: int  #: when the last valid command came, or the authority was granted
     pilot: str  #: ``held``, or why nobody holds the authority: ``released``, ``silent``, ``gone``, ``none``
     link_up: bool  #: hop proxy–vehicle
     battery: float | None
@@ -158,7 +158,7 @@ class FailsafeLadder:
     def _due(self, now_ns: int, inputs: FailsafeInputs) -> tuple[Failsafe, str]:
         if self.barred:
             return Failsafe.LAND, self.barred
-        silent_ns = now_ns - inputs.heard_ns
+        silent_ns = now_ns - inputs.last_command_ns
         silence = "silent" if inputs.pilot == "held" else inputs.pilot
         if silent_ns >= nanoseconds(self.settings.land_after_s):
             return Failsafe.LAND, silence

@@ -1,7 +1,7 @@
 """Whose flight this is: who began it, and who steers. Pure: the time is an argument.
 
 The proxy steers only for an application's own, new intent, or to end a flight that it began itself. What others arm,
-fly, switch or land is observed, told, and left alone. The rules in words are in ``docs/proxy.md``.
+fly, switch or land is observed, reported, and left alone. The rules in words are in ``docs/proxy.md``.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from skyloop.messages import FlightState
 
 #: A take-off that was asked for so long ago and does not show is none of ours any more: drivers give one up sooner.
 CLAIM_NS: Final = nanoseconds(15.0)
-#: A flight is over when the vehicle stood for so long: one that bounces, or says so for a moment, still flies.
+#: A flight is over when the vehicle stood for so long: one that bounces, or reports so for a moment, still flies.
 STANDING_NS: Final = nanoseconds(1.0)
 
 _GROUNDED: Final = (FlightState.LANDED, FlightState.EMERGENCY)
@@ -105,7 +105,7 @@ class Ownership:
 
     def _words(self, before: Whose) -> str:
         if before is not Whose.NOBODYS or self.left_to or not self._shared:
-            return ""  # the driver told who took it, or the flight is over, or it can't be anybody else's
+            return ""  # the driver reported who took it, or the flight is over, or it can't be anybody else's
         if self.whose is Whose.OURS:
             return "the vehicle is on a flight that this proxy began before it was restarted"
         return "the vehicle is flown by others: it is left alone until an application takes off, hovers or lands it"
