@@ -47,7 +47,8 @@ def look(name: str, seconds: float = 60.0) -> None:
 
 def turn(name: str, seconds: float = 5.0) -> None:
     """Asks politely, waits for the answer, climbs a little, and gives it back."""
-    with skyloop.connect(name, name="colleague", priority=8, takeover="ask", wait_s=30, on_exit="hover") as drone:
+    asking = skyloop.Authority(priority=8, takeover="ask", wait_s=30)
+    with skyloop.connect(name, name="colleague", authority=asking, on_exit="hover") as drone:
         print("my turn", flush=True)
         drone.velocity(up=0.1)
         time.sleep(seconds)

@@ -114,7 +114,9 @@ def asked() -> None:
             page.locator('.pane[data-mine="true"]').wait_for()
             page.keyboard.press("t")
             page.locator(".pill", has_text="hovering").wait_for()
-            with skyloop.connect("alpha", name="survey.py", priority=4, takeover="ask", for_s=600, stay=True):
+            with skyloop.connect(
+                "alpha", name="survey.py", authority=skyloop.Authority(priority=4, takeover="ask", for_s=600, stay=True)
+            ):
                 page.locator(".asks button.primary:enabled").wait_for()
                 page.locator(".camera[data-seq]").first.wait_for()
                 page.wait_for_timeout(1500)

@@ -1,8 +1,10 @@
 # What `import skyloop` offers: each name of this table is imported from there when it is first used.
 
 from skyloop import aio as aio
+from skyloop.client import Authority as Authority
 from skyloop.client import Drone as Drone
 from skyloop.client import Frame as Frame
+from skyloop.client import Network as Network
 from skyloop.client import Result as Result
 from skyloop.client import Swarm as Swarm
 from skyloop.client import connect as connect

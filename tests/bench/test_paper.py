@@ -92,7 +92,7 @@ def test_a_drone_that_was_put_down_takes_off_again_and_ctrl_c_ends_in_good_order
     with Running("paper", "--minutes", "1", "--headless", "--output", str(tmp_path / "out")) as demo:
         name = demo.until(r"is\s+up\s+as\s+(\S+)\s", 40)[1]
         demo.until("flying through", 40)
-        with skyloop.connect(name, priority=2, name="page", on_exit="hover") as other:
+        with skyloop.connect(name, authority=skyloop.Authority(priority=2), name="page", on_exit="hover") as other:
             other.land()
         with skyloop.connect(name, access="observe") as onlooker:
             onlooker.wait(lambda feedback: feedback.owner == "paper" and feedback.state.airborne, timeout_s=20.0)
@@ -140,7 +140,9 @@ def test_it_lets_go_while_somebody_else_flies_and_goes_on_when_given_back() -> N
         runner.start()
         try:
             wait_until(lambda: targets, "it was on its way")
-            with skyloop.connect(drone.name, priority=2, name="page", on_exit="hover") as other:
+            with skyloop.connect(
+                drone.name, authority=skyloop.Authority(priority=2), name="page", on_exit="hover"
+            ) as other:
                 wait_until(lambda: flight.away, "it let go")
                 assert flight.off_m is None
                 told = len(targets)

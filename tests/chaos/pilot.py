@@ -23,7 +23,9 @@ def fly(name: str, folder: Path, network: str | None) -> None:
     path = folder / f"{name}.pilot"
     first = max((entry.number for entry in read(path)), default=0) + 1
     journal = Journal(path)
-    with skyloop.connect(name, name="chaos", network=network or False, timeout_s=60.0, wait_s=60.0) as drone:
+    with skyloop.connect(
+        name, name="chaos", network=network or False, timeout_s=60.0, authority=skyloop.Authority(wait_s=60.0)
+    ) as drone:
         print("flying", flush=True)
         due = time.monotonic()
         for number in count(first):

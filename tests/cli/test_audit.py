@@ -25,7 +25,7 @@ def flown(start: Start, *arguments: str) -> None:
     """A proxy is started, flown, and ended."""
     proxy = start("proxy", FAST_SIM, "--name", "alpha", *arguments)
     proxy.until("ready")
-    with skyloop.connect("alpha", name="alice", priority=7) as drone:
+    with skyloop.connect("alpha", name="alice", authority=skyloop.Authority(priority=7)) as drone:
         drone.takeoff()
     proxy.signal(signal.SIGINT)
     proxy.wait()

@@ -134,7 +134,7 @@ def test_who_takes_over_keeps_the_drone(start: Callable[..., Process], alpha: Pr
     process = start("fly", write(GOOD + "    def on_authority(self, status):\n        self.stop()\n"), "--on", "alpha")
     with skyloop.connect("alpha", access="observe") as drone:
         drone.wait("flying", timeout_s=30.0)
-    with skyloop.connect("alpha", priority=1, name="other") as other:
+    with skyloop.connect("alpha", authority=skyloop.Authority(priority=1), name="other") as other:
         process.until("other took over: the drone is left to them")
         assert process.wait() == 0
         assert "landing" not in process.text

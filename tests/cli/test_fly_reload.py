@@ -135,7 +135,7 @@ def test_an_error_in_on_authority_is_told_and_the_drone_left_to_who_took_over(
     path.write_text(AUTHORITY)
     process = start("fly", str(path), "--on", "alpha", "--reload")
     looker.wait("flying", timeout_s=30.0)
-    with skyloop.connect("alpha", priority=1, name="other") as other:
+    with skyloop.connect("alpha", authority=skyloop.Authority(priority=1), name="other") as other:
         process.until("RuntimeError: in on_authority")
         other.land()
     process.signal(signal.SIGINT)

@@ -10,6 +10,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from skyloop.client import Authority
 from skyloop.client.connection import RedialPolicy
 from skyloop.client.drone import Drone, open_drone
 from skyloop.client.link_monitor import Thresholds
@@ -275,7 +276,7 @@ def scripted(**options: Any) -> Iterator[ScriptedProxy]:
 def flown(proxy: ScriptedProxy, *, app: str = "me", wait_s: float = 0.0, **options: Any) -> Iterator[Drone]:
     """A drone connected to it; closed at the end, without landing."""
     options.setdefault("policy", QUICK)
-    drone = open_drone(proxy.server.dial, app=app, **options, wait_s=wait_s, timeout_s=WAIT_S)
+    drone = open_drone(proxy.server.dial, app=app, **options, authority=Authority(wait_s=wait_s), timeout_s=WAIT_S)
     try:
         yield drone
     finally:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from skyloop.client.authority import Authority
+from skyloop.client.authority import AuthorityTracker
 from skyloop.messages import Event, EventKind, Feedback, RequestAuthority, Value
 
 NOW = 10_000_000_000
@@ -20,22 +20,22 @@ def owned(owner_id: int = 0, lease: int = 0, owner: str | None = None) -> Feedba
 
 
 @pytest.fixture
-def authority() -> Authority:
-    authority = Authority("me")
+def authority() -> AuthorityTracker:
+    authority = AuthorityTracker("me")
     authority.connected(3)
     authority.asked(RequestAuthority(16))
     return authority
 
 
 @pytest.fixture
-def held(authority: Authority) -> Authority:
+def held(authority: AuthorityTracker) -> AuthorityTracker:
     assert authority.granted(5, NOW)
     return authority
 
 
 def test_granted_by_reply_event_or_feedback() -> None:
     for way in ("reply", "event", "feedback"):
-        authority = Authority("me")
+        authority = AuthorityTracker("me")
         authority.connected(3)
         authority.asked(RequestAuthority(7))
         assert authority.pending
@@ -52,13 +52,13 @@ def test_granted_by_reply_event_or_feedback() -> None:
 
 
 def test_not_wanted_is_not_taken_from_feedback() -> None:
-    authority = Authority("me")
+    authority = AuthorityTracker("me")
     authority.connected(3)
     assert not authority.feedback(owned(3, 5, "me"), NOW)
     assert authority.status.state == "none"
 
 
-def test_queue(authority: Authority) -> None:
+def test_queue(authority: AuthorityTracker) -> None:
     assert authority.queued(2, "other")
     assert (authority.status.state, authority.status.holder, authority.status.position) == ("queued", "other", 2)
     assert authority.event(event(EventKind.AUTHORITY_QUEUED, app_id=3, position=1), NOW)
@@ -69,14 +69,14 @@ def test_queue(authority: Authority) -> None:
     assert authority.held
 
 
-def test_others_events_do_not_matter(held: Authority) -> None:
+def test_others_events_do_not_matter(held: AuthorityTracker) -> None:
     assert not held.event(event(EventKind.AUTHORITY_LOST, app_id=4, lease=5, reason="gone"), NOW)
     assert not held.event(event(EventKind.AUTHORITY_GRANTED, app_id=4, lease=9), NOW)
     assert not held.event(event(EventKind.STATE_CHANGED, app_id=3), NOW)
     assert held.held
 
 
-def test_pre_emption_by_event_and_by_feedback(held: Authority) -> None:
+def test_pre_emption_by_event_and_by_feedback(held: AuthorityTracker) -> None:
     assert held.event(event(EventKind.AUTHORITY_PREEMPTED, app_id=3, lease=5, by="boss"), NOW)
     assert (held.status.state, held.status.holder, held.status.lease) == ("preempted", "boss", 0)
     assert held.granted(7, NOW)
@@ -86,7 +86,7 @@ def test_pre_emption_by_event_and_by_feedback(held: Authority) -> None:
     assert held.status.state == "preempted", "still said to be taken away, not just waiting"
 
 
-def test_an_old_lease_told_late_changes_nothing(held: Authority) -> None:
+def test_an_old_lease_told_late_changes_nothing(held: AuthorityTracker) -> None:
     assert not held.event(event(EventKind.AUTHORITY_PREEMPTED, app_id=3, lease=4, by="boss"), NOW)
     held.event(event(EventKind.AUTHORITY_PREEMPTED, app_id=3, lease=5, by="boss"), NOW)
     assert not held.event(event(EventKind.AUTHORITY_GRANTED, app_id=3, lease=5), NOW)
@@ -94,13 +94,13 @@ def test_an_old_lease_told_late_changes_nothing(held: Authority) -> None:
     assert held.status.state == "preempted"
 
 
-def test_feedback_from_before_the_grant_does_not_end_it(held: Authority) -> None:
+def test_feedback_from_before_the_grant_does_not_end_it(held: AuthorityTracker) -> None:
     assert not held.feedback(owned(), NOW + 1)
     assert not held.feedback(owned(9, 4, "before"), NOW + 1)
     assert held.held
 
 
-def test_lost_by_silence(held: Authority) -> None:
+def test_lost_by_silence(held: AuthorityTracker) -> None:
     assert held.feedback(owned(), LATER)
     assert held.status.state == "none"
     assert held.wanted, "it is to be asked for again"
@@ -109,14 +109,14 @@ def test_lost_by_silence(held: Authority) -> None:
     assert held.status.state == "none"
 
 
-def test_lost_by_silence_and_the_event_was_lost_too(held: Authority) -> None:
+def test_lost_by_silence_and_the_event_was_lost_too(held: AuthorityTracker) -> None:
     kept = owned(3, 0, "me")  # the name stays on the vehicle, without a lease
     assert not held.feedback(kept, NOW + 1), "it may be from before the grant"
     assert held.feedback(kept, LATER)
     assert (held.status.state, held.wanted) == ("none", True)
 
 
-def test_the_time_it_was_asked_for_and_the_expected_wait(authority: Authority) -> None:
+def test_the_time_it_was_asked_for_and_the_expected_wait(authority: AuthorityTracker) -> None:
     assert authority.queued(2, "other", 40.0)
     assert authority.status.expected_wait_s == 40.0
     assert authority.event(event(EventKind.AUTHORITY_QUEUED, app_id=3, position=1, wait_s=10.0), NOW)
@@ -127,12 +127,12 @@ def test_the_time_it_was_asked_for_and_the_expected_wait(authority: Authority) -
     assert authority.status.until_ns == 99
 
 
-def test_who_lost_it_because_the_time_is_over_does_not_ask_again(held: Authority) -> None:
+def test_who_lost_it_because_the_time_is_over_does_not_ask_again(held: AuthorityTracker) -> None:
     assert held.event(event(EventKind.AUTHORITY_LOST, app_id=3, lease=5, reason="expired", by="other"), NOW)
     assert (held.status.state, held.wanted) == ("none", False)
 
 
-def test_that_the_holder_declined_is_remembered_until_it_is_asked_again(authority: Authority) -> None:
+def test_that_the_holder_declined_is_remembered_until_it_is_asked_again(authority: AuthorityTracker) -> None:
     assert not authority.event(Event(EventKind.AUTHORITY_DECLINED, "not yet", 0, data={"app_id": 4}), NOW)
     assert authority.declined == ""
     assert not authority.event(Event(EventKind.AUTHORITY_DECLINED, "not yet", 0, data={"app_id": 3}), NOW)
@@ -141,13 +141,13 @@ def test_that_the_holder_declined_is_remembered_until_it_is_asked_again(authorit
     assert authority.declined == ""
 
 
-def test_given_back_and_refused(held: Authority) -> None:
+def test_given_back_and_refused(held: AuthorityTracker) -> None:
     assert held.given_back()
     assert (held.status.state, held.wanted) == ("none", False)
     assert not held.refused()
 
 
-def test_a_new_connection_begins_anew(held: Authority) -> None:
+def test_a_new_connection_begins_anew(held: AuthorityTracker) -> None:
     assert held.disconnected()
     assert (held.status.state, held.wanted, held.status.priority) == ("none", True, 16)
     held.connected(1)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from skyloop.client import AuthorityStatus, Drone
+from skyloop.client import Authority, AuthorityStatus, Drone
 from skyloop.client.drone import open_drone
 from skyloop.errors import AuthorityError, ClosedError, NoAnswerError, RefusedError, UnsupportedError, UsageError
 from skyloop.messages import (
@@ -325,7 +325,7 @@ def test_somebody_else_flies(proxy: ScriptedProxy) -> None:
         open_drone(proxy.server.dial, app="me", policy=QUICK, timeout_s=WAIT_S)
     assert error.value.code == "busy"
     with pytest.raises(AuthorityError, match=r"did not give it back within 0\.05 s"):
-        open_drone(proxy.server.dial, app="me", policy=QUICK, wait_s=0.05, timeout_s=WAIT_S)
+        open_drone(proxy.server.dial, app="me", policy=QUICK, authority=Authority(wait_s=0.05), timeout_s=WAIT_S)
     proxy.until(lambda: isinstance(proxy.requests[-1], ReleaseAuthority), "leaving the line")
 
 

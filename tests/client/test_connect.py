@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import select
 import signal
 import subprocess
@@ -11,16 +12,18 @@ import textwrap
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import skyloop
 from skyloop.client import private_proxy
-from skyloop.client.connect import _script_name, connect
+from skyloop.client.connect import _script_name, connect, network_settings
 from skyloop.client.drone import open_drone
 from skyloop.client.private_proxy import PrivateProxy
 from skyloop.errors import LinkError, NoAnswerError, UnknownNameError, UsageError
 from skyloop.messages import FlightState, LinkState
+from skyloop.transport.fabric.settings import FabricSettings
 from skyloop.transport.local import LocalServer
 from tests.client.scripted import ScriptedProxy
 
@@ -31,6 +34,7 @@ ROOT = Path(__file__).parents[2]
 CHILD = """
 import os, sys
 sys.path.insert(0, {root!r})
+from skyloop.transport.fabric.settings import FabricSettings
 from skyloop.transport.local import LocalServer
 from tests.client.scripted import ScriptedProxy
 name, descriptor = sys.argv[sys.argv.index("--name") + 1], int(sys.argv[-1])
@@ -71,7 +75,7 @@ def alive(pid: int) -> bool:
 
 
 def test_by_name(alpha: ScriptedProxy) -> None:
-    with skyloop.connect("alpha", name="ada", priority=3) as drone:
+    with skyloop.connect("alpha", name="ada", authority=skyloop.Authority(priority=3)) as drone:
         assert drone.authority.state == "held"
         assert drone.authority.priority == 3
         assert drone.feedback().state is FlightState.LANDED
@@ -94,9 +98,7 @@ def test_wrong_name(alpha: ScriptedProxy) -> None:
         {"target": ""},
         {"target": 3},
         {"target": "Not A Name"},
-        {"target": "alpha", "priority": 32},
-        {"target": "alpha", "wait_s": -1.0},
-        {"target": "alpha", "wait_s": "1"},
+        {"target": "alpha", "authority": 4},
         {"target": "alpha", "timeout_s": float("nan")},
         {"target": "alpha", "rate_hz": 0.0},
         {"target": "alpha", "name": ""},
@@ -105,6 +107,43 @@ def test_wrong_name(alpha: ScriptedProxy) -> None:
 def test_unusable_arguments(arguments: dict[str, object]) -> None:
     with pytest.raises(UsageError):
         connect(**arguments)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "wish",
+    [{"priority": 32}, {"wait_s": -1.0}, {"wait_s": "1"}, {"for_s": 0.0}, {"takeover": "grab"}],
+)
+def test_unusable_wishes_for_the_authority(wish: dict[str, Any]) -> None:
+    with pytest.raises(UsageError, match=next(iter(wish))):
+        skyloop.Authority(**wish)
+
+
+@pytest.mark.parametrize(
+    ("old", "now"),
+    [
+        ({"priority": 4}, "authority=skyloop.Authority(priority=4)"),
+        ({"takeover": "ask"}, "authority=skyloop.Authority(takeover='ask')"),
+        ({"keys": "jane"}, "network=skyloop.Network(keys='jane')"),
+    ],
+)
+@pytest.mark.parametrize("function", [skyloop.connect, skyloop.swarm])
+def test_old_options_say_how_they_are_written_now(function: Any, old: dict[str, Any], now: str) -> None:
+    with pytest.raises(UsageError, match=re.escape(now)):
+        function("alpha", **old)
+
+
+def test_how_the_network_is_searched(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("zenoh")
+    monkeypatch.delenv("SKYLOOP_NETWORK", raising=False)
+    for off in (None, False, skyloop.Network(False)):
+        assert network_settings(off) is None
+    for everywhere in (True, skyloop.Network(), skyloop.Network(True)):
+        assert network_settings(everywhere) == FabricSettings()
+    there = FabricSettings(connect=("10.0.0.5:7447",), multicast=False)
+    for address in ("10.0.0.5:7447", skyloop.Network("10.0.0.5:7447"), there):
+        assert network_settings(address) == there
+    monkeypatch.setenv("SKYLOOP_NETWORK", "10.0.0.5:7447")
+    assert network_settings(skyloop.Network()) == network_settings() == there
 
 
 def test_script_name(monkeypatch: pytest.MonkeyPatch) -> None:

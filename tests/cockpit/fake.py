@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from skyloop.client import Drone
+from skyloop.client import Authority, Drone
 from skyloop.client.drone import open_drone
 from skyloop.client.feedback_history import FeedbackHistory
 from skyloop.client.frame import Arrival, Frame
@@ -252,7 +252,7 @@ class Node:
         return self._server.dial(handler)
 
     def connect(self, app: str, priority: int = 16, **options: Any) -> Drone:
-        return open_drone(self.dial, app=app, **options, priority=priority)
+        return open_drone(self.dial, app=app, **options, authority=Authority(priority=priority))
 
     def stop(self) -> None:
         if self.up:

@@ -136,7 +136,7 @@ def test_keyboard_flight(deck: Deck) -> None:
 def test_authority_passes_from_a_controller_to_a_person_and_back(deck: Deck) -> None:
     deck.proxy("passes")
     page = deck.page("passes")
-    with skyloop.connect("passes", name="follow.py", priority=16) as drone:
+    with skyloop.connect("passes", name="follow.py", authority=skyloop.Authority(priority=16)) as drone:
         page.wait_for_text(".holder", "follow.py")
         page.take_control()
         assert "You" in page.says(".holder")
@@ -153,7 +153,7 @@ def test_authority_passes_from_a_controller_to_a_person_and_back(deck: Deck) -> 
 def test_a_lower_priority_is_refused_with_its_reason(deck: Deck) -> None:
     deck.proxy("busy")
     page = deck.page("busy")
-    with skyloop.connect("busy", name="first.py", priority=2):
+    with skyloop.connect("busy", name="first.py", authority=skyloop.Authority(priority=2)):
         page.wait_for_text(".holder", "first.py")
         page.press("c")
         page.wait_for_text(".notice", "first.py has control with priority 2")
@@ -172,7 +172,9 @@ def test_a_person_who_is_asked_for_control_keeps_it_and_then_hands_it_over(deck:
     page.take_off()
     panel = page.pane.get_by_role("alertdialog")
     assert not panel.is_visible()
-    with skyloop.connect("asks", name="survey.py", priority=4, takeover="ask", stay=True, for_s=120) as drone:
+    with skyloop.connect(
+        "asks", name="survey.py", authority=skyloop.Authority(priority=4, takeover="ask", stay=True, for_s=120)
+    ) as drone:
         page.wait_for_text(".asks", "survey.py asks for control")
         for words in ("Priority 4, yours 8", "Wanted for 2 min", "it has control when the time is over"):
             assert words in page.says(".asks")
@@ -210,7 +212,7 @@ def test_a_question_that_is_withdrawn_vanishes(deck: Deck) -> None:
     allow_time("withdrawn")
     page = deck.page("withdrawn")
     page.take_control()
-    with skyloop.connect("withdrawn", name="survey.py", takeover="ask", stay=True):
+    with skyloop.connect("withdrawn", name="survey.py", authority=skyloop.Authority(takeover="ask", stay=True)):
         page.wait_for_text(".asks", "That is no higher than yours")
         page.press("q")
         assert page.page.evaluate("document.activeElement.className") == "asks"
@@ -222,7 +224,7 @@ def test_a_person_asks_first_waits_and_changes_her_mind(deck: Deck) -> None:
     deck.proxy("first")
     allow_time("first")
     page = deck.page("first")
-    with skyloop.connect("first", name="follow.py", priority=16) as drone:
+    with skyloop.connect("first", name="follow.py", authority=skyloop.Authority(priority=16)) as drone:
         page.wait_for_text(".holder", "follow.py")
         drone.on_takeover(lambda request: "measuring until noon" if request.priority == 8 else True)
         page.pane.get_by_role("button", name="Ask first").click()

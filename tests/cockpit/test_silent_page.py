@@ -6,7 +6,7 @@ import time
 from types import SimpleNamespace
 from typing import Any
 
-from skyloop.client.authority import Authority
+from skyloop.client.authority import AuthorityTracker
 from skyloop.client.command_schedule import CommandSchedule
 from skyloop.client.commands import CommandSender
 from skyloop.client.scheduler import Scheduler
@@ -33,7 +33,7 @@ class Flown:
         )
         self.pilot = CommandSender(
             Role.PILOT,
-            Authority("page"),
+            AuthorityTracker("page"),
             CommandSchedule(),
             connection,
             scheduler,

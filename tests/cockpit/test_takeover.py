@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from skyloop.client import AuthorityStatus, Drone
+from skyloop.client import Authority, AuthorityStatus, Drone
 from skyloop.client.drone import open_drone
 from skyloop.cockpit.commands import decode_command
 from skyloop.cockpit.takeover import QueuePosition, QueueTracker, TakeoverQuestions
@@ -24,7 +24,8 @@ S = 1_000_000_000
 @contextmanager
 def asks(node: Node, app: str = "survey.py", priority: int = 4, **options: Any) -> Iterator[Drone]:
     """A program that asks for the drone and waits in line."""
-    drone = open_drone(node.dial, app=app, priority=priority, takeover="ask", stay=True, **options)
+    asking = Authority(priority=priority, takeover="ask", stay=True, **options)
+    drone = open_drone(node.dial, app=app, authority=asking)
     try:
         yield drone
     finally:

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from skyloop.client import Drone, Frame
+from skyloop.client import Authority, Drone, Frame
 from skyloop.client.drone import open_drone
 from skyloop.control import Controller
 from skyloop.errors import AuthorityError, ParameterError, UnknownNameError, UnsupportedError
@@ -66,7 +66,9 @@ def node() -> Iterator[Node]:
 def connected(
     node: Node, app: str = "me", *, priority: int = 16, wait_s: float = 0.0, **options: Any
 ) -> Iterator[Drone]:
-    with open_drone(node.server.dial, app=app, **options, priority=priority, wait_s=wait_s) as drone:
+    with open_drone(
+        node.server.dial, app=app, **options, authority=Authority(priority=priority, wait_s=wait_s)
+    ) as drone:
         yield drone
 
 

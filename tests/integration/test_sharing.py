@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from skyloop import aio
-from skyloop.client import AuthorityStatus, Drone
+from skyloop.client import Authority, AuthorityStatus, Drone
 from skyloop.client.authority import TakeoverRequest, authority_wish
 from skyloop.client.commands import _busy
 from skyloop.client.drone import open_drone
@@ -34,7 +34,8 @@ class Shared:
     def joined(self, app: str, *, priority: int = 16, **options: Any) -> Iterator[Drone]:
         """A pilot, or an observer; gives everything back at the end without landing."""
         access = options.pop("access", "pilot")
-        drone = open_drone(self.server.dial, app=app, access=access, priority=priority, **options)
+        authority = Authority(priority=priority, **options)
+        drone = open_drone(self.server.dial, app=app, access=access, authority=authority)
         try:
             yield drone
         finally:
@@ -170,7 +171,7 @@ def test_with_asyncio(shared: Shared) -> None:
             return True
 
         alice.on_takeover(answer)
-        bob = aio.Drone(open_drone(shared.server.dial, app="bob", stay=True))
+        bob = aio.Drone(open_drone(shared.server.dial, app="bob", authority=Authority(stay=True)))
         await bob.request_authority(4, takeover="ask", wait_s=WAIT_S)
         assert bob.authority.state == "held"
         assert asked == ["bob"]

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 import skyloop
-from skyloop.client import Drone, Swarm
+from skyloop.client import Authority, Drone, Swarm
 from skyloop.client.connect import choose
 from skyloop.client.connection import RedialPolicy
 from skyloop.client.drone import open_drone
@@ -65,7 +65,7 @@ class Field:
 
     def connect(self, name: str, *, priority: int = 16, **options: Any) -> Drone:
         options.setdefault("app", "test")
-        return open_drone(self.servers[name].dial, policy=QUICK, **options, priority=priority)
+        return open_drone(self.servers[name].dial, policy=QUICK, **options, authority=Authority(priority=priority))
 
     def swarm(self, **options: Any) -> Swarm:
         return Swarm({name: self.connect(name) for name in self.vehicles}, **options)

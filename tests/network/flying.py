@@ -14,9 +14,9 @@ from tests.processes.conftest import eventually
 PERIOD_S = 0.05
 
 
-def connect(here: Here, target: str, /, **options: Any) -> str:
+def connect(here: Here, target: str, /, *, priority: int = 16, **options: Any) -> str:
     """Connect and write down what is told of the link and of events; where it is connected to."""
-    drone = here.drones[target] = skyloop.connect(target, **options)
+    drone = here.drones[target] = skyloop.connect(target, authority=skyloop.Authority(priority=priority), **options)
     drone.on_link(here.tell(f"{target} link"))
     drone.on_event(here.tell(f"{target} event"), inline=True)
     return drone.link.application.value

@@ -10,7 +10,7 @@ import skyloop
 
 def fly(name: str, priority: str = "16") -> None:
     """Take off and fly forward, commanded afresh ten times a second, until killed."""
-    with skyloop.connect(name, name="doomed", priority=int(priority)) as drone:
+    with skyloop.connect(name, name="doomed", authority=skyloop.Authority(priority=int(priority))) as drone:
         drone.takeoff()
         print("flying", flush=True)
         while True:

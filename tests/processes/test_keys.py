@@ -59,15 +59,15 @@ def skyloop_list(place: str, keys: Path | None) -> tuple[list[str], str]:
 
 
 def test_who_may_do_what(place: str, lab: Lab) -> None:
-    with skyloop.connect("alpha", network=place, keys=lab.folder("jane")) as jane:
+    with skyloop.connect("alpha", network=skyloop.Network(place, keys=lab.folder("jane"))) as jane:
         jane.takeoff()
         jane.wait("hovering")
-    with skyloop.connect("alpha", network=place, keys=lab.folder("olga"), access="observe") as olga:
+    with skyloop.connect("alpha", network=skyloop.Network(place, keys=lab.folder("olga")), access="observe") as olga:
         assert olga.feedback() is not None
         with pytest.raises(AuthorityError, match=r"the keys of olga, observer of \*: they give no right"):
             olga.config["limits.tilt"] = 0.1
     with pytest.raises(AuthorityError, match="the keys of bob, pilot of bravo: they give no right to fly"):
-        skyloop.connect("alpha", network=place, keys=lab.folder("bob"))
+        skyloop.connect("alpha", network=skyloop.Network(place, keys=lab.folder("bob")))
     with pytest.raises(UnknownNameError):
         skyloop.connect("alpha", network=place, timeout_s=1.0)
 
@@ -81,7 +81,7 @@ def test_the_list_shows_what_a_key_can_find_and_what_ends(place: str, lab: Lab) 
 
 
 def test_a_proxy_tells_that_its_roster_has_changed(place: str, lab: Lab) -> None:
-    with skyloop.connect("alpha", network=place, keys=lab.folder("olga"), access="observe") as olga:
+    with skyloop.connect("alpha", network=skyloop.Network(place, keys=lab.folder("olga")), access="observe") as olga:
         lab.revoke("bob")
 
         def told() -> bool:
@@ -106,18 +106,20 @@ def test_through_a_router_with_keys(
         network = ("--network", "--listen", f"{LOCAL}:0", "--connect", place, *keys, str(lab.folder("alpha")))
         alpha = start("-m", "skyloop", "proxy", "sim://?world=empty&cameras=none", "--name", "alpha", *network)
         alpha.until("ready")
-    with skyloop.connect("alpha", network=place, keys=lab.folder("jane")) as jane:
+    with skyloop.connect("alpha", network=skyloop.Network(place, keys=lab.folder("jane"))) as jane:
         jane.takeoff()
-        with skyloop.connect("alpha", network=place, keys=lab.folder("olga"), access="observe") as olga:
+        with skyloop.connect(
+            "alpha", network=skyloop.Network(place, keys=lab.folder("olga")), access="observe"
+        ) as olga:
             olga.wait("hovering")
     with pytest.raises(UnknownNameError):
         skyloop.connect("alpha", network=place, timeout_s=1.0)
     lab.revoke("bob")
     hub.until("revoked or changed: bob")
     stolen = Path(shutil.copytree(lab.folder("olga"), tmp_path / "stolen"))
-    with skyloop.connect("alpha", network=place, keys=stolen, access="observe") as olga:
+    with skyloop.connect("alpha", network=skyloop.Network(place, keys=stolen), access="observe") as olga:
         lab.revoke("olga")
         hub.until("reconnecting without olga")
         eventually(lambda: olga.link.application == "lost", "olga is shut out")
-    with skyloop.connect("alpha", network=place, keys=lab.folder("jane"), access="observe") as jane:
+    with skyloop.connect("alpha", network=skyloop.Network(place, keys=lab.folder("jane")), access="observe") as jane:
         assert jane.feedback() is not None

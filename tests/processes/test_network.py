@@ -92,7 +92,7 @@ def test_a_killed_proxy_is_told_and_found_again_with_everything_as_it_was(
     far: Callable[..., Process], place: str
 ) -> None:
     first = far()
-    with skyloop.connect("alpha", network=place, priority=5) as drone:
+    with skyloop.connect("alpha", network=place, authority=skyloop.Authority(priority=5)) as drone:
         frames: list[int] = []
         drone.on_frame(lambda frame: frames.append(frame.seq), scale=0.5)
         eventually(lambda: bool(frames), "pictures come")

@@ -68,7 +68,7 @@ def test_one_flies_priority_takes_over_and_no_command_of_an_old_lease_is_ever_ex
 ) -> None:
     proxy()
     with (
-        skyloop.connect("alpha", name="bob", priority=16) as bob,
+        skyloop.connect("alpha", name="bob", authority=skyloop.Authority(priority=16)) as bob,
         skyloop.connect("alpha", name="eve", access="observe") as eve,
         skyloop.connect("alpha", name="mallory", access="observe") as mallory,
         skyloop.connect("alpha", name="trent", access="observe") as trent,
@@ -84,9 +84,9 @@ def test_one_flies_priority_takes_over_and_no_command_of_an_old_lease_is_ever_ex
             with pytest.raises(AuthorityError, match="observe"):
                 observer.velocity(forward=1.0)
         with pytest.raises(AuthorityError, match="bob"):
-            skyloop.connect("alpha", name="carol", priority=16)
+            skyloop.connect("alpha", name="carol", authority=skyloop.Authority(priority=16))
 
-        with skyloop.connect("alpha", name="alice", priority=0, on_exit="hover") as alice:
+        with skyloop.connect("alpha", name="alice", authority=skyloop.Authority(priority=0), on_exit="hover") as alice:
             assert alice.authority.state == "held"
             eventually(lambda: bob.authority.state == "preempted", "bob knows that alice took over")
             with pytest.raises(AuthorityError, match="alice"):
@@ -125,7 +125,8 @@ def test_a_pilot_that_hangs_keeps_its_name_on_a_drone_that_fails_safe_until_some
         kept = observer.wait(lambda feedback: not feedback.lease, timeout_s=30.0)
         assert (kept.owner, kept.owner_priority) == ("doomed", 4)
         assert kept.failsafe is not Failsafe.NONE
-        with skyloop.connect("alpha", name="alice", priority=31, on_exit="hover") as alice:  # of lower priority
+        lower = skyloop.Authority(priority=31)
+        with skyloop.connect("alpha", name="alice", authority=lower, on_exit="hover") as alice:
             assert alice.authority.state == "held"
             observer.wait(lambda feedback: feedback.owner == "alice", timeout_s=30.0)
             pilot.signal(signal.SIGCONT)  # it asks for a new lease by itself, with its higher priority

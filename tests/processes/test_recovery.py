@@ -21,7 +21,7 @@ def test_a_killed_and_restarted_proxy_is_back_within_a_second_with_everything_as
     proxy: Callable[..., Process],
 ) -> None:
     first = proxy("sim://?world=empty&cameras=front")
-    with skyloop.connect("alpha", priority=5) as drone:
+    with skyloop.connect("alpha", authority=skyloop.Authority(priority=5)) as drone:
         told: list[tuple[float, LinkStatus]] = []
         drone.on_link(lambda status: told.append((time.monotonic(), status)))
         frames: list[int] = []

@@ -44,9 +44,12 @@ def test_observers_that_stop_reading_delay_no_command_and_no_emergency_stop(
     keys = lab.folder("jane") if by == "the network" else None
     with (
         skyloop.connect("alpha", name="eye", access="observe") as eye,
-        skyloop.connect("alpha", name="jane", network=network, keys=keys) as jane,
+        skyloop.connect("alpha", name="jane", network=skyloop.Network(network, keys=keys)) as jane,
         skyloop.connect(
-            "alpha", name="stopper", network=place, keys=lab.folder("jane"), priority=20, stay=True, wait_s=0.1
+            "alpha",
+            name="stopper",
+            network=skyloop.Network(place, keys=lab.folder("jane")),
+            authority=skyloop.Authority(priority=20, stay=True, wait_s=0.1),
         ) as stopper,
     ):
         events: list[Event] = []

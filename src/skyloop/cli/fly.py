@@ -44,6 +44,7 @@ def fly(
 ) -> None:
     """Take off, run a controller, land. Ctrl-C lands too, and so does an error in the controller without --reload."""
     from skyloop.cli.piloting import connect_pilot
+    from skyloop.client import Authority
     from skyloop.control.loading import load_controller
     from skyloop.control.reloading import Reloader
 
@@ -53,7 +54,8 @@ def fly(
     reloader = Reloader(file, class_name) if reload else None
     for number in (signal.SIGINT, signal.SIGTERM):  # the first is ignored where a shell runs this in the background
         signal.signal(number, _interrupt)
-    with connect_pilot(on, ADVICE, name=file.name[:64], priority=priority, wait_s=wait) as drone:
+    authority = Authority(priority=priority, wait_s=wait)
+    with connect_pilot(on, ADVICE, name=file.name[:64], authority=authority) as drone:
         controller = make(controller_class, drone)
         worked = _run(Flight(drone, controller, _say), drone, seconds, reloader, takeoff=takeoff)
         _land(drone)

@@ -58,8 +58,10 @@ def _read(name: str, key: str | None) -> list[Parameter]:
 
 def _write(name: str, key: str, value: str, priority: int) -> list[Parameter]:
     from skyloop.cli.piloting import connect_pilot
+    from skyloop.client import Authority
 
-    with connect_pilot(name, ADVICE, priority=priority, name="skyloop param", on_exit="hover") as drone:
+    authority = Authority(priority=priority)
+    with connect_pilot(name, ADVICE, authority=authority, name="skyloop param", on_exit="hover") as drone:
         drone.config[key] = parse_value(drone.config.describe(key), value)
         return [drone.config.describe(key)]
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Unpack
 
 from skyloop.client import Drone, connect
+from skyloop.client.connect import ConnectOptions
 from skyloop.errors import AuthorityError
 
 
-def connect_pilot(target: str, advice: str, **options: Any) -> Drone:
+def connect_pilot(target: str, advice: str, **options: Unpack[ConnectOptions]) -> Drone:
     """Connect as :func:`skyloop.connect` does; where somebody else flies, the error says who, and what to do."""
     try:
         return connect(target, **options)

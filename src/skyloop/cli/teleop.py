@@ -37,9 +37,11 @@ def teleop(
     The keys are those of the cockpit: W A S D, arrows, T take off, L land, Esc Esc motors off, Q end.
     """
     from skyloop.cli.piloting import connect_pilot
+    from skyloop.client import Authority
 
     keyboard = Keyboard()
-    with connect_pilot(name, ADVICE, name="skyloop teleop", priority=priority, wait_s=wait) as drone:
+    authority = Authority(priority=priority, wait_s=wait)
+    with connect_pilot(name, ADVICE, name="skyloop teleop", authority=authority) as drone:
         page = _page(drone) if cockpit else None
         try:
             Teleop(drone, speed, turn, "" if page is None else page.address()).run(keyboard)

@@ -1,8 +1,8 @@
 """The application's side: :func:`connect` returns a :class:`Drone`."""
 
-from skyloop.client.authority import AuthorityState, AuthorityStatus, TakeoverRequest
+from skyloop.client.authority import Authority, AuthorityState, AuthorityStatus, TakeoverRequest
 from skyloop.client.channels import Listener
-from skyloop.client.connect import connect, swarm
+from skyloop.client.connect import Network, connect, swarm
 from skyloop.client.connection import RedialPolicy
 from skyloop.client.drone import Drone
 from skyloop.client.frame import Frame
@@ -18,6 +18,8 @@ from skyloop.client.telemetry import LinkStatus
 Stats = dict[str, ChannelStats]
 
 __all__ = [
+    "Authority",
+    "Network",
     "AuthorityState",
     "AuthorityStatus",
     "ChannelStats",

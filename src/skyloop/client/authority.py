@@ -27,6 +27,43 @@ from skyloop.messages import (
 )
 
 AuthorityState = Literal["none", "queued", "held", "preempted"]
+TakeoverWay = Literal["now", "ask"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Authority:
+    """How an application asks for the authority over a drone: ``connect("alpha", authority=Authority(priority=4))``.
+
+    Attributes:
+        priority: 0 (highest) to 31 (lowest); a higher one pre-empts a lower one.
+        wait_s: How long to wait in the queue while another application holds the authority [s].
+        for_s: How long the authority is wanted [s], up to a day; then it goes to whoever wants it. None: open.
+        takeover: ``"now"`` pre-empts a holder of lower priority at once, ``"ask"`` asks the holder first.
+        stay: Whether to stay in the queue after ``wait_s``, without the authority, instead of failing.
+
+    Raises:
+        UsageError: If a value is out of range.
+    """
+
+    priority: int = DEFAULT_PRIORITY
+    wait_s: float = 0.0
+    for_s: float | None = None
+    takeover: TakeoverWay = "now"
+    stay: bool = False
+
+    def __post_init__(self) -> None:
+        authority_wish(self.priority, self.for_s, self.takeover)
+        check_seconds("wait_s", self.wait_s)
+
+
+def check_seconds(what: str, seconds: object) -> None:
+    """Check a time to wait.
+
+    Raises:
+        UsageError: If it is no finite number, or negative.
+    """
+    if not (isinstance(seconds, int | float) and 0.0 <= seconds < math.inf):
+        raise UsageError(f"{what} is {seconds!r} and must be a number of seconds")
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +90,7 @@ class AuthorityStatus:
     until_ns: int | None = None
 
 
-class Authority:
+class AuthorityTracker:
     """Follows the authority of one application. Methods that return a bool tell whether the status changed."""
 
     #: Feedback that names no owner may be older than the grant for this long.
@@ -186,7 +223,6 @@ def _whole(value: object) -> int:
     return value if isinstance(value, int) else 0
 
 
-TakeoverWay = Literal["now", "ask"]
 #: True: hand it over; False, or the reason as a text: decline; None: leave it to the proxy.
 TakeoverAnswer = bool | str | None
 

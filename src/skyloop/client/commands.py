@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable
 from typing import Final
 
-from skyloop.client.authority import Authority, AuthorityStatus
+from skyloop.client.authority import AuthorityStatus, AuthorityTracker
 from skyloop.client.channels import Emit
 from skyloop.client.command_schedule import CommandSchedule
 from skyloop.client.connection import ProxyConnection
@@ -50,7 +50,7 @@ class CommandSender:
     def __init__(
         self,
         role: Role,
-        authority: Authority,
+        authority: AuthorityTracker,
         schedule: CommandSchedule,
         connection: ProxyConnection,
         scheduler: Scheduler,

@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 import fnmatch
-import math
 import os
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import wraps
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal, Protocol
+from typing import TYPE_CHECKING, Final, Literal, ParamSpec, Protocol, TypeAlias, TypedDict, TypeVar, Unpack
 
-from skyloop.client.authority import TakeoverWay, authority_wish
+from skyloop.client.authority import Authority, check_seconds
 from skyloop.client.core import Access, DroneCore, OnExit
 from skyloop.client.drone import Drone
 from skyloop.client.scheduler import Scheduler
 from skyloop.client.swarm import OnError, Swarm, check_policy, in_parallel
 from skyloop.errors import LinkError, SwarmError, UnknownNameError, UsageError
-from skyloop.messages import DEFAULT_PRIORITY
 from skyloop.transport.base import ClientHandler, Dialer, TransportClient, check_name
 
 if TYPE_CHECKING:
-    from skyloop.transport.fabric.environment import Network
     from skyloop.transport.fabric.settings import FabricSettings
 
 NAME_TIMEOUT_S: Final = 5.0
@@ -31,22 +30,70 @@ START_TIMEOUT_S: Final = 20.0  #: for a private proxy and its vehicle
 CONNECTORS: Final = "skyloop.connectors"
 
 
+P = ParamSpec("P")
+R = TypeVar("R")
+#: Where options of earlier versions are now.
+_MOVED: Final = dict.fromkeys(("priority", "wait_s", "for_s", "takeover", "stay"), "authority=skyloop.Authority") | {
+    "keys": "network=skyloop.Network"
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Network:
+    """How a program joins the network: ``connect("alpha", network=Network("10.0.0.5:7447", keys=folder))``.
+
+    Attributes:
+        address: ``"10.0.0.5:7447"`` connects to an address (several with commas, with ``multicast`` among them to
+            search as well); True searches by multicast; False stays on this host. None: as the variable
+            ``SKYLOOP_NETWORK`` says, without which it searches by multicast.
+        keys: Folder of an identity; None: as the variable ``SKYLOOP_KEYS`` says.
+    """
+
+    address: bool | str | None = None
+    keys: Path | str | None = None
+
+
+NetworkChoice: TypeAlias = "Network | FabricSettings | bool | str | None"
+
+
+class ConnectOptions(TypedDict, total=False):
+    """Options of :func:`connect`, as it documents them."""
+
+    access: Access
+    name: str | None
+    timeout_s: float | None
+    rate_hz: float
+    stall_s: float
+    on_exit: OnExit
+    authority: Authority | None
+    network: NetworkChoice
+
+
+def explains_moved_options(function: Callable[P, R]) -> Callable[P, R]:
+    """Decorate a function of :class:`ConnectOptions` so that options of old names raise a :class:`UsageError`."""
+
+    @wraps(function)
+    def call(*args: P.args, **options: P.kwargs) -> R:
+        for name, value in options.items():
+            if name in _MOVED:
+                raise UsageError(f"{name}={value!r:.40} is written {_MOVED[name]}({name}={value!r:.40}) now")
+        return function(*args, **options)
+
+    return call
+
+
+@explains_moved_options
 def connect(
     target: str,
     *,
     access: Access = "pilot",
-    priority: int = DEFAULT_PRIORITY,
     name: str | None = None,
-    wait_s: float = 0.0,
     timeout_s: float | None = None,
     rate_hz: float = 32.0,
     stall_s: float = 1.0,
     on_exit: OnExit = "land",
-    network: Network = None,
-    keys: Path | str | None = None,
-    for_s: float | None = None,
-    takeover: TakeoverWay = "now",
-    stay: bool = False,
+    authority: Authority | None = None,
+    network: NetworkChoice = None,
 ) -> Drone:
     """Connect to a drone.
 
@@ -57,20 +104,15 @@ def connect(
             For an address a private proxy is started, which ends with the drone and with this process. A name is
             looked up on this host first and then, if ``network`` allows, on the network.
         access: ``"pilot"`` requests the authority, ``"observe"`` only reads.
-        priority: Of the request for the authority, 0 (highest) to 31; a higher one pre-empts a lower one.
         name: Name of this application, 1 to 64 characters; None: the running script's.
-        wait_s: How long to wait in the queue while another application holds the authority [s].
         timeout_s: Time for the proxy to answer [s]; None or 0: 5 s for a name, 20 s for an address.
         rate_hz: Rate at which commands are repeated, 1 to 200 Hz.
         stall_s: Time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never.
         on_exit: What an airborne vehicle does at the end of the block, ``"land"`` or ``"hover"``.
-        network: True searches by multicast; ``"10.0.0.5:7447"`` connects to an address (several with commas, with
-            ``multicast`` among them to search as well); False stays on this host. None: as the variable
+        authority: How a pilot asks for the authority: priority, waiting, asking its holder first. None:
+            ``Authority()``.
+        network: True, an address, or a :class:`Network` with keys; False stays on this host. None: as the variable
             ``SKYLOOP_NETWORK`` says, without which nothing leaves this host.
-        keys: Folder of an identity for the network; None: as the variable ``SKYLOOP_KEYS`` says.
-        for_s: How long the authority is wanted; see :meth:`Drone.request_authority`.
-        takeover: Whether its holder is asked first; see :meth:`Drone.request_authority`.
-        stay: Whether to stay in the queue without it; see :meth:`Drone.request_authority`.
 
     Raises:
         UnknownNameError: If no proxy of this name runs; carries suggestions.
@@ -83,10 +125,10 @@ def connect(
     """
     if not isinstance(target, str) or not target:
         raise UsageError(f"{target!r} is neither the name of a proxy nor a vehicle's address such as sim://")
-    authority_wish(priority, for_s, takeover)
-    for what, seconds in (("wait_s", wait_s), ("timeout_s", timeout_s)):
-        if seconds is not None and not (isinstance(seconds, int | float) and 0.0 <= seconds < math.inf):
-            raise UsageError(f"{what} is {seconds!r} and must be a number of seconds")
+    if not isinstance(authority, Authority | None):
+        raise UsageError(f"authority is {authority!r:.80} and must be a skyloop.Authority, as Authority(priority=4)")
+    if timeout_s is not None:
+        check_seconds("timeout_s", timeout_s)
     app = name if name is not None else _script_name()
     deadline = time.monotonic() + (timeout_s or (START_TIMEOUT_S if "://" in target else NAME_TIMEOUT_S))
     if "://" in target:
@@ -94,13 +136,8 @@ def connect(
         dial, end, reach, scheduler = connector.dialer(deadline), connector.close, connector.reach, connector.scheduler
     else:
         # Another process can use the name alone only if it finds the proxy without network settings.
-        others_find_it = keys is None and (network is None or network is False)
-        dial, end, reach, scheduler = (
-            dial_by_name(target, network, keys),
-            None,
-            target if others_find_it else None,
-            None,
-        )
+        others_find_it = network is None or network is False
+        dial, end, reach, scheduler = dial_by_name(target, network), None, target if others_find_it else None, None
     try:
         core = DroneCore(
             dial,
@@ -117,8 +154,7 @@ def connect(
         if end is not None:
             end()
         raise
-    left_s = deadline - time.monotonic()
-    core.open(priority=priority, wait_s=wait_s, timeout_s=left_s, for_s=for_s, takeover=takeover, stay=stay)
+    core.open(timeout_s=deadline - time.monotonic(), authority=authority)
     return Drone(core)
 
 
@@ -164,8 +200,21 @@ NETWORK_VARIABLE: Final = "SKYLOOP_NETWORK"
 _HINT: Final = "; only this host was looked at (network=True, or the variable SKYLOOP_NETWORK, looks further)"
 
 
-def network_settings(network: Network = None, keys: Path | str | None = None) -> FabricSettings | None:
-    """Return how to search the network; None if it is not to be searched. Arguments are those of :func:`connect`."""
+def network_settings(network: NetworkChoice = None, keys: Path | str | None = None) -> FabricSettings | None:
+    """Return how to search the network; None if it is not to be searched.
+
+    Args:
+        network: As for :func:`connect`.
+        keys: Folder of an identity, for the command line; None: as ``network`` says.
+
+    Raises:
+        UsageError: If an address or the folder is not valid.
+    """
+    if isinstance(network, Network):
+        address, keys = network.address, network.keys or keys
+        if address is None and NETWORK_VARIABLE not in os.environ:
+            address = True
+        return network_settings(address, keys)
     if network is False or (network is None and keys is None and not os.environ.get(NETWORK_VARIABLE)):
         return None  # without importing the network's packages
     from skyloop.transport.fabric.environment import choose
@@ -173,7 +222,7 @@ def network_settings(network: Network = None, keys: Path | str | None = None) ->
     return choose(network, keys)
 
 
-def dial_by_name(name: str, network: Network = None, keys: Path | str | None = None) -> Dialer:
+def dial_by_name(name: str, network: NetworkChoice = None) -> Dialer:
     """Return the dialer of the proxy with this name.
 
     Each time it prefers a proxy on this host, where Linux' local transport is available. It raises
@@ -182,13 +231,12 @@ def dial_by_name(name: str, network: Network = None, keys: Path | str | None = N
     Args:
         name: Name of the proxy.
         network: As for :func:`connect`.
-        keys: As for :func:`connect`.
 
     Raises:
         UsageError: If ``name`` can't be a name.
     """
     check_name(name)
-    settings = network_settings(network, keys)
+    settings = network_settings(network)
     if settings is None:
         return _hinting(_local(name))
     from skyloop.transport.fabric import dial
@@ -236,7 +284,10 @@ Missing = Literal["raise", "skip"]
 _WILD: Final = frozenset("*?[")
 
 
-def swarm(*targets: Target, on_error: OnError = "continue", missing: Missing = "raise", **options: Any) -> Swarm:
+@explains_moved_options
+def swarm(
+    *targets: Target, on_error: OnError = "continue", missing: Missing = "raise", **options: Unpack[ConnectOptions]
+) -> Swarm:
     """Connect to several drones at the same time; returns when all are connected.
 
     Args:
@@ -259,7 +310,7 @@ def swarm(*targets: Target, on_error: OnError = "continue", missing: Missing = "
     if missing not in ("raise", "skip"):
         raise UsageError(f'missing is {missing!r} and must be "raise" or "skip"')
     check_policy(on_error)
-    chosen = choose(targets, lambda: running_names(options.get("network"), options.get("keys")))
+    chosen = choose(targets, lambda: running_names(options.get("network")))
 
     def join(target: str) -> Callable[[], Drone]:
         return lambda: connect(target, **options)
@@ -315,17 +366,16 @@ def _named(target: Target, running: Callable[[], Iterable[str]], counts: dict[st
     return [(name, name) for name in found]
 
 
-def running_names(network: Network = None, keys: Path | str | None = None) -> list[str]:
+def running_names(network: NetworkChoice = None) -> list[str]:
     """Return the names of running proxies, sorted: on this host, and on the network if it is asked for.
 
     Args:
         network: As for :func:`connect`.
-        keys: As for :func:`connect`.
     """
     from skyloop.transport.local import list_names
 
     near = {proxy.name for proxy in list_names()}
-    settings = network_settings(network, keys)
+    settings = network_settings(network)
     if settings is None:
         return sorted(near)
     from skyloop.transport.fabric import list_proxies

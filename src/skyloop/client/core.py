@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Set
 from contextlib import contextmanager
 from typing import Any, Final, Literal, Protocol, TypedDict
 
-from skyloop.client.authority import Authority, TakeoverWay, authority_wish
+from skyloop.client.authority import Authority, AuthorityTracker, authority_wish
 from skyloop.client.channels import Listener, VideoChannel
 from skyloop.client.command_schedule import CommandSchedule
 from skyloop.client.commands import CommandSender
@@ -29,7 +29,6 @@ from skyloop.errors import (
     UsageError,
 )
 from skyloop.messages import (
-    DEFAULT_PRIORITY,
     AnyAction,
     EventKind,
     FlightState,
@@ -124,7 +123,7 @@ class DroneCore:
         self._to_close: list[Closable] = []  # what ends with the drone
         # Each part uses those before it; the receiver handles what arrives in every session.
         connection = self.connection = ProxyConnection(scheduler.clock)
-        authority = Authority(app)
+        authority = AuthorityTracker(app)
         state = self.state = ClientState(app, connection, scheduler)
         restorer = Restorer(connection, state.emit)
         self.config = Config(connection, authority, restorer)
@@ -161,23 +160,15 @@ class DroneCore:
     def open(
         self,
         *,
-        priority: int = DEFAULT_PRIORITY,
-        wait_s: float = 0.0,
         timeout_s: float = 5.0,
-        for_s: float | None = None,
-        takeover: TakeoverWay = "now",
-        stay: bool = False,
+        authority: Authority | None = None,
         acquire: bool = True,
     ) -> None:
         """Connect, then wait for feedback and, as a pilot, for the authority. Closes the drone if anything fails.
 
         Args:
-            priority: Of the request for the authority, 0 (highest) to 31.
-            wait_s: How long to wait in the queue for the authority [s].
             timeout_s: Time for the proxy to answer and to send its first feedback [s].
-            for_s: See :meth:`Drone.request_authority`.
-            takeover: See :meth:`Drone.request_authority`.
-            stay: See :meth:`Drone.request_authority`.
+            authority: How a pilot asks for the authority; None: ``Authority()``.
             acquire: Whether a pilot asks for the authority now; if False it does so when it wants.
 
         Raises:
@@ -194,7 +185,10 @@ class DroneCore:
                 raise NoAnswerError(f"{self.name} answered, but reported no vehicle state within {timeout_s:g} s")
             if acquire and self.role is Role.PILOT:
                 self.check_open()
-                self.commands.request(authority_wish(priority, for_s, takeover), wait_s, stay=stay)
+                asked = authority or Authority()
+                self.commands.request(
+                    authority_wish(asked.priority, asked.for_s, asked.takeover), asked.wait_s, stay=asked.stay
+                )
             self.state.scheduler.opened()
         except BaseException:
             self.close()

@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 
 from skyloop.client.authority import (
+    Authority,
     AuthorityStatus,
     TakeoverAnswer,
     TakeoverRequest,
@@ -44,7 +45,6 @@ from skyloop.errors import (
     UsageError,
 )
 from skyloop.messages import (
-    DEFAULT_PRIORITY,
     Annotation,
     AnyAction,
     Applied,
@@ -847,12 +847,8 @@ def open_drone(
     dial: Dialer,
     *,
     app: str,
-    priority: int = DEFAULT_PRIORITY,
-    wait_s: float = 0.0,
     timeout_s: float = 5.0,
-    for_s: float | None = None,
-    takeover: TakeoverWay = "now",
-    stay: bool = False,
+    authority: Authority | None = None,
     **options: Unpack[DroneOptions],
 ) -> Drone:
     """Connect by a dialer; applications call :func:`skyloop.connect`.
@@ -860,19 +856,15 @@ def open_drone(
     Args:
         dial: Makes a connection to the proxy each time one is needed.
         app: Name of this application, 1 to 64 characters.
-        priority: See :meth:`DroneCore.open`.
-        wait_s: See :meth:`DroneCore.open`.
         timeout_s: See :meth:`DroneCore.open`.
-        for_s: See :meth:`DroneCore.open`.
-        takeover: See :meth:`DroneCore.open`.
-        stay: See :meth:`DroneCore.open`.
+        authority: See :meth:`DroneCore.open`.
         **options: As for :class:`DroneCore`.
 
     Raises:
         SkyloopError: As :class:`DroneCore` and :meth:`DroneCore.open`.
     """
     core = DroneCore(dial, app=app, **options)
-    core.open(priority=priority, wait_s=wait_s, timeout_s=timeout_s, for_s=for_s, takeover=takeover, stay=stay)
+    core.open(timeout_s=timeout_s, authority=authority)
     return Drone(core)
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 
-from skyloop.client.authority import Authority
+from skyloop.client.authority import AuthorityTracker
 from skyloop.client.channels import Emit
 from skyloop.client.connection import ProxyConnection
 from skyloop.errors import AuthorityError, LinkError, ParameterError, RefusedError, UnknownNameError, UsageError
@@ -81,7 +81,7 @@ class Config(Mapping[str, Value]):
     method waits for the proxy's answer and raises :class:`NoAnswerError` if there is none within 2 s.
     """
 
-    def __init__(self, connection: ProxyConnection, authority: Authority, restorer: Restorer) -> None:
+    def __init__(self, connection: ProxyConnection, authority: AuthorityTracker, restorer: Restorer) -> None:
         self._connection = connection
         self._authority = authority
         self._restorer = restorer

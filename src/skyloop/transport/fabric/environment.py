@@ -21,17 +21,17 @@ _OFF: Final = frozenset({"", "off", "0", "false", "no"})
 
 #: ``True``: search by multicast; addresses to call, with ``multicast`` among them to search as well, separated by
 #: commas; ``False``: this host only; ``None``: as the environment says.
-Network = bool | str | FabricSettings | None
+NetworkChoice = bool | str | FabricSettings | None
 
 
-def choose(network: Network = None, keys: Path | str | None = None) -> FabricSettings | None:
+def choose(network: NetworkChoice = None, keys: Path | str | None = None) -> FabricSettings | None:
     """Return the settings of the network, None to stay on this host.
 
     A key that ends within a week is logged as a warning.
 
     Args:
-        network: See :data:`Network`; defaults to the variable ``SKYLOOP_NETWORK``, without which nothing leaves this
-            host.
+        network: See :data:`NetworkChoice`; defaults to the variable ``SKYLOOP_NETWORK``, without which nothing leaves
+            this host.
         keys: The folder of an identity; defaults to ``SKYLOOP_KEYS``.
 
     Raises:
@@ -44,7 +44,7 @@ def choose(network: Network = None, keys: Path | str | None = None) -> FabricSet
     return found
 
 
-def _choose(network: Network, keys: Path | str | None) -> FabricSettings | None:
+def _choose(network: NetworkChoice, keys: Path | str | None) -> FabricSettings | None:
     if isinstance(network, FabricSettings):
         return network if keys is None else secure(network, keys)
     wish = os.environ.get(NETWORK_VARIABLE, "") if network is None else network
