@@ -93,7 +93,7 @@ def test_a_restarted_proxy_finds_everything_put_back(proxy: ScriptedProxy, drone
     started_s = time.monotonic()
     proxy.start()
     told.until(LinkState.UP, at)
-    assert time.monotonic() - started_s < 1.0
+    assert time.monotonic() - started_s < 5.0
     drone.wait(lambda _: drone.authority.state == "held" and proxy.parameters["limits.tilt"] == 0.2, WAIT_S)
     assert RequestAuthority(16) in proxy.requests
     assert any(isinstance(request, SetParameter) for request in proxy.requests)

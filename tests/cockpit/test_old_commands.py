@@ -123,7 +123,7 @@ def test_old_sticks_fly_nothing_and_are_no_sign_of_life(client: TestClient, node
             pilot.say("ping", at_s=time.monotonic() - 8.0, seen_s=time.monotonic() - 8.0)
             time.sleep(0.02)
         until(lambda: node.flyer.state is FlightState.HOVERING)
-        assert time.monotonic() - begin_s < 2.0, "the page counts as silent all the same"
+        assert time.monotonic() - begin_s < 5.0, "the page counts as silent all the same"
         assert not count(node, Velocity(left=0.4))
         pilot.wait("refused", do="fly")
 

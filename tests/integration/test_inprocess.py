@@ -231,7 +231,7 @@ def test_a_restarted_proxy(node: Node, drone: Drone) -> None:
     started_s = time.monotonic()
     node.proxy.start()
     drone.wait(lambda _: drone.link.application is LinkState.UP and drone.authority.state == "held", WAIT_S)
-    assert time.monotonic() - started_s < 1.0
+    assert time.monotonic() - started_s < 5.0
     drone.wait(lambda _: node.proxy.parameters.get("limits.tilt").value == 0.2, WAIT_S)
     seen = len(frames)
     drone.wait(lambda _: len(frames) > seen + 2, WAIT_S)

@@ -177,7 +177,7 @@ def test_somebody_elses_lock_holds_nobody_up(place: Place, monkeypatch: pytest.M
         charlie = LocalServer("charlie", group=group)
         charlie.start(ServerLog())
         charlie.stop()
-        assert time.monotonic() - begin < 1.0
+        assert time.monotonic() - begin < 5.0
     finally:
         os.close(descriptor)
     lock = directory.path / ".lock"
@@ -194,7 +194,7 @@ def test_looking_waits_for_no_lock(place: Place) -> None:
     with directory.lock():
         begin = time.monotonic()
         assert [proxy.name for proxy in list_names()] == ["alpha"]
-        assert time.monotonic() - begin < 1.0
+        assert time.monotonic() - begin < 5.0
         assert dead.exists()
         with pytest.raises(LinkError, match="locked by another process"), directory.lock(timeout_s=0.0):
             pass

@@ -70,7 +70,7 @@ def test_a_killed_proxy_is_told_at_once_and_its_name_is_free(runtime_dir: Path) 
         killed = time.monotonic()
         child.kill()
         wait_until(lambda: log.closings, "it is told")
-        assert time.monotonic() - killed < 0.5
+        assert time.monotonic() - killed < 2.0
         child.wait()
         assert log.closings == ["the proxy is gone"]
         assert log.torn == []
@@ -108,7 +108,7 @@ def test_a_killed_application_is_told_at_once() -> None:
         killed = time.monotonic()
         child.kill()
         wait_until(lambda: log.left, "it is told")
-        assert time.monotonic() - killed < 0.5
+        assert time.monotonic() - killed < 2.0
         assert log.left == [(log.joined[0], f"the application is gone ({log.joined[0].address})")]
         assert server.subscribers(FEEDBACK) == 0
 
