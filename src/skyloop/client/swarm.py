@@ -10,11 +10,11 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, Final, Literal, Self, TypeVar, get_args
+from typing import Final, Literal, Self, TypeVar, get_args
 
 import numpy as np
 
-from skyloop.client.authority import AuthorityStatus
+from skyloop.client.authority import AuthorityStatus, TakeoverWay
 from skyloop.client.commands import checked, number
 from skyloop.client.drone import Drone
 from skyloop.client.statistics import DEPTH, Distribution, distribution
@@ -317,17 +317,31 @@ class Swarm:
         self.fail(what or getattr(function, "__name__", "each"), errors)
         return results
 
-    def request_authority(self, priority: int | None = None, **options: Any) -> dict[str, AuthorityStatus]:
+    def request_authority(
+        self,
+        priority: int | None = None,
+        *,
+        wait_s: float = 0.0,
+        for_s: float | None = None,
+        takeover: TakeoverWay = "now",
+        stay: bool = False,
+    ) -> dict[str, AuthorityStatus]:
         """Ask for the authority over all active drones.
 
         Args:
             priority: 0 (highest) to 31 (lowest); None: as in the last request.
-            **options: As for :meth:`Drone.request_authority`.
+            wait_s: As for :meth:`Drone.request_authority`.
+            for_s: As for :meth:`Drone.request_authority`.
+            takeover: As for :meth:`Drone.request_authority`.
+            stay: As for :meth:`Drone.request_authority`.
 
         Returns:
             The status of each, by name.
         """
-        return self.each(lambda drone: drone.request_authority(priority, **options), "request_authority")
+        return self.each(
+            lambda drone: drone.request_authority(priority, wait_s=wait_s, for_s=for_s, takeover=takeover, stay=stay),
+            "request_authority",
+        )
 
     def release_authority(self) -> None:
         """Release the authority over all active drones."""

@@ -1,35 +1,23 @@
-"""The drone for ``asyncio``: methods that wait are coroutines, the others plain calls.
-
-::
-
-    async with skyloop.aio.connect("sim://") as drone:
-        await drone.takeoff()
-        async for frame in drone.frames():
-            drone.velocity(forward=0.3)
-
-It wraps :class:`skyloop.client.Drone`, which works on threads of its own and is available as :attr:`Drone.sync`.
-Cancelling a call ends the waiting; what it was waiting for is not undone.
-"""
+"""One drone for ``asyncio``."""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import inspect
-import threading
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
+from collections.abc import AsyncIterator, Awaitable, Callable, Generator, Iterable
 from types import TracebackType
-from typing import Any, TypeVar, Unpack
+from typing import Any, Unpack
 
 from skyloop import client
-from skyloop.client.authority import TakeoverAnswer
+from skyloop.aio.bridge import Callback, LoopNotifier, in_thread, on_loop, reject_in_step
+from skyloop.client.authority import TakeoverAnswer, TakeoverWay
 from skyloop.client.channels import VideoOptions
+from skyloop.client.connect import ConnectOptions
 from skyloop.client.frame import Arrival
 from skyloop.client.logbook import Logbook
-from skyloop.client.mailbox import Mailbox, Notifier
+from skyloop.client.mailbox import Mailbox
 from skyloop.client.results import ResultMailbox, checked_age, silence
 from skyloop.client.telemetry import Wanted
-from skyloop.drivers.uri import parse_uri
 from skyloop.errors import NoAnswerError, UsageError
 from skyloop.messages import (
     Annotation,
@@ -45,10 +33,6 @@ from skyloop.messages import (
 )
 from skyloop.messages.annotation import Shape
 
-T = TypeVar("T")
-#: A callback of an asyncio application, a function or a coroutine function. It runs on the event loop.
-Callback = Callable[[T], object] | Callable[[T], Awaitable[object]]
-
 
 class connect:  # noqa: N801  (used like the function skyloop.connect)
     """Connect to a drone: ``async with connect(target, …) as drone``, or ``drone = await connect(…)``.
@@ -57,7 +41,7 @@ class connect:  # noqa: N801  (used like the function skyloop.connect)
     advances only while its application waits in calls of :class:`skyloop.client.Drone`.
     """
 
-    def __init__(self, target: str, **options: Any) -> None:
+    def __init__(self, target: str, **options: Unpack[ConnectOptions]) -> None:
         """Keep the arguments; awaiting or entering connects.
 
         Args:
@@ -68,7 +52,7 @@ class connect:  # noqa: N801  (used like the function skyloop.connect)
         self._options = options
         self._drone: Drone | None = None
 
-    def __await__(self) -> Any:
+    def __await__(self) -> Generator[Any, None, Drone]:
         return self._connect().__await__()
 
     async def __aenter__(self) -> Drone:
@@ -82,8 +66,8 @@ class connect:  # noqa: N801  (used like the function skyloop.connect)
             await self._drone.__aexit__(kind, error, traceback)
 
     async def _connect(self) -> Drone:
-        _reject_in_step(self._target)
-        sync = await _in_thread(lambda: client.connect(self._target, **self._options), abandoned=lambda d: d.close())
+        reject_in_step(self._target)
+        sync = await in_thread(lambda: client.connect(self._target, **self._options), abandoned=lambda d: d.close())
         return Drone(sync)
 
 
@@ -95,19 +79,19 @@ class Config:
 
     async def get(self, name: str) -> Value:
         """Return the present value."""
-        return await _in_thread(lambda: self._sync[name])
+        return await in_thread(lambda: self._sync[name])
 
     async def set(self, name: str, value: object) -> None:
         """Write one value."""
-        await _in_thread(lambda: self._sync.__setitem__(name, value))
+        await in_thread(lambda: self._sync.__setitem__(name, value))
 
     async def items(self) -> list[tuple[str, Value]]:
         """Return (name, value) of all parameters, sorted by name."""
-        return await _in_thread(self._sync.items)
+        return await in_thread(self._sync.items)
 
     async def describe(self, name: str) -> Parameter:
         """Return all that is known of a parameter: type, unit, range, default, value, description."""
-        return await _in_thread(lambda: self._sync.describe(name))
+        return await in_thread(lambda: self._sync.describe(name))
 
 
 class Drone:
@@ -128,11 +112,11 @@ class Drone:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        await _in_thread(lambda: self.sync.__exit__(kind, error, traceback))
+        await in_thread(lambda: self.sync.__exit__(kind, error, traceback))
 
     async def close(self) -> None:
         """Release the authority and end the connection. Does not land."""
-        await _in_thread(self.sync.close)
+        await in_thread(self.sync.close)
 
     # Properties; nothing here waits ----------------------------------------------------------------------------
 
@@ -168,7 +152,7 @@ class Drone:
 
     async def stats(self) -> client.Stats:
         """Return statistics by channel; see :attr:`skyloop.client.Drone.stats`."""
-        return await _in_thread(lambda: self.sync.stats)
+        return await in_thread(lambda: self.sync.stats)
 
     def recent_events(self) -> list[Event]:
         """Return the last 256 events, oldest first."""
@@ -178,11 +162,11 @@ class Drone:
 
     async def takeoff(self, *, wait: bool = True, timeout_s: float = 15.0) -> None:
         """Take off, then hover; see :meth:`skyloop.client.Drone.takeoff`."""
-        await _in_thread(lambda: self.sync.takeoff(wait=wait, timeout_s=timeout_s))
+        await in_thread(lambda: self.sync.takeoff(wait=wait, timeout_s=timeout_s))
 
     async def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> None:
         """Land at the present position; see :meth:`skyloop.client.Drone.land`."""
-        await _in_thread(lambda: self.sync.land(wait=wait, timeout_s=timeout_s))
+        await in_thread(lambda: self.sync.land(wait=wait, timeout_s=timeout_s))
 
     def hover(self) -> bool:
         """Stop and hold the position."""
@@ -226,9 +210,19 @@ class Drone:
         """Make ``action`` the newest set-point."""
         return self.sync.command(action)
 
-    async def request_authority(self, priority: int | None = None, **options: Any) -> client.AuthorityStatus:
+    async def request_authority(
+        self,
+        priority: int | None = None,
+        *,
+        wait_s: float = 0.0,
+        for_s: float | None = None,
+        takeover: TakeoverWay = "now",
+        stay: bool = False,
+    ) -> client.AuthorityStatus:
         """Ask for the authority and wait for it; see :meth:`skyloop.client.Drone.request_authority`."""
-        return await _in_thread(lambda: self.sync.request_authority(priority, **options))
+        return await in_thread(
+            lambda: self.sync.request_authority(priority, wait_s=wait_s, for_s=for_s, takeover=takeover, stay=stay)
+        )
 
     def on_takeover(
         self, function: Callable[[client.TakeoverRequest], TakeoverAnswer | Awaitable[TakeoverAnswer]]
@@ -237,11 +231,11 @@ class Drone:
 
         See :meth:`skyloop.client.Drone.on_takeover`; here it runs on the event loop and may be a coroutine function.
         """
-        return Listener(self.sync.on_takeover(_on_loop(function)))
+        return Listener(self.sync.on_takeover(on_loop(function)))
 
     async def release_authority(self) -> None:
         """Release the authority, or leave the queue."""
-        await _in_thread(self.sync.release_authority)
+        await in_thread(self.sync.release_authority)
 
     # Reading ---------------------------------------------------------------------------------------------------
 
@@ -251,7 +245,7 @@ class Drone:
 
     async def next_feedback(self, timeout_s: float = 1.0) -> Feedback:
         """Wait for feedback that was not read before, and return the newest."""
-        return await _in_thread(lambda: self.sync.next_feedback(timeout_s))
+        return await in_thread(lambda: self.sync.next_feedback(timeout_s))
 
     def frame(self, camera: str | None = None, *, max_age_s: float | None = None) -> client.Frame | None:
         """Return the newest frame without waiting; see :meth:`skyloop.client.Drone.frame`.
@@ -262,14 +256,14 @@ class Drone:
 
     async def next_frame(self, camera: str | None = None, *, timeout_s: float = 1.0) -> client.Frame:
         """Wait for a frame that this method has not returned before, and return the newest."""
-        return await _in_thread(lambda: self.sync.next_frame(camera, timeout_s=timeout_s))
+        return await in_thread(lambda: self.sync.next_frame(camera, timeout_s=timeout_s))
 
     async def wait(self, state: Wanted, timeout_s: float = 10.0) -> Feedback:
         """Wait until the newest feedback is as wanted; see :meth:`skyloop.client.Drone.wait`.
 
         A predicate is called on another thread.
         """
-        return await _in_thread(lambda: self.sync.wait(state, timeout_s))
+        return await in_thread(lambda: self.sync.wait(state, timeout_s))
 
     async def frames(
         self, camera: str | None = None, *, timeout_s: float = 5.0, **how: Unpack[VideoOptions]
@@ -285,7 +279,7 @@ class Drone:
             NoAnswerError: If no frame comes within ``timeout_s``.
         """
         channel = self.sync._core.channel(camera, **how)
-        notifier = _LoopNotifier()
+        notifier = LoopNotifier()
         came = notifier.came
         mailbox: Mailbox[Arrival] = Mailbox(notifier=notifier)
         with self.sync._core.closing(mailbox), channel.into(mailbox):
@@ -299,7 +293,7 @@ class Drone:
                 if arrival is None:
                     continue
                 if arrival.header.encoding is Encoding.JPEG:
-                    frame = await _in_thread(lambda arrival=arrival: channel.picture(arrival))  # type: ignore[misc]
+                    frame = await in_thread(lambda arrival=arrival: channel.picture(arrival))  # type: ignore[misc]
                 else:
                     frame = channel.picture(arrival)
                 if frame is not None:
@@ -322,7 +316,7 @@ class Drone:
         Raises:
             NoAnswerError: If no result that is new enough comes in time.
         """
-        notifier = _LoopNotifier()
+        notifier = LoopNotifier()
         came, loop = notifier.came, notifier.loop
         mailbox = ResultMailbox(checked_age(max_age_s), notifier)
         with self.sync._core.closing(mailbox), self.sync._core.result_channel(processor).into(mailbox):
@@ -342,43 +336,51 @@ class Drone:
 
     def on_feedback(self, function: Callback[Feedback]) -> Listener:
         """Call ``function`` with the newest feedback, on the event loop."""
-        return Listener(self.sync.on_feedback(_on_loop(function)))
+        return Listener(self.sync.on_feedback(on_loop(function)))
 
     def on_event(self, function: Callback[Event]) -> Listener:
         """Call ``function`` with each event, on the event loop."""
-        return Listener(self.sync.on_event(_on_loop(function)))
+        return Listener(self.sync.on_event(on_loop(function)))
 
     def on_link(self, function: Callback[client.LinkStatus]) -> Listener:
         """Call ``function`` on the event loop whenever one of the two hops changes its state."""
-        return Listener(self.sync.on_link(_on_loop(function)))
+        return Listener(self.sync.on_link(on_loop(function)))
 
     def on_command(self, function: Callback[Applied]) -> Listener:
         """Call ``function`` with what the proxy made of each command of any application, on the event loop."""
-        return Listener(self.sync.on_command(_on_loop(function)))
+        return Listener(self.sync.on_command(on_loop(function)))
 
     def on_annotation(self, function: Callback[Annotation]) -> Listener:
         """Call ``function`` with what any application draws on a frame, on the event loop."""
-        return Listener(self.sync.on_annotation(_on_loop(function)))
+        return Listener(self.sync.on_annotation(on_loop(function)))
 
     def on_log(self, function: Callback[LogEntry]) -> Listener:
         """Call ``function`` with what any application logs, on the event loop."""
-        return Listener(self.sync.on_log(_on_loop(function)))
+        return Listener(self.sync.on_log(on_loop(function)))
 
     def on_result(
         self, function: Callback[client.Result], processor: str | None = None, *, max_age_s: float | None = None
     ) -> Listener:
         """Call ``function`` with results, on the event loop; see :meth:`skyloop.client.Drone.on_result`."""
-        return Listener(self.sync.on_result(_on_loop(function), processor, max_age_s=max_age_s))
+        return Listener(self.sync.on_result(on_loop(function), processor, max_age_s=max_age_s))
 
     def on_frame(
-        self, function: Callable[[client.Frame], object], camera: str | None = None, **options: Any
-    ) -> client.Listener[Any]:
+        self,
+        function: Callable[[client.Frame], object],
+        camera: str | None = None,
+        *,
+        depth: int = 1,
+        inline: bool = False,
+        **how: Unpack[VideoOptions],
+    ) -> client.Listener[Arrival]:
         """Call ``function`` with the newest frame, on a thread of its own: work on images would block the event loop.
 
         Args:
             function: A plain function.
             camera: Name of the camera; None: the vehicle's first.
-            **options: As for :meth:`skyloop.client.Drone.on_frame`.
+            depth: As for :meth:`skyloop.client.Drone.on_frame`.
+            inline: As for :meth:`skyloop.client.Drone.on_frame`.
+            **how: As for :meth:`skyloop.client.Drone.frames`.
 
         Raises:
             UsageError: If it is a coroutine function.
@@ -387,7 +389,7 @@ class Drone:
             raise UsageError(
                 "on_frame takes a plain function, which runs on a thread of its own; else iterate over frames()"
             )
-        return self.sync.on_frame(function, camera, **options)
+        return self.sync.on_frame(function, camera, depth=depth, inline=inline, **how)
 
     def annotate(self, frame: client.Frame, shapes: Iterable[Shape], source: str | None = None) -> bool:
         """Publish shapes drawn over a frame; see :meth:`skyloop.client.Drone.annotate`."""
@@ -424,74 +426,3 @@ class Listener:
     def errors(self) -> int:
         """Calls that raised."""
         return self._sync.errors
-
-
-class _LoopNotifier(Notifier):
-    """Wakes the coroutine that waits for :attr:`came`, from any thread."""
-
-    __slots__ = ("came", "loop")
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.came = asyncio.Event()
-        self.loop = asyncio.get_running_loop()
-
-    def notify(self) -> None:
-        with contextlib.suppress(RuntimeError):  # the loop has ended
-            self.loop.call_soon_threadsafe(self.came.set)
-
-
-def _reject_in_step(target: str) -> None:
-    """Raise :class:`UsageError` for a stepped replay, whose time would stand still here."""
-    if isinstance(target, str) and target.startswith("replay://") and parse_uri(target).options.get("speed") == "max":
-        raise UsageError(
-            f"{target}: speed=max is in step with the one thread that waits, which an event loop never does: use "
-            "skyloop.connect, or give a number, such as speed=10"
-        )
-
-
-def _on_loop(function: Callback[T]) -> Callable[[T], Any]:
-    """Wrap ``function`` so that another thread can call it: it runs on this event loop and is waited for."""
-    loop = asyncio.get_running_loop()
-
-    async def call(sample: T) -> object:
-        result = function(sample)
-        return await result if inspect.isawaitable(result) else result
-
-    def from_thread(sample: T) -> object:
-        return None if loop.is_closed() else asyncio.run_coroutine_threadsafe(call(sample), loop).result()
-
-    return from_thread
-
-
-async def _in_thread(function: Callable[[], T], *, abandoned: Callable[[T], object] | None = None) -> T:
-    """Run a function that waits on a thread of its own: a pool could be full when the vehicle has to land.
-
-    If the caller is cancelled meanwhile, ``abandoned`` is called with the result that nobody waits for.
-    """
-    loop = asyncio.get_running_loop()
-    future: asyncio.Future[T] = loop.create_future()
-
-    def settle(result: T | None, error: BaseException | None) -> None:
-        if future.cancelled():
-            if error is None and abandoned is not None:
-                threading.Thread(target=abandoned, args=(result,), daemon=True).start()
-        elif error is not None:
-            future.set_exception(error)
-        else:
-            future.set_result(result)  # type: ignore[arg-type]
-
-    def work() -> None:
-        result, error = None, None
-        try:
-            result = function()
-        except BaseException as problem:  # noqa: BLE001  (it is raised where the result is awaited)
-            error = problem
-        try:
-            loop.call_soon_threadsafe(settle, result, error)
-        except RuntimeError:  # the loop has ended
-            if error is None and abandoned is not None:
-                abandoned(result)  # type: ignore[arg-type]
-
-    threading.Thread(target=work, name="skyloop-aio", daemon=True).start()
-    return await future

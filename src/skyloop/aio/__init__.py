@@ -1,0 +1,19 @@
+"""Drones and swarms for ``asyncio``: methods that wait are coroutines, the others plain calls.
+
+::
+
+    async with skyloop.aio.connect("sim://") as drone:
+        await drone.takeoff()
+        async for frame in drone.frames():
+            drone.velocity(forward=0.3)
+
+They wrap :class:`skyloop.client.Drone` and :class:`skyloop.client.Swarm`, which work on threads of their own and are
+available as :attr:`Drone.sync` and :attr:`Swarm.sync`. Cancelling a call ends the waiting; what it was waiting for is
+not undone.
+"""
+
+from skyloop.aio.bridge import Callback
+from skyloop.aio.drone import Config, Drone, Listener, connect
+from skyloop.aio.swarm import Swarm, swarm
+
+__all__ = ["Callback", "Config", "Drone", "Listener", "Swarm", "connect", "swarm"]
