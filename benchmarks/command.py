@@ -23,7 +23,7 @@ from skyloop.cli.bench import (
     measure_delays,
     measuring,
     parse_sizes,
-    tell_skipped,
+    print_skipped,
 )
 from skyloop.errors import UsageError
 
@@ -92,7 +92,7 @@ def load(
     )
     with measuring("load", output) as progress:
         results = load.measure(wanted_s, cases, record_to=record_to, skipped=skipped, progress=progress)
-    tell_skipped(results.skipped)
+    print_skipped(results.skipped)
     found = [tables.load_table(results), tables.cpu_table(results), verdict_table(judge_load(results))]
     finish("load", results, as_rich(found, str(results.machine)), output)
 
@@ -104,7 +104,7 @@ def codecs(seconds: Seconds = None, minutes: Minutes = None, output: Output = No
     wanted_s = duration_s(seconds, minutes)
     with measuring("codecs", output) as progress:
         results = codecs.measure(wanted_s, progress)
-    tell_skipped(results.skipped)
+    print_skipped(results.skipped)
     finish("codecs", results, as_rich([tables.codecs_table(results)], str(results.machine)), output)
 
 
@@ -158,7 +158,7 @@ def scale(
     wanted_s, numbers = duration_s(seconds, minutes), parse_numbers(counts, "1,2,5,10,20,50", "--counts")
     with measuring("scale", output) as progress:
         results = scale.measure(wanted_s, scale.cases_of(numbers), progress)
-    tell_skipped(results.skipped)
+    print_skipped(results.skipped)
     found = [tables.scale_table(results, many) for many in ("proxies", "observers")]
     finish("scale", results, as_rich(found, str(results.machine)), output, draw)
 

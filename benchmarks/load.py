@@ -196,7 +196,7 @@ class _Tally:
             name = f"{channel}, {of}" if of else channel
             kind = channel.partition(",")[0]
             self._period_s[name] = turn.period_s(kind)
-            self.delays_ns.setdefault(name, []).extend(heard - sent for sent, heard in pairs)
+            self.delays_ns.setdefault(name, []).extend(received - sent for sent, received in pairs)
             self.sent[name] = self.sent.get(name, 0) + times * turn.count(kind)
 
     def use(self, turn: Turn, before_s: Mapping[str, float], after_s: Mapping[str, float]) -> None:

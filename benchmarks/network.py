@@ -216,7 +216,7 @@ class _Tally:
         for channel in CHANNELS:
             self._period_s[channel] = turn.period_s(channel)
             self._sent[channel] += turn.count(channel)
-            self._delays_ns[channel] += [heard - sent for sent, heard in arrivals[channel]]
+            self._delays_ns[channel] += [received - sent for sent, received in arrivals[channel]]
 
     def result(self, seconds: float) -> CaseResult:
         channels = {channel: self._channel(channel) for channel in CHANNELS}

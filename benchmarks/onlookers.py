@@ -27,14 +27,14 @@ def observe(pipe: Pipe, proxy: str) -> None:
     """Run an observer of feedback and video, which connects when told to and sends at the end what it received."""
     pipe.send("ready")
     while pipe.recv() is not None:
-        heard = Recorder()
-        listening = Listening(heard.heard)
+        recorder = Recorder()
+        listening = Listening(recorder.received)
         with connect(proxy, access="observe", name="observer") as drone:
             drone.on_feedback(listening.feedback, inline=True)
             drone.on_frame(listening.frame, camera=CAMERA, inline=True)
             pipe.send("connected")
             pipe.recv()
-        pipe.send(heard.arrivals)
+        pipe.send(recorder.arrivals)
 
 
 def record(pipe: Pipe, proxy: str, file: str, fill: bool) -> None:

@@ -214,14 +214,14 @@ class _Stage:
         sleep_until(begin_ns + round(seconds * 1e9))
         used_s = {part: after_s - before_s[part] for part, after_s in self._used_s().items()}
         memory = {part: memory_bytes(workers[0].pid) / 1e6 for part, workers in self.parts.items() if workers}
-        heard = [worker.answer(seconds + SETTLE_S + _ANSWERS_WITHIN_S) for worker in producers]
+        received = [worker.answer(seconds + SETTLE_S + _ANSWERS_WITHIN_S) for worker in producers]
         for worker in self.parts["observers"]:
             worker.pipe.send("end")
         observed = [worker.answer(_ANSWERS_WITHIN_S) for worker in self.parts["observers"]]
         tally = _Tally(turn, begin_ns)
-        for arrivals in heard[: self._case.proxies]:
+        for arrivals in received[: self._case.proxies]:
             tally.add({COMMAND: arrivals.get(COMMAND, [])}, COMMAND)
-        tally.add(heard[-1], FEEDBACK, times=self._case.proxies)
+        tally.add(received[-1], FEEDBACK, times=self._case.proxies)
         for arrivals in observed:
             tally.add(arrivals, FEEDBACK, of="observers")
             if self._case.video:
@@ -280,7 +280,7 @@ class _Tally:
     def add(self, arrivals: Arrivals, channel: str, *, of: str = "", times: int = 1) -> None:
         name = f"{channel}, {of}" if of else channel
         found = since(arrivals, self._begin_ns).get(channel, [])
-        self._delays_ns.setdefault(name, []).extend(heard - sent for sent, heard in found)
+        self._delays_ns.setdefault(name, []).extend(received - sent for sent, received in found)
         self._sent[name] = self._sent.get(name, 0) + times * self._turn.count(channel)
 
     def channels(self) -> dict[str, Summary]:
@@ -308,7 +308,7 @@ def fly_all(pipe: Pipe, addresses: Sequence[str]) -> None:
         with ExitStack() as stack:
             applications = []
             for each in addresses:
-                applications.append(over_network.Pilot(each, recorder.heard))
+                applications.append(over_network.Pilot(each, recorder.received))
                 stack.callback(applications[-1].close)
             pipe.send(time.monotonic() - opening_s)
             if (begin_ns := pipe.recv()) is None:
@@ -324,15 +324,15 @@ def observe(pipe: Pipe, address: str, video: bool) -> None:
     """Run an observer of feedback and, if wanted, video, which sends at the end of a turn what it received."""
     pipe.send("ready")
     while pipe.recv() is not None:
-        heard = Recorder()
-        listening = Listening(heard.heard)
+        recorder = Recorder()
+        listening = Listening(recorder.received)
         with over_network.connect(address, "observe") as drone:
             drone.on_feedback(listening.feedback, inline=True)
             if video:
                 drone.on_frame(listening.frame, camera=CAMERA, inline=True, **over_network.JPEG)
             pipe.send("connected")
             pipe.recv()
-        pipe.send(heard.arrivals)
+        pipe.send(recorder.arrivals)
 
 
 def route(pipe: Pipe, places: Sequence[str]) -> None:

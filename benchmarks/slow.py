@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from skyloop.bench import ours
-from skyloop.bench.contract import Heard
+from skyloop.bench.contract import Received
 from skyloop.bench.schedule import VIDEO
 from skyloop.bench.vehicle import CAMERA
 from skyloop.client import Frame
@@ -20,11 +20,11 @@ SLOW_VIDEO: Final = f"{VIDEO}, slow processor"
 class Application(ours.Application):
     """The pilot's end, with the slow processor."""
 
-    def __init__(self, address: str, heard: Heard) -> None:
-        super().__init__(address, heard)
+    def __init__(self, address: str, received: Received) -> None:
+        super().__init__(address, received)
 
         def slow(frame: Frame) -> None:
-            heard(SLOW_VIDEO, frame.captured_ns)
+            received(SLOW_VIDEO, frame.captured_ns)
             until = time.monotonic() + SLOW_S
             mean = np.zeros(frame.shape, np.float32)
             while time.monotonic() < until:  # what image processing does: long work on arrays

@@ -38,14 +38,14 @@ def test_a_child_ends_when_its_input_does_and_its_last_words_stay_known() -> Non
         assert child.stdout.readline() == b"ready\n"
         assert child.code is None
         assert child.wait(0.0) is None
-        assert child.said == ""
+        assert child.quoted_output == ""
         child.part()
         child.end()
         assert child.code == 1
         child.close()
         child.close()
         assert child.ending == "ended with exit code 1"
-        assert child.said.startswith("; its output:\nxxx")
+        assert child.quoted_output.startswith("; its output:\nxxx")
         assert child.last_words.endswith("no vehicle")
         assert len(child.last_words) <= 2000
 
@@ -63,7 +63,7 @@ def test_one_that_does_not_end_is_terminated_and_at_last_killed() -> None:
             child.stdout.readline()
             child.end(0.05, 20.0 if last is signal.SIGTERM else 0.05)
             assert child.ending == f"was killed by signal {last.value}"
-            assert child.said == ""
+            assert child.quoted_output == ""
 
 
 @pytest.mark.process

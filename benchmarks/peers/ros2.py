@@ -20,7 +20,7 @@ from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 from sensor_msgs.msg import Image as ImageMessage
 from sensor_msgs.msg import Imu
 
-from skyloop.bench.contract import Heard, Image
+from skyloop.bench.contract import Image, Received
 from skyloop.bench.schedule import COMMAND, FEEDBACK, VIDEO
 from skyloop.bench.waypoints import Setpoint
 
@@ -52,12 +52,12 @@ class _End:
 
 
 class Vehicle(_End):
-    def __init__(self, address: str, heard: Heard) -> None:
+    def __init__(self, address: str, received: Received) -> None:
         super().__init__("vehicle", address)
         self._feedback = self._node.create_publisher(Imu, FEEDBACK, _QUALITY)
         self._video = self._node.create_publisher(ImageMessage, VIDEO, _QUALITY)
         self._node.create_subscription(
-            TwistStamped, COMMAND, lambda message: heard(COMMAND, _stamp_of(message)), _QUALITY
+            TwistStamped, COMMAND, lambda message: received(COMMAND, _stamp_of(message)), _QUALITY
         )
         self._thread.start()
 
@@ -82,15 +82,15 @@ class Vehicle(_End):
 
 
 class Application(_End):
-    def __init__(self, address: str, heard: Heard) -> None:
+    def __init__(self, address: str, received: Received) -> None:
         super().__init__("application", address)
         self._commands = self._node.create_publisher(TwistStamped, COMMAND, _QUALITY)
 
         def show(message: Any) -> None:
             np.frombuffer(message.data, np.uint8).reshape(message.height, message.width, 3)
-            heard(VIDEO, _stamp_of(message))
+            received(VIDEO, _stamp_of(message))
 
-        self._node.create_subscription(Imu, FEEDBACK, lambda message: heard(FEEDBACK, _stamp_of(message)), _QUALITY)
+        self._node.create_subscription(Imu, FEEDBACK, lambda message: received(FEEDBACK, _stamp_of(message)), _QUALITY)
         self._node.create_subscription(ImageMessage, VIDEO, show, _QUALITY)
         self._thread.start()
         self._wait_for_the_vehicle()

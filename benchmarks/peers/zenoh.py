@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from skyloop.bench.contract import Heard, Image
+from skyloop.bench.contract import Image, Received
 from skyloop.bench.schedule import COMMAND, FEEDBACK, VIDEO
 from skyloop.bench.waypoints import Setpoint
 
@@ -28,9 +28,9 @@ class _End:
             f"bench/{topic}", congestion_control=zenoh.CongestionControl.DROP, express=True
         )
 
-    def _packets(self, topic: str, heard: Heard) -> None:
+    def _packets(self, topic: str, received: Received) -> None:
         def take(sample: Any) -> None:
-            heard(topic, _PACKET.unpack(sample.payload.to_bytes())[0])
+            received(topic, _PACKET.unpack(sample.payload.to_bytes())[0])
 
         self._session.declare_subscriber(f"bench/{topic}", take)
 
@@ -39,10 +39,10 @@ class _End:
 
 
 class Vehicle(_End):
-    def __init__(self, address: str, heard: Heard) -> None:
+    def __init__(self, address: str, received: Received) -> None:
         self._session, endpoint = _listen()
         (Path(address) / "zenoh").write_text(endpoint)
-        self._packets(COMMAND, heard)
+        self._packets(COMMAND, received)
         self._feedback = self._publisher(FEEDBACK)
         self._video = self._publisher(VIDEO)
 
@@ -55,14 +55,14 @@ class Vehicle(_End):
 
 
 class Application(_End):
-    def __init__(self, address: str, heard: Heard) -> None:
+    def __init__(self, address: str, received: Received) -> None:
         self._session = _open("connect", (Path(address) / "zenoh").read_text())
-        self._packets(FEEDBACK, heard)
+        self._packets(FEEDBACK, received)
 
         def show(sample: Any) -> None:
             sent_ns, width, height = _FRAME.unpack(sample.attachment.to_bytes())
             np.frombuffer(sample.payload.to_bytes(), np.uint8).reshape(height, width, 3)
-            heard(VIDEO, sent_ns)
+            received(VIDEO, sent_ns)
 
         self._session.declare_subscriber(f"bench/{VIDEO}", show)
         self._commands = self._publisher(COMMAND)

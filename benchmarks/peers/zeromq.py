@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import zmq
 
-from skyloop.bench.contract import Heard, Image
+from skyloop.bench.contract import Image, Received
 from skyloop.bench.schedule import COMMAND, FEEDBACK, VIDEO
 from skyloop.bench.waypoints import Setpoint
 
@@ -62,11 +62,11 @@ def _receive(sock: Any, take: Callable[[Any], None]) -> None:
 
 
 class Vehicle(_End):
-    def __init__(self, address: str, heard: Heard) -> None:
+    def __init__(self, address: str, received: Received) -> None:
         super().__init__(address)
         self._feedback = self._publish(FEEDBACK, binds=True)
         self._video = self._publish(VIDEO, binds=True)
-        self._subscribe(COMMAND, lambda sock: heard(COMMAND, _PACKET.unpack(sock.recv())[0]), binds=True)
+        self._subscribe(COMMAND, lambda sock: received(COMMAND, _PACKET.unpack(sock.recv())[0]), binds=True)
 
     def feedback(self, sent_ns: int) -> None:
         self._feedback.send(_PACKET.pack(sent_ns, *[0.5] * 11))
@@ -78,16 +78,16 @@ class Vehicle(_End):
 
 
 class Application(_End):
-    def __init__(self, address: str, heard: Heard) -> None:
+    def __init__(self, address: str, received: Received) -> None:
         super().__init__(address)
         self._commands = self._publish(COMMAND, binds=False)
 
         def show(sock: Any) -> None:
             sent_ns, width, height = _FRAME.unpack(sock.recv())
             np.frombuffer(sock.recv(copy=False).buffer, np.uint8).reshape(height, width, 3)
-            heard(VIDEO, sent_ns)
+            received(VIDEO, sent_ns)
 
-        self._subscribe(FEEDBACK, lambda sock: heard(FEEDBACK, _PACKET.unpack(sock.recv())[0]), binds=False)
+        self._subscribe(FEEDBACK, lambda sock: received(FEEDBACK, _PACKET.unpack(sock.recv())[0]), binds=False)
         self._subscribe(VIDEO, show, binds=False)
 
     def command(self, sent_ns: int, setpoint: Setpoint) -> None:

@@ -34,7 +34,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
     views: _Count = 0  #: pictures of the board that it is made of
     rejected: _Count = 0  #: pictures that did not go with the others
     coverage: float | None = None  #: share of the picture's area in which corners were seen, 0 to 1
-    fx_deviation: float | None = None  #: standard deviation of the focal length [px], as far as the corners tell
+    fx_deviation: float | None = None  #: standard deviation of the focal length [px], as far as the corners show it
     camera: str = ""  #: a name for people
 
     def __post_init__(self) -> None:

@@ -69,7 +69,7 @@ class ChildProcess:
         return f"was killed by signal {-code}" if code is not None and code < 0 else f"ended with exit code {code}"
 
     @property
-    def said(self) -> str:
+    def quoted_output(self) -> str:
         """Its last words as the end of a message; empty for none."""
         text = self.last_words
         return f"; its output:\n{text}" if text else ""

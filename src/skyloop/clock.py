@@ -1,7 +1,7 @@
 """Times and clocks: all times are integer nanoseconds on a monotonic clock, and decisions take the time as an argument.
 
 ``time.monotonic_ns`` is ``CLOCK_MONOTONIC``: one clock for all processes of a host, so that ages across processes of
-one host need no estimation. The exception are time namespaces, as containers may have: :func:`clock_identity` tells
+one host need no estimation. The exception are time namespaces, as containers may have: :func:`clock_identity` shows
 them apart. Wall-clock time is never used for ages.
 """
 
@@ -35,7 +35,7 @@ def nanoseconds(s: float) -> int:
 def clock_identity() -> str:
     """Return which monotonic clock this process reads; processes with the same identity read the same clock.
 
-    It names the boot of the host's kernel and the time namespace. Empty where the boot can't be told, as on systems
+    It names the boot of the host's kernel and the time namespace. Empty where the boot is not known, as on systems
     other than Linux.
     """
     try:

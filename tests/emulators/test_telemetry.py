@@ -150,23 +150,23 @@ def test_the_drones_clock() -> None:
     clock = DroneClock(booted_ns=5_000_000_000)
     assert clock.navdata_time(8_250_000_000) == 3 << 21 | 250_000
     assert clock.milliseconds(8_250_000_000) == 3250
-    assert clock.navdata_time(5_000_000_000 + 2049 * 10**9) == 1 << 21, "begins anew after 2048 s"
+    assert clock.navdata_time(5_000_000_000 + 2049 * 10**9) == 1 << 21, "wraps after 2048 s"
 
 
 def test_listeners_have_numbers_of_their_own() -> None:
     listeners = Listeners()
     first, second = ("127.0.0.1", 1), ("127.0.0.1", 2)
-    assert listeners.heard(first)
+    assert listeners.refresh(first)
     assert listeners.next_sequences() == [(first, 1)]
-    assert listeners.heard(second)
-    assert not listeners.heard(first)
+    assert listeners.refresh(second)
+    assert not listeners.refresh(first)
     assert dict(listeners.next_sequences()) == {first: 2, second: 1}
 
 
 def test_a_listener_too_many_takes_the_place_of_the_one_not_heard_of_for_longest() -> None:
     listeners = Listeners()
     for port in range(MOST):
-        listeners.heard(("127.0.0.1", port))
-    listeners.heard(("127.0.0.1", 0))
-    listeners.heard(("127.0.0.1", 99))
+        listeners.refresh(("127.0.0.1", port))
+    listeners.refresh(("127.0.0.1", 0))
+    listeners.refresh(("127.0.0.1", 99))
     assert {port for (_, port), _ in listeners.next_sequences()} == {0, 99, *range(2, MOST)}

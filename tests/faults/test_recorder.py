@@ -24,7 +24,7 @@ from skyloop.recording.child import RecorderProcess
 from skyloop.recording.engine import Engine
 from skyloop.recording.options import MB, Options
 from skyloop.recording.output import RecordingFile
-from skyloop.recording.status import News, RecorderState, Status
+from skyloop.recording.status import RecorderEvent, RecorderState, Status
 from skyloop.recording.translation import Translator
 from skyloop.recording.writer import FileWriter
 from skyloop.transport.memory import MemoryServer
@@ -163,7 +163,7 @@ def test_the_command_ends_when_the_recording_has_failed(
 
 
 def test_what_a_library_prints_in_the_recorders_process_does_not_end_its_news(monkeypatch: pytest.MonkeyPatch) -> None:
-    news: list[News] = []
+    news: list[RecorderEvent] = []
     process = object.__new__(RecorderProcess)
 
     class Child:
@@ -172,7 +172,7 @@ def test_what_a_library_prints_in_the_recorders_process_does_not_end_its_news(mo
         def wait(self) -> int:
             return 1
 
-    lines = [b"a library says hello\n", b'{"news":{"text":"raises"}}\n', b'{"news":{"text":"heard"}}\n']
+    lines = [b"a library says hello\n", b'{"event":{"text":"raises"}}\n', b'{"event":{"text":"received"}}\n']
 
     class Lines(list[bytes]):
         def __enter__(self) -> Any:
@@ -180,7 +180,7 @@ def test_what_a_library_prints_in_the_recorders_process_does_not_end_its_news(mo
 
         def __exit__(self, *_: object) -> None: ...
 
-    def hear(one: News) -> None:
+    def hear(one: RecorderEvent) -> None:
         if one.text == "raises":
             raise RuntimeError("who hears may raise anything")
         news.append(one)
@@ -188,14 +188,14 @@ def test_what_a_library_prints_in_the_recorders_process_does_not_end_its_news(mo
     child: Any = Child()
     child.stdout = Lines(lines)
     process._process = child
-    process._hear = hear
+    process._on_event = hear
     process._bell = Notifier()
     process._trouble = None
     process._status = Status(state=RecorderState.RECORDING, path="f.mcap")
-    child.ending, child.said = "ended with exit code 1", ""
+    child.ending, child.quoted_output = "ended with exit code 1", ""
     process._listen()
     assert process.status.state is RecorderState.FAILED
-    assert [one.text.split(";")[0] for one in news] == ["heard", "the recorder's process ended with exit code 1"]
+    assert [one.text.split(";")[0] for one in news] == ["received", "the recorder's process ended with exit code 1"]
 
 
 def test_feedback_is_recorded_beside_samples_that_make_no_sense(rig: Rig, tmp_path: Path) -> None:

@@ -57,16 +57,16 @@ class Scene:
     def __enter__(self) -> Scene:
         self.firmware.start()
         autopilot = self.firmware.autopilot
-        hear = autopilot.heard
+        hear = autopilot.on_message
 
-        def heard(port: object, message: Message, now_ns: int) -> None:
+        def on_message(port: object, message: Message, now_ns: int) -> None:
             if message.get_srcSystem() != STATION:
                 if message.get_type() == "COMMAND_LONG" and message.command in STEERING:
                     self.ours.append(message.command)
                 self.set_points += message.get_type().startswith("SET_")
             hear(port, message, now_ns)  # type: ignore[arg-type]
 
-        autopilot.heard = heard  # type: ignore[method-assign]
+        autopilot.on_message = on_message  # type: ignore[method-assign]
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -96,7 +96,7 @@ class Scene:
         frame = self._codec.encode(m.MAVLink_command_long_message(1, 1, command, 0, *padded))
         (message,) = Codec(1, 1).decode(frame, whole=True)
         running = self.firmware._started
-        running._loop.post(partial(running._heard, running.autopilot.ports[0], message))
+        running._loop.post(partial(running._on_message, running.autopilot.ports[0], message))
 
     def station_mode(self, mode: str) -> None:
         self.station(m.MAV_CMD_DO_SET_MODE, 1.0, *MODES[self.kind][mode])

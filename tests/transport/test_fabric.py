@@ -70,7 +70,7 @@ def test_a_subscription_arrives_where_much_waits_before_it() -> None:
         client._outgoing = Outgoing(depth=0)
         client.subscribe(FEEDBACK, False)
         wait_until(lambda: bool(log.closings), "a connection that can't tell the proxy has ended")
-        assert "can't be told about 'feedback'" in log.closings[0]
+        assert "the subscription to 'feedback' can't be sent" in log.closings[0]
         client.close()
     finally:
         server.stop()

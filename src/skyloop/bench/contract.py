@@ -1,7 +1,7 @@
 """The contract by which every contender is measured: two processes with one end each, and stamps on one clock.
 
-A contender is a module with two classes, ``Vehicle(address, heard)`` and ``Application(address, heard)``. The
-sender's stamp is taken when the user's data are there and before the contender is called; ``heard(channel, sent_ns)``
+A contender is a module with two classes, ``Vehicle(address, received)``, ``Application(address, received)``. The
+sender's stamp is taken when the data are there and before the contender is called; ``received(channel, sent_ns)``
 is called when the receiver's user has them, a frame as an array. Stamps travel with the samples.
 
 Interpreters that have no more than NumPy and the contender import this, so nothing else is imported here.
@@ -24,7 +24,7 @@ from skyloop.bench.workers import Pipe
 
 Image = NDArray[np.uint8]
 #: Called for each sample that its receiver has: its channel, and when it was sent [ns, monotonic].
-Heard = Callable[[str, int], None]
+Received = Callable[[str, int], None]
 #: By channel: when each sample was sent, and when it was received [ns].
 Arrivals = dict[str, list[tuple[int, int]]]
 
@@ -50,7 +50,7 @@ class Recorder:
     def __init__(self) -> None:
         self.arrivals: Arrivals = {}
 
-    def heard(self, channel: str, sent_ns: int) -> None:
+    def received(self, channel: str, sent_ns: int) -> None:
         """Note that a sample of a channel was received now. Any thread."""
         now_ns = time.monotonic_ns()
         self.arrivals.setdefault(channel, []).append((sent_ns, now_ns))
@@ -61,7 +61,7 @@ def vehicle_side(pipe: Pipe, module: str, address: str) -> None:
     contender = import_module(module)
     for turn in _turns(pipe):
         recorder = Recorder()
-        end: VehicleEnd = contender.Vehicle(address, recorder.heard)
+        end: VehicleEnd = contender.Vehicle(address, recorder.received)
         try:
             pipe.send("open")
             if (begin_ns := pipe.recv()) is None:
@@ -78,7 +78,7 @@ def application_side(pipe: Pipe, module: str, address: str) -> None:
     contender = import_module(module)
     for turn in _turns(pipe):
         recorder = Recorder()
-        end: ApplicationEnd = contender.Application(address, recorder.heard)
+        end: ApplicationEnd = contender.Application(address, recorder.received)
         try:
             pipe.send("open")
             begin_ns = pipe.recv()
@@ -99,16 +99,16 @@ def produce(end: VehicleEnd, turn: Turn, begin_ns: int) -> None:
         begin_ns: When counting begins, on the monotonic clock.
     """
 
-    def tell() -> None:
+    def publish_feedback() -> None:
         for _ in paced(turn.deadlines_ns(FEEDBACK, begin_ns)):
             end.feedback(time.monotonic_ns())
 
-    teller = threading.Thread(target=tell, name="bench-feedback", daemon=True)
-    teller.start()
+    publisher = threading.Thread(target=publish_feedback, name="bench-feedback", daemon=True)
+    publisher.start()
     image = picture(turn.size)
     for _ in paced(turn.deadlines_ns(VIDEO, begin_ns)):
         end.frame(time.monotonic_ns(), image)
-    teller.join()
+    publisher.join()
 
 
 def picture(size: Size) -> Image:

@@ -115,7 +115,7 @@ def _cells(name: str, size: str, done: Sequence[tuple[Turn, Arrivals]]) -> list[
     cells = []
     for channel in CHANNELS:
         sent = sum(turn.count(channel) for turn, _ in done)
-        delays_ns = [heard - at for _, arrivals in done for at, heard in arrivals[channel]]
+        delays_ns = [received - at for _, arrivals in done for at, received in arrivals[channel]]
         if not delays_ns:
             raise LinkError(f"not one sample of {channel} with frames of {size} arrived through {name}")
         cells.append(Cell(name, size, channel, summarize(delays_ns, sent=sent, period_s=done[0][0].period_s(channel))))
@@ -128,9 +128,9 @@ def _series(channel: str, done: Sequence[tuple[Turn, Arrivals]]) -> Series:
     before_s = 0.0
     for turn, arrivals in done:
         first_ns = min(pair[0] for pairs in arrivals.values() for pair in pairs)
-        for sent_ns, heard_ns in arrivals[channel]:
+        for sent_ns, received_ns in arrivals[channel]:
             at_s.append(round(before_s + (sent_ns - first_ns) / 1e9, 3))
-            delay_us.append(round((heard_ns - sent_ns) / 1e3, 1))
+            delay_us.append(round((received_ns - sent_ns) / 1e3, 1))
         before_s += turn.seconds
     return Series(channel, at_s, delay_us)
 

@@ -29,7 +29,7 @@ _OTHERS: Final = {
 }
 _PAPER: Final = "#b8463d"
 _BINS: Final = 60
-_SHOWN: Final = 99.5  #: percentile up to which a distribution is drawn; how many lie beyond is said
+_SHOWN: Final = 99.5  #: percentile up to which a distribution is drawn; how many lie beyond is stated
 _SETTINGS: Final[Any] = {
     "font.size": 10,
     "axes.spines.top": False,

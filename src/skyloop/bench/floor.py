@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from skyloop.bench.contract import Heard, Image
+from skyloop.bench.contract import Image, Received
 from skyloop.bench.schedule import COMMAND, FEEDBACK, LARGE, VIDEO
 from skyloop.bench.waypoints import Setpoint
 
@@ -30,7 +30,7 @@ MEMORY_BYTES = LARGE.frame_bytes
 class Vehicle:
     """The vehicle's end; see :class:`skyloop.bench.contract.VehicleEnd`."""
 
-    def __init__(self, address: str, heard: Heard) -> None:
+    def __init__(self, address: str, received: Received) -> None:
         self._path = Path(address) / "floor"
         descriptor = os.memfd_create("skyloop-bench-floor")
         os.ftruncate(descriptor, MEMORY_BYTES)
@@ -40,7 +40,7 @@ class Vehicle:
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._listener.bind(str(self._path))
         self._listener.listen(1)
-        self._heard = heard
+        self._received = received
         self._socket: socket.socket
         self._thread = threading.Thread(target=self._receive, name="floor-receive", daemon=True)
         self._thread.start()
@@ -68,19 +68,19 @@ class Vehicle:
         with self._socket as sock:
             socket.send_fds(sock, [b"memory"], [self._descriptor])
             while packet := sock.recv(256):
-                self._heard(COMMAND, STAMP.unpack_from(packet)[0])
+                self._received(COMMAND, STAMP.unpack_from(packet)[0])
 
 
 class Application:
     """The application's end; see :class:`skyloop.bench.contract.ApplicationEnd`."""
 
-    def __init__(self, address: str, heard: Heard) -> None:
+    def __init__(self, address: str, received: Received) -> None:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._socket.connect(str(Path(address) / "floor"))
         _, (descriptor, *_), _, _ = socket.recv_fds(self._socket, 16, 1)
         self._memory = mmap.mmap(descriptor, MEMORY_BYTES, prot=mmap.PROT_READ)
         os.close(descriptor)
-        self._heard = heard
+        self._received = received
         self._thread = threading.Thread(target=self._receive, name="floor-receive", daemon=True)
         self._thread.start()
 
@@ -93,11 +93,11 @@ class Application:
         self._socket.close()
 
     def _receive(self) -> None:
-        sock, memory, heard = self._socket, self._memory, self._heard
+        sock, memory, received = self._socket, self._memory, self._received
         while packet := sock.recv(256):
             sent_ns, width, height = STAMP.unpack_from(packet)
             if width:
                 np.frombuffer(memory, np.uint8, width * height * 3).reshape(height, width, 3)
-                heard(VIDEO, sent_ns)
+                received(VIDEO, sent_ns)
             else:
-                heard(FEEDBACK, sent_ns)
+                received(FEEDBACK, sent_ns)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from skyloop.bench.contract import Heard, Image
+from skyloop.bench.contract import Image, Received
 from skyloop.bench.schedule import FEEDBACK, VIDEO
 from skyloop.bench.vehicle import CAMERA, BenchVehicle, stamped
 from skyloop.bench.waypoints import Setpoint
@@ -28,9 +28,9 @@ def proxy_name(address: str) -> str:
 class Vehicle:
     """The vehicle's end; see :class:`skyloop.bench.contract.VehicleEnd`."""
 
-    def __init__(self, address: str, heard: Heard) -> None:
+    def __init__(self, address: str, received: Received) -> None:
         name, server = self._server(address)
-        self._vehicle = BenchVehicle(heard)
+        self._vehicle = BenchVehicle(received)
         self._proxy = Proxy(self._vehicle, server, name=name)
         self._proxy.start()
 
@@ -40,7 +40,7 @@ class Vehicle:
         return name, LocalServer(name)
 
     def feedback(self, sent_ns: int) -> None:
-        self._vehicle.tell(sent_ns)
+        self._vehicle.publish_feedback(sent_ns)
 
     def frame(self, sent_ns: int, image: Image) -> None:
         self._vehicle.show(sent_ns, image)
@@ -53,22 +53,22 @@ class Listening:
     """Reports each feedback and frame once, on the connection's receiving thread.
 
     Args:
-        heard: Called with each.
+        received: Called with each.
     """
 
-    def __init__(self, heard: Heard) -> None:
-        self._heard = heard
+    def __init__(self, received: Received) -> None:
+        self._received = received
         self._known_ns = 0
 
     def feedback(self, feedback: Feedback) -> None:
         """Report feedback that is new."""
         if feedback.captured_ns > self._known_ns:  # the proxy repeats an old state when somebody took the authority
             self._known_ns = feedback.captured_ns
-            self._heard(FEEDBACK, feedback.captured_ns)
+            self._received(FEEDBACK, feedback.captured_ns)
 
     def frame(self, frame: Frame) -> None:
         """Report a frame."""
-        self._heard(VIDEO, frame.captured_ns)
+        self._received(VIDEO, frame.captured_ns)
 
 
 class Application:
@@ -77,9 +77,9 @@ class Application:
     looks = True  #: at the video
     video = VideoOptions()  #: how it wants that
 
-    def __init__(self, address: str, heard: Heard) -> None:
+    def __init__(self, address: str, received: Received) -> None:
         self._drone = self._connect(address)
-        listening = Listening(heard)
+        listening = Listening(received)
         self._drone.on_feedback(listening.feedback, inline=True)
         if self.looks:
             self._drone.on_frame(listening.frame, camera=CAMERA, inline=True, **self.video)

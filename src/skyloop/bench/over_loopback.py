@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from skyloop.bench.contract import Heard
+from skyloop.bench.contract import Received
 from skyloop.bench.ours import Application as NearApplication
 from skyloop.bench.ours import Listening, proxy_name
 from skyloop.bench.ours import Vehicle as NearVehicle
@@ -20,9 +20,9 @@ _HOST = "127.0.0.1"
 class Vehicle(NearVehicle):
     """The vehicle's end, which listens at a free port of loopback."""
 
-    def __init__(self, address: str, heard: Heard) -> None:
+    def __init__(self, address: str, received: Received) -> None:
         name, place = proxy_name(address), f"{_HOST}:{free_port(_HOST)}"
-        self._vehicle = BenchVehicle(heard)
+        self._vehicle = BenchVehicle(received)
         server = FabricServer(name, FabricSettings(listen=(place,), multicast=False))
         self._proxy = Proxy(self._vehicle, server, name=name)
         self._proxy.start()
@@ -32,9 +32,9 @@ class Vehicle(NearVehicle):
 class Application(NearApplication):
     """The application's end, which connects to that port."""
 
-    def __init__(self, address: str, heard: Heard) -> None:
+    def __init__(self, address: str, received: Received) -> None:
         place = (Path(address) / "fabric").read_text()
         self._drone = connect(proxy_name(address), name="bench", on_exit="hover", network=place)
-        listening = Listening(heard)
+        listening = Listening(received)
         self._drone.on_feedback(listening.feedback, inline=True)
         self._drone.on_frame(listening.frame, camera=CAMERA, inline=True, encoding="raw")

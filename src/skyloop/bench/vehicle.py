@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import Final
 
-from skyloop.bench.contract import Heard, Image
+from skyloop.bench.contract import Image, Received
 from skyloop.bench.schedule import COMMAND
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.uri import parse_uri
@@ -41,17 +41,17 @@ def stamp_of(up: float, now_ns: int) -> int:
 
 
 class BenchVehicle(Driver):
-    """A vehicle that hovers for ever, and gives feedback and frames when it is told to.
+    """A vehicle that hovers for ever, and gives feedback and frames on request.
 
     Args:
-        heard: Called with each new set-point, on the thread that applies it.
+        received: Called with each new set-point, on the thread that applies it.
     """
 
     shared = False
 
-    def __init__(self, heard: Heard) -> None:
+    def __init__(self, received: Received) -> None:
         super().__init__(parse_uri("bench://"))
-        self._heard = heard
+        self._received = received
         self._last_up = 0.0
 
     def capabilities(self) -> Capabilities:
@@ -59,7 +59,7 @@ class BenchVehicle(Driver):
 
     def _open(self, sink: Sink) -> None:
         sink.link(LinkState.UP)
-        self.tell(time.monotonic_ns())
+        self.publish_feedback(time.monotonic_ns())
 
     def _close(self) -> None:
         """There is nothing to give back."""
@@ -68,7 +68,7 @@ class BenchVehicle(Driver):
         now_ns = time.monotonic_ns()
         if type(action) is Velocity and action.up != self._last_up:  # each call has another one: equal ones are repeats
             self._last_up = action.up
-            self._heard(COMMAND, stamp_of(action.up, now_ns))
+            self._received(COMMAND, stamp_of(action.up, now_ns))
         return action
 
     def show(self, captured_ns: int, image: Image) -> None:
@@ -78,7 +78,7 @@ class BenchVehicle(Driver):
             height, width, _ = image.shape
             sink.frame(CAMERA, image, captured_ns, width=width, height=height)
 
-    def tell(self, captured_ns: int) -> None:
+    def publish_feedback(self, captured_ns: int) -> None:
         """Give feedback with as many values as a real vehicle's."""
         sink = self._sink
         if sink is None:

@@ -123,5 +123,5 @@ def child(number: str) -> None:
 
     with Connection(int(number)) as pipe:
         module, name, arguments = pipe.recv()
-        with contextlib.suppress(KeyboardInterrupt, EOFError, BrokenPipeError):  # whoever measured has ended
+        with contextlib.suppress(KeyboardInterrupt, EOFError, BrokenPipeError):  # the measuring process has ended
             getattr(import_module(module), name)(pipe, *arguments)

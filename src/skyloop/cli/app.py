@@ -118,5 +118,5 @@ def _skyloop(
 ) -> None:
     """Fly small drones by their cameras: simulated ones, real ones, several at once.
 
-    skyloop COMMAND --help tells more about a command, with an example.
+    skyloop COMMAND --help shows more about a command, with an example.
     """

@@ -175,7 +175,7 @@ def measure_delays(
     from skyloop.bench import delays, tables
     from skyloop.bench.targets import judge_delays
 
-    tell_skipped(skipped)
+    print_skipped(skipped)
     results = delays.measure(seconds, sizes, others, skipped, progress)
     verdicts = tables.verdict_table(judge_delays(results))
     return results, as_rich(
@@ -205,7 +205,7 @@ def _sim(seconds: float, progress: Report) -> tuple[Any, list[Table]]:
     return results, [physics_table(results), drawing_table(results)]
 
 
-def tell_skipped(skipped: Mapping[str, str]) -> None:
+def print_skipped(skipped: Mapping[str, str]) -> None:
     """Write to standard error what could not be measured, and why."""
     for name, why in skipped.items():
         typer.echo(f"without {name}: {why}", err=True)

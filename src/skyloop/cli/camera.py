@@ -56,7 +56,7 @@ Dictionary = Annotated[str, typer.Option(metavar="NAME", help="Of a ChArUco boar
 def _camera() -> None:
     """Print a board, and calibrate a camera by pictures of it.
 
-    skyloop camera COMMAND --help tells more about each.
+    skyloop camera COMMAND --help shows more about each.
     """
 
 
@@ -117,7 +117,7 @@ def calibrate(
     collector = search.collector
     if collector is None:
         raise UsageError("no picture came")
-    _say(f"{search.looked} pictures looked at, {len(collector.views)} views of the board taken")
+    _print(f"{search.looked} pictures looked at, {len(collector.views)} views of the board taken")
     found, rejected = fit(collector.views, *collector.size, model=model.value, camera=camera or "")
     found.save(output)
     _report(found, rejected, output)
@@ -152,17 +152,17 @@ class _Search:
                 if not self.every and len(self.collector.views) >= self._most:
                     break
         except KeyboardInterrupt:
-            _say("ended by Ctrl-C")
+            _print("ended by Ctrl-C")
 
     def _take(self, collector: Collector, view: BoardView | None, name: str) -> None:
         if view is None:
             if self.every:
-                _say(f"{name}: the board is not seen, or too little of it")
+                _print(f"{name}: the board is not seen, or too little of it")
         elif self.every:
             collector.views.append(view)
         elif collector.offer(view):
             seen = f"{len(view.pixels)} corners, {collector.coverage:.0%} of the picture covered"
-            _say(f"view {len(collector.views)}: {seen}")
+            _print(f"view {len(collector.views)}: {seen}")
 
 
 def _board(columns: int, rows: int, square_mm: float, kind: Kind, dictionary: str) -> Board:
@@ -173,7 +173,7 @@ def _board(columns: int, rows: int, square_mm: float, kind: Kind, dictionary: st
 
 def _report(found: Calibration, rejected: list[BoardView], output: Path) -> None:
     for view in rejected:
-        _say(f"taken out, as it does not go with the others: {view.name}")
+        _print(f"taken out, as it does not go with the others: {view.name}")
     sure = "" if found.fx_deviation is None else f" ± {found.fx_deviation:.1f}"
     assert found.rms_px is not None
     assert found.coverage is not None
@@ -183,9 +183,9 @@ def _report(found: Calibration, rejected: list[BoardView], output: Path) -> None
     )
     typer.echo(f"reprojection error {found.rms_px:.3f} px RMS over {found.views} views, coverage {found.coverage:.0%}")
     if found.rms_px > _GOOD_RMS_PX:
-        _say("that error is large: is the board flat, and its size in squares as given?")
+        _print("that error is large: is the board flat, and its size in squares as given?")
     if found.coverage < _GOOD_COVERAGE:
-        _say("little of the picture was covered: the distortion is known there only; show the board in the corners too")
+        _print("little of the image was covered: the distortion is known there only; show the board in the corners too")
     typer.echo(f"wrote {output}")
 
 
@@ -275,10 +275,10 @@ class _Vehicle:
             for frame in self._drone.frames(self._camera, timeout_s=_PATIENCE_S):
                 yield f"picture {frame.seq}", frame
                 if time.monotonic() > end:
-                    _say(f"{self._seconds:g} s are over")
+                    _print(f"{self._seconds:g} s are over")
                     return
         except NoAnswerError as error:
-            _say(str(error))
+            _print(str(error))
 
     def draw(self, frame: Any, view: BoardView) -> None:
         """Show in the cockpit what was found."""
@@ -288,5 +288,5 @@ class _Vehicle:
         self._drone.annotate(frame, [Points(corners, (64, 220, 100))], source="calibration")
 
 
-def _say(text: str) -> None:
+def _print(text: str) -> None:
     print(text, file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""``skyloop doctor ADDRESS``: connects to one vehicle and says which of its settings need attention.
+"""``skyloop doctor ADDRESS``: connects to one vehicle and lists which of its settings need attention.
 
 It flies nothing.
 """
@@ -14,8 +14,8 @@ from skyloop.messages import EventKind, LinkState, Severity
 if TYPE_CHECKING:
     from skyloop.drivers.recording_sink import RecordingSink
 
-HEARD_S: Final = 3.5  #: for a vehicle to be heard; who asks is answered within 5 s
-PATIENCE_S: Final = 40.0  #: for one that is heard to be read
+ANSWER_S: Final = 3.5  #: for a vehicle to answer; the user gets a result within 5 s
+PATIENCE_S: Final = 40.0  #: for one that answers to be read
 FEEDBACK_S: Final = 3.0
 
 
@@ -31,7 +31,7 @@ def examine_vehicle(address: str) -> Iterator[Finding]:
     driver, sink = make_driver(address), RecordingSink(watch=set())
     driver.open(sink)
     try:
-        sink.wait(lambda: sink.link_state not in (None, LinkState.CONNECTING), HEARD_S)
+        sink.wait(lambda: sink.link_state not in (None, LinkState.CONNECTING), ANSWER_S)
         if sink.link_state not in (LinkState.UP, LinkState.DEGRADED):
             yield _unreachable(sink)
             return

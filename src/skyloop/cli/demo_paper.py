@@ -42,7 +42,7 @@ VEHICLE: Final = {
     "truth": 1,
 }
 _FIRST_PICTURE_S = 10.0
-_TELL_EVERY_S = 30.0  # where there is no terminal
+_PRINT_EVERY_S = 30.0  # where there is no terminal
 
 
 def paper(
@@ -127,7 +127,7 @@ class _Flight:
     load: float | None = None  #: average number of processes that wanted a core, of the minute before the flight's end
     _stopped: bool = False
     _on_stop: Callable[[], None] | None = None
-    _told_s: float = field(default_factory=time.monotonic)
+    _printed_s: float = field(default_factory=time.monotonic)
 
     def fly(self, uri: str, port: int | None, browser: bool) -> None:
         """``port`` None: no page. Raises the errors of connecting, of recording and of take-off."""
@@ -160,7 +160,7 @@ class _Flight:
             land(drone, self.console)
 
     def _follow(self, drone: Drone, flight: PaperFlight) -> None:
-        """Until the time is over, whoever flies. Whoever landed it gets it back into the air by letting go."""
+        """Until the time is over, whichever application flies; one that landed it must release it to start again."""
         began_s = time.monotonic()
         self.console.print(f"flying through waypoints for {self.seconds:g} s, or until Ctrl-C")
         with Progress(
@@ -177,7 +177,7 @@ class _Flight:
                 flown_s = time.monotonic() - began_s
                 words = _status(drone, flight)
                 bar.update(task, completed=flown_s, description=words)
-                self._tell(f"{flown_s:4.0f} s  {words}")
+                self._print(f"{flown_s:4.0f} s  {words}")
                 return self._stopped or _put_down(drone)
 
             while not self._stopped and (left_s := began_s + self.seconds - time.monotonic()) > 0.0:
@@ -187,10 +187,10 @@ class _Flight:
                 if flight.done or drone.closed:
                     return
 
-    def _tell(self, words: str) -> None:
+    def _print(self, words: str) -> None:
         now_s = time.monotonic()
-        if not self.console.is_terminal and now_s - self._told_s >= _TELL_EVERY_S:
-            self._told_s = now_s
+        if not self.console.is_terminal and now_s - self._printed_s >= _PRINT_EVERY_S:
+            self._printed_s = now_s
             self.console.print(words)
 
     def _stop(self) -> None:

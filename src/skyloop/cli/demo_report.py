@@ -128,8 +128,8 @@ class DemoReport:
         seen = "never seen" if self.share_in_view is None else f"{self.share_in_view:.1%} of {self.frames} frames"
         rows = [
             ("marker in view since first seen", seen),
-            ("range error, by the camera", _told(self.estimated)),
-            ("range error, truly", _told(self.true)),
+            ("range error, by the camera", _spread_text(self.estimated)),
+            ("range error, truly", _spread_text(self.true)),
             ("collisions", str(self.collisions)),
             ("first picture after", "–" if self.first_picture_s is None else f"{self.first_picture_s:.1f} s"),
         ]
@@ -143,7 +143,7 @@ class DemoReport:
         return table
 
 
-def _told(spread: Spread | None) -> str:
+def _spread_text(spread: Spread | None) -> str:
     return "not known" if spread is None else f"{spread} (after the first {SETTLING_S:g} s)"
 
 

@@ -184,7 +184,7 @@ def _run(firmwares: Sequence[Emulated]) -> None:
 
 
 def describe(firmware: Emulated) -> str:
-    """Return one line that says where a drone listens."""
+    """Return one line with the ports of a drone."""
     from skyloop.emulators.ardrone import ArdroneFirmware
     from skyloop.emulators.tello import TelloFirmware
 

@@ -26,13 +26,13 @@ class Flight:
     Args:
         drone: Connected, and in the air if the controller expects that.
         controller: Of that drone.
-        say: Shows a line to the user.
+        report: Shows a line to the user.
     """
 
-    def __init__(self, drone: Drone, controller: Controller, say: Callable[[str], None]) -> None:
+    def __init__(self, drone: Drone, controller: Controller, report: Callable[[str], None]) -> None:
         self._drone = drone
         self._controller = controller
-        self._say = say
+        self._report = report
 
     def run(self, seconds: float | None) -> bool:
         """Run the controller; what it raises is shown, and leaves the vehicle hovering.
@@ -46,10 +46,10 @@ class Flight:
         try:
             summary = self._controller.run(seconds=seconds)
         except Exception as error:  # noqa: BLE001  the user's code may raise anything
-            self._say(what_failed(error))
-            self._say("the controller failed")
+            self._report(what_failed(error))
+            self._report("the controller failed")
             return False
-        self._say(str(summary))
+        self._report(str(summary))
         return True
 
     def run_reloading(self, seconds: float | None, reloader: Reloader, make: Make) -> bool:
@@ -69,16 +69,16 @@ class Flight:
                 left = None if seconds is None else max(0.0, deadline - time.monotonic())
                 summary = self._controller.run(seconds=left, until=lambda: reloader.waiting)
             except Exception as error:  # noqa: BLE001  the user's code may raise anything
-                self._say(what_failed(error))
-                self._say("the controller failed: hovering; save the file to go on, Ctrl-C lands")
+                self._report(what_failed(error))
+                self._report("the controller failed: hovering; save the file to go on, Ctrl-C lands")
                 if not self._await_mended(reloader, make, deadline):
                     return False
                 continue
             if summary.reason != "until":
-                self._say(str(summary))
+                self._report(str(summary))
                 return True
             if not self._take(reloader, make):
-                self._say("the saved file is not flown: the one before keeps flying")
+                self._report("the saved file is not flown: the one before keeps flying")
 
     def _await_mended(self, reloader: Reloader, make: Make, deadline: float) -> bool:
         """Hover until a file was saved that can be flown; False if the time is over or the drone gone before."""
@@ -97,10 +97,10 @@ class Flight:
             after = make(found)
             after.on_reload(self._controller)
         except Exception as error:  # noqa: BLE001  the user's code may raise anything
-            self._say(what_failed(error))
+            self._report(what_failed(error))
             return False
         self._controller = after
-        self._say(f"reloaded {type(after).__name__}, {reloader.age_s:.2f} s after it was seen to be saved")
+        self._report(f"reloaded {type(after).__name__}, {reloader.age_s:.2f} s after it was seen to be saved")
         return True
 
 
@@ -110,12 +110,12 @@ def what_failed(error: Exception) -> str:
     An error that Skyloop raised on purpose with no line of the user in it is one line; any other is shown in full.
     """
     home = str(Path(__file__).parents[1])
-    told = traceback.TracebackException.from_exception(error)
-    if all(line.filename.startswith(home) for line in told.stack):
-        return f"skyloop: {error}" if isinstance(error, SkyloopError) else "".join(told.format()).rstrip()
-    part: traceback.TracebackException | None = told
+    trace = traceback.TracebackException.from_exception(error)
+    if all(line.filename.startswith(home) for line in trace.stack):
+        return f"skyloop: {error}" if isinstance(error, SkyloopError) else "".join(trace.format()).rstrip()
+    part: traceback.TracebackException | None = trace
     while part is not None:
         theirs = [line for line in part.stack if not line.filename.startswith(home)]
         part.stack = traceback.StackSummary.from_list(theirs)
         part = part.__cause__ or part.__context__
-    return "".join(told.format()).rstrip()
+    return "".join(trace.format()).rstrip()

@@ -57,7 +57,7 @@ def fly(
     authority = Authority(priority=priority, wait_s=wait)
     with connect_pilot(on, ADVICE, name=file.name[:64], authority=authority) as drone:
         controller = make(controller_class, drone)
-        worked = _run(Flight(drone, controller, _say), drone, seconds, reloader, takeoff=takeoff)
+        worked = _run(Flight(drone, controller, _print), drone, seconds, reloader, takeoff=takeoff)
         _land(drone)
     if not worked:
         raise typer.Exit(1)
@@ -86,14 +86,14 @@ def _run(flight: Flight, drone: Drone, seconds: float | None, reloader: Reloader
     """Whether it ended as it should. Errors of the take-off come out; those of the controller are shown."""
     try:
         if takeoff and drone.capabilities.actions and not drone.feedback().state.airborne:
-            _say(f"taking off with {drone.name}")
+            _print(f"taking off with {drone.name}")
             drone.takeoff()
         if reloader is None:
             return flight.run(seconds)
         with reloader:
             return flight.run_reloading(seconds, reloader, lambda found: make(found, drone))
     except KeyboardInterrupt:
-        _say("stopped by Ctrl-C")
+        _print("stopped by Ctrl-C")
     return True
 
 
@@ -102,13 +102,13 @@ def _land(drone: Drone) -> None:
     if not drone.feedback().state.airborne:
         return
     if drone.authority.state in ("queued", "preempted"):
-        _say(f"{drone.authority.holder or 'somebody else'} took over: the drone is left to them")
+        _print(f"{drone.authority.holder or 'somebody else'} took over: the drone is left to them")
         return
-    _say("landing")
+    _print("landing")
     try:
         drone.land()
     except KeyboardInterrupt:
-        _say("left in the air: its proxy lets it hover, then lands it")
+        _print("left in the air: its proxy lets it hover, then lands it")
         drone.close()
         raise
 
@@ -117,5 +117,5 @@ def _interrupt(number: int, frame: FrameType | None) -> NoReturn:  # noqa: ARG00
     raise KeyboardInterrupt
 
 
-def _say(text: str) -> None:
+def _print(text: str) -> None:
     typer.echo(text, err=True)

@@ -27,7 +27,7 @@ Directory = Annotated[
 def _keys() -> None:
     """Keys for the network: make a lab's authority, issue identities, look at them, revoke them.
 
-    skyloop keys COMMAND --help tells more about each; docs/security.md has a lab in five commands.
+    skyloop keys COMMAND --help shows more about each; docs/security.md has a lab in five commands.
     """
 
 
@@ -64,7 +64,7 @@ def issue(
     entry = lab.issue(make_identity(name, role, drones), days)
     typer.echo(f"{entry.identity}: valid until {_day(entry.expires_at)}")
     typer.echo(f"copy {lab.folder(name)} to its machine, for --keys")
-    _tell_roster(lab.directory, [each for each in lab.roster.entries if each.name != name])
+    _print_roster(lab.directory, [each for each in lab.roster.entries if each.name != name])
 
 
 @keys.command(short_help="Who has keys, until when", epilog=f"{_EXAMPLE}show")
@@ -91,8 +91,8 @@ def show(
     ends = [("the lab's authority", authority.expires)]
     ends += [(f"the key of {entry.name}", entry.expires_at) for entry in roster.entries if not entry.revoked]
     for what, end in ends:
-        if notice := expiry_warning(what, end, now):
-            typer.echo(f"skyloop: {notice}", err=True)
+        if warning := expiry_warning(what, end, now):
+            typer.echo(f"skyloop: {warning}", err=True)
 
 
 @keys.command(short_help="Shut somebody out", epilog=f"{_EXAMPLE}revoke jane")
@@ -106,10 +106,10 @@ def revoke(
     lab = Lab.open(_place(directory))
     entry = lab.revoke(name)
     typer.echo(f"{name} is revoked; who has an older roster lets it in until {_day(entry.last_at)}")
-    _tell_roster(lab.directory, lab.roster.entries)
+    _print_roster(lab.directory, lab.roster.entries)
 
 
-def _tell_roster(directory: Path, entries: tuple[Entry, ...] | list[Entry]) -> None:
+def _print_roster(directory: Path, entries: tuple[Entry, ...] | list[Entry]) -> None:
     others = [entry.name for entry in entries if not entry.revoked]
     if others:
         typer.echo(f"copy {directory / 'roster.json'} into the keys of the others: {', '.join(others)}")

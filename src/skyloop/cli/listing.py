@@ -94,14 +94,14 @@ def merged(near: list[Row], settings: FabricSettings) -> list[Row]:
 
 
 def describe(name: str) -> Row:
-    """Return what the proxy with this name says of itself, on this host or the network."""
+    """Return what the proxy with this name reports of itself, on this host or the network."""
     from skyloop.client.connect import network_settings
 
     return described(Row(name, transport=""), network_settings())
 
 
 def described(row: Row, settings: FabricSettings | None) -> Row:
-    """Return what a proxy says of itself; for one that does not answer, the reason."""
+    """Return what a proxy reports of itself; for one that does not answer, the reason."""
     from skyloop.client import connect
 
     far = "local" not in row.transport

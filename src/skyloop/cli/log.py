@@ -46,7 +46,7 @@ class Which(StrEnum):
 def _log() -> None:
     """Look at recordings: what is in them, a report, exports, comparisons; and mend them.
 
-    skyloop log COMMAND --help tells more about each.
+    skyloop log COMMAND --help shows more about each.
     """
 
 
@@ -87,7 +87,7 @@ def list_recordings(
         raise UsageError(f"{folder}: {error.strerror}") from None
     rows = [(path, describe(path)) for path in paths]
     if json:
-        found = [{"name": path.name, **msgspec.structs.asdict(told)} for path, told in rows]
+        found = [{"name": path.name, **msgspec.structs.asdict(summary)} for path, summary in rows]
         typer.echo(msgspec.json.encode(found).decode())
     elif rows:
         console().print(log_tables.listing(rows))
@@ -111,7 +111,7 @@ def report(
     target = output or file.with_suffix(".html")
     with _progress("drawing") as progress:
         write_report(recording, recording.drone(drone).name, target, pictures=pictures, progress=progress)
-    _say(f"{target}: {target.stat().st_size / 1e6:.1f} MB")
+    _print(f"{target}: {target.stat().st_size / 1e6:.1f} MB")
 
 
 @log.command(short_help="Samples and pictures for other programs", epilog=f"{_EXAMPLE}export flight.mcap --to csv")
@@ -140,7 +140,7 @@ def export(
         target = output or file.with_name(f"{file.stem}-{chosen}.mp4")
         with _progress(f"encoding {chosen}") as progress:
             count = ways.export_mp4(recording, name, chosen, target, burn_time=burn_time, progress=progress)
-        _say(f"{target}: {count} frames of {chosen}")
+        _print(f"{target}: {count} frames of {chosen}")
         return
     _refuse({"--camera": camera is not None, "--burn-time": burn_time}, to)
     with _progress("reading") as progress:
@@ -151,7 +151,7 @@ def export(
         write = ways.export_csv if to is Form.CSV else ways.export_parquet
         written = write(found, output or file.with_name(f"{file.stem}-{to.value}"))
     rows = ", ".join(f"{len(table)} × {title}" for title, table in found.items())
-    _say(f"{written[0] if len(written) == 1 else written[0].parent}: {rows}")
+    _print(f"{written[0] if len(written) == 1 else written[0].parent}: {rows}")
 
 
 @log.command(
@@ -181,7 +181,7 @@ def compare(
         from skyloop.recording.review.compare_page import write_comparison
 
         write_comparison(found, str(old), str(new), output)
-        _say(f"{output}: {output.stat().st_size / 1e3:.0f} kB")
+        _print(f"{output}: {output.stat().st_size / 1e3:.0f} kB")
 
 
 @log.command(short_help="Mend a recording that was cut off", epilog=f"{_EXAMPLE}recover flight.mcap")
@@ -198,17 +198,17 @@ def recover(
     with _progress("looking") as progress:
         wrong = mending.problems(recording, progress)
     if not wrong and output is None:
-        _say(f"{file} is whole: there is nothing to mend")
+        _print(f"{file} is whole: there is nothing to mend")
         return
     target = output or file.with_name(f"{file.stem}-recovered.mcap")
     with _progress("mending") as progress:
         saved = mending.recover(recording, target, progress)
     for problem in saved.why:
-        _say(f"{file}: {problem}")
+        _print(f"{file}: {problem}")
     for topic, count in sorted(saved.messages.items()):
         typer.echo(f"{count:8} {topic}")
     lost = f"; at most {saved.lost} bytes are lost" if saved.lost else ""
-    _say(f"{target}: {sum(saved.messages.values())} messages, {saved.seconds:.1f} s saved{lost}")
+    _print(f"{target}: {sum(saved.messages.values())} messages, {saved.seconds:.1f} s saved{lost}")
 
 
 # Inside --------------------------------------------------------------------------------------------------------
@@ -257,5 +257,5 @@ def _progress(what: str) -> Iterator[Callable[[float], None]]:
         yield lambda share: bar.update(task, completed=share)
 
 
-def _say(text: str) -> None:
+def _print(text: str) -> None:
     typer.echo(text, err=True)

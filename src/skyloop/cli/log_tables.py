@@ -33,13 +33,13 @@ def listing(rows: Sequence[tuple[Path, Described]]) -> Table:
     table = Table(box=None)
     for title in ("recording", "begun", "lasts", "drones", "problem"):
         table.add_column(title, overflow="fold")
-    for path, told in rows:
+    for path, summary in rows:
         table.add_row(
             Text(path.name),
-            "" if told.started is None else time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(told.started)),
-            "" if told.seconds is None else f"{told.seconds:.1f} s",
-            Text(", ".join(told.drones)),
-            Text(told.problem),
+            "" if summary.started is None else time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(summary.started)),
+            "" if summary.seconds is None else f"{summary.seconds:.1f} s",
+            Text(", ".join(summary.drones)),
+            Text(summary.problem),
         )
     return table
 
@@ -68,7 +68,7 @@ def _head(recording: Recording, summary: Summary) -> Table:
 
 def _channels(summary: Summary) -> Table:
     table = Table(box=None)
-    table.add_column("topic", overflow="fold")  # never cut: it tells the rows apart
+    table.add_column("topic", overflow="fold")  # never cut: it distinguishes the rows
     for title in ("count", "rate", "gaps", "longest", "missing", "size"):
         table.add_column(title, justify="right", no_wrap=True)
     table.add_column("delay [ms]: median (p99)")

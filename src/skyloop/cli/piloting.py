@@ -10,7 +10,7 @@ from skyloop.errors import AuthorityError
 
 
 def connect_pilot(target: str, advice: str, **options: Unpack[ConnectOptions]) -> Drone:
-    """Connect as :func:`skyloop.connect` does; where somebody else flies, the error says who, and what to do."""
+    """Connect as :func:`skyloop.connect` does; where another client flies, the error names it and says what to do."""
     try:
         return connect(target, **options)
     except AuthorityError as error:

@@ -55,7 +55,7 @@ def process(
     """Take the newest frames of a drone, and publish what a class of yours finds in them. Read-only.
 
     The class has a method process(self, frame) that returns numbers, texts, lists, dicts, dataclasses or small NumPy
-    arrays; drone.results("NAME") and Controller.on_result get them. A line each second says how it goes.
+    arrays; drone.results("NAME") and Controller.on_result get them. A line each second shows its progress.
     """
     from skyloop.processing import Settings, load_processor
 
@@ -84,7 +84,7 @@ def _work(
     processor = code.make()
     app = f"{settings.name[:32]}@{socket.gethostname()[:20]}:{os.getpid()}"
     with connect(target, access="observe", name=app) as drone:
-        worker = Worker(drone, processor, settings, _say)
+        worker = Worker(drone, processor, settings, _print)
         if child:
             end_with_parent(worker.stop)
         ended = threading.Event()
@@ -119,7 +119,7 @@ def _lead(
     if "://" in drone:
         raise UsageError(f"several workers need one proxy: skyloop proxy {drone} --name alpha, then --drone alpha")
     due = time.monotonic() + LINE_EVERY_S
-    with Group(child_command(_arguments(settings, target, drone, seconds)), workers, _say) as group:
+    with Group(child_command(_arguments(settings, target, drone, seconds)), workers, _print) as group:
         while (ended := group.look()) is None:
             time.sleep(_LOOK_S)
             status = group.status
@@ -157,5 +157,5 @@ def _interrupt(number: int, frame: FrameType | None) -> NoReturn:  # noqa: ARG00
     raise KeyboardInterrupt
 
 
-def _say(text: str) -> None:
+def _print(text: str) -> None:
     typer.echo(text, err=True)

@@ -59,8 +59,8 @@ def router(
     while not ended.wait(_POLL_S):  # looks up now and then: the kernel may hand a signal to any thread
         if chosen.ring is None:
             continue
-        for news in chosen.ring.poll():
-            typer.echo(f"skyloop: {news}", err=True)
+        for change in chosen.ring.poll():
+            typer.echo(f"skyloop: {change}", err=True)
         out = session.shut_out()
         if out:
             typer.echo(f"skyloop: reconnecting without {', '.join(sorted(out))}", err=True)

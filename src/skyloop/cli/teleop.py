@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from skyloop.cockpit.child import CockpitProcess
 
 ADVICE = "wait in line with --wait SECONDS, take over with a higher --priority, or observe: skyloop watch"
-PERIOD_S: Final = 0.05  #: how often a moved stick is sent anew; sooner at each press
+PERIOD_S: Final = 0.05  #: how often a moved stick is sent again; sooner at each press
 REFRESH_S: Final = 0.125
 EVENTS_SHOWN: Final = 3
 GAINS: Final = (0.25, 0.5, 1.0, 2.0, 4.0)  #: that + and - step through
@@ -62,7 +62,7 @@ class Teleop:
         self._sticks = Sticks()
         self._gain = 1.0
         self._moving = False  # whether a stick was moved when it was sent last
-        self._said = ""
+        self._message = ""
 
     def run(self, keyboard: Keyboard) -> None:
         """Fly until Q is pressed.
@@ -88,9 +88,9 @@ class Teleop:
     def obey(self, order: Order) -> None:
         """Carry out a key's order; one that is not possible is reported and changes nothing."""
         try:
-            self._said = self._obey(order)
+            self._message = self._obey(order)
         except SkyloopError as error:
-            self._said = str(error)
+            self._message = str(error)
 
     def _obey(self, order: Order) -> str:
         drone = self._drone
@@ -122,7 +122,7 @@ class Teleop:
             return
         try:
             if not self._drone.feedback().state.airborne:
-                self._said = "on the ground: T takes off" if moved else self._said
+                self._message = "on the ground: T takes off" if moved else self._message
             elif moved:
                 speed, turn = self._speed * self._gain, self._turn * self._gain
                 self._drone.velocity(
@@ -134,7 +134,7 @@ class Teleop:
             else:
                 self._drone.hover()
         except AuthorityError as error:
-            self._said = f"{error} (C takes control)"
+            self._message = f"{error} (C takes control)"
         self._moving = moved
 
     def picture(self) -> Group:
@@ -144,8 +144,8 @@ class Teleop:
         drone = self._drone
         keys = Text("  ").join(Text.assemble((key, "bold"), f" {does}") for key, does in KEY_MAP)
         video = Text(self._page or f"skyloop cockpit {drone.name} shows the video", "dim")
-        said = Text(self._said, "bold")
-        return Group(said, state_panel(drone), keys, video, channels(drone), *events(drone, EVENTS_SHOWN))
+        message = Text(self._message, "bold")
+        return Group(message, state_panel(drone), keys, video, channels(drone), *events(drone, EVENTS_SHOWN))
 
 
 def _page(drone: Drone) -> CockpitProcess:

@@ -68,7 +68,7 @@ class PrivateProxy:
                         if served:
                             raise
                         raise NoAnswerError(
-                            f"the proxy for {self.uri} did not start in time{self._process.said}"
+                            f"the proxy for {self.uri} did not start in time{self._process.quoted_output}"
                         ) from error
                     self._wait_for_output()
                 else:
@@ -90,7 +90,7 @@ class PrivateProxy:
             return
         if child.code == _USAGE_ERROR and (words := child.last_words.removeprefix("skyloop: ")):
             raise UsageError(words)
-        raise LinkError(f"the proxy for {self.uri} {child.ending}{child.said}")
+        raise LinkError(f"the proxy for {self.uri} {child.ending}{child.quoted_output}")
 
     def _wait_for_output(self) -> None:
         """Sleep until the child prints something (that it is ready), ends, or a moment has passed."""

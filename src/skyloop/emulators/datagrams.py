@@ -21,12 +21,12 @@ _SEND_BUFFER: Final = 1 << 20  # room for pictures of an AR.Drone 1
 
 
 class DatagramPort:
-    """Answers whoever sends to it, at the port that the datagram came from. Used on the loop's thread.
+    """Answers every sender, at the port that the datagram came from. Used on the loop's thread.
 
     Args:
         loop: Calls back when something comes.
         bind: Address and port of this machine; port 0 is any free one.
-        heard: Called with each datagram and its sender.
+        on_datagram: Called with each datagram and its sender.
         name: For errors, and for the seeds of the faults.
         faults: Befall the datagrams each way.
         delay_s: By which all of them are late, each way.
@@ -39,14 +39,14 @@ class DatagramPort:
         self,
         loop: Loop,
         bind: Address,
-        heard: Callable[[bytes, Address], None],
+        on_datagram: Callable[[bytes, Address], None],
         *,
         name: str,
         faults: Faults,
         delay_s: float,
     ) -> None:
         self._loop = loop
-        self._heard = heard
+        self._on_datagram = on_datagram
         self._faults = faults
         self._name = name
         self._delay_ns = nanoseconds(delay_s)
@@ -78,7 +78,7 @@ class DatagramPort:
             except OSError:  # nothing more, or an answer that could not be delivered
                 return
             for each, address in self._inward.items((datagram, sender)):
-                self._later(partial(self._heard, each, address))
+                self._later(partial(self._on_datagram, each, address))
 
     def _later(self, call: Callable[[], None]) -> None:
         if self._delay_ns:

@@ -120,7 +120,7 @@ class Emulator(ABC, Generic[R]):
         self._running: R | None = None
 
     def start(self) -> None:
-        """Switch it on: everything begins anew, but at the ports that it had before.
+        """Switch it on: everything is reset, but at the ports that it had before.
 
         Raises:
             LinkError: A port is taken.

@@ -22,7 +22,7 @@ from skyloop.errors import LinkError, MissingExtraError, NoAnswerError, SkyloopE
 from skyloop.messages import Severity
 from skyloop.recording.engine import Engine
 from skyloop.recording.options import Options
-from skyloop.recording.status import News, RecorderState, Status
+from skyloop.recording.status import RecorderEvent, RecorderState, Status
 
 START_S: Final = 20.0
 _END_S: Final = 15.0  # to write what was received, before the child is terminated
@@ -44,7 +44,7 @@ class Line(msgspec.Struct, frozen=True, omit_defaults=True):
     """A child's message to its parent: one JSON object per line."""
 
     status: Status | None = None
-    news: News | None = None
+    event: RecorderEvent | None = None
     trouble: str = ""  #: why it could not start
     usage: bool = False  #: whether that was a UsageError
 
@@ -66,31 +66,32 @@ def run_child(order: Order) -> int:
     on_parent_end(stop.set)
     if hasattr(os, "nice"):
         os.nice(_NICE)
-    news: deque[News] = deque()  # sent by this thread, so that a parent that does not read never blocks the writing
+    # Sent by this thread, so that a parent that does not read never blocks the writing.
+    events: deque[RecorderEvent] = deque()
     with contextlib.ExitStack() as stack:
         try:
             drones = [stack.enter_context(connect(t, access="observe", name="recorder")) for t in order.targets]
-            engine = Engine(drones, Path(order.path), order.options, news.append)
+            engine = Engine(drones, Path(order.path), order.options, events.append)
             engine.start()
         except SkyloopError as error:
-            _say(Line(trouble=str(error), usage=isinstance(error, UsageError)))
+            _print(Line(trouble=str(error), usage=isinstance(error, UsageError)))
             return 2
         stack.callback(engine.stop)
         while not stop.is_set():
-            _report(engine, news)
+            _report(engine, events)
             stop.wait(_TELL_S)
         engine.stop()
-        _report(engine, news)
+        _report(engine, events)
     return 0
 
 
-def _report(engine: Engine, news: deque[News]) -> None:
-    while news:
-        _say(Line(news=news.popleft()))
-    _say(Line(status=engine.status))
+def _report(engine: Engine, events: deque[RecorderEvent]) -> None:
+    while events:
+        _print(Line(event=events.popleft()))
+    _print(Line(status=engine.status))
 
 
-def _say(line: Line) -> None:
+def _print(line: Line) -> None:
     with contextlib.suppress(OSError):  # the parent is gone
         sys.stdout.buffer.write(msgspec.json.encode(line) + b"\n")
         sys.stdout.buffer.flush()
@@ -102,19 +103,19 @@ def _say(line: Line) -> None:
 class RecorderProcess:
     """A child process that records; it ends with :meth:`stop`, and with this process, however that ends."""
 
-    def __init__(self, order: Order, hear: Callable[[News], None] = lambda _: None) -> None:
+    def __init__(self, order: Order, on_event: Callable[[RecorderEvent], None] = lambda _: None) -> None:
         """Start the child, and wait until it records.
 
         Args:
             order: What to record.
-            hear: Called with the child's news, on a thread that reads them.
+            on_event: Called with the child's events, on a thread that reads them.
 
         Raises:
             UsageError: The child can't record because of a wrong argument.
             LinkError: The child can't record for another reason, or has ended.
             NoAnswerError: The child does not start in time.
         """
-        self._hear = hear
+        self._on_event = on_event
         self._status = Status(path=order.path)
         self._trouble: Line | None = None
         self._bell = Notifier()
@@ -174,19 +175,19 @@ class RecorderProcess:
             reason = f"the recorder's process {self._how_it_ended()}"
             self._status = msgspec.structs.replace(self._status, state=RecorderState.FAILED, reason=reason)
             with contextlib.suppress(Exception):
-                self._hear(News(f"{reason}; what it wrote is in {self._status.path}", Severity.ERROR))
+                self._on_event(RecorderEvent(f"{reason}; what it wrote is in {self._status.path}", Severity.ERROR))
         self._bell.notify()
 
     def _take(self, line: Line) -> None:
         if line.status is not None:
             self._status = line.status
-        if line.news is not None:
-            self._hear(line.news)
+        if line.event is not None:
+            self._on_event(line.event)
         if line.trouble:
             self._trouble = line
 
     def _how_it_ended(self) -> str:
-        return f"{self._process.ending}{self._process.said}"
+        return f"{self._process.ending}{self._process.quoted_output}"
 
 
 def check_installed() -> None:

@@ -13,7 +13,7 @@ from skyloop.logfile.layout import ClockPair, DroneRecord, to_plain
 from skyloop.messages import Severity
 from skyloop.recording.backlog import Backlog
 from skyloop.recording.options import MB, Options
-from skyloop.recording.status import News, Status
+from skyloop.recording.status import RecorderEvent, Status
 from skyloop.recording.taps import Tap
 from skyloop.recording.translation import Translator
 from skyloop.recording.writer import FileWriter
@@ -29,7 +29,7 @@ class Engine:
         drones: Sequence[Drone],
         path: Path,
         options: Options,
-        hear: Callable[[News], None] = lambda _: None,
+        on_event: Callable[[RecorderEvent], None] = lambda _: None,
         **writing: Any,
     ) -> None:
         """Initialise the recorder without opening a file.
@@ -38,7 +38,7 @@ class Engine:
             drones: Connected ones, with different names.
             path: The first file.
             options: What to record and how.
-            hear: Called with news, on the writing thread.
+            on_event: Called with each event, on the writing thread.
             **writing: Replaces the disk, for tests.
 
         Raises:
@@ -49,7 +49,7 @@ class Engine:
         if len(set(names)) < len(names):
             raise UsageError(f"the drones of one recording need different names, not {', '.join(names)}")
         options.check_cameras(camera.name for drone in drones for camera in drone.capabilities.cameras)
-        self._hear = hear
+        self._on_event = on_event
         self._backlog = Backlog(round(options.buffer_mb * MB))
         self._taps = [Tap(number, drone, options, self._backlog) for number, drone in enumerate(drones)]
         clock = ClockPair.now()
@@ -62,12 +62,12 @@ class Engine:
             Translator(drone.name, drone.capabilities, clock, lambda drone=drone: drone.clock_offset_ns)  # type: ignore[misc]
             for drone in drones
         ]
-        self._writer = FileWriter(path, options, self._backlog, records, translators, clock, self._tell, **writing)
+        self._writer = FileWriter(path, options, self._backlog, records, translators, clock, self._publish, **writing)
         self._writer.dropped = lambda: self._counts(Tap.dropped)
         self._writer.missed = lambda: self._counts(Tap.missed)
-        self._writer.each_second = self._tell_drops
-        self._told_unwritable = 0
-        self._told: dict[Tap, tuple[dict[str, int], dict[str, int]]] = {tap: ({}, {}) for tap in self._taps}
+        self._writer.each_second = self._report_drops
+        self._reported_unwritable = 0
+        self._reported: dict[Tap, tuple[dict[str, int], dict[str, int]]] = {tap: ({}, {}) for tap in self._taps}
 
     def start(self) -> None:
         """Open the file, and start recording.
@@ -114,24 +114,24 @@ class Engine:
 
     # On the writing thread -------------------------------------------------------------------------------------
 
-    def _tell(self, text: str, severity: Severity) -> None:
+    def _publish(self, text: str, severity: Severity) -> None:
         for tap in self._taps:
-            self._tell_one(tap, text, severity)
-        self._hear(News(text, severity))
+            self._publish_to(tap, text, severity)
+        self._on_event(RecorderEvent(text, severity))
 
-    def _tell_one(self, tap: Tap, text: str, severity: Severity) -> None:
+    def _publish_to(self, tap: Tap, text: str, severity: Severity) -> None:
         """Write an event to the file, and log it with the drone."""
         tap.put_event(text, severity, {"state": self._writer.state.value, "path": str(self._writer.path)})
         tap.drone.log.text(text, name="recording", severity=severity)
 
-    def _tell_drops(self) -> None:
+    def _report_drops(self) -> None:
         writer = self._writer
-        unwritable = writer.unwritable > self._told_unwritable
-        self._told_unwritable = writer.unwritable
+        unwritable = writer.unwritable > self._reported_unwritable
+        self._reported_unwritable = writer.unwritable
         for tap in self._taps:
             tap.look()
             now = (tap.dropped(), tap.missed())
-            before, self._told[tap] = self._told[tap], now
+            before, self._reported[tap] = self._reported[tap], now
             if now == before:
                 continue
             tap.put_drops(*now)
@@ -140,5 +140,5 @@ class Engine:
                 words = ", ".join(f"{count} of {channel}" for channel, count in more.items() if count)
                 why = f"can't be written ({writer.unwritable_why})" if unwritable else _TOO_SLOW
                 text = f"{tap.drone.name}: the recording leaves out {words}: {why}"
-                self._tell_one(tap, text, Severity.WARNING)
-                self._hear(News(text, Severity.WARNING))
+                self._publish_to(tap, text, Severity.WARNING)
+                self._on_event(RecorderEvent(text, Severity.WARNING))

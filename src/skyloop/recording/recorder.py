@@ -13,7 +13,7 @@ from skyloop.messages import EventKind
 from skyloop.recording.child import Order, RecorderProcess, check_installed
 from skyloop.recording.engine import Engine
 from skyloop.recording.options import Options, VideoEncoding, channels_of, first_path
-from skyloop.recording.status import News, RecorderState, Status
+from skyloop.recording.status import RecorderEvent, RecorderState, Status
 
 
 class Backend(Protocol):
@@ -49,7 +49,7 @@ class Recorder:
             self._backend = self._within(drones, path, options)
         else:
             targets = tuple(drone if isinstance(drone, str) else str(drone._core.reach) for drone in drones)
-            self._backend = RecorderProcess(Order(targets, str(path.absolute()), options), self._hear)
+            self._backend = RecorderProcess(Order(targets, str(path.absolute()), options), self._on_event)
 
     def _within(self, drones: Sequence[Drone | str], path: Path, options: Options) -> Engine:
         try:
@@ -59,7 +59,7 @@ class Recorder:
                     drone = connect(drone, access="observe", name="recorder")
                     self._own.append(drone)
                 known.append(drone)
-            engine = Engine(known, path, options, self._hear)
+            engine = Engine(known, path, options, self._on_event)
             engine.start()
         except BaseException:
             self._close_own()
@@ -127,9 +127,9 @@ class Recorder:
     def __repr__(self) -> str:
         return f"<Recorder {self.path} ({self.state.value}, {self.seconds:.0f} s, {self.bytes / 1e6:.1f} MB)>"
 
-    def _hear(self, news: News) -> None:
+    def _on_event(self, event: RecorderEvent) -> None:
         for drone in self._listening:
-            drone.tell(EventKind.RECORDING, news.text, news.severity)
+            drone.tell(EventKind.RECORDING, event.text, event.severity)
 
     def _close_own(self) -> None:
         for drone in self._own:

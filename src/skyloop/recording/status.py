@@ -35,8 +35,8 @@ class Status(msgspec.Struct, frozen=True):
     missed: dict[str, dict[str, int]] = {}  #: by drone and channel: never received
 
 
-class News(msgspec.Struct, frozen=True):
-    """Something that people and applications should know of a recording."""
+class RecorderEvent(msgspec.Struct, frozen=True):
+    """Something that happened to a recording, for people and applications."""
 
     text: str
     severity: Severity = Severity.INFO

@@ -99,7 +99,7 @@ class FileWriter:
         self._backlog = backlog
         self._translators = translators
         self._clock = clock
-        self._tell = tell
+        self._report = tell
         self._opener = opener
         self._free = free
         self._floor = round(options.min_free_mb * MB)
@@ -191,7 +191,7 @@ class FileWriter:
                 self._count(file)
         with contextlib.suppress(Exception):
             text = f"the recording to {self.path} has ended ({self.reason}): what was written stays, nothing is added"
-            self._tell(text, Severity.ERROR)
+            self._report(text, Severity.ERROR)
 
     def step(self, now_ns: int) -> None:
         """Do what is due at a time [ns, monotonic]. Called by the thread, or by a test."""
@@ -236,7 +236,7 @@ class FileWriter:
             self._commit()
 
     def _messages(self, item: Item) -> list[Message]:
-        """Translate a sample: all of it, or nothing if it can't be translated, whoever sent it."""
+        """Translate a sample: all of it, or nothing if it can't be translated."""
         try:
             return list(self._translators[item.drone].messages(item))
         except Exception as error:  # noqa: BLE001  (samples hold what any application may send)
@@ -310,7 +310,7 @@ class FileWriter:
         self._chains.clear()
         self.files.append(path)
         self.state, self.reason = RecorderState.RECORDING, ""
-        self._tell(f"recording to {path}", Severity.INFO)
+        self._report(f"recording to {path}", Severity.INFO)
 
     def _next_free(self, number: int, overwrite: bool) -> Path:
         path = numbered(self._path, number)
@@ -342,7 +342,7 @@ class FileWriter:
             self._uncommitted.clear()
         if (self.state, self.reason) != (RecorderState.PAUSED, why):
             self.state, self.reason = RecorderState.PAUSED, why
-            self._tell(f"recording stands still ({why}): what was written stays, frames are lost", Severity.ERROR)
+            self._report(f"recording stands still ({why}): what was written stays, frames are lost", Severity.ERROR)
 
     def _look(self) -> None:
         """Check the disk and the file."""
@@ -366,9 +366,9 @@ class FileWriter:
                 self._close("rotated")
             self._pause(left)
         elif room is Room.NO_FRAMES:
-            self._tell(f"{left}: frames are recorded no longer", Severity.WARNING)
+            self._report(f"{left}: frames are recorded no longer", Severity.WARNING)
         else:
-            self._tell(f"{left}: everything is recorded again", Severity.INFO)
+            self._report(f"{left}: everything is recorded again", Severity.INFO)
 
     def _end(self) -> None:
         try:

@@ -57,7 +57,7 @@ class Autopilot:
     def set_limits(self, drone: int, limits: Limits) -> None:
         """Change a drone's limits.
 
-        A set-point in force is clamped only when it is given anew; the tilt, climb and altitude that the loops
+        A set-point in force is clamped only when it is given again; the tilt, climb and altitude that the loops
         themselves ask for follow at once.
         """
         self.limits[drone] = limits
@@ -101,7 +101,7 @@ class Autopilot:
         """Land drones with a low battery, and stop those with an empty one; called now and then."""
         self._loops.set_strength(self._batteries.strength())
         low = (self._batteries.charge <= LOW_BATTERY).nonzero()[0].tolist()
-        self._warned.intersection_update(low)  # who was given a fresh battery will be told anew
+        self._warned.intersection_update(low)  # a new battery is warned of again
         for drone in low:
             if drone not in self._warned:
                 self._warned.add(drone)

@@ -11,7 +11,7 @@ from skyloop.messages import FlightState
 
 
 class Happening(Enum):
-    """What changes a state: the pilot's commands first, then what the vehicle notices itself."""
+    """What changes a state: the pilot's commands first, then what the vehicle detects itself."""
 
     TAKEOFF = auto()
     LAND = auto()

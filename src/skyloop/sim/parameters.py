@@ -1,6 +1,6 @@
 """Parameters of a simulated vehicle.
 
-The defaults are an AR.Drone 2 with its indoor hull, as far as public sources tell; a value without a source is an
+The defaults are an AR.Drone 2 with its indoor hull, as far as public sources state; a value without a source is an
 estimate and says so.
 
 Sources: [P] Parrot, AR.Drone 2.0 technical specifications. [E] J. Engel, J. Sturm, D. Cremers, "Camera-Based

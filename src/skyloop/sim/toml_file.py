@@ -20,7 +20,7 @@ T = TypeVar("T")
 MAX_BYTES: Final = 1 << 18  #: of a file; the largest world that is shipped takes 5 kB
 #: Parts of a key: a parser goes through all of them for each key below, which takes minutes for some ten thousand.
 MAX_DEPTH: Final = 16
-MAX_WHOLE: Final = (1 << 63) - 1  #: as TOML has it; larger ones are neither told nor computed with
+MAX_WHOLE: Final = (1 << 63) - 1  #: as TOML has it; larger ones are neither shown nor computed with
 _SHOWN: Final = 80  #: characters of a wrong value in a message
 # Nothing in it is tried twice, and it begins where a part does: it is as fast for what it does not find.
 _PART = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
@@ -94,7 +94,7 @@ def read_tables(values: Mapping[str, Any], source: str, kind: type[T]) -> T:
 
 
 def _explained(message: str, values: Any, source: str, kind: type[Any]) -> FileFormatError:
-    """Return msgspec's error with what was given and what was meant: it tells only where, and what it expected."""
+    """Return msgspec's error with what was given and what was meant: it has only the place, and what was expected."""
     place, key, value, info = Place(source), "", values, inspect.type_info(kind)
     found = _WHERE.search(message)
     for name, number in _STEP.findall(found.group(1)) if found else ():

@@ -4,7 +4,7 @@ A transport carries whole packets between one proxy (the *transport server*) and
 clients*). It knows packets and topics, but not what they mean. An implementation passes the tests of
 :mod:`skyloop.transport.conformance`.
 
-- No call ever blocks on the other end. A packet that does not fit now is not sent, and the caller is told so.
+- No call ever blocks on the other end. A packet that does not fit now is not sent, and the caller gets False.
 - A packet arrives whole or not at all. Order is kept within one connection. A packet has 1 to :data:`MAX_PACKET`
   bytes; sending any other raises :class:`skyloop.errors.UsageError`.
 - Handlers are called on the transport's receiving threads, one call at a time per end, so they must return quickly. A
@@ -195,7 +195,7 @@ class TransportServer(ABC):
             The number of subscribers to which it could *not* be handed over.
 
         Raises:
-            UsageError: The pixels are not what the header says.
+            UsageError: The pixels are not as in the header.
         """
 
     @abstractmethod
@@ -203,13 +203,13 @@ class TransportServer(ABC):
         """Return how many applications subscribed to a topic; what nobody subscribed to need not be made."""
 
     def admit(self, peer: Peer, *, pilot: bool) -> str:  # noqa: ARG002  (all are let stay)
-        """Decide whether an application that has said who it is may stay: some places are kept for pilots.
+        """Decide whether an application that has sent who it is may stay: some places are kept for pilots.
 
         The default lets every application stay.
 
         Args:
             peer: The application's connection.
-            pilot: Whether it said that it is a pilot.
+            pilot: Whether it stated that it is a pilot.
 
         Returns:
             Why it can't stay; empty if it can.
@@ -377,7 +377,7 @@ def too_many_topics(topic: str) -> str:
 
 
 def check_frame(header: FrameHeader, pixels: Pixels) -> None:
-    """Check that pixels are what their header says.
+    """Check that pixels are as in their header.
 
     Args:
         header: The frame's header.

@@ -163,7 +163,7 @@ class Joined:
 
 
 def resources() -> tuple[int, int]:
-    """Return how many threads and, where ``/proc`` tells it, open descriptors this process has.
+    """Return how many threads and, where ``/proc`` shows it, open descriptors this process has.
 
     The collector runs before they are counted.
     """

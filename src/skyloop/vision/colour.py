@@ -18,7 +18,7 @@ Rgb = tuple[int, int, int]
 
 _HUE_DEG: Final = 16.0  # on each side of the colour's own
 _SATURATION: Final = 0.5  # of the colour's own: paint in the light and in the shade
-_LEAST_SATURATION: Final = 80  # of 255: a colour with less is too grey to be told from others
+_LEAST_SATURATION: Final = 80  # of 255: a colour with less is too grey to be distinguished from others
 _LEAST_VALUE: Final = 35  # of 255: darker pixels have no hue worth the name
 
 

@@ -61,7 +61,7 @@ class GroundTracker:
         return tuple((float(x), float(y)) for x, y in self._corners)
 
     def forget(self) -> None:
-        """Forget all corners; the next frame starts anew at the present position."""
+        """Forget all corners; the next frame restarts at the present position."""
         self._grey, self._corners, self._ground = None, np.empty((0, 2), np.float32), np.empty((0, 2))
 
     def see(
@@ -76,7 +76,7 @@ class GroundTracker:
 
         Returns:
             Position (2,) [m] along yaw 0 and to its left, and the number of corners; None for the first frame, where
-            too few corners were found again, and where attitude or height are not known. Then tracking starts anew at
+            too few corners were found again, and where attitude or height are not known. Then tracking restarts at
             the last position.
 
         Raises:

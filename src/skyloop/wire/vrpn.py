@@ -19,7 +19,7 @@ the name (u32, with the NUL at its end) and the name. A tracker's pose has the t
 ``vrpn_Tracker Pos_Quat``, and as payload the sensor (i32), 4 bytes of padding, the position x, y, z [m] and the
 quaternion x, y, z, w (7 doubles).
 
-A client that never tells a UDP port gets everything over TCP.
+A client that never sends a UDP port gets everything over TCP.
 
 Sources: ``Format_Of_Protocol.txt``, ``vrpn_Connection.C`` (``marshall_message``, ``check_vrpn_cookie``) and
 ``vrpn_Tracker.C`` (``encode_to``) of https://github.com/vrpn/vrpn (Boost licence).
@@ -78,7 +78,7 @@ class Decoder:
             The poses that are complete now, in the order in which they were sent; everything else is skipped.
 
         Raises:
-            DecodeError: These bytes are not VRPN, or the server ends the connection. The decoder is of no use then.
+            DecodeError: These bytes are not VRPN, or the server ends the connection. The decoder is unusable then.
         """
         self._pending += data
         if not self._greeted:

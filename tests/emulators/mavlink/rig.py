@@ -84,7 +84,7 @@ class Rig:
 
     def say(self, message: Message, codec: Codec | None = None) -> None:
         (came,) = self._ears.decode((codec or self._program).encode(message), whole=True)
-        self.autopilot.heard(self.wire, came, self._now_ns)
+        self.autopilot.on_message(self.wire, came, self._now_ns)
 
     def command(self, number: int, *arguments: float) -> int | None:
         """The result; None without an acknowledgement."""
@@ -154,7 +154,7 @@ class Rig:
 
     def texts(self) -> list[str]:
         """What it said since the last look."""
-        said = [text for each in self.of("STATUSTEXT") for _, text in self._texts.heard(each)]
+        said = [text for each in self.of("STATUSTEXT") for _, text in self._texts.on_message(each)]
         self.wire.sent.clear()
         return said
 

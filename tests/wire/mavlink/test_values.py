@@ -62,7 +62,7 @@ def travelled(messages: list[Message]) -> list[Message]:
 
 def whole_texts(messages: list[Message]) -> list[str]:
     texts = Texts()
-    return [text for message in messages for _, text in texts.heard(message)]
+    return [text for message in messages for _, text in texts.on_message(message)]
 
 
 def test_a_text_of_px4_comes_in_chunks_and_ends_in_a_tab() -> None:
@@ -84,7 +84,7 @@ def test_a_lost_chunk_is_shown() -> None:
 
 def test_texts_that_never_end_are_given_out_and_not_kept() -> None:
     texts = Texts()
-    told = [whole for n in range(1, 40) for whole in texts.heard(travelled(chunks_of("x" * 60, 4, n))[0])]
+    told = [whole for n in range(1, 40) for whole in texts.on_message(travelled(chunks_of("x" * 60, 4, n))[0])]
     assert len(told) == 31
 
 

@@ -67,7 +67,7 @@ class Experiment(msgspec.Struct, frozen=True, tag_field="what", tag="paper"):
 
 
 @dataclass(slots=True)
-class Heard:
+class DelaySamples:
     """Samples of one channel: when each was sent, how long it took, its number."""
 
     sent_ns: list[int] = field(default_factory=list)
@@ -80,9 +80,9 @@ class Heard:
         self.delay_ns.append(int(delay_ns))
         self.seq.append(int(seq))
 
-    def within(self, first_ns: int, last_ns: int) -> Heard:
+    def within(self, first_ns: int, last_ns: int) -> DelaySamples:
         """Return the samples that were sent in a time [ns]."""
-        found = Heard()
+        found = DelaySamples()
         for row in zip(self.sent_ns, self.delay_ns, self.seq, strict=True):
             if first_ns <= row[0] <= last_ns:
                 found.add(*row)
@@ -94,8 +94,10 @@ class _Gathered:
     """The samples that one pass through the recording finds."""
 
     application: int | None = None
-    heard: dict[str, Heard] = field(default_factory=lambda: {COMMAND: Heard(), FEEDBACK: Heard(), VIDEO: Heard()})
-    recorded: dict[str, Heard] = field(default_factory=lambda: {FEEDBACK: Heard(), VIDEO: Heard()})
+    received: dict[str, DelaySamples] = field(
+        default_factory=lambda: {name: DelaySamples() for name in (COMMAND, FEEDBACK, VIDEO)}
+    )
+    recorded: dict[str, DelaySamples] = field(default_factory=lambda: {FEEDBACK: DelaySamples(), VIDEO: DelaySamples()})
     echoes: list[Applied] = field(default_factory=list)
     targets: list[tuple[int, tuple[float, ...]]] = field(default_factory=list)
     poses: list[tuple[int, tuple[float, ...]]] = field(default_factory=list)
@@ -120,14 +122,14 @@ def evaluate(
     recording = Recording.open(path)
     known = recording.drone()
     found = _gather(recording, known.name, known.clock_offset_ns, progress)
-    heard = found.heard
-    if found.application is None or found.size is None or not heard[FEEDBACK].sent_ns:
+    received = found.received
+    if found.application is None or found.size is None or not received[FEEDBACK].sent_ns:
         raise FileFormatError(f"{path} is no recording of the paper's experiment: skyloop demo paper makes one")
     for echo in found.echoes:
         if echo.app_id == found.application and not isinstance(echo.asked, Idle):
-            heard[COMMAND].add(echo.sent_ns, echo.applied_ns - echo.sent_ns, echo.seq)
-    first_ns, last_ns = heard[FEEDBACK].sent_ns[0], heard[FEEDBACK].sent_ns[-1]
-    heard = {name: samples.within(first_ns, last_ns) for name, samples in heard.items()}
+            received[COMMAND].add(echo.sent_ns, echo.applied_ns - echo.sent_ns, echo.seq)
+    first_ns, last_ns = received[FEEDBACK].sent_ns[0], received[FEEDBACK].sent_ns[-1]
+    received = {name: samples.within(first_ns, last_ns) for name, samples in received.items()}
     recorded = {name: samples.within(first_ns, last_ns) for name, samples in found.recorded.items()}
     size = str(found.size)
     delays = Delays(
@@ -137,8 +139,8 @@ def evaluate(
         contenders={OURS.name: "at the controller", RECORDER: "at the recorder"},
         versions={},
         skipped={},
-        cells=[*_cells(OURS.name, size, heard), *_cells(RECORDER, size, recorded)],
-        series=[_series(name, samples, first_ns) for name, samples in heard.items() if samples.delay_ns],
+        cells=[*_cells(OURS.name, size, received), *_cells(RECORDER, size, recorded)],
+        series=[_series(name, samples, first_ns) for name, samples in received.items() if samples.delay_ns],
     )
     way, tracking = _track(found, first_ns, last_ns)
     return Experiment(
@@ -198,7 +200,7 @@ def _logged(found: _Gathered, entry: LogEntry) -> None:
     elif entry.name in (FEEDBACK_HEARD, VIDEO_HEARD):
         channel = FEEDBACK if entry.name == FEEDBACK_HEARD else VIDEO
         for row in np.reshape(entry.values, (-1, 3)):
-            found.heard[channel].add(*row)
+            found.received[channel].add(*row)
     elif entry.name == TARGET:
         found.targets.append((entry.at_ns, entry.values))
     elif entry.name == MOCAP:
@@ -208,9 +210,9 @@ def _logged(found: _Gathered, entry: LogEntry) -> None:
 # Delays ----------------------------------------------------------------------------------------------------------
 
 
-def _cells(name: str, size: str, heard: dict[str, Heard]) -> list[Cell]:
+def _cells(name: str, size: str, received: dict[str, DelaySamples]) -> list[Cell]:
     cells = []
-    for channel, samples in heard.items():
+    for channel, samples in received.items():
         if samples.delay_ns:
             summary = summarize(samples.delay_ns, sent=numbered(samples.seq, channel), period_s=_PERIODS_S[channel])
             cells.append(Cell(name, size, channel, summary))
@@ -225,7 +227,7 @@ def numbered(seq: Sequence[int], channel: str) -> int:
     return len(seq) if channel == COMMAND else max(seq) - min(seq) + 1
 
 
-def _series(channel: str, samples: Heard, first_ns: int) -> Series:
+def _series(channel: str, samples: DelaySamples, first_ns: int) -> Series:
     at_s = [round((sent_ns - first_ns) / NS_PER_S, 3) for sent_ns in samples.sent_ns]
     return Series(channel, at_s, [round(delay_ns / 1e3, 1) for delay_ns in samples.delay_ns])
 

@@ -126,8 +126,8 @@ class DelayLog:
             ended = self._ended.wait(FLUSH_S)
             log.number(APPLICATION, self._drone.app_id)
             log.array(WAYPOINTS, CORNERS)
-            for name, heard in self._rows.items():
-                rows = [heard.popleft() for _ in range(len(heard))]
+            for name, row_queue in self._rows.items():
+                rows = [row_queue.popleft() for _ in range(len(row_queue))]
                 if rows:
                     log.array(name, rows)
             if ended:

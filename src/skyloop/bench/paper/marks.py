@@ -7,7 +7,7 @@ from typing import Final
 from skyloop.messages import Vector
 
 APPLICATION: Final = "paper.application"  #: a number: which of the applications it is, as echoes of commands name them
-#: Arrays, row by row: when the proxy published it [ns, its clock], how much later it was heard [ns], and its number.
+#: Arrays, row by row: when the proxy published it [ns, its clock], how much later it was received [ns], and its number.
 FEEDBACK_HEARD: Final = "paper.delays.feedback"
 VIDEO_HEARD: Final = "paper.delays.video"
 #: An array: x, y, z of where it should be at that time [m], and how many waypoints were reached before.

@@ -81,7 +81,7 @@ def _path_title(results: Experiment) -> str:
 def delay_table(results: Experiment) -> tables.Table:
     """Return the paper's Table 1 with our figures beside it, as the controller saw the delays.
 
-    The recording does not tell how many commands were lost.
+    The recording does not show how many commands were lost.
     """
     found = tables.paper_table(results.delays)
     spreads = [f"{results.deviation_us[channel] / 1e3:.3f}" for channel in PAPER_MEAN_MS]

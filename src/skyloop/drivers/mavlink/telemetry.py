@@ -351,7 +351,7 @@ class HealthMonitor:
     def on_text(self, message: Message) -> list[Notice]:
         """Handle a ``STATUSTEXT``; return whole texts, marked where they say why it can't be armed."""
         notices = []
-        for severity, text in self._texts.heard(message):
+        for severity, text in self._texts.on_message(message):
             if severity >= DEBUG:
                 continue
             weight = Severity.ERROR if severity <= 3 else Severity.WARNING if severity == 4 else Severity.INFO

@@ -19,7 +19,7 @@ class DroneClock:
     booted_ns: int
 
     def navdata_time(self, at_ns: int) -> int:
-        """Return seconds in the upper 11 bits and microseconds in the lower 21: begins anew after 2048 s."""
+        """Return seconds in the upper 11 bits and microseconds in the lower 21: wraps after 2048 s."""
         s, us = divmod((at_ns - self.booted_ns) // _NS_PER_US, _US_PER_S)
         return s % (1 << _SECOND_BITS) << _MICROSECOND_BITS | us
 

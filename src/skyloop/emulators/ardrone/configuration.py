@@ -45,7 +45,7 @@ _CHANNELS: Final = {1: 4, 2: 2}  # of the camera, or pairs of cameras
 class Configuration:
     """All keys of an AR.Drone 1 or 2. Never raises for what it is sent: what makes no sense is ignored.
 
-    A number out of range is brought into it, which no source tells of the drone. A key of the category session, user
+    A number out of range is brought into it, which no source reports of the drone. A key of the category session, user
     or application has a value for each id; new ids begin with the factory's values.
     """
 

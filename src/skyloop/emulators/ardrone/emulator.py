@@ -61,7 +61,7 @@ class RunningFirmware(RunningEmulator):
 
     def _open_ports(self, wanted: Ports) -> None:
         self._navdata_port = self._datagrams("navdata", wanted.navdata, self._asked_for_navdata)
-        self._at_port = self._datagrams("AT", wanted.at, self._heard_commands)
+        self._at_port = self._datagrams("AT", wanted.at, self._on_commands)
         self._control_port = self._stream("control", wanted.control)
         self._video_stream: StreamPort | None = None
         self._video_datagrams: DatagramPort | None = None
@@ -73,10 +73,10 @@ class RunningFirmware(RunningEmulator):
             video = self._video_stream.port
         self.ports = Ports(self._navdata_port.port, video, self._at_port.port, self._control_port.port)
 
-    def _datagrams(self, name: str, port: int, heard: Callable[[bytes, Address], None]) -> DatagramPort:
+    def _datagrams(self, name: str, port: int, on_datagram: Callable[[bytes, Address], None]) -> DatagramPort:
         settings = self._settings
         opened = DatagramPort(
-            self._loop, (settings.bind, port), heard, name=name, faults=settings.faults, delay_s=settings.delay_s
+            self._loop, (settings.bind, port), on_datagram, name=name, faults=settings.faults, delay_s=settings.delay_s
         )
         self._open.append(opened)
         return opened
@@ -88,7 +88,7 @@ class RunningFirmware(RunningEmulator):
 
     # Commands and navdata, on the loop's thread ----------------------------------------------------------------
 
-    def _heard_commands(self, datagram: bytes, _sender: Address) -> None:
+    def _on_commands(self, datagram: bytes, _sender: Address) -> None:
         self.logic.receive(datagram)
         self._look_at_video()
 
@@ -97,7 +97,7 @@ class RunningFirmware(RunningEmulator):
         self._control_port.broadcast(text)
 
     def _asked_for_navdata(self, _datagram: bytes, sender: Address) -> None:
-        if self._navdata_clients.heard(sender):
+        if self._navdata_clients.refresh(sender):
             self._demo_due_ns = 0
 
     def _tick(self, report: Report) -> None:
@@ -180,7 +180,7 @@ class RunningFirmware(RunningEmulator):
             outlet.offer(self._stale, starts=True)
 
     def _asked_for_video(self, _datagram: bytes, sender: Address) -> None:
-        self._video_clients.heard(sender)
+        self._video_clients.refresh(sender)
 
     def _encoded(self, piece: Piece) -> None:
         """Send a picture. On the encoder's thread."""

@@ -21,7 +21,7 @@ class Listeners:
     def __init__(self) -> None:
         self._sequences: dict[Address, int] = {}  # in the order in which they asked last
 
-    def heard(self, address: Address) -> bool:
+    def refresh(self, address: Address) -> bool:
         """Add an address that asked. Return whether it is new."""
         sequence = self._sequences.pop(address, None)
         self._sequences[address] = FIRST_SEQUENCE if sequence is None else sequence

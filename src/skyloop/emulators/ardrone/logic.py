@@ -88,11 +88,11 @@ class ArdroneLogic:
         self._send_text = send_text
         self._clock = clock
         self._sequence = CommandSequence()
-        self._heard_ns = clock()  # what came last; until something does, the start
+        self._received_ns = clock()  # what came last; until something does, the start
         self._linked = False  # something came since the start, or since the link was lost
         self._watchdog = True
         self._ack = False
-        self.lost = False  #: nothing was heard for so long that the link counts as lost
+        self.lost = False  #: nothing was received for so long that the link counts as lost
         self._ids: Ids | None = None  # from the command right before
         self.configuration = Configuration(version)
         self.flight = FlightControl(vehicle, self.configuration, version=version)
@@ -128,7 +128,7 @@ class ArdroneLogic:
             if not self._sequence.takes(command.sequence, now_ns):
                 self.stale += 1
                 continue
-            self._heard_ns, self._linked, self.lost = now_ns, True, False
+            self._received_ns, self._linked, self.lost = now_ns, True, False
             ids, self._ids = self._ids, None
             self._execute(command, ids)
 
@@ -144,7 +144,7 @@ class ArdroneLogic:
     @property
     def silence_s(self) -> float:
         """Time since the last command that was accepted, or since the start [s]."""
-        return seconds(self._clock() - self._heard_ns)
+        return seconds(self._clock() - self._received_ns)
 
     def _lose_link(self) -> None:
         """Reset the link.

@@ -7,11 +7,11 @@ from typing import Final
 from skyloop.clock import nanoseconds
 from skyloop.wire.ardrone.at import SILENCE_RESET_S
 
-RESTART: Final = 1  #: the sequence number with which a client begins anew
+RESTART: Final = 1  #: the sequence number with which a client restarts
 
 
 class CommandSequence:
-    """Accepts a command only if its number is greater than that of the last one accepted, or 1, which begins anew.
+    """Accepts a command only if its number is greater than that of the last one accepted, or 1, which restarts.
 
     After two seconds without an accepted command any number greater than 0 is new again. The Developer Guide asks
     clients to begin with 1; a drone that insisted on it would never again obey a client whose first datagram got lost,

@@ -90,12 +90,12 @@ class Outlet:
 
     def _read(self) -> None:
         try:
-            heard = self._socket.recv(_READ)
+            data = self._socket.recv(_READ)
         except BlockingIOError:
             return
         except OSError:
-            heard = b""
-        if not heard:
+            data = b""
+        if not data:
             self._gone(self)
 
 
@@ -126,7 +126,7 @@ class StreamPort:
         return int(self._socket.getsockname()[1])
 
     def accept(self) -> None:
-        """Accept whoever waits."""
+        """Accept the connections that wait."""
         while True:
             try:
                 connection, _ = self._socket.accept()

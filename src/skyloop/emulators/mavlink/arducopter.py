@@ -177,7 +177,7 @@ class ArduCopter(Autopilot):
             self._paused, self._turn, self._speeds = False, None, self._usual_speeds()
             if mode == "RTL":
                 self._begin_return()
-            self.tell_heartbeat()
+            self.send_heartbeat()
 
     def _usual_speeds(self) -> Speeds:
         across, up, down = (self.parameters[f"WPNAV_SPEED{which}"] / 100.0 for which in ("", "_UP", "_DN"))
@@ -207,12 +207,12 @@ class ArduCopter(Autopilot):
         number = whole(arguments[1])
         mode = COPTER_MODES.get(number)
         if mode is None:
-            self.say(f"No such mode {number}")
+            self.send_text(f"No such mode {number}")
             return FAILED
         needs_place = mode in ("GUIDED", "LOITER", "RTL", "BRAKE", "POSHOLD")
         if mode == "AUTO" or (needs_place and not self.has_origin):
             why = "init failed" if mode == "AUTO" else "requires position"
-            self.say(f"Mode change to {mode} failed: {why}")
+            self.send_text(f"Mode change to {mode} failed: {why}")
             return FAILED
         self._set_mode(mode)
         return ACCEPTED
@@ -228,14 +228,14 @@ class ArduCopter(Autopilot):
 
     def _refuse_arming(self) -> int | None:
         if self.time_s < self._boot_s:
-            self.say("Arm: Gyros inconsistent", CRITICAL)
-            self.say("Arm: Need Position Estimate", CRITICAL)
+            self.send_text("Arm: Gyros inconsistent", CRITICAL)
+            self.send_text("Arm: Need Position Estimate", CRITICAL)
             return FAILED
         if self.mode in _NOT_ARMABLE:
-            self.say(f"Arm: {self.mode} mode not armable", CRITICAL)
+            self.send_text(f"Arm: {self.mode} mode not armable", CRITICAL)
             return FAILED
         if self.mode == "GUIDED" and not self.has_origin:
-            self.say("Arm: Need Position Estimate", CRITICAL)
+            self.send_text("Arm: Need Position Estimate", CRITICAL)
             return FAILED
         return None
 
@@ -343,7 +343,7 @@ class ArduCopter(Autopilot):
         if order not in (0, 1):
             return DENIED
         if self.mode != "GUIDED":
-            self.say(f"Failed to {'resume' if order else 'pause'}", INFO)
+            self.send_text(f"Failed to {'resume' if order else 'pause'}", INFO)
             return FAILED
         self._paused = not order
         return ACCEPTED
@@ -388,9 +388,9 @@ class ArduCopter(Autopilot):
             return
         self.failsafe = lost
         if not lost:
-            self.say("GCS Failsafe Cleared")
+            self.send_text("GCS Failsafe Cleared")
             return
-        self.say("GCS Failsafe")
+        self.send_text("GCS Failsafe")
         if self.armed and self.flight.standing:
             self._disarm("")
         elif self.armed:

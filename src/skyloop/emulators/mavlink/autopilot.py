@@ -68,7 +68,7 @@ class Autopilot(ABC):
     LONG_FRAMES: ClassVar[dict[int, int]]  #: frame of a command with a position in COMMAND_LONG, if it is accepted
     NOTHING_TO_TELL: ClassVar[int]  #: result for a request of a message that it does not have
     BYTEWISE: ClassVar[bool]
-    TELLS_PREARM: ClassVar[bool] = True  #: SYS_STATUS says that it has a check before arming, besides its outcome
+    REPORTS_PREARM: ClassVar[bool] = True  #: SYS_STATUS shows that it has a check before arming, besides its outcome
     DISARM_S: ClassVar[float]  #: armed on the ground for so long, it disarms
 
     def __init__(self, vehicle: Vehicle, system: int, boot_s: float, gps: bool) -> None:
@@ -135,7 +135,7 @@ class Autopilot(ABC):
 
     @property
     def settled(self) -> bool:
-        """Whether its estimator says that the position is good, which is the last thing that a boot waits for."""
+        """Whether its estimator reports a good position, which is the last thing that a boot waits for."""
         return self.time_s >= self._boot_s and self.has_origin
 
     @property
@@ -219,7 +219,7 @@ class Autopilot(ABC):
             for parameter in self.parameters.pending(port):
                 port.send(parameter)
 
-    def say(self, text: str, severity: int = WARNING) -> None:
+    def send_text(self, text: str, severity: int = WARNING) -> None:
         """Send a text to everybody.
 
         Args:
@@ -231,14 +231,14 @@ class Autopilot(ABC):
             for chunk in chunks_of(text, severity, self._text):
                 port.send(chunk)
 
-    def tell_heartbeat(self) -> None:
+    def send_heartbeat(self) -> None:
         """Send a heartbeat besides the usual ones."""
         for port in self.ports:
             port.send(MAKERS[m.MAVLINK_MSG_ID_HEARTBEAT](self))
 
     # Messages come -----------------------------------------------------------------------------------------------
 
-    def heard(self, port: Port, message: Message, now_ns: int) -> None:
+    def on_message(self, port: Port, message: Message, now_ns: int) -> None:
         """Handle a message. Before the first report all are ignored: it is not awake yet.
 
         Args:
@@ -274,7 +274,7 @@ class Autopilot(ABC):
         elif kind in ("RC_CHANNELS_OVERRIDE", "MANUAL_CONTROL"):
             self._sticks(message)
         elif kind.startswith("PARAM_"):
-            for answer in self.parameters.heard(port, message):
+            for answer in self.parameters.on_message(port, message):
                 port.send(answer)
         elif not self._own(port, message):
             for answer in answers(message):
@@ -378,12 +378,12 @@ class Autopilot(ABC):
         self.armed, self._armed_s, self._flown, self._landed_s = True, self.time_s, False, None
         if not self._home_given:
             self.home = self.flight.place
-        self.say(self._words("armed"), INFO)
+        self.send_text(self._words("armed"), INFO)
         return ACCEPTED
 
     def _disarm(self, text: str) -> None:
         self.armed = False
-        self.say(text or self._words("disarmed"), INFO)
+        self.send_text(text or self._words("disarmed"), INFO)
         self._disarmed()
 
     def crashed(self, text: str) -> None:

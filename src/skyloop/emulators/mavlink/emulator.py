@@ -32,11 +32,11 @@ class RunningFirmware(RunningEmulator):
         kind = _KINDS[settings.kind]
         self.autopilot = kind(SimulatedVehicle(host.simulation, drone), settings.system, settings.boot_s, settings.gps)
         try:
-            udp = UdpPort(self._loop, settings, Streams(kind.RATES), self._heard)
+            udp = UdpPort(self._loop, settings, Streams(kind.RATES), self._on_message)
             self._open.append(udp)
             tcp = None
             if settings.ports.tcp is not None:
-                tcp = TcpPort(self._loop, settings, Streams(kind.RATES), self._heard)
+                tcp = TcpPort(self._loop, settings, Streams(kind.RATES), self._on_message)
                 self._open.append(tcp)
             self.ports = Ports(udp.port, settings.ports.remote, tcp.port if tcp is not None else None)
             self.autopilot.ports = (udp,) if tcp is None else (udp, tcp)
@@ -51,8 +51,8 @@ class RunningFirmware(RunningEmulator):
             self.stop()
             raise
 
-    def _heard(self, port: Port, message: object) -> None:
-        self.autopilot.heard(port, message, monotonic_ns())
+    def _on_message(self, port: Port, message: object) -> None:
+        self.autopilot.on_message(port, message, monotonic_ns())
 
     def _tick(self, report: Report) -> None:
         self.autopilot.tick(report)

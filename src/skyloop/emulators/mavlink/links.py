@@ -13,7 +13,7 @@ from skyloop.emulators.mavlink.settings import Settings
 from skyloop.emulators.mavlink.streams import Streams
 from skyloop.wire.mavlink.codec import Codec, Message
 
-Heard = Callable[["Port", Message], None]
+OnMessage = Callable[["Port", Message], None]
 
 AUTOPILOT_COMPONENT: Final = 1
 PEER_NS: Final = nanoseconds(3.0)  #: a peer that is silent for so long may be replaced by another
@@ -35,22 +35,22 @@ def _codec(settings: Settings) -> Codec:
 
 
 class UdpPort:
-    """A UDP port: sends to the remote port until somebody is heard, then to whoever was heard.
+    """A UDP port: sends to the remote port until a message comes, then to its sender.
 
     Args:
         loop: Calls back when something comes.
         settings: Of the firmware.
         streams: Rates of the messages.
-        heard: Called with each message.
+        on_message: Called with each message.
 
     Raises:
         LinkError: The port is taken.
     """
 
-    def __init__(self, loop: Loop, settings: Settings, streams: Streams, heard: Heard) -> None:
+    def __init__(self, loop: Loop, settings: Settings, streams: Streams, on_message: OnMessage) -> None:
         self.streams = streams
         self._settings = settings
-        self._heard = heard
+        self._on_message = on_message
         self._codec = _codec(settings)
         self._peer: Address = (settings.bind if settings.bind != "0.0.0.0" else "127.0.0.1", settings.ports.remote)
         self._peer_ns = -PEER_NS
@@ -84,7 +84,7 @@ class UdpPort:
         if sender == self._peer or now_ns - self._peer_ns >= PEER_NS:
             self._peer, self._peer_ns = sender, now_ns
         for message in messages:
-            self._heard(self, message)
+            self._on_message(self, message)
 
 
 class TcpPort:
@@ -94,17 +94,17 @@ class TcpPort:
         loop: Calls back when something comes.
         settings: Of the firmware.
         streams: Rates of the messages.
-        heard: Called with each message.
+        on_message: Called with each message.
 
     Raises:
         LinkError: The port is taken.
     """
 
-    def __init__(self, loop: Loop, settings: Settings, streams: Streams, heard: Heard) -> None:
+    def __init__(self, loop: Loop, settings: Settings, streams: Streams, on_message: OnMessage) -> None:
         self.streams = streams
         self._loop = loop
         self._settings = settings
-        self._heard = heard
+        self._on_message = on_message
         self._codec = _codec(settings)
         self._client: socket.socket | None = None
         self._server = bound(socket.SOCK_STREAM, (settings.bind, settings.ports.tcp or 0), "MAVLink")
@@ -167,4 +167,4 @@ class TcpPort:
             self._drop()
             return
         for message in self._codec.decode(data):
-            self._heard(self, message)
+            self._on_message(self, message)

@@ -103,7 +103,7 @@ class ParameterTable:
             raise KeyError(name)
         self._values[name] = value
 
-    def heard(self, port: Port, message: Message) -> Iterable[Message]:
+    def on_message(self, port: Port, message: Message) -> Iterable[Message]:
         """Handle a message of the parameters' protocol; yield the answers that are sent at once."""
         kind = message.get_type()
         if kind == "PARAM_REQUEST_LIST":

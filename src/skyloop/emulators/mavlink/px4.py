@@ -80,7 +80,7 @@ class Px4(Autopilot):
     NOTHING_TO_TELL = DENIED
     BYTEWISE = True
     DISARM_S = 11.1
-    TELLS_PREARM = False
+    REPORTS_PREARM = False
 
     def __init__(self, vehicle: Vehicle, system: int, boot_s: float, gps: bool) -> None:
         super().__init__(vehicle, system, boot_s, gps)
@@ -138,7 +138,7 @@ class Px4(Autopilot):
     def _look_at_set_points(self) -> None:
         if self.mode == "OFFBOARD" and not self._fresh:
             self.failsafe = True
-            self.say("Failsafe activated", CRITICAL)
+            self.send_text("Failsafe activated", CRITICAL)
             self._enter("AUTO.LOITER" if round(self.parameters["COM_OBL_RC_ACT"]) == 5 else "POSCTL")
         elif self.failsafe and self._intended == "OFFBOARD" and self._fresh and not self._lost_gcs:
             self.failsafe = False  # back by itself: the user wanted it
@@ -198,11 +198,11 @@ class Px4(Autopilot):
         if mode is None or mode == "AUTO.READY":
             return ACCEPTED
         if mode == "OFFBOARD" and not self._fresh:
-            self.say("Switching to Offboard is currently not available", CRITICAL)
+            self.send_text("Switching to Offboard is currently not available", CRITICAL)
         elif mode in _STICKS and self.armed:
-            self.say("Switching to Position is currently not available", CRITICAL)
+            self.send_text("Switching to Position is currently not available", CRITICAL)
         elif mode == "AUTO.MISSION":
-            self.say("Switching to Mission is currently not available: no valid mission", CRITICAL)
+            self.send_text("Switching to Mission is currently not available: no valid mission", CRITICAL)
         else:
             if mode == "AUTO.TAKEOFF":
                 self._manoeuvres.begin_rise(self.home[2] + self.parameters["MIS_TAKEOFF_ALT"])
@@ -222,11 +222,11 @@ class Px4(Autopilot):
     def _refuse_arming(self) -> int | None:
         if self.ready:
             return None
-        self.say("Arming denied: Resolve system health failures first\t", CRITICAL)
+        self.send_text("Arming denied: Resolve system health failures first\t", CRITICAL)
         return TEMPORARILY_REJECTED
 
     def _refuse_disarming(self) -> int:
-        self.say("Disarming denied: not landed\t", CRITICAL)
+        self.send_text("Disarming denied: not landed\t", CRITICAL)
         return TEMPORARILY_REJECTED
 
     def _take_off(self, arguments: Arguments) -> int:
@@ -249,7 +249,7 @@ class Px4(Autopilot):
         elif message.get_type() == "SET_POSITION_TARGET_GLOBAL_INT":
             found = global_target_of(message, self._datum(message.coordinate_frame))
             if found is None:
-                self.say(
+                self.send_text(
                     f"SET_POSITION_TARGET_GLOBAL_INT invalid coordinate frame {message.coordinate_frame}\t", CRITICAL
                 )
                 return
@@ -259,14 +259,14 @@ class Px4(Autopilot):
         elif message.coordinate_frame in self.FRAMES:
             made = target_of(message)
         else:
-            self.say(f"SET_POSITION_TARGET_LOCAL_NED coordinate frame {message.coordinate_frame} unsupported\t")
+            self.send_text(f"SET_POSITION_TARGET_LOCAL_NED coordinate frame {message.coordinate_frame} unsupported\t")
             return
         self.set_points += 1
         self._target, self._target_s = made, self.time_s
 
     # Places and speeds by command ------------------------------------------------------------------------------
 
-    def _reposition(self, arguments: Arguments, frame: int) -> int:  # noqa: ARG002  above the sea, whatever it says
+    def _reposition(self, arguments: Arguments, frame: int) -> int:  # noqa: ARG002  above the sea, whatever it names
         """HOLD at another position. Disarmed it only changes the mode."""
         if whole(arguments[1]) != 1:
             return UNSUPPORTED
@@ -292,7 +292,7 @@ class Px4(Autopilot):
         self._waiting_at = Target((east, north, up), yaw=yaw)
         return ACCEPTED
 
-    def _set_home(self, arguments: Arguments, frame: int) -> int:  # noqa: ARG002  above the sea, whatever it says
+    def _set_home(self, arguments: Arguments, frame: int) -> int:  # noqa: ARG002  above the sea, whatever it names
         if arguments[0] > 0.5:
             place = self.flight.place
         elif not all(map(math.isfinite, arguments[4:7])):
@@ -330,12 +330,12 @@ class Px4(Autopilot):
             return
         self._lost_gcs = lost
         if not lost:
-            self.say("GCS connection regained")
+            self.send_text("GCS connection regained")
             return
-        self.say("Preflight Fail: No connection to the GCS\t")
+        self.send_text("Preflight Fail: No connection to the GCS\t")
         action = round(self.parameters["NAV_DLL_ACT"])
         if action and self.armed and not self.flight.standing:
-            self.say("Failsafe activated", CRITICAL)
+            self.send_text("Failsafe activated", CRITICAL)
             self.failsafe = True
             self._intended = {1: "AUTO.LOITER", 2: "AUTO.RTL", 3: "AUTO.LAND"}.get(action, "AUTO.LOITER")
             self._enter(self._intended)

@@ -28,7 +28,7 @@ class Ports:
     """Ports of one emulated autopilot.
 
     Args:
-        udp: The autopilot's own, from which it sends to ``remote`` until it hears somebody.
+        udp: The autopilot's own, from which it sends to ``remote`` until a message comes.
         remote: UDP, of the other end.
         tcp: Its server for one client; None: it has none.
     """

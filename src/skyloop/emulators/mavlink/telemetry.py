@@ -35,7 +35,7 @@ class AutopilotState(Protocol):
     """What the messages are made from; see :class:`skyloop.emulators.mavlink.autopilot.Autopilot`."""
 
     AUTOPILOT: ClassVar[int]  #: MAV_AUTOPILOT
-    TELLS_PREARM: ClassVar[bool]
+    REPORTS_PREARM: ClassVar[bool]
     flight: FlightControl
     gps: bool
     report: Report
@@ -99,7 +99,7 @@ def _global(a: AutopilotState) -> Message | None:
 
 def _status(a: AutopilotState) -> Message:
     believed = a.report.believed
-    present = _SENSORS | _BATTERY | (PREARM if a.TELLS_PREARM else 0)
+    present = _SENSORS | _BATTERY | (PREARM if a.REPORTS_PREARM else 0)
     health = (present & ~PREARM) | (PREARM if a.ready else 0)
     charge, volts = round(believed.battery * 100), round(believed.battery_v * 1000)
     return m.MAVLink_sys_status_message(present, present, health, 250, volts, 500, charge, 0, 0, 0, 0, 0, 0)

@@ -11,7 +11,7 @@ At an address of this machine, for a test::
         firmware.port  # UDP, where it takes commands
         host.simulation.truth(0).position_m  # what the vehicle really does
 
-State and video go to ports 8890 and 11111 of whoever sent ``command``, or where ``port`` says (SDK 3.0). With
+State and video go to ports 8890 and 11111 of the sender of ``command``, or to those set by ``port`` (SDK 3.0). With
 ``faults=Faults(seed=1, drop=0.1)`` of :mod:`skyloop.faults` datagrams get lost both ways.
 """
 

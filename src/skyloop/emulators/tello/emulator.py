@@ -100,16 +100,16 @@ class RunningFirmware(RunningEmulator):
 
     def _datagrams(self, name: str, port: int) -> DatagramPort:
         settings = self._settings
-        heard = self._heard if name == "command" else lambda _datagram, _sender: None
+        on_datagram = self._on_datagram if name == "command" else lambda _datagram, _sender: None
         opened = DatagramPort(
-            self._loop, (settings.bind, port), heard, name=name, faults=settings.faults, delay_s=settings.delay_s
+            self._loop, (settings.bind, port), on_datagram, name=name, faults=settings.faults, delay_s=settings.delay_s
         )
         self._open.append(opened)
         return opened
 
     # On the loop's thread ----------------------------------------------------------------------------------------
 
-    def _heard(self, datagram: bytes, sender: Address) -> None:
+    def _on_datagram(self, datagram: bytes, sender: Address) -> None:
         self.logic.receive(datagram, sender)
         self._look_at_video()
 

@@ -64,7 +64,7 @@ class TelloLogic:
         self._link_quality = link_quality
         self._report: Report | None = None
         self._job: tuple[Job, Address | None] | None = None  # and who gets the answer
-        self._heard_ns = clock()
+        self._received_ns = clock()
         self._speed_cm_s = USUAL_SPEED_CM_S
         self._start: tuple[float, float] | None = None  # yaw when switched on, altitude at take-off
         self._motor_s = 0.0
@@ -88,12 +88,12 @@ class TelloLogic:
         if not text or (self.client is None and text != ENTER):
             self.unknown += 1
             return
-        self._heard_ns = self._clock()
+        self._received_ns = self._clock()
         if text == ENTER:
             self.client = sender[0]
-        said = self._obey(text, sender)
-        if said:
-            self._answer(said, sender)
+        reply = self._obey(text, sender)
+        if reply:
+            self._answer(reply, sender)
 
     def supervise(self, report: Report) -> None:
         """Handle the newest report of the vehicle: go on with the present command. Called regularly."""
@@ -107,18 +107,18 @@ class TelloLogic:
         if truth.state is FlightState.EMERGENCY:
             self._job = None
             self._vehicle.command(ResetEmergency())  # taken as soon as it lies: a Tello has no state of emergency
-        if self._clock() - self._heard_ns > nanoseconds(SILENCE_S) and truth.state in _FLYING:
+        if self._clock() - self._received_ns > nanoseconds(SILENCE_S) and truth.state in _FLYING:
             self._job = Landing(), None
         if self._job is None:
             return
         job, sender = self._job
-        action, said = job.step(report)
+        action, reply = job.step(report)
         if action is not None:
             self._vehicle.command(action)
-        if said is not None:
+        if reply is not None:
             self._job = None
             if sender is not None:
-                self._answer(said, sender)
+                self._answer(reply, sender)
 
     # Telling ---------------------------------------------------------------------------------------------------
 

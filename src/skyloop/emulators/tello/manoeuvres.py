@@ -37,15 +37,15 @@ class Rising:
 
     def __init__(self, report: Report) -> None:
         self._begun_s = report.truth.time_s
-        self._told = False
+        self._commanded = False
 
     def step(self, report: Report) -> Step:
         """Return what to command now, and the answer once it is done."""
         elapsed_s = report.truth.time_s - self._begun_s
         state = report.truth.state
-        if not self._told:
-            self._told = elapsed_s >= SPIN_UP_S
-            return (Takeoff() if self._told else None), None
+        if not self._commanded:
+            self._commanded = elapsed_s >= SPIN_UP_S
+            return (Takeoff() if self._commanded else None), None
         if state in (FlightState.LANDED, FlightState.EMERGENCY):
             return None, "error" if elapsed_s > SPIN_UP_S + 0.5 else None
         return None, OK if state in _FLYING and elapsed_s >= TAKEOFF_ANSWER_S else None

@@ -62,8 +62,8 @@ def fields(snapshot: Snapshot) -> dict[str, str]:
 
 def state_string(snapshot: Snapshot, sdk: Sdk) -> bytes:
     """Return the datagram that is sent ten times a second."""
-    told = list(fields(snapshot).items())
-    return build(told if sdk is Sdk.V1_3 else [*_pad_fields(snapshot.pad), *told])
+    values = list(fields(snapshot).items())
+    return build(values if sdk is Sdk.V1_3 else [*_pad_fields(snapshot.pad), *values])
 
 
 def answer(question: str, snapshot: Snapshot) -> str:
@@ -72,16 +72,16 @@ def answer(question: str, snapshot: Snapshot) -> str:
     Raises:
         KeyError: The question is not about the state.
     """
-    told = fields(snapshot)
+    values = fields(snapshot)
     answers = {
-        "battery?": told["bat"],
-        "time?": told["time"],
-        "height?": f"{int(told['h']) // 10}dm",
-        "temp?": f"{told['templ']}~{told['temph']}C",
-        "attitude?": "".join(f"{name}:{told[name]};" for name in ("pitch", "roll", "yaw")),
-        "baro?": told["baro"],
-        "acceleration?": "".join(f"{name}:{told[name]};" for name in ("agx", "agy", "agz")),
-        "tof?": f"{int(told['tof']) * 10}mm",
+        "battery?": values["bat"],
+        "time?": values["time"],
+        "height?": f"{int(values['h']) // 10}dm",
+        "temp?": f"{values['templ']}~{values['temph']}C",
+        "attitude?": "".join(f"{name}:{values[name]};" for name in ("pitch", "roll", "yaw")),
+        "baro?": values["baro"],
+        "acceleration?": "".join(f"{name}:{values[name]};" for name in ("agx", "agy", "agz")),
+        "tof?": f"{int(values['tof']) * 10}mm",
     }
     return f"{answers[question]}\r\n"
 

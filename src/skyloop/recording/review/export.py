@@ -31,7 +31,7 @@ _CODECS: Final = ("libx264", "libopenh264", "mpeg4")  #: the first that this PyA
 def export_csv(found: dict[str, Table], folder: Path) -> list[Path]:
     """Write ``CHANNEL.csv`` for each table: UTF-8, comma, a header line; what is not known is empty.
 
-    A text that a spreadsheet would take for a formula gets an apostrophe before it, because applications, and whoever
+    A text that a spreadsheet would take for a formula gets an apostrophe before it, because applications, and those who
     made the file, choose such texts.
 
     Args:

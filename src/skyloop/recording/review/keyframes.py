@@ -34,13 +34,13 @@ def moments(first_s: float, last_s: float, events: Table | None, most: int) -> l
     chosen: list[tuple[float, str]] = []
     if events is not None:
         rows = zip(events.numbers("t_s"), events["kind"], events["severity"], events["text"], strict=True)
-        telling = [
+        candidates = [
             (float(t), str(text))
             for t, kind, severity, text in rows
             if first_s <= t <= last_s and (kind in _TELLING or severity != "info")
         ]
-        step = max(1, -(-len(telling) // max(1, most // 2)))
-        chosen = telling[::step]
+        step = max(1, -(-len(candidates) // max(1, most // 2)))
+        chosen = candidates[::step]
     even = np.linspace(first_s, last_s, most)
     distance = (last_s - first_s) / max(1, most - 1)
     for t in even:

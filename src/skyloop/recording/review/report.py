@@ -53,11 +53,11 @@ def write_report(
     Raises:
         UsageError: The file can't be written.
     """
-    tell = progress or (lambda _: None)
-    summary = summarise(recording, lambda share: tell(share / 3))
-    found = tables(recording, drone, _TABLES, lambda share: tell((1 + share) / 3))
+    report_progress = progress or (lambda _: None)
+    summary = summarise(recording, lambda share: report_progress(share / 3))
+    found = tables(recording, drone, _TABLES, lambda share: report_progress((1 + share) / 3))
     page = make_page(recording, drone, found, summary)
-    _frames(page, recording, drone, found, pictures, lambda share: tell((2 + share) / 3))
+    _frames(page, recording, drone, found, pictures, lambda share: report_progress((2 + share) / 3))
     _events(page, found.get("events"))
     _channels(page, summary)
     page.add(

@@ -160,6 +160,6 @@ def _row(topic: str, tally: _Tally, series: dict[str, Any]) -> Row:
 
 
 def _missing(numbers: list[int]) -> int:
-    """By the gaps in numbers that grow by one; one that is not higher begins anew."""
+    """By the gaps in numbers that grow by one; one that is not higher restarts the count."""
     steps = np.diff(np.array(numbers, np.int64))
     return int((steps[steps > 1] - 1).sum())

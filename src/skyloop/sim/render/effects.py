@@ -13,7 +13,7 @@ from skyloop.sim.render.base import Image
 from skyloop.sim.render.opencv import cv2
 
 _SPARE = 61  # rows and pixels of noise beyond a picture's own, so that each frame cuts another part out
-_BLUR_FROM_PX = 0.8  # a shorter smear can't be told from none
+_BLUR_FROM_PX = 0.8  # a shorter smear can't be distinguished from none
 
 
 class SensorEffects:

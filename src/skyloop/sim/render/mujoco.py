@@ -29,7 +29,7 @@ _FINER: Final = 2.0  # pixels of the larger picture to one behind a lens
 
 
 def _load() -> Any:
-    """MuJoCo, told to draw off screen. Its choice is made when it is imported, and it would look for a display."""
+    """MuJoCo, set to draw off screen. Its choice is made when it is imported, and it would look for a display."""
     if sys.platform == "linux" and "MUJOCO_GL" not in os.environ:
         backend = next((name for name, library in _BACKENDS.items() if ctypes.util.find_library(library)), None)
         if backend is None:

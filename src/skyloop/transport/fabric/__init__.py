@@ -1,6 +1,6 @@
 """The transport of the network, on Eclipse Zenoh.
 
-``docs/network.md`` says how to use it, ``docs/wire-format.md`` what travels. It needs the extra ``network``; without
+``docs/network.md`` shows how to use it, ``docs/wire-format.md`` what travels. It needs the extra ``network``; without
 it each function here raises :class:`MissingExtraError`.
 """
 

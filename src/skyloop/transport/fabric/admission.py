@@ -42,7 +42,7 @@ class Admission(NamedTuple):
 
 
 def admit(
-    ring: KeyRing | None, name: str, run: str, sender: layout.Sender, wish: packets.Join, topics: Seal | None
+    ring: KeyRing | None, name: str, run: str, sender: layout.Sender, request: packets.Join, topics: Seal | None
 ) -> Admission:
     """Check a request to join, and make the proxy's answer.
 
@@ -51,7 +51,7 @@ def admit(
         name: The proxy's name.
         run: This run of the proxy.
         sender: Who asks, by the key of the request.
-        wish: The request.
+        request: The request.
         topics: The seal of what is published, None without keys.
 
     Returns:
@@ -64,7 +64,7 @@ def admit(
         return Admission(packets.encode_own(packets.Welcome(packets.REVISION, run)))
     from skyloop.keys.agreement import Agreement
 
-    proof, agreed = Agreement(ring, *_terms(name, run, sender)).answer(wish.proof)
+    proof, agreed = Agreement(ring, *_terms(name, run, sender)).answer(request.proof)
     identity = agreed.identity
     if identity.name != sender.who:
         raise LinkError(f"these are the keys of {identity}, and not of {sender.who}")
@@ -75,7 +75,7 @@ def admit(
     sealed, trailer = sealer.seal(where, b"", packets.key(topics.generation, topics.key))
     welcome = packets.encode_own(packets.Welcome(packets.REVISION, run, proof, trailer + sealed))
     return Admission(
-        welcome, wish.proof, identity, agreed.expires, sealer, Open().use(agreed.up), generation=topics.generation
+        welcome, request.proof, identity, agreed.expires, sealer, Open().use(agreed.up), generation=topics.generation
     )
 
 

@@ -69,7 +69,7 @@ def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1
         chosen = chosen.current()
         if before is not None and not before.parted:
             # One end may have forgotten the other while the other has not: such a session finds nobody, or gets no
-            # answers, and Zenoh does not notice. A new one has another identity, which nobody mistakes for the old.
+            # answers, and Zenoh does not detect that. A new one has another identity than the old.
             retire(before.session)
             before = None
         session = acquire(chosen, Part.APP)
@@ -123,7 +123,7 @@ class FabricClient(TransportClient):
 
     def __init__(self, session: Session, name: str, handler: ClientHandler, find_s: float) -> None:
         self._session = session
-        self.parted = False  #: the proxy has said that it ends this connection, or let it end
+        self.parted = False  #: the proxy has announced that it ends this connection, or let it end
         self._name = name
         self._handler = handler
         self._who = session.settings.who
@@ -209,14 +209,14 @@ class FabricClient(TransportClient):
                     topic, bytes.fromhex(self._run), self._admission.topics, self._enqueue_published, self._reject
                 )
                 self._subscriptions[topic] = wanted, wanted.declare(self._session, self._name, self._id)
-            told = self._keep(layout.ASK, packets.subscribe(topic, on), own=True)
+            sent = self._keep(layout.ASK, packets.subscribe(topic, on), own=True)
             declared: list[Any] = []
             if not on:
                 unwanted, declared = self._subscriptions.pop(topic)
                 unwanted.end()
         undeclare(declared)
-        if not told:  # the next connection subscribes anew; this one would wait for what never comes
-            self._end(f"the proxy does not take what is sent to it, and can't be told about {topic!r}")
+        if not sent:  # the next connection subscribes again; this one would wait for what never comes
+            self._end(f"the proxy does not take what is sent to it: the subscription to {topic!r} can't be sent")
 
     def close(self) -> None:
         self._end("closed by the application")
@@ -359,8 +359,8 @@ class FabricClient(TransportClient):
         if ring is None or proxy is None or now_s < self._keys_s:
             return
         self._keys_s = now_s + KEYS_S
-        for news in ring.poll():
-            _log.warning("%s", news)
+        for change in ring.poll():
+            _log.warning("%s", change)
         linked = self._session.shut_out()
         if not ring.admits(proxy):
             reason = f"the keys of the proxy, {proxy}, were revoked or changed"

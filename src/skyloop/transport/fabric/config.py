@@ -34,7 +34,7 @@ class Part(StrEnum):
 #: Signs of life in the time of a lease: so many that on a path that loses three packets in ten some arrive.
 KEEP_ALIVES: Final = 8
 #: Messages that wait to be sent, by priority (Zenoh's most). Its default is 2, and what comes then is dropped within a
-#: millisecond: ten drones of one process tell of the same event in the same moment.
+#: millisecond: ten drones of one process report the same event in the same moment.
 _QUEUES: Final = dict.fromkeys(("real_time", "data_high", "data", "data_low"), 16)
 #: A neighbour that takes none of Zenoh's own declarations for so long is cut off [µs]; one of Zenoh's few receiving
 #: threads waits for it meanwhile. All else is dropped when a link is congested.

@@ -62,7 +62,7 @@ class ServerConnection:
         self.announced = False  #: the handler knows of it
         self.confirmed = False  #: its token was seen, so that Zenoh will report its end
         self.ended = False  #: what still comes is not wanted any more
-        self.reason = ""  #: why it ends, as soon as one end has said so
+        self.reason = ""  #: why it ends, as soon as one end has given a reason
         self.lock = threading.Lock()
         self.outgoing = Outgoing()  #: packets to it
         self.receiver = Receiver()  #: packets from it
@@ -122,7 +122,7 @@ class ServerConnection:
             self._own.append(packet)
 
     def acknowledge(self, number: int) -> None:
-        """Have it told that its packets up to this number were taken."""
+        """Acknowledge its packets up to this number."""
         with self.lock:
             self._taken = max(self._taken, number)
 

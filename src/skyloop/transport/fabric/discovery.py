@@ -84,7 +84,7 @@ def oldest_first(session: Session, name: str) -> list[ProxyInfo]:
 def runs(session: Session, name: str = "*") -> set[tuple[str, str]]:
     """Return NAME and RUN of the transport servers whose tokens are seen now.
 
-    It takes as long as the linked nodes need to tell what they know, at most :data:`SYNC_S`.
+    It takes as long as the linked nodes need to send what they know, at most :data:`SYNC_S`.
     """
     found = set()
     for reply in session.zenoh.liveliness().get(layout.alive(name, "*"), timeout=SYNC_S):

@@ -39,22 +39,22 @@ def choose(network: NetworkChoice = None, keys: Path | str | None = None) -> Fab
     """
     found = _choose(network, keys)
     if found is not None and found.ring is not None:
-        for notice in found.ring.poll():
-            _log.warning("%s", notice)
+        for change in found.ring.poll():
+            _log.warning("%s", change)
     return found
 
 
 def _choose(network: NetworkChoice, keys: Path | str | None) -> FabricSettings | None:
     if isinstance(network, FabricSettings):
         return network if keys is None else secure(network, keys)
-    wish = os.environ.get(NETWORK_VARIABLE, "") if network is None else network
-    if isinstance(wish, bool):
-        wish = MULTICAST if wish else ""
-    if wish.strip().lower() in _OFF:
+    requested = os.environ.get(NETWORK_VARIABLE, "") if network is None else network
+    if isinstance(requested, bool):
+        requested = MULTICAST if requested else ""
+    if requested.strip().lower() in _OFF:
         if keys is not None and network is None:
             raise UsageError(f"keys are for the network: give network=True as well, or set {NETWORK_VARIABLE}")
         return None
-    words = [word.strip() for word in wish.split(",") if word.strip()]
+    words = [word.strip() for word in requested.split(",") if word.strip()]
     connect = tuple(word for word in words if word.lower() not in _ON)
     return settings(connect=connect, multicast=len(connect) < len(words), keys=keys)
 

@@ -26,7 +26,7 @@ from skyloop.transport.base import Pixels
 from skyloop.transport.frame_encoding import encode_frame
 
 WINDOW: Final = 2  #: frames on the way to one reader
-#: Forms of one camera's frames: each costs its encoding anew, the n parts of one together no more than that. The usual
+#: Forms of one camera's frames: each costs its own encoding, the n parts of one together no more than that. The usual
 #: ones come on top of them, so that there is room for a pilot whatever others have asked for.
 MAX_FORMS: Final = 32
 MAX_FORMS_EACH: Final = 8  #: of them that one connection may read
@@ -110,7 +110,7 @@ class FramePublisher:
         self._threads: dict[str, threading.Thread] = {}
         self._number = 0
         self._ended = False
-        self._unable: set[str] = set()  # topics that can't be encoded, and of which that was said
+        self._unable: set[str] = set()  # topics that can't be encoded, and of which that was logged
 
     def publish(self, header: FrameHeader, pixels: Pixels) -> int:
         """Take a frame and have it encoded and sent by the camera's thread.

@@ -53,7 +53,7 @@ class ProxyWatch:
             within_s: How long [s].
 
         Returns:
-            The run of each candidate with what it says of itself, the best first. That is the oldest; with keys the
+            The run of each candidate with what it reports of itself, the best first. That is the oldest; with keys the
             next ones follow, as the oldest may turn out to have no key for this name.
 
         Raises:
@@ -75,9 +75,9 @@ class ProxyWatch:
         return self._candidates()
 
     def _candidates(self) -> list[tuple[str, packets.ProxyInfo | None]]:
-        told = [about for about in discovery.oldest_first(self._session, self._name) if about.run in self._runs]
+        running = [about for about in discovery.oldest_first(self._session, self._name) if about.run in self._runs]
         with self._changed:
-            found: list[tuple[str, packets.ProxyInfo | None]] = [(about.run, about) for about in told]
+            found: list[tuple[str, packets.ProxyInfo | None]] = [(about.run, about) for about in running]
             found += [(run, None) for run in sorted(self._runs - {run for run, _ in found})]
         if not found:
             raise NoAnswerError(f"the proxy {self._name!r} was found on the network, and is gone again")

@@ -75,7 +75,7 @@ def alive(name: str, run: str) -> str:
 
 
 def info(name: str) -> str:
-    """Return the key at which a proxy says who it is, to anybody who asks."""
+    """Return the key at which a proxy answers who it is."""
     return f"{ROOT}/{name}/info"
 
 
@@ -128,7 +128,7 @@ def video_for(name: str, camera: str, variant: str, connection: str) -> str:
 
 
 def parse_sender(key: str) -> Sender:
-    """Return whom a key belongs to.
+    """Return the owner of a key.
 
     Raises:
         DecodeError: It is not a key of an application.

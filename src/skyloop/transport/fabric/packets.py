@@ -78,7 +78,7 @@ _KEY = struct.Struct("<I32s")
 
 
 class Join(msgspec.Struct, frozen=True, array_like=True):
-    """What an application says when it asks to be let in, as MessagePack."""
+    """What an application sends when it asks to be admitted, as MessagePack."""
 
     revision: int
     run: str  #: of the proxy that is meant

@@ -80,9 +80,9 @@ class ConnectionRegistry:
         self._shut: frozenset[str] = frozenset()  # who was shut out when the key of topics was made
         self.dropped = 0  #: applications that were disconnected because they did not take what was sent to them
         self.turned_away = 0  #: connections and signs of life that were too many of one key, or in all
-        self._away = ""  # why, until the handler was told
+        self._away = ""  # why, until the handler was notified
         self.strays = 0  #: samples and queries that came from nobody that is connected
-        self._stray_commands = 0  # commands and orders among them that the handler was not told of yet
+        self._stray_commands = 0  # commands and requests among them that the handler was not notified of yet
 
     def open(self) -> None:
         """Let applications in from now on."""
@@ -135,7 +135,7 @@ class ConnectionRegistry:
     def stray(self, key: str) -> None:
         """Count a packet from nobody that is connected, by the key by which it came."""
         self.strays += 1
-        if f"/{layout.ASK}/" not in key:  # what an application says when it leaves may come late
+        if f"/{layout.ASK}/" not in key:  # what an application sends when it leaves may come late
             self._stray_commands += 1
 
     # --- what Zenoh calls, on its own threads ---
@@ -245,7 +245,7 @@ class ConnectionRegistry:
         """End connections that must not go on; call it from time to time on the thread that calls the handler.
 
         Those are connections whose application was let in and never showed its token, takes nothing of what is sent to
-        it, or has no right to be here any more. The handler is told of commands from nobody that is connected, and of
+        it, or has no right to be here any more. The handler is notified of commands from unknown applications, and of
         connections that were turned away.
 
         Args:
@@ -339,7 +339,7 @@ class ConnectionRegistry:
             self.end(connection, reason)
 
     def end(self, connection: ServerConnection, reason: str) -> None:
-        """Remove a connection; the handler is told after the connection's last packet. Any thread."""
+        """Remove a connection; the handler is notified after the connection's last packet. Any thread."""
         with self._lock:
             if self._connections.pop(connection.id, None) is None:
                 return

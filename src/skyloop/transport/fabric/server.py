@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 #: Packets of one application that wait for the handler, and as many commands. Further packets are not acknowledged, so
 #: that they are sent again; further commands are dropped, as newer ones follow.
 MAX_WAITING: Final = 64
-FAREWELL_S: Final = 0.5  #: how long a transport server that stops waits for its applications to hear why
+FAREWELL_S: Final = 0.5  #: how long a transport server that stops waits for its applications to receive the reason
 _POLL_S: Final = 0.5
 _REFUSED: Final = b""  # in place of a packet that was
 _UPWARD: Final = (layout.ASK, layout.ORDER, layout.COMMAND)
@@ -50,7 +50,7 @@ class FabricServer(TransportServer):
     Args:
         name: The proxy's name.
         settings: How to join the network; by default by multicast, without keys.
-        vehicle: The vehicle's address, which is told to anybody who asks for the proxy.
+        vehicle: The vehicle's address, which is sent to anybody who searches for the proxy.
 
     Raises:
         UsageError: The name is not valid, or the keys are not for it.
@@ -274,7 +274,7 @@ class FabricServer(TransportServer):
                 checked = time.monotonic()
                 try:
                     self._registry.check(handler)
-                except Exception:  # noqa: BLE001  nobody else hears the applications: this thread must go on
+                except Exception:  # noqa: BLE001  nothing else receives from the applications: this thread must go on
                     _log.exception("the connections of %s could not be checked; it is tried again", self.address)
             item = self._queue.get(_POLL_S)
             if item is None:

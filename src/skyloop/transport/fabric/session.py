@@ -212,7 +212,7 @@ def host_name() -> str:
 def renewed(session: Session) -> Session:
     """Replace a session, which nobody else uses, by one at the same addresses with the newest roster.
 
-    All its links end and are made anew.
+    All its links end and are made again.
 
     Args:
         session: From :func:`acquire`; it is released.

@@ -1,4 +1,4 @@
-"""How this process joins the network: where it listens, whom it connects to, and with which keys."""
+"""How this process joins the network: where it listens, what it connects to, and with which keys."""
 
 from __future__ import annotations
 

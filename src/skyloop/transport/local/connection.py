@@ -16,7 +16,7 @@ class ServerConnection:
     Args:
         sock: Accepted from the listener.
         peer: As the handler knows it.
-        who: The process at the other end, as the kernel says.
+        who: The process at the other end, as the kernel reports it.
     """
 
     __slots__ = (
@@ -35,16 +35,16 @@ class ServerConnection:
 
     def __init__(self, sock: Socket, peer: Peer, who: Credentials) -> None:
         sock.limit_backlog()
-        self.who = who  #: as the kernel says
+        self.who = who  #: as the kernel reports it
         self._socket = sock
         self._send = sock.send
         self.receive = sock.recv
         self.peer = peer
-        self.joined = False  #: it said hello, and the handler knows of it
-        self.admitted = False  #: it said who it is, and the handler let it stay
-        self.pilot = False  #: it said that it is one
+        self.joined = False  #: it sent Hello, and the handler knows of it
+        self.admitted = False  #: it sent who it is, and the handler let it stay
+        self.pilot = False  #: it stated that it is one
         self.ending = False  #: by the server: what it sent before is not wanted any more
-        self.reason = ""  #: why it ends, as soon as one end has said so
+        self.reason = ""  #: why it ends, as soon as one end has given a reason
         self.topics: set[str] = set()
 
     def limit_silence(self, seconds: float) -> None:
@@ -75,7 +75,7 @@ class ServerConnection:
     def hang_up(self, reason: str) -> None:
         """End the connection and send the reason to the application. Any thread.
 
-        The receiving thread notices the end as it does any other.
+        The receiving thread detects the end as it does any other.
         """
         if not self.ending:
             self.reason = self.reason or reason

@@ -261,7 +261,7 @@ def is_live(path: Path) -> bool:
 
 
 def owner_pid(path: Path) -> int | None:
-    """Return the process that listens at this path; None if that can't be told at once."""
+    """Return the process that listens at this path; None if that is not known at once."""
     probe = Socket()
     probe.setblocking(False)
     try:

@@ -41,7 +41,7 @@ class Viewer:
         self.connection = connection
         self.leases: dict[int, SlotMemory] = {}
         self.announced: set[int] = set()
-        self.retire_before = 0  #: slots below this number were retired, and the client is to be told so; 0: no
+        self.retire_before = 0  #: slots below this number were retired, and the client is to be notified; 0: no
         self.active = True  #: frames are sent to it; if not, it may still hold some
         self.waits = False  #: it was passed over
 
@@ -273,5 +273,5 @@ class FrameExchange:
         with self._lock:
             for name, camera in list(self._cameras.items()):
                 camera.leave(connection)
-                if not camera.viewers:  # it is made anew for the next one: no name is kept for nobody
+                if not camera.viewers:  # it is made again for the next one: no name is kept for nobody
                     del self._cameras[name]

@@ -72,7 +72,7 @@ class LocalServer(TransportServer):
         self._connections: set[ServerConnection] = set()
         self._peers: dict[int, ServerConnection] = {}  # by the peer's number
         self._topics: dict[str, tuple[ServerConnection, ...]] = {}
-        self._lock = PriorityLock()  # whoever holds it may call the handler
+        self._lock = PriorityLock()  # its holder may call the handler
         self._receivers: set[int] = set()  # identities of the receiving threads
         self._last_id = 0
         self._started = False
@@ -209,7 +209,7 @@ class LocalServer(TransportServer):
     def _make_room(self, who: Credentials) -> str:
         """Find a place for a caller; return why there is none, empty if there is.
 
-        Where all places are taken, the oldest connection that has not said who it is gives way, so that such
+        Where all places are taken, the oldest connection that has not sent who it is gives way, so that such
         connections keep nobody out, however many they are.
         """
         with self._lock:

@@ -110,7 +110,7 @@ class SlotView:
         self._interface = self._describe(capacity)
 
     def interface(self, size: int) -> dict[str, Any]:
-        """Return NumPy's description of the first ``size`` bytes; it is made anew only when their number changes."""
+        """Return NumPy's description of the first ``size`` bytes; it is made again only when their number changes."""
         if self._interface["shape"][0] != size:
             self._interface = self._describe(size)
         return self._interface

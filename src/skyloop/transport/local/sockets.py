@@ -30,7 +30,7 @@ class Socket(socket.socket):
 
     def __init__(self, fileno: int | None = None) -> None:
         super().__init__(socket.AF_UNIX, socket.SOCK_SEQPACKET, 0, fileno)
-        self.settimeout(None)  # whatever socket.setdefaulttimeout() says
+        self.settimeout(None)  # whatever socket.setdefaulttimeout() is set to
 
     def __del__(self) -> None:
         self.close()

@@ -15,7 +15,7 @@ Value: TypeAlias = bool | int | float | str | tuple[float, ...]
 
 
 class Category(Enum):
-    """Who a key belongs to when several sessions, users and applications are told apart (AR.Drone 2)."""
+    """Who a key belongs to when several sessions, users and applications are distinguished (AR.Drone 2)."""
 
     COMMON = "common"
     APPLICATION = "application"

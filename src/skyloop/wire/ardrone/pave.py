@@ -184,7 +184,7 @@ class PaveParser:
         while (inner := self._buffer.find(SIGNATURE, self._searched, limit)) >= 0:
             self._searched = inner
             if inner + MIN_HEADER > len(self._buffer):
-                return False  # cannot be told yet
+                return False  # not known yet
             if _read_header(self._buffer, inner, self.max_payload) is not None:
                 self.broken_frames += 1
                 self._skip(inner)

@@ -61,7 +61,7 @@ class Codec:
             self._receiver.buf, self._receiver.buf_index = bytearray(), 0
         try:
             found = self._receiver.parse_buffer(data) or []
-        except Exception:  # noqa: BLE001  whatever a field of noise made of it: begin anew with the next bytes
+        except Exception:  # noqa: BLE001  whatever a field of noise made of it: restart with the next bytes
             self._receiver = self._fresh()
             self.damaged += 1
             return []

@@ -25,7 +25,7 @@ class Texts:
     def __init__(self) -> None:
         self._open: dict[tuple[int, int], tuple[int, dict[int, str]]] = {}
 
-    def heard(self, message: Message) -> list[tuple[int, str]]:
+    def on_message(self, message: Message) -> list[tuple[int, str]]:
         """The texts that are complete with this message, with their severities (0 emergency to 7 debug)."""
         text = _printable(message.text)
         number = message.id

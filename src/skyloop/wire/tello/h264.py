@@ -1,4 +1,4 @@
-"""As much of H.264 as it takes to tell pictures apart and to notice that one is missing. ITU-T H.264, 7.3 and 7.4."""
+"""As much of H.264 as it takes to separate pictures and to detect that one is missing. ITU-T H.264, 7.3 and 7.4."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ def shape_of(command: str) -> Shape:
 
 
 def is_error(reply: str) -> bool:
-    """Whether it says that a command was not done, whichever."""
+    """Whether it reports that a command, whichever, was not executed."""
     return _ERROR.match(reply) is not None
 
 

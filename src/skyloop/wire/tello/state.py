@@ -1,8 +1,8 @@
 """The Tello's state, ten texts a second, as typed values in the units that it comes in; what it does not know is None.
 
 Axes are those of aviation, x forward, y right, z down: positive pitch is nose up, positive roll right side down,
-positive yaw clockwise. That attitude and accelerations agree in this is seen in recorded strings: a Tello that tells a
-pitch of 8° tells 0.116 g along its x.
+positive yaw clockwise. That attitude and accelerations agree in this is seen in recorded strings: a Tello that sends a
+pitch of 8° sends 0.116 g along its x.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from skyloop.errors import DecodeError
 LONGEST: Final = 1024
 FIELDS: Final = 64  #: more than any version has
 NO_DISTANCE_CM: Final = 6553  #: the distance sensor's "nothing measured"
-GROUND_CM: Final = 10  #: what the distance sensor tells on the ground, and the least that it can
+GROUND_CM: Final = 10  #: what the distance sensor reports on the ground, and the least that it can
 NO_PAD: Final = -1  #: none is seen; -2: they are not looked for
 NOWHERE_CM: Final = -100  #: each coordinate while no pad is seen
 _FIELD: Final = re.compile(r"([a-z]+):(-?\d+(?:\.\d+)?(?:,-?\d+(?:\.\d+)?){0,2})\Z")
@@ -36,7 +36,7 @@ class Pad:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """One state string. None: not told, or told as what means that it is not known."""
+    """One state string. None: missing, or the value that means "not known"."""
 
     pitch_deg: float | None = None
     roll_deg: float | None = None
@@ -46,12 +46,12 @@ class State:
     distance_cm: float | None = None  #: ``tof``: to what is below
     height_cm: float | None = None  #: above where it took off; may be negative
     battery_percent: float | None = None
-    barometer: float | None = None  #: as told; its zero and unit differ between versions
+    barometer: float | None = None  #: as sent; its zero and unit differ between versions
     motor_s: int | None = None  #: how long motors have run since it was switched on
     acceleration_mg: Vector | None = None
     pad: Pad | None = None
-    pads: bool = False  #: whether it tells of pads at all
-    fields: tuple[tuple[str, float | Vector], ...] = ()  #: all of it, as told
+    pads: bool = False  #: whether it has fields for pads at all
+    fields: tuple[tuple[str, float | Vector], ...] = ()  #: all of it, as sent
 
 
 def parse(datagram: bytes) -> State:

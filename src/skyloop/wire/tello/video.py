@@ -1,7 +1,7 @@
 """The Tello's video datagrams to pictures: H.264 in Annex B form, cut into pieces of 1460 bytes, without any header.
 
 Nothing numbers the pieces. A piece that is shorter than the others ends a picture; one that begins with a start code
-begins the next. Of a picture whose piece was lost in the middle nothing tells but that it does not decode.
+begins the next. Of a picture whose piece was lost in the middle the only sign is that it does not decode.
 """
 
 from __future__ import annotations
