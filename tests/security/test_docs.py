@@ -63,7 +63,7 @@ def test_each_row_about_the_door_is_a_test() -> None:
 
 
 def test_each_row_about_replays_is_a_test() -> None:
-    table = rows(section(PAGE, "## Commands that are sent again"))
+    table = rows(section(PAGE, "## Replayed commands"))
     assert table == [[words, f"`{reason}`"] for words, (_, reason) in REPLAYS.items()]
     for name, _ in REPLAYS.values():
         assert callable(getattr(test_replays, f"test_{name}")), name
