@@ -9,7 +9,7 @@ from typing import Any
 from skyloop.client.authority import AuthorityTracker
 from skyloop.client.command_schedule import CommandSchedule
 from skyloop.client.commands import CommandSender
-from skyloop.client.scheduler import Scheduler
+from skyloop.client.connection import Scheduler
 from skyloop.cockpit.control_session import GONE_S
 from skyloop.messages import Command, EmergencyStop, FlightState, Hover, RequestAuthority, Role, Velocity, decode
 from tests.cockpit.fake import Node, until

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from skyloop.client import Drone, Frame
+from skyloop.client.connection import Scheduler
 from skyloop.client.drone import open_drone
-from skyloop.client.scheduler import Scheduler
 from skyloop.errors import UsageError
 from skyloop.messages import Applied, FlightState, Velocity
 from skyloop.proxy.proxy import Proxy

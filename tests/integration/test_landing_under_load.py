@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 
+from skyloop.client.connection import Scheduler
 from skyloop.client.drone import open_drone
-from skyloop.client.scheduler import Scheduler
 from skyloop.messages import EventKind, Failsafe, FlightState, Hover, Land, Refusal, Takeoff
 from skyloop.transport.testing import wait_until
 from tests.proxy.fake import Bench

@@ -8,9 +8,9 @@ from collections.abc import Iterator
 import msgspec
 import pytest
 
+from skyloop.client.connection import Scheduler
 from skyloop.client.feedback_history import FeedbackHistory
 from skyloop.client.results import MAX_CHANNELS, MAX_WORKERS, Result, ResultChannels, ResultMailbox
-from skyloop.client.scheduler import Scheduler
 from skyloop.messages import (
     Annotation,
     Done,

@@ -10,12 +10,11 @@ from contextlib import contextmanager
 from types import TracebackType
 from typing import Final, Generic, Protocol, Self, TypedDict, TypeVar
 
-from skyloop.client.connection import ProxyConnection
+from skyloop.client.connection import ProxyConnection, Scheduler
 from skyloop.client.feedback_history import FeedbackHistory
 from skyloop.client.frame import Arrival, Frame, SmallArrival
 from skyloop.client.link_monitor import StallWatch
 from skyloop.client.mailbox import Holder, Mailbox
-from skyloop.client.scheduler import Scheduler
 from skyloop.client.statistics import ChannelCounter, ChannelStats
 from skyloop.errors import DecodeError
 from skyloop.messages import CameraInfo, EncodedFrame, EventKind, FrameHeader, Severity, VideoRequest

@@ -11,8 +11,7 @@ from typing import Final
 from skyloop.client.authority import AuthorityStatus, AuthorityTracker
 from skyloop.client.channels import Emit
 from skyloop.client.command_schedule import CommandSchedule
-from skyloop.client.connection import ProxyConnection
-from skyloop.client.scheduler import Scheduler
+from skyloop.client.connection import ProxyConnection, Scheduler
 from skyloop.client.statistics import ChannelCounter
 from skyloop.errors import AuthorityError, LinkError, NoAnswerError, UsageError
 from skyloop.messages import (

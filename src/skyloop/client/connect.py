@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, ParamSpec, Protocol, TypeAlias, TypedDict, TypeVar, Unpack
 
 from skyloop.client.authority import Authority, check_seconds
+from skyloop.client.connection import Scheduler
 from skyloop.client.core import Access, DroneCore, OnExit
 from skyloop.client.drone import Drone
-from skyloop.client.scheduler import Scheduler
 from skyloop.client.swarm import OnError, Swarm, check_policy, in_parallel
 from skyloop.errors import LinkError, SwarmError, UnknownNameError, UsageError
 from skyloop.transport.base import ClientHandler, Dialer, TransportClient, check_name

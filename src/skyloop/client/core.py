@@ -12,11 +12,10 @@ from skyloop.client.channels import Listener, VideoChannel
 from skyloop.client.command_schedule import CommandSchedule
 from skyloop.client.commands import CommandSender
 from skyloop.client.completion import ActionWait
-from skyloop.client.connection import ConnectionSupervisor, ProxyConnection, RedialPolicy
+from skyloop.client.connection import ConnectionSupervisor, ProxyConnection, RedialPolicy, Scheduler
 from skyloop.client.logbook import Logbook
 from skyloop.client.parameters import Config, Restorer
 from skyloop.client.results import ResultChannel, checked_age, checked_name
-from skyloop.client.scheduler import Scheduler
 from skyloop.client.telemetry import ClientState, Mailboxes, Receiver
 from skyloop.client.worker import Membership
 from skyloop.errors import (

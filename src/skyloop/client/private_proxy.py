@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from skyloop.child_process import GRACE_S, ChildProcess
-from skyloop.client.scheduler import Scheduler
+from skyloop.client.connection import Scheduler
 from skyloop.errors import LinkError, NoAnswerError, UsageError
 from skyloop.transport.base import ClientHandler, Dialer, TransportClient
 

@@ -12,10 +12,9 @@ from typing import Any, Final, TypeVar
 import msgspec
 
 from skyloop.client.channels import Channel, Listener
-from skyloop.client.connection import ProxyConnection
+from skyloop.client.connection import ProxyConnection, Scheduler
 from skyloop.client.feedback_history import FeedbackHistory
 from skyloop.client.mailbox import Mailbox, Notifier
-from skyloop.client.scheduler import Scheduler
 from skyloop.client.statistics import ChannelCounter, ChannelStats
 from skyloop.clock import Clock
 from skyloop.errors import DecodeError, UsageError

@@ -11,13 +11,12 @@ from typing import Final, Self
 
 from skyloop.client.channels import Channel, VideoChannel, usual
 from skyloop.client.commands import CommandSender
-from skyloop.client.connection import ProxyConnection
+from skyloop.client.connection import ProxyConnection, Scheduler
 from skyloop.client.feedback_history import FeedbackHistory
 from skyloop.client.frame import Arrival, Frame
 from skyloop.client.mailbox import Mailbox
 from skyloop.client.parameters import Restorer
 from skyloop.client.results import Result, ResultChannels, ResultMailbox
-from skyloop.client.scheduler import Scheduler
 from skyloop.client.statistics import ChannelCounter, ChannelStats
 from skyloop.errors import UnknownNameError
 from skyloop.messages import (

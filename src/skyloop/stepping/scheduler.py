@@ -6,9 +6,8 @@ import threading
 from collections.abc import Callable
 from typing import Final, Protocol
 
-from skyloop.client.connection import ConnectionSupervisor
+from skyloop.client.connection import ConnectionSupervisor, Scheduler
 from skyloop.client.mailbox import Notifier
-from skyloop.client.scheduler import Scheduler
 from skyloop.clock import NS_PER_S, ManualClock, nanoseconds
 from skyloop.errors import UsageError
 from skyloop.messages import LinkState
