@@ -27,6 +27,7 @@ from skyloop.messages import Feedback as Feedback
 from skyloop.messages import FlightState as FlightState
 from skyloop.messages import Points as Points
 from skyloop.messages import Polyline as Polyline
+from skyloop.messages import Position as Position
 from skyloop.messages import Text as Text
 from skyloop.messages import Velocity as Velocity
 from skyloop.motion_capture import mocap as mocap

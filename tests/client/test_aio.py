@@ -52,6 +52,7 @@ def test_a_flight(proxy: ScriptedProxy) -> None:
             assert drone.feedback().state is FlightState.HOVERING
             assert drone.velocity(forward=0.1)
             assert drone.attitude(pitch=0.1)
+            await drone.go_to(x=0, y=0, z=1, wait=False)
             assert drone.hover()
             assert drone.idle()
             assert drone.command(Hover())

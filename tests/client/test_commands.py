@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -26,6 +27,7 @@ from skyloop.messages import (
     Hover,
     Idle,
     Land,
+    Position,
     Refusal,
     Refused,
     ReleaseAuthority,
@@ -86,6 +88,17 @@ def test_idle_keeps_the_authority_before_the_first_command(proxy: ScriptedProxy,
         (lambda drone: drone.command("hover"), "a command is one of attitude, "),
         (lambda drone: drone.command(Velocity(forward=math.nan)), "NaN"),
         (lambda drone: drone.request_authority(32), "from 0"),
+        (lambda drone: drone.go_to(x=math.nan, y=0.0, z=1.0), "x is nan and must be finite"),
+        (lambda drone: drone.go_to(x=0.0, y="1", z=1.0), "y is '1' and must be a number"),
+        (lambda drone: drone.go_to(x=0.0, y=0.0, z=True), "z is True"),
+        (lambda drone: drone.go_to(x=0.0, y=2e5, z=1.0), "y is 200000 m and must be within"),
+        (lambda drone: drone.go_to(x=0.0, y=0.0, z=1.0, yaw=math.inf), "yaw is inf"),
+        (lambda drone: drone.go_to(x=0.0, y=0.0, z=1.0, speed=0.0), "speed is 0 m/s and must be more than 0"),
+        (lambda drone: drone.go_to(x=0.0, y=0.0, z=1.0, tolerance_m=0.0), "tolerance_m is 0 and must be more than 0"),
+        (lambda drone: drone.go_to(x=0.0, y=0.0, z=1.0, tolerance_rad=-1), "tolerance_rad is -1"),
+        (lambda drone: drone.command(Position(0.0, 0.0, math.nan)), "NaN"),
+        (lambda drone: drone.command(Position(0.0, 0.0, 1.0, speed=-1.0)), "position: speed is -1 m/s"),
+        (lambda drone: drone.command(Position("a", 0.0, 1.0)), "that is no number"),  # type: ignore[arg-type]
     ],
 )
 def test_unusable_arguments(drone: Drone, call: Callable[[Any], object], message: str) -> None:
@@ -212,6 +225,101 @@ def test_take_off_that_is_refused_for_good(
     thread.join(WAIT_S)
     after = len(proxy.commands)
     proxy.until(lambda: Idle() in proxy.actions()[after:], "what was refused is asked for no longer")
+
+
+PLACE = Position(1.0, 2.0, 1.5, 0.5, 0.8)
+THERE = {"position": (1.1, 2.0, 1.5), "yaw": 0.45, "velocity": (0.0, 0.0, 0.0)}
+
+
+def go_to(drone: Drone, timeout_s: float = WAIT_S) -> None:
+    drone.go_to(x=1.0, y=2.0, z=1.5, yaw=0.5, speed=0.8, timeout_s=timeout_s)
+
+
+@pytest.mark.parametrize(
+    "not_yet",
+    [{"position": (1.3, 2.0, 1.5)}, {"position": None}, {"yaw": 0.8}, {"yaw": None}, {"velocity": (0.5, 0.0, 0.0)}],
+)
+def test_go_to_waits_until_the_vehicle_is_there(proxy: ScriptedProxy, drone: Drone, not_yet: dict[str, Any]) -> None:
+    proxy.state = FlightState.FLYING
+    proxy.more |= THERE | not_yet
+    with pytest.raises(NoAnswerError, match=r"position was not completed within 0\.3 s: the vehicle is flying$"):
+        go_to(drone, timeout_s=0.3)
+    proxy.until_commanded(PLACE)
+    arriving = background(lambda: proxy.until_commanded(PLACE, len(proxy.commands)), lambda: proxy.more.update(THERE))
+    go_to(drone)
+    arriving.join(WAIT_S)
+    after = len(proxy.commands)
+    proxy.until(lambda: proxy.actions()[after:].count(PLACE) > 3, "it is told to stay there")
+
+
+def test_go_to_need_not_wait_and_does_not_decay(proxy: ScriptedProxy) -> None:
+    with flown(proxy, stall_s=0.05) as drone:
+        drone.go_to(x=1, y=2, z=1.5, wait=False)
+        wanted = Position(1.0, 2.0, 1.5)
+        proxy.until(lambda: proxy.actions().count(wanted) > 8, "a target is safe to hold")
+        assert Hover() not in proxy.actions()
+        assert {command.intent for command in proxy.commands if command.action == wanted} == {1}
+
+
+@pytest.mark.parametrize(
+    ("reason", "error"),
+    [
+        (Refusal.UNSUPPORTED, UnsupportedError),
+        (Refusal.WRONG_STATE, RefusedError),
+        (Refusal.OUT_OF_RANGE, RefusedError),
+        (Refusal.DRIVER_FAILED, RefusedError),
+    ],
+)
+def test_a_place_that_is_refused(
+    proxy: ScriptedProxy, drone: Drone, reason: Refusal, error: type[RefusedError | UnsupportedError]
+) -> None:
+    proxy.state = FlightState.FLYING
+
+    def vehicle() -> None:
+        command = proxy.until_commanded(PLACE)
+        proxy.event(EventKind.COMMAND_REFUSED, "me: never", "me", reason=reason.value, seq=command.seq)
+
+    refusing = background(vehicle)
+    with pytest.raises(error, match="me: never"):
+        go_to(drone)
+    refusing.join(WAIT_S)
+    after = len(proxy.commands)
+    proxy.until(lambda: Idle() in proxy.actions()[after:], "what was refused is asked for no longer")
+
+
+def test_a_failsafe_and_another_command_end_the_way(proxy: ScriptedProxy, drone: Drone) -> None:
+    proxy.state = FlightState.FLYING
+    failing = background(lambda: failsafe(proxy, proxy.until_commanded(PLACE)))
+    with pytest.raises(RefusedError, match="position was ended on the way, by a failsafe or a lost link"):
+        go_to(drone)
+    failing.join(WAIT_S)
+    proxy.more["failsafe"] = Failsafe.NONE
+    before = len(proxy.commands)
+    hovering = background(lambda: proxy.until_commanded(PLACE, before), drone.hover)
+    with pytest.raises(RefusedError, match="another command took its place"):
+        go_to(drone)
+    hovering.join(WAIT_S)
+
+
+def test_losing_the_authority_ends_the_way(proxy: ScriptedProxy, drone: Drone) -> None:
+    taking_over = background(lambda: proxy.until_commanded(PLACE), proxy.take_over)
+    with pytest.raises(AuthorityError, match="boss took over"):
+        go_to(drone)
+    taking_over.join(WAIT_S)
+
+
+def test_a_proxy_of_an_earlier_version_is_never_sent_what_it_does_not_know(proxy: ScriptedProxy) -> None:
+    older = frozenset({"takeoff", "land", "hover", "velocity"})
+    proxy.capabilities = msgspec.structs.replace(proxy.capabilities, actions=older)
+    with flown(proxy) as drone:
+        for wait in (True, False):
+            with pytest.raises(UnsupportedError, match="a proxy of an earlier version must be updated"):
+                drone.go_to(x=0.0, y=0.0, z=1.0, wait=wait)
+        with pytest.raises(UnsupportedError, match="position is not possible"):
+            drone.command(Position(0.0, 0.0, 1.0))
+        drone.hover()
+        proxy.until_commanded(Hover())
+        assert Position not in map(type, proxy.actions())
 
 
 def test_closing_or_losing_the_authority_ends_a_take_off(proxy: ScriptedProxy, drone: Drone) -> None:

@@ -193,13 +193,19 @@ class Flyer(Driver):
         self._thread: threading.Thread | None = None
 
     def capabilities(self) -> Capabilities:
-        return Capabilities("fake", frozenset(ACTION_NAMES.values()), (CameraInfo("front", 32, 24, 50.0),))
+        actions = frozenset(ACTION_NAMES.values()) - {"position"}  # the proxy flies it there
+        return Capabilities("fake", actions, (CameraInfo("front", 32, 24, 50.0),))
 
     def _open(self, sink: Sink) -> None:
         self._ended.clear()
         sink.link(LinkState.UP)
         self._thread = threading.Thread(target=self._run, args=(sink,), daemon=True, name="flyer")
         self._thread.start()
+
+    def link(self, state: LinkState) -> None:
+        """Tell this of the vehicle's link."""
+        assert self._sink is not None
+        self._sink.link(state, "told so")
 
     def _close(self) -> None:
         self._ended.set()

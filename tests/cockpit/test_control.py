@@ -19,7 +19,18 @@ from skyloop.cockpit.fleet import Fleet
 from skyloop.control import Controller
 from skyloop.control.follow import FollowMarker
 from skyloop.errors import DecodeError
-from skyloop.messages import AnyAction, EmergencyStop, Feedback, FlightState, Hover, Land, Role, Takeoff, Velocity
+from skyloop.messages import (
+    AnyAction,
+    EmergencyStop,
+    Feedback,
+    FlightState,
+    Hover,
+    Land,
+    LinkState,
+    Role,
+    Takeoff,
+    Velocity,
+)
 from tests.cockpit.fake import Node, Nodes, cockpit, open_socket, this_user, until
 from tests.cockpit.testclient import TestClient, WebSocketTestSession
 
@@ -284,6 +295,32 @@ def test_sticks_end_the_way_to_a_place(client: TestClient, node: Node) -> None:
         pilot.say("ping")
         pilot.wait("pong")
         assert node.flyer.applied[-1] == Hover()
+
+
+def test_a_place_that_the_proxy_refuses_is_told_with_its_reason(client: TestClient, node: Node) -> None:
+    with page(client) as pilot:
+        pilot.take().take_off()
+        pilot.say("set", name="safety.box.x_high", value=2.0)
+        pilot.wait("done", do="set")
+        pilot.say("goto", x=3, y=0, z=1)
+        assert "outside of the safety box" in pilot.wait("refused", do="goto")["why"]
+        until(lambda: node.flyer.state is FlightState.HOVERING)
+        pilot.say("goto", x=0.5, y=0, z=0.3)
+        with pilot.staying():
+            pilot.wait("done", do="goto")
+
+
+def test_a_way_that_something_else_ended_is_told(client: TestClient, node: Node) -> None:
+    with page(client) as pilot:
+        pilot.take().take_off()
+        pilot.say("goto", x=50, y=0, z=1)
+        until(lambda: node.flyer.state is FlightState.FLYING)
+        with pilot.staying():
+            node.flyer.link(LinkState.LOST)
+            pilot.wait("refused", do="goto")
+            node.flyer.link(LinkState.UP)
+        until(lambda: node.flyer.state is FlightState.HOVERING)
+        assert node.flyer.place[0] < 40.0
 
 
 def test_no_place_without_a_position() -> None:

@@ -41,6 +41,7 @@ from skyloop.messages import (
     Points,
     Polyline,
     Pong,
+    Position,
     ProcessorResult,
     ProcessorShare,
     Refusal,
@@ -89,6 +90,8 @@ SAMPLES: dict[str, Sample] = {
     "command-reset-emergency": Command(6, 7, 6, 1_000_000_006, ResetEmergency()),
     "command-attitude": Command(7, 7, 7, 1_000_000_007, Attitude(0.1, -0.05, 0.5, -0.25)),
     "command-velocity": Command(8, 7, 8, 1_000_000_008, Velocity(0.3, -0.1, 0.0, 0.1)),
+    "command-position": Command(9, 7, 9, 1_000_000_009, Position(1.5, -2.0, 1.2, 0.7, 0.8, 0.5)),
+    "command-position-minimal": Command(10, 7, 10, 1_000_000_010, Position(1.5, -2.0, 1.2)),
     "applied": Applied(
         8, 7, 2, 1_000_000_008, 1_000_090_008, Velocity(9.0, 0.0, 0.0, 0.0), Velocity(1.0, 0.0, 0.0, 0.0)
     ),
@@ -189,7 +192,9 @@ SAMPLES: dict[str, Sample] = {
             4711,
             "sim://?seed=1",
             6_000_000_000,
-            Capabilities("sim", frozenset({"takeoff"}), (CAMERA,), "a simulated quadrotor", "never mind"),
+            Capabilities(
+                "sim", frozenset({"takeoff"}), (CAMERA,), "a simulated quadrotor", "never mind", frozenset({"hover"})
+            ),
             "0c7b3a6e-5f1d-4a53-9f0e-1d2c3b4a5968/4026531834",
         ),
     ),

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from skyloop.errors import DecodeError
 from skyloop.messages import (
+    AnyReply,
     Attitude,
     AuthorityGranted,
     AuthorityQueued,
@@ -24,6 +25,7 @@ from skyloop.messages import (
     EventKind,
     Intrinsics,
     Kind,
+    Position,
     Reply,
     Request,
     RequestAuthority,
@@ -71,7 +73,39 @@ def test_an_older_proxy_does_not_tell_its_clock() -> None:
     older = decode((PACKETS / "older" / "reply-welcome-without-clock.bin").read_bytes())
     newer = SAMPLES["reply-welcome"]
     assert isinstance(newer, Reply)
-    assert older == Reply(newer.id, msgspec.structs.replace(newer.body, clock=""))
+    assert older == without_software(msgspec.structs.replace(newer.body, clock=""))
+
+
+def test_an_older_proxy_does_not_tell_what_it_adds_to_the_vehicles_actions() -> None:
+    newer = SAMPLES["reply-welcome"]
+    assert isinstance(newer, Reply)
+    assert isinstance(newer.body, Welcome)
+    older = decode((PACKETS / "older" / "reply-welcome-without-software.bin").read_bytes())
+    assert older == without_software(newer.body)
+
+
+def without_software(welcome: AnyReply) -> Reply:
+    assert isinstance(welcome, Welcome)
+    capabilities = msgspec.structs.replace(welcome.capabilities, software=frozenset())
+    return Reply(1, msgspec.structs.replace(welcome, capabilities=capabilities))
+
+
+@pytest.mark.parametrize(
+    ("action", "words"),
+    [
+        (Position(1e5 + 1, 0.0, 0.0), "x is 100001 m and must be within 100000 m"),
+        (Position(0.0, -1e9, 0.0), "y is -1e"),
+        (Position(0.0, 0.0, 1e6), "z is 1e"),
+        (Position(0.0, 0.0, 1.0, yaw=1e4), "yaw is 10000 rad and must be from -1000 to 1000"),
+        (Position(0.0, 0.0, 1.0, speed=0.0), "speed is 0 m/s and must be more than 0"),
+        (Position(0.0, 0.0, 1.0, yaw_rate=-1.0), "yaw_rate is -1 rad/s and must be more than 0"),
+    ],
+)
+def test_places_that_make_no_sense_say_so(action: Position, words: str) -> None:
+    assert action.finite
+    assert words in action.problem
+    assert not Position(1.0, 2.0, 3.0, -7.0, 0.1, 0.1).problem
+    assert not Velocity(1e9).problem
 
 
 @pytest.mark.parametrize(
@@ -200,7 +234,7 @@ def test_fields_of_a_later_version_are_skipped_and_defaults_fill_missing_ones() 
 
 @pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
 def test_non_finite_actions_decode_and_say_so(number: float) -> None:
-    for action in (Attitude(climb=number), Velocity(up=number)):
+    for action in (Attitude(climb=number), Velocity(up=number), Position(0.0, number, 0.0), Position(0, 0, 0, number)):
         sample = decode(encode(Command(1, 1, 1, 1, action)))
         assert isinstance(sample, Command)
         assert not sample.action.finite

@@ -35,6 +35,7 @@ from skyloop.messages import (
     Parameter,
     Ping,
     Pong,
+    Position,
     Reply,
     Request,
     RequestAuthority,
@@ -69,6 +70,7 @@ _NEXT = {
     Land: FlightState.LANDING,
     Attitude: FlightState.FLYING,
     Velocity: FlightState.FLYING,
+    Position: FlightState.FLYING,
     EmergencyStop: FlightState.EMERGENCY,
     ResetEmergency: FlightState.LANDED,
 }

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skyloop.clock import NS_PER_S
-from skyloop.messages import Attitude, Feedback, FlightState, Hover, Land, Takeoff, Velocity
+from skyloop.messages import Attitude, Feedback, FlightState, Hover, Land, Position, Takeoff, Velocity
+from skyloop.messages.geometry import wrap_angle
 from skyloop.proxy.core.autopilot import PERIOD_S, Autopilot, AutopilotSettings, software_actions
 
 ATTITUDE = frozenset({"attitude"})
@@ -77,9 +78,10 @@ def taken_off(mass: PointMass) -> Autopilot:
 @pytest.mark.parametrize(
     ("native", "added"),
     [
-        ({"attitude"}, {"takeoff", "hover", "land", "velocity"}),
-        ({"velocity"}, {"takeoff", "hover", "land"}),
-        ({"takeoff", "land", "hover", "attitude"}, {"velocity"}),
+        ({"attitude"}, {"takeoff", "hover", "land", "velocity", "position"}),
+        ({"velocity"}, {"takeoff", "hover", "land", "position"}),
+        ({"takeoff", "land", "hover", "attitude"}, {"velocity", "position"}),
+        ({"takeoff", "land", "hover", "velocity", "position"}, set()),
         ({"takeoff", "land"}, set()),
         (set(), set()),
     ],
@@ -282,3 +284,94 @@ def test_whatever_it_hears_it_never_tilts_beyond_the_limit(
         if told is not None:
             assert math.hypot(told.roll, told.pitch) <= 0.2 * (1 + 1e-9)
             assert abs(told.climb) <= 0.5
+
+
+# To a place ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("yaw", [0.0, 2.0, -3.0])
+@pytest.mark.parametrize("wind", [(0.0, 0.0), (0.8, -0.5)])
+def test_a_place_is_reached_and_held(yaw: float, wind: tuple[float, float]) -> None:
+    mass = PointMass(yaw=yaw, wind=wind)
+    autopilot = taken_off(mass)
+    autopilot.start(Position(3.0, -2.0, 2.0, yaw=-1.0), mass.now_ns, mass.feedback())
+    assert autopilot.state(FlightState.UNKNOWN) is FlightState.FLYING
+    fly(autopilot, mass, 30.0)
+    assert math.dist(mass.position, (3.0, -2.0, 2.0)) < 0.15
+    assert math.hypot(*mass.velocity) < 0.1
+    assert wrap_angle(mass.yaw + 1.0) == pytest.approx(0.0, abs=0.05)
+
+
+def test_the_heading_is_kept_where_none_is_asked_for() -> None:
+    mass = PointMass(yaw=0.5)
+    autopilot = taken_off(mass)
+    autopilot.start(Position(1.0, 1.0, 1.0), mass.now_ns, mass.feedback())
+    fly(autopilot, mass, 1.0)
+    mass.yaw = 0.8  # a gust turns it
+    fly(autopilot, mass, 9.0)
+    assert mass.yaw == pytest.approx(0.5, abs=0.05)
+    autopilot.start(Position(1.0, 1.0, 1.0, yaw=2.0), mass.now_ns, mass.feedback())
+    fly(autopilot, mass, 8.0)
+    autopilot.start(Position(0.0, 1.0, 1.0), mass.now_ns, mass.feedback())
+    fly(autopilot, mass, 8.0)
+    assert mass.yaw == pytest.approx(2.0, abs=0.05), "what it was turned to is kept, not what was before"
+
+
+PLACES = st.floats(-50.0, 50.0)
+
+
+@given(
+    st.tuples(PLACES, PLACES, PLACES),
+    st.tuples(PLACES, PLACES, PLACES),
+    st.floats(-math.pi, math.pi),
+    st.none() | st.floats(-10.0, 10.0),
+    st.floats(0.05, 10.0),
+    st.floats(0.05, 3.0),
+)
+def test_the_way_is_straight_and_within_its_speeds(
+    place: tuple[float, float, float],
+    target: tuple[float, float, float],
+    heading: float,
+    yaw: float | None,
+    speed: float,
+    yaw_rate: float,
+) -> None:
+    autopilot = Autopilot(frozenset({"velocity"}))
+    feedback = Feedback(captured_ns=0, yaw=heading, position=place)
+    autopilot.start(Position(*target, yaw, speed, yaw_rate), 0, feedback)
+    told = autopilot.step(0, feedback)
+    assert isinstance(told, Velocity)
+    cos, sin = math.cos(heading), math.sin(heading)
+    world = (cos * told.forward - sin * told.left, sin * told.forward + cos * told.left, told.up)
+    pace, away = math.hypot(*world), math.dist(place, target)
+    assert pace <= min(speed, away) + 1e-9
+    assert pace**2 / 2 <= 0.6 * away + 1e-6, "it can still be stopped there"
+    assert math.dist([one * away for one in world], [(b - a) * pace for a, b in zip(place, target, strict=True)]) < 1e-6
+    assert abs(told.yaw_rate) <= yaw_rate
+    turn = 0.0 if yaw is None else wrap_angle(yaw - heading)
+    assert told.yaw_rate * turn >= 0.0
+
+
+@pytest.mark.parametrize(
+    "lacking",
+    [{"position": None}, {"yaw": None}, {"captured_ns": -NS_PER_S}],
+    ids=["no position", "no yaw", "old"],
+)
+def test_it_stops_while_it_does_not_know_where_it_is(lacking: dict[str, object]) -> None:
+    autopilot = Autopilot(frozenset({"velocity"}))
+    known: dict[str, object] = {"captured_ns": 0, "yaw": 0.0, "position": (0.0, 0.0, 1.0)}
+    autopilot.start(Position(5.0, 0.0, 1.0), 0, Feedback(**known))  # type: ignore[arg-type]
+    assert autopilot.step(0, Feedback(**known)) == Velocity(forward=1.0)  # type: ignore[arg-type]
+    assert autopilot.step(0, Feedback(**(known | lacking))) == Velocity()  # type: ignore[arg-type]
+    assert autopilot.step(0, None) == Velocity()
+
+
+def test_what_is_not_allowed_on_the_way_is_not_flown() -> None:
+    autopilot = Autopilot(frozenset({"velocity"}))
+    autopilot.guard = lambda wanted, _feedback, _now_ns: Velocity(up=wanted.up)
+    feedback = Feedback(captured_ns=0, yaw=0.0, position=(0.0, 0.0, 1.0))
+    autopilot.start(Position(5.0, 0.0, 1.1), 0, feedback)
+    told = autopilot.step(0, feedback)
+    assert isinstance(told, Velocity)
+    assert (told.forward, told.left) == (0.0, 0.0)
+    assert told.up > 0.0

@@ -187,6 +187,34 @@ class Drone:
         """
         return self.sync.velocity(forward=forward, left=left, up=up, yaw_rate=yaw_rate)
 
+    async def go_to(
+        self,
+        *,
+        x: float,
+        y: float,
+        z: float,
+        yaw: float | None = None,
+        speed: float | None = None,
+        wait: bool = True,
+        timeout_s: float = 60.0,
+        tolerance_m: float = 0.2,
+        tolerance_rad: float = 0.15,
+    ) -> None:
+        """Fly straight to a place, and stay there; see :meth:`skyloop.client.Drone.go_to`."""
+        await in_thread(
+            lambda: self.sync.go_to(
+                x=x,
+                y=y,
+                z=z,
+                yaw=yaw,
+                speed=speed,
+                wait=wait,
+                timeout_s=timeout_s,
+                tolerance_m=tolerance_m,
+                tolerance_rad=tolerance_rad,
+            )
+        )
+
     def attitude(self, *, roll: float = 0.0, pitch: float = 0.0, climb: float = 0.0, yaw_rate: float = 0.0) -> bool:
         """Hold an attitude with a climb rate.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Awaitable, Callable, Generator, Iterator, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Generator, Iterator, Mapping, Sequence
 from types import TracebackType
 from typing import Any, TypeVar, Unpack
 
@@ -146,6 +146,20 @@ class Swarm:
     async def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> None:
         """Land all active drones at their present positions, at the same time."""
         await in_thread(lambda: self.sync.land(wait=wait, timeout_s=timeout_s))
+
+    async def go_to(
+        self,
+        places: Mapping[str, Sequence[float]],
+        *,
+        speed: float | None = None,
+        wait: bool = True,
+        timeout_s: float = 60.0,
+        tolerance_m: float = 0.2,
+    ) -> None:
+        """Fly each drone straight to its own place; see :meth:`skyloop.client.Swarm.go_to`."""
+        await in_thread(
+            lambda: self.sync.go_to(places, speed=speed, wait=wait, timeout_s=timeout_s, tolerance_m=tolerance_m)
+        )
 
     async def hover(self) -> dict[str, bool]:
         """Stop and hold the position, with all active drones."""

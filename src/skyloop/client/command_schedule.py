@@ -21,6 +21,7 @@ from skyloop.messages import (
     Hover,
     Idle,
     Land,
+    Position,
     ResetEmergency,
     Takeoff,
     Velocity,
@@ -60,7 +61,8 @@ class CommandSchedule:
 
         Args:
             rate_hz: Rate of repeats, 1 to 200 Hz.
-            stall_s: Time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never.
+            stall_s: Time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never. A
+                place to fly to does not decay: the vehicle stops there.
             min_interval_s: Least time between two set-points of the application [s]; repeats in between do not count.
             keep_s: A set-point given while the link was down is sent when it is back, if it is not older than this [s].
 
@@ -161,7 +163,7 @@ class CommandSchedule:
     @property
     def wants_flight(self) -> bool:
         """Whether the newest set-point keeps, or brings, the vehicle in the air."""
-        return isinstance(self.action, Takeoff | Hover | Velocity | Attitude)
+        return isinstance(self.action, Takeoff | Hover | Velocity | Attitude | Position)
 
     def _decays(self, now_ns: int) -> bool:
         if self._stall_ns is None or not isinstance(self.action, Velocity | Attitude):

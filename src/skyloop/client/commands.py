@@ -27,6 +27,7 @@ from skyloop.messages import (
     EventKind,
     Feedback,
     Land,
+    Position,
     Refused,
     ReleaseAuthority,
     RequestAuthority,
@@ -435,13 +436,59 @@ def checked(action: AnyAction) -> AnyAction:
     """Return ``action`` if it can be commanded.
 
     Raises:
-        UsageError: If it is no action, or has a number that is not finite.
+        UsageError: If it is no action, or has a number that is not finite or makes no sense.
     """
     if type(action) not in _ACTIONS:
         raise UsageError(f"a command is one of {', '.join(sorted(ACTION_NAMES.values()))}, not {action!r}")
-    if not action.finite:
+    try:
+        finite, problem = action.finite, action.problem
+    except TypeError as error:
+        raise UsageError(f"{action!r} has something that is no number: {error}") from None
+    if not finite:
         raise UsageError(f"{action!r} has a number that is NaN or infinite")
+    if problem:
+        raise UsageError(f"{action.name}: {problem}")
     return action
+
+
+def position_of(x: object, y: object, z: object, yaw: object = None, speed: object = None) -> Position:
+    """Return the action that flies to a place.
+
+    Args:
+        x: East [m].
+        y: North [m].
+        z: Up [m].
+        yaw: Counter-clockwise from x [rad]; None: keep the present one.
+        speed: Greatest one [m/s]; None: as fast as the limits allow.
+
+    Raises:
+        UsageError: If something is no number, not finite, or makes no sense.
+    """
+    place = Position(
+        number("x", x),
+        number("y", y),
+        number("z", z),
+        None if yaw is None else number("yaw", yaw),
+        None if speed is None else number("speed", speed),
+    )
+    checked(place)
+    return place
+
+
+def above_zero(name: str, value: object) -> float:
+    """Return ``value`` as a finite float above zero.
+
+    Args:
+        name: Name of the argument, for the error.
+        value: What was given.
+
+    Raises:
+        UsageError: If it is no such number.
+    """
+    found = number(name, value)
+    if not found > 0.0:
+        raise UsageError(f"{name} is {found:g} and must be more than 0")
+    return found
 
 
 def number(name: str, value: object) -> float:

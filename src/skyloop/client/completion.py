@@ -2,26 +2,49 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Set
+from collections.abc import Callable
 from typing import Final
 
 from skyloop.client.commands import CommandSender
 from skyloop.client.connection import ProxyConnection
 from skyloop.client.telemetry import ClientState
 from skyloop.errors import AuthorityError, ClosedError, NoAnswerError, RefusedError, UnsupportedError
-from skyloop.messages import AnyAction, Event, FlightState, Land, Refusal
+from skyloop.messages import AnyAction, Event, Feedback, FlightState, Land, Position, Refusal
+from skyloop.messages.geometry import wrap_angle
 
+AT_REST_M_S: Final = 0.3  #: a vehicle that is slower than this at its place has arrived
 _STALE_NS: Final = 100_000_000  #: feedback received sooner after a command may be older than it
+#: Refusals of one packet, not of what was asked for: the next repeat is younger, and newer.
+_OF_ONE_PACKET: Final = (Refusal.STALE, Refusal.OUT_OF_SEQUENCE)
+
+
+def is_there(target: Position, feedback: Feedback, tolerance_m: float, tolerance_rad: float) -> bool:
+    """Return whether a vehicle is in the air at a place, and nearly at rest.
+
+    Args:
+        target: The place.
+        feedback: The vehicle's; without a velocity it counts as at rest.
+        tolerance_m: How far from it is near enough [m].
+        tolerance_rad: The same of its yaw, if it has one [rad].
+    """
+    if feedback.position is None or math.dist(feedback.position, target.place) > tolerance_m:
+        return False
+    yaw = feedback.yaw
+    if target.yaw is not None and (yaw is None or abs(wrap_angle(target.yaw - yaw)) > tolerance_rad):
+        return False
+    flies = feedback.state.airborne or feedback.state is FlightState.UNKNOWN
+    return flies and (feedback.velocity is None or math.hypot(*feedback.velocity) <= AT_REST_M_S)
 
 
 class ActionWait:
-    """One commanded action, and the wait for newer feedback that shows one of its final states."""
+    """One commanded action, and the wait for newer feedback that shows that it is done."""
 
     def __init__(
         self,
         action: AnyAction,
-        states: Set[FlightState],
+        is_done: Callable[[Feedback], bool],
         send: Callable[[AnyAction], object],
         closed: Callable[[], bool],
         commands: CommandSender,
@@ -32,7 +55,7 @@ class ActionWait:
 
         Args:
             action: The action.
-            states: Flight states in which it is done.
+            is_done: Whether feedback that is newer than the action shows it.
             send: Sends it, now and where it is commanded again.
             closed: Whether the drone was closed.
             commands: Tells what became of the command.
@@ -43,7 +66,7 @@ class ActionWait:
             AuthorityError: As ``send`` does.
         """
         self._action = action
-        self._states = states
+        self._is_done = is_done
         self._send = send
         self._closed = closed
         self._commands = commands
@@ -51,8 +74,8 @@ class ActionWait:
         self._connection = connection
         self._asked_ns = state.scheduler.clock()
         self._problem: Exception | None = None
+        self._seq = commands.seq + 1  # it may be sent a little later: what was refused before it does not concern it
         send(action)
-        self._seq = commands.seq
 
     def wait(self, timeout_s: float, deadline_s: float) -> None:
         """Wait until the action is done.
@@ -76,17 +99,21 @@ class ActionWait:
 
     def _over(self) -> bool:
         """Whether it is done, or waiting longer is of no use."""
+        if type(self._action) is Position:  # a vehicle may be there and be refused to stay
+            self._problem = self._why_not()
+            if self._problem is not None:
+                return True
         newest = self._state.newest
         new = self._state.received_ns - self._asked_ns > _STALE_NS
-        if newest is not None and newest.state in self._states and new:
+        if newest is not None and new and self._is_done(newest):
             return True
         self._problem = self._why_not()
         if self._problem is not None:
             return True
         if type(self._action) is Land and (self._commands.lapsed(self._action) or self._is_too_old()):
             # Old set-points are not sent again by themselves, but the caller still waits for this landing.
+            self._seq = self._commands.seq + 1
             self._send(self._action)
-            self._seq = self._commands.seq
         return False
 
     def _why_not(self) -> Exception | None:
@@ -97,10 +124,19 @@ class ActionWait:
         status = self._commands.status
         if status.state in ("queued", "preempted"):
             return AuthorityError(f"{name}: {status.holder or 'another application'} took over the authority")
+        if type(self._action) is Position and self._commands.lapsed(self._action):
+            return RefusedError(
+                f"{name} was ended on the way, by a failsafe or a lost link: ask anew", code="not_fresh"
+            )
+        if type(self._action) is Position and status.state == "held" and not self._commands.is_newest(self._action):
+            return RefusedError(f"{name} was ended on the way: another command took its place", code="replaced")
         refusal = self._state.refusal
         if refusal is None or not self._concerns(refusal):
             return None
         reason = refusal.data.get("reason")
+        if type(self._action) is Position and reason not in _OF_ONE_PACKET:
+            unsupported = reason == Refusal.UNSUPPORTED
+            return UnsupportedError(refusal.text) if unsupported else RefusedError(refusal.text, code=str(reason))
         if reason == Refusal.UNSUPPORTED:
             return UnsupportedError(refusal.text)
         if reason == Refusal.WRONG_STATE:

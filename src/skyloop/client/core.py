@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Set
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, Final, Literal, Protocol, TypedDict
 
@@ -29,12 +29,15 @@ from skyloop.errors import (
 )
 from skyloop.messages import (
     AnyAction,
+    Capabilities,
     EventKind,
+    Feedback,
     FlightState,
     Hello,
     Hover,
     Land,
     LinkState,
+    Position,
     Role,
     Severity,
 )
@@ -228,7 +231,7 @@ class DroneCore:
         try:
             if not self.closed and self._flies():
                 if self._on_exit == "land":
-                    self.complete(Land(), DOWN, True, LANDING_S)
+                    self.complete(Land(), lambda feedback: feedback.state in DOWN, True, LANDING_S)
                 else:
                     self.command(Hover())
         except SkyloopError as error:
@@ -285,10 +288,12 @@ class DroneCore:
         if welcome is not None and not welcome.capabilities.actions:
             why_not = welcome.capabilities.why_not or "the vehicle takes no commands"
             raise UnsupportedError(f"{action.name} is not possible: {why_not}")
+        if welcome is not None and type(action) is Position:
+            _check_knows_places(welcome.capabilities)
         return self.commands.command(action, now=now)
 
-    def complete(self, action: AnyAction, states: Set[FlightState], wait: bool, timeout_s: float) -> None:
-        """Send the command and, if ``wait``, wait until feedback shows one of ``states``; see :meth:`Drone.land`."""
+    def complete(self, action: AnyAction, is_done: Callable[[Feedback], bool], wait: bool, timeout_s: float) -> None:
+        """Send the command and, if ``wait``, wait until feedback shows that it is done; see :meth:`Drone.land`."""
         if not wait:
             self.command(action, now=True)
             return
@@ -296,7 +301,7 @@ class DroneCore:
             self.check_may_wait()
         deadline_s = time.monotonic() + timeout_s
         waiting = ActionWait(
-            action, states, self.command, lambda: self.closed, self.commands, self.state, self.connection
+            action, is_done, self.command, lambda: self.closed, self.commands, self.state, self.connection
         )
         self.check_may_wait()
         waiting.wait(timeout_s, deadline_s)
@@ -434,3 +439,12 @@ class DroneCore:
         """Emit an event that a callback of the application raised an exception."""
         text = f"{where} raised {type(error).__name__}: {error}"
         self.state.emit(EventKind.CALLBACK_ERROR, text, Severity.ERROR, where=where)
+
+
+def _check_knows_places(capabilities: Capabilities) -> None:
+    """Raise if the proxy does not know the action, which proxies of earlier versions would not even decode."""
+    if "position" not in capabilities.actions | capabilities.software:
+        raise UnsupportedError(
+            f"position is not possible: neither the vehicle ({capabilities.vehicle}) nor its proxy can fly to a "
+            "place; a proxy of an earlier version must be updated"
+        )

@@ -22,7 +22,8 @@ from skyloop.client.authority import (
     authority_wish,
 )
 from skyloop.client.channels import Channel, Listener, VideoOptions
-from skyloop.client.commands import checked, number
+from skyloop.client.commands import above_zero, checked, number, position_of
+from skyloop.client.completion import is_there
 from skyloop.client.core import DOWN, UP, DroneCore, DroneOptions
 from skyloop.client.frame import Arrival, Frame
 from skyloop.client.logbook import checked_time
@@ -276,7 +277,7 @@ class Drone:
             ClosedError: If the drone is closed.
             UsageError: If called with ``wait`` from an inline callback; nothing is sent.
         """
-        self._core.complete(Takeoff(), UP, wait, timeout_s)
+        self._core.complete(Takeoff(), lambda feedback: feedback.state in UP, wait, timeout_s)
 
     def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> None:
         """Land at the present position.
@@ -297,7 +298,7 @@ class Drone:
             ClosedError: If the drone is closed.
             UsageError: If called with ``wait`` from an inline callback; the landing is commanded all the same.
         """
-        self._core.complete(Land(), DOWN, wait, timeout_s)
+        self._core.complete(Land(), lambda feedback: feedback.state in DOWN, wait, timeout_s)
 
     def hover(self) -> bool:
         """Stop and hold the position. Returns and raises as every command; see :class:`Drone`."""
@@ -338,6 +339,52 @@ class Drone:
         return self._core.command(
             Attitude(number("roll", roll), number("pitch", pitch), number("climb", climb), number("yaw_rate", yaw_rate))
         )
+
+    def go_to(
+        self,
+        *,
+        x: float,
+        y: float,
+        z: float,
+        yaw: float | None = None,
+        speed: float | None = None,
+        wait: bool = True,
+        timeout_s: float = 60.0,
+        tolerance_m: float = 0.2,
+        tolerance_rad: float = 0.15,
+    ) -> None:
+        """Fly straight to a place, and stay there.
+
+        World axes, those of ``Feedback.position``. ArduPilot and PX4 do it natively, elsewhere the proxy flies by
+        velocity. Unlike a velocity it does not decay when the application falls silent: the vehicle stops there. The
+        place is held until the next command, also after a time-out. Nothing keeps it away from obstacles.
+
+        Args:
+            x: East [m].
+            y: North [m].
+            z: Up [m].
+            yaw: Counter-clockwise from x, turned to on the way [rad]; None: keep the present one.
+            speed: Greatest speed on the way [m/s]; None: as fast as ``limits.speed`` and ``limits.climb`` allow, which
+                hold in any case.
+            wait: Wait until the vehicle is there and nearly at rest; else only send the command.
+            timeout_s: How long to wait [s].
+            tolerance_m: How far from the place is near enough [m].
+            tolerance_rad: The same of ``yaw`` [rad].
+
+        Raises:
+            NoAnswerError: If the vehicle is not there in time; names its state and, if known, the reason.
+            RefusedError: If the proxy refuses it, as where the position is not known, the place is outside of the
+                safety box or in a no-fly zone, or a zone is in the way; or if a failsafe or another command ends it.
+            UnsupportedError: If neither the vehicle nor its proxy can fly to a place.
+            LinkError: Without ``wait``, if the link is down; the vehicle does not fly there later either.
+            AuthorityError: If the authority is not held, or another application takes it over meanwhile.
+            ClosedError: If the drone is closed.
+            UsageError: If a number is not finite or makes no sense, or if called with ``wait`` from an inline callback;
+                nothing is sent.
+        """
+        place = position_of(x, y, z, yaw, speed)
+        near_m, near_rad = above_zero("tolerance_m", tolerance_m), above_zero("tolerance_rad", tolerance_rad)
+        self._core.complete(place, lambda feedback: is_there(place, feedback, near_m, near_rad), wait, timeout_s)
 
     def emergency_stop(self) -> bool:
         """Cut the motors at once: the vehicle falls.

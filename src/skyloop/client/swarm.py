@@ -6,7 +6,7 @@ import logging
 import threading
 import time
 from array import array
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from types import TracebackType
@@ -15,7 +15,7 @@ from typing import Final, Literal, Self, TypeVar, get_args
 import numpy as np
 
 from skyloop.client.authority import AuthorityStatus, TakeoverWay
-from skyloop.client.commands import checked, number
+from skyloop.client.commands import above_zero, checked, number, position_of
 from skyloop.client.drone import Drone
 from skyloop.client.statistics import DEPTH, Distribution, distribution
 from skyloop.client.telemetry import Wanted, as_predicate
@@ -29,7 +29,7 @@ from skyloop.errors import (
     UnknownNameError,
     UsageError,
 )
-from skyloop.messages import AnyAction, Attitude, Feedback, Hover, Idle, LinkState, ResetEmergency, Velocity
+from skyloop.messages import AnyAction, Attitude, Feedback, Hover, Idle, LinkState, Position, ResetEmergency, Velocity
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -232,6 +232,48 @@ class Swarm:
         return self.command(
             Attitude(number("roll", roll), number("pitch", pitch), number("climb", climb), number("yaw_rate", yaw_rate))
         )
+
+    def go_to(
+        self,
+        places: Mapping[str, Sequence[float]],
+        *,
+        speed: float | None = None,
+        wait: bool = True,
+        timeout_s: float = 60.0,
+        tolerance_m: float = 0.2,
+    ) -> None:
+        """Fly each drone straight to its own place, all at the same time; see :meth:`Drone.go_to`.
+
+        Nothing keeps the drones apart on the way: :class:`skyloop.control.Formation` plans ways that do. Drones that
+        are set aside are left out.
+
+        Args:
+            places: By name of the drone: x, y, z in its world axes [m], and if wanted the yaw [rad].
+            speed: Greatest speed on the way [m/s]; None: as fast as the limits allow.
+            wait: Wait until each is there; else only send the commands.
+            timeout_s: How long to wait [s].
+            tolerance_m: How far from its place is near enough [m].
+
+        Raises:
+            UnknownNameError: If no drone of the swarm has one of the names; nothing is sent then.
+            UsageError: If a place can't be flown to; nothing is sent then.
+            SwarmError: As ``on_error`` says.
+            ClosedError: If the swarm was closed.
+        """
+        self._check_open()
+        wanted = {name: _place(name, place, speed) for name, place in places.items()}
+        near_m = above_zero("tolerance_m", tolerance_m)
+        for name in wanted:
+            self[name]
+
+        def job(drone: Drone, to: Position) -> Callable[[], None]:
+            return lambda: drone.go_to(
+                x=to.x, y=to.y, z=to.z, yaw=to.yaw, speed=speed, wait=wait, timeout_s=timeout_s, tolerance_m=near_m
+            )
+
+        jobs = {name: job(drone, wanted[name]) for name, drone in self.active.items() if name in wanted}
+        _, errors = in_parallel(jobs)
+        self.fail("go_to", errors)
 
     def reset_emergency(self) -> dict[str, bool]:
         """Leave the emergency state, on the ground, with all active drones."""
@@ -525,6 +567,13 @@ def _try_all(items: Mapping[str, T], function: Callable[[T], R]) -> tuple[dict[s
         except SkyloopError as error:
             errors[name] = error
     return results, errors
+
+
+def _place(name: str, numbers: Sequence[float], speed: float | None) -> Position:
+    if not 3 <= len(numbers) <= 4:
+        raise UsageError(f"the place of {name} is {numbers!r:.60} and must be x, y, z [m], and if wanted the yaw [rad]")
+    x, y, z, yaw = (*numbers, None)[:4]
+    return position_of(x, y, z, yaw, speed)
 
 
 def _wait_open(drones: Mapping[str, Drone]) -> None:

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from starlette.websockets import WebSocket
 
+from skyloop.client.commands import position_of
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
 from skyloop.cockpit.commands import (
     Alive,
@@ -41,9 +42,9 @@ from skyloop.cockpit.commands import (
 from skyloop.cockpit.feeds import call_soon
 from skyloop.cockpit.stream import PageSocket
 from skyloop.cockpit.takeover import QueuePosition, TakeoverDialog
-from skyloop.control.waypoint import Waypoint, lacking, reached, velocity_to
+from skyloop.control.waypoint import Waypoint, lacking, reached
 from skyloop.errors import AuthorityError, DecodeError, LinkError, RefusedError, SkyloopError
-from skyloop.messages import EventKind, FlightState, Land, LinkState, Refusal, Takeoff
+from skyloop.messages import EventKind, FlightState, Land, LinkState, Position, Refusal, Takeoff
 
 if TYPE_CHECKING:
     from skyloop.cockpit.pilot_connection import PilotConnection
@@ -54,7 +55,8 @@ SILENT_S: Final = 0.5  #: a page that flies and sends nothing for so long counts
 GONE_S: Final = (
     2.0  #: a page that receives nothing from the cockpit for so long flies nothing, and its control runs out
 )
-GOTO_PERIOD_S: Final = 0.05
+GOTO_M_S: Final = 1.0  #: greatest speed on the way to a place
+GOTO_PERIOD_S: Final = 0.05  #: between looks whether it is there
 _REFUSE_AGAIN_S: Final = 1.0  # the same refusal of sticks, which come twenty times a second
 _UP: Final = frozenset({FlightState.HOVERING, FlightState.FLYING})
 _DOWN: Final = frozenset({FlightState.LANDED})
@@ -204,9 +206,14 @@ class ControlSession:
         if not pilot.feedback().state.airborne:
             raise RefusedError("it can't be flown to a place: it is not in the air, take off first")
         goal = Waypoint(command.x, command.y, command.z, command.yaw)
+        place = position_of(goal.x, goal.y, goal.z, goal.yaw, GOTO_M_S)
         self._end_flight()
+        if not pilot.command(place):
+            with suppress(SkyloopError):
+                pilot.idle()  # or it would fly there after all when the link is back soon
+            raise LinkError(f"{command.do} was not sent: the link to the proxy is {pilot.link.application}")
         self._station.goals[self.app] = goal
-        self._goto = self._start_job(self._follow(pilot, goal))
+        self._goto = self._start_job(self._follow(pilot, place, goal))
         self._acknowledge(command)
         self._restart_silence_timer()
 
@@ -280,11 +287,12 @@ class ControlSession:
         value = await asyncio.to_thread(write)
         self._send({"type": "done", "do": command.do, "name": command.name, "value": value})
 
-    async def _follow(self, pilot: PilotConnection, goal: Waypoint) -> None:
-        """Fly to a place. Ends there, with the first thing that goes wrong, and with the page's next command."""
+    async def _follow(self, pilot: PilotConnection, place: Position, goal: Waypoint) -> None:
+        """Watch the way to a place. Ends there, with the first thing that goes wrong, and with the next command."""
         try:
             while not reached(goal, pilot.feedback(max_age_s=1.0)):
-                pilot.command(velocity_to(goal, pilot.feedback()))
+                if pilot.has_ended(place):
+                    raise RefusedError("it was ended on the way, by a failsafe or a lost link")
                 await asyncio.sleep(GOTO_PERIOD_S)
             pilot.hover()
             self._send({"type": "done", "do": "goto"})
@@ -453,6 +461,8 @@ class ControlSession:
         self._refused_command = self._commands
         self._awaited = None
         self._refuse(self._last_command, event.text)
+        if self._goto is not None:
+            self._hover()
         if self._last_command == TakeOff().do:
             with suppress(SkyloopError):
                 pilot.idle()  # or it would take off, to everybody's surprise, once it can

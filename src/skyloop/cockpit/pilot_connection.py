@@ -9,7 +9,7 @@ from skyloop.client.commands import ANSWER_S
 from skyloop.client.core import DroneCore
 from skyloop.clock import monotonic_ns
 from skyloop.errors import LinkError, RefusedError
-from skyloop.messages import AnswerTakeover, FlightState, LinkState, Refused
+from skyloop.messages import AnswerTakeover, AnyAction, FlightState, LinkState, Refused
 from skyloop.transport.base import Dialer
 
 
@@ -86,6 +86,10 @@ class PilotConnection(Drone):
     def proxy_now_ns(self) -> int:
         """The time on the proxy's clock, as estimated."""
         return monotonic_ns() + self.clock_offset_ns
+
+    def has_ended(self, action: AnyAction) -> bool:
+        """Whether a failsafe, a lost link or a lost lease ended this action, while it was the newest."""
+        return self._core.commands.lapsed(action)
 
     @property
     def is_flying(self) -> bool:

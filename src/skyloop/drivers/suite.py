@@ -46,6 +46,7 @@ from skyloop.messages import (
     Idle,
     Land,
     LinkState,
+    Position,
     ResetEmergency,
     Takeoff,
     Value,
@@ -80,13 +81,14 @@ class DriverSuite:
     close_grace_s: ClassVar[float] = 2.0  #: for threads that were joined to vanish from the system's tables
 
     #: What the flight test commands: speed and climb [m/s], tilt [rad], yaw rate [rad/s]; how far the vehicle must go
-    #: (distance [m]) and turn [rad].
+    #: (distance [m]) and turn [rad]; and how near [m] it must come to a place that it is to fly to.
     speed: ClassVar[float] = 0.4
     climb: ClassVar[float] = 0.4
     tilt: ClassVar[float] = 0.08
     yaw_rate: ClassVar[float] = 0.6
     distance: ClassVar[float] = 0.15
     turn: ClassVar[float] = 0.2
+    near: ClassVar[float] = 0.15
 
     #: How old a sample or frame may be when it arrives [s].
     feedback_age_s: ClassVar[float] = 0.5
@@ -316,7 +318,8 @@ class DriverSuite:
         with self.opened() as (driver, sink):
             self.hear(sink)
             actions = driver.capabilities().actions
-            harmless: list[AnyAction] = [Idle(), Land(), Hover(), Attitude(climb=-0.1), Velocity(up=-0.1)]
+            set_points: list[AnyAction] = [Attitude(climb=-0.1), Velocity(up=-0.1), Position(0.0, 0.0, 0.0)]
+            harmless: list[AnyAction] = [Idle(), Land(), Hover(), *set_points]
             announced = [action for action in harmless if action.name in actions]
             if not announced:
                 raise unittest.SkipTest("the vehicle takes no actions")
@@ -404,12 +407,17 @@ class DriverSuite:
     # Flight --------------------------------------------------------------------------------------------------------
 
     def test_flight(self) -> None:
-        """The vehicle takes off, moves both ways along each axis with the right sign, and lands."""
+        """The vehicle takes off, moves both ways along each axis with the right sign, and lands.
+
+        One that takes positions flies to some besides.
+        """
         with self.opened(watch=set()) as (driver, sink):
             flight = Flight(self, driver, sink)
             flight.take_off()
             try:
                 flight.moves_along_axes()
+                if "position" in driver.capabilities().actions:
+                    flight.goes_to_places()
                 if "hover" in driver.capabilities().actions:
                     driver.apply(Hover())
                     flight.until(lambda f: f.state is FlightState.HOVERING, self.motion_timeout_s, "hovering")

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 
 from skyloop.drivers.base import Driver
 from skyloop.drivers.recording_sink import RecordingSink
-from skyloop.messages import Attitude, Feedback, FlightState, Hover, Land, Takeoff, Velocity
+from skyloop.messages import Attitude, Feedback, FlightState, Hover, Land, Position, Takeoff, Velocity
 from skyloop.messages.geometry import wrap_angle
 
 if TYPE_CHECKING:
     from skyloop.drivers.suite import DriverSuite
 
+NEAR_RAD = 0.3  #: so near is a vehicle turned to where it was told to look
 #: How far the vehicle went from the first sample to the second, with sign; None if it does not report it.
 Measure = Callable[[Feedback, Feedback], float | None]
 
@@ -125,6 +126,28 @@ class Flight:
             self._goes("yaw", _turned, sign * suite.turn, turn=sign * suite.yaw_rate)
             self._goes("forward", _ahead, sign * suite.distance, forward=sign * suite.speed)
             self._goes("left", _aside, sign * suite.distance, left=sign * suite.speed)
+
+    def goes_to_places(self) -> None:
+        """Fly to a place aside and above and turn, then back, for a vehicle that flies to places by itself.
+
+        Raises:
+            AssertionError: It was not there, or not turned, within the suite's ``motion_timeout_s``.
+        """
+        suite, start = self.suite, self.sink.newest
+        assert start is not None
+        assert start.position is not None, "a vehicle that takes positions tells its own"
+        x, y, z = start.position
+        turn = 0.0 if start.yaw is None else start.yaw + suite.turn
+        away = Position(x + suite.distance, y - suite.distance, z + suite.distance, turn, speed=suite.speed)
+        for place in (away, Position(x, y, z, speed=suite.speed)):
+            self.driver.apply(place)
+
+            def is_there(feedback: Feedback, place: Position = place) -> bool:
+                near = feedback.position is not None and math.dist(feedback.position, place.place) <= suite.near
+                turned = feedback.yaw is None or abs(wrap_angle(turn - feedback.yaw)) <= NEAR_RAD
+                return near and turned  # without a yaw it keeps the one that it has
+
+            self.until(is_there, suite.motion_timeout_s, f"at {place}")
 
     def _goes(self, axis: str, measure: Measure, goal: float, **set_point: float) -> None:
         """Command, wait until the vehicle has gone as far as the goal on its side, then stop."""

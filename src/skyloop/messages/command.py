@@ -6,10 +6,14 @@ Axes are the body's (ROS REP 103): x forward, y left, z up; yaw is counter-clock
 from __future__ import annotations
 
 import math
+from typing import Final
 
 import msgspec
 
 from skyloop.messages.numbers import Count, TimeNs
+
+FARTHEST_M: Final = 100_000.0  #: a place farther from the origin, along any axis, is taken for a mistake
+MOST_TURNS_RAD: Final = 1000.0  #: so is a larger yaw
 
 
 class Action(msgspec.Struct, frozen=True, array_like=True):
@@ -24,6 +28,11 @@ class Action(msgspec.Struct, frozen=True, array_like=True):
     def finite(self) -> bool:
         """Whether all numbers of the action are finite."""
         return True
+
+    @property
+    def problem(self) -> str:
+        """What makes no sense about its numbers, in words for a person; empty if they can be flown."""
+        return ""
 
 
 class Idle(Action, frozen=True, array_like=True, tag=0):
@@ -82,7 +91,50 @@ class Velocity(Action, frozen=True, array_like=True, tag=7):
         return math.isfinite(self.forward + self.left + self.up + self.yaw_rate)
 
 
-AnyAction = Idle | Takeoff | Hover | Land | EmergencyStop | ResetEmergency | Attitude | Velocity
+class Position(Action, frozen=True, array_like=True, tag=8):
+    """A place to fly to and to stay at, in the world's axes of ``Feedback.position``.
+
+    ``x`` east, ``y`` north, ``z`` up [m]; ``yaw`` counter-clockwise from x [rad], None keeps the present heading;
+    ``speed`` [m/s] along the way and ``yaw_rate`` [rad/s] are the greatest ones, None: as fast as the limits allow.
+    """
+
+    x: float
+    y: float
+    z: float
+    yaw: float | None = None
+    speed: float | None = None
+    yaw_rate: float | None = None
+
+    @property
+    def finite(self) -> bool:
+        """Whether all numbers of the action are finite."""
+        return math.isfinite(
+            self.x + self.y + self.z + (self.yaw or 0.0) + (self.speed or 0.0) + (self.yaw_rate or 0.0)
+        )
+
+    @property
+    def problem(self) -> str:
+        """What makes no sense about its numbers, in words for a person; empty if they can be flown."""
+        for name in ("x", "y", "z"):
+            if abs(value := getattr(self, name)) > FARTHEST_M:
+                return (
+                    f"{name} is {value:g} m and must be within {FARTHEST_M:g} m of the origin of the vehicle's position"
+                )
+        if self.yaw is not None and abs(self.yaw) > MOST_TURNS_RAD:
+            return f"yaw is {self.yaw:g} rad and must be from {-MOST_TURNS_RAD:g} to {MOST_TURNS_RAD:g} rad"
+        if self.speed is not None and not self.speed > 0.0:
+            return f"speed is {self.speed:g} m/s and must be more than 0 (None: as fast as the limits allow)"
+        if self.yaw_rate is not None and not self.yaw_rate > 0.0:
+            return f"yaw_rate is {self.yaw_rate:g} rad/s and must be more than 0 (None: as fast as the limits allow)"
+        return ""
+
+    @property
+    def place(self) -> tuple[float, float, float]:
+        """The place: x, y, z [m]."""
+        return self.x, self.y, self.z
+
+
+AnyAction = Idle | Takeoff | Hover | Land | EmergencyStop | ResetEmergency | Attitude | Velocity | Position
 
 ACTION_NAMES: dict[type[Action], str] = {
     Idle: "idle",
@@ -93,6 +145,7 @@ ACTION_NAMES: dict[type[Action], str] = {
     ResetEmergency: "reset_emergency",
     Attitude: "attitude",
     Velocity: "velocity",
+    Position: "position",
 }
 
 

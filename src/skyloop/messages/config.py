@@ -33,6 +33,7 @@ class Capabilities(msgspec.Struct, frozen=True, array_like=True):
     cameras: tuple[CameraInfo, ...] = ()
     description: str = ""
     why_not: str = ""  #: for a vehicle that can't fly: why, in words for a person
+    software: frozenset[str] = frozenset()  #: names of the actions that the proxy's software autopilot adds
 
 
 # Requests ------------------------------------------------------------------------------------------------------

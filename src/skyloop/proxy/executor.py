@@ -16,13 +16,14 @@ from skyloop.messages import (
     Hover,
     Idle,
     Land,
+    Position,
     Takeoff,
     Velocity,
 )
 from skyloop.proxy.core.autopilot import Autopilot, software_actions
 from skyloop.proxy.publisher import VehiclePublisher
 
-_FLYING = (Takeoff, Hover, Attitude, Velocity)
+_FLYING = (Takeoff, Hover, Attitude, Velocity, Position)
 
 
 class ActionExecutor:
@@ -45,6 +46,8 @@ class ActionExecutor:
         }
         self.why_not = capabilities.why_not
         self.autopilot = autopilot
+        #: Whether what the vehicle does on the way to a place must be checked: then the software autopilot flies there.
+        self.guarded = False
         self._driver = driver
         self._vehicle = publisher
         self._in_force: AnyAction = Idle()
@@ -75,7 +78,7 @@ class ActionExecutor:
 
         ``new``: an application newly asked for it; else it repeats what was applied before.
         """
-        if type(action) in self.native:
+        if type(action) in self.native and not (self.guarded and type(action) is Position and self.autopilot):
             applied = self._driver.apply(action, new=new)
             if self.autopilot is not None:
                 self.autopilot.stop(action.name)
@@ -123,5 +126,5 @@ class ActionExecutor:
 
     def _start(self, action: AnyAction, now_ns: int) -> None:
         assert self.autopilot is not None
-        assert isinstance(action, Takeoff | Hover | Land | Velocity)
+        assert isinstance(action, Takeoff | Hover | Land | Velocity | Position)
         self.autopilot.start(action, now_ns, self._vehicle.feedback_now)

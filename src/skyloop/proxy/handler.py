@@ -100,6 +100,8 @@ class CommandHandler:
             self.authority, self.ladder, self.ownership, supported=executor.supported, why_not=executor.why_not
         )
         self.on_ownership: Callable[[bool], None] = lambda _: None  #: called with whether the flight is ours, locked
+        if executor.autopilot is not None:
+            executor.autopilot.guard = self.checks.guard
         self._lock = threading.RLock()
         self._executor = executor
         self._vehicle = publisher
@@ -130,6 +132,7 @@ class CommandHandler:
             self.authority.timeout_ns = settings.authority_timeout_ns
             self.authority.ask_ns = settings.authority_ask_ns
             self.ladder.settings = settings.failsafe
+            self._executor.guarded = settings.safety is not None
             if self._executor.autopilot is not None:
                 self._executor.autopilot.settings = settings.autopilot
 
@@ -255,6 +258,8 @@ class CommandHandler:
             self._observe_ownership(now_ns)
         decision = checks.decide(command, session.sequence, state, vehicle.link_state, vehicle.feedback_now, now_ns)
         if decision.refusal is not None:
+            if decision.action is not None:
+                self._stop_instead(decision.action, now_ns)
             return self._refuse(session, command, decision.refusal, decision.why), now_ns
         applied: AnyAction = _NOTHING
         if decision.action is not None:
@@ -275,6 +280,13 @@ class CommandHandler:
         if not self.ladder.idle:
             self._apply_failsafe(self.ladder.fresh_command(), now_ns)
         return applied, applied_ns
+
+    def _stop_instead(self, action: AnyAction, now_ns: int) -> None:
+        """Do what a refused set-point leaves to be done: the one before it must not go on."""
+        try:
+            self._executor.execute(action, now_ns, new=False)
+        except Exception as error:  # noqa: BLE001  it is reported, and the refusal is told
+            self._vehicle.driver_failed("apply", error)
 
     def _stop_motors(self, session: Session, command: Command, now_ns: int) -> tuple[AnyAction, int]:
         """Carry out the emergency stop of any pilot: without a lease, however old or out of sequence."""

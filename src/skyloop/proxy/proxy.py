@@ -101,14 +101,17 @@ class Proxy:
         self.clock = clock
         self.run_id = secrets.randbits(63)  #: another number in each run
         self.capabilities = driver.capabilities()
+        software = software_actions(self.capabilities.actions)
+        if software != self.capabilities.software:
+            self.capabilities = msgspec.structs.replace(self.capabilities, software=software)
         uri = str(driver.uri)
         self._welcome = Welcome(0, name, self.run_id, os.getpid(), uri, 0, self.capabilities, clock_identity())
         self._sessions: dict[int, Session] = {}
         self._counters = Counters()
         self._counts = self._counters.counts
         self.events = EventPublisher(server_end.publish, clock, self._counters)
-        software = software_actions(self.capabilities.actions)
-        autopilot = Autopilot(self.capabilities.actions) if software else None
+        steerable = bool(self.capabilities.actions & {"attitude", "velocity"})
+        autopilot = Autopilot(self.capabilities.actions) if steerable else None
         self.publisher = VehiclePublisher(
             server=server_end,
             events=self.events,

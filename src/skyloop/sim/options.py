@@ -11,7 +11,8 @@ from skyloop.sim.parameters import VehicleParameters
 from skyloop.sim.world import Wind, World
 from skyloop.sim.world_file import load_world
 
-EVERY_ACTION: Final = frozenset(ACTION_NAMES.values())
+#: What simulated vehicles do by themselves; to places the proxy flies them.
+EVERY_ACTION: Final = frozenset(ACTION_NAMES.values()) - {"position"}
 STANDARD_VEHICLE: Final = VehicleParameters()
 
 

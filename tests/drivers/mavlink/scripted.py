@@ -40,6 +40,7 @@ class Vehicle:
         self.flags = 0x1F  #: of its estimator
         self.boot_ms = 10_000
         self.place = (0.0, 0.0, 0.0)
+        self.knows_place = True
         self.velocity = (0.0, 0.0, 0.0)
         self.yaw = 0.0
         self.amsl_m = 488.0
@@ -54,8 +55,9 @@ class Vehicle:
         present = receiver | 0x10000000 * (self.autopilot != PX4)  # a PX4 never says that it has this check
         healthy = receiver | 0x10000000 * self.ready
         altitude = -self.place[2]
+        local = m.MAVLink_local_position_ned_message(self.boot_ms, *self.place, *self.velocity)
         return [
-            m.MAVLink_local_position_ned_message(self.boot_ms, *self.place, *self.velocity),
+            *([local] if self.knows_place else []),
             m.MAVLink_global_position_int_message(
                 self.boot_ms, 0, 0, round((self.amsl_m + altitude) * 1000), round(altitude * 1000), 0, 0, 0, 0
             ),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import pytest
 
@@ -14,11 +15,13 @@ from skyloop.messages import (
     Hover,
     Idle,
     Land,
+    Position,
     ResetEmergency,
     Takeoff,
     Velocity,
 )
 from skyloop.wire.mavlink.axes import angles_of, from_wire
+from skyloop.wire.mavlink.codec import Message
 from skyloop.wire.mavlink.modes import Landed
 from skyloop.wire.mavlink.texts import chunks_of
 from tests.drivers.mavlink.scripted import ARDUPILOT, PX4, Bench, Vehicle
@@ -32,7 +35,7 @@ LAND = {ARDUPILOT: ("LAND", (MODE, 1.0, 9.0, 0.0, 0.0)), PX4: ("AUTO.LAND", (MOD
 SET_POINT = "SET_POSITION_TARGET_LOCAL_NED"
 
 
-def steering(autopilot: int, action: Velocity | Attitude = Velocity(forward=1.0)) -> Bench:  # noqa: B008  immutable
+def steering(autopilot: int, action: Velocity | Attitude | Position = Velocity(forward=1.0)) -> Bench:  # noqa: B008  immutable
     """Flying by set-points."""
     bench = Bench(Vehicle(autopilot)).flying(GUIDED[autopilot])
     bench.apply(action)
@@ -656,3 +659,116 @@ def test_a_stop_that_did_not_succeed_can_be_pressed_again_and_given_up(autopilot
     bench.apply(Land())
     bench.go_on(0.5)
     assert LAND[autopilot][1] in bench.commands()
+
+
+# Places ----------------------------------------------------------------------------------------------------------
+
+
+def follows(bench: Bench, seconds: float) -> list[Message]:
+    """The vehicle is wherever it was told to be 0.1 s before."""
+    said: list[Message] = []
+    for _ in range(round(seconds / 0.1)):
+        bench.go_on(0.1)
+        said += bench.heard_of(SET_POINT)
+        newest = said[-1]
+        bench.vehicle.place, bench.vehicle.yaw = (newest.x, newest.y, newest.z), newest.yaw
+    return said
+
+
+@AUTOPILOTS
+def test_a_place_is_told_in_the_vehicles_axes_step_by_step(autopilot: int) -> None:
+    bench = Bench(Vehicle(autopilot)).flying(GUIDED[autopilot])
+    bench.vehicle.place, bench.vehicle.yaw = (1.0, 2.0, -3.0), 0.0
+    bench.go_on(0.1)
+    asked = Position(2.0, 4.0, 3.5, math.pi / 2 - 0.6, 0.8, 0.5)  # east, north, up; counter-clockwise from east
+    assert bench.apply(asked) == asked
+    said = follows(bench, 9.0)
+    assert bench.state() is FlightState.FLYING
+    assert {(each.coordinate_frame, each.type_mask) for each in said} == {(1, 0x9F8)}
+    first, last = said[0], said[-1]
+    assert (first.x, first.y, first.z) == pytest.approx((1.0, 2.0, -3.0), abs=0.05), "it begins where the vehicle is"
+    assert (last.x, last.y, last.z) == pytest.approx((4.0, 2.0, -3.5), abs=1e-3), "north, east, down"
+    assert last.yaw == pytest.approx(0.6, abs=1e-3), "clockwise from north"
+    steps = [math.dist((a.x, a.y, a.z), (b.x, b.y, b.z)) for a, b in pairwise(said)]
+    assert max(steps) <= 0.8 * 0.05, "no faster than it was asked to, at 25 Hz"
+    assert max(abs(b.yaw - a.yaw) for a, b in pairwise(said)) <= 0.5 * 0.05
+    assert steps[-1] < 1e-3
+    assert max(steps[:3]) < max(steps), "it begins slowly"
+
+
+@AUTOPILOTS
+def test_without_a_yaw_the_heading_is_kept(autopilot: int) -> None:
+    bench = Bench(Vehicle(autopilot)).flying(GUIDED[autopilot])
+    bench.vehicle.yaw = 1.2
+    bench.go_on(0.1)
+    bench.apply(Position(3.0, 0.0, 3.0))
+    assert {round(each.yaw, 3) for each in follows(bench, 2.0)} == {1.2}
+    bench.apply(Position(3.0, 0.0, 3.0, math.pi / 2))
+    follows(bench, 4.0)
+    bench.apply(Position(1.0, 0.0, 3.0))
+    assert {round(each.yaw, 2) for each in follows(bench, 1.0)} == {0.0}
+
+
+def test_what_it_is_told_waits_for_a_vehicle_that_does_not_follow() -> None:
+    bench = Bench(Vehicle(ARDUPILOT)).flying("GUIDED")
+    bench.apply(Position(0.0, 50.0, 3.0, speed=2.0))
+    bench.go_on(10.0)
+    said = bench.heard_of(SET_POINT)
+    assert max(each.x for each in said) == pytest.approx(3.0, abs=0.01), "1.5 s ahead, however long it stands"
+
+
+def test_a_way_begins_only_in_the_mode_that_follows_it() -> None:
+    bench = Bench(Vehicle(PX4)).flying("AUTO.LOITER")
+    bench.apply(Position(0.0, 5.0, 3.0))
+    bench.go_on(1.5)
+    assert {each.x for each in bench.heard_of(SET_POINT)} == {0.0}
+    bench.vehicle.mode = "OFFBOARD"
+    bench.go_on(1.0)
+    assert bench.heard_of(SET_POINT)[-1].x > 0.2
+
+
+@AUTOPILOTS
+def test_it_stops_where_its_position_is_lost(autopilot: int) -> None:
+    bench = steering(autopilot, Position(0.0, 5.0, 3.0))
+    bench.go_on(0.2)
+    bench.said.clear()
+    bench.vehicle.knows_place = False
+    bench.go_on(1.5)
+    said = bench.heard_of(SET_POINT)[-1]
+    assert (said.type_mask, said.vx, said.vy, said.vz) == (0x5C7, 0.0, 0.0, 0.0)
+
+
+@AUTOPILOTS
+def test_on_the_ground_nothing_comes_of_a_place(autopilot: int) -> None:
+    bench = Bench(Vehicle(autopilot)).found()
+    assert bench.apply(Position(0.0, 0.0, 2.0)) == Idle()
+    bench.go_on(1.5)
+    assert (bench.commands(), bench.heard_of(SET_POINT)) == ([], [])
+
+
+@AUTOPILOTS
+def test_who_takes_it_over_on_the_way_keeps_it(autopilot: int) -> None:
+    bench = steering(autopilot, Position(0.0, 5.0, 3.0))
+    bench.vehicle.mode = LAND[autopilot][0]
+    bench.go_on(1.0)
+    bench.said.clear()
+    for new in (True, False):
+        with pytest.raises(DriverError, match="was not chosen here"):
+            bench.apply(Position(0.0, 5.0, 3.0), new=new)
+    bench.go_on(1.0)
+    assert (bench.commands(), bench.heard_of(SET_POINT)) == ([], [])
+
+
+@AUTOPILOTS
+def test_hovering_and_a_failsafe_end_the_way(autopilot: int) -> None:
+    bench = steering(autopilot, Position(0.0, 5.0, 3.0))
+    bench.apply(Hover())
+    bench.go_on(0.5)
+    assert {each.type_mask for each in bench.heard_of(SET_POINT)[1:]} <= {0x5C7, 0xDF8}
+    bench.apply(Position(0.0, 5.0, 3.0))
+    bench.go_on(0.2)
+    bench.said.clear()
+    bench.apply(Hover(), alone=True)
+    bench.go_on(0.4)
+    assert set(bench.commands()) == {HOLD[autopilot][1]}
+    assert {each.type_mask for each in bench.heard_of(SET_POINT)} <= {0x5C7}

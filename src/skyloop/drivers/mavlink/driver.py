@@ -36,7 +36,7 @@ from skyloop.messages import (
 from skyloop.wire.mavlink.parameter_values import is_integer
 
 ACTIONS: Final = frozenset(
-    {"idle", "takeoff", "hover", "land", "attitude", "velocity", "emergency_stop", "reset_emergency"}
+    {"idle", "takeoff", "hover", "land", "attitude", "velocity", "position", "emergency_stop", "reset_emergency"}
 )
 
 

@@ -1,4 +1,4 @@
-"""Holding, a velocity, an attitude and a take-off, each as the messages that make the vehicle fly it. Pure."""
+"""Holding, a velocity, a place, an attitude and a take-off, each as the messages that make the vehicle fly it. Pure."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from skyloop.clock import nanoseconds, seconds
 from skyloop.drivers.mavlink.autopilots import AutopilotProfile, ThrustModel
 from skyloop.drivers.mavlink.microservices import ACCEPTED, CommandSender, VehicleCommand, result_name
 from skyloop.drivers.mavlink.telemetry import VehicleState
-from skyloop.messages import Attitude, Velocity
+from skyloop.messages import Attitude, Position, Velocity
 from skyloop.messages.geometry import quaternion_from_euler, wrap_angle
-from skyloop.wire.mavlink.axes import Vector, flip, to_wire
+from skyloop.wire.mavlink.axes import Vector, flip, swap, to_wire, yaw_between
 from skyloop.wire.mavlink.codec import Message
 from skyloop.wire.mavlink.codec import dialect as m
 from skyloop.wire.mavlink.modes import Landed
@@ -21,6 +21,7 @@ WORLD: Final = 1
 BODY: Final = 8  #: levelled
 VELOCITY_AND_YAW_RATE: Final = 0x5C7
 POSITION: Final = 0xDF8
+POSITION_AND_YAW: Final = 0x9F8
 ATTITUDE_AND_THRUST: Final = 0x07  #: without rates
 VELOCITY_PERIOD_NS: Final = 40_000_000  #: between repeats of a velocity or position: 25 Hz
 ATTITUDE_PERIOD_NS: Final = 20_000_000  #: the same for an attitude, which turns meanwhile
@@ -28,6 +29,11 @@ MOST_YAW_LEAD_RAD: Final = 0.5  #: the heading that is asked for waits for a veh
 STOPPED_M_S: Final = 0.25  #: slower than this, the position is held instead of a speed of zero,
 STOPPING_S: Final = 3.0  #: and after this in any case
 MOST_STEP_S: Final = 0.1
+WAY_M_S: Final = 1.0  #: on the way to a place, where no speed is given
+WAY_TURN_RAD_S: Final = 0.8
+WAY_M_S2: Final = 0.8  #: at its beginning and its end
+LEASH_S: Final = 1.5  #: so far ahead of the vehicle, by time at the speed of the way, is the place that it is told
+LEASH_M: Final = 0.3  #: and at least this
 
 Target = tuple[int, int]  #: system and component
 
@@ -88,6 +94,76 @@ class VelocitySetpoint:
         return velocity_message(self.action, target)
 
 
+class PositionSetpoint:
+    """Flies straight to a place and stays there.
+
+    Autopilots fly to a position as fast as their own parameters let them. So what they are told moves to the place, at
+    the speed of the action at most, and stays near the vehicle.
+
+    Args:
+        action: The place; may be replaced in flight.
+    """
+
+    period_ns = VELOCITY_PERIOD_NS
+
+    def __init__(self, action: Position) -> None:
+        self.action = action
+        self._at: Vector | None = None  # what the vehicle is told: north, east, down
+        self._speed_m_s = 0.0
+        self._yaw: float | None = None  # clockwise from north
+        self._keep_yaw: float | None = None  # where none is asked for
+        self._before_ns = 0
+
+    def replace(self, action: Position) -> None:
+        """Fly elsewhere, from where it is on its way."""
+        if self.action.yaw is not None and action.yaw is None:
+            self._keep_yaw = None  # the heading that it has by now
+        self.action = action
+
+    def hold_back(self) -> None:
+        """Begin where the vehicle is, as it does not follow yet."""
+        self._at = self._yaw = None
+
+    def message(self, vehicle: VehicleState, target: Target, now_ns: int) -> Message:
+        """Return the set-point that is due now; a velocity of zero while position or heading are not known."""
+        if vehicle.position is None or vehicle.yaw is None:
+            self.hold_back()
+            return velocity_message(Velocity(), target)
+        if self._at is None or self._yaw is None:
+            self._at, self._yaw, self._speed_m_s, self._before_ns = vehicle.position, vehicle.yaw, 0.0, now_ns
+        step_s = min(MOST_STEP_S, seconds(now_ns - self._before_ns))
+        self._before_ns = now_ns
+        self._move(self._at, vehicle.position, step_s)
+        self._turn(self._yaw, vehicle.yaw, step_s)
+        return m.MAVLink_set_position_target_local_ned_message(
+            0, *target, WORLD, POSITION_AND_YAW, *self._at, 0, 0, 0, 0, 0, 0, self._yaw, 0
+        )
+
+    def _move(self, at: Vector, vehicle: Vector, step_s: float) -> None:
+        """Move what it is told towards the place."""
+        goal, most = swap(*self.action.place), self.action.speed or WAY_M_S
+        left = math.dist(at, goal)
+        self._speed_m_s = min(most, self._speed_m_s + WAY_M_S2 * step_s, math.sqrt(2.0 * WAY_M_S2 * left))
+        step = self._speed_m_s * step_s
+        at = goal if left <= max(step, 1e-3) else _between(at, goal, step / left)
+        leash, ahead = max(LEASH_M, LEASH_S * most), math.dist(vehicle, at)
+        self._at = at if ahead <= leash else _between(vehicle, at, leash / ahead)
+
+    def _turn(self, yaw: float, heading: float, step_s: float) -> None:
+        if self._keep_yaw is None:
+            self._keep_yaw = heading
+        goal = self._keep_yaw if self.action.yaw is None else yaw_between(self.action.yaw)
+        most = (self.action.yaw_rate or WAY_TURN_RAD_S) * step_s
+        yaw += max(-most, min(most, wrap_angle(goal - yaw)))
+        lead = wrap_angle(yaw - heading)
+        self._yaw = wrap_angle(heading + max(-MOST_YAW_LEAD_RAD, min(MOST_YAW_LEAD_RAD, lead)))
+
+
+def _between(start: Vector, end: Vector, share: float) -> Vector:
+    x, y, z = (a + share * (b - a) for a, b in zip(start, end, strict=True))
+    return x, y, z
+
+
 class AttitudeSetpoint:
     """Flies an attitude with climb rate and yaw rate; the heading that is asked for turns step by step.
 
@@ -130,7 +206,7 @@ class AttitudeSetpoint:
         return self._yaw
 
 
-Setpoint = PositionHold | VelocitySetpoint | AttitudeSetpoint
+Setpoint = PositionHold | VelocitySetpoint | PositionSetpoint | AttitudeSetpoint
 
 
 PATIENCE_NS: Final = nanoseconds(6.0)  #: a take-off that nobody asked for in so long is given up if it is not armed

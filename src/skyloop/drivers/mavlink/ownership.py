@@ -13,10 +13,11 @@ from skyloop.drivers.mavlink.autopilots import AutopilotProfile
 from skyloop.drivers.mavlink.manoeuvres import STRAYED_NS
 from skyloop.drivers.mavlink.telemetry import VehicleState
 from skyloop.errors import DriverError
-from skyloop.messages import AnyAction, Attitude, Velocity
+from skyloop.messages import AnyAction, Attitude, Position, Velocity
 
 LATE_NS: Final = nanoseconds(3.0)  #: a command to change the mode may take effect so much later
 PAUSE_NS: Final = nanoseconds(0.5)  #: an action after such a pause is no repeat
+_SET_POINTS: Final = (Velocity, Attitude, Position)
 
 
 class FlightOwnership:
@@ -74,7 +75,7 @@ class FlightOwnership:
         if not self.left_to:
             return
         decided = new and (type(action) is not self._repeated or now_ns - at_ns > PAUSE_NS)
-        if isinstance(action, Velocity | Attitude) or not decided:
+        if isinstance(action, _SET_POINTS) or not decided:
             raise DriverError(
                 f"the vehicle is in {self.left_to}, which was not chosen here: "
                 "hover, take off or land first to take it over"
@@ -90,7 +91,7 @@ class FlightOwnership:
             alone: Whether nobody is in command: a failsafe.
             new: Whether an application newly asked for it.
         """
-        begins = not self._steering or not isinstance(action, Velocity | Attitude)
+        begins = not self._steering or not isinstance(action, _SET_POINTS)
         if alone or (new and begins):
             self._from = "" if vehicle is None else vehicle.mode
         self._steering, self._by_itself, self.left_to = True, False, ""

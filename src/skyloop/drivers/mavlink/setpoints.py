@@ -17,6 +17,7 @@ from skyloop.drivers.mavlink.manoeuvres import (
     STRAYED_NS,
     AttitudeSetpoint,
     PositionHold,
+    PositionSetpoint,
     Setpoint,
     TakeoffSequence,
     VelocitySetpoint,
@@ -36,6 +37,7 @@ from skyloop.messages import (
     Hover,
     Idle,
     Land,
+    Position,
     ResetEmergency,
     Severity,
     Takeoff,
@@ -204,7 +206,7 @@ class SetpointController:
         elif self.goal is not Goal.FOLLOW or not isinstance(self._setpoint, PositionHold):
             self._follow(PositionHold(now_ns))
 
-    def _steer(self, action: Velocity | Attitude, vehicle: VehicleState | None, now_ns: int) -> AnyAction:
+    def _steer(self, action: Velocity | Attitude | Position, vehicle: VehicleState | None, now_ns: int) -> AnyAction:
         if vehicle is None:
             raise DriverError("no data from the vehicle: set-points are refused until the link is up")
         if self.stopped or vehicle.airborne is False or self.goal is Goal.TAKE_OFF:
@@ -216,6 +218,11 @@ class SetpointController:
                 self._setpoint.action = action
             else:
                 self._follow(VelocitySetpoint(action))
+        elif isinstance(action, Position):
+            if isinstance(self._setpoint, PositionSetpoint) and self.goal is Goal.FOLLOW:
+                self._setpoint.replace(action)
+                return action  # what it is told moves step by step: there is nothing to hurry for
+            self._follow(PositionSetpoint(action))
         else:
             if not (isinstance(self._setpoint, AttitudeSetpoint) and self.goal is Goal.FOLLOW):
                 self._follow(AttitudeSetpoint(action, self._make_thrust()))
@@ -281,7 +288,7 @@ class SetpointController:
             return FlightState.FLYING
         return (
             FlightState.FLYING
-            if isinstance(self._setpoint, VelocitySetpoint | AttitudeSetpoint)
+            if isinstance(self._setpoint, VelocitySetpoint | PositionSetpoint | AttitudeSetpoint)
             else FlightState.HOVERING
         )
 
@@ -350,6 +357,8 @@ class SetpointController:
         if now_ns - self._sent_ns < self._setpoint.period_ns:
             return []
         self._sent_ns = now_ns
+        if not inside and isinstance(self._setpoint, PositionSetpoint):
+            self._setpoint.hold_back()
         return [self._setpoint.message(vehicle, self._commands.target, now_ns)]
 
     def _ask_for(self, mode: str, now_ns: int) -> None:

@@ -89,7 +89,10 @@ def capabilities_of(recording: Recording, drone: DroneRecord) -> Capabilities:
     )
 
 
-_ACTIONS: Final = ("takeoff", "land", "hover", "velocity", "attitude", "emergency_stop", "reset_emergency")
+_ACTIONS: Final = (
+    *("takeoff", "land", "hover", "velocity", "attitude", "position"),
+    *("emergency_stop", "reset_emergency"),
+)
 
 
 def _camera(recording: Recording, drone: str, name: str, known: CameraInfo | None) -> CameraInfo:

@@ -1,4 +1,6 @@
-"""The software autopilot: take-off, hover, land and velocity for vehicles that lack them. Pure: stepped from outside.
+"""The software autopilot: take-off, hover, land, velocity and position for vehicles that lack them. Pure.
+
+Stepped from outside.
 
 A vehicle that takes velocities gets velocities; one that takes only attitude with climb rate gets the output of a
 velocity loop (proportional and integral, the common cascade of small multirotors: e.g. R. Mahony, V. Kumar, P. Corke,
@@ -9,18 +11,25 @@ forward the nose goes down, which is positive pitch; to accelerate left the left
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Final
 
 from skyloop.clock import NS_PER_S, seconds
-from skyloop.messages import Attitude, Feedback, FlightState, Hover, Land, Takeoff, Velocity
+from skyloop.messages import Attitude, Feedback, FlightState, Hover, Land, Position, Takeoff, Velocity
+from skyloop.messages.geometry import wrap_angle
 
 PERIOD_S: Final = 0.02  #: the pace that it is made for
 STALE_NS: Final = NS_PER_S // 2  #: older feedback is not steered by: level out instead
 ALTITUDE_GAIN: Final = 1.0  #: climb per metre of altitude error [1/s]
 POSITION_GAIN: Final = 0.6  #: speed per metre of position error [1/s]
 POSITION_SPEED: Final = 0.5  #: at most [m/s]
+GO_GAIN: Final = 0.9  #: on the way to a place: speed per metre that is left [1/s]
+GO_SPEED: Final = 1.0  #: at most, where none is given [m/s]
+GO_DECELERATION: Final = 0.6  #: towards it [m/s²]
+TURN_GAIN: Final = 1.5  #: yaw rate per radian that is left [1/s]
+TURN_RATE: Final = 1.2  #: at most, where none is given [rad/s]
 SETTLED_SPEED: Final = 0.2  #: below it the place to hold is fixed [m/s]
 ARRIVED: Final = 0.1  #: a take-off ends so far below its altitude [m]
 TOUCH_ALTITUDE: Final = 0.1  #: below it the vehicle stands on the ground [m]
@@ -30,7 +39,7 @@ STALL_NS: Final = NS_PER_S
 STALL_HEADWAY: Final = 0.02  #: [m]
 BLIND_LANDING_NS: Final = 15 * NS_PER_S  #: how long a landing takes where the altitude is not known
 
-SOFTWARE: Final = frozenset({"takeoff", "hover", "land", "velocity"})
+SOFTWARE: Final = frozenset({"takeoff", "hover", "land", "velocity", "position"})
 
 
 def software_actions(native: frozenset[str]) -> frozenset[str]:
@@ -60,6 +69,7 @@ class Mode(Enum):
     HOVER = auto()
     LAND = auto()
     VELOCITY = auto()
+    POSITION = auto()
 
 
 _STATES: Final = {
@@ -67,6 +77,7 @@ _STATES: Final = {
     Mode.HOVER: FlightState.HOVERING,
     Mode.LAND: FlightState.LANDING,
     Mode.VELOCITY: FlightState.FLYING,
+    Mode.POSITION: FlightState.FLYING,
 }
 _STANDING: Final = (FlightState.LANDED, FlightState.EMERGENCY)
 
@@ -77,15 +88,18 @@ class Autopilot:
     def __init__(self, native: frozenset[str], settings: AutopilotSettings | None = None) -> None:
         self.settings = settings or AutopilotSettings()
         self.mode = Mode.OFF
+        #: On the way to a place: the velocity that is allowed instead of the wanted one, by the newest feedback.
+        self.guard: Callable[[Velocity, Feedback, int], Velocity] = lambda wanted, _feedback, _now_ns: wanted
         self._state = FlightState.LANDED
         self._takes_velocity = "velocity" in native
         self._owns_state = not native & {"takeoff", "land"}  # such a vehicle has no notion of it
-        self._target = Velocity()
+        self._target: Velocity | Position = Velocity()
         self._integral = (0.0, 0.0)  # forward, left [rad]
         self._stepped_ns: int | None = None
         self._begun_ns = 0
         self._hold_altitude: float | None = None
         self._hold_position: tuple[float, float] | None = None
+        self._hold_yaw: float | None = None
         self._lowest = math.inf
         self._lowest_ns = 0
 
@@ -104,17 +118,21 @@ class Autopilot:
         if self.mode is Mode.OFF and (feedback.altitude or 0.0) > AIRBORNE_ALTITUDE:
             self._state = FlightState.FLYING
 
-    def start(self, action: Takeoff | Hover | Land | Velocity, now_ns: int, feedback: Feedback | None) -> None:
+    def start(
+        self, action: Takeoff | Hover | Land | Velocity | Position, now_ns: int, feedback: Feedback | None
+    ) -> None:
         """Begin to do this; :meth:`step` goes on with it. Repeats of what is being done change nothing."""
         mode = _MODES[type(action)]
-        if isinstance(action, Velocity):
+        if isinstance(action, Velocity | Position):
+            if isinstance(self._target, Position) and self._target.yaw is not None:
+                self._hold_yaw = None  # where it was turned to is kept from here on, not where it looked before
             self._target = action
         if mode is self.mode:
             return
         if self.mode is Mode.OFF:
             self._integral, self._stepped_ns = (0.0, 0.0), None
         self.mode, self._state, self._begun_ns = mode, _STATES[mode], now_ns
-        self._hold_position = None
+        self._hold_position = self._hold_yaw = None
         self._hold_altitude = feedback.altitude if feedback is not None else None
         self._lowest, self._lowest_ns = math.inf, now_ns
 
@@ -149,6 +167,8 @@ class Autopilot:
             return self._descend(now_ns, altitude)
         if self.mode is Mode.HOVER:
             return self._hold(known, altitude)
+        if isinstance(self._target, Position):
+            return self._go(self._target, known, now_ns)
         return self._target
 
     def _rise(self, now_ns: int, altitude: float | None) -> Velocity:
@@ -193,6 +213,27 @@ class Autopilot:
         forward, left = _shorten(cos * east + sin * north, cos * north - sin * east, POSITION_SPEED)
         return Velocity(forward, left, up)
 
+    def _go(self, target: Position, known: Feedback | None, now_ns: int) -> Velocity:
+        """Straight towards a place, and slower near it; a speed of zero while position or yaw are not known."""
+        if known is None or known.position is None or known.yaw is None:
+            return Velocity()
+        if self._hold_yaw is None:
+            self._hold_yaw = known.yaw
+        east, north, up = (to - at for to, at in zip(target.place, known.position, strict=True))
+        away = math.hypot(east, north, up)
+        most = GO_SPEED if target.speed is None else target.speed
+        speed = min(GO_GAIN * away, most, math.sqrt(2.0 * GO_DECELERATION * away))
+        share = speed / away if away > 1e-9 else 0.0
+        cos, sin = math.cos(known.yaw), math.sin(known.yaw)
+        turn = wrap_angle((self._hold_yaw if target.yaw is None else target.yaw) - known.yaw)
+        wanted = Velocity(
+            forward=share * (cos * east + sin * north),
+            left=share * (cos * north - sin * east),
+            up=share * up,
+            yaw_rate=_bound(TURN_GAIN * turn, TURN_RATE if target.yaw_rate is None else target.yaw_rate),
+        )
+        return self.guard(wanted, known, now_ns)
+
     def _tilt(self, wanted: Velocity, known: Feedback | None, dt: float) -> tuple[float, float]:
         """Roll and pitch [rad] that bring the velocity to the wanted one; level while the velocity is not known."""
         if known is None or known.velocity is None:
@@ -213,7 +254,13 @@ class Autopilot:
         return -left, forward
 
 
-_MODES: Final = {Takeoff: Mode.TAKEOFF, Hover: Mode.HOVER, Land: Mode.LAND, Velocity: Mode.VELOCITY}
+_MODES: Final = {
+    Takeoff: Mode.TAKEOFF,
+    Hover: Mode.HOVER,
+    Land: Mode.LAND,
+    Velocity: Mode.VELOCITY,
+    Position: Mode.POSITION,
+}
 
 
 def _bound(value: float, most: float) -> float:

@@ -23,6 +23,7 @@ from skyloop.messages import (
     Idle,
     Land,
     LinkState,
+    Position,
     Refusal,
     ResetEmergency,
     Takeoff,
@@ -32,12 +33,13 @@ from skyloop.proxy.core.authority import Authority
 from skyloop.proxy.core.failsafe import REASONS, FailsafeLadder
 from skyloop.proxy.core.limits import Ceiling, Clamp, Limits
 from skyloop.proxy.core.ownership import Ownership, Whose
+from skyloop.proxy.core.places import decide_place
 from skyloop.proxy.core.safety import Safety
 
 MAX_AHEAD_S: Final = 0.05  #: how far in the future a command's time may lie: the error of the clocks' offset
 _MAX_AHEAD_NS: Final = nanoseconds(MAX_AHEAD_S)
 _HOVER_ACTION: Final = Hover()
-_SET_POINTS: Final = (Velocity, Attitude)
+_SET_POINTS: Final = (Velocity, Attitude, Position)
 _TAKING: Final = (Takeoff, Hover, Land)  #: newly asked for, they take a vehicle that others fly
 
 
@@ -110,13 +112,14 @@ STATE_POLICIES: Final[dict[type[Action], dict[FlightState, StatePolicy]]] = {
     ResetEmergency: _row(emergency=_APPLY, unknown=_APPLY, other=_REFUSE),
     Attitude: _SET_POINT,
     Velocity: _SET_POINT,
+    Position: _SET_POINT,
 }
 
 
 class Decision(NamedTuple):
     """What becomes of a command that the first checks let through."""
 
-    action: AnyAction | None = None  #: what the vehicle must do; None: nothing new
+    action: AnyAction | None = None  #: what the vehicle must do; None: nothing new. Of a refused one: instead of it
     refusal: Refusal | None = None
     why: str = ""  #: of the refusal, for a person
     new: bool = False  #: the application newly asked for it; else the library repeats it
@@ -198,7 +201,7 @@ class CommandChecks:
         problem = self._problem(command, sequence, state, link, new)
         if problem is not None:
             return Decision(None, *problem, new)
-        is_set_point = kind is Velocity or kind is Attitude
+        is_set_point = kind is Velocity or kind is Attitude or kind is Position
         if policy is StatePolicy.HOLD and is_set_point and self._ladder.step is Failsafe.LAND:
             policy = StatePolicy.HOVER  # the ladder's landing, not a pilot's: a pilot who is back breaks it off
         if policy is StatePolicy.REFUSE:
@@ -209,6 +212,13 @@ class CommandChecks:
         enforced = None
         if policy is StatePolicy.HOVER or kind is Hover:
             action, clamps = self._hover_below_ceiling(state, feedback)
+        elif type(action) is Position:
+            place = decide_place(action, self.limits, self.safety, feedback, now_ns, new=new)
+            if place.action is None:  # what was flown before is not wanted any more either
+                instead = _HOVER_ACTION if Hover in self._supported else None
+                return Decision(instead, place.refusal, place.why, new)  # without a refusal: until it is known again
+            action, clamps = place.action, place.clamps
+            enforced = None if self.safety is None else True
         elif is_set_point:
             action, clamps = self.limits.clamp(action, feedback.altitude if feedback else None)  # type: ignore[arg-type]
             if self.safety is not None:
@@ -216,6 +226,14 @@ class CommandChecks:
                 clamps += walls
         takes_off = kind is Takeoff and policy is StatePolicy.APPLY
         return Decision(action, None, "", new, takes_off, clamps, enforced)
+
+    def guard(self, wanted: Velocity, feedback: Feedback, now_ns: int) -> Velocity:
+        """Return the nearest velocity that limits, safety box and zones allow, on the way to a place."""
+        allowed, _ = self.limits.clamp(wanted, feedback.altitude)
+        if self.safety is not None:
+            allowed, _, _ = self.safety.clamp(allowed, feedback, now_ns)
+        assert isinstance(allowed, Velocity)
+        return allowed
 
     def _problem(
         self, command: Command, sequence: CommandSequence, state: FlightState, link: LinkState, new: bool

@@ -71,6 +71,20 @@ class Box:
             key=lambda wall: wall.distance,
         )
 
+    def holds(self, place: Vec3) -> bool:
+        """Whether a place is within it, or on its surface."""
+        return all(low <= at <= high for low, high, at in zip(self.low, self.high, place, strict=True))
+
+    def is_in_the_way(self, start: Vec3, end: Vec3) -> bool:
+        """Whether the straight way between two places leads through it."""
+        first, last = 0.0, 1.0
+        for low, high, at, to in zip(self.low, self.high, start, end, strict=True):
+            first, last = _within(low, high, at, to, first, last)
+        return first <= last
+
+    def __str__(self) -> str:
+        return f"box {_numbers(*self.low, *self.high)}"
+
 
 @dataclass(frozen=True, slots=True)
 class Cylinder:
@@ -96,6 +110,24 @@ class Cylinder:
         if across >= along:
             return Wall((aside[0], aside[1], 0.0), across, ZONES)
         return Wall((0.0, 0.0, up), along, ZONES)
+
+    def holds(self, place: Vec3) -> bool:
+        """Whether a place is within it, or on its surface."""
+        return math.hypot(place[0] - self.x, place[1] - self.y) <= self.radius and self.low <= place[2] <= self.high
+
+    def is_in_the_way(self, start: Vec3, end: Vec3) -> bool:
+        """Whether the straight way between two places leads through it."""
+        first, last = _within(self.low, self.high, start[2], end[2], 0.0, 1.0)
+        if first > last:
+            return False
+        x, y, across, along = start[0] - self.x, start[1] - self.y, end[0] - start[0], end[1] - start[1]
+        length = across * across + along * along
+        nearest = 0.0 if length == 0.0 else -(x * across + y * along) / length  # of the whole line, as a share of it
+        share = max(first, min(last, nearest))
+        return math.hypot(x + share * across, y + share * along) <= self.radius
+
+    def __str__(self) -> str:
+        return f"cylinder {_numbers(self.x, self.y, self.radius, self.low, self.high)}"
 
 
 Zone = Box | Cylinder
@@ -137,6 +169,25 @@ class Safety:
         if isinstance(action, Attitude):
             return *self._attitude(action, walls, turn, now or (0.0, 0.0, 0.0), late_s), True
         return action, (), True
+
+    def problem_at(self, place: Vec3) -> str:
+        """Return why a place can't be flown to, and what can, in words for a person; empty if it can."""
+        if self.box is not None and not self.box.holds(place):
+            return f"the place is outside of the safety box, {self.box} [m] ({BOX})"
+        for zone in self.zones:
+            if zone.holds(place):
+                return f"the place is in a no-fly zone, {zone} [m] ({ZONES}): choose a place outside of it"
+        return ""
+
+    def problem_between(self, start: Vec3, end: Vec3) -> str:
+        """Return what is in the straight way between two places, in words for a person; empty if nothing is.
+
+        A zone that the way begins in may be left.
+        """
+        for zone in self.zones:
+            if not zone.holds(start) and zone.is_in_the_way(start, end):
+                return f"a no-fly zone is in the straight way there, {zone} [m] ({ZONES}): fly round it, place by place"
+        return ""
 
     def allowed_speed(self, distance: float, late_s: float) -> float:
         """The greatest speed towards a wall so far away [m/s]; 0 beyond it."""
@@ -272,6 +323,18 @@ def _parse_zone(text: str) -> Zone:
 def _wrong(why: str) -> ParameterError:
     form = "box x y z x y z; cylinder x y radius z_low z_high"
     return ParameterError(f"{ZONES}: {why}; it looks like {form!r} [m]", code=Refusal.OUT_OF_RANGE)
+
+
+def _within(low: float, high: float, at: float, to: float, first: float, last: float) -> tuple[float, float]:
+    """The part of a way from ``at`` to ``to``, of that between the shares ``first`` and ``last``, between two walls."""
+    if at == to:
+        return (first, last) if low <= at <= high else (1.0, 0.0)
+    one, other = (low - at) / (to - at), (high - at) / (to - at)
+    return max(first, min(one, other)), min(last, max(one, other))
+
+
+def _numbers(*numbers: float) -> str:
+    return " ".join(f"{number:g}" for number in numbers)
 
 
 def _dot(a: Vec3, b: Vec3) -> float:

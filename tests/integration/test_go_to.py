@@ -1,0 +1,146 @@
+"""Flights to a place: the proxy's on simulated vehicles, the autopilots' own on both emulated ones."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+
+import pytest
+
+from skyloop import aio
+from skyloop.client import Drone, Swarm
+from skyloop.client.drone import open_drone
+from skyloop.drivers.registry import make_driver
+from skyloop.emulators.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
+from skyloop.errors import NoAnswerError, RefusedError, SwarmError, UnknownNameError, UsageError
+from skyloop.messages import Applied, Feedback, FlightState, Hover, Velocity
+from skyloop.proxy import Proxy
+from skyloop.sim.host import SimHost
+from skyloop.sim.options import SimOptions
+from skyloop.transport.memory import MemoryServer
+from tests.client.scripted import WAIT_S
+
+SIM = "sim://?world=empty&seed=2&wind=0&noise=0&cameras=none&position=1"
+KINDS = {kind.value: kind for kind in Kind}
+LONG_S = 60.0
+
+
+@contextmanager
+def flown(vehicle: str) -> Iterator[Drone]:
+    """A drone in the air: the address of a simulated one, or the kind of an emulated autopilot."""
+    with ExitStack() as stack:
+        address = vehicle
+        if vehicle in KINDS:
+            world = SimHost(with_multirotors(SimOptions(world="empty", seed=4, wind=0.0)))
+            kind = KINDS[vehicle]
+            address = stack.enter_context(MavlinkFirmware(world, kind=kind, ports=Ports.free(kind), boot_s=0.5)).address
+        server = MemoryServer("v")
+        proxy = Proxy(make_driver(address), server, name="v")
+        proxy.start()
+        stack.callback(proxy.stop)
+        drone = stack.enter_context(open_drone(server.dial, app="me", on_exit="hover", timeout_s=WAIT_S))
+        drone.wait(lambda feedback: feedback.vehicle_link == "up" and feedback.position is not None, LONG_S)
+        drone.takeoff(timeout_s=LONG_S)
+        yield drone
+
+
+def place(feedback: Feedback) -> tuple[float, float, float]:
+    assert feedback.position is not None
+    return feedback.position
+
+
+@pytest.mark.parametrize("vehicle", [SIM, SIM + "&native=velocity", SIM + "&native=attitude", *KINDS])
+def test_there_and_back(vehicle: str) -> None:
+    with flown(vehicle) as drone:
+        native = "position" in drone.capabilities.actions
+        assert native is (vehicle in KINDS)
+        assert ("position" in drone.capabilities.software) is not native
+        echoes: list[Applied] = []
+        with drone.on_command(echoes.append, inline=True):
+            x, y, z = place(drone.feedback())
+            speeds: list[float] = []
+            with drone.on_feedback(lambda feedback: speeds.append(math.hypot(*(feedback.velocity or ()))), inline=True):
+                drone.go_to(x=x + 2.0, y=y - 1.0, z=z + 0.6, yaw=1.0, speed=0.8, timeout_s=LONG_S)
+            there = drone.feedback()
+            assert math.dist(place(there), (x + 2.0, y - 1.0, z + 0.6)) <= 0.2
+            assert there.yaw == pytest.approx(1.0, abs=0.16)
+            assert max(speeds) < 0.8 + 0.3, "no faster than it was asked to, but for what it overshoots"
+            drone.go_to(x=x, y=y, z=z, timeout_s=LONG_S)
+            back = drone.feedback()
+            assert math.dist(place(back), (x, y, z)) <= 0.2
+            assert back.yaw == pytest.approx(1.0, abs=0.2), "the heading is kept"
+        kinds = {type(echo.applied) for echo in echoes if echo.app_id == 0}
+        assert kinds <= ({Hover} if native else {Velocity, Hover, *kinds}), "the proxy only steers what does not itself"
+        drone.velocity(up=0.2)
+        drone.wait("flying", WAIT_S)
+        drone.hover()
+        drone.wait("hovering", LONG_S)
+
+
+@pytest.mark.parametrize("vehicle", [SIM, *KINDS])
+def test_walls_hold_for_the_place_and_on_the_way(vehicle: str) -> None:
+    with flown(vehicle) as drone:
+        x, y, z = place(drone.feedback())
+        drone.config["safety.box.x_high"] = x + 1.5
+        drone.config["safety.zones"] = f"cylinder {x - 1.5} {y} 0.4 0 50"
+        with pytest.raises(RefusedError, match=r"outside of the safety box, box .*safety\.box"):
+            drone.go_to(x=x + 2.0, y=y, z=z)
+        with pytest.raises(RefusedError, match="in the straight way there"):
+            drone.go_to(x=x - 3.0, y=y, z=z)
+        with pytest.raises(RefusedError, match="the place is in a no-fly zone"):
+            drone.go_to(x=x - 1.5, y=y, z=z)
+        furthest = [x]
+        with drone.on_feedback(lambda feedback: furthest.append(place(feedback)[0]), inline=True):
+            drone.go_to(x=x + 1.2, y=y, z=z, speed=2.0, timeout_s=LONG_S, tolerance_m=0.3)
+        assert max(furthest) < x + 1.5 + 0.1
+
+
+def test_an_application_that_is_gone_on_the_way_gets_the_failsafe() -> None:
+    with flown(SIM) as drone:
+        x, y, z = place(drone.feedback())
+        drone.go_to(x=x + 50.0, y=y, z=z, speed=1.0, wait=False)
+        drone.wait(lambda feedback: place(feedback)[0] > x + 0.5, WAIT_S)
+        drone.release_authority()
+        drone.wait("hovering", WAIT_S)
+        assert place(drone.feedback())[0] < x + 5.0
+        assert drone.feedback().failsafe == "hover"
+
+
+def test_a_place_that_is_too_far_for_the_time_is_held_on_to() -> None:
+    with flown(SIM) as drone:
+        x, y, z = place(drone.feedback())
+        with pytest.raises(NoAnswerError, match=r"position was not completed within 0\.5 s: the vehicle is flying"):
+            drone.go_to(x=x + 3.0, y=y, z=z, timeout_s=0.5)
+        drone.wait(lambda feedback: place(feedback)[0] > x + 2.0, WAIT_S)
+
+
+def test_a_swarm_and_asyncio_fly_to_places() -> None:
+    with ExitStack() as stack:
+        servers = {name: MemoryServer(name) for name in ("a", "b")}
+        for name, server in servers.items():
+            proxy = Proxy(make_driver(SIM), server, name=name)
+            proxy.start()
+            stack.callback(proxy.stop)
+        drones = {name: open_drone(server.dial, app="me", timeout_s=WAIT_S) for name, server in servers.items()}
+        swarm = stack.enter_context(Swarm(drones, on_error="raise"))
+        swarm.takeoff(timeout_s=LONG_S)
+        homes = {drone.name: place(drone.feedback()) for drone in swarm}
+        places = {name: (x + 0.5, y, z + 0.2, 0.5) for name, (x, y, z) in homes.items()}
+        swarm.go_to(places, speed=0.8)
+        for drone in swarm:
+            assert math.dist(place(drone.feedback()), places[drone.name][:3]) <= 0.2
+        swarm.go_to(homes, wait=False)
+        swarm.wait_all(lambda feedback: abs(place(feedback)[0] - homes["a"][0]) < 0.2, WAIT_S)
+        with pytest.raises(UnknownNameError):
+            swarm.go_to({"c": (0.0, 0.0, 1.0)})
+        with pytest.raises(UsageError, match=r"place of a is \(0\.0, 1\.0\) and must be x, y, z"):
+            swarm.go_to({"a": (0.0, 1.0)})
+        with pytest.raises(SwarmError, match=r"limits\.altitude"):
+            swarm.go_to({"a": (0.0, 0.0, 60.0)})
+        x, y, z = homes["a"]
+        asyncio.run(aio.Swarm(swarm).go_to({"a": (x, y, z + 0.3)}, timeout_s=WAIT_S))
+        assert place(drones["a"].feedback())[2] == pytest.approx(z + 0.3, abs=0.2)
+        asyncio.run(aio.Drone(drones["a"]).go_to(x=x, y=y, z=z, timeout_s=WAIT_S))
+        assert drones["a"].feedback().state is FlightState.FLYING

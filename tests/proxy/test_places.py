@@ -1,0 +1,296 @@
+"""Which places can be flown to, how fast, and what the proxy makes of a command to do so."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from skyloop.clock import NS_PER_S
+from skyloop.messages import (
+    EventKind,
+    Feedback,
+    FlightState,
+    Hover,
+    Position,
+    Refusal,
+    SetParameter,
+    Velocity,
+)
+from skyloop.proxy.core.limits import Limits
+from skyloop.proxy.core.places import PlaceDecision, decide_place
+from skyloop.proxy.core.safety import Box, Cylinder, Safety
+from tests.proxy.fake import ALL, App, Bench
+
+NOW = 100 * NS_PER_S
+LIMITS = Limits(climb=1.0, yaw_rate=1.5, speed=2.0, altitude=5.0)
+ROOM = Safety(Box((-4.0, -4.0, 0.0), (4.0, 4.0, 3.0)), (Cylinder(2.0, 0.0, 0.5, 0.0, 3.0),))
+SOFTWARE = ALL - {"position"}
+
+
+def at(x: float, y: float, z: float, **more: Any) -> Feedback:
+    known: dict[str, Any] = {"captured_ns": NOW, "position": (x, y, z), "yaw": 0.0, "altitude": z}
+    return Feedback(**(known | more))
+
+
+START = at(0.0, 0.0, 1.0)
+
+
+# What is decided -------------------------------------------------------------------------------------------------
+
+
+def test_both_speeds_are_filled_in() -> None:
+    decided = decide_place(Position(3.0, 0.0, 1.0, 0.5), LIMITS, None, START, NOW, new=True)
+    assert decided.action == Position(3.0, 0.0, 1.0, 0.5, 2.0, 1.5)
+    assert decided.clamps == ()
+    slow = Position(3.0, 0.0, 1.0, None, 0.3, 0.2)
+    assert decide_place(slow, LIMITS, None, START, NOW, new=True).action == slow
+
+
+@pytest.mark.parametrize(
+    ("asked", "speed", "limit"),
+    [
+        (Position(3.0, 0.0, 1.0, speed=9.0), 2.0, "limits.speed"),
+        (Position(0.0, 0.0, 4.0, speed=9.0), 1.0, "limits.climb"),
+        (Position(3.0, 0.0, 4.0, speed=9.0), math.sqrt(2.0), "limits.climb"),
+        (Position(0.01, 0.0, 1.0, speed=9.0), 1.0, "limits.climb"),
+    ],
+)
+def test_the_speed_keeps_to_the_limits_across_and_upwards(asked: Position, speed: float, limit: str) -> None:
+    decided = decide_place(asked, LIMITS, None, START, NOW, new=True)
+    assert decided.action is not None
+    assert decided.action.speed == pytest.approx(speed)
+    (clamp,) = decided.clamps
+    assert (clamp.limit, clamp.asked, clamp.applied) == (limit, 9.0, decided.action.speed)
+    assert decide_place(asked, LIMITS, None, START, NOW, new=False).clamps == (), "repeats are not told again"
+
+
+@pytest.mark.parametrize(
+    ("asked", "feedback", "reason", "words"),
+    [
+        (Position(0.0, 0.0, 1.0, speed=-1.0), START, Refusal.OUT_OF_RANGE, "speed is -1"),
+        (Position(1.0, 0.0, 1.0), None, Refusal.WRONG_STATE, "does not tell its position"),
+        (Position(1.0, 0.0, 1.0), at(0, 0, 1, position=None), Refusal.WRONG_STATE, "motion capture"),
+        (Position(1.0, 0.0, 1.0), at(0, 0, 1, yaw=None), Refusal.WRONG_STATE, "does not tell its yaw"),
+        (Position(1.0, 0.0, 1.0), at(0, 0, 1, captured_ns=NOW - 3 * NS_PER_S), Refusal.WRONG_STATE, "3.0 s old"),
+        (Position(0.0, 0.0, 7.0), START, Refusal.OUT_OF_RANGE, "z is 7 m, and at most 5.00 m is allowed"),
+        (Position(0.0, 0.0, 6.0), at(0, 0, 1, altitude=2.0), Refusal.OUT_OF_RANGE, "at most 4.00 m"),
+        (Position(5.0, 0.0, 1.0), START, Refusal.OUT_OF_RANGE, "outside of the safety box, box -4 -4 0 4 4 3"),
+        (Position(0.0, 0.0, 3.5), START, Refusal.OUT_OF_RANGE, "outside of the safety box"),
+        (Position(2.1, 0.1, 1.0), START, Refusal.OUT_OF_RANGE, "in a no-fly zone, cylinder 2 0 0.5 0 3"),
+        (Position(3.5, 0.1, 1.0), START, Refusal.OUT_OF_RANGE, "in the straight way there, cylinder 2 0 0.5 0 3"),
+    ],
+)
+def test_what_is_refused_and_why(asked: Position, feedback: Feedback | None, reason: Refusal, words: str) -> None:
+    decided = decide_place(asked, LIMITS, ROOM, feedback, NOW, new=True)
+    assert (decided.action, decided.refusal) == (None, reason)
+    assert words in decided.why
+
+
+def test_an_old_position_is_waited_for_a_moment() -> None:
+    old = at(0, 0, 1, captured_ns=NOW - NS_PER_S)
+    for new in (True, False):
+        assert decide_place(Position(1.0, 0.0, 1.0), LIMITS, ROOM, old, NOW, new=new) == PlaceDecision()
+
+
+def test_repeats_are_lowered_to_a_lower_ceiling_and_drift_past_a_zone_is_not_refused() -> None:
+    decided = decide_place(Position(0.0, 0.0, 4.0), Limits(altitude=3.0), None, START, NOW, new=False)
+    assert decided.action is not None
+    assert decided.action.z == pytest.approx(3.0)
+    assert [clamp.limit for clamp in decided.clamps] == ["limits.altitude"]
+    past = Position(3.5, 0.1, 1.0)
+    assert decide_place(past, LIMITS, ROOM, START, NOW, new=False).action is not None
+    inside = Position(2.1, 0.1, 1.0)
+    assert decide_place(inside, LIMITS, ROOM, START, NOW, new=False).refusal is Refusal.OUT_OF_RANGE
+
+
+def test_a_zone_that_the_vehicle_is_in_can_be_left() -> None:
+    decided = decide_place(Position(0.0, 0.0, 1.0), LIMITS, ROOM, at(2.1, 0.0, 1.0), NOW, new=True)
+    assert decided.action is not None
+
+
+COORDINATE = st.floats(-6.0, 6.0)
+PLACE = st.tuples(COORDINATE, COORDINATE, COORDINATE)
+
+
+@given(PLACE, PLACE, st.sampled_from([Box((-1.0, -2.0, 0.5), (2.0, 1.0, 2.0)), Cylinder(0.5, -0.5, 1.5, 0.0, 2.0)]))
+def test_a_zone_is_in_the_way_if_a_place_of_the_way_is_in_it(
+    start: tuple[float, float, float], end: tuple[float, float, float], zone: Box | Cylinder
+) -> None:
+    shares = [step / 200 for step in range(201)]
+    places = [tuple(a + share * (b - a) for a, b in zip(start, end, strict=True)) for share in shares]
+    if any(zone.holds((x, y, z)) for x, y, z in places):
+        assert zone.is_in_the_way(start, end)
+    elif zone.is_in_the_way(start, end):  # it is only touched, between two of the places that were looked at
+        step = math.dist(start, end) / 200
+        assert min(abs(zone.wall_outside((x, y, z)).distance) for x, y, z in places) <= step + 1e-9
+
+
+@given(PLACE, PLACE, st.floats(0.1, 20.0))
+def test_what_is_flown_keeps_to_each_limit(
+    start: tuple[float, float, float], end: tuple[float, float, float], speed: float
+) -> None:
+    assume(math.dist(start, end) > 0.1)
+    limits = Limits(climb=0.7, speed=1.3, altitude=100.0)
+    action = decide_place(Position(*end, speed=speed), limits, None, at(*start), NOW, new=True).action
+    assert action is not None
+    assert action.speed is not None
+    away = math.dist(start, end)
+    assert action.speed <= speed
+    assert action.speed * math.dist(start[:2], end[:2]) / away <= 1.3 + 1e-9
+    assert action.speed * abs(end[2] - start[2]) / away <= 0.7 + 1e-9
+
+
+# What the proxy does ---------------------------------------------------------------------------------------------
+
+
+def placed(bench: Bench, **more: Any) -> App:
+    """A pilot whose vehicle hovers 1 m above the origin."""
+    pilot = bench.airborne()
+    bench.driver.report(position=(0.0, 0.0, 1.0), yaw=0.0, altitude=1.0, **more)
+    bench.driver.told.clear()
+    return pilot
+
+
+def write(bench: Bench, pilot: App, name: str, value: float | str) -> None:
+    pilot.ask(SetParameter(name, value, pilot.lease))
+    bench.driver.report()
+
+
+def test_a_vehicle_that_flies_to_places_is_told_the_place_with_its_limits() -> None:
+    with Bench() as bench:
+        pilot = placed(bench)
+        pilot.command(Position(3.0, 0.0, 1.0, 0.5))
+        told = Position(3.0, 0.0, 1.0, 0.5, 2.0, 1.75)
+        assert bench.driver.told == [told]
+        assert pilot.applied[-1].applied == told
+        assert pilot.applied[-1].asked == Position(3.0, 0.0, 1.0, 0.5)
+        bench.run(0.1)
+        assert bench.driver.told == [told], "it flies there by itself"
+
+
+def test_any_other_is_flown_there_by_velocity() -> None:
+    with Bench(SOFTWARE) as bench:
+        pilot = placed(bench)
+        pilot.command(Position(3.0, 0.0, 1.0))
+        bench.run(0.1, lambda: bench.driver.report())
+        assert set(map(type, bench.driver.told)) == {Velocity}
+        (told,) = {action for action in bench.driver.told if isinstance(action, Velocity)}
+        assert (told.forward, told.left, told.up) == pytest.approx((math.sqrt(2 * 0.6 * 3.0), 0.0, 0.0))
+        pilot.command(Hover())
+        bench.driver.told.clear()
+        bench.run(0.1)
+        assert bench.driver.told == [], "hovering ends it"
+
+
+def test_a_vehicle_without_a_position_is_refused_with_the_reason() -> None:
+    with Bench(SOFTWARE) as bench:
+        pilot = bench.airborne()
+        pilot.command(Position(3.0, 0.0, 1.0))
+        (event,) = pilot.told(EventKind.COMMAND_REFUSED)
+        assert event.data["reason"] == Refusal.WRONG_STATE
+        assert "the vehicle does not tell its position" in event.text
+        assert bench.driver.told == [Hover()]
+
+
+def test_a_refused_place_ends_the_set_point_before_it() -> None:
+    with Bench() as bench:
+        pilot = placed(bench)
+        write(bench, pilot, "safety.box.x_high", 2.0)
+        pilot.command(Velocity(forward=0.5))
+        pilot.command(Position(3.0, 0.0, 1.0))
+        assert isinstance(bench.driver.told[-1], Hover)
+        (event,) = pilot.told(EventKind.COMMAND_REFUSED)
+        assert event.data["reason"] == Refusal.OUT_OF_RANGE
+        assert "safety.box" in event.text
+
+
+def test_a_position_that_gets_lost_on_the_way_stops_a_vehicle_that_flies_there_itself() -> None:
+    with Bench() as bench:
+        pilot = placed(bench)
+        pilot.command(Position(3.0, 0.0, 1.0))
+        bench.driver.report(position=None)
+        pilot.command(Position(3.0, 0.0, 1.0), repeat=True)
+        assert bench.driver.told[-1] == Hover()
+        assert pilot.refusals() == [Refusal.WRONG_STATE]
+
+
+@pytest.mark.parametrize("actions", [ALL, SOFTWARE], ids=["native", "software"])
+def test_a_vehicle_that_is_not_heard_for_a_moment_stops_and_then_goes_on(actions: frozenset[str]) -> None:
+    with Bench(actions) as bench:
+        pilot = placed(bench)
+        pilot.command(Position(3.0, 0.0, 1.0))
+        bench.clock.advance(0.6)
+        pilot.command(Position(3.0, 0.0, 1.0), repeat=True)
+        bench.driver.report()
+        pilot.command(Position(3.0, 0.0, 1.0), repeat=True)
+        bench.tick()
+        flies = Position if actions is ALL else Velocity
+        assert [type(action) for action in bench.driver.told][-2:] == [Hover, flies]
+        assert pilot.refusals() == []
+
+
+def test_with_walls_the_proxy_checks_each_step_of_the_way() -> None:
+    with Bench() as bench:
+        pilot = placed(bench)
+        write(bench, pilot, "safety.box.x_high", 3.0)
+        pilot.command(Position(2.9, 0.0, 1.0))
+        assert Position not in map(type, bench.driver.told)
+        bench.driver.report(position=(2.5, 0.0, 1.0), velocity=(2.0, 0.0, 0.0))
+        bench.tick()
+        told = bench.driver.told[-1]
+        assert isinstance(told, Velocity)
+        assert told.forward < 0.2, "as slow as any velocity so near to the wall: the way alone allows 0.36 m/s"
+        write(bench, pilot, "safety.box.x_high", 2.7)
+        pilot.command(Position(2.9, 0.0, 1.0), repeat=True)
+        assert bench.driver.told[-1] == Hover(), "the place is outside by now"
+        assert pilot.refusals() == [Refusal.OUT_OF_RANGE]
+
+
+def test_walls_that_are_set_on_the_way_take_over_from_the_vehicle() -> None:
+    with Bench() as bench:
+        pilot = placed(bench)
+        pilot.command(Position(3.0, 0.0, 1.0))
+        write(bench, pilot, "safety.zones", "box 10 10 0 11 11 3")
+        pilot.command(Position(3.0, 0.0, 1.0), repeat=True)
+        bench.tick()
+        assert [type(action) for action in bench.driver.told] == [Position, Velocity]
+
+
+@pytest.mark.parametrize("actions", [ALL, SOFTWARE], ids=["native", "software"])
+def test_a_pilot_who_falls_silent_on_the_way_gets_the_failsafe(actions: frozenset[str]) -> None:
+    with Bench(actions) as bench:
+        pilot = placed(bench)
+        pilot.command(Position(100.0, 0.0, 1.0))
+        bench.run(3.0, lambda: bench.driver.report())
+        assert Hover() in bench.driver.told
+        after = bench.driver.told[bench.driver.told.index(Hover()) :]
+        assert not {Position, Velocity} & set(map(type, after)), "nothing flies on"
+
+
+@pytest.mark.parametrize("state", [FlightState.LANDED, FlightState.EMERGENCY])
+def test_on_the_ground_it_is_refused(state: FlightState) -> None:
+    with Bench(SOFTWARE) as bench:
+        pilot = placed(bench, state=state)
+        pilot.command(Position(0.0, 0.0, 2.0))
+        assert pilot.refusals() == [Refusal.WRONG_STATE]
+        bench.tick()
+        assert bench.driver.told == []
+
+
+@pytest.mark.parametrize("wrong", [Position(math.nan, 0.0, 1.0), Position(0.0, 0.0, 1.0, math.inf)])
+def test_numbers_that_are_none_are_refused(wrong: Position) -> None:
+    with Bench() as bench:
+        pilot = placed(bench)
+        pilot.command(wrong)
+        assert pilot.refusals() == [Refusal.NON_FINITE]
+        assert bench.driver.told == []
+
+
+def test_applications_are_told_what_the_proxy_adds() -> None:
+    with Bench(SOFTWARE) as bench:
+        welcome = bench.stranger().hello("somebody")
+        assert welcome.capabilities.software == {"position"}
