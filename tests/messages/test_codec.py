@@ -98,7 +98,7 @@ def without_software(welcome: AnyReply) -> Reply:
         (Position(0.0, 0.0, 1e6), "z is 1e"),
         (Position(0.0, 0.0, 1.0, yaw=1e4), "yaw is 10000 rad and must be from -1000 to 1000"),
         (Position(0.0, 0.0, 1.0, speed=0.0), "speed is 0 m/s and must be more than 0"),
-        (Position(0.0, 0.0, 1.0, yaw_rate=-1.0), "yaw_rate is -1 rad/s and must be more than 0"),
+        (Position(0.0, 0.0, 1.0, turn_rate=-1.0), "turn_rate is -1 rad/s and must be more than 0"),
     ],
 )
 def test_places_that_make_no_sense_say_so(action: Position, words: str) -> None:

@@ -55,6 +55,7 @@ from skyloop.messages import (
     LogEntry,
     Parameter,
     ParameterType,
+    Position,
     Severity,
     Takeoff,
     Value,
@@ -90,6 +91,7 @@ class Plan:
     compression: CompressionType = CompressionType.ZSTD
     chunk_size: int = 16 * 1024
     closed: bool = True
+    places: bool = False  #: it flies to a place instead of by velocity
     shift_ns: int = 0  #: of the commands, on the proxy's clock
     extra: Callable[[int], Feedback | None] = field(default=lambda at_ms: None)  #: replaces the feedback of a time
     packed: Callable[[int], bytes | None] = field(default=lambda number: None)  #: replaces the file of a picture
@@ -139,6 +141,8 @@ def action_at(plan: Plan, at_ms: int) -> AnyAction:
         return Takeoff()
     if share > 0.8:
         return Land()
+    if plan.places:
+        return Position(1.0, 2.0, 1.2 * plan.gain)
     return Velocity(forward=0.4 * plan.gain, left=0.1 * math.sin(at_ms / 300))
 
 

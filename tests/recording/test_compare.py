@@ -13,6 +13,7 @@ from skyloop.errors import FileFormatError, UnknownNameError
 from skyloop.logfile.reader import Recording
 from skyloop.messages import Feedback
 from skyloop.recording.review.compare import compare
+from skyloop.recording.review.tables import tables
 from tests.cli.conftest import Ended
 from tests.recording.flights import MS, Plan, feedback_at, write_flight
 
@@ -39,6 +40,20 @@ def test_a_timid_controller(flight: Path, other_flight: Path) -> None:
     assert found.part_at_s == pytest.approx(0.51, abs=0.02)  # with the first velocity
     assert found.aligned == "by their clock, which is the same"
     assert compare(Recording.open(flight), Recording.open(other_flight), part=0.3).part_at_s is None
+
+
+def test_flights_to_a_place(tmp_path: Path) -> None:
+    paths = [write_flight(tmp_path / f"{gain}.mcap", Plan(places=True, gain=gain)) for gain in (1.0, 2.0)]
+    low, high = map(Recording.open, paths)
+    fields = {field.name: field for field in compare(low, high, what="asked").fields}
+    assert fields["z"].unit == "m"
+    assert fields["z"].rms == pytest.approx(1.2)
+    assert fields["x"].rms == 0.0
+    assert "yaw" not in fields, "none was asked for"
+    commands = tables(low, "alpha")["commands"]
+    flying = commands["asked"] == "position"
+    assert commands["applied_y"][flying] == pytest.approx(2.0)
+    assert not commands.known("applied_yaw")
 
 
 def test_a_replay_knows_where_it_is(tmp_path: Path, flight: Path) -> None:

@@ -95,7 +95,7 @@ class Position(Action, frozen=True, array_like=True, tag=8):
     """A place to fly to and to stay at, in the world's axes of ``Feedback.position``.
 
     ``x`` east, ``y`` north, ``z`` up [m]; ``yaw`` counter-clockwise from x [rad], None keeps the present heading;
-    ``speed`` [m/s] along the way and ``yaw_rate`` [rad/s] are the greatest ones, None: as fast as the limits allow.
+    ``speed`` [m/s] along the way and ``turn_rate`` [rad/s] are the greatest ones, None: as fast as the limits allow.
     """
 
     x: float
@@ -103,13 +103,13 @@ class Position(Action, frozen=True, array_like=True, tag=8):
     z: float
     yaw: float | None = None
     speed: float | None = None
-    yaw_rate: float | None = None
+    turn_rate: float | None = None
 
     @property
     def finite(self) -> bool:
         """Whether all numbers of the action are finite."""
         return math.isfinite(
-            self.x + self.y + self.z + (self.yaw or 0.0) + (self.speed or 0.0) + (self.yaw_rate or 0.0)
+            self.x + self.y + self.z + (self.yaw or 0.0) + (self.speed or 0.0) + (self.turn_rate or 0.0)
         )
 
     @property
@@ -124,8 +124,8 @@ class Position(Action, frozen=True, array_like=True, tag=8):
             return f"yaw is {self.yaw:g} rad and must be from {-MOST_TURNS_RAD:g} to {MOST_TURNS_RAD:g} rad"
         if self.speed is not None and not self.speed > 0.0:
             return f"speed is {self.speed:g} m/s and must be more than 0 (None: as fast as the limits allow)"
-        if self.yaw_rate is not None and not self.yaw_rate > 0.0:
-            return f"yaw_rate is {self.yaw_rate:g} rad/s and must be more than 0 (None: as fast as the limits allow)"
+        if self.turn_rate is not None and not self.turn_rate > 0.0:
+            return f"turn_rate is {self.turn_rate:g} rad/s and must be more than 0 (None: as fast as the limits allow)"
         return ""
 
     @property

@@ -153,7 +153,7 @@ class PositionSetpoint:
         if self._keep_yaw is None:
             self._keep_yaw = heading
         goal = self._keep_yaw if self.action.yaw is None else yaw_between(self.action.yaw)
-        most = (self.action.yaw_rate or WAY_TURN_RAD_S) * step_s
+        most = (self.action.turn_rate or WAY_TURN_RAD_S) * step_s
         yaw += max(-most, min(most, wrap_angle(goal - yaw)))
         lead = wrap_angle(yaw - heading)
         self._yaw = wrap_angle(heading + max(-MOST_YAW_LEAD_RAD, min(MOST_YAW_LEAD_RAD, lead)))

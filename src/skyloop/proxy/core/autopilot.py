@@ -230,7 +230,7 @@ class Autopilot:
             forward=share * (cos * east + sin * north),
             left=share * (cos * north - sin * east),
             up=share * up,
-            yaw_rate=_bound(TURN_GAIN * turn, TURN_RATE if target.yaw_rate is None else target.yaw_rate),
+            yaw_rate=_bound(TURN_GAIN * turn, TURN_RATE if target.turn_rate is None else target.turn_rate),
         )
         return self.guard(wanted, known, now_ns)
 

@@ -63,11 +63,11 @@ def decide_place(
     speed, limit = _fastest(at, place, limits)
     if new and action.speed is not None and action.speed > speed:  # told once: the direction turns near the place
         clamps.append(Clamp(limit, action.speed, speed))
-    yaw_rate = limits.yaw_rate
-    if action.yaw_rate is not None and action.yaw_rate > yaw_rate:
-        clamps.append(Clamp("limits.yaw_rate", action.yaw_rate, yaw_rate))
+    turn_rate = limits.yaw_rate
+    if action.turn_rate is not None and action.turn_rate > turn_rate:
+        clamps.append(Clamp("limits.yaw_rate", action.turn_rate, turn_rate))
     fitted = Position(
-        x, y, z, action.yaw, min(speed, action.speed or math.inf), min(yaw_rate, action.yaw_rate or math.inf)
+        x, y, z, action.yaw, min(speed, action.speed or math.inf), min(turn_rate, action.turn_rate or math.inf)
     )
     return PlaceDecision(fitted, tuple(clamps))
 

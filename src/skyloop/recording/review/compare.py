@@ -18,7 +18,11 @@ from skyloop.recording.review.tables import ACTION_FIELDS, begin_ns
 RATE_HZ: Final = 100.0  #: rate at which both are compared; a command holds until the next one
 PART: Final = 0.01  #: greatest difference of set-points that are equal, in their SI unit
 _POSITION: Final = "replay.position_s"
-_UNITS: Final = {"roll": "rad", "pitch": "rad", "yaw_rate": "rad/s"}
+_UNITS: Final = {
+    **dict.fromkeys(("roll", "pitch", "yaw"), "rad"),
+    **dict.fromkeys(("yaw_rate", "turn_rate"), "rad/s"),
+    **dict.fromkeys(("x", "y", "z"), "m"),
+}
 
 What = Literal["asked", "applied"]
 
@@ -146,7 +150,8 @@ def _commands(recording: Recording, drone: str, what: What, zero_ns: int, offset
         times.append((applied.applied_ns + offset_ns - zero_ns) / NS_PER_S)
         names.append(action.name)
         for name, column in numbers.items():
-            column.append(float(getattr(action, name, np.nan)))
+            value = getattr(action, name, None)
+            column.append(np.nan if value is None else float(value))
     order = np.argsort(np.array(times, np.float64), kind="stable")
     return Commands(
         np.array(times, np.float64)[order],

@@ -31,7 +31,10 @@ AXES: Final[dict[str, tuple[str, ...]]] = {
     "position": ("x", "y", "z"),
 }
 #: The numbers that an action may carry, in the order of the columns.
-ACTION_FIELDS: Final = ("roll", "pitch", "climb", "forward", "left", "up", "yaw_rate")
+ACTION_FIELDS: Final = (
+    *("roll", "pitch", "climb", "forward", "left", "up", "yaw_rate"),
+    *("x", "y", "z", "yaw", "speed", "turn_rate"),
+)
 _ABSURD: Final = 1e30  #: greatest number in any unit: its square, and a sum of many, must not overflow
 Cell = float | int | str | bool | None
 
