@@ -28,7 +28,7 @@ class Detector:
     def process(self, frame: skyloop.Frame) -> Output:  # BGR, shape (h, w, 3), uint8
         seen = self.markers.detect(frame)
         outlines = [skyloop.Polyline(tuple(map(tuple, one.corners.tolist())), closed=True) for one in seen]
-        return Output([Sighting(right=one.position[0], ahead=one.position[2]) for one in seen], outlines)
+        return Output([Sighting(right=one.position_m[0], ahead=one.position_m[2]) for one in seen], outlines)
 
 
 class Face(skyloop.Controller):

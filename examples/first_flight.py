@@ -12,7 +12,7 @@ def main(target: str = "sim://") -> None:
         for frame in islice(drone.frames(max_fps=10), 63):  # the newest picture: BGR, (h, w, 3), uint8
             drone.velocity(forward=0.4, yaw_rate=1.0)  # m/s, rad/s: a circle of 0.4 m, counter-clockwise
             if frame.feedback is not None:  # the drone's state when the picture was taken
-                height = frame.feedback.altitude
+                height = frame.feedback.altitude_m
                 print(f"{frame.age_s * 1000:.0f} ms ago, {height:.2f} m up: {frame.mean():.0f} bright")
         drone.land()
 

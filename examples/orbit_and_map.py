@@ -24,7 +24,7 @@ class Map(OrbitPlace):
 
     def on_frame(self, frame: skyloop.Frame) -> None:  # on_feedback flies, this one maps
         state = frame.feedback
-        if state is None or state.position is None:
+        if state is None or state.position_m is None:
             return
         shapes: list[skyloop.Polyline | skyloop.Text] = []
         for marker in self.detector.detect(frame):

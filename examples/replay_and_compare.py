@@ -27,7 +27,7 @@ class Face(skyloop.Controller):
         if not seen:
             self.drone.velocity(yaw_rate=0.7)  # rad/s, counter-clockwise
             return
-        right, down, ahead = seen[0].position  # metres, from the camera
+        right, down, ahead = seen[0].position_m  # metres, from the camera
         self.drone.velocity(forward=0.8 * (ahead - 1.5), up=-0.8 * down, yaw_rate=-self.gain * right / ahead)
 
 

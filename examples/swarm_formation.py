@@ -19,7 +19,7 @@ def main(*targets: str, seconds: float = 6.0) -> None:
         drones.wait_all("hovering", timeout_s=15)
         formation = Formation(drones, apart_m=0.6)
         middle = [
-            sum(axis) / len(drones) for axis in zip(*(f.position for f in drones.feedback().values()), strict=True)
+            sum(axis) / len(drones) for axis in zip(*(f.position_m for f in drones.feedback().values()), strict=True)
         ]
         for shape, yaw in ((vee(len(drones), 1.0), 0.0), (circle(len(drones), 1.2), math.pi / 2)):
             report = formation.fly_to(placed(shape, at=middle, yaw=yaw), speed_m_s=0.8)

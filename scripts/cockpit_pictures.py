@@ -129,7 +129,7 @@ def rounds(name: str, number: int) -> Fly:
     def fly(stop: threading.Event) -> None:
         with skyloop.connect(name, name=f"rounds.py {number + 1}") as drone:
             drone.takeoff()
-            x, y, _ = drone.feedback().position or (0.0, 0.0, 0.0)
+            x, y, _ = drone.feedback().position_m or (0.0, 0.0, 0.0)
             turns = [2 * math.pi * (corner / 3 + number / 9) for corner in range(3)]
             corners = [
                 (x + ROUND_M * math.cos(turn), y + 0.5 * ROUND_M * math.sin(turn), 1.0 + 0.25 * number)
@@ -140,7 +140,7 @@ def rounds(name: str, number: int) -> Fly:
                 goal = Waypoint(*corners[corner % 3])
                 feedback = drone.feedback()
                 drone.log.array("waypoints", corners)
-                drone.log.number("distance_m", math.dist(goal.position, feedback.position or goal.position))
+                drone.log.number("distance_m", math.dist(goal.position, feedback.position_m or goal.position))
                 if reached(goal, feedback):
                     corner += 1
                 drone.command(velocity_to(goal, feedback))

@@ -21,10 +21,10 @@ angles = st.floats(-1.4, 1.4)
 
 
 def test_a_point_ahead_of_a_camera_that_looks_forward() -> None:
-    north = Feedback(captured_ns=0, position=(1.0, 2.0, 1.5), roll=0.0, pitch=0.0, yaw=math.pi / 2)
+    north = Feedback(captured_ns=0, position_m=(1.0, 2.0, 1.5), roll_rad=0.0, pitch_rad=0.0, yaw_rad=math.pi / 2)
     assert camera_in_world(FRONT, north).apply([0.0, 0.0, 2.0]) == pytest.approx([1.0, 4.12, 1.5])
     assert camera_in_world(FRONT, north).apply([0.5, 0.0, 2.0]) == pytest.approx([1.5, 4.12, 1.5]), "right is east"
-    down = Feedback(captured_ns=0, position=(0.0, 0.0, 1.5), roll=0.0, pitch=0.3, yaw=0.0)
+    down = Feedback(captured_ns=0, position_m=(0.0, 0.0, 1.5), roll_rad=0.0, pitch_rad=0.3, yaw_rad=0.0)
     assert camera_in_world(FRONT, down).apply([0.0, 0.0, 2.0])[2] < 1.5 - 2 * math.sin(0.29), "nose down looks down"
     assert attitude(down).apply([0.0, 0.0, 1.0]) == pytest.approx([math.sin(0.3), 0.0, math.cos(0.3)])
 
@@ -33,7 +33,7 @@ def test_a_point_ahead_of_a_camera_that_looks_forward() -> None:
 def test_cameras_are_where_the_simulator_has_them(
     roll: float, pitch: float, yaw: float, place: tuple[float, float, float]
 ) -> None:
-    feedback = Feedback(captured_ns=0, position=place, roll=roll, pitch=pitch, yaw=yaw)
+    feedback = Feedback(captured_ns=0, position_m=place, roll_rad=roll, pitch_rad=pitch, yaw_rad=yaw)
     for model in (FRONT_CAMERA, BOTTOM_CAMERA):
         expected = model.pose(np.array(place), feedback.rotation)
         found = camera_in_world(model.info(), feedback)
@@ -44,15 +44,15 @@ def test_cameras_are_where_the_simulator_has_them(
 
 
 def test_a_position_from_elsewhere_goes_first() -> None:
-    feedback = Feedback(captured_ns=0, position=(9.0, 9.0, 9.0), roll=0.0, pitch=0.0, yaw=0.0)
+    feedback = Feedback(captured_ns=0, position_m=(9.0, 9.0, 9.0), roll_rad=0.0, pitch_rad=0.0, yaw_rad=0.0)
     assert body_in_world(feedback, (1.0, 2.0, 3.0)).translation == pytest.approx([1.0, 2.0, 3.0])
 
 
 def test_what_is_not_known_is_said() -> None:
     with pytest.raises(UsageError, match="does not report its position"):
-        body_in_world(Feedback(captured_ns=0, roll=0.0, pitch=0.0, yaw=0.0))
+        body_in_world(Feedback(captured_ns=0, roll_rad=0.0, pitch_rad=0.0, yaw_rad=0.0))
     with pytest.raises(UsageError, match="attitude"):
-        body_in_world(Feedback(captured_ns=0, position=(0.0, 0.0, 0.0)))
+        body_in_world(Feedback(captured_ns=0, position_m=(0.0, 0.0, 0.0)))
     with pytest.raises(UsageError, match="how it is mounted"):
         camera_in_body(CameraInfo("front", 320, 240, 30.0))
     for position, rotation in (

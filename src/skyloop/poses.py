@@ -51,7 +51,7 @@ def body_in_world(feedback: Feedback, position: ArrayLike | None = None) -> Rigi
 
     Raises :class:`UsageError` while attitude or position is not known.
     """
-    place = feedback.position if position is None else position
+    place = feedback.position_m if position is None else position
     if place is None:
         raise UsageError("the vehicle does not report its position: give the one that you know")
     return transform(place, _rotation(feedback))
@@ -62,7 +62,7 @@ def camera_in_body(camera: CameraInfo) -> RigidTransform:
 
     Raises :class:`UsageError` if it does not say how it is turned.
     """
-    return transform((0.0, 0.0, 0.0) if camera.position is None else camera.position, mounting_rotation(camera))
+    return transform((0.0, 0.0, 0.0) if camera.position_m is None else camera.position_m, mounting_rotation(camera))
 
 
 def camera_in_world(camera: CameraInfo, feedback: Feedback, position: ArrayLike | None = None) -> RigidTransform:

@@ -107,7 +107,7 @@ class JournalledVehicle(Driver):
             if self._state is FlightState.LANDING and now_ns >= self._land_at_ns:
                 self._become(FlightState.LANDED)
             altitude = 0.0 if self._state is FlightState.LANDED else 1.0
-            sink.feedback(Feedback(captured_ns=now_ns, state=self._state, battery=0.9, altitude=altitude))
+            sink.feedback(Feedback(captured_ns=now_ns, state=self._state, battery=0.9, altitude_m=altitude))
             if sink.wants("front"):
                 sink.frame("front", pixels, now_ns, width=WIDTH, height=HEIGHT)
 

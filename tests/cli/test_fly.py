@@ -30,7 +30,7 @@ import skyloop
 class Raising(skyloop.Controller):
     def on_feedback(self, feedback):
         self.drone.velocity(forward=0.2)
-        self.helper(feedback.altitude)
+        self.helper(feedback.altitude_m)
 
     def helper(self, altitude):
         return altitude / 0

@@ -138,7 +138,7 @@ def test_a_flight_by_keys(terminal: Terminal) -> None:
         terminal.press(b"t")
         drone.wait("hovering", timeout_s=30.0)
         terminal.press(b"w\x1b[D")
-        drone.wait(lambda feedback: (feedback.velocity or (0.0,))[0] > 0.05, 20.0)
+        drone.wait(lambda feedback: (feedback.velocity_m_s or (0.0,))[0] > 0.05, 20.0)
         drone.wait("hovering", timeout_s=30.0)  # no key is held any more
         terminal.press(b"+")
         terminal.until("1 m/s, 1.6 rad/s")

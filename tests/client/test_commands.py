@@ -228,7 +228,7 @@ def test_take_off_that_is_refused_for_good(
 
 
 PLACE = Position(1.0, 2.0, 1.5, 0.5, 0.8)
-THERE = {"position": (1.1, 2.0, 1.5), "yaw": 0.45, "velocity": (0.0, 0.0, 0.0)}
+THERE = {"position_m": (1.1, 2.0, 1.5), "yaw_rad": 0.45, "velocity_m_s": (0.0, 0.0, 0.0)}
 
 
 def go_to(drone: Drone, timeout_s: float = WAIT_S) -> None:
@@ -237,7 +237,13 @@ def go_to(drone: Drone, timeout_s: float = WAIT_S) -> None:
 
 @pytest.mark.parametrize(
     "not_yet",
-    [{"position": (1.3, 2.0, 1.5)}, {"position": None}, {"yaw": 0.8}, {"yaw": None}, {"velocity": (0.5, 0.0, 0.0)}],
+    [
+        {"position_m": (1.3, 2.0, 1.5)},
+        {"position_m": None},
+        {"yaw_rad": 0.8},
+        {"yaw_rad": None},
+        {"velocity_m_s": (0.5, 0.0, 0.0)},
+    ],
 )
 def test_go_to_waits_until_the_vehicle_is_there(proxy: ScriptedProxy, drone: Drone, not_yet: dict[str, Any]) -> None:
     proxy.state = FlightState.FLYING

@@ -144,11 +144,11 @@ def test_sizes_are_checked() -> None:
 def test_the_state_at_the_capture_gets_better_until_it_is_final() -> None:
     history = FeedbackHistory()
     frame = Arrival(header(), pixels(), 3000, 0, history).frame()
-    history.add(Feedback(captured_ns=500, altitude=1.0))
+    history.add(Feedback(captured_ns=500, altitude_m=1.0))
     assert frame.feedback is not None
-    assert (frame.feedback.altitude, frame.feedback_reach_s) == (1.0, 500 / 1e9)
-    history.add(Feedback(captured_ns=2000, altitude=4.0))
-    assert frame.feedback.altitude == pytest.approx(2.0)
+    assert (frame.feedback.altitude_m, frame.feedback_reach_s) == (1.0, 500 / 1e9)
+    history.add(Feedback(captured_ns=2000, altitude_m=4.0))
+    assert frame.feedback.altitude_m == pytest.approx(2.0)
     assert frame.feedback_reach_s == pytest.approx(1000 / 1e9)
     history.add(Feedback(captured_ns=100))  # the proxy was restarted: what this frame knows stays
-    assert frame.feedback.altitude == pytest.approx(2.0)
+    assert frame.feedback.altitude_m == pytest.approx(2.0)

@@ -73,15 +73,20 @@ def test_a_clock_that_was_set_is_believed_at_once() -> None:
 
 def test_the_state_between_two_samples() -> None:
     a = Feedback(
-        captured_ns=0, yaw=3.0, altitude=1.0, velocity=(0.0, 2.0, 0.0), state=FlightState.HOVERING, battery=0.5
+        captured_ns=0,
+        yaw_rad=3.0,
+        altitude_m=1.0,
+        velocity_m_s=(0.0, 2.0, 0.0),
+        state=FlightState.HOVERING,
+        battery=0.5,
     )
-    b = Feedback(captured_ns=100, yaw=-3.0, altitude=2.0, velocity=(1.0, 0.0, 0.0), state=FlightState.FLYING)
+    b = Feedback(captured_ns=100, yaw_rad=-3.0, altitude_m=2.0, velocity_m_s=(1.0, 0.0, 0.0), state=FlightState.FLYING)
     middle = interpolate(a, b, 25)
     assert middle.captured_ns == 25
-    assert middle.yaw == pytest.approx(3.0 + 0.25 * (math.tau - 6.0))
-    assert middle.altitude == pytest.approx(1.25)
-    assert middle.velocity == pytest.approx((0.25, 1.5, 0.0))
-    assert (middle.state, middle.battery, middle.roll) == (FlightState.HOVERING, 0.5, None)
+    assert middle.yaw_rad == pytest.approx(3.0 + 0.25 * (math.tau - 6.0))
+    assert middle.altitude_m == pytest.approx(1.25)
+    assert middle.velocity_m_s == pytest.approx((0.25, 1.5, 0.0))
+    assert (middle.state, middle.battery, middle.roll_rad) == (FlightState.HOVERING, 0.5, None)
     assert interpolate(a, b, 75).state is FlightState.FLYING
     assert interpolate(a, b, 75).battery is None
 
@@ -89,7 +94,7 @@ def test_the_state_between_two_samples() -> None:
 @given(angles, angles, st.floats(0.0, 1.0))
 def test_angles_take_the_shorter_way(a: float, b: float, share: float) -> None:
     at = round(share * 10**6)
-    got = interpolate(Feedback(captured_ns=0, yaw=a), Feedback(captured_ns=10**6, yaw=b), at).yaw
+    got = interpolate(Feedback(captured_ns=0, yaw_rad=a), Feedback(captured_ns=10**6, yaw_rad=b), at).yaw_rad
     assert got is not None
     assert -math.pi <= got <= math.pi
     whole = abs(math.remainder(b - a, math.tau))
@@ -101,10 +106,10 @@ def test_history_looks_on_both_sides() -> None:
     history = FeedbackHistory(depth=4)
     assert history.at(5) == (None, None, False)
     for at in (0, 10**9, 2 * 10**9):
-        history.add(Feedback(captured_ns=at, altitude=at / 1e9))
+        history.add(Feedback(captured_ns=at, altitude_m=at / 1e9))
     state, reach_s, final = history.at(1_250_000_000)
     assert state is not None
-    assert state.altitude == pytest.approx(1.25)
+    assert state.altitude_m == pytest.approx(1.25)
     assert (reach_s, final) == (0.75, True)
     state, reach_s, final = history.at(10**9)
     assert state is not None

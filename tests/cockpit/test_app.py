@@ -165,7 +165,7 @@ def test_another_vehicle_under_the_same_name_is_told(client: TestClient, drone: 
 
 def test_overview_shows_all_drones() -> None:
     alpha, beta = FakeDrone(), FakeDrone()
-    beta.newest = flying(battery=0.05, position=(1.0, 2.0, 3.0))
+    beta.newest = flying(battery=0.05, position_m=(1.0, 2.0, 3.0))
     with (
         cockpit(fake_fleet({"beta": beta, "alpha": alpha})) as client,
         open_socket(client, "overview") as first,

@@ -94,7 +94,7 @@ def test_horizon_follows_the_attitude(deck: Deck) -> None:
         drone.hover()
 
         def agree() -> bool:
-            roll = drone.feedback().roll
+            roll = drone.feedback().roll_rad
             return roll is not None and abs(rotation(page) + roll * 57.29578) < 1.0
 
         page.until(agree, "horizon and feedback agree")
@@ -106,16 +106,16 @@ def test_keyboard_flight(deck: Deck) -> None:
     page = deck.page("keys")
     with observe("keys") as drone:
         page.take_off()
-        before = drone.feedback().position
+        before = drone.feedback().position_m
         page.page.keyboard.down("w")
-        page.until(lambda: (drone.feedback().velocity or (0,))[0] > 0.4, "it flies forward")
+        page.until(lambda: (drone.feedback().velocity_m_s or (0,))[0] > 0.4, "it flies forward")
         page.until(
             lambda: float(page.says('[data-figure="Speed"]').replace("−", "-")) > 0.4, "the page shows its speed"
         )
         page.wait_for_text(".command", "forward 0.80")
         page.page.keyboard.up("w")
         page.until(lambda: drone.feedback().state is FlightState.HOVERING, "it hovers when the key is released")
-        after = drone.feedback().position
+        after = drone.feedback().position_m
         assert before is not None
         assert after is not None
         assert after[0] > before[0], "it flew forward; how far depends on how soon the page saw its speed"
@@ -361,7 +361,7 @@ def test_gamepad(deck: Deck) -> None:
                 page.page.wait_for_timeout(200)
                 page.page.evaluate("window.pad.axes = [0, 0, 0, -1]")
                 pushed_s = time.monotonic()
-            return (drone.feedback().velocity or (0,))[0] > 0.3
+            return (drone.feedback().velocity_m_s or (0,))[0] > 0.3
 
         page.until(flies_forward, "the right stick flies forward")
         page.page.evaluate("window.pad = null")
@@ -377,10 +377,10 @@ def test_a_click_on_the_map_is_a_waypoint(deck: Deck) -> None:
         canvas.wait_for()
         box = canvas.bounding_box()
         assert box is not None
-        start = drone.feedback().position
+        start = drone.feedback().position_m
         canvas.click(position={"x": box["width"] * 0.75, "y": box["height"] / 2})
         page.wait_for_text(".notice", "waypoint is reached")
-        there = drone.feedback().position
+        there = drone.feedback().position_m
         assert start is not None
         assert there is not None
         assert there[0] > start[0] + 0.3, "to the right is east"

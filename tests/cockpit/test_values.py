@@ -101,11 +101,11 @@ def test_what_is_not_known_is_null_and_not_zero() -> None:
 
 def test_every_number_has_a_name_of_its_own() -> None:
     feedback = flying(
-        yaw=1.0,
-        velocity=(3.0, 4.0, 0.0),
-        angular_velocity=(1.0, 2.0, 3.0),
-        acceleration=(0.0, 0.0, 9.81),
-        position=(5.0, 6.0, 7.0),
+        yaw_rad=1.0,
+        velocity_m_s=(3.0, 4.0, 0.0),
+        angular_velocity_rad_s=(1.0, 2.0, 3.0),
+        acceleration_m_s2=(0.0, 0.0, 9.81),
+        position_m=(5.0, 6.0, 7.0),
         native={"rpm": 4, "armed": True, "mode": "x", "pwm": (1.0, 2.0), "bad": math.nan},
     )
     values = flat_values(feedback, {"error": 0.5}, Attitude(roll=0.1, climb=math.inf))

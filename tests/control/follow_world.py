@@ -116,12 +116,12 @@ class FollowWorld:
         return Feedback(
             captured_ns=self.now_ns,
             state=FlightState.FLYING,
-            roll=self.roll + tilt[0],
-            pitch=self.pitch + tilt[1],
-            yaw=self.yaw,
-            altitude=float(self.position[2]),
-            velocity=(float(velocity[0]), float(velocity[1]), float(velocity[2])),
-            angular_velocity=(0.0, 0.0, self.yaw_rate),
+            roll_rad=self.roll + tilt[0],
+            pitch_rad=self.pitch + tilt[1],
+            yaw_rad=self.yaw,
+            altitude_m=float(self.position[2]),
+            velocity_m_s=(float(velocity[0]), float(velocity[1]), float(velocity[2])),
+            angular_velocity_rad_s=(0.0, 0.0, self.yaw_rate),
         )
 
     def _look(self) -> tuple[np.ndarray, np.ndarray, Feedback, int] | None:

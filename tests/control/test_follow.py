@@ -56,12 +56,12 @@ class Recorder:
 def state(captured_ns: int) -> Feedback:
     return Feedback(
         captured_ns=captured_ns,
-        roll=0.0,
-        pitch=0.0,
-        yaw=0.0,
-        altitude=1.0,
-        velocity=(0, 0, 0),
-        angular_velocity=(0, 0, 0),
+        roll_rad=0.0,
+        pitch_rad=0.0,
+        yaw_rad=0.0,
+        altitude_m=1.0,
+        velocity_m_s=(0, 0, 0),
+        angular_velocity_rad_s=(0, 0, 0),
     )
 
 

@@ -17,7 +17,13 @@ from tests.control.follow_world import FollowWorld
 
 
 def still(at_s: float, **values: object) -> Feedback:
-    known: dict[str, object] = {"roll": 0.0, "pitch": 0.0, "yaw": 0.0, "altitude": 1.0, "velocity": (0.0, 0.0, 0.0)}
+    known: dict[str, object] = {
+        "roll_rad": 0.0,
+        "pitch_rad": 0.0,
+        "yaw_rad": 0.0,
+        "altitude_m": 1.0,
+        "velocity_m_s": (0.0, 0.0, 0.0),
+    }
     return Feedback(captured_ns=nanoseconds(at_s), **(known | values))  # type: ignore[arg-type]
 
 
@@ -95,14 +101,14 @@ def test_comes_round_to_the_face(side: int) -> None:
 
 def test_tilt_is_taken_out() -> None:
     # Nose down by 0.2 rad (positive pitch): a marker at the vehicle's own height is seen above the body's axis.
-    law = law_that_sees([1.5 * math.cos(0.2), 0.0, 1.5 * math.sin(0.2)], [-1.0, 0.0, 0.0], pitch=0.2)
+    law = law_that_sees([1.5 * math.cos(0.2), 0.0, 1.5 * math.sin(0.2)], [-1.0, 0.0, 0.0], pitch_rad=0.2)
     assert abs(law.step(nanoseconds(1.05)).up) < 0.02
 
 
 def test_own_motion_since_the_capture_counts() -> None:
     law = law_that_sees([2.0, 0.0, 0.0], [-1.0, 0.0, 0.0])
     for k in range(1, 6):  # flew 0.5 m nearer since
-        law.feedback(still(1.0 + 0.06 * k, velocity=(1.85, 0.0, 0.0)))
+        law.feedback(still(1.0 + 0.06 * k, velocity_m_s=(1.85, 0.0, 0.0)))
     assert law.step(nanoseconds(1.3)).forward < 0.1
 
 
@@ -119,7 +125,7 @@ def test_search_turns_and_goes_to_other_heights() -> None:
     yaw, altitude, heights = 0.0, 1.0, []
     for k in range(1200):
         now = 1.0 + 0.02 * k
-        law.feedback(still(now, yaw=yaw, altitude=altitude))
+        law.feedback(still(now, yaw_rad=yaw, altitude_m=altitude))
         wanted = law.step(nanoseconds(now))
         assert wanted.forward == wanted.left == 0.0
         yaw, altitude = math.remainder(yaw + wanted.yaw_rate * 0.02, 2 * math.pi), altitude + wanted.up * 0.02
@@ -140,7 +146,7 @@ def test_whatever_is_seen_the_answer_is_finite_and_within_limits(
     position: list[float], normal: list[float], angles: list[float], altitude: float | None, wait_s: float
 ) -> None:
     roll, pitch, yaw = angles
-    law = law_that_sees(position, normal, roll=roll, pitch=pitch, yaw=yaw, altitude=altitude)
+    law = law_that_sees(position, normal, roll_rad=roll, pitch_rad=pitch, yaw_rad=yaw, altitude_m=altitude)
     limits = law.settings
     wanted = law.step(nanoseconds(1.0 + wait_s))
     assert wanted.finite
@@ -152,7 +158,7 @@ def test_whatever_is_seen_the_answer_is_finite_and_within_limits(
 def test_odometry_places_a_capture_between_samples() -> None:
     odometry = Odometry()
     for k in range(11):
-        odometry.add(still(1.0 + 0.1 * k, yaw=math.pi / 2, velocity=(0.5, 0.0, 0.1)))
+        odometry.add(still(1.0 + 0.1 * k, yaw_rad=math.pi / 2, velocity_m_s=(0.5, 0.0, 0.1)))
     motion = odometry.at(nanoseconds(1.55))
     assert motion is not None
     assert motion.position == pytest.approx([0.0, 0.275, 0.055])
@@ -161,9 +167,9 @@ def test_odometry_places_a_capture_between_samples() -> None:
 
 def test_odometry_passes_over_what_is_old_or_incomplete() -> None:
     odometry = Odometry()
-    odometry.add(still(1.0, velocity=(1.0, 0.0, 0.0)))
-    odometry.add(still(0.9, velocity=(9.0, 0.0, 0.0)))
-    odometry.add(still(1.1, velocity=None))
+    odometry.add(still(1.0, velocity_m_s=(1.0, 0.0, 0.0)))
+    odometry.add(still(0.9, velocity_m_s=(9.0, 0.0, 0.0)))
+    odometry.add(still(1.1, velocity_m_s=None))
     motion = odometry.at(nanoseconds(1.0))
     assert motion is not None
     assert motion.velocity == pytest.approx([1.0, 0.0, 0.0])

@@ -66,10 +66,10 @@ class Mover(FakeVehicle):
             sample = Feedback(
                 captured_ns=time.monotonic_ns(),
                 state=self.state,
-                yaw=self.yaw,
-                altitude=z,
-                velocity=(v.forward, v.left, v.up),
-                position=(x, y, z) if self.tells else None,
+                yaw_rad=self.yaw,
+                altitude_m=z,
+                velocity_m_s=(v.forward, v.left, v.up),
+                position_m=(x, y, z) if self.tells else None,
             )
             sink.feedback(sample)
 
@@ -192,7 +192,7 @@ def test_a_leader_that_fails_lets_the_followers_hover() -> None:
 
 
 def test_the_place_beside_a_leader() -> None:
-    leader = Feedback(captured_ns=0, position=(1.0, 2.0, 3.0), yaw=math.pi / 2)
+    leader = Feedback(captured_ns=0, position_m=(1.0, 2.0, 3.0), yaw_rad=math.pi / 2)
     assert np.allclose(station(leader, (1.0, 0.5, 0.2)), (0.5, 3.0, 3.2))
     assert np.allclose(station(leader, (1.0, 0.5, 0.2), turn=False), (2.0, 2.5, 3.2))
     with pytest.raises(UsageError, match="does not report its position"):

@@ -52,12 +52,12 @@ class World:
         v = self.velocity
         return Feedback(
             captured_ns=self.now_ns,
-            roll=0.0,
-            pitch=0.0,
-            yaw=self.yaw,
-            altitude=float(self.position[2]),
-            velocity=(v.forward, v.left, v.up),
-            angular_velocity=(0.0, 0.0, v.yaw_rate),
+            roll_rad=0.0,
+            pitch_rad=0.0,
+            yaw_rad=self.yaw,
+            altitude_m=float(self.position[2]),
+            velocity_m_s=(v.forward, v.left, v.up),
+            angular_velocity_rad_s=(0.0, 0.0, v.yaw_rate),
         )
 
     def _along(self) -> np.ndarray:

@@ -17,7 +17,7 @@ WANTED = np.array([[-0.1, -0.1], [0.1, -0.1], [0.1, 0.1], [-0.1, 0.1]])
 
 
 def tilted(at_s: float, pitch: float) -> Feedback:
-    return Feedback(captured_ns=nanoseconds(at_s), state=FlightState.FLYING, roll=0.0, pitch=pitch, yaw=0.0)
+    return Feedback(captured_ns=nanoseconds(at_s), state=FlightState.FLYING, roll_rad=0.0, pitch_rad=pitch, yaw_rad=0.0)
 
 
 def phase_at(law: ImageServoLaw, at_s: float) -> ServoPhase:

@@ -17,7 +17,7 @@ from skyloop.messages.geometry import rotation_from_euler
 
 Array = NDArray[np.float64]
 FORWARD = CameraInfo(
-    "front", 320, 240, 15.0, rotation=(0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0), position=(0.12, 0.0, 0.0)
+    "front", 320, 240, 15.0, rotation=(0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0), position_m=(0.12, 0.0, 0.0)
 )
 SQUARE = np.array([[-0.15, 0.15], [0.15, 0.15], [0.15, -0.15], [-0.15, -0.15]])
 small = st.floats(-0.5, 0.5)
@@ -27,8 +27,8 @@ def seen(position: Array, yaw: float, roll: float = 0.0, pitch: float = 0.0) -> 
     """What the camera of a vehicle in the world sees of a square at x = 2 that faces it: points and depths."""
     world = np.column_stack([np.full(4, 2.0), -SQUARE[:, 0], SQUARE[:, 1]])
     body = (world - position) @ rotation_from_euler(roll, pitch, yaw)
-    assert FORWARD.position is not None
-    optical = (body - np.asarray(FORWARD.position)) @ np.asarray(FORWARD.rotation).reshape(3, 3)
+    assert FORWARD.position_m is not None
+    optical = (body - np.asarray(FORWARD.position_m)) @ np.asarray(FORWARD.rotation).reshape(3, 3)
     return optical[:, :2] / optical[:, 2:], optical[:, 2]
 
 
@@ -58,8 +58,8 @@ def test_points_move_with_what_the_vehicle_does(motion: tuple[int, ...]) -> None
 def test_tilt_is_taken_out(roll: float, pitch: float) -> None:
     # About the camera's own centre nothing but the tilt differs: the lever arm is not what is asked here.
     level, _ = seen(np.zeros(3), 0.0)
-    assert FORWARD.position is not None
-    lever = np.asarray(FORWARD.position)
+    assert FORWARD.position_m is not None
+    lever = np.asarray(FORWARD.position_m)
     place = lever - rotation_from_euler(roll, pitch, 0.0) @ lever
     tilted, _ = seen(place, 0.0, roll, pitch)
     assert levelled(tilted, FORWARD, roll, pitch) == pytest.approx(level, abs=1e-9)

@@ -67,7 +67,7 @@ def test_waypoints_are_reached_held_and_looked_from() -> None:
         drone.takeoff()
         seen: list[tuple[int, float, np.ndarray, float]] = []
         flight = Waypoints(drone, [Waypoint(0.5, 0, 1, yaw=1.0), (0.5, 0.4, 1.2)], hold_s=1.0, yaw=FixedYaw(-0.5))
-        drone.on_feedback(lambda f: seen.append((flight.reached, f.captured_ns / 1e9, truth(f), f.yaw or 0.0)))
+        drone.on_feedback(lambda f: seen.append((flight.reached, f.captured_ns / 1e9, truth(f), f.yaw_rad or 0.0)))
         summary = flight.run(seconds=40.0)
         assert summary.reason == "stopped"
         assert flight.done
@@ -103,7 +103,7 @@ class Capture:
     def _take(self, feedback: Feedback) -> None:
         if not self.frozen:
             x, y, z = truth(feedback).tolist()
-            self._newest = Fix(feedback.captured_ns, (x, y, z), feedback.yaw or 0.0)
+            self._newest = Fix(feedback.captured_ns, (x, y, z), feedback.yaw_rad or 0.0)
 
     def __call__(self) -> Fix | None:
         return None if self.blind else self._newest

@@ -75,8 +75,8 @@ def test_there_means_over_and_near_and_turned() -> None:
         law.step(fix(1.0 + 0.1 * k, 0.1, 0.0, 1.0, yaw=1.0))
     assert law.over
     assert law.there(here)
-    assert not law.there(here._replace(yaw=1.5))
-    assert not law.there(here._replace(position=(0.1, 0.2, 1.0)))
+    assert not law.there(here._replace(yaw_rad=1.5))
+    assert not law.there(here._replace(position_m=(0.1, 0.2, 1.0)))
     law.follow(EAST)
     assert law.time_s == 0.0
     assert not law.over
@@ -123,13 +123,13 @@ def test_set_points_stay_within_the_limits(fixes: list[tuple[float, float, float
 
 
 def test_a_fix_of_feedback_has_its_velocity_in_world_axes() -> None:
-    known = Feedback(captured_ns=5, position=(1.0, 2.0, 3.0), yaw=math.pi / 2, velocity=(0.5, 0.1, 0.2))
+    known = Feedback(captured_ns=5, position_m=(1.0, 2.0, 3.0), yaw_rad=math.pi / 2, velocity_m_s=(0.5, 0.1, 0.2))
     found = fix_of(known)
     assert found is not None
-    assert found.velocity == pytest.approx((-0.1, 0.5, 0.2))
-    assert fix_of(Feedback(captured_ns=5, position=(1.0, 2.0, 3.0))) is None
-    assert fix_of(Feedback(captured_ns=5, yaw=0.0)) is None
-    still = fix_of(Feedback(captured_ns=5, position=(1.0, 2.0, 3.0), yaw=0.0))
+    assert found.velocity_m_s == pytest.approx((-0.1, 0.5, 0.2))
+    assert fix_of(Feedback(captured_ns=5, position_m=(1.0, 2.0, 3.0))) is None
+    assert fix_of(Feedback(captured_ns=5, yaw_rad=0.0)) is None
+    still = fix_of(Feedback(captured_ns=5, position_m=(1.0, 2.0, 3.0), yaw_rad=0.0))
     assert still == Fix(5, (1.0, 2.0, 3.0), 0.0, None)
 
 

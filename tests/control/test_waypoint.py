@@ -21,7 +21,7 @@ angles = some.floats(-10, 10)
 def at(
     position: Vector | None = (0.0, 0.0, 0.0), yaw: float | None = 0.0, velocity: Vector | None = (0.0, 0.0, 0.0)
 ) -> Feedback:
-    return Feedback(captured_ns=1, position=position, yaw=yaw, velocity=velocity)
+    return Feedback(captured_ns=1, position_m=position, yaw_rad=yaw, velocity_m_s=velocity)
 
 
 @pytest.mark.parametrize(
@@ -69,17 +69,17 @@ def test_an_ideal_vehicle_gets_there(x: float, y: float, z: float, yaw: float, h
         if reached(goal, here):
             break
         v = velocity_to(goal, here)
-        assert here.position is not None
-        assert here.yaw is not None
-        c, s = math.cos(here.yaw), math.sin(here.yaw)
+        assert here.position_m is not None
+        assert here.yaw_rad is not None
+        c, s = math.cos(here.yaw_rad), math.sin(here.yaw_rad)
         moved = (c * v.forward - s * v.left, s * v.forward + c * v.left, v.up)
-        east, north, up = (at_ + step_s * one for at_, one in zip(here.position, moved, strict=True))
-        here = at((east, north, up), here.yaw + step_s * v.yaw_rate, (v.forward, v.left, v.up))
+        east, north, up = (at_ + step_s * one for at_, one in zip(here.position_m, moved, strict=True))
+        here = at((east, north, up), here.yaw_rad + step_s * v.yaw_rate, (v.forward, v.left, v.up))
     assert reached(goal, here)
-    assert here.position is not None
-    assert here.yaw is not None
-    assert math.dist(here.position, goal.position) <= SETTINGS.near_m
-    assert abs(wrap_angle(here.yaw - turn)) <= SETTINGS.near_rad
+    assert here.position_m is not None
+    assert here.yaw_rad is not None
+    assert math.dist(here.position_m, goal.position) <= SETTINGS.near_m
+    assert abs(wrap_angle(here.yaw_rad - turn)) <= SETTINGS.near_rad
 
 
 def test_there_means_at_rest() -> None:

@@ -87,7 +87,7 @@ def test_everything_is_told_again(flight: Path) -> None:
         states = [feedback.state for feedback in sink.feedbacks]
         assert {FlightState.LANDED, FlightState.TAKING_OFF, FlightState.FLYING, FlightState.LANDING} == set(states)
         told = sink.feedbacks[30]
-        assert told.altitude is not None
+        assert told.altitude_m is not None
         assert told.owner is None
         assert told.seq == 0
 
@@ -245,7 +245,7 @@ def test_each_drone_of_a_recording_gives_its_own_samples(tmp_path: Path) -> None
 
     def stands(at_ms: int) -> Feedback:
         flying = feedback_at(Plan(), at_ms, at_ms // 40 + 1)
-        return msgspec.structs.replace(flying, state=FlightState.LANDED, battery=0.25, position=(7.0, 8.0, 0.0))
+        return msgspec.structs.replace(flying, state=FlightState.LANDED, battery=0.25, position_m=(7.0, 8.0, 0.0))
 
     beta = Plan(drone="beta", seconds=1.6, feedback_ms=40, frame_ms=0, command_ms=0, lossy=False, capabilities=standing)
     beta.extra = stands
@@ -264,7 +264,7 @@ def test_each_drone_of_a_recording_gives_its_own_samples(tmp_path: Path) -> None
     described, sink = seen["beta"]
     assert described.description == "recording of beta: the second one"
     assert (sink.feedback_count, sink.frame_counts) == (40, {})
-    states = {(feedback.state, feedback.battery, feedback.position) for feedback in sink.feedbacks}
+    states = {(feedback.state, feedback.battery, feedback.position_m) for feedback in sink.feedbacks}
     assert states == {(FlightState.LANDED, 0.25, (7.0, 8.0, 0.0))}
     assert not any("replay.asked" in (feedback.native or {}) for feedback in sink.feedbacks), "commands are alpha's"
     with played(path) as (driver, _):

@@ -156,9 +156,9 @@ def test_the_truth_comes_with_the_feedback() -> None:
         in_the_air(driver, sink)
         newest = sink.newest
     assert newest is not None
-    assert newest.altitude == pytest.approx(number(newest, "truth.z"), abs=0.1)
-    assert newest.position is not None
-    assert newest.position[0] == number(newest, "truth.x")
+    assert newest.altitude_m == pytest.approx(number(newest, "truth.z"), abs=0.1)
+    assert newest.position_m is not None
+    assert newest.position_m[0] == number(newest, "truth.x")
     assert 1.5 < math.hypot(number(newest, "truth.target.x"), number(newest, "truth.target.y")) < 2.6
     assert abs(number(newest, "truth.target.yaw")) <= math.pi
 
@@ -169,7 +169,7 @@ def test_without_truth_feedback_holds_what_a_drone_knows() -> None:
     assert newest is not None
     assert newest.native is not None
     assert set(newest.native) == {"sim.time_s"}
-    assert newest.position is None
+    assert newest.position_m is None
 
 
 def test_a_bump_is_told_and_a_crash_is_an_emergency() -> None:
@@ -224,7 +224,7 @@ def test_one_that_takes_attitudes_only_holds_its_place_without_its_radio_too() -
         with pytest.raises(UsageError, match="sim takes no hover"):
             driver.apply(Hover())
         driver.apply(Attitude(climb=0.5))
-        assert sink.wait(lambda: sink.newest is not None and (sink.newest.altitude or 0.0) > 0.6, 10.0)
+        assert sink.wait(lambda: sink.newest is not None and (sink.newest.altitude_m or 0.0) > 0.6, 10.0)
         driver.set_parameter("sim.link", False)
         driver.set_parameter("sim.link", True)
         told = sink.feedback_count

@@ -77,7 +77,7 @@ class NeverUp(Toy):  # type: ignore[misc, valid-type]
 
 class Degrees(Altered):
     def alter(self, feedback: Feedback) -> Feedback:
-        return msgspec.structs.replace(feedback, yaw=90.0)
+        return msgspec.structs.replace(feedback, yaw_rad=90.0)
 
 
 class NotANumber(Altered):
@@ -94,15 +94,15 @@ class LeftIsRight(Altered):
     """Its world's y axis points south."""
 
     def alter(self, feedback: Feedback) -> Feedback:
-        assert feedback.position is not None
-        x, y, z = feedback.position
-        return msgspec.structs.replace(feedback, position=(x, -y, z))
+        assert feedback.position_m is not None
+        x, y, z = feedback.position_m
+        return msgspec.structs.replace(feedback, position_m=(x, -y, z))
 
 
 class YawIsClockwise(Altered):
     def alter(self, feedback: Feedback) -> Feedback:
-        assert feedback.yaw is not None
-        return msgspec.structs.replace(feedback, yaw=-feedback.yaw)
+        assert feedback.yaw_rad is not None
+        return msgspec.structs.replace(feedback, yaw_rad=-feedback.yaw_rad)
 
 
 class DownIsUp(Toy):  # type: ignore[misc, valid-type]
@@ -165,7 +165,7 @@ FAULTS: list[tuple[type[Driver], str, str]] = [
     (TakesAnyOption, "test_unknown_option_is_refused", "must raise UsageError"),
     (UnknownAction, "test_capabilities_before_open", "loop_the_loop"),
     (NeverUp, "test_feedback", "not reported UP"),
-    (Degrees, "test_feedback", "yaw is 90, outside"),
+    (Degrees, "test_feedback", "yaw_rad is 90, outside"),
     (NotANumber, "test_feedback", "must be finite"),
     (FromTheFuture, "test_feedback", "in the future"),
     (LeftIsRight, "test_flight", "along left"),

@@ -113,10 +113,10 @@ class ToyDriver(Driver):
         return Feedback(
             captured_ns=time.monotonic_ns(),
             state=FlightState.EMERGENCY if self._stopped else state,
-            roll=0.0,
-            pitch=0.0,
-            yaw=self._yaw,
-            altitude=self._z,
-            velocity=(moving.forward, moving.left, moving.up),
-            position=(self._x, self._y, self._z),
+            roll_rad=0.0,
+            pitch_rad=0.0,
+            yaw_rad=self._yaw,
+            altitude_m=self._z,
+            velocity_m_s=(moving.forward, moving.left, moving.up),
+            position_m=(self._x, self._y, self._z),
         )

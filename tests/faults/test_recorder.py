@@ -222,9 +222,9 @@ def test_numbers_of_the_vehicle_that_are_none_are_not_known(rig: Rig) -> None:
     rig.other.on_feedback(came.append, inline=True)
     events: list[Event] = []
     rig.other.on_event(events.append, inline=True)
-    bad = Feedback(captured_ns=1, yaw=float("nan"), altitude=2.0, velocity=(0.0, float("inf"), 0.0))
+    bad = Feedback(captured_ns=1, yaw_rad=float("nan"), altitude_m=2.0, velocity_m_s=(0.0, float("inf"), 0.0))
     rig.proxy.publisher.feedback(bad)
     files.until(lambda: any(one.captured_ns == 1 for one in came), "it came")
     (sample,) = [one for one in came if one.captured_ns == 1]
-    assert (sample.yaw, sample.altitude, sample.velocity) == (None, 2.0, None)
+    assert (sample.yaw_rad, sample.altitude_m, sample.velocity_m_s) == (None, 2.0, None)
     files.until(lambda: any("yaw, velocity came as NaN" in one.text for one in events), "it is told")

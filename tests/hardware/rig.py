@@ -93,14 +93,14 @@ def until(
 
 def place(feedback: Feedback) -> tuple[float, float, float]:
     """East, north, up [m]."""
-    assert feedback.position is not None, "the vehicle does not tell where it is"
-    return feedback.position
+    assert feedback.position_m is not None, "the vehicle does not tell where it is"
+    return feedback.position_m
 
 
 def speed(feedback: Feedback) -> float:
     """Horizontally [m/s]."""
-    assert feedback.velocity is not None, "the vehicle does not tell its speed"
-    return math.hypot(*feedback.velocity[:2])
+    assert feedback.velocity_m_s is not None, "the vehicle does not tell its speed"
+    return math.hypot(*feedback.velocity_m_s[:2])
 
 
 def holds(

@@ -44,11 +44,19 @@ def test_it_gets_ready(rig: Rig) -> None:
     """Attitude, place and battery are told, and that it may be armed."""
     with rig.connect() as drone:
         until(drone, lambda f: bool((f.native or {}).get("mavlink.ready")), READY_S, "ready to be armed")
-        newest = until(drone, lambda f: f.position is not None and f.velocity is not None, 30.0, "knows its place")
+        newest = until(
+            drone, lambda f: f.position_m is not None and f.velocity_m_s is not None, 30.0, "knows its place"
+        )
         assert newest.state is FlightState.LANDED
-        assert None not in (newest.roll, newest.pitch, newest.yaw, newest.altitude, newest.angular_velocity)
-        assert abs(newest.roll or 0.0) < 0.3
-        assert abs(newest.pitch or 0.0) < 0.3
+        assert None not in (
+            newest.roll_rad,
+            newest.pitch_rad,
+            newest.yaw_rad,
+            newest.altitude_m,
+            newest.angular_velocity_rad_s,
+        )
+        assert abs(newest.roll_rad or 0.0) < 0.3
+        assert abs(newest.pitch_rad or 0.0) < 0.3
 
 
 @pytest.mark.parametrize("flight", [1, 2])
@@ -64,7 +72,7 @@ def test_a_flight(rig: Rig, flight: int) -> None:
         before = hold_without_set_points(drone)
         until(
             drone,
-            lambda f: (f.velocity or (0.0,))[0] > 0.5,
+            lambda f: (f.velocity_m_s or (0.0,))[0] > 0.5,
             15.0,
             "flying forward before the pilot goes silent",
             lambda: drone.velocity(forward=1.0),
@@ -77,7 +85,7 @@ def test_a_flight(rig: Rig, flight: int) -> None:
         until(drone, lambda f: f.state.airborne, 5.0, "still in the air")
         until(
             drone,
-            lambda f: (f.velocity or (0.0,))[0] > 0.5,
+            lambda f: (f.velocity_m_s or (0.0,))[0] > 0.5,
             15.0,
             "flying forward before the proxy is killed",
             lambda: drone.velocity(forward=1.0),
@@ -89,7 +97,7 @@ def test_a_flight(rig: Rig, flight: int) -> None:
     rig.start()
     drone = rig.connect()
     try:
-        newest = until(drone, lambda f: f.velocity is not None, 20.0, "its speed is told again")
+        newest = until(drone, lambda f: f.velocity_m_s is not None, 20.0, "its speed is told again")
         assert speed(newest) < 0.5, "without the proxy it must not fly on"
         holds(drone, 2.0, 1.0, "after the proxy is back nothing old is flown")
         land(drone)
@@ -101,13 +109,13 @@ def test_a_flight(rig: Rig, flight: int) -> None:
 
 def take_off(drone: skyloop.Drone) -> None:
     until(drone, lambda f: bool((f.native or {}).get("mavlink.ready")), READY_S, "ready to be armed")
-    ground = drone.feedback().altitude or 0.0
+    ground = drone.feedback().altitude_m or 0.0
     height = float(str(drone.config["limits.takeoff_altitude"]))
     if float(str(drone.config["limits.altitude"])) < height + CLIMBS_M:
         drone.config["limits.altitude"] = height + CLIMBS_M
     drone.takeoff(timeout_s=TAKEOFF_S)
-    newest = until(drone, lambda f: (f.altitude or 0.0) - ground > 0.7 * height, 10.0, "at its height")
-    assert (newest.altitude or 0.0) - ground < height + 2.5  # a PX4 rises to MIS_TAKEOFF_ALT at least
+    newest = until(drone, lambda f: (f.altitude_m or 0.0) - ground > 0.7 * height, 10.0, "at its height")
+    assert (newest.altitude_m or 0.0) - ground < height + 2.5  # a PX4 rises to MIS_TAKEOFF_ALT at least
     assert newest.state in (FlightState.HOVERING, FlightState.FLYING)
 
 
@@ -116,7 +124,7 @@ def flies_north(drone: skyloop.Drone) -> None:
     begun = place(drone.feedback())
     deadline = time.monotonic() + 20.0
     while place(drone.feedback())[1] - begun[1] < 2.0:
-        yaw = drone.feedback().yaw
+        yaw = drone.feedback().yaw_rad
         assert yaw is not None
         drone.velocity(forward=math.sin(yaw), left=math.cos(yaw))
         assert time.monotonic() < deadline, f"not 2 m north of {begun}: {drone.feedback()}"
@@ -127,11 +135,11 @@ def flies_north(drone: skyloop.Drone) -> None:
 
 def flies_by_its_body(drone: skyloop.Drone) -> None:
     """Forward turns with the heading."""
-    yaw = drone.feedback().yaw
+    yaw = drone.feedback().yaw_rad
     assert yaw is not None
     until(
         drone,
-        lambda f: f.yaw is not None and wrap_angle(f.yaw - yaw) > 0.5,
+        lambda f: f.yaw_rad is not None and wrap_angle(f.yaw_rad - yaw) > 0.5,
         15.0,
         "turned to the left",
         lambda: drone.velocity(yaw_rate=0.5),
@@ -144,9 +152,9 @@ def flies_by_its_body(drone: skyloop.Drone) -> None:
 def goes(drone: skyloop.Drone, forward: float, left: float) -> None:
     """A metre that way."""
     begun = drone.feedback()
-    assert begun.yaw is not None
+    assert begun.yaw_rad is not None
     east, north, _ = place(begun)
-    way = begun.yaw + math.atan2(left, forward)
+    way = begun.yaw_rad + math.atan2(left, forward)
 
     def gone(feedback: skyloop.Feedback) -> float:
         here = place(feedback)
@@ -161,33 +169,33 @@ def goes(drone: skyloop.Drone, forward: float, left: float) -> None:
 
 def flies_by_attitude(drone: skyloop.Drone) -> None:
     """Tilts, climbs and sinks by rate; holds its altitude in between."""
-    low = drone.feedback().altitude or 0.0
+    low = drone.feedback().altitude_m or 0.0
     until(
         drone,
-        lambda f: (f.altitude or 0.0) > low + 0.8,
+        lambda f: (f.altitude_m or 0.0) > low + 0.8,
         15.0,
         "0.8 m higher by attitude with climb rate",
         lambda: drone.attitude(climb=0.5),
     )
     until(
         drone,
-        lambda f: (f.velocity or (0.0,))[0] > 0.3,
+        lambda f: (f.velocity_m_s or (0.0,))[0] > 0.3,
         15.0,
         "forward by its pitch",
         lambda: drone.attitude(pitch=0.1),
     )
     until(
         drone,
-        lambda f: (f.velocity or (0.0, 0.0))[1] > 0.2,
+        lambda f: (f.velocity_m_s or (0.0, 0.0))[1] > 0.2,
         15.0,
         "to the left by its roll",
         lambda: drone.attitude(roll=-0.1),
     )
     until(drone, lambda f: speed(f) < 0.4, 15.0, "stopped", drone.hover)
-    high = drone.feedback().altitude or 0.0
+    high = drone.feedback().altitude_m or 0.0
     until(
         drone,
-        lambda f: (f.altitude or 0.0) < high - 0.5,
+        lambda f: (f.altitude_m or 0.0) < high - 0.5,
         15.0,
         "lower by attitude with climb rate",
         lambda: drone.attitude(climb=-0.4),
@@ -203,7 +211,7 @@ def fly_level(drone: skyloop.Drone, seconds: float) -> float:
     while time.monotonic() < deadline:
         drone.attitude()
         time.sleep(0.05)
-    return drone.feedback().altitude or 0.0
+    return drone.feedback().altitude_m or 0.0
 
 
 def hovers(drone: skyloop.Drone) -> None:

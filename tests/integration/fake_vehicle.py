@@ -83,7 +83,7 @@ class FakeVehicle(Driver):
                 continue
             number += 1
             now_ns = time.monotonic_ns()
-            sink.feedback(Feedback(captured_ns=now_ns, state=self.state, yaw=number * 0.01, altitude=1.0))
+            sink.feedback(Feedback(captured_ns=now_ns, state=self.state, yaw_rad=number * 0.01, altitude_m=1.0))
             if sink.wants("front"):
                 picture = np.full((24, 32, 3), number % 256, np.uint8)
                 sink.frame("front", picture, now_ns, width=32, height=24)

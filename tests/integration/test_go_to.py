@@ -41,14 +41,14 @@ def flown(vehicle: str) -> Iterator[Drone]:
         proxy.start()
         stack.callback(proxy.stop)
         drone = stack.enter_context(open_drone(server.dial, app="me", on_exit="hover", timeout_s=WAIT_S))
-        drone.wait(lambda feedback: feedback.vehicle_link == "up" and feedback.position is not None, LONG_S)
+        drone.wait(lambda feedback: feedback.vehicle_link == "up" and feedback.position_m is not None, LONG_S)
         drone.takeoff(timeout_s=LONG_S)
         yield drone
 
 
 def place(feedback: Feedback) -> tuple[float, float, float]:
-    assert feedback.position is not None
-    return feedback.position
+    assert feedback.position_m is not None
+    return feedback.position_m
 
 
 @pytest.mark.parametrize("vehicle", [SIM, SIM + "&native=velocity", SIM + "&native=attitude", *KINDS])
@@ -61,16 +61,18 @@ def test_there_and_back(vehicle: str) -> None:
         with drone.on_command(echoes.append, inline=True):
             x, y, z = place(drone.feedback())
             speeds: list[float] = []
-            with drone.on_feedback(lambda feedback: speeds.append(math.hypot(*(feedback.velocity or ()))), inline=True):
+            with drone.on_feedback(
+                lambda feedback: speeds.append(math.hypot(*(feedback.velocity_m_s or ()))), inline=True
+            ):
                 drone.go_to(x=x + 2.0, y=y - 1.0, z=z + 0.6, yaw=1.0, speed=0.8, timeout_s=LONG_S)
             there = drone.feedback()
             assert math.dist(place(there), (x + 2.0, y - 1.0, z + 0.6)) <= 0.2
-            assert there.yaw == pytest.approx(1.0, abs=0.16)
+            assert there.yaw_rad == pytest.approx(1.0, abs=0.16)
             assert max(speeds) < 0.8 + 0.3, "no faster than it was asked to, but for what it overshoots"
             drone.go_to(x=x, y=y, z=z, timeout_s=LONG_S)
             back = drone.feedback()
             assert math.dist(place(back), (x, y, z)) <= 0.2
-            assert back.yaw == pytest.approx(1.0, abs=0.2), "the heading is kept"
+            assert back.yaw_rad == pytest.approx(1.0, abs=0.2), "the heading is kept"
         kinds = {type(echo.applied) for echo in echoes if echo.app_id == 0}
         assert kinds <= ({Hover} if native else {Velocity, Hover, *kinds}), "the proxy only steers what does not itself"
         drone.velocity(up=0.2)

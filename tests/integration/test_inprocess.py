@@ -120,8 +120,8 @@ def test_a_frame_knows_the_state_at_its_capture(node: Node, drone: Drone) -> Non
     assert frame.feedback is not None
     assert frame.feedback_reach_s is not None
     assert frame.feedback_reach_s < 0.5
-    assert frame.feedback.yaw is not None
-    frames_of_yaw = frame.feedback.yaw / 0.01
+    assert frame.feedback.yaw_rad is not None
+    frames_of_yaw = frame.feedback.yaw_rad / 0.01
     assert frames_of_yaw % 256 == pytest.approx(int(frame[0, 0, 0]), abs=0.01), "the picture shows the same number"
 
 

@@ -52,7 +52,7 @@ def test_wrapped_angles_are_the_same_angle(angle: float) -> None:
 
 
 def test_feedback_gives_its_rotation_once_it_knows_it() -> None:
-    known = Feedback(captured_ns=1, roll=0.1, pitch=-0.2, yaw=0.3)
+    known = Feedback(captured_ns=1, roll_rad=0.1, pitch_rad=-0.2, yaw_rad=0.3)
     assert euler_from_rotation(known.rotation) == pytest.approx((0.1, -0.2, 0.3))
     with pytest.raises(ValueError, match="not reported its attitude"):
-        _ = Feedback(captured_ns=1, roll=0.1, pitch=None, yaw=0.3).rotation
+        _ = Feedback(captured_ns=1, roll_rad=0.1, pitch_rad=None, yaw_rad=0.3).rotation

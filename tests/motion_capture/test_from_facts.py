@@ -55,10 +55,10 @@ def test_the_poses_that_the_server_sends_come_out(address: str) -> None:
         assert capture.unknown == set()
     assert {one.body for one in seen} == {"alpha"}
     for one in seen:
-        place, yaw = pose(frame_of(one.position[2]))
-        assert one.position == pytest.approx(place, abs=1e-6), "metres, z up"
-        assert math.remainder(one.yaw - yaw, math.tau) == pytest.approx(0.0, abs=1e-5)
-    assert len({one.position for one in seen}) > ENOUGH / 2, "they are not one and the same"
+        place, yaw = pose(frame_of(one.position_m[2]))
+        assert one.position_m == pytest.approx(place, abs=1e-6), "metres, z up"
+        assert math.remainder(one.yaw_rad - yaw, math.tau) == pytest.approx(0.0, abs=1e-5)
+    assert len({one.position_m for one in seen}) > ENOUGH / 2, "they are not one and the same"
 
 
 @pytest.fixture

@@ -54,10 +54,10 @@ def test_the_recorded_poses_come_out_in_our_axes(server: Process) -> None:
             wait_until(lambda: len(seen) >= ENOUGH, "poses came")
         assert capture.state("alpha") is TrackState.TRACKED
         assert capture.unknown == set()
-    assert all((pose.position, pose.quaternion) in expected for pose in seen)
-    assert len({pose.position for pose in seen}) > ENOUGH / 2, "they are not one and the same"
+    assert all((pose.position_m, pose.quaternion) in expected for pose in seen)
+    assert len({pose.position_m for pose in seen}) > ENOUGH / 2, "they are not one and the same"
     assert [pose.captured_ns for pose in seen] == sorted({pose.captured_ns for pose in seen})
-    assert 1.3 < pose.position[2] < 1.6, "it flew at head height: z is up"
+    assert 1.3 < pose.position_m[2] < 1.6, "it flew at head height: z is up"
     assert pose.transform.rotation.as_matrix().shape == (3, 3)
 
 

@@ -78,7 +78,7 @@ def test_y_up_becomes_z_up_and_what_stands_keeps_standing() -> None:
     assert quaternion == UPRIGHT
     about_y = (0.0, math.sin(0.3), 0.0, math.cos(0.3))  # turned by 0.6 rad about what was up
     pose = BodyPose("a", 0, *z_up((0.0, 0.0, 0.0), about_y))
-    assert pose.yaw == pytest.approx(0.6)
+    assert pose.yaw_rad == pytest.approx(0.6)
 
 
 @given(angles, st.floats(-1.5, 1.5), angles)
@@ -88,9 +88,9 @@ def test_quaternions_agree_with_scipy(roll: float, pitch: float, yaw: float) -> 
     assert np.allclose(matrix(ours), theirs.as_matrix(), atol=1e-9)
     pose = BodyPose("a", 0, (1.0, 2.0, 3.0), ours)
     assert np.allclose(pose.rotation.as_matrix(), matrix(ours), atol=1e-9)
-    assert np.allclose(pose.transform.translation, pose.position)
-    assert math.remainder(pose.yaw - yaw, math.tau) == pytest.approx(0.0, abs=1e-6)
-    assert plausible(pose.position, ours)
+    assert np.allclose(pose.transform.translation, pose.position_m)
+    assert math.remainder(pose.yaw_rad - yaw, math.tau) == pytest.approx(0.0, abs=1e-6)
+    assert plausible(pose.position_m, ours)
 
 
 @pytest.mark.parametrize(
@@ -113,12 +113,12 @@ def fed(speed: float, count: int = 30, step_ms: int = 10) -> Track:
 def test_velocity_is_that_of_the_body_in_spite_of_noise() -> None:
     pose = fed(0.7).pose
     assert pose is not None
-    assert pose.velocity is not None
-    assert pose.velocity[0] == pytest.approx(0.7, abs=0.02)
-    assert pose.velocity[2] == pytest.approx(0.0, abs=1e-9)
+    assert pose.velocity_m_s is not None
+    assert pose.velocity_m_s[0] == pytest.approx(0.7, abs=0.02)
+    assert pose.velocity_m_s[2] == pytest.approx(0.0, abs=1e-9)
     few = fed(0.7, count=3).pose
     assert few is not None
-    assert few.velocity is None
+    assert few.velocity_m_s is None
 
 
 def test_a_body_that_is_not_seen_has_no_pose_and_is_lost_once() -> None:
@@ -134,7 +134,7 @@ def test_a_body_that_is_not_seen_has_no_pose_and_is_lost_once() -> None:
     assert not track.look(900 * MS)
     found = track.add(1000 * MS, (0.0, 0.0, 1.0), UPRIGHT)
     assert found is not None
-    assert found.velocity is None, "nothing is known across a gap"
+    assert found.velocity_m_s is None, "nothing is known across a gap"
     assert track.add(1000 * MS, (0.1, 0.0, 1.0), UPRIGHT) is None, "not newer"
 
 

@@ -28,7 +28,7 @@ def test_a_path_is_flown_by_motion_capture_recorded_and_the_truth(proxy: Proxy, 
     proxy(TRUE)
     path = tmp_path / "flight.mcap"
     with skyloop.connect("alpha") as drone, skyloop.mocap("sim://", {"alpha": "alpha"}) as capture:
-        assert capture.wait("alpha").position[2] < 0.2
+        assert capture.wait("alpha").position_m[2] < 0.2
         found = capture.calibrate(drone, seconds=1.0)
         assert found.spread_m < 0.001
         assert found.poses >= 20
@@ -38,8 +38,8 @@ def test_a_path_is_flown_by_motion_capture_recorded_and_the_truth(proxy: Proxy, 
             summary = follow.run(seconds=20)
             assert follow.done, summary
             pose = capture.wait("alpha")
-            assert math.dist(pose.position, (0.6, 0.0, 1.0)) < 0.3
-            wait_until(lambda: capture.wait("alpha").velocity is not None, "two poses in a row tell its velocity")
+            assert math.dist(pose.position_m, (0.6, 0.0, 1.0)) < 0.3
+            wait_until(lambda: capture.wait("alpha").velocity_m_s is not None, "two poses in a row tell its velocity")
             with pytest.raises(UsageError, match="alpha flies"):
                 capture.calibrate(drone)
             drone.land()
@@ -68,10 +68,10 @@ def test_poses_are_told_with_the_drone_at_most_so_often(proxy: Proxy) -> None:
         assert min(np.diff(times)) > 70_000_000
         values = entries[-1].values
         assert values is not None
-        assert values[:7] == pytest.approx([*poses[-1].position, *poses[-1].quaternion], abs=0.05)
+        assert values[:7] == pytest.approx([*poses[-1].position_m, *poses[-1].quaternion], abs=0.05)
         shown = mocap_values(values)
         assert shown is not None
-        assert shown["yaw"] == pytest.approx(poses[-1].yaw, abs=0.01)
+        assert shown["yaw"] == pytest.approx(poses[-1].yaw_rad, abs=0.01)
         for wrong in (0.0, math.nan):
             with pytest.raises(UsageError, match="max_hz"):
                 capture.link(drone, max_hz=wrong)

@@ -211,13 +211,13 @@ def test_a_sensor_that_is_named_is_the_body_and_no_other(option: str, body: str,
             wait_until(lambda: len(seen) >= 50, "poses came")
         assert capture.unknown == {f"{TRACKER}:{1 - sensor}"}
     place, _ = pose(1)
-    assert {one.position[0] for one in seen} == {place[0] + server.APART_M * sensor}
+    assert {one.position_m[0] for one in seen} == {place[0] + server.APART_M * sensor}
 
 
 def test_two_drones_fly_by_two_sensors_of_one_tracker() -> None:
     bodies = {"alpha": f"{TRACKER}:0", "beta": f"{TRACKER}:1"}
     with listening(streaming(0, 1)) as address, mocap(address, bodies) as capture:
-        apart = capture.wait("beta").position[0] - capture.wait("alpha").position[0]
+        apart = capture.wait("beta").position_m[0] - capture.wait("alpha").position_m[0]
     assert apart == pytest.approx(server.APART_M)
 
 

@@ -78,7 +78,7 @@ def test_a_killed_pilot_leaves_it_hovering_and_then_landing(
     with skyloop.connect("alpha", access="observe") as observer:
         pilot = start(PILOTS, "fly", "alpha")
         pilot.until("flying")
-        observer.wait(lambda feedback: (feedback.velocity or (0.0,))[0] > 0.2, timeout_s=30.0)
+        observer.wait(lambda feedback: (feedback.velocity_m_s or (0.0,))[0] > 0.2, timeout_s=30.0)
         pilot.signal(signal.SIGKILL)
         observer.wait(lambda feedback: feedback.failsafe is Failsafe.HOVER, timeout_s=10.0)
         observer.wait("hovering", timeout_s=30.0)

@@ -88,7 +88,7 @@ def test_a_killed_pilot_leaves_it_hovering_and_then_landing(
         wait_until_ready(observer)
         pilot = start(PILOTS, "fly", "alpha")
         pilot.until("flying", 40.0)
-        observer.wait(lambda feedback: (feedback.velocity or (0.0,))[0] > 0.2, timeout_s=30.0)
+        observer.wait(lambda feedback: (feedback.velocity_m_s or (0.0,))[0] > 0.2, timeout_s=30.0)
         pilot.signal(signal.SIGKILL)
         observer.wait(lambda feedback: feedback.failsafe is Failsafe.HOVER, timeout_s=10.0)
         observer.wait("hovering", timeout_s=30.0)
@@ -108,7 +108,7 @@ def test_an_autopilot_that_goes_silent_in_flight_is_found_again_and_flies_nothin
         wait_until_ready(drone)
         drone.takeoff(timeout_s=30.0)
         begun = time.monotonic()
-        while (drone.feedback().velocity or (0.0,))[0] < 0.3:
+        while (drone.feedback().velocity_m_s or (0.0,))[0] < 0.3:
             assert time.monotonic() - begun < 15.0
             drone.velocity(forward=0.5)
             time.sleep(0.05)
@@ -120,7 +120,7 @@ def test_an_autopilot_that_goes_silent_in_flight_is_found_again_and_flies_nothin
         assert any(event.kind is EventKind.VEHICLE_LINK for event in drone.recent_events())
         drone.velocity(left=0.5)
         begun = time.monotonic()
-        while (drone.feedback().velocity or (0.0, 0.0))[1] < 0.3:
+        while (drone.feedback().velocity_m_s or (0.0, 0.0))[1] < 0.3:
             told = [event.text for event in drone.recent_events()][-14:]
             assert time.monotonic() - begun < 15.0, f"a fresh command flies it again: {drone.feedback()}; {told}"
             drone.velocity(left=0.5)

@@ -41,7 +41,7 @@ def test_it_turns_by_the_results_of_another_process(alpha: str, capsys: pytest.C
     yaws: list[float] = []
     with skyloop.connect(alpha, access="observe") as eye:
         eye.on_annotation(drawn.append)
-        eye.on_feedback(lambda feedback: yaws.append(feedback.yaw or 0.0))
+        eye.on_feedback(lambda feedback: yaws.append(feedback.yaw_rad or 0.0))
         runpy.run_path(str(EXAMPLE), run_name="example")["main"](alpha, seconds=5.0)
         eye.wait(lambda feedback: feedback.state == "landed" and feedback.owner is None)
     assert " results (" in capsys.readouterr().out

@@ -84,7 +84,7 @@ class FakeDriver(Driver):
         self.clock = clock
         self.sink: Sink | None = None
         self.told: list[AnyAction] = []
-        self.now = Feedback(captured_ns=0, state=FlightState.LANDED, battery=0.9, altitude=1.0)
+        self.now = Feedback(captured_ns=0, state=FlightState.LANDED, battery=0.9, altitude_m=1.0)
         self.fail: set[str] = set()  #: calls that raise now
         self.native = list(parameters)
         self.while_setting: Callable[[], None] = lambda: None

@@ -54,10 +54,10 @@ class PointMass:
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
         return Feedback(
             captured_ns=self.now_ns,
-            yaw=self.yaw,
-            altitude=self.position[2],
-            velocity=(cos * east + sin * north, cos * north - sin * east, up),
-            position=(self.position[0], self.position[1], self.position[2]) if position else None,
+            yaw_rad=self.yaw,
+            altitude_m=self.position[2],
+            velocity_m_s=(cos * east + sin * north, cos * north - sin * east, up),
+            position_m=(self.position[0], self.position[1], self.position[2]) if position else None,
         )
 
 
@@ -96,7 +96,7 @@ def test_it_adds_what_set_points_can_make(native: set[str], added: set[str]) -> 
 )
 def test_signs_are_those_of_rep_103(wanted: Velocity, roll_sign: int, pitch_sign: int) -> None:
     autopilot = Autopilot(ATTITUDE)
-    still = Feedback(captured_ns=0, velocity=(0.0, 0.0, 0.0))
+    still = Feedback(captured_ns=0, velocity_m_s=(0.0, 0.0, 0.0))
     autopilot.start(wanted, 0, still)
     told = autopilot.step(0, still)
     assert isinstance(told, Attitude)
@@ -127,7 +127,7 @@ def test_a_velocity_is_reached_and_held(wanted: Velocity) -> None:
     autopilot = taken_off(mass)
     autopilot.start(wanted, mass.now_ns, mass.feedback())
     fly(autopilot, mass, 8.0)
-    velocity = mass.feedback().velocity
+    velocity = mass.feedback().velocity_m_s
     assert velocity is not None
     assert velocity == pytest.approx((wanted.forward, wanted.left, wanted.up), abs=0.12)
     assert autopilot.state(FlightState.UNKNOWN) is FlightState.FLYING
@@ -158,10 +158,10 @@ def test_hover_without_a_position_stands_still() -> None:
 
 def test_a_vehicle_that_takes_velocities_gets_velocities() -> None:
     autopilot = Autopilot(frozenset({"velocity"}))
-    feedback = Feedback(captured_ns=0, altitude=0.0)
+    feedback = Feedback(captured_ns=0, altitude_m=0.0)
     autopilot.start(Takeoff(), 0, feedback)
     assert autopilot.step(0, feedback) == Velocity(up=0.5)
-    high = Feedback(captured_ns=STEP_NS, altitude=0.95)
+    high = Feedback(captured_ns=STEP_NS, altitude_m=0.95)
     assert autopilot.step(STEP_NS, high) == Velocity()
     assert autopilot.step(2 * STEP_NS, high) == Velocity(up=pytest.approx(0.05))  # type: ignore[arg-type]
 
@@ -183,7 +183,7 @@ def test_without_knowledge_it_stays_level_and_goes_by_time() -> None:
 
 def test_stale_feedback_is_not_steered_by() -> None:
     autopilot = Autopilot(ATTITUDE)
-    old = Feedback(captured_ns=0, velocity=(3.0, 3.0, 0.0))
+    old = Feedback(captured_ns=0, velocity_m_s=(3.0, 3.0, 0.0))
     autopilot.start(Hover(), 0, old)
     assert autopilot.step(NS_PER_S // 2, old) != Attitude()
     assert autopilot.step(NS_PER_S // 2 + 1, old) == Attitude()
@@ -193,7 +193,7 @@ def test_an_altimeter_that_never_reads_zero_still_ends_the_landing() -> None:
     autopilot = Autopilot(ATTITUDE)
     for step in range(200):
         now = step * STEP_NS
-        feedback = Feedback(captured_ns=now, altitude=max(0.25, 1.0 - 0.4 * step * PERIOD_S))
+        feedback = Feedback(captured_ns=now, altitude_m=max(0.25, 1.0 - 0.4 * step * PERIOD_S))
         if step == 0:
             autopilot.start(Land(), now, feedback)
         autopilot.step(now, feedback)
@@ -245,9 +245,9 @@ def test_an_attitude_on_the_ground_is_no_flight() -> None:
 
 def test_a_vehicle_first_seen_in_the_air_is_flying() -> None:
     autopilot = Autopilot(ATTITUDE)
-    autopilot.on_first_feedback(Feedback(captured_ns=0, altitude=0.1))
+    autopilot.on_first_feedback(Feedback(captured_ns=0, altitude_m=0.1))
     assert autopilot.state(FlightState.UNKNOWN) is FlightState.LANDED
-    autopilot.on_first_feedback(Feedback(captured_ns=0, altitude=1.0))
+    autopilot.on_first_feedback(Feedback(captured_ns=0, altitude_m=1.0))
     assert autopilot.state(FlightState.UNKNOWN) is FlightState.FLYING
 
 
@@ -277,7 +277,9 @@ def test_whatever_it_hears_it_never_tilts_beyond_the_limit(
     now = 0
     for action, altitude, velocity, position in heard:
         now += STEP_NS
-        feedback = Feedback(captured_ns=now, altitude=altitude, velocity=velocity, position=position, yaw=0.3)
+        feedback = Feedback(
+            captured_ns=now, altitude_m=altitude, velocity_m_s=velocity, position_m=position, yaw_rad=0.3
+        )
         autopilot.start(action, now, feedback)
         told = autopilot.step(now, feedback)
         assert told is None or isinstance(told, Attitude)
@@ -337,7 +339,7 @@ def test_the_way_is_straight_and_within_its_speeds(
     yaw_rate: float,
 ) -> None:
     autopilot = Autopilot(frozenset({"velocity"}))
-    feedback = Feedback(captured_ns=0, yaw=heading, position=place)
+    feedback = Feedback(captured_ns=0, yaw_rad=heading, position_m=place)
     autopilot.start(Position(*target, yaw, speed, yaw_rate), 0, feedback)
     told = autopilot.step(0, feedback)
     assert isinstance(told, Velocity)
@@ -354,12 +356,12 @@ def test_the_way_is_straight_and_within_its_speeds(
 
 @pytest.mark.parametrize(
     "lacking",
-    [{"position": None}, {"yaw": None}, {"captured_ns": -NS_PER_S}],
+    [{"position_m": None}, {"yaw_rad": None}, {"captured_ns": -NS_PER_S}],
     ids=["no position", "no yaw", "old"],
 )
 def test_it_stops_while_it_does_not_know_where_it_is(lacking: dict[str, object]) -> None:
     autopilot = Autopilot(frozenset({"velocity"}))
-    known: dict[str, object] = {"captured_ns": 0, "yaw": 0.0, "position": (0.0, 0.0, 1.0)}
+    known: dict[str, object] = {"captured_ns": 0, "yaw_rad": 0.0, "position_m": (0.0, 0.0, 1.0)}
     autopilot.start(Position(5.0, 0.0, 1.0), 0, Feedback(**known))  # type: ignore[arg-type]
     assert autopilot.step(0, Feedback(**known)) == Velocity(forward=1.0)  # type: ignore[arg-type]
     assert autopilot.step(0, Feedback(**(known | lacking))) == Velocity()  # type: ignore[arg-type]
@@ -369,7 +371,7 @@ def test_it_stops_while_it_does_not_know_where_it_is(lacking: dict[str, object])
 def test_what_is_not_allowed_on_the_way_is_not_flown() -> None:
     autopilot = Autopilot(frozenset({"velocity"}))
     autopilot.guard = lambda wanted, _feedback, _now_ns: Velocity(up=wanted.up)
-    feedback = Feedback(captured_ns=0, yaw=0.0, position=(0.0, 0.0, 1.0))
+    feedback = Feedback(captured_ns=0, yaw_rad=0.0, position_m=(0.0, 0.0, 1.0))
     autopilot.start(Position(5.0, 0.0, 1.1), 0, feedback)
     told = autopilot.step(0, feedback)
     assert isinstance(told, Velocity)

@@ -32,7 +32,7 @@ SOFTWARE = ALL - {"position"}
 
 
 def at(x: float, y: float, z: float, **more: Any) -> Feedback:
-    known: dict[str, Any] = {"captured_ns": NOW, "position": (x, y, z), "yaw": 0.0, "altitude": z}
+    known: dict[str, Any] = {"captured_ns": NOW, "position_m": (x, y, z), "yaw_rad": 0.0, "altitude_m": z}
     return Feedback(**(known | more))
 
 
@@ -73,11 +73,11 @@ def test_the_speed_keeps_to_the_limits_across_and_upwards(asked: Position, speed
     [
         (Position(0.0, 0.0, 1.0, speed=-1.0), START, Refusal.OUT_OF_RANGE, "speed is -1"),
         (Position(1.0, 0.0, 1.0), None, Refusal.WRONG_STATE, "does not tell its position"),
-        (Position(1.0, 0.0, 1.0), at(0, 0, 1, position=None), Refusal.WRONG_STATE, "motion capture"),
-        (Position(1.0, 0.0, 1.0), at(0, 0, 1, yaw=None), Refusal.WRONG_STATE, "does not tell its yaw"),
+        (Position(1.0, 0.0, 1.0), at(0, 0, 1, position_m=None), Refusal.WRONG_STATE, "motion capture"),
+        (Position(1.0, 0.0, 1.0), at(0, 0, 1, yaw_rad=None), Refusal.WRONG_STATE, "does not tell its yaw"),
         (Position(1.0, 0.0, 1.0), at(0, 0, 1, captured_ns=NOW - 3 * NS_PER_S), Refusal.WRONG_STATE, "3.0 s old"),
         (Position(0.0, 0.0, 7.0), START, Refusal.OUT_OF_RANGE, "z is 7 m, and at most 5.00 m is allowed"),
-        (Position(0.0, 0.0, 6.0), at(0, 0, 1, altitude=2.0), Refusal.OUT_OF_RANGE, "at most 4.00 m"),
+        (Position(0.0, 0.0, 6.0), at(0, 0, 1, altitude_m=2.0), Refusal.OUT_OF_RANGE, "at most 4.00 m"),
         (Position(5.0, 0.0, 1.0), START, Refusal.OUT_OF_RANGE, "outside of the safety box, box -4 -4 0 4 4 3"),
         (Position(0.0, 0.0, 3.5), START, Refusal.OUT_OF_RANGE, "outside of the safety box"),
         (Position(2.1, 0.1, 1.0), START, Refusal.OUT_OF_RANGE, "in a no-fly zone, cylinder 2 0 0.5 0 3"),
@@ -150,7 +150,7 @@ def test_what_is_flown_keeps_to_each_limit(
 def placed(bench: Bench, **more: Any) -> App:
     """A pilot whose vehicle hovers 1 m above the origin."""
     pilot = bench.airborne()
-    bench.driver.report(position=(0.0, 0.0, 1.0), yaw=0.0, altitude=1.0, **more)
+    bench.driver.report(position_m=(0.0, 0.0, 1.0), yaw_rad=0.0, altitude_m=1.0, **more)
     bench.driver.told.clear()
     return pilot
 
@@ -212,7 +212,7 @@ def test_a_position_that_gets_lost_on_the_way_stops_a_vehicle_that_flies_there_i
     with Bench() as bench:
         pilot = placed(bench)
         pilot.command(Position(3.0, 0.0, 1.0))
-        bench.driver.report(position=None)
+        bench.driver.report(position_m=None)
         pilot.command(Position(3.0, 0.0, 1.0), repeat=True)
         assert bench.driver.told[-1] == Hover()
         assert pilot.refusals() == [Refusal.WRONG_STATE]
@@ -239,7 +239,7 @@ def test_with_walls_the_proxy_checks_each_step_of_the_way() -> None:
         write(bench, pilot, "safety.box.x_high", 3.0)
         pilot.command(Position(2.9, 0.0, 1.0))
         assert Position not in map(type, bench.driver.told)
-        bench.driver.report(position=(2.5, 0.0, 1.0), velocity=(2.0, 0.0, 0.0))
+        bench.driver.report(position_m=(2.5, 0.0, 1.0), velocity_m_s=(2.0, 0.0, 0.0))
         bench.tick()
         told = bench.driver.told[-1]
         assert isinstance(told, Velocity)

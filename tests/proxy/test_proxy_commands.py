@@ -333,7 +333,7 @@ def test_above_the_limit_of_altitude_the_vehicle_comes_down_while_it_is_steered(
     bench: Bench, action: AnyAction
 ) -> None:
     pilot = bench.airborne()
-    bench.driver.report(altitude=7.4)
+    bench.driver.report(altitude_m=7.4)
     for at in range(5):
         pilot.command(action, repeat=at > 0)
     applied = bench.driver.told[-1]
@@ -341,6 +341,6 @@ def test_above_the_limit_of_altitude_the_vehicle_comes_down_while_it_is_steered(
     assert (applied.up if isinstance(applied, Velocity) else applied.climb) == -1.0
     (told,) = pilot.told(EventKind.COMMAND_CLAMPED)
     assert told.data["limit"] == "limits.altitude"
-    bench.driver.report(altitude=5.0)
+    bench.driver.report(altitude_m=5.0)
     pilot.command(Hover())
     assert bench.driver.told[-1] == Hover()

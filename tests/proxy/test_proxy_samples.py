@@ -48,9 +48,9 @@ def sink_of(bench: Bench) -> Sink:
 def test_feedback_is_stamped_with_the_proxys_own_fields(bench: Bench) -> None:
     pilot = bench.pilot("alice", 9)
     bench.clock.advance(0.01)
-    bench.driver.report(altitude=2.5, native={"temperature": 21})
+    bench.driver.report(altitude_m=2.5, native={"temperature": 21})
     feedback = pilot.last_feedback()
-    assert (feedback.altitude, feedback.native) == (2.5, {"temperature": 21})
+    assert (feedback.altitude_m, feedback.native) == (2.5, {"temperature": 21})
     assert feedback.captured_ns == feedback.published_ns == bench.clock()
     assert (feedback.owner, feedback.owner_id, feedback.owner_priority, feedback.lease) == ("alice", 1, 9, 1)
     assert feedback.vehicle_link is LinkState.UP
@@ -79,7 +79,7 @@ def test_before_anything_was_heard_there_is_feedback_without_invented_data() -> 
         bench.proxy.publisher._raw = None
         bench.run(0.3)
         feedback = app.last_feedback()
-        assert (feedback.state, feedback.altitude, feedback.battery) == (FlightState.UNKNOWN, None, None)
+        assert (feedback.state, feedback.altitude_m, feedback.battery) == (FlightState.UNKNOWN, None, None)
 
 
 def test_changes_of_the_flight_state_are_told(bench: Bench) -> None:
@@ -94,9 +94,9 @@ def test_changes_of_the_flight_state_are_told(bench: Bench) -> None:
 
 def test_native_telemetry_that_is_too_large_is_left_out_and_told(bench: Bench) -> None:
     app = bench.join("me")
-    bench.driver.report(altitude=3.0, native={"text": "x" * 70_000})
+    bench.driver.report(altitude_m=3.0, native={"text": "x" * 70_000})
     feedback = app.last_feedback()
-    assert (feedback.altitude, feedback.native) == (3.0, None)
+    assert (feedback.altitude_m, feedback.native) == (3.0, None)
     assert len(app.told(EventKind.DRIVER_ERROR)) == 1
 
 
@@ -258,14 +258,14 @@ def test_logs_go_to_who_wants_them_from_any_role(bench: Bench) -> None:
 
 def test_the_software_autopilots_state_is_shown() -> None:
     with Bench(actions={"attitude"}) as bench:
-        bench.driver.report(state=FlightState.UNKNOWN, altitude=0.0, velocity=(0.0, 0.0, 0.0))
+        bench.driver.report(state=FlightState.UNKNOWN, altitude_m=0.0, velocity_m_s=(0.0, 0.0, 0.0))
         bench.tick()
         pilot = bench.pilot()
         pilot.command(Takeoff())
 
         def rise() -> None:
-            altitude = (bench.driver.now.altitude or 0.0) + 0.02
-            bench.driver.report(altitude=min(1.0, altitude), state=FlightState.UNKNOWN)
+            altitude = (bench.driver.now.altitude_m or 0.0) + 0.02
+            bench.driver.report(altitude_m=min(1.0, altitude), state=FlightState.UNKNOWN)
             pilot.command(Takeoff(), repeat=True)
 
         bench.run(0.5, rise)

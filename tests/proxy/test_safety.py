@@ -22,7 +22,7 @@ NOW = 10 * NS_PER_S
 
 
 def at(x: float, y: float, z: float = 1.0, yaw: float = 0.0, **known: Any) -> Feedback:
-    fields: dict[str, Any] = {"captured_ns": NOW, "position": (x, y, z), "yaw": yaw} | known
+    fields: dict[str, Any] = {"captured_ns": NOW, "position_m": (x, y, z), "yaw_rad": yaw} | known
     return Feedback(**fields)
 
 
@@ -66,9 +66,9 @@ def test_an_old_position_costs_way() -> None:
 
 def test_who_is_too_fast_is_braked() -> None:
     most = ROOM.allowed_speed(0.2, 0.3)
-    braked, _ = clamp(ROOM, Velocity(2.0), at(1.8, 0.0, velocity=(1.5, 0.0, 0.0)))
+    braked, _ = clamp(ROOM, Velocity(2.0), at(1.8, 0.0, velocity_m_s=(1.5, 0.0, 0.0)))
     assert braked.forward == pytest.approx(most - 0.5 * (1.5 - most))
-    assert clamp(ROOM, Velocity(), at(1.8, 0.0, velocity=(1.5, 0.0, 0.0)))[1] == [], "it does not ask to go there"
+    assert clamp(ROOM, Velocity(), at(1.8, 0.0, velocity_m_s=(1.5, 0.0, 0.0)))[1] == [], "it does not ask to go there"
 
 
 def test_outside_it_may_only_come_back() -> None:
@@ -105,9 +105,9 @@ def test_safety_are_gone_round() -> None:
 
 
 def test_a_tilt_is_turned_into_one_that_brakes() -> None:
-    slow = at(0.0, 0.0, velocity=(0.2, 0.0, 0.0))
+    slow = at(0.0, 0.0, velocity_m_s=(0.2, 0.0, 0.0))
     assert clamp(ROOM, Attitude(pitch=0.2), slow)[1] == []
-    fast = at(1.5, 0.0, velocity=(1.5, 0.0, 0.0))
+    fast = at(1.5, 0.0, velocity_m_s=(1.5, 0.0, 0.0))
     braked, limits = clamp(ROOM, Attitude(roll=0.1, pitch=0.2, yaw_rate=0.4), fast)
     assert limits == [BOX]
     assert braked.pitch == pytest.approx(-math.atan(1.0 / 9.80665), abs=1e-3)
@@ -121,8 +121,8 @@ def test_a_tilt_is_turned_into_one_that_brakes() -> None:
     "feedback",
     [
         None,
-        Feedback(captured_ns=NOW, yaw=0.0),
-        Feedback(captured_ns=NOW, position=(0.0, 0.0, 0.0)),
+        Feedback(captured_ns=NOW, yaw_rad=0.0),
+        Feedback(captured_ns=NOW, position_m=(0.0, 0.0, 0.0)),
         at(5.0, 0.0, captured_ns=NOW - NS_PER_S),
     ],
 )
@@ -214,7 +214,7 @@ def test_the_proxy_enforces_what_is_written_and_tells(bench: Bench) -> None:
     assert "a box or a cylinder" in refused.message
     pilot.command(Velocity(1.5))
     assert bench.driver.told[-1] == Velocity(1.5), "its position is not known"
-    bench.driver.report(position=(1.9, 0.0, 1.0), yaw=0.0)
+    bench.driver.report(position_m=(1.9, 0.0, 1.0), yaw_rad=0.0)
     pilot.command(Velocity(1.5))
     applied = bench.driver.told[-1]
     assert isinstance(applied, Velocity)

@@ -86,7 +86,11 @@ class Vehicle(FakeVehicle):
             number += 1
             now_ns = time.monotonic_ns()
             place = (number * 0.01, 0.0, 1.0)
-            sink.feedback(Feedback(captured_ns=now_ns, state=self.state, roll=0.0, pitch=0.0, yaw=0.1, position=place))
+            sink.feedback(
+                Feedback(
+                    captured_ns=now_ns, state=self.state, roll_rad=0.0, pitch_rad=0.0, yaw_rad=0.1, position_m=place
+                )
+            )
             if sink.wants("front"):
                 pixels = np.frombuffer(self.shown(now_ns), np.uint8)
                 sink.frame("front", pixels, now_ns, width=32, height=24, encoding=self.encoding, intrinsics=INTRINSICS)

@@ -75,7 +75,7 @@ def test_csv(log: Log, flight: Path, tmp_path: Path) -> None:
         rows = list(csv.DictReader(file))
     assert len(rows) == 96
     assert rows[0]["battery_v"] == ""
-    assert float(rows[10]["position_x"]) == tables(Recording.open(flight), "alpha")["feedback"]["position_x"][10]
+    assert float(rows[10]["position_x_m"]) == tables(Recording.open(flight), "alpha")["feedback"]["position_x_m"][10]
     assert int(rows[1]["captured_ns"]) == BEGIN_NS + 16 * MS
 
 
@@ -92,7 +92,7 @@ def test_numpy(log: Log, flight: Path, tmp_path: Path) -> None:
     ended = log("export", flight, "--to", "npz", "-o", tmp_path / "flight.npz")
     assert ended.code == 0
     with np.load(tmp_path / "flight.npz") as arrays:
-        assert arrays["feedback/altitude"].max() == pytest.approx(1.2)
+        assert arrays["feedback/altitude_m"].max() == pytest.approx(1.2)
         assert arrays["events/text"].tolist().count("touched a chair") == 1
 
 

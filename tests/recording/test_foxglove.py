@@ -45,7 +45,9 @@ def test_quaternions_are_the_rotations_of_the_attitude(roll: float, pitch: float
 
 
 def test_a_pose_with_a_position_and_one_without() -> None:
-    known = Feedback(captured_ns=1, roll=0.0, pitch=0.0, yaw=math.pi / 2, altitude=9.0, position=(1.0, 2.0, 3.0))
+    known = Feedback(
+        captured_ns=1, roll_rad=0.0, pitch_rad=0.0, yaw_rad=math.pi / 2, altitude_m=9.0, position_m=(1.0, 2.0, 3.0)
+    )
     place = foxglove.pose(known)
     assert place is not None
     message = PoseInFrame.FromString(foxglove.pose_in_world(AT_NS, place))
@@ -56,10 +58,10 @@ def test_a_pose_with_a_position_and_one_without() -> None:
     )
     assert foxglove.read_pose(message.SerializeToString())[0] == (1.0, 2.0, 3.0)
     assert message.pose.orientation.z == pytest.approx(math.sqrt(0.5))
-    above = foxglove.pose(Feedback(captured_ns=1, roll=0.0, pitch=0.0, yaw=0.0, altitude=1.5))
+    above = foxglove.pose(Feedback(captured_ns=1, roll_rad=0.0, pitch_rad=0.0, yaw_rad=0.0, altitude_m=1.5))
     assert above is not None
     assert (above.position.x, above.position.y, above.position.z) == (0.0, 0.0, 1.5)
-    assert foxglove.pose(Feedback(captured_ns=1, altitude=1.5)) is None
+    assert foxglove.pose(Feedback(captured_ns=1, altitude_m=1.5)) is None
     transform = FrameTransform.FromString(foxglove.world_to_drone("alpha", AT_NS, place))
     assert (transform.parent_frame_id, transform.child_frame_id) == ("world", "alpha")
     assert len(PosesInFrame.FromString(foxglove.path_in_world(AT_NS, [place, above])).poses) == 2

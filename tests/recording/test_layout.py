@@ -71,8 +71,8 @@ def test_every_channel_has_a_sample_here() -> None:
 
 
 def test_keys_are_fields_and_what_is_not_known_is_absent() -> None:
-    plain = json.loads(encode(Feedback(captured_ns=1, altitude=2.0)))
-    assert plain["altitude"] == 2.0
+    plain = json.loads(encode(Feedback(captured_ns=1, altitude_m=2.0)))
+    assert plain["altitude_m"] == 2.0
     assert plain["failsafe"] == "none"
     assert "battery" not in plain
     applied = json.loads(encode(ALL["applied"]))
@@ -88,8 +88,8 @@ def test_numbers_that_are_not_finite_come_back_as_nan(numbers: list[float], nati
     assert isinstance(back, Velocity)
     for before, after in zip(numbers, msgspec.structs.astuple(back), strict=True):
         assert after == before if math.isfinite(before) else math.isnan(after)
-    feedback = decode(encode(Feedback(captured_ns=1, velocity=(1.0, math.inf, 0.0), native=dict(native))), Feedback)
-    assert feedback.velocity is None, "a vector that is not known in one part is not known"
+    feedback = decode(encode(Feedback(captured_ns=1, velocity_m_s=(1.0, math.inf, 0.0), native=dict(native))), Feedback)
+    assert feedback.velocity_m_s is None, "a vector that is not known in one part is not known"
     assert feedback.native is not None
     assert all(math.isnan(feedback.native[k]) or feedback.native[k] == v for k, v in native.items())  # type: ignore[arg-type]
 
@@ -103,7 +103,7 @@ def test_numbers_that_are_not_finite_come_back_as_nan(numbers: list[float], nati
         (b"{}", Feedback),
         (b'{"captured_ns": "soon"}', Feedback),
         (b'{"captured_ns": 1, "state": "levitating"}', Feedback),
-        (b'{"captured_ns": 1, "velocity": [1, 2]}', Feedback),
+        (b'{"captured_ns": 1, "velocity_m_s": [1, 2]}', Feedback),
         (encode(ALL["applied"]).replace(b"velocity", b"teleport"), Applied),
         (encode(ALL["annotation"]).replace(b'"polyline"', b"7"), Annotation),
         (b"7", FrameRecord),
@@ -172,7 +172,7 @@ def test_what_is_plotted_is_in_the_schemas() -> None:
         found: dict[str, Any] = json.loads(schema(kind))["properties"]
         return found
 
-    assert {"roll", "altitude", "battery", "velocity", "native"} <= set(properties(Feedback))
+    assert {"roll_rad", "altitude_m", "battery", "velocity_m_s", "native"} <= set(properties(Feedback))
     assert {"forward", "roll", "action"} <= set(properties(Applied)["asked"]["properties"])
     assert properties(TYPES[Channel.LOGS])["number"] == {"type": "number"}
 

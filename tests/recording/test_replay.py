@@ -53,9 +53,9 @@ class Steering(skyloop.Controller):
         self.ages_ms.append(frame.age_s * 1e3)
         state = frame.feedback
         assert state is not None
-        assert state.yaw is not None
+        assert state.yaw_rad is not None
         if state.state == "flying":
-            self.drone.velocity(forward=self.gain * float(frame.mean()) / 100, yaw_rate=-0.1 * state.yaw)
+            self.drone.velocity(forward=self.gain * float(frame.mean()) / 100, yaw_rate=-0.1 * state.yaw_rad)
 
 
 class Bolder(Steering):

@@ -233,8 +233,8 @@ def test_key_frames_are_at_events_and_in_between() -> None:
 
 def test_the_way_without_a_position() -> None:
     t_s = np.arange(0.0, 2.0, 0.1)
-    columns = {"t_s": t_s, "velocity_forward": np.full(20, 0.5), "velocity_left": np.zeros(20)}
-    columns["yaw"] = np.full(20, math.pi / 2)
+    columns = {"t_s": t_s, "velocity_forward_m_s": np.full(20, 0.5), "velocity_left_m_s": np.zeros(20)}
+    columns["yaw_rad"] = np.full(20, math.pi / 2)
     way = facts.way(Table("feedback", columns))
     assert way is not None
     assert "drifts" in way.source

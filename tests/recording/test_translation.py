@@ -115,11 +115,15 @@ def test_the_path_is_told_once_a_second_and_only_with_positions() -> None:
     counts = 0
     for tenth in range(30):
         state = Feedback(
-            captured_ns=tenth * 100_000_000, roll=0.0, pitch=0.0, yaw=0.0, position=(0.1 * tenth, 0.0, 1.0)
+            captured_ns=tenth * 100_000_000,
+            roll_rad=0.0,
+            pitch_rad=0.0,
+            yaw_rad=0.0,
+            position_m=(0.1 * tenth, 0.0, 1.0),
         )
         counts += "/alpha/path" in topics(messages(found, state))
     assert counts == 3
-    blind = Feedback(captured_ns=10**10, roll=0.0, pitch=0.0, yaw=0.0, altitude=1.0)
+    blind = Feedback(captured_ns=10**10, roll_rad=0.0, pitch_rad=0.0, yaw_rad=0.0, altitude_m=1.0)
     assert topics(messages(found, blind)) == ["/alpha/feedback", "/alpha/pose", "/tf"]
 
 

@@ -54,7 +54,7 @@ def test_gates_are_found_and_placed(renderer: PlanarRenderer) -> None:
         if not seen:
             continue
         found += 1
-        away.append(float(np.linalg.norm(pose.rotation @ seen[0].position + pose.position_m - gate.position_m)))
+        away.append(float(np.linalg.norm(pose.rotation @ seen[0].position_m + pose.position_m - gate.position_m)))
         normal = pose.rotation @ seen[0].normal
         turned.append(abs(wrap_angle(math.atan2(-normal[1], -normal[0]) - gate.yaw_rad)))
         assert len(seen[0].outline) == 4
@@ -147,7 +147,11 @@ def test_ground_tells_the_way_in_spite_of_tilt_and_turn(renderer: PlanarRenderer
         attitude = (0.08 * math.sin(3 * t), 0.06 * math.cos(2 * t), 0.3 * math.sin(0.5 * t))
         picture, _ = taken(renderer, BOTTOM_CAMERA, place, attitude, number)
         state = Feedback(
-            captured_ns=number, roll=attitude[0], pitch=attitude[1], yaw=attitude[2], altitude=float(place[2])
+            captured_ns=number,
+            roll_rad=attitude[0],
+            pitch_rad=attitude[1],
+            yaw_rad=attitude[2],
+            altitude_m=float(place[2]),
         )
         found = tracker.see(picture, state, BOTTOM_CAMERA.intrinsics())
         assert (found is None) == (number == 0)
@@ -161,6 +165,6 @@ def test_ground_tells_the_way_in_spite_of_tilt_and_turn(renderer: PlanarRenderer
 
 def test_ground_without_texture_is_no_ground() -> None:
     tracker = GroundTracker(BOTTOM_CAMERA.info())
-    state = Feedback(captured_ns=0, roll=0.0, pitch=0.0, yaw=0.0, altitude=1.0)
+    state = Feedback(captured_ns=0, roll_rad=0.0, pitch_rad=0.0, yaw_rad=0.0, altitude_m=1.0)
     for _ in range(3):
         assert tracker.see(GREY, state, BOTTOM_CAMERA.intrinsics()) is None

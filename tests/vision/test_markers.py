@@ -34,7 +34,7 @@ def test_pose_of_a_marker(turn: float, nod: float, position: list[float]) -> Non
     expected = project(square(rotation, np.array(position), 0.3))
     assert np.abs(sighting.corners - expected).max() < 0.7
     assert sighting.distance_m == pytest.approx(np.linalg.norm(position), rel=0.02)
-    assert np.linalg.norm(sighting.position - position) < 0.03 * sighting.distance_m
+    assert np.linalg.norm(sighting.position_m - position) < 0.03 * sighting.distance_m
     # Seen nearly from the front, turning either way looks the same: only what is plainly turned must come out so.
     angle = np.arccos(np.clip(sighting.normal @ rotation[:, 2], -1, 1))
     assert angle < (0.15 if sighting.ambiguity < 0.3 else 0.9)
@@ -60,13 +60,13 @@ def test_several_in_the_order_of_their_ids() -> None:
     seen = MarkerDetector().detect(image, INTRINSICS)
     assert [s.id for s in seen] == [3, 9, 21]
     for sighting in seen:
-        assert np.linalg.norm(sighting.position - places[sighting.id]) < 0.06
+        assert np.linalg.norm(sighting.position_m - places[sighting.id]) < 0.06
 
 
 def test_body_axes() -> None:
     sighting = see(facing(), [0.3, 0.2, 1.5])
-    camera = CameraInfo("front", 320, 240, 30.0, rotation=FORWARD, position=(0.1, 0.0, -0.02))
-    right, down, ahead = sighting.position
+    camera = CameraInfo("front", 320, 240, 30.0, rotation=FORWARD, position_m=(0.1, 0.0, -0.02))
+    right, down, ahead = sighting.position_m
     assert sighting.position_in_body(camera) == pytest.approx([ahead + 0.1, -right, -down - 0.02])
     assert sighting.normal_in_body(camera)[0] < -0.9
     with pytest.raises(UsageError, match="mounted"):
@@ -82,7 +82,7 @@ def test_distorted_lens() -> None:
     x, y = np.moveaxis(ideal.reshape(240, 320, 2).astype(np.float32), 2, 0)
     bent = np.asarray(cv2.remap(straight, x, y, cv2.INTER_LINEAR), np.uint8)
     (sighting,) = MarkerDetector().detect(bent, lens)
-    assert np.linalg.norm(sighting.position - [0.35, 0.2, 1.5]) < 0.03
+    assert np.linalg.norm(sighting.position_m - [0.35, 0.2, 1.5]) < 0.03
 
 
 def test_fisheye_model_is_understood() -> None:

@@ -147,7 +147,7 @@ def _status(drone: Drone, follower: FollowMarker) -> Text:
         str(follower.mode),
         "not seen yet" if share is None else f"in view {share:.0%}",
         f"{score.ranges[-1][1] + follower.distance_m:.2f} m away" if score.ranges else "",
-        "" if feedback.altitude is None else f"altitude {feedback.altitude:.2f} m",
+        "" if feedback.altitude_m is None else f"altitude {feedback.altitude_m:.2f} m",
         "" if feedback.battery is None else f"battery {feedback.battery:.0%}",
         "" if frame is None else f"picture {frame.age_s * 1e3:.0f} ms old",
     ]

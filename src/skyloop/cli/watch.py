@@ -87,7 +87,7 @@ def state_line(drone: Drone) -> str:
     parts = [
         time.strftime("%H:%M:%S"),
         feedback.state.value,
-        f"altitude {_metres(feedback.altitude)}",
+        f"altitude {_metres(feedback.altitude_m)}",
         f"battery {_share(feedback.battery)}",
         f"pilot {feedback.owner or 'nobody'}",
         f"proxy {link.application.value}",
@@ -140,8 +140,8 @@ def _state(drone: Drone) -> Table:
     table.add_row("state", Text(feedback.state.value, "bold"), "pilot", Text(feedback.owner or "nobody"))
     table.add_row("battery", _share(feedback.battery), "failsafe", feedback.failsafe.value)
     table.add_row("roll, pitch, yaw", _angles(feedback), "link to proxy", link.application.value)
-    table.add_row("altitude", _metres(feedback.altitude), "link to vehicle", link.vehicle.value)
-    table.add_row("velocity", _vector(feedback.velocity, "m/s"), "position", _vector(feedback.position, "m"))
+    table.add_row("altitude", _metres(feedback.altitude_m), "link to vehicle", link.vehicle.value)
+    table.add_row("velocity", _vector(feedback.velocity_m_s, "m/s"), "position", _vector(feedback.position_m, "m"))
     return table
 
 
@@ -163,9 +163,9 @@ def channels(drone: Drone) -> Table:
 
 
 def _angles(feedback: Feedback) -> str:
-    if feedback.roll is None or feedback.pitch is None or feedback.yaw is None:
+    if feedback.roll_rad is None or feedback.pitch_rad is None or feedback.yaw_rad is None:
         return "unknown"
-    return " ".join(f"{math.degrees(a):6.1f}°" for a in (feedback.roll, feedback.pitch, feedback.yaw))
+    return " ".join(f"{math.degrees(a):6.1f}°" for a in (feedback.roll_rad, feedback.pitch_rad, feedback.yaw_rad))
 
 
 def _share(value: float | None) -> str:

@@ -29,13 +29,13 @@ def is_there(target: Position, feedback: Feedback, tolerance_m: float, tolerance
         tolerance_m: How far from it is near enough [m].
         tolerance_rad: The same of its yaw, if it has one [rad].
     """
-    if feedback.position is None or math.dist(feedback.position, target.place) > tolerance_m:
+    if feedback.position_m is None or math.dist(feedback.position_m, target.place) > tolerance_m:
         return False
-    yaw = feedback.yaw
+    yaw = feedback.yaw_rad
     if target.yaw is not None and (yaw is None or abs(wrap_angle(target.yaw - yaw)) > tolerance_rad):
         return False
     flies = feedback.state.airborne or feedback.state is FlightState.UNKNOWN
-    return flies and (feedback.velocity is None or math.hypot(*feedback.velocity) <= AT_REST_M_S)
+    return flies and (feedback.velocity_m_s is None or math.hypot(*feedback.velocity_m_s) <= AT_REST_M_S)
 
 
 class ActionWait:

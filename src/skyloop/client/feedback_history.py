@@ -68,14 +68,14 @@ def interpolate(a: Feedback, b: Feedback, captured_ns: int) -> Feedback:
         captured_ns=captured_ns,
         battery=_number(a.battery, b.battery, share),
         battery_v=_number(a.battery_v, b.battery_v, share),
-        roll=_angle(a.roll, b.roll, share),
-        pitch=_angle(a.pitch, b.pitch, share),
-        yaw=_angle(a.yaw, b.yaw, share),
-        altitude=_number(a.altitude, b.altitude, share),
-        velocity=_vector(a.velocity, b.velocity, share),
-        angular_velocity=_vector(a.angular_velocity, b.angular_velocity, share),
-        acceleration=_vector(a.acceleration, b.acceleration, share),
-        position=_vector(a.position, b.position, share),
+        roll_rad=_angle(a.roll_rad, b.roll_rad, share),
+        pitch_rad=_angle(a.pitch_rad, b.pitch_rad, share),
+        yaw_rad=_angle(a.yaw_rad, b.yaw_rad, share),
+        altitude_m=_number(a.altitude_m, b.altitude_m, share),
+        velocity_m_s=_vector(a.velocity_m_s, b.velocity_m_s, share),
+        angular_velocity_rad_s=_vector(a.angular_velocity_rad_s, b.angular_velocity_rad_s, share),
+        acceleration_m_s2=_vector(a.acceleration_m_s2, b.acceleration_m_s2, share),
+        position_m=_vector(a.position_m, b.position_m, share),
     )
 
 

@@ -81,7 +81,7 @@ class TelemetryView:
             **{key: vehicle[key] for key in ("name", "uri", "vehicle", "transport", "can_fly", "why_not", "cameras")},
             **{key: motion[key] for key in ("airborne", "battery", "position", "altitude")},
             "state": motion["flight"],
-            "yaw": None if feedback is None else number(feedback.yaw),
+            "yaw": None if feedback is None else number(feedback.yaw_rad),
             "owner": self.holder(feedback),
             "me": self.is_mine(feedback),
             "links": self._links(),

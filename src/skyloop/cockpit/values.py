@@ -23,14 +23,22 @@ STALE_VIDEO_S: Final = 1.0
 STALE_FEEDBACK_S: Final = 1.0
 MAX_TEXT = 1000  #: characters of an event that pages get: there may be hundreds for a new one
 
-#: Names of a vector's parts: body axes (x forward, y left, z up), or world axes.
-_PARTS = {
-    "velocity": ("forward", "left", "up"),
-    "angular_velocity": ("x", "y", "z"),
-    "acceleration": ("x", "y", "z"),
-    "position": ("x", "y", "z"),
+#: The page's names of feedback's numbers.
+_NUMBERS = {
+    "battery": "battery",
+    "battery_v": "battery_v",
+    "roll": "roll_rad",
+    "pitch": "pitch_rad",
+    "yaw": "yaw_rad",
+    "altitude": "altitude_m",
 }
-_NUMBERS = ("battery", "battery_v", "roll", "pitch", "yaw", "altitude")
+#: The page's names of feedback's vectors and of their parts: body axes (x forward, y left, z up), or world axes.
+_VECTORS = {
+    "velocity": ("velocity_m_s", ("forward", "left", "up")),
+    "angular_velocity": ("angular_velocity_rad_s", ("x", "y", "z")),
+    "acceleration": ("acceleration_m_s2", ("x", "y", "z")),
+    "position": ("position_m", ("x", "y", "z")),
+}
 
 _BROKEN: Final = (LinkState.LOST, LinkState.CLOSED)
 
@@ -51,9 +59,9 @@ def feedback_values(feedback: Feedback, now_ns: int) -> Json:
         "age_s": number(seconds(now_ns - feedback.captured_ns)),
         "captured_ns": str(feedback.captured_ns),  # too large for JavaScript's numbers
         "state": str(feedback.state),
-        **{name: number(getattr(feedback, name)) for name in _NUMBERS},
-        "velocity": vector(feedback.velocity),
-        "position": vector(feedback.position),
+        **_scalars(feedback),
+        "velocity": vector(feedback.velocity_m_s),
+        "position": vector(feedback.position_m),
         "failsafe": str(feedback.failsafe),
         "owner": feedback.owner,
         "owner_priority": feedback.owner_priority,
@@ -61,19 +69,23 @@ def feedback_values(feedback: Feedback, now_ns: int) -> Json:
     }
 
 
+def _scalars(feedback: Feedback) -> dict[str, float | None]:
+    return {name: number(getattr(feedback, field)) for name, field in _NUMBERS.items()}
+
+
 def motion_values(feedback: Feedback | None) -> Json:
     """Return what instruments show, each value known by itself."""
     if feedback is None:
         names = ("attitude", "angular_velocity", "altitude", "velocity", "speed", "position", "battery")
         return {**dict.fromkeys(names), "flight": "unknown", "airborne": False}
-    velocity = feedback.velocity
+    velocity = feedback.velocity_m_s
     return {
-        "attitude": {name: number(getattr(feedback, name)) for name in ("roll", "pitch", "yaw")},
-        "angular_velocity": vector(feedback.angular_velocity),
-        "altitude": number(feedback.altitude),
+        "attitude": {name: number(getattr(feedback, _NUMBERS[name])) for name in ("roll", "pitch", "yaw")},
+        "angular_velocity": vector(feedback.angular_velocity_rad_s),
+        "altitude": number(feedback.altitude_m),
         "velocity": vector(velocity),
         "speed": None if velocity is None else number(math.hypot(*velocity)),
-        "position": vector(feedback.position),
+        "position": vector(feedback.position_m),
         "battery": number(feedback.battery),
         "flight": str(feedback.state),
         "airborne": feedback.state.airborne,
@@ -94,9 +106,9 @@ def flat_values(
     """
     found: dict[str, float | None] = {}
     if feedback is not None:
-        found |= {name: number(getattr(feedback, name)) for name in _NUMBERS if getattr(feedback, name) is not None}
-        for name, parts in _PARTS.items():
-            values = getattr(feedback, name)
+        found |= {name: value for name, value in _scalars(feedback).items() if value is not None}
+        for name, (field, parts) in _VECTORS.items():
+            values = getattr(feedback, field)
             if values is not None:
                 found |= {f"{name}.{part}": number(value) for part, value in zip(parts, values, strict=True)}
         for name, value in (feedback.native or {}).items():

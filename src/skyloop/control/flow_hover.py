@@ -105,11 +105,11 @@ class FlowLaw:
             captured_ns: Capture of the frame.
         """
         newest = self._newest
-        if newest is None or newest.yaw is None or newest.altitude is None:
+        if newest is None or newest.yaw_rad is None or newest.altitude_m is None:
             return
         if self._seen_ns is None or seconds(captured_ns - self._seen_ns) > 1.0:
             self._filter.start(place, 0.02, captured_ns)
-            self._kept = _Kept(newest.yaw, newest.altitude, np.asarray(place, np.float64))
+            self._kept = _Kept(newest.yaw_rad, newest.altitude_m, np.asarray(place, np.float64))
         else:
             self._filter.update(place, 0.02, captured_ns)
         self._seen_ns = captured_ns
@@ -121,7 +121,7 @@ class FlowLaw:
         self._last_ns = now_ns
         if self._seen_ns is None or self._kept is None or newest is None:
             return Attitude()
-        if seconds(now_ns - self._seen_ns) > s.fresh_s or newest.yaw is None or newest.altitude is None:
+        if seconds(now_ns - self._seen_ns) > s.fresh_s or newest.yaw_rad is None or newest.altitude_m is None:
             self.phase, self.off_m = FlowPhase.LOST, None
             return Attitude()
         self.phase = FlowPhase.HOLDING
@@ -130,13 +130,13 @@ class FlowLaw:
         self.off_m = float(np.linalg.norm(self._kept.place - self._filter.at(now_ns).position))
         self._integral = shortened(self._integral + s.integral * off * dt_s, 0.5 * s.tilt_rad * GRAVITY_M_S2)
         wanted = shortened(s.gain * off - s.damping * ahead.velocity + self._integral, s.tilt_rad * GRAVITY_M_S2)
-        c, si = math.cos(newest.yaw), math.sin(newest.yaw)
+        c, si = math.cos(newest.yaw_rad), math.sin(newest.yaw_rad)
         forward, left = c * wanted[0] + si * wanted[1], c * wanted[1] - si * wanted[0]
         return Attitude(
             roll=-math.atan2(left, GRAVITY_M_S2),
             pitch=math.atan2(forward, GRAVITY_M_S2),
-            climb=clamped(s.height_gain * (self._kept.altitude - newest.altitude), 0.5),
-            yaw_rate=clamped(s.yaw_gain * wrap_angle(self._kept.yaw - newest.yaw), 1.0),
+            climb=clamped(s.height_gain * (self._kept.altitude - newest.altitude_m), 0.5),
+            yaw_rate=clamped(s.yaw_gain * wrap_angle(self._kept.yaw - newest.yaw_rad), 1.0),
         )
 
 

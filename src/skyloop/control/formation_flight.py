@@ -125,7 +125,7 @@ class Formation:
             UsageError: A drone can't be flown by its position, or none is active.
             SwarmError: A drone failed, and the swarm's ``on_error`` does not say to continue.
         """
-        here = {name: np.array(sample.position) for name, sample in self._ready().items()}
+        here = {name: np.array(sample.position_m) for name, sample in self._ready().items()}
         still = np.zeros(3)
         for _ in self.drones.ticks(self._rate_hz, seconds):
             now = {name: sample for name, sample in self._look().items() if name in here}
@@ -172,7 +172,7 @@ class Formation:
                 break
             first = now[leader]
             slots = {name: station(first, wanted[name], turn=turn) for name in wanted if name in now}
-            goals = {name: _waypoint(slot, first.yaw if turn else None) for name, slot in slots.items()}
+            goals = {name: _waypoint(slot, first.yaw_rad if turn else None) for name, slot in slots.items()}
             drift = dict.fromkeys(goals, _world_velocity(first))
             followers = {name: now[name] for name in goals}
             self._steer(
@@ -253,7 +253,7 @@ class Formation:
     def _report(self, goals: Mapping[str, NDArray[np.float64]], seconds: float) -> FormationReport:
         now = self._look()
         slots = {name: _vector(goal) for name, goal in goals.items()}
-        errors = {name: math.dist(slots[name], now[name].position or slots[name]) for name in slots if name in now}
+        errors = {name: math.dist(slots[name], now[name].position_m or slots[name]) for name in slots if name in now}
         spread = self.drones.spread
         return FormationReport(seconds, slots, errors, self._closest_m, None if spread is None else spread.maximum)
 
@@ -273,11 +273,11 @@ def station(leader: Feedback, offset: ArrayLike, *, turn: bool = True) -> NDArra
         UsageError: The leader's position or yaw are not known.
     """
     problem = lacking(leader)
-    if problem or leader.position is None or leader.yaw is None:
+    if problem or leader.position_m is None or leader.yaw_rad is None:
         raise UsageError(f"no place relative to the leader can be kept: {problem}")
     relative = _offset(offset)
-    turned = rotation_from_euler(0.0, 0.0, leader.yaw) @ relative if turn else relative
-    return np.asarray(leader.position + turned, dtype=np.float64)
+    turned = rotation_from_euler(0.0, 0.0, leader.yaw_rad) @ relative if turn else relative
+    return np.asarray(leader.position_m + turned, dtype=np.float64)
 
 
 def _minimum_jerk(share: float) -> tuple[float, float]:
@@ -292,7 +292,7 @@ def _offset(offset: ArrayLike) -> NDArray[np.float64]:
 
 
 def _positions(samples: Mapping[str, Feedback]) -> Places:
-    positions = [sample.position or (math.nan, math.nan, math.nan) for sample in samples.values()]
+    positions = [sample.position_m or (math.nan, math.nan, math.nan) for sample in samples.values()]
     return places(np.array(positions).reshape(-1, 3))
 
 
@@ -307,13 +307,13 @@ def _vector(place: NDArray[np.float64]) -> Vector:
 
 def _turned(velocity: Velocity, sample: Feedback, way: float) -> NDArray[np.float64]:
     """Turn a velocity from the body's levelled axes into the world's, or back with ``way`` -1."""
-    rotation = rotation_from_euler(0.0, 0.0, way * (sample.yaw or 0.0))
+    rotation = rotation_from_euler(0.0, 0.0, way * (sample.yaw_rad or 0.0))
     return np.asarray(rotation @ (velocity.forward, velocity.left, velocity.up), dtype=np.float64)
 
 
 def _world_velocity(sample: Feedback) -> NDArray[np.float64]:
     """Return the reported velocity in world axes; zero for a drone that does not report it."""
-    return _turned(Velocity(*(sample.velocity or (0.0, 0.0, 0.0))), sample, 1.0)
+    return _turned(Velocity(*(sample.velocity_m_s or (0.0, 0.0, 0.0))), sample, 1.0)
 
 
 def _command(world: NDArray[np.float64], sample: Feedback, yaw_rate: float) -> Velocity:

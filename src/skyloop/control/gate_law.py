@@ -111,7 +111,7 @@ class GateLaw:
     def feedback(self, feedback: Feedback) -> None:
         """Update with the vehicle's newest state."""
         self._odometry.add(feedback)
-        self._altitude = feedback.altitude
+        self._altitude = feedback.altitude_m
 
     def see(self, position: Array, normal: Array, at_capture: Feedback, captured_ns: int, trust: float = 1.0) -> None:
         """Update with a sighting.
@@ -127,7 +127,7 @@ class GateLaw:
             trust: How sure the normal is, 0 to 1.
         """
         motion = self._odometry.at(captured_ns)
-        if motion is None or at_capture.roll is None or at_capture.pitch is None or at_capture.yaw is None:
+        if motion is None or at_capture.roll_rad is None or at_capture.pitch_rad is None or at_capture.yaw_rad is None:
             return
         to_level = at_capture.rotation
         distance = float(np.linalg.norm(position))

@@ -108,8 +108,8 @@ class ImageServoLaw:
 
     def feedback(self, feedback: Feedback) -> None:
         """Update with the vehicle's newest state."""
-        self._yaw, self._altitude = feedback.yaw, feedback.altitude
-        self._flown = None if feedback.velocity is None else np.asarray(feedback.velocity)
+        self._yaw, self._altitude = feedback.yaw_rad, feedback.altitude_m
+        self._flown = None if feedback.velocity_m_s is None else np.asarray(feedback.velocity_m_s)
 
     def see(self, points: Array, at_capture: Feedback, captured_ns: int) -> None:
         """Update with the points of a frame.
@@ -122,10 +122,10 @@ class ImageServoLaw:
             at_capture: Feedback with the attitude at the capture.
             captured_ns: Capture of the frame.
         """
-        if at_capture.roll is None or at_capture.pitch is None:
+        if at_capture.roll_rad is None or at_capture.pitch_rad is None:
             return
         try:
-            level = levelled(points, self._camera, at_capture.roll, at_capture.pitch)
+            level = levelled(points, self._camera, at_capture.roll_rad, at_capture.pitch_rad)
         except UsageError:
             return
         self.error = math.sqrt(float(((level - self._wanted) ** 2).sum(axis=1).mean()))

@@ -56,7 +56,7 @@ def camera_twist(camera: CameraInfo) -> Array:
         UsageError: The camera does not say how it is mounted.
     """
     to_camera = mounting_rotation(camera).T
-    place = np.zeros(3) if camera.position is None else np.asarray(camera.position)
+    place = np.zeros(3) if camera.position_m is None else np.asarray(camera.position_m)
     up = np.array([0.0, 0.0, 1.0])
     twist = np.zeros((6, 4))
     twist[:3, :3] = to_camera

@@ -109,7 +109,7 @@ class LandingLaw:
     def feedback(self, feedback: Feedback) -> None:
         """Update with the vehicle's newest state."""
         self._odometry.add(feedback)
-        self._altitude = feedback.altitude
+        self._altitude = feedback.altitude_m
 
     def see(self, position: Array, at_capture: Feedback, captured_ns: int) -> None:
         """Update with a sighting. Ignored while the vehicle's attitude or motion is not known.
@@ -120,7 +120,7 @@ class LandingLaw:
             captured_ns: Capture of the frame.
         """
         motion = self._odometry.at(captured_ns)
-        if motion is None or at_capture.roll is None or at_capture.pitch is None or at_capture.yaw is None:
+        if motion is None or at_capture.roll_rad is None or at_capture.pitch_rad is None or at_capture.yaw_rad is None:
             return
         place = motion.position + at_capture.rotation @ position
         # Tilt's error of half a degree moves the place by a hundredth of the distance.

@@ -164,7 +164,7 @@ class FollowPath(_PathFlyer):
         self.on_path = False  #: the start was reached
 
     def _begin(self, fix: Fix) -> PathLaw:
-        return PathLaw(_way(fix.position, _vector(self.path.position(0.0)), APPROACH_M_S), self.settings, self._yaw)
+        return PathLaw(_way(fix.position_m, _vector(self.path.position(0.0)), APPROACH_M_S), self.settings, self._yaw)
 
     def _look(self, law: PathLaw, fix: Fix) -> None:
         if self.on_path:
@@ -234,7 +234,7 @@ class Waypoints(_PathFlyer):
 
     def _begin(self, fix: Fix) -> PathLaw:
         goal = self.waypoints[0]
-        return PathLaw(_way(fix.position, goal.position, *self._speed), self.settings, self._mode(goal))
+        return PathLaw(_way(fix.position_m, goal.position, *self._speed), self.settings, self._mode(goal))
 
     def _look(self, law: PathLaw, fix: Fix) -> None:
         self.error.add(law.off_m)

@@ -116,7 +116,7 @@ class PathLaw:
     def there(self, fix: Fix) -> bool:
         """Whether the path is over and the vehicle within the acceptance radius of its end, at the wanted yaw."""
         s = self.settings
-        turned = 0.0 if self._wanted_yaw is None else wrap_angle(self._wanted_yaw - fix.yaw)
+        turned = 0.0 if self._wanted_yaw is None else wrap_angle(self._wanted_yaw - fix.yaw_rad)
         return self.over and self._off(fix) <= s.near_m and abs(turned) <= s.near_rad
 
     def step(self, fix: Fix) -> Velocity:
@@ -130,12 +130,12 @@ class PathLaw:
         wanted = np.array(
             [
                 loop.step(float(to), at, dt_s, float(feed))
-                for loop, to, at, feed in zip(self._loops, target, fix.position, ahead, strict=True)
+                for loop, to, at, feed in zip(self._loops, target, fix.position_m, ahead, strict=True)
             ]
         )
-        if fix.velocity is not None:
-            wanted += self.settings.velocity_gain * (wanted - fix.velocity)
-        c, s = math.cos(fix.yaw), math.sin(fix.yaw)
+        if fix.velocity_m_s is not None:
+            wanted += self.settings.velocity_gain * (wanted - fix.velocity_m_s)
+        c, s = math.cos(fix.yaw_rad), math.sin(fix.yaw_rad)
         turn = self._turn(fix)
         velocity = self._limiter.step(
             np.array([c * wanted[0] + s * wanted[1], c * wanted[1] - s * wanted[0], wanted[2], turn]), dt_s
@@ -146,7 +146,7 @@ class PathLaw:
         return velocity
 
     def _off(self, fix: Fix) -> float:
-        return float(np.linalg.norm(self._path.position(self.time_s) - fix.position))
+        return float(np.linalg.norm(self._path.position(self.time_s) - fix.position_m))
 
     def _go_on(self, dt_s: float, off_m: float) -> None:
         """Advance the path's time, slower beyond the leash, and not at all from twice the leash on."""
@@ -162,5 +162,5 @@ class PathLaw:
             self._turning = 0.0 if now is None or soon is None else wrap_angle(soon - now) / _AHEAD_S
             self._wanted_yaw = self._wanted_yaw if now is None else now
         if self._wanted_yaw is None:
-            self._wanted_yaw = fix.yaw
-        return self._turning + self.settings.yaw_gain * wrap_angle(self._wanted_yaw - fix.yaw)
+            self._wanted_yaw = fix.yaw_rad
+        return self._turning + self.settings.yaw_gain * wrap_angle(self._wanted_yaw - fix.yaw_rad)

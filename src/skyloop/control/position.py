@@ -17,9 +17,9 @@ class Fix(NamedTuple):
     """A position in world axes (x east, y north, z up) at one time."""
 
     at_ns: int  #: on the proxy's clock
-    position: Vector  #: [m]
-    yaw: float  #: counter-clockwise from x [rad]
-    velocity: Vector | None = None  #: in world axes [m/s], if it is known
+    position_m: Vector  #: [m]
+    yaw_rad: float  #: counter-clockwise from x [rad]
+    velocity_m_s: Vector | None = None  #: in world axes [m/s], if it is known
 
 
 #: Returns the newest known position, None while it is not known; must not block.
@@ -32,9 +32,14 @@ def fix_of(feedback: Feedback) -> Fix | None:
     Returns:
         The fix at the feedback's capture; None while position or yaw are not known.
     """
-    if feedback.position is None or feedback.yaw is None:
+    if feedback.position_m is None or feedback.yaw_rad is None:
         return None
-    return Fix(feedback.captured_ns, feedback.position, feedback.yaw, _world_velocity(feedback.velocity, feedback.yaw))
+    return Fix(
+        feedback.captured_ns,
+        feedback.position_m,
+        feedback.yaw_rad,
+        _world_velocity(feedback.velocity_m_s, feedback.yaw_rad),
+    )
 
 
 class DeadReckoning:
@@ -70,7 +75,7 @@ class DeadReckoning:
         if motion is None or motion.at_ns != feedback.captured_ns:
             return  # nothing new, or nothing of use
         east, north, up = motion.position.tolist()
-        height = up if feedback.altitude is None else feedback.altitude
+        height = up if feedback.altitude_m is None else feedback.altitude_m
         vx, vy, vz = motion.velocity.tolist()
         place = (self._begin[0] + east, self._begin[1] + north, height)
         self._newest = Fix(motion.at_ns, place, motion.yaw, (vx, vy, vz))

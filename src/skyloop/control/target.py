@@ -73,18 +73,18 @@ class Odometry:
 
     def add(self, feedback: Feedback) -> None:
         """Integrate the next sample. Samples without velocity or yaw, or not newer than the last, are ignored."""
-        if feedback.velocity is None or feedback.yaw is None:
+        if feedback.velocity_m_s is None or feedback.yaw_rad is None:
             return
         last = self._history[-1] if self._history else None
         if last is not None and feedback.captured_ns <= last.at_ns:
             return
-        velocity = rotation_from_euler(0.0, 0.0, feedback.yaw) @ np.asarray(feedback.velocity)
-        rate = 0.0 if feedback.angular_velocity is None else feedback.angular_velocity[2]
+        velocity = rotation_from_euler(0.0, 0.0, feedback.yaw_rad) @ np.asarray(feedback.velocity_m_s)
+        rate = 0.0 if feedback.angular_velocity_rad_s is None else feedback.angular_velocity_rad_s[2]
         position = np.zeros(3)
         if last is not None:
             dt = min(seconds(feedback.captured_ns - last.at_ns), _LONGEST_STEP_S)
             position = last.position + (last.velocity + velocity) * (dt / 2)
-        self._history.append(Motion(feedback.captured_ns, position, velocity, feedback.yaw, rate))
+        self._history.append(Motion(feedback.captured_ns, position, velocity, feedback.yaw_rad, rate))
         while seconds(feedback.captured_ns - self._history[0].at_ns) > _HISTORY_S:
             self._history.popleft()
 

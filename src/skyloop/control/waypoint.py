@@ -62,9 +62,9 @@ class WaypointSettings:
 
 def lacking(feedback: Feedback) -> str:
     """Return why a vehicle can't be flown to a position, or an empty string if it can."""
-    if feedback.position is None:
+    if feedback.position_m is None:
         return "the vehicle does not report its position"
-    return "the vehicle does not report its yaw" if feedback.yaw is None else ""
+    return "the vehicle does not report its yaw" if feedback.yaw_rad is None else ""
 
 
 def velocity_to(goal: Waypoint, feedback: Feedback, settings: WaypointSettings | None = None) -> Velocity:
@@ -86,8 +86,8 @@ def velocity_to(goal: Waypoint, feedback: Feedback, settings: WaypointSettings |
     away = math.hypot(east, north)
     speed = _approach(away, s.speed_m_s, s)
     share = speed / away if away > 1e-9 else 0.0
-    assert feedback.yaw is not None
-    c, si = math.cos(feedback.yaw), math.sin(feedback.yaw)
+    assert feedback.yaw_rad is not None
+    c, si = math.cos(feedback.yaw_rad), math.sin(feedback.yaw_rad)
     return Velocity(
         forward=share * (c * east + si * north),
         left=share * (c * north - si * east),
@@ -109,7 +109,7 @@ def reached(goal: Waypoint, feedback: Feedback, settings: WaypointSettings | Non
     """
     s = settings or WaypointSettings()
     east, north, up, yaw = _errors(goal, feedback)
-    velocity = feedback.velocity
+    velocity = feedback.velocity_m_s
     at_rest = velocity is None or math.hypot(*velocity) <= s.slow_m_s
     return at_rest and math.hypot(east, north, up) <= s.near_m and abs(yaw) <= s.near_rad
 
@@ -117,10 +117,10 @@ def reached(goal: Waypoint, feedback: Feedback, settings: WaypointSettings | Non
 def _errors(goal: Waypoint, feedback: Feedback) -> tuple[float, float, float, float]:
     """Return east, north, up [m] and yaw [rad] from where the vehicle is to the goal."""
     problem = lacking(feedback)
-    if problem or feedback.position is None or feedback.yaw is None:
+    if problem or feedback.position_m is None or feedback.yaw_rad is None:
         raise UsageError(f"it can't fly to a waypoint: {problem}")
-    x, y, z = feedback.position
-    turn = 0.0 if goal.yaw is None else wrap_angle(goal.yaw - feedback.yaw)
+    x, y, z = feedback.position_m
+    turn = 0.0 if goal.yaw is None else wrap_angle(goal.yaw - feedback.yaw_rad)
     return goal.x - x, goal.y - y, goal.z - z, turn
 
 

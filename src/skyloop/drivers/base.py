@@ -134,7 +134,7 @@ class ExternalPose:
     """Where something outside of the vehicle, such as motion capture, saw it.
 
     Args:
-        position: Of the body's origin in world axes, x east, y north, z up [m].
+        position_m: Of the body's origin in world axes, x east, y north, z up [m].
         quaternion: (x, y, z, w), rotates body axes (x forward, y left, z up) to world axes.
         captured_ns: When it was measured, on this host's monotonic clock.
         position_std_m: Standard deviation of the position [m], 0 or more; None if it is not known.
@@ -145,14 +145,14 @@ class ExternalPose:
             by more than 0.001.
     """
 
-    position: Vector
+    position_m: Vector
     quaternion: tuple[float, float, float, float]
     captured_ns: int
     position_std_m: float | None = None
     attitude_std_rad: float | None = None
 
     def __post_init__(self) -> None:
-        check_pose(self.position, self.quaternion, self.position_std_m, self.attitude_std_rad)
+        check_pose(self.position_m, self.quaternion, self.position_std_m, self.attitude_std_rad)
 
 
 @dataclass(frozen=True, slots=True)

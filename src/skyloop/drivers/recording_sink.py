@@ -242,14 +242,14 @@ class RecordingSink:
 PLAUSIBLE: dict[str, tuple[float, float]] = {
     "battery": (0.0, 1.0),
     "battery_v": (0.0, 60.0),
-    "roll": (-math.pi, math.pi),
-    "pitch": (-math.pi, math.pi),
-    "yaw": (-math.pi - 1e-9, math.pi + 1e-9),
-    "altitude": (-50.0, 500.0),
-    "velocity": (-60.0, 60.0),
-    "angular_velocity": (-50.0, 50.0),
-    "acceleration": (-500.0, 500.0),
-    "position": (-1e5, 1e5),
+    "roll_rad": (-math.pi, math.pi),
+    "pitch_rad": (-math.pi, math.pi),
+    "yaw_rad": (-math.pi - 1e-9, math.pi + 1e-9),
+    "altitude_m": (-50.0, 500.0),
+    "velocity_m_s": (-60.0, 60.0),
+    "angular_velocity_rad_s": (-50.0, 50.0),
+    "acceleration_m_s2": (-500.0, 500.0),
+    "position_m": (-1e5, 1e5),
 }
 
 

@@ -77,7 +77,7 @@ class Flight:
             self.until(lambda f: f.state in settled, self.suite.takeoff_timeout_s, "hovering after take-off")
             return
         self.set_point(up=self.suite.climb)
-        self.until(lambda f: f.altitude is None or f.altitude > 0.6, self.suite.takeoff_timeout_s, "0.6 m high")
+        self.until(lambda f: f.altitude_m is None or f.altitude_m > 0.6, self.suite.takeoff_timeout_s, "0.6 m high")
         self.set_point()
 
     def land(self) -> None:
@@ -93,7 +93,9 @@ class Flight:
         self.set_point(up=-self.suite.climb)
         low = FlightState.LANDED
         self.until(
-            lambda f: f.state is low or (f.altitude is not None and f.altitude < 0.1), self.suite.land_timeout_s, "down"
+            lambda f: f.state is low or (f.altitude_m is not None and f.altitude_m < 0.1),
+            self.suite.land_timeout_s,
+            "down",
         )
 
     def set_point(self, *, forward: float = 0.0, left: float = 0.0, up: float = 0.0, turn: float = 0.0) -> None:
@@ -135,16 +137,16 @@ class Flight:
         """
         suite, start = self.suite, self.sink.newest
         assert start is not None
-        assert start.position is not None, "a vehicle that takes positions tells its own"
-        x, y, z = start.position
-        turn = 0.0 if start.yaw is None else start.yaw + suite.turn
+        assert start.position_m is not None, "a vehicle that takes positions tells its own"
+        x, y, z = start.position_m
+        turn = 0.0 if start.yaw_rad is None else start.yaw_rad + suite.turn
         away = Position(x + suite.distance, y - suite.distance, z + suite.distance, turn, speed=suite.speed)
         for place in (away, Position(x, y, z, speed=suite.speed)):
             self.driver.apply(place)
 
             def is_there(feedback: Feedback, place: Position = place) -> bool:
-                near = feedback.position is not None and math.dist(feedback.position, place.place) <= suite.near
-                turned = feedback.yaw is None or abs(wrap_angle(turn - feedback.yaw)) <= NEAR_RAD
+                near = feedback.position_m is not None and math.dist(feedback.position_m, place.place) <= suite.near
+                turned = feedback.yaw_rad is None or abs(wrap_angle(turn - feedback.yaw_rad)) <= NEAR_RAD
                 return near and turned  # without a yaw it keeps the one that it has
 
             self.until(is_there, suite.motion_timeout_s, f"at {place}")
@@ -174,15 +176,15 @@ class Flight:
 
 
 def _height(start: Feedback, now: Feedback) -> float | None:
-    if start.altitude is not None and now.altitude is not None:
-        return now.altitude - start.altitude
+    if start.altitude_m is not None and now.altitude_m is not None:
+        return now.altitude_m - start.altitude_m
     return _speed_sign(now, 2)
 
 
 def _turned(start: Feedback, now: Feedback) -> float | None:
-    if start.yaw is None or now.yaw is None:
+    if start.yaw_rad is None or now.yaw_rad is None:
         return None
-    return wrap_angle(now.yaw - start.yaw)
+    return wrap_angle(now.yaw_rad - start.yaw_rad)
 
 
 def _ahead(start: Feedback, now: Feedback) -> float | None:
@@ -195,18 +197,18 @@ def _aside(start: Feedback, now: Feedback) -> float | None:
 
 def _along(start: Feedback, now: Feedback, axis: int) -> float | None:
     """Return the way along the heading (axis 0) or to its left (1) [m]; the speed there if no position is known."""
-    if start.position is None or now.position is None or start.yaw is None:
+    if start.position_m is None or now.position_m is None or start.yaw_rad is None:
         return _speed_sign(now, axis)
-    east, north = now.position[0] - start.position[0], now.position[1] - start.position[1]
-    heading = start.yaw + axis * math.pi / 2
+    east, north = now.position_m[0] - start.position_m[0], now.position_m[1] - start.position_m[1]
+    heading = start.yaw_rad + axis * math.pi / 2
     return east * math.cos(heading) + north * math.sin(heading)
 
 
 def _speed_sign(now: Feedback, axis: int) -> float | None:
-    return None if now.velocity is None else now.velocity[axis]
+    return None if now.velocity_m_s is None else now.velocity_m_s[axis]
 
 
 def _speed(feedback: Feedback | None) -> float:
-    if feedback is None or feedback.velocity is None:
+    if feedback is None or feedback.velocity_m_s is None:
         return math.inf
-    return math.hypot(*feedback.velocity)
+    return math.hypot(*feedback.velocity_m_s)

@@ -63,7 +63,7 @@ __all__ = [
 T = TypeVar("T")
 
 PROFILE: Final = "skyloop"  #: of the MCAP header
-VERSION: Final = 1  #: of this layout
+VERSION: Final = 2  #: of this layout; files of layout 1, with the names of before, are read too
 JSON: Final = "json"  #: message encoding of Skyloop's own samples
 JSON_SCHEMA: Final = "jsonschema"  #: schema encoding of Skyloop's own samples
 PROTOBUF: Final = "protobuf"  #: both encodings of messages for viewers

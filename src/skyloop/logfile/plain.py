@@ -15,7 +15,7 @@ import msgspec
 from msgspec import inspect
 
 from skyloop.errors import FileFormatError
-from skyloop.messages import ACTION_NAMES, Points, Polyline, Text
+from skyloop.messages import ACTION_NAMES, CameraInfo, Feedback, Points, Polyline, Text
 
 T = TypeVar("T")
 
@@ -56,6 +56,22 @@ _TAGS: Final[dict[type, tuple[str, str]]] = {
     Polyline: ("shape", "polyline"),
     Points: ("shape", "points"),
     Text: ("shape", "text"),
+}
+
+
+#: Names of fields in recordings of layout 1, by those of today.
+_FORMER: Final[dict[type, dict[str, str]]] = {
+    Feedback: {
+        "roll_rad": "roll",
+        "pitch_rad": "pitch",
+        "yaw_rad": "yaw",
+        "altitude_m": "altitude",
+        "velocity_m_s": "velocity",
+        "angular_velocity_rad_s": "angular_velocity",
+        "acceleration_m_s2": "acceleration",
+        "position_m": "position",
+    },
+    CameraInfo: {"position_m": "position"},
 }
 
 
@@ -149,9 +165,13 @@ def _restore_type(info: inspect.Type) -> _Restore:
 def _restore_struct(info: inspect.StructType) -> _Restore:
     fields = [(field.name, _restore_type(field.type), _default(field)) for field in info.fields]
     tag = [] if info.tag is None else [info.tag]
+    former = _FORMER.get(info.cls, {})
 
     def restore(value: dict[str, Any]) -> Any:
-        restored = {name: item(value[name]) if name in value else default() for name, item, default in fields}
+        restored = {}
+        for name, item, default in fields:
+            key = name if name in value else former.get(name, name)
+            restored[name] = item(value[key]) if key in value else default()
         return [*tag, *restored.values()] if info.array_like else restored
 
     return restore

@@ -20,6 +20,7 @@ from skyloop.logfile.layout import (
     META_END,
     META_RECORDING,
     TYPES,
+    VERSION,
     Channel,
     ClockPair,
     DroneRecord,
@@ -107,6 +108,11 @@ class Recording:
             end = from_metadata(texts[META_END], End) if META_END in texts else None
         except FileFormatError as error:
             raise FileFormatError(f"{found.path}: {error}") from None
+        if not 1 <= start.layout <= VERSION:
+            raise FileFormatError(
+                f"{found.path} has layout {start.layout}, and this version of Skyloop reads layouts 1 to {VERSION}: "
+                "use the version that recorded it, or a newer one"
+            )
         return cls(found.path, start, clock, end, found)
 
     # What it is ------------------------------------------------------------------------------------------------

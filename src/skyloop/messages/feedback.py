@@ -34,14 +34,14 @@ class Feedback(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
     state: FlightState = FlightState.UNKNOWN
     battery: Finite | None = None  #: charge left, 0 to 1
     battery_v: Finite | None = None  #: voltage [V]
-    roll: Finite | None = None  #: [rad]
-    pitch: Finite | None = None  #: [rad]
-    yaw: Finite | None = None  #: [rad]
-    altitude: Finite | None = None  #: height above the ground below [m]
-    velocity: Vector | None = None  #: body's levelled axes: forward, left, up [m/s]
-    angular_velocity: Vector | None = None  #: about the body's axes [rad/s]
-    acceleration: Vector | None = None  #: specific force along the body's axes, gravity included [m/s²]
-    position: Vector | None = None  #: in world axes [m], if the vehicle knows it
+    roll_rad: Finite | None = None  #: [rad]
+    pitch_rad: Finite | None = None  #: [rad]
+    yaw_rad: Finite | None = None  #: [rad]
+    altitude_m: Finite | None = None  #: height above the ground below [m]
+    velocity_m_s: Vector | None = None  #: body's levelled axes: forward, left, up [m/s]
+    angular_velocity_rad_s: Vector | None = None  #: about the body's axes [rad/s]
+    acceleration_m_s2: Vector | None = None  #: specific force along the body's axes, gravity included [m/s²]
+    position_m: Vector | None = None  #: in world axes [m], if the vehicle knows it
     native: dict[str, Value] | None = None  #: the vehicle's own telemetry, by its own names and in its own units
 
     seq: Count = 0  #: grows by one with each sample of a proxy's run
@@ -64,6 +64,6 @@ class Feedback(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
         """
         from skyloop.messages.geometry import rotation_from_euler
 
-        if self.roll is None or self.pitch is None or self.yaw is None:
+        if self.roll_rad is None or self.pitch_rad is None or self.yaw_rad is None:
             raise ValueError("the vehicle has not reported its attitude yet")
-        return rotation_from_euler(self.roll, self.pitch, self.yaw)
+        return rotation_from_euler(self.roll_rad, self.pitch_rad, self.yaw_rad)

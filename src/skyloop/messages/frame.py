@@ -61,5 +61,5 @@ class CameraInfo(msgspec.Struct, frozen=True, array_like=True):
     intrinsics: Intrinsics | None = None
     #: rotation from the camera's optical axes (x right, y down, z forward) to the body's axes, row by row
     rotation: tuple[Finite, Finite, Finite, Finite, Finite, Finite, Finite, Finite, Finite] | None = None
-    position: tuple[Finite, Finite, Finite] | None = None  #: of the optical centre in body axes [m]
+    position_m: tuple[Finite, Finite, Finite] | None = None  #: of the optical centre in body axes [m]
     stream: str = ""  #: codec in which its pictures can be had as they come, ``h264``; empty: as frames only

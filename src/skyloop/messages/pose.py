@@ -15,7 +15,7 @@ class VehiclePose(msgspec.Struct, frozen=True, array_like=True):
     """A pose for the vehicle itself, from a pilot's application. World axes x east, y north, z up."""
 
     captured_ns: TimeNs  #: when it was so, on the proxy's clock
-    position: tuple[float, float, float]  #: of the body's origin [m]
+    position_m: tuple[float, float, float]  #: of the body's origin [m]
     quaternion: tuple[float, float, float, float]  #: x, y, z, w, from body axes (forward, left, up) to world axes
     position_std_m: float | None = None  #: standard deviation, if it is known
     attitude_std_rad: float | None = None  #: standard deviation, if it is known

@@ -70,7 +70,7 @@ def calibrate(
             f"{len(poses)} poses are too few for a calibration, at least {MIN_POSES}: is the body tracked?"
         )
     mean = mean_quaternion([pose.quaternion for pose in poses])
-    spread_m = _spread(np.array([pose.position for pose in poses]))
+    spread_m = _spread(np.array([pose.position_m for pose in poses]))
     angles = [_angle(mean, pose.quaternion) for pose in poses]
     spread_rad = math.sqrt(sum(angle * angle for angle in angles) / len(angles))
     if spread_m > max_spread_m or spread_rad > max_spread_rad:

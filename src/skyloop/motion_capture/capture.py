@@ -310,7 +310,7 @@ class MotionCapture:
                 self._check_open()
         feedback = drone.feedback()
         found = calibrate(
-            poses, roll=feedback.roll or 0.0, pitch=feedback.pitch or 0.0, yaw=feedback.yaw, heading=heading
+            poses, roll=feedback.roll_rad or 0.0, pitch=feedback.pitch_rad or 0.0, yaw=feedback.yaw_rad, heading=heading
         )
         self._calibrations[name] = found
         return found
@@ -334,7 +334,7 @@ class MotionCapture:
         with self._changed:
             calibration = self._calibrations.get(track.body)
             seen = seen if calibration is None else calibration.apply(seen)
-            pose = track.add(captured_ns, seen.position, seen.quaternion)
+            pose = track.add(captured_ns, seen.position_m, seen.quaternion)
             self._changed.notify_all()
         if pose is not None:
             self._report(track)
@@ -419,10 +419,10 @@ class Linked:
             return
         # Accept poses a quarter of a period early: else a rate near the system's own would be halved.
         self._due_ns = pose.captured_ns + self._period_ns * 3 // 4
-        values = (*pose.position, *pose.quaternion, *(pose.velocity or ()))
+        values = (*pose.position_m, *pose.quaternion, *(pose.velocity_m_s or ()))
         at_ns = pose.captured_ns + self._drone.clock_offset_ns
         if self._to_vehicle:  # first, as the vehicle flies by it
-            self._drone.send_external_pose(pose.position, pose.quaternion, at_ns=at_ns)
+            self._drone.send_external_pose(pose.position_m, pose.quaternion, at_ns=at_ns)
         self._drone.log.array(MOCAP, values, at_ns=at_ns)
 
     def _event(self, event: TrackEvent) -> None:
@@ -445,6 +445,6 @@ def fixes(capture: MotionCapture, drone: Drone) -> Callable[[], Fix | None]:
         pose = capture.pose(name)
         if pose is None:
             return None
-        return Fix(pose.captured_ns + drone.clock_offset_ns, pose.position, pose.yaw, pose.velocity)
+        return Fix(pose.captured_ns + drone.clock_offset_ns, pose.position_m, pose.yaw_rad, pose.velocity_m_s)
 
     return newest

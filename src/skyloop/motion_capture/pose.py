@@ -28,12 +28,12 @@ class BodyPose:
 
     body: str
     captured_ns: int  #: on this host's monotonic clock
-    position: Vector  #: [m]
+    position_m: Vector  #: [m]
     quaternion: Quaternion  #: x, y, z, w: turns body axes into world axes
-    velocity: Vector | None = None  #: [m/s], world axes; None until there are enough poses
+    velocity_m_s: Vector | None = None  #: [m/s], world axes; None until there are enough poses
 
     @property
-    def yaw(self) -> float:
+    def yaw_rad(self) -> float:
         """Heading [rad]: of the body's x axis, from the world's x axis, counter-clockwise seen from above."""
         x, y, z, w = self.quaternion
         return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
@@ -55,7 +55,7 @@ class BodyPose:
         Raises:
             MissingExtraError: SciPy is not installed, or too old.
         """
-        found: RigidTransform = scipy_types().RigidTransform.from_components(self.position, self.rotation)
+        found: RigidTransform = scipy_types().RigidTransform.from_components(self.position_m, self.rotation)
         return found
 
 

@@ -112,7 +112,7 @@ class ActionExecutor:
         if self.autopilot is None:
             return None
         feedback = self._vehicle.feedback_now
-        if not self._had_feedback and feedback is not None and feedback.altitude is not None:
+        if not self._had_feedback and feedback is not None and feedback.altitude_m is not None:
             self._had_feedback = True
             self.autopilot.on_first_feedback(feedback)
         action = self.autopilot.step(now_ns, feedback)

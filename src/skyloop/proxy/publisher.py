@@ -62,8 +62,8 @@ _RESULTS_TOPIC: Final = RESULTS + "/"
 _CHANNELS: Final = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
 _LINK_UP: Final = frozenset({LinkState.UP, LinkState.DEGRADED})
 _replace = msgspec.structs.replace
-_NUMBERS: Final = ("battery", "battery_v", "roll", "pitch", "yaw", "altitude")
-_VECTORS: Final = ("velocity", "angular_velocity", "acceleration", "position")
+_NUMBERS: Final = ("battery", "battery_v", "roll_rad", "pitch_rad", "yaw_rad", "altitude_m")
+_VECTORS: Final = ("velocity_m_s", "angular_velocity_rad_s", "acceleration_m_s2", "position_m")
 
 
 class VehiclePublisher:
@@ -133,9 +133,9 @@ class VehiclePublisher:
 
     def _finite(self, raw: Feedback) -> Feedback:
         """A number that is NaN or infinite is not known: nothing here and at no application has to reckon with it."""
-        vectors = (raw.velocity, raw.angular_velocity, raw.acceleration, raw.position)
-        total = (raw.battery or 0.0) + (raw.battery_v or 0.0) + (raw.altitude or 0.0)
-        total += (raw.roll or 0.0) + (raw.pitch or 0.0) + (raw.yaw or 0.0)
+        vectors = (raw.velocity_m_s, raw.angular_velocity_rad_s, raw.acceleration_m_s2, raw.position_m)
+        total = (raw.battery or 0.0) + (raw.battery_v or 0.0) + (raw.altitude_m or 0.0)
+        total += (raw.roll_rad or 0.0) + (raw.pitch_rad or 0.0) + (raw.yaw_rad or 0.0)
         for vector in vectors:
             if vector is not None:
                 total += vector[0] + vector[1] + vector[2]

@@ -61,7 +61,7 @@ class Relay:
         try:
             self._driver.external_pose(
                 ExternalPose(
-                    pose.position, pose.quaternion, pose.captured_ns, pose.position_std_m, pose.attitude_std_rad
+                    pose.position_m, pose.quaternion, pose.captured_ns, pose.position_std_m, pose.attitude_std_rad
                 )
             )
         except UsageError as error:

@@ -153,10 +153,12 @@ def pose(feedback: Feedback) -> Pose | None:
 
     Without a position it is above the origin at its altitude, so that attitude and height can still be seen.
     """
-    if feedback.roll is None or feedback.pitch is None or feedback.yaw is None:
+    if feedback.roll_rad is None or feedback.pitch_rad is None or feedback.yaw_rad is None:
         return None
-    x, y, z = feedback.position or (0.0, 0.0, feedback.altitude or 0.0)
-    return Pose(position=Vector3(x=x, y=y, z=z), orientation=quaternion(feedback.roll, feedback.pitch, feedback.yaw))
+    x, y, z = feedback.position_m or (0.0, 0.0, feedback.altitude_m or 0.0)
+    return Pose(
+        position=Vector3(x=x, y=y, z=z), orientation=quaternion(feedback.roll_rad, feedback.pitch_rad, feedback.yaw_rad)
+    )
 
 
 def quaternion(roll: float, pitch: float, yaw: float) -> Quaternion:
@@ -194,7 +196,7 @@ def drone_to_camera(drone: str, camera: CameraInfo, at_ns: int) -> bytes | None:
 
     from skyloop.messages.geometry import euler_from_rotation
 
-    x, y, z = camera.position or (0.0, 0.0, 0.0)
+    x, y, z = camera.position_m or (0.0, 0.0, 0.0)
     turned = quaternion(*euler_from_rotation(np.array(camera.rotation).reshape(3, 3)))
     return _transform(drone, optical_frame(drone, camera.name), at_ns, Vector3(x=x, y=y, z=z), turned)
 

@@ -142,7 +142,7 @@ class Translator:
         yield Message(layout.pose_topic(drone), foxglove.PoseInFrame, pose, log_ns, at_ns)
         transform = foxglove.world_to_drone(drone, at_ns, place)
         yield Message(layout.TF, foxglove.FrameTransform, transform, log_ns, at_ns)
-        if feedback.position is not None:
+        if feedback.position_m is not None:
             self._path.add(place)
             if at_ns >= self._path_due_ns:
                 self._path_due_ns = at_ns + _PATH_EVERY_NS

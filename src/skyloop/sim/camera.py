@@ -113,7 +113,7 @@ class CameraModel:
             fps=self.fps,
             intrinsics=self.intrinsics(),
             rotation=self.rotation,
-            position=self.position_m,
+            position_m=self.position_m,
         )
 
     def pose(

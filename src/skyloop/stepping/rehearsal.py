@@ -166,9 +166,9 @@ class _NoisySink:
         self._gauss = chance.gauss
 
     def feedback(self, feedback: Feedback) -> None:
-        if feedback.position is not None:
-            x, y, z = (value + self._gauss(0.0, self._noise_m) for value in feedback.position)
-            feedback = msgspec.structs.replace(feedback, position=(x, y, z))
+        if feedback.position_m is not None:
+            x, y, z = (value + self._gauss(0.0, self._noise_m) for value in feedback.position_m)
+            feedback = msgspec.structs.replace(feedback, position_m=(x, y, z))
         self._sink.feedback(feedback)
 
     def __getattr__(self, name: str) -> Any:

@@ -49,7 +49,7 @@ class GroundTracker:
         """
         self._cv: Any = opencv("optical flow")
         self._mounting = mounting_rotation(camera)
-        self._offset = np.zeros(3) if camera.position is None else np.asarray(camera.position, np.float64)
+        self._offset = np.zeros(3) if camera.position_m is None else np.asarray(camera.position_m, np.float64)
         self._grey: NDArray[np.uint8] | None = None
         self._corners = np.empty((0, 2), np.float32)  # pixels in the last frame
         self._ground = np.empty((0, 2))  # where they are on the ground, in the axes of `place`
@@ -84,8 +84,12 @@ class GroundTracker:
         """
         pixels, intrinsics = checked(image, intrinsics)
         grey = self._cv.cvtColor(pixels, self._cv.COLOR_BGR2GRAY) if pixels.ndim == 3 else pixels.copy()
-        height = at_capture.altitude
-        if height is None or height < _LOWEST_M or None in (at_capture.roll, at_capture.pitch, at_capture.yaw):
+        height = at_capture.altitude_m
+        if (
+            height is None
+            or height < _LOWEST_M
+            or None in (at_capture.roll_rad, at_capture.pitch_rad, at_capture.yaw_rad)
+        ):
             self.forget()
             return None
         began = self._grey is None
@@ -140,5 +144,5 @@ class GroundTracker:
         level = np.column_stack([rays, np.ones(len(rays))]) @ (turn @ self._mounting).T
         lever = turn @ self._offset
         good = level[:, 2] < -0.2
-        depth = np.where(good, -((at_capture.altitude or 0.0) + lever[2]) / np.where(good, level[:, 2], 1.0), 0.0)
+        depth = np.where(good, -((at_capture.altitude_m or 0.0) + lever[2]) / np.where(good, level[:, 2], 1.0), 0.0)
         return level[:, :2] * depth[:, None] + lever[:2], good

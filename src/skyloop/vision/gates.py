@@ -101,7 +101,7 @@ class GateDetector:
         if pose is None or pose.position[2] > _FARTHEST_M or pose.rotation[1, 1] > -0.7:  # its up is the picture's
             return None
         corners = project(np.column_stack([rays, np.ones(len(rays))]), intrinsics)
-        return GateSighting(corners=corners, position=pose.position, rotation=pose.rotation, ambiguity=pose.ambiguity)
+        return GateSighting(corners=corners, position_m=pose.position, rotation=pose.rotation, ambiguity=pose.ambiguity)
 
     def _four_corners(self, edge: Array) -> Array | None:
         """Return rough corners, (4, 2) pixels, from the top left clockwise; None for another shape."""

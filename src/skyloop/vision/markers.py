@@ -90,7 +90,7 @@ class MarkerDetector:
         if pose is None:
             return None
         return MarkerSighting(
-            id=number, corners=corners, position=pose.position, rotation=pose.rotation, ambiguity=pose.ambiguity
+            id=number, corners=corners, position_m=pose.position, rotation=pose.rotation, ambiguity=pose.ambiguity
         )
 
 

@@ -26,7 +26,7 @@ class PlanarSighting:
     """One flat thing in one image."""
 
     corners: Array  #: (4, 2) pixels: its own top left, top right, bottom right, bottom left
-    position: Array  #: (3,) its centre in the camera's optical axes [m]
+    position_m: Array  #: (3,) its centre in the camera's optical axes [m]
     rotation: Array  #: (3, 3) from its own axes (x right, y up, z out of its face) to optical axes
     ambiguity: float  #: how well the second best pose explains the corners: 0 not at all, 1 as well as the best
 
@@ -42,12 +42,12 @@ class PlanarSighting:
         Raises:
             MissingExtraError: SciPy is not installed.
         """
-        return transform(self.position, self.rotation)
+        return transform(self.position_m, self.rotation)
 
     @property
     def distance_m(self) -> float:
         """Distance from the camera's optical centre to its centre."""
-        return float(np.linalg.norm(self.position))
+        return float(np.linalg.norm(self.position_m))
 
     @property
     def outline(self) -> tuple[tuple[float, float], ...]:
@@ -60,8 +60,8 @@ class PlanarSighting:
         Raises:
             UsageError: The camera does not say how it is mounted.
         """
-        offset = np.zeros(3) if camera.position is None else np.asarray(camera.position)
-        return mounting_rotation(camera) @ self.position + offset
+        offset = np.zeros(3) if camera.position_m is None else np.asarray(camera.position_m)
+        return mounting_rotation(camera) @ self.position_m + offset
 
     def normal_in_body(self, camera: CameraInfo) -> Array:
         """Return the unit vector out of its face in body axes, shape (3,).

@@ -46,17 +46,17 @@ def test_the_recorded_datagram() -> None:
     assert demo is not None
     feedback = feedback_of(navdata(), demo, 5, 0.0, native_of(navdata(), everything=True))
     assert (feedback.state, feedback.battery, feedback.battery_v) == (FlightState.LANDED, 0.5, 11.686)
-    assert feedback.roll == pytest.approx(math.radians(0.55))
-    assert feedback.pitch == pytest.approx(math.radians(-2.974)), "nose up"
-    assert feedback.yaw == pytest.approx(math.radians(-1.933)), "clockwise"
-    assert feedback.altitude == 0.0
-    assert feedback.velocity == pytest.approx((0.0000585, 0.000882, 0.0), abs=1e-6)
-    assert feedback.acceleration == pytest.approx((0.7874, 0.3267, 9.2430), abs=1e-3)
-    assert feedback.angular_velocity == pytest.approx((-0.00196, -0.0012, -0.00108), abs=1e-5)
+    assert feedback.roll_rad == pytest.approx(math.radians(0.55))
+    assert feedback.pitch_rad == pytest.approx(math.radians(-2.974)), "nose up"
+    assert feedback.yaw_rad == pytest.approx(math.radians(-1.933)), "clockwise"
+    assert feedback.altitude_m == 0.0
+    assert feedback.velocity_m_s == pytest.approx((0.0000585, 0.000882, 0.0), abs=1e-6)
+    assert feedback.acceleration_m_s2 == pytest.approx((0.7874, 0.3267, 9.2430), abs=1e-3)
+    assert feedback.angular_velocity_rad_s == pytest.approx((-0.00196, -0.0012, -0.00108), abs=1e-5)
     assert not implausible(feedback)
     # The accelerometers agree with the drone's own attitude from them, so their axes and signs are understood.
-    assert feedback.acceleration is not None
-    forward, left, up = feedback.acceleration
+    assert feedback.acceleration_m_s2 is not None
+    forward, left, up = feedback.acceleration_m_s2
     assert math.degrees(math.atan2(forward, up)) == pytest.approx(4.866, abs=0.1)
     assert math.degrees(math.atan2(left, up)) == pytest.approx(2.024, abs=0.1)
 
@@ -106,17 +106,17 @@ def test_every_option_has_a_name() -> None:
 @pytest.mark.parametrize(
     ("demo", "field", "value"),
     [
-        (Demo(theta=-90_000.0), "pitch", math.pi / 2),
-        (Demo(phi=90_000.0), "roll", math.pi / 2),
-        (Demo(psi=90_000.0), "yaw", -math.pi / 2),
-        (Demo(vx=1000.0, vy=500.0), "velocity", (1.0, -0.5, 0.0)),
-        (Demo(altitude=1234), "altitude", 1.234),
+        (Demo(theta=-90_000.0), "pitch_rad", math.pi / 2),
+        (Demo(phi=90_000.0), "roll_rad", math.pi / 2),
+        (Demo(psi=90_000.0), "yaw_rad", -math.pi / 2),
+        (Demo(vx=1000.0, vy=500.0), "velocity_m_s", (1.0, -0.5, 0.0)),
+        (Demo(altitude=1234), "altitude_m", 1.234),
         (Demo(battery=100), "battery", 1.0),
         (Demo(battery=101), "battery", None),
-        (Demo(theta=math.nan), "pitch", None),
-        (Demo(phi=math.inf), "roll", None),
-        (Demo(psi=1e30), "yaw", None),
-        (Demo(vx=math.nan), "velocity", None),
+        (Demo(theta=math.nan), "pitch_rad", None),
+        (Demo(phi=math.inf), "roll_rad", None),
+        (Demo(psi=1e30), "yaw_rad", None),
+        (Demo(vx=math.nan), "velocity_m_s", None),
     ],
 )
 def test_units_signs_and_what_cannot_be(demo: Demo, field: str, value: object) -> None:
@@ -126,18 +126,18 @@ def test_units_signs_and_what_cannot_be(demo: Demo, field: str, value: object) -
 def test_body_axes_of_the_full_mode() -> None:
     measured = PhysMeasures(accs=(100.0, 200.0, -1000.0), gyros=(90.0, 45.0, -180.0))
     feedback = told(Demo(), measured, RawMeasures(vbat=11_000))
-    assert feedback.acceleration == pytest.approx((0.980665, -1.96133, 9.80665))
-    assert feedback.angular_velocity == pytest.approx((math.pi / 2, -math.pi / 4, math.pi))
+    assert feedback.acceleration_m_s2 == pytest.approx((0.980665, -1.96133, 9.80665))
+    assert feedback.angular_velocity_rad_s == pytest.approx((math.pi / 2, -math.pi / 4, math.pi))
     assert feedback.battery_v == 11.0
     assert told(Demo(), RawMeasures()).battery_v is None, "zero volts are no measurement"
 
 
 def test_what_is_not_told_is_none() -> None:
     feedback = told(Demo(), climb=None)
-    assert feedback.velocity is None
-    assert feedback.acceleration is None
-    assert feedback.angular_velocity is None
-    assert feedback.position is None
+    assert feedback.velocity_m_s is None
+    assert feedback.acceleration_m_s2 is None
+    assert feedback.angular_velocity_rad_s is None
+    assert feedback.position_m is None
 
 
 @pytest.mark.parametrize(

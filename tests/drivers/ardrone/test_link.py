@@ -73,7 +73,8 @@ def test_a_flight_with_a_tenth_of_the_datagrams_lost() -> None:
         wait_state(sink, FlightState.HOVERING, FlightState.FLYING)
         assert driver.apply(Attitude(pitch=0.5)) == Attitude(pitch=0.25)
         assert sink.wait(
-            lambda: sink.newest is not None and sink.newest.pitch is not None and sink.newest.pitch > 0.1, PATIENCE_S
+            lambda: sink.newest is not None and sink.newest.pitch_rad is not None and sink.newest.pitch_rad > 0.1,
+            PATIENCE_S,
         )
         driver.apply(Hover())
         driver.apply(Land())
@@ -135,7 +136,7 @@ def test_emergency_is_told_and_reset_only_when_asked() -> None:
             assert sink.wait(lambda: True, 0.01)
         assert sink.newest is not None
         assert sink.newest.state is FlightState.EMERGENCY
-        assert sink.wait(lambda: sink.newest is not None and (sink.newest.altitude or 0.0) < 0.1, PATIENCE_S)
+        assert sink.wait(lambda: sink.newest is not None and (sink.newest.altitude_m or 0.0) < 0.1, PATIENCE_S)
         driver.apply(ResetEmergency())
         wait_state(sink, FlightState.LANDED)
 

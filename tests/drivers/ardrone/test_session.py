@@ -310,7 +310,7 @@ def test_feedback_comes_with_the_counts() -> None:
     rig.run(0.5)
     feedback = rig.sink.newest
     assert feedback is not None
-    assert (feedback.state, feedback.battery, feedback.altitude) == (FlightState.LANDED, 0.7, 0.0)
+    assert (feedback.state, feedback.battery, feedback.altitude_m) == (FlightState.LANDED, 0.7, 0.0)
     assert feedback.native is not None
     assert feedback.native["navdata.damaged"] == 1
     assert not rig.sink.problems

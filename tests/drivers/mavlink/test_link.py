@@ -66,7 +66,7 @@ def test_tcp_is_up_when_a_heartbeat_comes_and_not_when_it_is_connected() -> None
                 assert sink.wait(lambda: sink.link_state is LinkState.LOST, PATIENCE_S), sink.links
                 first.close()
                 up(sink)
-                assert sink.wait(lambda: sink.newest is not None and sink.newest.roll is not None, PATIENCE_S)
+                assert sink.wait(lambda: sink.newest is not None and sink.newest.roll_rad is not None, PATIENCE_S)
 
 
 def test_tcp_is_connected_again_after_the_vehicle_was_away() -> None:

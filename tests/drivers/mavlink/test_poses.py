@@ -48,7 +48,7 @@ def test_the_poses_quaternion_is_scipys() -> None:
 
 
 def test_as_a_vision_estimate_of_unknown_accuracy() -> None:
-    message = pose_message(ExternalPose(POSE.position, POSE.quaternion, POSE.captured_ns), PoseMessage.VISION)
+    message = pose_message(ExternalPose(POSE.position_m, POSE.quaternion, POSE.captured_ns), PoseMessage.VISION)
     assert (message.usec, message.x, message.y, message.z) == (1_234_567, 2.0, 1.0, -3.0)
     assert (message.roll, message.pitch, message.yaw) == pytest.approx(ANGLES)
     assert math.isnan(message.covariance[0])

@@ -52,16 +52,16 @@ def test_what_does_not_flow_is_absent_and_what_stops_becomes_so() -> None:
     bench = Bench(Vehicle(ARDUPILOT))
     bench.hear(bench.vehicle.heartbeat())
     first = bench.newest
-    assert (first.roll, first.altitude, first.velocity, first.battery, first.position) == (None,) * 5
+    assert (first.roll_rad, first.altitude_m, first.velocity_m_s, first.battery, first.position_m) == (None,) * 5
     bench.found()
-    assert None not in (bench.newest.altitude, bench.newest.velocity, bench.newest.battery)
+    assert None not in (bench.newest.altitude_m, bench.newest.velocity_m_s, bench.newest.battery)
     for _ in range(80):  # 1.6 s with nothing but the attitude
         bench.clock.advance(0.02)
         bench.vehicle.boot_ms += 20
         bench.hear(bench.vehicle.telemetry()[-1])
         bench.tick()
-    assert bench.newest.roll is not None
-    assert (bench.newest.velocity, bench.newest.position) == (None, None)
+    assert bench.newest.roll_rad is not None
+    assert (bench.newest.velocity_m_s, bench.newest.position_m) == (None, None)
     assert (bench.newest.native or {})["mavlink.age.local_position_ned"] == pytest.approx(1.6, abs=0.05)
 
 
@@ -73,12 +73,12 @@ def test_units_axes_and_signs() -> None:
     vehicle.place = (10.0, 20.0, -3.0)
     bench.found()
     newest = bench.newest
-    assert newest.yaw == pytest.approx(0.0, abs=1e-6)
-    assert newest.roll == pytest.approx(0.1)
-    assert newest.pitch == pytest.approx(-0.2), "nose up"
-    assert newest.velocity == pytest.approx((2.0, 1.0, 0.5), abs=1e-5), "forward is east, left is north"
-    assert newest.position == pytest.approx((20.0, 10.0, 3.0))
-    assert newest.altitude == pytest.approx(3.0, abs=1e-3)
+    assert newest.yaw_rad == pytest.approx(0.0, abs=1e-6)
+    assert newest.roll_rad == pytest.approx(0.1)
+    assert newest.pitch_rad == pytest.approx(-0.2), "nose up"
+    assert newest.velocity_m_s == pytest.approx((2.0, 1.0, 0.5), abs=1e-5), "forward is east, left is north"
+    assert newest.position_m == pytest.approx((20.0, 10.0, 3.0))
+    assert newest.altitude_m == pytest.approx(3.0, abs=1e-3)
     assert newest.battery == pytest.approx(0.8)
     assert newest.battery_v == pytest.approx(12.0)
 
@@ -89,7 +89,7 @@ def test_another_vehicle_with_the_same_id_is_told_and_left_alone() -> None:
     bench.hear(m.MAVLink_attitude_message(20_000, 1.0, 0, 0, 0, 0, 0), peer=("127.0.0.1", 14581), codec=other)
     for _ in range(3):
         bench.hear(bench.vehicle.heartbeat(), peer=("127.0.0.1", 14581), codec=other)
-    assert bench.newest.roll == pytest.approx(0.1)
+    assert bench.newest.roll_rad == pytest.approx(0.1)
     told = [text for text in bench.texts if "another vehicle" in text]
     assert len(told) == 1
     assert "peer=HOST:PORT" in told[0]
@@ -139,7 +139,7 @@ def test_what_can_not_be_flown_is_seen_and_refused_clearly(autopilot: int, kind:
         bench.clock.advance(0.02)
         bench.hear(heartbeat, bench.vehicle.telemetry()[-1])
         bench.tick()
-    assert bench.newest.roll is not None
+    assert bench.newest.roll_rad is not None
     assert any(why in text for text in bench.texts)
     with pytest.raises(DriverError, match="can't be flown"):
         bench.apply(Takeoff())
@@ -251,7 +251,7 @@ def test_a_plane_is_seen_and_the_whole_recording_is_taken() -> None:
     newest = sink.newest
     assert newest is not None
     assert implausible(newest) == []
-    assert None not in (newest.roll, newest.pitch, newest.yaw, newest.altitude, newest.velocity)
+    assert None not in (newest.roll_rad, newest.pitch_rad, newest.yaw_rad, newest.altitude_m, newest.velocity_m_s)
 
 
 class _Timeless(RecordingSink):
@@ -291,10 +291,10 @@ def test_hostile_messages_never_raise_and_feedback_stays_plausible(
             bench.session.command(Hover(), bench.clock())
         bench.tick()
     for feedback in bench.sink.feedbacks:
-        for name in ("roll", "pitch", "yaw", "altitude", "battery", "battery_v"):
+        for name in ("roll_rad", "pitch_rad", "yaw_rad", "altitude_m", "battery", "battery_v"):
             value = getattr(feedback, name)
             assert value is None or math.isfinite(value), name
-        for name in ("velocity", "position", "angular_velocity", "acceleration"):
+        for name in ("velocity_m_s", "position_m", "angular_velocity_rad_s", "acceleration_m_s2"):
             vector = getattr(feedback, name)
             assert vector is None or all(map(math.isfinite, vector)), name
 

@@ -37,11 +37,11 @@ def test_a_flight(lost: float) -> None:
     rig.do(Takeoff())
     rig.until(lambda: rig.state is FlightState.TAKING_OFF, 8.0)
     rig.until(lambda: rig.state is FlightState.HOVERING, 10.0)
-    assert rig.feedback.altitude is not None
-    assert rig.feedback.altitude > 0.4
+    assert rig.feedback.altitude_m is not None
+    assert rig.feedback.altitude_m > 0.4
     rig.do(Velocity(forward=0.5))
     rig.until(lambda: rig.state is FlightState.FLYING, 1.0)
-    rig.until(lambda: (rig.feedback.velocity or (0.0,))[0] > 0.35, 4.0)
+    rig.until(lambda: (rig.feedback.velocity_m_s or (0.0,))[0] > 0.35, 4.0)
     rig.do(Hover())
     rig.until(lambda: rig.state is FlightState.HOVERING, 1.0)
     rig.run(30.0)
@@ -338,17 +338,17 @@ def test_feedback_agrees_with_the_truth() -> None:
     rig.do(Velocity(forward=0.4, left=0.3, yaw_rate=0.5))
     rig.run(2.5)
     feedback, truth = rig.feedback, rig.bench.truth
-    assert feedback.yaw == pytest.approx(math.remainder(truth.yaw_rad - start_yaw, math.tau), abs=0.1)
-    assert feedback.altitude == pytest.approx(truth.position_m[2], abs=0.1)
-    assert feedback.velocity is not None
-    assert feedback.velocity[0] == pytest.approx(0.4, abs=0.15)
-    assert feedback.velocity[1] == pytest.approx(0.3, abs=0.15)
-    assert feedback.pitch == pytest.approx(truth.pitch_rad, abs=0.03)
-    assert feedback.roll == pytest.approx(truth.roll_rad, abs=0.03)
-    assert feedback.acceleration is not None
-    assert feedback.acceleration[2] == pytest.approx(9.8, abs=1.0)
+    assert feedback.yaw_rad == pytest.approx(math.remainder(truth.yaw_rad - start_yaw, math.tau), abs=0.1)
+    assert feedback.altitude_m == pytest.approx(truth.position_m[2], abs=0.1)
+    assert feedback.velocity_m_s is not None
+    assert feedback.velocity_m_s[0] == pytest.approx(0.4, abs=0.15)
+    assert feedback.velocity_m_s[1] == pytest.approx(0.3, abs=0.15)
+    assert feedback.pitch_rad == pytest.approx(truth.pitch_rad, abs=0.03)
+    assert feedback.roll_rad == pytest.approx(truth.roll_rad, abs=0.03)
+    assert feedback.acceleration_m_s2 is not None
+    assert feedback.acceleration_m_s2[2] == pytest.approx(9.8, abs=1.0)
     assert feedback.battery == pytest.approx(1.0, abs=0.05)
-    assert feedback.position is None
+    assert feedback.position_m is None
     assert feedback.native is not None
     assert feedback.native["state.received"] > 10  # type: ignore[operator]
 
@@ -357,7 +357,7 @@ def test_velocity_may_be_left_out() -> None:
     rig = Rig(TelloOptions("drone", video=False, velocity_axes=VelocityAxes.NONE))
     rig.ready()
     rig.run(0.5)
-    assert rig.feedback.velocity is None
+    assert rig.feedback.velocity_m_s is None
 
 
 # Damage ------------------------------------------------------------------------------------------------------------

@@ -163,7 +163,7 @@ def test_the_emulated_camera_is_the_one_that_is_announced() -> None:
     assert (announced.fx, announced.fy, announced.cx, announced.cy) == (FRONT.fx, FRONT.fy, FRONT.cx, FRONT.cy)
     assert announced.distortion == FRONT.distortion
     assert front.rotation == FRONT.rotation
-    assert front.position == FRONT.position_m
+    assert front.position_m == FRONT.position_m
     small = intrinsics_for(front, "front", 640)
     assert small is not None
     assert small.fx == pytest.approx(FRONT.fx * 640 / 960)

@@ -312,7 +312,7 @@ def pose_message(pose: ExternalPose, kind: PoseMessage) -> Message:
         pose: In our axes.
         kind: The message that it becomes.
     """
-    position = swap(*pose.position)
+    position = swap(*pose.position_m)
     roll, pitch, yaw = angles_of(pose.quaternion)
     angles = roll, 0.0 - pitch, yaw_between(yaw)
     covariance = _covariance(pose)

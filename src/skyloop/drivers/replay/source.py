@@ -109,7 +109,7 @@ def _camera(recording: Recording, drone: str, name: str, known: CameraInfo | Non
         encoding,
         header.intrinsics or (known.intrinsics if known is not None else None),
         known.rotation if known is not None else None,
-        known.position if known is not None else None,
+        known.position_m if known is not None else None,
     )
 
 

@@ -73,12 +73,12 @@ def feedback_of(
         captured_ns=captured_ns,
         state=flight,
         battery=None if state.battery_percent is None else state.battery_percent / 100,
-        roll=_angle(state.roll_deg),
-        pitch=_angle(None if state.pitch_deg is None else -state.pitch_deg),
-        yaw=_angle(None if state.yaw_deg is None else -state.yaw_deg),
-        altitude=height_m(state),
-        velocity=velocity_m_s(state, axes),
-        acceleration=None
+        roll_rad=_angle(state.roll_deg),
+        pitch_rad=_angle(None if state.pitch_deg is None else -state.pitch_deg),
+        yaw_rad=_angle(None if state.yaw_deg is None else -state.yaw_deg),
+        altitude_m=height_m(state),
+        velocity_m_s=velocity_m_s(state, axes),
+        acceleration_m_s2=None
         if acceleration is None
         else (acceleration[0] * factor, -acceleration[1] * factor, -acceleration[2] * factor),
         native=native,

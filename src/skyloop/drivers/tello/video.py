@@ -45,7 +45,7 @@ _CAMERAS: Final = (
         30.0,
         intrinsics=_CALIBRATION,
         rotation=(0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0),
-        position=(0.05, 0.0, 0.0),
+        position_m=(0.05, 0.0, 0.0),
     ),
     CameraInfo(BOTTOM, 320, 240, 30.0, rotation=(0.0, -1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0)),
 )

@@ -115,7 +115,7 @@ class Autopilot:
 
     def on_first_feedback(self, feedback: Feedback) -> None:
         """The vehicle's first feedback: a proxy may have been restarted under a flying one."""
-        if self.mode is Mode.OFF and (feedback.altitude or 0.0) > AIRBORNE_ALTITUDE:
+        if self.mode is Mode.OFF and (feedback.altitude_m or 0.0) > AIRBORNE_ALTITUDE:
             self._state = FlightState.FLYING
 
     def start(
@@ -133,7 +133,7 @@ class Autopilot:
             self._integral, self._stepped_ns = (0.0, 0.0), None
         self.mode, self._state, self._begun_ns = mode, _STATES[mode], now_ns
         self._hold_position = self._hold_yaw = None
-        self._hold_altitude = feedback.altitude if feedback is not None else None
+        self._hold_altitude = feedback.altitude_m if feedback is not None else None
         self._lowest, self._lowest_ns = math.inf, now_ns
 
     def stop(self, action_name: str) -> None:
@@ -160,7 +160,7 @@ class Autopilot:
         return Attitude(roll, pitch, wanted.up, wanted.yaw_rate)
 
     def _wanted(self, now_ns: int, known: Feedback | None) -> Velocity:
-        altitude = known.altitude if known is not None else None
+        altitude = known.altitude_m if known is not None else None
         if self.mode is Mode.TAKEOFF:
             return self._rise(now_ns, altitude)
         if self.mode is Mode.LAND:
@@ -201,31 +201,31 @@ class Autopilot:
             if self._hold_altitude is None:
                 self._hold_altitude = altitude
             up = _bound((self._hold_altitude - altitude) * ALTITUDE_GAIN, self.settings.climb)
-        if known is None or known.position is None or known.yaw is None:
+        if known is None or known.position_m is None or known.yaw_rad is None:
             return Velocity(up=up)
-        x, y, _ = known.position
+        x, y, _ = known.position_m
         if self._hold_position is None:
-            if known.velocity is None or math.hypot(*known.velocity[:2]) > SETTLED_SPEED:
+            if known.velocity_m_s is None or math.hypot(*known.velocity_m_s[:2]) > SETTLED_SPEED:
                 return Velocity(up=up)
             self._hold_position = (x, y)
         east, north = (self._hold_position[0] - x) * POSITION_GAIN, (self._hold_position[1] - y) * POSITION_GAIN
-        cos, sin = math.cos(known.yaw), math.sin(known.yaw)
+        cos, sin = math.cos(known.yaw_rad), math.sin(known.yaw_rad)
         forward, left = _shorten(cos * east + sin * north, cos * north - sin * east, POSITION_SPEED)
         return Velocity(forward, left, up)
 
     def _go(self, target: Position, known: Feedback | None, now_ns: int) -> Velocity:
         """Straight towards a place, and slower near it; a speed of zero while position or yaw are not known."""
-        if known is None or known.position is None or known.yaw is None:
+        if known is None or known.position_m is None or known.yaw_rad is None:
             return Velocity()
         if self._hold_yaw is None:
-            self._hold_yaw = known.yaw
-        east, north, up = (to - at for to, at in zip(target.place, known.position, strict=True))
+            self._hold_yaw = known.yaw_rad
+        east, north, up = (to - at for to, at in zip(target.place, known.position_m, strict=True))
         away = math.hypot(east, north, up)
         most = GO_SPEED if target.speed is None else target.speed
         speed = min(GO_GAIN * away, most, math.sqrt(2.0 * GO_DECELERATION * away))
         share = speed / away if away > 1e-9 else 0.0
-        cos, sin = math.cos(known.yaw), math.sin(known.yaw)
-        turn = wrap_angle((self._hold_yaw if target.yaw is None else target.yaw) - known.yaw)
+        cos, sin = math.cos(known.yaw_rad), math.sin(known.yaw_rad)
+        turn = wrap_angle((self._hold_yaw if target.yaw is None else target.yaw) - known.yaw_rad)
         wanted = Velocity(
             forward=share * (cos * east + sin * north),
             left=share * (cos * north - sin * east),
@@ -236,10 +236,10 @@ class Autopilot:
 
     def _tilt(self, wanted: Velocity, known: Feedback | None, dt: float) -> tuple[float, float]:
         """Roll and pitch [rad] that bring the velocity to the wanted one; level while the velocity is not known."""
-        if known is None or known.velocity is None:
+        if known is None or known.velocity_m_s is None:
             return 0.0, 0.0
         settings = self.settings
-        forward_error, left_error = wanted.forward - known.velocity[0], wanted.left - known.velocity[1]
+        forward_error, left_error = wanted.forward - known.velocity_m_s[0], wanted.left - known.velocity_m_s[1]
         integral = _shorten(
             self._integral[0] + settings.velocity_i * forward_error * dt,
             self._integral[1] + settings.velocity_i * left_error * dt,

@@ -220,7 +220,7 @@ class CommandChecks:
             action, clamps = place.action, place.clamps
             enforced = None if self.safety is None else True
         elif is_set_point:
-            action, clamps = self.limits.clamp(action, feedback.altitude if feedback else None)  # type: ignore[arg-type]
+            action, clamps = self.limits.clamp(action, feedback.altitude_m if feedback else None)  # type: ignore[arg-type]
             if self.safety is not None:
                 action, walls, enforced = self.safety.clamp(action, feedback, now_ns)
                 clamps += walls
@@ -229,7 +229,7 @@ class CommandChecks:
 
     def guard(self, wanted: Velocity, feedback: Feedback, now_ns: int) -> Velocity:
         """Return the nearest velocity that limits, safety box and zones allow, on the way to a place."""
-        allowed, _ = self.limits.clamp(wanted, feedback.altitude)
+        allowed, _ = self.limits.clamp(wanted, feedback.altitude_m)
         if self.safety is not None:
             allowed, _, _ = self.safety.clamp(allowed, feedback, now_ns)
         assert isinstance(allowed, Velocity)
@@ -266,7 +266,7 @@ class CommandChecks:
         in_place = state is FlightState.HOVERING or state is FlightState.FLYING
         if Velocity not in self._supported or feedback is None or not in_place:
             return _HOVER_ACTION, ()
-        sink, clamps = self._ceiling.instead(self.limits, feedback.altitude)
+        sink, clamps = self._ceiling.instead(self.limits, feedback.altitude_m)
         return (_HOVER_ACTION, ()) if sink is None else (sink, clamps)
 
 

@@ -40,15 +40,15 @@ def decide_place(
     if action.problem:
         return PlaceDecision(None, (), Refusal.OUT_OF_RANGE, action.problem)
     unknown = _why_unknown(feedback, now_ns)
-    if unknown or feedback is None or feedback.position is None:
+    if unknown or feedback is None or feedback.position_m is None:
         return PlaceDecision(None, (), Refusal.WRONG_STATE, unknown)
     if now_ns - feedback.captured_ns > STALE_NS:
         return PlaceDecision()
     x, y, z = action.place
-    at = feedback.position
+    at = feedback.position_m
     clamps: list[Clamp] = []
-    if feedback.altitude is not None:
-        above = feedback.altitude + z - at[2] - limits.altitude
+    if feedback.altitude_m is not None:
+        above = feedback.altitude_m + z - at[2] - limits.altitude
         if above > SLACK_M:
             if new:
                 why = f"z is {z:g} m, and at most {z - above:.2f} m is allowed: {limits.altitude:g} m above the ground"
@@ -74,12 +74,12 @@ def decide_place(
 
 def _why_unknown(feedback: Feedback | None, now_ns: int) -> str:
     """Why the vehicle can't be flown to a place now, and what helps; empty if it can."""
-    if feedback is None or feedback.position is None:
+    if feedback is None or feedback.position_m is None:
         return (
             "the vehicle does not tell its position: fly it by velocity, or let it know its place (GPS, optical flow, "
             "or motion capture by tell_pose, where the vehicle takes that)"
         )
-    if feedback.yaw is None:
+    if feedback.yaw_rad is None:
         return "the vehicle does not tell its yaw: fly it by velocity"
     age_ns = now_ns - feedback.captured_ns
     if age_ns > LOST_NS:

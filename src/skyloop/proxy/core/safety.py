@@ -155,15 +155,15 @@ class Safety:
         Returns:
             The set-point, what was in the way, and whether the position is known; if not, the set-point is unchanged.
         """
-        if feedback is None or feedback.position is None or feedback.yaw is None:
+        if feedback is None or feedback.position_m is None or feedback.yaw_rad is None:
             return action, (), False
         if now_ns - feedback.captured_ns > STALE_NS:
             return action, (), False
         late_s = self.reaction_s + max(0.0, seconds(now_ns - feedback.captured_ns))
-        walls = [] if self.box is None else list(self.box.walls_inside(feedback.position))
-        walls += [zone.wall_outside(feedback.position) for zone in self.zones]
-        turn = (math.cos(feedback.yaw), math.sin(feedback.yaw))
-        now = None if feedback.velocity is None else _to_world(feedback.velocity, turn)
+        walls = [] if self.box is None else list(self.box.walls_inside(feedback.position_m))
+        walls += [zone.wall_outside(feedback.position_m) for zone in self.zones]
+        turn = (math.cos(feedback.yaw_rad), math.sin(feedback.yaw_rad))
+        now = None if feedback.velocity_m_s is None else _to_world(feedback.velocity_m_s, turn)
         if isinstance(action, Velocity):
             return *self._velocity(action, walls, turn, now, late_s), True
         if isinstance(action, Attitude):

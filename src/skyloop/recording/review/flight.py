@@ -38,15 +38,15 @@ def way(feedback: Table) -> Way | None:
     """
     t_s = feedback.numbers("t_s")
     for source, x, y in (
-        ("the vehicle's own position", "position_x", "position_y"),
+        ("the vehicle's own position", "position_x_m", "position_y_m"),
         ("the simulator's true position", "native.truth.x", "native.truth.y"),
     ):
         if feedback.known(x) and feedback.known(y):
             return Way(t_s, feedback.numbers(x), feedback.numbers(y), source)
-    if not (feedback.known("velocity_forward") and feedback.known("yaw")):
+    if not (feedback.known("velocity_forward_m_s") and feedback.known("yaw_rad")):
         return None
-    forward, left = feedback.numbers("velocity_forward"), feedback.numbers("velocity_left")
-    yaw = feedback.numbers("yaw")
+    forward, left = feedback.numbers("velocity_forward_m_s"), feedback.numbers("velocity_left_m_s")
+    yaw = feedback.numbers("yaw_rad")
     steps = np.diff(t_s, prepend=t_s[:1])
     steps = np.where(steps > _LONGEST_STEP_S, 0.0, steps)
     east = np.nan_to_num(forward * np.cos(yaw) - left * np.sin(yaw))
@@ -98,10 +98,10 @@ def facts(
     found = [("recorded", f"{seconds:.1f} s")]
     if feedback is not None and len(feedback):
         found.append(("in the air", f"{airborne_s(feedback):.1f} s"))
-        altitude = feedback.numbers("altitude")
-        if feedback.known("altitude"):
+        altitude = feedback.numbers("altitude_m")
+        if feedback.known("altitude_m"):
             found.append(("highest", f"{np.nanmax(altitude):.2f} m"))
-        speed = np.hypot(feedback.numbers("velocity_forward"), feedback.numbers("velocity_left"))
+        speed = np.hypot(feedback.numbers("velocity_forward_m_s"), feedback.numbers("velocity_left_m_s"))
         if np.isfinite(speed).any():
             found.append(("fastest", f"{np.nanmax(speed):.2f} m/s"))
         if path is not None:

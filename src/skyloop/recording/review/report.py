@@ -111,14 +111,14 @@ def _losses(summary: Summary, drone: str) -> Iterator[str]:
 def _path(page: Page, feedback: Table, way: flight.Way) -> None:
     page.way(way)
     t_s = feedback.numbers("t_s")
-    high = Line("altitude", t_s, feedback.numbers("altitude"))
+    high = Line("altitude", t_s, feedback.numbers("altitude_m"))
     page.add(
         '<h2>Path</h2><div class="pair"><section class="panel"><header><h3>From above<i>m, x east, y north</i></h3>'
     )
     page.add(f'<span class="sub">{escape(way.source)}; from blue to orange</span></header>')
     page.add(map_chart("path", way.x, way.y, way.t_s) + "</section>")
     page.add('<section class="panel"><header><h3>From the side<i>m, height over x</i></h3></header>')
-    page.add(map_chart("side", way.x, high.values, t_s) if feedback.known("altitude") else "<p>not known</p>")
+    page.add(map_chart("side", way.x, high.values, t_s) if feedback.known("altitude_m") else "<p>not known</p>")
     page.add("</section></div>")
 
 
@@ -149,23 +149,23 @@ def _charts(
     feedback, commands = found.get("feedback"), found.get("commands")
     if feedback is not None:
         t_s = feedback.numbers("t_s")
-        if feedback.known("altitude"):
-            yield "Altitude", "m", [Line("altitude", t_s, feedback.numbers("altitude"))], 1.0, True
+        if feedback.known("altitude_m"):
+            yield "Altitude", "m", [Line("altitude", t_s, feedback.numbers("altitude_m"))], 1.0, True
         attitude = [
-            Line(name, t_s, np.degrees(feedback.numbers(name)), style)
+            Line(name, t_s, np.degrees(feedback.numbers(f"{name}_rad")), style)
             for name, style in (("roll", "c1"), ("pitch", "c2"))
-            if feedback.known(name)
+            if feedback.known(f"{name}_rad")
         ]
         attitude += _set_points(commands, ("roll", "c1"), ("pitch", "c2"), degrees=True)
         if attitude:
             yield "Roll and pitch", "°, right side and nose down are positive", attitude, 6.0, False
-        if feedback.known("yaw"):
-            yield "Yaw", "°, counter-clockwise", [Line("yaw", t_s, _turned(feedback.numbers("yaw")))], 20.0, False
+        if feedback.known("yaw_rad"):
+            yield "Yaw", "°, counter-clockwise", [Line("yaw", t_s, _turned(feedback.numbers("yaw_rad")))], 20.0, False
         names = (("forward", "c1"), ("left", "c2"), ("up", "c3"))
         velocity = [
-            Line(name, t_s, feedback.numbers(f"velocity_{name}"), style)
+            Line(name, t_s, feedback.numbers(f"velocity_{name}_m_s"), style)
             for name, style in names
-            if feedback.known(f"velocity_{name}")
+            if feedback.known(f"velocity_{name}_m_s")
         ]
         velocity += _set_points(commands, *names, ("climb", "c3"))
         if velocity:

@@ -23,12 +23,12 @@ from skyloop.messages import (
     Parameter,
 )
 
-#: Names of the parts of vectors, in their order.
-AXES: Final[dict[str, tuple[str, ...]]] = {
-    "velocity": ("forward", "left", "up"),
-    "angular_velocity": ("x", "y", "z"),
-    "acceleration": ("x", "y", "z"),
-    "position": ("x", "y", "z"),
+#: Columns of the parts of feedback's vectors, in their order.
+VECTORS: Final[dict[str, tuple[str, str, str]]] = {
+    "velocity_m_s": ("velocity_forward_m_s", "velocity_left_m_s", "velocity_up_m_s"),
+    "angular_velocity_rad_s": ("angular_velocity_x_rad_s", "angular_velocity_y_rad_s", "angular_velocity_z_rad_s"),
+    "acceleration_m_s2": ("acceleration_x_m_s2", "acceleration_y_m_s2", "acceleration_z_m_s2"),
+    "position_m": ("position_x_m", "position_y_m", "position_z_m"),
 }
 #: The numbers that an action may carry, in the order of the columns.
 ACTION_FIELDS: Final = (
@@ -203,9 +203,8 @@ def _feedback(feedback: Feedback) -> dict[str, Cell]:
     cells: dict[str, Cell] = {}
     for name in feedback.__struct_fields__:
         value = getattr(feedback, name)
-        if name in AXES:
-            for axis, number in zip(AXES[name], value or (None, None, None), strict=True):
-                cells[f"{name}_{axis}"] = number
+        if name in VECTORS:
+            cells |= zip(VECTORS[name], value or (None, None, None), strict=True)
         elif name != "native":
             cells[name] = "" if value is None and name == "owner" else value
     for name, value in (feedback.native or {}).items():
