@@ -27,13 +27,13 @@ COLUMNS = {
 SEEN = {"nobody", "kim", "bob", "olga"}
 WORKS = {
     "find the drone": {*SEEN, "oscar", "bravo", "hub"},
-    "say who the proxy is in its place": {"nobody"},  # with keys a proxy hands on nothing of others
+    "answer discovery in the proxy's place": {"nobody"},  # with keys a proxy hands on nothing of others
     "see its feedback": SEEN,
     "see its video": SEEN,
     "read its parameters": SEEN,
     "request the authority": {"nobody", "kim"},
     "stop its motors": {"nobody", "kim"},
-    "take over the token of another pilot's life, and end it": set(),  # Zenoh: it lives while one of the two does
+    "take over another pilot's liveliness token, and end it": set(),  # Zenoh: it lives while one of the two does
 }
 
 

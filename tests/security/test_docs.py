@@ -21,7 +21,7 @@ DOORS = {
     "another drone's proxy listens as if it were this one": (
         "another_drones_proxy_that_listens_as_this_one_is_not_found"
     ),
-    "a command, an emergency stop, a request for the authority or a parameter by the network's key for questions": (
+    "a command, an emergency stop, a request for the authority or a parameter on the Zenoh key of observers": (
         "an_order_by_the_key_for_questions_is_refused_and_told"
     ),
     "a command for a lease in force, by another pilot's own connection": (
@@ -41,12 +41,12 @@ REPLAYS = {
         Refusal.NO_AUTHORITY,
     ),
     "by an observer": ("by_an_observer", Refusal.OBSERVER),
-    "by somebody who did not say hello": ("by_somebody_who_did_not_say_hello", Refusal.PROTOCOL),
+    "by a client that did not send Hello": ("by_somebody_who_did_not_say_hello", Refusal.PROTOCOL),
     "by the same pilot under a later lease": ("by_the_same_pilot_under_a_later_lease", Refusal.FOREIGN_LEASE),
     "when nobody flies": ("when_nobody_flies", Refusal.FOREIGN_LEASE),
     "after its time, with a newer number": ("after_its_time", Refusal.STALE),
     "with a time in the future": ("before_its_time", Refusal.STALE),
-    "after a failsafe that its pilot has not asked for anew": ("from_before_the_failsafe", Refusal.NOT_FRESH),
+    "after a failsafe, without a new intent of its pilot": ("from_before_the_failsafe", Refusal.NOT_FRESH),
 }
 
 
