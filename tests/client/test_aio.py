@@ -316,3 +316,27 @@ def test_errors_come_out(proxy: ScriptedProxy) -> None:
                     raise RuntimeError("mine")
 
     run(ask())
+
+
+def test_the_asyncio_face_has_all_that_the_other_has() -> None:
+    def public(kind: type) -> set[str]:
+        return {name for name in dir(kind) if not name.startswith("_")}
+
+    assert public(skyloop.client.Drone) <= public(aio.Drone)
+    assert public(skyloop.client.Swarm) - public(aio.Swarm) == {"fail"}, "for formations, which fly in threads"
+
+
+def test_clocks_poses_and_own_events_are_the_drones(proxy: ScriptedProxy) -> None:
+    async def fly() -> None:
+        async with aio.connect("me") as drone:
+            assert not drone.closed
+            assert drone.clock_offset_ns == drone.clock_uncertainty_ns == 0
+            sample = await drone.next_feedback()
+            assert sample.captured_ns <= drone.now_ns
+            assert 0.0 <= drone.age_s(sample) < WAIT_S
+            assert drone.send_external_pose((0.0, 1.0, 2.0), (0.0, 0.0, 0.0, 1.0))
+            drone.emit(EventKind.VEHICLE_MESSAGE, "seen")
+            assert any(event.text == "seen" for event in drone.recent_events())
+        assert drone.closed
+
+    run(fly())

@@ -26,10 +26,13 @@ from skyloop.messages import (
     Capabilities,
     Encoding,
     Event,
+    EventKind,
     Feedback,
     LogEntry,
     Parameter,
+    Severity,
     Value,
+    Vector,
 )
 from skyloop.messages.annotation import Shape
 
@@ -150,6 +153,30 @@ class Drone:
         """State of both hops, application to proxy and proxy to vehicle."""
         return self.sync.link
 
+    @property
+    def closed(self) -> bool:
+        """Whether it was closed."""
+        return self.sync.closed
+
+    @property
+    def now_ns(self) -> int:
+        """Present time on the proxy's clock [ns]."""
+        return self.sync.now_ns
+
+    @property
+    def clock_offset_ns(self) -> int:
+        """The proxy's clock less this process's [ns]; see :attr:`skyloop.client.Drone.clock_offset_ns`."""
+        return self.sync.clock_offset_ns
+
+    @property
+    def clock_uncertainty_ns(self) -> int:
+        """Largest error of ``clock_offset_ns`` [ns]; see :attr:`skyloop.client.Drone.clock_uncertainty_ns`."""
+        return self.sync.clock_uncertainty_ns
+
+    def age_s(self, sample: Feedback | client.Frame) -> float:
+        """Return the time since the sample's capture [s], within ``clock_uncertainty_ns``."""
+        return self.sync.age_s(sample)
+
     async def stats(self) -> client.Stats:
         """Return statistics by channel; see :attr:`skyloop.client.Drone.stats`."""
         return await in_thread(lambda: self.sync.stats)
@@ -237,6 +264,24 @@ class Drone:
     def command(self, action: AnyAction) -> bool:
         """Make ``action`` the newest set-point."""
         return self.sync.command(action)
+
+    def send_external_pose(
+        self,
+        position: Vector,
+        quaternion: tuple[float, float, float, float],
+        *,
+        at_ns: int | None = None,
+        position_std_m: float | None = None,
+        attitude_std_rad: float | None = None,
+    ) -> bool:
+        """Send the vehicle its own pose, measured from outside; see :meth:`skyloop.client.Drone.send_external_pose`."""
+        return self.sync.send_external_pose(
+            position, quaternion, at_ns=at_ns, position_std_m=position_std_m, attitude_std_rad=attitude_std_rad
+        )
+
+    def emit(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: str) -> None:
+        """Emit an event of this application's own; see :meth:`skyloop.client.Drone.emit`."""
+        self.sync.emit(kind, text, severity, **data)
 
     async def request_authority(
         self,

@@ -730,7 +730,7 @@ class Drone:
             raise UsageError(f"this can't be drawn on a frame: {error}") from None
         return self._core.connection.transmit(packet)
 
-    def tell(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: str) -> None:
+    def emit(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: str) -> None:
         """Emit an event of this application's own (number 0), which only its own callbacks get.
 
         Args:

@@ -87,7 +87,7 @@ class Behaviour(Controller):
         if feedback.captured_ns - self._frame_ns > nanoseconds(BLIND_S):
             if not self.blind:
                 self.blind = True
-                self.tell("no frames arrive: hovering", Severity.WARNING)
+                self.emit("no frames arrive: hovering", Severity.WARNING)
             self.drone.hover()
 
     def on_frame(self, frame: Frame) -> None:
@@ -97,7 +97,7 @@ class Behaviour(Controller):
         self._frame_ns = frame.captured_ns
         if self.blind:
             self.blind = False
-            self.tell("frames arrive again")
+            self.emit("frames arrive again")
         shapes = self.look(frame)
         wanted = self._law.step(frame.captured_ns + nanoseconds(frame.age_s))
         self._report_phase()
@@ -124,25 +124,25 @@ class Behaviour(Controller):
             text: What was achieved; the event's text after the name.
         """
         self.done = True
-        self.tell(text)
+        self.emit(text)
         self.drone.hover()
         self.stop()
 
-    def tell(self, text: str, severity: Severity = Severity.INFO) -> None:
+    def emit(self, text: str, severity: Severity = Severity.INFO) -> None:
         """Emit an event to this application's event subscribers.
 
         Args:
             text: Follows the behaviour's name and a colon.
             severity: How important it is.
         """
-        self.drone.tell(EventKind.VEHICLE_MESSAGE, f"{self.name}: {text}", severity)
+        self.drone.emit(EventKind.VEHICLE_MESSAGE, f"{self.name}: {text}", severity)
 
     def _report_phase(self) -> None:
         phase = self.phase
         if phase is not self._reported:
             lost = phase in self.losses and self._reported is not None
             self._reported = phase
-            self.tell(phase.value, Severity.WARNING if lost else Severity.INFO)
+            self.emit(phase.value, Severity.WARNING if lost else Severity.INFO)
 
 
 def camera_info(drone: Drone, camera: str | None) -> CameraInfo:

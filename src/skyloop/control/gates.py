@@ -122,7 +122,7 @@ class FlyThroughGates(Behaviour):
         if gate is None:
             self.finish(f"through {before.name}, the last of {len(self._gates)}")
         else:
-            self.tell(f"through {before.name}, on to {gate.name}")
+            self.emit(f"through {before.name}, on to {gate.name}")
             self._gate_law.next_gate(turning=gate.turning)
 
     def _drawing(self, gate: GateKind, seen: list[GateSighting]) -> list[Shape]:

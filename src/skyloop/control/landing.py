@@ -81,7 +81,7 @@ class LandOnMarker(Behaviour):
             super().on_feedback(feedback)
         elif feedback.state is FlightState.LANDED and not self.done:
             self.done = True
-            self.tell("standing on the marker")
+            self.emit("standing on the marker")
             self.stop()
 
     def look(self, frame: Frame) -> list[Shape]:

@@ -93,7 +93,7 @@ class _PathFlyer(Controller):
             return
         if self.lost:
             self.lost = False
-            self.drone.tell(EventKind.VEHICLE_MESSAGE, "the position is known again: flying on", Severity.INFO)
+            self.drone.emit(EventKind.VEHICLE_MESSAGE, "the position is known again: flying on", Severity.INFO)
         if self._law is None:
             self._law = self._begin(fix)
         wanted = self._law.step(fix)
@@ -117,7 +117,7 @@ class _PathFlyer(Controller):
     def _lose(self) -> None:
         if not self.lost:
             self.lost = True
-            self.drone.tell(EventKind.VEHICLE_MESSAGE, "the position is not known: hovering", Severity.WARNING)
+            self.drone.emit(EventKind.VEHICLE_MESSAGE, "the position is not known: hovering", Severity.WARNING)
         if self._law is not None:
             self._law.pause()
         self.drone.hover()

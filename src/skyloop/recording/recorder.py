@@ -129,7 +129,7 @@ class Recorder:
 
     def _on_event(self, event: RecorderEvent) -> None:
         for drone in self._listening:
-            drone.tell(EventKind.RECORDING, event.text, event.severity)
+            drone.emit(EventKind.RECORDING, event.text, event.severity)
 
     def _close_own(self) -> None:
         for drone in self._own:
