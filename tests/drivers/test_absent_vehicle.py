@@ -29,11 +29,11 @@ class Session(VehicleSession):
         return f"silence{since}{why}"
 
     def _lose(self, reason: str, now_ns: int) -> None:
-        self._heard_ns = None
+        self._received_ns = None
         self._set_link_state(LinkState.LOST, reason)
 
     def hear(self, now_ns: int) -> None:
-        self._heard_ns, self._unreachable = now_ns, ""
+        self._received_ns, self._unreachable = now_ns, ""
         self._set_link_state(LinkState.UP)
 
     def told(self, now_s: float) -> list[tuple[LinkState, str, str]]:

@@ -48,9 +48,9 @@ def examine_vehicle(address: str) -> Iterator[Finding]:
         for event in sink.events:
             if event.kind is EventKind.DRIVER_ERROR or event.severity is Severity.ERROR:
                 yield Finding("vehicle", Health.MISSING, event.text)
-        for remark in driver.checkup():
-            health = Health.GOOD if remark.good else Health.MISSING
-            yield Finding(remark.what, health, remark.detail, remark.advice)
+        for diagnostic in driver.checkup():
+            health = Health.GOOD if diagnostic.good else Health.MISSING
+            yield Finding(diagnostic.what, health, diagnostic.detail, diagnostic.advice)
     finally:
         driver.close()
 

@@ -156,7 +156,7 @@ class ExternalPose:
 
 
 @dataclass(frozen=True, slots=True)
-class Remark:
+class Diagnostic:
     """Something about a vehicle's settings that a person may want to know before flying.
 
     Args:
@@ -326,7 +326,7 @@ class Driver(ABC):
         """
         raise UnsupportedError(f"{self.uri.scheme}:// takes no poses from outside")
 
-    def checkup(self) -> list[Remark]:
+    def checkup(self) -> list[Diagnostic]:
         """Return which of the vehicle's settings need attention before flying, for ``skyloop doctor ADDRESS``.
 
         Called while the driver is open.

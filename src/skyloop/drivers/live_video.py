@@ -108,7 +108,7 @@ class Picture:
         sink.frame(camera, self.pixels, self.captured_ns, width=self.width, height=self.height, intrinsics=intrinsics)
 
 
-class Notice(Enum):
+class VideoEvent(Enum):
     """What a receiver reports besides pictures."""
 
     STREAMING = "streaming"  #: frames come
@@ -116,8 +116,8 @@ class Notice(Enum):
     UNSUPPORTED = "unsupported"  #: frames come in another codec, or are noise; reported once for each row of them
     FAULT = "fault"  #: an error of this program, reported once; the video goes on
 
-    def tell(self, sink: Sink, where: str, text: str) -> None:
-        """Emit it as an event.
+    def publish(self, sink: Sink, where: str, text: str) -> None:
+        """Publish it as an event.
 
         Args:
             sink: The proxy's.
@@ -129,10 +129,10 @@ class Notice(Enum):
 
 
 _EVENTS: Final = {
-    Notice.STREAMING: (EventKind.VEHICLE_MESSAGE, Severity.INFO),
-    Notice.LOST: (EventKind.VEHICLE_MESSAGE, Severity.WARNING),
-    Notice.UNSUPPORTED: (EventKind.DRIVER_ERROR, Severity.ERROR),
-    Notice.FAULT: (EventKind.DRIVER_ERROR, Severity.ERROR),
+    VideoEvent.STREAMING: (EventKind.VEHICLE_MESSAGE, Severity.INFO),
+    VideoEvent.LOST: (EventKind.VEHICLE_MESSAGE, Severity.WARNING),
+    VideoEvent.UNSUPPORTED: (EventKind.DRIVER_ERROR, Severity.ERROR),
+    VideoEvent.FAULT: (EventKind.DRIVER_ERROR, Severity.ERROR),
 }
 
 
@@ -169,7 +169,7 @@ class LiveVideo:
         connect: Opens the connection of this number, counted from 0; raises OSError if it can't. On the reading thread.
         make_decoder: Makes the decoder; raises MissingExtraError if none is installed. On the thread of :meth:`start`.
         show: Called with each picture on the decoding thread; must return quickly.
-        told: Called with each notice and its text on either thread; must return quickly.
+        on_event: Called with each event and its text on either thread; must return quickly.
         wants: Whether anybody wants pictures. Called on the reading thread.
         came: Called with every whole frame as it arrived, on the reading thread.
         clock: Monotonic, ns.
@@ -183,7 +183,7 @@ class LiveVideo:
         connect: Callable[[int], Stream],
         make_decoder: Callable[[], Decoder],
         show: Callable[[Picture], None],
-        told: Callable[[Notice, str], None],
+        on_event: Callable[[VideoEvent, str], None],
         wants: Callable[[], bool] = lambda: True,
         came: Callable[[Coded], None] | None = None,
         clock: Clock = monotonic_ns,
@@ -194,7 +194,7 @@ class LiveVideo:
         self._connect = connect
         self._make_decoder = make_decoder
         self._show = show
-        self._told = told
+        self._on_event = on_event
         self._wants = wants
         self._frame_came = came
         self._clock = clock
@@ -258,7 +258,7 @@ class LiveVideo:
 
     def _read(self) -> None:
         failures = 0
-        said = ""
+        reported = ""
         while not self._stop.is_set():
             before = self._connections
             try:
@@ -270,10 +270,10 @@ class LiveVideo:
             else:
                 return
             if self._connections > before:
-                failures, said = 0, ""
-            if reason != said:
-                said = reason
-                self._tell(Notice.LOST, f"{self._place}: {reason}")
+                failures, reported = 0, ""
+            if reason != reported:
+                reported = reason
+                self._emit(VideoEvent.LOST, f"{self._place}: {reason}")
             self._stop.wait(RETRY_S[min(failures, len(RETRY_S) - 1)])
             failures += 1
 
@@ -292,7 +292,7 @@ class LiveVideo:
                 frames = stream.read()
                 if frames and not streaming:
                     streaming = True
-                    self._tell(Notice.STREAMING, self._place)
+                    self._emit(VideoEvent.STREAMING, self._place)
                     with self._came:
                         self._connections += 1
                 wanted = bool(frames) and self._wants()
@@ -318,7 +318,7 @@ class LiveVideo:
     def _decode(self, decoder: Decoder) -> None:
         connection = -1
         refusals = 0
-        said = ""
+        reported = ""
         while (taken := self._next()) is not None:
             coded, show = taken
             if coded.connection != connection:
@@ -338,12 +338,12 @@ class LiveVideo:
                 refusals += 1
                 self._refused += 1
                 if refusals == REFUSALS:
-                    self._tell(Notice.UNSUPPORTED, str(error))
+                    self._emit(VideoEvent.UNSUPPORTED, str(error))
             except Exception as error:  # noqa: BLE001  a surprise of a codec or a callback must not end the video
                 decoder.restart()
-                if repr(error) != said:
-                    said = repr(error)
-                    self._tell(Notice.FAULT, said)
+                if repr(error) != reported:
+                    reported = repr(error)
+                    self._emit(VideoEvent.FAULT, reported)
 
     def _next(self) -> tuple[Coded, bool] | None:
         """Wait for a frame while pictures are wanted. Return it and whether to show it; None after :meth:`stop`."""
@@ -351,6 +351,6 @@ class LiveVideo:
             self._came.wait_for(lambda: self._stop.is_set() or (self._wanted and len(self._backlog)))
             return None if self._stop.is_set() else self._backlog.take(self._clock())
 
-    def _tell(self, notice: Notice, text: str) -> None:
+    def _emit(self, event: VideoEvent, text: str) -> None:
         if not self._stop.is_set():
-            self._told(notice, text)
+            self._on_event(event, text)

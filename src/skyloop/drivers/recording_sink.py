@@ -107,7 +107,7 @@ class RecordingSink:
             self._check_time("feedback", feedback.captured_ns, now_ns)
             self.feedbacks.append(feedback)
             self.feedback_count += 1
-            self._tell()
+            self._notify()
 
     def frame(
         self,
@@ -128,7 +128,7 @@ class RecordingSink:
             seen = SeenFrame(camera, shaped, captured_ns, now_ns, width, height, encoding, intrinsics)
             self.frames.append(seen)
             self.frame_counts[camera] += 1
-            self._tell()
+            self._notify()
 
     def wants(self, camera: str) -> bool:
         """Return whether the camera is in ``watch``, or True if that is None."""
@@ -154,7 +154,7 @@ class RecordingSink:
             if not data.startswith((b"\0\0\1", b"\0\0\0\1")):
                 self.problems.append(f"picture of {camera}: not H.264 in Annex B form")
             self.pictures.append(SeenPicture(camera, data, captured_ns, width, height, key, intrinsics))
-            self._tell()
+            self._notify()
 
     def wants_stream(self, camera: str) -> bool:  # noqa: ARG002  (of all cameras or of none)
         """Return ``record``."""
@@ -165,13 +165,13 @@ class RecordingSink:
         with self._changed:
             self.links.append((LinkState(state), reason))
             self.remedy = remedy
-            self._tell()
+            self._notify()
 
     def event(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: Value) -> None:
         """Keep an event."""
         with self._changed:
             self.events.append(SeenEvent(EventKind(kind), text, Severity(severity), data))
-            self._tell()
+            self._notify()
 
     # What a test calls -----------------------------------------------------------------------------------------
 
@@ -203,7 +203,7 @@ class RecordingSink:
                     return condition()
         return True
 
-    def _tell(self) -> None:
+    def _notify(self) -> None:
         self.calls += 1
         self._changed.notify_all()
 

@@ -97,7 +97,7 @@ class DriverSuite:
     #: Parameters that the suite must not write.
     untouched_parameters: ClassVar[frozenset[str]] = frozenset()
 
-    # To be written or overridden by whoever tests a driver ---------------------------------------------------------
+    # To be written or overridden in a driver's test ---------------------------------------------------------
 
     def make(self, uri: VehicleUri) -> Driver:
         """Return a new driver, not opened. The default finds its class by the entry point of the URI's scheme.
@@ -189,10 +189,10 @@ class DriverSuite:
         try:
             self.make(VehicleUri(good.scheme, good.place, options))
         except UsageError as error:
-            told = str(error)
+            reported = str(error)
         else:
             raise AssertionError("an option that the driver does not know must raise UsageError in the constructor")
-        assert "no_such_option_at_all" in told, f"the error must name the option: {told}"
+        assert "no_such_option_at_all" in reported, f"the error must name the option: {reported}"
 
     # Life cycle ----------------------------------------------------------------------------------------------------
 
@@ -228,12 +228,12 @@ class DriverSuite:
     def test_gives_threads_and_descriptors_back(self) -> None:
         """Opening and closing leaves no threads or descriptors behind."""
         with self.opened() as (_, sink):  # what libraries keep for themselves is kept from here on
-            self.hear(sink)
+            self.wait_for_feedback(sink)
         gc.collect()
         before = _resources()
         for _ in range(3):
             with self.opened() as (_, sink):
-                self.hear(sink)
+                self.wait_for_feedback(sink)
         gc.collect()
         end = time.monotonic() + self.close_grace_s
         while _exceeds(_resources(), before) and time.monotonic() < end:
@@ -297,7 +297,7 @@ class DriverSuite:
     def test_link_lost_and_found(self) -> None:
         """The link is reported LOST with a reason when the vehicle disappears, and UP when it is back."""
         with self.opened() as (_, sink):
-            self.hear(sink)
+            self.wait_for_feedback(sink)
             self.vehicle_disappears()
             try:
                 lost = sink.wait(lambda: sink.link_state is LinkState.LOST, self.lost_timeout_s)
@@ -316,7 +316,7 @@ class DriverSuite:
         On the ground, with actions that do not take off; the flight has its own test.
         """
         with self.opened() as (driver, sink):
-            self.hear(sink)
+            self.wait_for_feedback(sink)
             actions = driver.capabilities().actions
             set_points: list[AnyAction] = [Attitude(climb=-0.1), Velocity(up=-0.1), Position(0.0, 0.0, 0.0)]
             harmless: list[AnyAction] = [Idle(), Land(), Hover(), *set_points]
@@ -338,7 +338,7 @@ class DriverSuite:
     def test_a_repeat_keeps_what_is_in_force(self) -> None:
         """A repeated action applies what a new one does while nobody else commands the vehicle. On the ground."""
         with self.opened() as (driver, sink):
-            self.hear(sink)
+            self.wait_for_feedback(sink)
             assert driver.left_to() == "", f"on the ground it is left to {driver.left_to()!r}"
             announced = [action for action in (Land(), Hover()) if action.name in driver.capabilities().actions]
             if not announced:
@@ -352,7 +352,7 @@ class DriverSuite:
         driver = self.new_driver()
         assert isinstance(driver.failsafe(Hover()), bool), "failsafe before open() must return a bool"
         with self.opened() as (driver, sink):
-            self.hear(sink)
+            self.wait_for_feedback(sink)
             assert isinstance(driver.failsafe(Hover()), bool)
             assert isinstance(driver.failsafe(Land()), bool)
         assert isinstance(driver.failsafe(Land()), bool), "failsafe after close() must return a bool"
@@ -362,7 +362,7 @@ class DriverSuite:
     def test_parameters_are_well_formed(self) -> None:
         """Parameters have unique dotted lower-case names, and values and defaults that fit their own description."""
         with self.opened() as (driver, sink):
-            self.hear(sink)
+            self.wait_for_feedback(sink)
             parameters = driver.parameters()
         names = [parameter.name for parameter in parameters]
         assert len(names) == len(set(names)), "two parameters have one name"
@@ -377,7 +377,7 @@ class DriverSuite:
     def test_parameters_round_trip(self) -> None:
         """What is written to a parameter is in force and listed. Writes the old value back."""
         with self.opened() as (driver, sink):
-            self.hear(sink)
+            self.wait_for_feedback(sink)
             writable = [p for p in driver.parameters() if not p.read_only and p.name not in self.untouched_parameters]
             if not writable:
                 raise unittest.SkipTest("the vehicle has no parameter to write")
@@ -386,15 +386,15 @@ class DriverSuite:
                     for value in (another_value(parameter), parameter.value):
                         in_force = driver.set_parameter(parameter.name, value)
                         assert same(in_force, value), f"{parameter.name}: wrote {value!r}, {in_force!r} is in force"
-                        told = next(p.value for p in driver.parameters() if p.name == parameter.name)
-                        assert same(told, in_force), f"{parameter.name}: {in_force!r} in force, {told!r} listed"
+                        reported = next(p.value for p in driver.parameters() if p.name == parameter.name)
+                        assert same(reported, in_force), f"{parameter.name}: {in_force!r} in force, {reported!r} listed"
                 finally:
                     driver.set_parameter(parameter.name, parameter.value)
 
     def test_bad_parameters_are_refused(self) -> None:
         """Writing an unknown or read-only parameter raises ParameterError or UnknownNameError."""
         with self.opened() as (driver, sink):
-            self.hear(sink)
+            self.wait_for_feedback(sink)
             read_only = [parameter for parameter in driver.parameters() if parameter.read_only]
             tries: list[tuple[str, Value]] = [("no.such.parameter", 1.0)]
             for name, value in tries + [(p.name, p.value) for p in read_only]:
@@ -440,7 +440,7 @@ class DriverSuite:
             driver.apply(ResetEmergency())
             flight.until(lambda f: f.state is FlightState.LANDED, self.emergency_timeout_s, "landed after the reset")
 
-    def hear(self, sink: RecordingSink) -> None:
+    def wait_for_feedback(self, sink: RecordingSink) -> None:
         """Wait for the first feedback.
 
         Args:
@@ -449,8 +449,8 @@ class DriverSuite:
         Raises:
             AssertionError: None came within :attr:`feedback_timeout_s`.
         """
-        heard = sink.wait(lambda: sink.feedback_count > 0, self.feedback_timeout_s)
-        assert heard, f"no feedback within {self.feedback_timeout_s} s of the link being up"
+        received = sink.wait(lambda: sink.feedback_count > 0, self.feedback_timeout_s)
+        assert received, f"no feedback within {self.feedback_timeout_s} s of the link being up"
 
 
 def _resources() -> tuple[int, int]:

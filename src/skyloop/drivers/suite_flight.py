@@ -40,7 +40,7 @@ class Flight:
         self.actions = driver.capabilities().actions
         if not self.actions & {"velocity", "attitude"}:
             raise unittest.SkipTest("the vehicle takes no set-points")
-        suite.hear(sink)
+        suite.wait_for_feedback(sink)
 
     def until(self, condition: Callable[[Feedback], bool], timeout_s: float, what: str) -> Feedback:
         """Wait until the newest feedback meets a condition.

@@ -1,4 +1,4 @@
-"""The link of every vehicle that is heard through sockets: its thread, and sockets renewed while nothing is heard.
+"""The link of every vehicle that is reached by sockets: its thread, and sockets renewed while nothing is received.
 
 What the link carries is decided by the session: see :mod:`skyloop.drivers.vehicle_session`.
 """
@@ -21,7 +21,7 @@ from skyloop.drivers.vehicle_session import SinkCallback, VehicleSession
 from skyloop.messages import AnyAction, EventKind, Severity
 
 PAUSE_S: Final = 0.03  #: after an error
-RENEW_NS: Final = nanoseconds(2.0)  #: between new sockets while nothing is heard: this host's address may have changed
+RENEW_NS: Final = nanoseconds(2.0)  #: between new sockets without data: this host's address may have changed
 MAX_DATAGRAM: Final = 65_536
 BURST: Final = 32  #: datagrams that are read before commands get their turn
 
@@ -156,11 +156,11 @@ class VehicleLink(ABC, Generic[S]):
         """Send what is due. With the lock held, on any thread."""
 
     def _renewal_ns(self) -> int | None:
-        """Return how long after they were opened last the sockets are opened anew; None: not as things stand.
+        """Return how long after they were opened last the sockets are opened again; None: not as things stand.
 
-        By default what suits UDP: while nothing is heard. Called with the lock held.
+        By default what suits UDP: while nothing is received. Called with the lock held.
         """
-        return None if self.session.is_heard else RENEW_NS
+        return None if self.session.is_receiving else RENEW_NS
 
     def _poll(self, now_ns: int) -> None:
         """Do what follows another pace than the session's. With the lock held, on the link's thread."""
@@ -235,7 +235,7 @@ class VehicleLink(ABC, Generic[S]):
                 try:
                     self._step()
                 except Exception as error:  # noqa: BLE001  whatever happens, the vehicle must keep getting commands
-                    self._deliver([partial(_tell_failure, error)])
+                    self._deliver([partial(_report_failure, error)])
                     self._stopping.wait(PAUSE_S)
         finally:
             with self.lock:
@@ -255,5 +255,5 @@ class VehicleLink(ABC, Generic[S]):
                 pass
 
 
-def _tell_failure(error: Exception, sink: Sink) -> None:
+def _report_failure(error: Exception, sink: Sink) -> None:
     sink.event(EventKind.DRIVER_ERROR, f"the link to the vehicle failed: {error!r}", Severity.ERROR, where="link")

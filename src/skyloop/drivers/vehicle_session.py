@@ -12,7 +12,7 @@ from skyloop.drivers.base import Sink
 from skyloop.drivers.link_trouble import LinkTrouble, trouble_of
 from skyloop.messages import AnyAction, EventKind, LinkState, Severity, Value
 
-RETELL_NS: Final = nanoseconds(2.0)  #: least time between two reasons that are reported while nothing is heard
+REPORT_AGAIN_NS: Final = nanoseconds(2.0)  #: least time between two reasons that are reported while nothing is received
 
 SinkCallback: TypeAlias = Callable[[Sink], None]
 
@@ -23,11 +23,11 @@ class LinkTimeouts:
 
     degraded_ns: int
     lost_ns: int
-    first_word_ns: int  #: since opening; a vehicle that was never heard by then is reported as lost
+    first_word_ns: int  #: since opening; a vehicle without any data by then is reported as lost
 
 
 @dataclass(frozen=True, slots=True)
-class Notice:
+class VehicleEvent:
     """An event that a session has for the sink, with the arguments of :meth:`skyloop.drivers.base.Sink.event`."""
 
     kind: EventKind
@@ -36,7 +36,7 @@ class Notice:
     data: dict[str, Value] = field(default_factory=dict)
 
 
-def message(text: str, reason: str, severity: Severity = Severity.INFO, **data: Value) -> Notice:
+def message(text: str, reason: str, severity: Severity = Severity.INFO, **data: Value) -> VehicleEvent:
     """Return a message of the vehicle itself.
 
     Args:
@@ -45,14 +45,14 @@ def message(text: str, reason: str, severity: Severity = Severity.INFO, **data: 
         severity: For people and for filters.
         **data: More for programs.
     """
-    return Notice(EventKind.VEHICLE_MESSAGE, text, severity, {"reason": reason, **data})
+    return VehicleEvent(EventKind.VEHICLE_MESSAGE, text, severity, {"reason": reason, **data})
 
 
 class VehicleSession(ABC):
     """The protocol of one opened driver with its vehicle. Not thread-safe.
 
-    Time comes as an argument; bytes go in and out. What the proxy's sink is to be told is collected as callbacks, for
-    the caller to run when it holds no lock. A kind of vehicle sets ``_heard_ns`` with whatever it understood, and calls
+    Time comes as an argument; bytes go in and out. Calls of the proxy's sink are collected as callbacks, for
+    the caller to run when it holds no lock. A kind of vehicle sets ``_received_ns`` with each valid packet, and calls
     :meth:`_check_silence` with each poll.
 
     Args:
@@ -66,16 +66,16 @@ class VehicleSession(ABC):
         self.link_state: LinkState | None = None  #: as last reported
         self._pending: list[SinkCallback] = []
         self._opened_ns = now_ns
-        self._heard_ns: int | None = None  # None: not since it was opened or lost
+        self._received_ns: int | None = None  # None: not since it was opened or lost
         self._unreachable = ""
         self._remedy = ""  # of what is unreachable
-        self._told_why = ""
-        self._told_ns = now_ns
+        self._reported_reason = ""
+        self._reported_ns = now_ns
 
     @property
-    def is_heard(self) -> bool:
-        """Whether the vehicle is heard, or was until just now."""
-        return self._heard_ns is not None
+    def is_receiving(self) -> bool:
+        """Whether data of the vehicle arrive, or did until just now."""
+        return self._received_ns is not None
 
     @abstractmethod
     def command(self, action: AnyAction, now_ns: int) -> AnyAction:
@@ -94,7 +94,7 @@ class VehicleSession(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """End the session: every caller that waits for an answer is told that it failed."""
+        """End the session: every caller that waits for an answer gets a failure."""
 
     def unreachable(self, reason: str) -> None:
         """Note why the vehicle can't be reached: nobody listens, there is no route to it, or the connection failed.
@@ -111,18 +111,18 @@ class VehicleSession(ABC):
 
     def drain(self) -> list[SinkCallback]:
         """Return the callbacks for the sink that are pending since the last call, in order."""
-        for notice in self._new_notices():
-            self._notice(notice)
+        for event in self._new_events():
+            self._publish_event(event)
         pending, self._pending = self._pending, []
         return pending
 
-    def _new_notices(self) -> Iterable[Notice]:
+    def _new_events(self) -> Iterable[VehicleEvent]:
         """Return the events of this kind of vehicle since the last call."""
         return ()
 
     @abstractmethod
     def _describe_silence(self, since: str, why: str) -> str:
-        """Say to people that nothing is heard.
+        """Return the text for people while nothing is received.
 
         Args:
             since: How long, empty or a phrase that begins with a blank.
@@ -130,7 +130,7 @@ class VehicleSession(ABC):
         """
 
     def _advice(self) -> str:
-        """Return what a person can do where nothing is heard and nothing has failed, as an instruction."""
+        """Return what a person can do where nothing is received and nothing has failed, as an instruction."""
         return "check the vehicle's power, and host and port in the address"
 
     def _trouble(self, error: OSError) -> LinkTrouble:
@@ -138,19 +138,19 @@ class VehicleSession(ABC):
 
     @abstractmethod
     def _lose(self, reason: str, now_ns: int, /) -> None:
-        """Drop all state of the lost vehicle: everything begins anew with its next packet."""
+        """Drop all state of the lost vehicle: everything starts over with its next packet."""
 
     def _check_silence(self, now_ns: int) -> None:
         patience = self.TIMEOUTS
-        if self._heard_ns is None:
+        if self._received_ns is None:
             if self.link_state is LinkState.CONNECTING and now_ns - self._opened_ns >= patience.first_word_ns:
-                self._told_ns = now_ns
+                self._reported_ns = now_ns
                 self._set_link_state(LinkState.LOST, self._silence_text())
-            elif self._unreachable != self._told_why and now_ns - self._told_ns >= RETELL_NS:
-                self._told_ns = now_ns
-                self._tell(LinkState.LOST, self._silence_text())
+            elif self._unreachable != self._reported_reason and now_ns - self._reported_ns >= REPORT_AGAIN_NS:
+                self._reported_ns = now_ns
+                self._report_link(LinkState.LOST, self._silence_text())
             return
-        silent_ns = now_ns - self._heard_ns
+        silent_ns = now_ns - self._received_ns
         if silent_ns >= patience.lost_ns:
             self._lose(self._silence_text(silent_ns), now_ns)
         elif silent_ns >= patience.degraded_ns and self.link_state is LinkState.UP:
@@ -162,14 +162,14 @@ class VehicleSession(ABC):
 
     def _set_link_state(self, state: LinkState, reason: str = "") -> None:
         if state is not self.link_state:
-            self._tell(state, reason)
+            self._report_link(state, reason)
 
-    def _tell(self, state: LinkState, reason: str) -> None:
-        self.link_state, self._told_why = state, self._unreachable
+    def _report_link(self, state: LinkState, reason: str) -> None:
+        self.link_state, self._reported_reason = state, self._unreachable
         remedy = ""
         if state in (LinkState.CONNECTING, LinkState.LOST):
             remedy = (self._remedy if self._unreachable else "") or self._advice()
         self._pending.append(lambda sink: sink.link(state, reason, remedy))
 
-    def _notice(self, notice: Notice) -> None:
-        self._pending.append(lambda sink: sink.event(notice.kind, notice.text, notice.severity, **notice.data))
+    def _publish_event(self, event: VehicleEvent) -> None:
+        self._pending.append(lambda sink: sink.event(event.kind, event.text, event.severity, **event.data))

@@ -45,21 +45,21 @@ def test_the_handshake() -> None:
     desk.submit(Write("control:outdoor", "TRUE"))
     assert desk.says() == [("CONFIG", ("control:outdoor", "TRUE"))]
     assert desk.says(0.03) == []
-    assert desk.configurator.heard(True)
+    assert desk.configurator.on_acknowledge(True)
     assert desk.says(0.03) == [CLEAR]
     assert desk.results == []
-    assert desk.configurator.heard(False)
+    assert desk.configurator.on_acknowledge(False)
     assert desk.results == [None]
     assert desk.says(0.03) == []
 
 
 def test_an_acknowledgement_of_before_is_cleared_first() -> None:
     desk = Desk()
-    desk.configurator.heard(True)
+    desk.configurator.on_acknowledge(True)
     desk.submit(Write("control:outdoor", "TRUE"))
     assert desk.says() == [CLEAR]
     assert desk.says(0.03) == [CLEAR]
-    assert desk.configurator.heard(False)
+    assert desk.configurator.on_acknowledge(False)
     assert desk.says(0.03) == [("CONFIG", ("control:outdoor", "TRUE"))]
 
 
@@ -98,7 +98,7 @@ def test_reading_everything() -> None:
 
 def test_a_stray_acknowledgement_is_cleared() -> None:
     desk = Desk()
-    desk.configurator.heard(True)
+    desk.configurator.on_acknowledge(True)
     assert desk.says() == [CLEAR]
 
 
@@ -139,8 +139,8 @@ def test_exchanges_wait_for_one_another() -> None:
     desk.says()
     desk.says(0.3)
     assert desk.results == ["the drone was busy with other settings"]
-    desk.configurator.heard(True)
-    desk.configurator.heard(False)
+    desk.configurator.on_acknowledge(True)
+    desk.configurator.on_acknowledge(False)
     assert desk.says() == [("CONFIG", ("c:c", "3"))]
 
 
@@ -160,8 +160,8 @@ def test_an_exchange_may_follow_from_the_end_of_another() -> None:
     desk.configurator.submit(Exchange(iter(()), ns(99), lambda failure: desk.submit(Write("after:it", "1"))))
     desk.submit(Write("in:line", "1"))
     assert desk.says() == [("CONFIG", ("after:it", "1"))]
-    desk.configurator.heard(True)
-    desk.configurator.heard(False)
+    desk.configurator.on_acknowledge(True)
+    desk.configurator.on_acknowledge(False)
     assert desk.says() == [("CONFIG", ("in:line", "1"))]
 
 

@@ -29,8 +29,8 @@ EVERY = State(0xFFFFFFFF)
 )
 def test_an_emergency_and_why(bits: State, reason: str) -> None:
     health = Health()
-    health.notices(State.FLYING)
-    first = health.notices(State.EMERGENCY | bits)[0]
+    health.changes(State.FLYING)
+    first = health.changes(State.EMERGENCY | bits)[0]
     assert (first.kind, first.severity, first.data) == (EventKind.EMERGENCY, Severity.ERROR, {"reason": reason})
     assert reason in first.text
     assert emergency_reason(bits) == reason
@@ -38,8 +38,8 @@ def test_an_emergency_and_why(bits: State, reason: str) -> None:
 
 def test_the_end_of_an_emergency() -> None:
     health = Health()
-    health.notices(State.EMERGENCY)
-    (notice,) = health.notices(State(0))
+    health.changes(State.EMERGENCY)
+    (notice,) = health.changes(State(0))
     assert (notice.kind, notice.data) == (EventKind.VEHICLE_MESSAGE, {"reason": "reset"})
 
 
@@ -55,18 +55,18 @@ def test_the_end_of_an_emergency() -> None:
 )
 def test_a_condition_begins_and_ends(bit: State, reason: str) -> None:
     health = Health()
-    (begun,) = health.notices(bit)
+    (begun,) = health.changes(bit)
     assert begun.severity is not Severity.INFO
     assert begun.data == {"reason": reason, "active": True}
-    assert health.notices(bit) == []
-    (ended,) = health.notices(State(0))
+    assert health.changes(bit) == []
+    (ended,) = health.changes(State(0))
     assert (ended.severity, ended.data) == (Severity.INFO, {"reason": reason, "active": False})
 
 
 def test_a_healthy_flight_is_no_news() -> None:
     health = Health()
     for state in (State.BOOTSTRAP, State.DEMO, State.DEMO | State.FLYING, State.COMMUNICATION_WATCHDOG, State(0)):
-        assert health.notices(state) == []
+        assert health.changes(state) == []
 
 
 @given(st.lists(BITS, max_size=10))
@@ -74,13 +74,13 @@ def test_each_change_is_told_once(states: list[State]) -> None:
     health = Health()
     active: set[object] = set()
     for state in states:
-        for notice in health.notices(state):
+        for notice in health.changes(state):
             if "active" in notice.data:
                 reason = notice.data["reason"]
                 assert (reason in active) is not notice.data["active"]
                 active ^= {reason}
-        assert health.notices(state) == []
+        assert health.changes(state) == []
 
 
 def test_every_bit_may_be_set() -> None:
-    assert len(Health().notices(EVERY)) > 5
+    assert len(Health().changes(EVERY)) > 5

@@ -144,7 +144,7 @@ def test_emergency_is_told_and_reset_only_when_asked() -> None:
 def test_parameters_that_the_drone_refuses() -> None:
     with firmware() as drone, opened(drone.ports, "&video=0&navdata=full") as (driver, sink):
         wait_up(sink)
-        with pytest.raises(ParameterError, match="did not take") as caught:
+        with pytest.raises(ParameterError, match="did not accept") as caught:
             driver.set_parameter("ardrone.control.altitude_max", 10**9)
         assert caught.value.code == "refused"
         with pytest.raises(UnknownNameError, match=r"limits\.tilt"):

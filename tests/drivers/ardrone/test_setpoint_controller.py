@@ -118,7 +118,7 @@ def test_a_takeoff_has_its_time() -> None:
     assert cockpit.ref() == Ref.TAKEOFF
     cockpit.now_s += 0.2
     assert cockpit.ref() == Ref(0)
-    assert ["did not take off" in notice.text for notice in cockpit.setpoints.notices()] == [True]
+    assert ["did not take off" in notice.text for notice in cockpit.setpoints.pop_events()] == [True]
 
 
 @pytest.mark.parametrize("condition", [AIR, GROUND, None])
@@ -169,7 +169,7 @@ def test_without_limits_it_hovers_and_says_so_once() -> None:
     for _ in range(3):
         assert cockpit.take(Attitude(pitch=0.1)) == Hover()
     assert cockpit.pcmd()[0] == 0
-    assert len(cockpit.setpoints.notices()) == 1
+    assert len(cockpit.setpoints.pop_events()) == 1
 
 
 def test_absolute_control() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from skyloop.clock import seconds
 from skyloop.drivers.ardrone.video import VideoReceiver
-from skyloop.drivers.live_video import Notice
+from skyloop.drivers.live_video import VideoEvent
 from skyloop.emulators.ardrone import ArdroneFirmware, Ports
 from skyloop.emulators.ardrone.settings import with_ardrones
 from skyloop.sim.host import SimHost
@@ -27,14 +27,16 @@ def test_pictures_come_in_time_and_again_after_a_restart(
     host = SimHost(with_ardrones(SimOptions(world="room", seed=1)))
     viewer = Viewer()
     with ArdroneFirmware(host, version=version, ports=Ports.free(), header_size=header_size) as firmware:
-        receiver = VideoReceiver(HOST, firmware.ports.video, version=version, show=viewer.show, told=viewer.told)
+        receiver = VideoReceiver(
+            HOST, firmware.ports.video, version=version, show=viewer.show, on_event=viewer.on_event
+        )
         receiver.start()
         viewer.wait(lambda: len(viewer.seen) >= 15, "15 pictures")
         now_ns = time.monotonic_ns()
         assert seconds(now_ns - viewer.seen[-1][1]) < 1.0
         firmware.stop()
         if version == 2:
-            viewer.wait(lambda: viewer.texts(Notice.LOST), "the loss")
+            viewer.wait(lambda: viewer.texts(VideoEvent.LOST), "the loss")
         before = len(viewer.seen)
         firmware.start()
         viewer.wait(lambda: len(viewer.seen) >= before + 15, "pictures after the restart")

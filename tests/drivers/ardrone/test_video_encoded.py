@@ -99,7 +99,7 @@ def test_recordings_of_real_drones_are_handed_on_byte_by_byte(name: str, first: 
             port.port,
             version=2,
             show=viewer.show,
-            told=viewer.told,
+            on_event=viewer.on_event,
             wants=lambda: viewer.looks,
             came=stream.take,
             clock=ManualClock(),

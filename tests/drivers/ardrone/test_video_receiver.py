@@ -13,7 +13,7 @@ import pytest
 from skyloop.clock import ManualClock
 from skyloop.drivers.ardrone.video import VideoReceiver
 from skyloop.drivers.backlog import LATE_NS
-from skyloop.drivers.live_video import Notice, VideoCounters
+from skyloop.drivers.live_video import VideoCounters, VideoEvent
 from skyloop.errors import MissingExtraError, UsageError
 from tests.drivers.ardrone.video_ports import (
     HOST,
@@ -86,7 +86,7 @@ def test_the_recordings_of_real_drones(name: str, shown: int, waited: int, damag
     assert {number: content for number, _, content in viewer.seen} == true_pictures(name)
     assert viewer.numbers == sorted(viewer.numbers)
     assert viewer.sizes == {(640, 360)}
-    assert viewer.notices[0] == (Notice.STREAMING, f"{HOST}:{port.port}")
+    assert viewer.notices[0] == (VideoEvent.STREAMING, f"{HOST}:{port.port}")
     # Each frame came at the time of its stamp, but for the very first.
     came_ns = [(stamp - stamps[1]) * MS for stamp in stamps[-shown:]]
     assert [taken_ns for _, taken_ns, _ in viewer.seen][1:] == came_ns[1:]
@@ -179,7 +179,7 @@ def test_a_lost_connection_is_made_anew_and_told_once() -> None:
         counters = receiver.counters
     first = frames(LONG)[0].number
     assert viewer.numbers == [first + n for n in (*range(9), *range(15, 20))]
-    assert [notice for notice, _ in viewer.notices] == [Notice.STREAMING, Notice.LOST, Notice.STREAMING]
+    assert [notice for notice, _ in viewer.notices] == [VideoEvent.STREAMING, VideoEvent.LOST, VideoEvent.STREAMING]
     assert "the drone ended the stream" in viewer.notices[1][1]
     assert (counters.reconnects, counters.waited, counters.damaged) == (1, 6, 1)
     assert counters.lost_bytes == 1000
@@ -199,7 +199,7 @@ def test_a_drone_that_is_not_there_is_told_once_and_waited_for() -> None:
         with TcpPort(play, port=port):
             viewer.wait(lambda: len(viewer.seen) == 3, "pictures")
     refused = f"{HOST}:{port}: Connection refused"
-    assert viewer.notices[:2] == [(Notice.LOST, refused), (Notice.STREAMING, f"{HOST}:{port}")]
+    assert viewer.notices[:2] == [(VideoEvent.LOST, refused), (VideoEvent.STREAMING, f"{HOST}:{port}")]
 
 
 def test_a_drone_that_falls_silent_is_given_up_and_tried_again() -> None:
@@ -214,9 +214,9 @@ def test_a_drone_that_falls_silent_is_given_up_and_tried_again() -> None:
         connection.recv(1)
 
     with TcpPort(play) as port, receiving(viewer, port.port, clock=clock) as receiver:
-        viewer.wait(lambda: len(viewer.texts(Notice.STREAMING)) == 2, "a second connection")
+        viewer.wait(lambda: len(viewer.texts(VideoEvent.STREAMING)) == 2, "a second connection")
         assert receiver.counters.lost_bytes > 0
-    assert viewer.texts(Notice.LOST)[0].endswith("no frame came for 3 s")
+    assert viewer.texts(VideoEvent.LOST)[0].endswith("no frame came for 3 s")
 
 
 def test_a_codec_that_is_not_decoded_is_told_once() -> None:
@@ -230,7 +230,9 @@ def test_a_codec_that_is_not_decoded_is_told_once() -> None:
     with TcpPort(play) as port, receiving(viewer, port.port) as receiver:
         while receiver.counters.refused < 10:
             threading.Event().wait(0.001)
-    assert [text.split(",")[0] for text in viewer.texts(Notice.UNSUPPORTED)] == ["the drone sends video in codec P264"]
+    assert [text.split(",")[0] for text in viewer.texts(VideoEvent.UNSUPPORTED)] == [
+        "the drone sends video in codec P264"
+    ]
     assert not viewer.seen
 
 
@@ -247,12 +249,12 @@ def test_a_viewer_that_fails_is_told_of_and_goes_on() -> None:
         connection.recv(1)
 
     with TcpPort(play) as port:
-        receiver = VideoReceiver(HOST, port.port, version=2, show=fail, told=viewer.told, clock=ManualClock())
+        receiver = VideoReceiver(HOST, port.port, version=2, show=fail, on_event=viewer.on_event, clock=ManualClock())
         receiver.start()
         while len(tries) < 3:
             threading.Event().wait(0.001)
         receiver.stop()
-    assert viewer.texts(Notice.FAULT) == ["RuntimeError('no screen')"]
+    assert viewer.texts(VideoEvent.FAULT) == ["RuntimeError('no screen')"]
 
 
 def test_stopping_is_quick_whether_the_drone_is_there_or_not_and_can_be_repeated() -> None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from skyloop.clock import ManualClock
 from skyloop.drivers.ardrone.video import WAKE, UvlcVideo
 from skyloop.drivers.backlog import Coded
-from skyloop.drivers.live_video import Notice
+from skyloop.drivers.live_video import VideoEvent
 from skyloop.emulators.ardrone.uvlc import encode
 from skyloop.wire.ardrone.uvlc import UvlcDecoder, is_intra, is_p264
 from tests.drivers.ardrone.video_ports import HOST, PATIENCE_S, Viewer, digest, receiver_of
@@ -88,11 +88,11 @@ def test_it_is_asked_again_and_again(port: UdpPort) -> None:
             assert port.wait() == WAKE
             clock.advance(0.6)
         clock.advance(5.0)
-        viewer.wait(lambda: viewer.texts(Notice.LOST), "that nothing came")
+        viewer.wait(lambda: viewer.texts(VideoEvent.LOST), "that nothing came")
         assert port.wait() == WAKE
     finally:
         receiver.stop()
-    assert viewer.texts(Notice.LOST) == [f"{HOST}:{port.port}: no frame came for 3 s"]
+    assert viewer.texts(VideoEvent.LOST) == [f"{HOST}:{port.port}: no frame came for 3 s"]
 
 
 def test_what_others_send_is_not_taken(port: UdpPort, packets: list[bytes]) -> None:
@@ -124,7 +124,7 @@ def test_p264_is_refused_with_one_notice(port: UdpPort, packets: list[bytes]) ->
         viewer.wait(lambda: viewer.seen, "a picture after the codec was set")
     finally:
         receiver.stop()
-    (text,) = viewer.texts(Notice.UNSUPPORTED)
+    (text,) = viewer.texts(VideoEvent.UNSUPPORTED)
     assert text.startswith("the drone sends video in P264")
     assert "video:video_codec" in text
 

@@ -13,7 +13,7 @@ import av
 
 from skyloop.clock import ManualClock
 from skyloop.drivers.ardrone.video import VideoReceiver
-from skyloop.drivers.live_video import Notice, Picture
+from skyloop.drivers.live_video import Picture, VideoEvent
 from skyloop.wire.ardrone.pave import PaveFrame, PaveParser
 from tests.recordings import recorded
 
@@ -70,7 +70,7 @@ class Viewer:
         self.looks = True
         self.seen: list[tuple[int, int, Digest]] = []  # number, capture time, content
         self.sizes: set[tuple[int, int]] = set()
-        self.notices: list[tuple[Notice, str]] = []
+        self.notices: list[tuple[VideoEvent, str]] = []
         self.gate = threading.Event()  #: showing a picture takes until this is set
         self.gate.set()
         self._news = threading.Condition()
@@ -87,7 +87,7 @@ class Viewer:
             self._news.notify_all()
         self.gate.wait(PATIENCE_S)
 
-    def told(self, notice: Notice, text: str) -> None:
+    def on_event(self, notice: VideoEvent, text: str) -> None:
         with self._news:
             self.notices.append((notice, text))
             self._news.notify_all()
@@ -96,7 +96,7 @@ class Viewer:
         with self._news:
             assert self._news.wait_for(lambda: bool(condition()), PATIENCE_S), f"{what}: {self.notices} {self.numbers}"
 
-    def texts(self, notice: Notice) -> list[str]:
+    def texts(self, notice: VideoEvent) -> list[str]:
         return [text for kind, text in self.notices if kind is notice]
 
 
@@ -107,7 +107,7 @@ def receiver_of(viewer: Viewer, port: int, version: int = 2, clock: ManualClock 
         port,
         version=version,
         show=viewer.show,
-        told=viewer.told,
+        on_event=viewer.on_event,
         wants=lambda: viewer.looks,
         clock=clock or ManualClock(),
     )

@@ -48,7 +48,7 @@ def test_ways(text: str, way: ConnectionKind, place: str, number: int) -> None:
         ("mavlink://udpin:0.0.0.0:14550?origin=91,0,0", "origin"),
         ("mavlink://udpin:0.0.0.0:14550?pose=mocap", "odometry"),
         ("mavlink://udpin:0.0.0.0:14550?signing_key=/nowhere", "can't be read"),
-        ("mavlink://udpin:0.0.0.0:14550?camera_fps=30", "say camera="),
+        ("mavlink://udpin:0.0.0.0:14550?camera_fps=30", "give camera="),
         ("mavlink://udpin:0.0.0.0:14550?camera=", "camera is empty"),
         ("mavlink://udpin:0.0.0.0:14550?camera=picture.jpg", "must be one of rtsp"),
         ("mavlink://udpin:0.0.0.0:14550?camera=/dev/video0&camera_facing=up", "camera_facing"),

@@ -99,9 +99,9 @@ def test_a_vehicle_is_chosen_by_its_system_id_and_by_its_peer() -> None:
     for text, right in (("sysid=2", Codec(2, 1)), ("peer=127.0.0.1:14581", Codec(1, 1))):
         bench = Bench(Vehicle(PX4), options(f"mavlink://udpin:127.0.0.1:14540?parameters=no&{text}"))
         bench.hear(bench.vehicle.heartbeat())
-        assert not bench.session.is_heard
+        assert not bench.session.is_receiving
         bench.hear(bench.vehicle.heartbeat(), peer=("127.0.0.1", 14581), codec=right)
-        assert bench.session.is_heard
+        assert bench.session.is_receiving
 
 
 def test_after_a_loss_no_other_system_is_flown_instead() -> None:
@@ -109,16 +109,16 @@ def test_after_a_loss_no_other_system_is_flown_instead() -> None:
     bench.go_on(3.0, silent=True)
     assert bench.link() is LinkState.LOST
     bench.hear(bench.vehicle.heartbeat(), codec=Codec(9, 1))
-    assert not bench.session.is_heard
+    assert not bench.session.is_receiving
     bench.hear(bench.vehicle.heartbeat(), peer=("127.0.0.1", 20_000))
-    assert bench.session.is_heard, "the same system, from elsewhere"
+    assert bench.session.is_receiving, "the same system, from elsewhere"
 
 
 @pytest.mark.parametrize(("system", "component", "kind", "autopilot"), [(255, 190, 6, 8), (1, 100, 30, 8)])
 def test_ground_stations_and_cameras_are_no_vehicles(system: int, component: int, kind: int, autopilot: int) -> None:
     bench = Bench(Vehicle(PX4))
     bench.hear(m.MAVLink_heartbeat_message(kind, autopilot, 0, 0, 4, 3), codec=Codec(system, component))
-    assert not bench.session.is_heard
+    assert not bench.session.is_receiving
     assert bench.texts == []
 
 

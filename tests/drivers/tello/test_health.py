@@ -13,26 +13,26 @@ def hot(celsius: float) -> State:
 
 def test_heat_is_told_when_it_comes_and_goes() -> None:
     health = Health()
-    assert health.notices(hot(89)) == []
-    (told,) = health.notices(hot(90))
+    assert health.changes(hot(89)) == []
+    (told,) = health.changes(hot(90))
     assert (told.severity, told.data["reason"], told.data["active"]) == (Severity.WARNING, "hot", True)
-    assert health.notices(hot(86)) == []
-    (gone,) = health.notices(hot(84))
+    assert health.changes(hot(86)) == []
+    (gone,) = health.changes(hot(84))
     assert gone.data["active"] is False
-    assert health.notices(State()) == []
+    assert health.changes(State()) == []
 
 
 def test_a_pad_that_flickers_is_told_once() -> None:
     health = Health()
     seen = State(pad=Pad(3, (10.0, 20.0, 80.0), None))
-    (told,) = health.notices(seen)
+    (told,) = health.changes(seen)
     assert told.data["place"] == (0.1, 0.2, 0.8)
     for _ in range(PAD_LOST - 1):
-        assert health.notices(State()) == []
-    assert health.notices(seen) == []
+        assert health.changes(State()) == []
+    assert health.changes(seen) == []
     for _ in range(PAD_LOST - 1):
-        assert health.notices(State()) == []
-    (gone,) = health.notices(State())
+        assert health.changes(State()) == []
+    (gone,) = health.changes(State())
     assert (gone.data["pad"], gone.data["in_view"]) == (3, False)
-    (unplaced,) = health.notices(State(pad=Pad(4, None, None)))
+    (unplaced,) = health.changes(State(pad=Pad(4, None, None)))
     assert "place" not in unplaced.data

@@ -86,7 +86,7 @@ class Configurator:
         self._exchange: Exchange | None = None
         self._step: Step | None = None
         self._phase = _Phase.IDLE
-        self._acknowledged = False  # the bit as last heard
+        self._acknowledged = False  # the bit as last received
         self._asked_ns = 0
         self._dumps = 0
         self._dump: bytearray | None = None  # None: not connected
@@ -118,7 +118,7 @@ class Configurator:
 
     # What is received ---------------------------------------------------------------------------------------------
 
-    def heard(self, acknowledged: bool) -> bool:
+    def on_acknowledge(self, acknowledged: bool) -> bool:
         """Handle the acknowledge bit of the newest navdata.
 
         Returns:
@@ -269,7 +269,7 @@ def own_ids(session: int) -> Ids:
     """Return Skyloop's ids.
 
     Args:
-        session: A number. Settings of application and user persist; those of a session begin anew with each number.
+        session: A number. Settings of application and user persist; those of a session start over with each number.
     """
     return Ids(
         session=f"{session & 0xFFFFFFFF:08x}",

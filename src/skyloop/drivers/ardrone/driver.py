@@ -14,7 +14,7 @@ from skyloop.drivers.ardrone.protocol import ArdroneSession
 from skyloop.drivers.ardrone.video import EncodedStream, VideoReceiver, cameras_of, make_decoder
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.intrinsics import intrinsics_of
-from skyloop.drivers.live_video import Notice, Picture
+from skyloop.drivers.live_video import Picture, VideoEvent
 from skyloop.drivers.uri import VehicleUri
 from skyloop.drivers.vehicle_session import SinkCallback
 from skyloop.errors import DriverError, ParameterError, SkyloopError
@@ -164,15 +164,15 @@ class ArdroneDriver(Driver):
         def show(picture: Picture) -> None:
             picture.show(sink, self._camera, self._intrinsics(picture.width, picture.height))
 
-        def tell(notice: Notice, text: str) -> None:
-            notice.tell(sink, "video", text)
+        def publish_video_event(event: VideoEvent, text: str) -> None:
+            event.publish(sink, "video", text)
 
         self._video = VideoReceiver(
             options.host,
             options.ports.video,
             version=version,
             show=show,
-            told=tell,
+            on_event=publish_video_event,
             wants=lambda: sink.wants(self._camera),
             came=EncodedStream(sink, lambda: self._camera, self._intrinsics).take if version == 2 else None,
         )

@@ -192,7 +192,7 @@ class DumpClient:
             code = connection.connect_ex((self.address, self._port))
         except OSError as error:  # no address to speak of
             connection.close()
-            configurator.dump_failed(self._told(error.strerror or str(error)))
+            configurator.dump_failed(self._with_port(error.strerror or str(error)))
             return
         self._connection = connection
         self._selector.register(connection, selectors.EVENT_READ | selectors.EVENT_WRITE, self._ready)
@@ -210,7 +210,7 @@ class DumpClient:
 
     def _fail(self, configurator: Configurator, reason: str) -> None:
         self.close()
-        configurator.dump_failed(self._told(reason))
+        configurator.dump_failed(self._with_port(reason))
 
-    def _told(self, reason: str) -> str:
+    def _with_port(self, reason: str) -> str:
         return f"TCP port {self._port}: {reason}"

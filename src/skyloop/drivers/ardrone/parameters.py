@@ -161,16 +161,16 @@ def written(entries: Mapping[str, Entry], name: str, value: Value) -> tuple[Entr
     return entry, entry.to_text(value)
 
 
-def taken(entry: Entry, wanted: str, told: str) -> bool:
+def taken(entry: Entry, wanted: str, reported: str) -> bool:
     """Return whether the drone reports what was written, apart from its way of writing numbers.
 
     Args:
         entry: The parameter.
         wanted: The text that was written.
-        told: The text that was read back.
+        reported: The text that was read back.
     """
     try:
-        one, other = parse_value(wanted, entry.like), parse_value(told, entry.like)
+        one, other = parse_value(wanted, entry.like), parse_value(reported, entry.like)
     except DecodeError:
         return False
     if isinstance(one, float) and isinstance(other, float):
@@ -293,7 +293,7 @@ def _widened(parameter: Parameter) -> Parameter:
 # Commands that are no action -----------------------------------------------------------------------------------------
 
 #: Sends a command at a number of ticks.
-Say = Callable[[AtMessage, int], None]
+Send = Callable[[AtMessage, int], None]
 
 _REPEATS: Final = 3
 _MAGNETOMETER: Final = 0  #: the device of ``CALIB``
@@ -349,12 +349,12 @@ class Commands:
 
     Args:
         setpoints: Knows the drone's condition, and takes the heading of absolute control.
-        say: Sends a command.
+        send: Sends a command.
     """
 
-    def __init__(self, setpoints: SetpointController, say: Say) -> None:
+    def __init__(self, setpoints: SetpointController, send: Send) -> None:
         self._setpoints = setpoints
-        self._say = say
+        self._send = send
         self._values: dict[str, Value] = {}
 
     def parameters(self, version: int | None) -> list[Parameter]:
@@ -410,7 +410,7 @@ class Commands:
         duration = self._values.get(_LEDS_DURATION.name, _LEDS_DURATION.value)
         assert isinstance(frequency, float)
         assert isinstance(duration, float)
-        self._say(("LED", (LED_ANIMATIONS.index(name), frequency, round(duration))), _REPEATS)
+        self._send(("LED", (LED_ANIMATIONS.index(name), frequency, round(duration))), _REPEATS)
 
     def _fly(self, name: str) -> None:
         number = next(at for at, (known, _) in enumerate(FLIGHT_ANIMATIONS) if known == name)
@@ -423,7 +423,7 @@ class Commands:
             raise _refused(f"{message[0]} is for a drone that stands level on the ground: land first")
         if not on_ground and (not condition.flying or condition.emergency):
             raise _refused(f"{message[0]} is for a drone in the air: take off first")
-        self._say(message, times)
+        self._send(message, times)
 
     def _condition(self) -> Condition:
         condition = self._setpoints.condition

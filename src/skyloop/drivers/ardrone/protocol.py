@@ -20,7 +20,7 @@ from skyloop.drivers.ardrone.telemetry import (
     feedback_of,
     native_of,
 )
-from skyloop.drivers.vehicle_session import LinkTimeouts, Notice, VehicleSession, message
+from skyloop.drivers.vehicle_session import LinkTimeouts, VehicleEvent, VehicleSession, message
 from skyloop.messages import AnyAction, EventKind, LinkState, Severity, Value
 from skyloop.wire.ardrone.at import AtMessage, format_command
 from skyloop.wire.ardrone.navdata import Navdata, State
@@ -60,9 +60,9 @@ HURRY_NS: Final = nanoseconds(
 )  #: least time between a datagram and a new set-point that does not wait for its tick
 DEGRADED_NS: Final = nanoseconds(0.25)  #: of silence
 LOST_NS: Final = nanoseconds(1.0)
-FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a drone that was never heard by then is reported as lost
+FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a drone without any data by then is reported as lost
 START_NS: Final = nanoseconds(0.25)  #: between requests for navdata while none come
-SETUP_NS: Final = nanoseconds(6.0)  #: to set the drone up, before it is tried anew
+SETUP_NS: Final = nanoseconds(6.0)  #: to set the drone up, before it is tried again
 SETUP_PATIENCE_NS: Final = nanoseconds(3.0)  #: after it the link is DEGRADED, and the drone may fly without set-up
 DEAF_NS: Final = nanoseconds(1.0)  #: a watchdog bit that stays for so long means that our commands are ignored
 REPEATS: Final = 3  #: of a command that has no acknowledgement
@@ -108,7 +108,7 @@ class ArdroneSession(VehicleSession):
         self._setup_ns: int | None = None
         self._setups_failed = 0
         self._state = State(0)
-        self._said_ns = 0
+        self._sent_ns = 0
         self._started_ns = 0
         self._published_ns = 0
         self._deaf_since_ns: int | None = None
@@ -130,7 +130,7 @@ class ArdroneSession(VehicleSession):
         before = self.setpoints.intent
         applied = self.setpoints.apply(action, now_ns)
         if self.setpoints.intent != before:
-            self.due_ns = min(self.due_ns, max(now_ns, self._said_ns + HURRY_NS))
+            self.due_ns = min(self.due_ns, max(now_ns, self._sent_ns + HURRY_NS))
         return applied
 
     def send(self, message: AtMessage, times: int = REPEATS) -> None:
@@ -145,8 +145,8 @@ class ArdroneSession(VehicleSession):
         self.configurator.submit(exchange)
         self.due_ns = 0
 
-    def _new_notices(self) -> list[Notice]:
-        return self.setpoints.notices()
+    def _new_events(self) -> list[VehicleEvent]:
+        return self.setpoints.pop_events()
 
     def close(self) -> None:
         """End the session: exchanges that are not done fail."""
@@ -161,13 +161,13 @@ class ArdroneSession(VehicleSession):
             return
         state = navdata.state
         demo = navdata.get(Demo)
-        self._notice_break(state, now_ns)
-        self._state, self._heard_ns = state, now_ns
+        self._detect_break(state, now_ns)
+        self._state, self._received_ns = state, now_ns
         self.setpoints.on_condition(Condition(state, control_state(demo) if demo is not None else None), now_ns)
-        if self.configurator.heard(bool(state & State.COMMAND_ACK)):
+        if self.configurator.on_acknowledge(bool(state & State.COMMAND_ACK)):
             self.due_ns = 0
-        for notice in self._health.notices(state):
-            self._notice(notice)
+        for event in self._health.changes(state):
+            self._publish_event(event)
         if self._setup_ns is None:
             self._begin_setup(now_ns)
         elif self.link_state is LinkState.DEGRADED and self.ready:
@@ -175,8 +175,8 @@ class ArdroneSession(VehicleSession):
         if demo is not None:
             self._publish(navdata, demo, now_ns)
 
-    def _notice_break(self, state: State, now_ns: int) -> None:
-        """Notice that the drone restarted or lost us, even if it was silent for less time than we would notice.
+    def _detect_break(self, state: State, now_ns: int) -> None:
+        """Detect that the drone restarted or lost us, even if it was silent for less time than we would detect.
 
         What it forgot meanwhile is not known.
         """
@@ -204,9 +204,9 @@ class ArdroneSession(VehicleSession):
     def poll(self, now_ns: int) -> bytes:
         """Return the datagram for the AT port that is due now, empty if nothing is to be sent."""
         self._check_silence(now_ns)
-        self.due_ns, self._said_ns = now_ns + TICK_NS, now_ns
+        self.due_ns, self._sent_ns = now_ns + TICK_NS, now_ns
         messages: list[AtMessage] = []
-        if self._state & State.COMMUNICATION_WATCHDOG and self._heard_ns is not None:
+        if self._state & State.COMMUNICATION_WATCHDOG and self._received_ns is not None:
             messages.append(_WATCHDOG)
             self._check_deafness(now_ns)
         else:
@@ -218,7 +218,7 @@ class ArdroneSession(VehicleSession):
 
     def wants_start(self, now_ns: int) -> bool:
         """Return whether to ask for navdata now, because none come. True once in :data:`START_NS`."""
-        silent_ns = now_ns - (self._heard_ns if self._heard_ns is not None else 0)
+        silent_ns = now_ns - (self._received_ns if self._received_ns is not None else 0)
         if silent_ns < DEGRADED_NS or now_ns - self._started_ns < START_NS:
             return False
         self._started_ns = now_ns
@@ -252,7 +252,7 @@ class ArdroneSession(VehicleSession):
     # Losing and finding ----------------------------------------------------------------------------------------
 
     def _lose(self, reason: str, _now_ns: int) -> None:
-        self._heard_ns = self._setup_ns = None
+        self._received_ns = self._setup_ns = None
         self.ready = False
         self._once.clear()
         self.configurator.abandon(reason)
@@ -279,23 +279,23 @@ class ArdroneSession(VehicleSession):
         self.due_ns = 0
 
     def _setup_done(self, setup: Setup, failure: str | None) -> None:
-        if self._setup_ns is None or self._heard_ns is None:
+        if self._setup_ns is None or self._received_ns is None:
             return  # it was lost meanwhile
         if failure is not None:
             self._setups_failed += 1
             self.configurator.trouble = failure
-            self._submit_setup(self._heard_ns)
+            self._submit_setup(self._received_ns)
             return
         self._setups_failed = 0
         self.version = setup.version or self.version
         if setup.refused_ids:
             text = "the drone keeps no settings of our own: they are shared with everybody who connects to it"
-            self._notice(message(text, "ids_refused", Severity.WARNING))
+            self._publish_event(message(text, "ids_refused", Severity.WARNING))
         self.ready = True
         self.read_limits()
         if self.setpoints.limits is None:
             text = "the drone's configuration has no limits: set-points are refused"
-            self._notice(Notice(EventKind.DRIVER_ERROR, text, Severity.ERROR, {"where": "configuration"}))
+            self._publish_event(VehicleEvent(EventKind.DRIVER_ERROR, text, Severity.ERROR, {"where": "configuration"}))
         self._set_link_state(LinkState.UP)
 
     def read_limits(self) -> None:

@@ -15,7 +15,7 @@ from enum import Enum, auto
 from typing import Final
 
 from skyloop.clock import nanoseconds
-from skyloop.drivers.vehicle_session import Notice
+from skyloop.drivers.vehicle_session import VehicleEvent
 from skyloop.errors import DecodeError, DriverError
 from skyloop.messages import (
     AnyAction,
@@ -110,7 +110,7 @@ def _within(value: float, limit: float) -> float:
 
 
 TAKEOFF_PATIENCE_NS: Final = nanoseconds(5.0)  #: a drone that has not started by then refuses to
-TOGGLE_NS: Final = nanoseconds(0.5)  #: the emergency bit is cleared and set anew if it showed no effect for so long
+TOGGLE_NS: Final = nanoseconds(0.5)  #: the emergency bit is cleared and set again if it showed no effect for so long
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +146,7 @@ class SetpointController:
     """
 
     def __init__(self) -> None:
-        self.condition: Condition | None = None  #: None while the drone is not heard
+        self.condition: Condition | None = None  #: None while nothing is received from the drone
         self.limits: StickLimits | None = None  #: None until they were read
         self.reference_rad: float | None = None
         self._decision = Decision.STAY
@@ -155,10 +155,10 @@ class SetpointController:
         self._decided_ns = 0
         self._toggle: bool | None = None  #: whether the motors shall be cut (True) or released (False); None: neither
         self._toggle_ns = 0
-        self._heard_ns = 0
-        self._told_blind = False
+        self._received_ns = 0
+        self._warned_blind = False
         self._steering = False  # this flight was begun, or taken, here: else another program may be flying it
-        self._notices: list[Notice] = []
+        self._events: list[VehicleEvent] = []
 
     @property
     def intent(self) -> tuple[object, ...]:
@@ -178,7 +178,7 @@ class SetpointController:
             What is applied: an attitude within the drone's limits, or hover while the limits are not known.
 
         Raises:
-            DriverError: A take-off while the drone is not heard or in emergency, a reset while it is not heard, or an
+            DriverError: A take-off while nothing is received or in emergency, a reset while nothing is reced, or an
                 action that the drone does not have.
         """
         if isinstance(action, Idle):
@@ -226,11 +226,11 @@ class SetpointController:
     def _steer(self, action: Attitude) -> AnyAction:
         if self.limits is None:
             self._remain(None)
-            if not self._told_blind:
-                self._told_blind = True
+            if not self._warned_blind:
+                self._warned_blind = True
                 text = "the drone's limits are not known yet: it hovers instead of following set-points"
-                self._notices.append(
-                    Notice(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, {"reason": "limits_unknown"})
+                self._events.append(
+                    VehicleEvent(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, {"reason": "limits_unknown"})
                 )
             return Hover()
         stick, applied = stick_of(action, self.limits)
@@ -248,7 +248,7 @@ class SetpointController:
         """Handle the newest navdata."""
         if self.condition is not None and self.condition.flying and not condition.flying:
             self._stick = None
-        self.condition, self._heard_ns = condition, now_ns
+        self.condition, self._received_ns = condition, now_ns
         if self._toggle is condition.emergency:
             self._toggle = None
         if not (condition.flying or condition.emergency) and self._decision is not Decision.TAKE_OFF:
@@ -261,9 +261,9 @@ class SetpointController:
             self._landing_is_ours = False
 
     def lost(self) -> None:
-        """Forget the drone's condition, and a take-off that is under way: the drone is not heard any more."""
+        """Forget the drone's condition and a take-off that is under way, as nothing is received any more."""
         self.condition = None
-        self._told_blind = False
+        self._warned_blind = False
         if self._toggle is False:
             self._toggle = None
         if self._decision is Decision.TAKE_OFF:
@@ -271,9 +271,9 @@ class SetpointController:
 
     # What is sent ----------------------------------------------------------------------------------------------
 
-    def notices(self) -> list[Notice]:
-        """Return the notices since the last call."""
-        notices, self._notices = self._notices, []
+    def pop_events(self) -> list[VehicleEvent]:
+        """Return the events since the last call."""
+        notices, self._events = self._events, []
         return notices
 
     def messages(self, now_ns: int) -> list[AtMessage]:
@@ -292,9 +292,9 @@ class SetpointController:
     def _emergency_bits(self, now_ns: int) -> Ref | None:
         if self._toggle is None:
             return None
-        if self.condition is None or self._heard_ns - self._toggle_ns < TOGGLE_NS:
+        if self.condition is None or self._received_ns - self._toggle_ns < TOGGLE_NS:
             return Ref.EMERGENCY
-        self._toggle_ns = now_ns  # it was heard since, and shows no effect: let go once, for the next edge
+        self._toggle_ns = now_ns  # data came since, and show no effect: clear the bit once, for the next edge
         return Ref(0)
 
     def _flight_bits(self, now_ns: int) -> Ref | None:
@@ -303,7 +303,9 @@ class SetpointController:
                 return Ref.TAKEOFF
             self._decision = Decision.STAY
             text = "the drone did not take off: it may refuse because of its battery, its tilt or its sensors"
-            self._notices.append(Notice(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, {"reason": "no_takeoff"}))
+            self._events.append(
+                VehicleEvent(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, {"reason": "no_takeoff"})
+            )
         if self._decision is Decision.LAND:
             return Ref(0)
         if self.condition is None:

@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.drivers.live_clock import LiveClock
-from skyloop.drivers.vehicle_session import Notice
+from skyloop.drivers.vehicle_session import VehicleEvent
 from skyloop.errors import DecodeError
 from skyloop.messages import EventKind, Feedback, FlightState, Severity, Value
 from skyloop.messages.geometry import wrap_angle
@@ -293,11 +293,11 @@ class Health:
     """Reports each change of the drone's health bits once."""
 
     def __init__(self) -> None:
-        self._told = State(0)
+        self._reported = State(0)
 
-    def notices(self, state: State) -> list[Notice]:
+    def changes(self, state: State) -> list[VehicleEvent]:
         """Return what changed since the last call."""
-        before, self._told = self._told, state
+        before, self._reported = self._reported, state
         changed = before ^ state
         found = []
         if changed & State.EMERGENCY:
@@ -307,15 +307,17 @@ class Health:
                 continue
             data: dict[str, Value] = {"reason": name, "active": bool(state & bit)}
             if state & bit:
-                found.append(Notice(EventKind.VEHICLE_MESSAGE, text, severity, data))
+                found.append(VehicleEvent(EventKind.VEHICLE_MESSAGE, text, severity, data))
             else:
-                found.append(Notice(EventKind.VEHICLE_MESSAGE, f"no longer: {text}", Severity.INFO, data))
+                found.append(VehicleEvent(EventKind.VEHICLE_MESSAGE, f"no longer: {text}", Severity.INFO, data))
         return found
 
 
-def _emergency(state: State) -> Notice:
+def _emergency(state: State) -> VehicleEvent:
     if not state & State.EMERGENCY:
-        return Notice(EventKind.VEHICLE_MESSAGE, "the drone left the emergency", Severity.INFO, {"reason": "reset"})
+        return VehicleEvent(
+            EventKind.VEHICLE_MESSAGE, "the drone left the emergency", Severity.INFO, {"reason": "reset"}
+        )
     reason = emergency_reason(state)
     text = f"the drone cut its motors ({reason}); reset the emergency when it lies safely"
-    return Notice(EventKind.EMERGENCY, text, Severity.ERROR, {"reason": reason})
+    return VehicleEvent(EventKind.EMERGENCY, text, Severity.ERROR, {"reason": reason})

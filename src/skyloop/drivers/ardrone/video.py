@@ -22,7 +22,7 @@ from skyloop.drivers.backlog import Coded
 from skyloop.drivers.base import Sink
 from skyloop.drivers.intrinsics import intrinsics_of
 from skyloop.drivers.live_clock import LiveClock
-from skyloop.drivers.live_video import Decoded, Decoder, LiveVideo, Notice, Picture, Stream
+from skyloop.drivers.live_video import Decoded, Decoder, LiveVideo, Picture, Stream, VideoEvent
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import DecodeError, MissingExtraError, UnsupportedError, UsageError
 from skyloop.messages import CameraInfo, Intrinsics
@@ -167,7 +167,7 @@ class PaveStream:
     def __init__(self, host: str, port: int, connection: int, clock: Clock) -> None:
         self._clock = clock
         self._assembly = PaveAssembly(connection)
-        self._heard_ns = clock()
+        self._received_ns = clock()
         self._socket = socket.create_connection((host, port), CONNECT_S)
         self._socket.settimeout(POLL_S)
 
@@ -196,8 +196,8 @@ class PaveStream:
                 self._assembly.end()
                 raise ConnectionError("the drone ended the stream")
             frames = self._assembly.feed(data, self._clock())
-        self._heard_ns = self._clock() if frames else self._heard_ns
-        _give_up_if_silent(self._clock() - self._heard_ns)
+        self._received_ns = self._clock() if frames else self._received_ns
+        _give_up_if_silent(self._clock() - self._received_ns)
         return frames
 
     def close(self) -> None:
@@ -217,7 +217,7 @@ class DatagramStream:
         self.lost_bytes = 0
         self._connection = connection
         self._clock = clock
-        self._heard_ns = clock()
+        self._received_ns = clock()
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._socket.settimeout(POLL_S)
@@ -226,7 +226,7 @@ class DatagramStream:
         except OSError:
             self._socket.close()
             raise
-        self._woken_ns = self._heard_ns
+        self._woken_ns = self._received_ns
 
     def read(self) -> list[Coded]:
         """Return the picture that arrived, after :data:`POLL_S` at most.
@@ -245,9 +245,9 @@ class DatagramStream:
             self._woken_ns = now_ns
             self._socket.send(WAKE)
         if data:
-            self._heard_ns = now_ns
+            self._received_ns = now_ns
             return [Coded(data, is_intra(data), now_ns, now_ns, self._connection)]
-        _give_up_if_silent(now_ns - self._heard_ns)
+        _give_up_if_silent(now_ns - self._received_ns)
         return []
 
     def close(self) -> None:
@@ -441,7 +441,7 @@ class VideoReceiver(LiveVideo):
         *,
         version: int,
         show: Callable[[Picture], None],
-        told: Callable[[Notice, str], None],
+        on_event: Callable[[VideoEvent, str], None],
         wants: Callable[[], bool] = lambda: True,
         came: Callable[[Coded], None] | None = None,
         clock: Clock = monotonic_ns,
@@ -455,7 +455,7 @@ class VideoReceiver(LiveVideo):
             connect=lambda connection: open_stream(version, host, port, connection, clock),
             make_decoder=partial(make_decoder, version),
             show=show,
-            told=told,
+            on_event=on_event,
             wants=wants,
             came=came,
             clock=clock,

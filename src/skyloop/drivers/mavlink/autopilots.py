@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Final, Protocol
 
-from skyloop.drivers.base import Remark
+from skyloop.drivers.base import Diagnostic
 from skyloop.drivers.mavlink.microservices import VehicleCommand
 from skyloop.drivers.mavlink.telemetry import PREARM, SLOW_S, Telemetry, VehicleState
 from skyloop.wire.mavlink.codec import dialect as m
@@ -116,12 +116,12 @@ class _SafetyNet:
     otherwise: str  #: what comes of another value
     advice: str
 
-    def remark(self, value: float) -> Remark:
+    def diagnostic(self, value: float) -> Diagnostic:
         """Judge the parameter's value."""
         detail = f"{self.name} is {value:g}"
         if self.good(value):
-            return Remark(self.what, True, detail)
-        return Remark(self.what, False, f"{detail}: {self.otherwise}", f"set the parameter mavlink.{self.advice}")
+            return Diagnostic(self.what, True, detail)
+        return Diagnostic(self.what, False, f"{detail}: {self.otherwise}", f"set the parameter mavlink.{self.advice}")
 
 
 def _on(value: float) -> bool:
@@ -176,8 +176,8 @@ class AutopilotProfile(ABC):
     def thrust_model(self, values: Values) -> ThrustModel:
         """Return how a climb rate is asked for beside an attitude."""
 
-    def safety_remarks(self, values: Values, own_system: int) -> list[Remark]:  # noqa: ARG002
-        """Return a remark for each safety net that this autopilot has a parameter for.
+    def safety_diagnostics(self, values: Values, own_system: int) -> list[Diagnostic]:  # noqa: ARG002
+        """Return a diagnostic for each safety net that this autopilot has a parameter for.
 
         By default both autopilots only drop the last set-point when this computer or its link dies.
 
@@ -185,7 +185,7 @@ class AutopilotProfile(ABC):
             values: The vehicle's parameters.
             own_system: The MAVLink system that we are.
         """
-        return [net.remark(values[net.name]) for net in self.SAFETY_NETS if net.name in values]
+        return [net.diagnostic(values[net.name]) for net in self.SAFETY_NETS if net.name in values]
 
 
 class ArduCopterProfile(AutopilotProfile):
@@ -261,16 +261,16 @@ class ArduCopterProfile(AutopilotProfile):
             return CollectiveThrust(hover=values.get("MOT_THST_HOVER", 0.35))
         return ClimbRateThrust(up_m_s=copter_speed(values, "UP", 2.5), down_m_s=copter_speed(values, "DN", 1.5))
 
-    def safety_remarks(self, values: Values, own_system: int) -> list[Remark]:
+    def safety_diagnostics(self, values: Values, own_system: int) -> list[Diagnostic]:
         """Return the safety nets, and whether it watches for our heartbeats."""
-        remarks = super().safety_remarks(values, own_system)
+        diagnostics = super().safety_diagnostics(values, own_system)
         listens = values.get("MAV_GCS_SYSID", values.get("SYSID_MYGCS"))
         if listens is not None and listens != own_system:
             detail = (
                 f"it monitors heartbeats of system {listens:g}, this is system {own_system}: it won't detect our loss"
             )
-            remarks.append(Remark("ground station", False, detail, f"give the address ?own_sysid={listens:g}"))
-        return remarks
+            diagnostics.append(Diagnostic("ground station", False, detail, f"give the address ?own_sysid={listens:g}"))
+        return diagnostics
 
 
 class Px4Profile(AutopilotProfile):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from skyloop.clock import monotonic_ns
-from skyloop.drivers.base import Driver, ExternalPose, Remark, Sink
+from skyloop.drivers.base import Diagnostic, Driver, ExternalPose, Sink
 from skyloop.drivers.mavlink.link import MavlinkLink
 from skyloop.drivers.mavlink.microservices import pose_message
 from skyloop.drivers.mavlink.options import options_of
@@ -111,20 +111,20 @@ class MavlinkDriver(Driver):
     def external_pose(self, pose: ExternalPose) -> None:
         """Send the pose as ``ODOMETRY``, or as what ``?pose=`` says."""
         link = self._opened()
-        if not link.session.is_heard:
+        if not link.session.is_receiving:
             raise DriverError("no data from the vehicle: an external pose can't be sent until the link is up")
         link.send(pose_message(pose, self.options.pose))
 
-    def checkup(self) -> list[Remark]:
+    def checkup(self) -> list[Diagnostic]:
         """Return which of the autopilot's own safety nets are off, and what to set."""
         link = self._opened()
         with link.lock:
             session = link.session
             autopilot, values = session.autopilot, session.parameters.values
         if autopilot is None or not values:
-            return [Remark("parameters", False, "the vehicle's parameters were not read, so nothing is known")]
-        name = Remark("autopilot", True, session.description)
-        return [name, *autopilot.safety_remarks(values, self.options.own_system)]
+            return [Diagnostic("parameters", False, "the vehicle's parameters were not read, so nothing is known")]
+        name = Diagnostic("autopilot", True, session.description)
+        return [name, *autopilot.safety_diagnostics(values, self.options.own_system)]
 
     def _opened(self) -> MavlinkLink:
         if self._link is None:

@@ -43,7 +43,7 @@ class MavlinkConnection(Protocol):
 
         Args:
             data: One packet.
-            peer: The receiver of a datagram; None: whoever the address names.
+            peer: The receiver of a datagram; None: the one in the address.
 
         Raises:
             OSError: It can't be sent.
@@ -53,7 +53,7 @@ class MavlinkConnection(Protocol):
 
 
 class UdpListener:
-    """Listens on a UDP port, and answers whoever is heard.
+    """Listens on a UDP port, and answers each sender.
 
     Raises:
         OSError: The port can't be opened.
@@ -89,7 +89,7 @@ class UdpListener:
     def send(self, data: bytes, peer: Peer) -> None:
         """Send a datagram; drop it if there is no peer yet, or no room."""
         if peer is None:
-            return  # no vehicle was heard yet
+            return  # no vehicle was received yet
         with suppress(BlockingIOError):
             self._socket.sendto(data, peer)
 
@@ -111,7 +111,7 @@ class UdpSender(UdpListener):
         super().__init__(Address(ConnectionKind.UDP_IN, "", 0))
 
     def send(self, data: bytes, peer: Peer) -> None:
-        """Send a datagram to the peer, or to the address until somebody was heard."""
+        """Send a datagram to the peer, or to the address until something was received."""
         super().send(data, peer or self._to)
 
 
@@ -318,7 +318,7 @@ class MavlinkLink(VehicleLink[MavlinkSession]):
             return RETRY_NS
         if self._broken:
             return 0
-        return None if self.session.is_heard or connection.whole else SILENT_NS
+        return None if self.session.is_receiving or connection.whole else SILENT_NS
 
     def _open_sockets(self) -> None:
         with self.lock:

@@ -303,8 +303,8 @@ class TakeoffSequence:
             return
         height = vehicle.altitude_m if vehicle.altitude_m is not None else 0.0
         self._seen = self._seen or vehicle.mode in self._autopilot.TAKING_OFF
-        told = self._climb_command is not None or vehicle.mode in self._autopilot.TAKING_OFF
-        self.rose = self.rose or (told and vehicle.armed and self._is_off_ground(vehicle.landed, height))
+        commanded = self._climb_command is not None or vehicle.mode in self._autopilot.TAKING_OFF
+        self.rose = self.rose or (commanded and vehicle.armed and self._is_off_ground(vehicle.landed, height))
         cut_short = self._is_cut_short(vehicle)
         self._observe_mode(vehicle, cut_short, now_ns)
         if not vehicle.armed and now_ns - self._armed_ns > ARMED_NS:

@@ -13,7 +13,7 @@ from skyloop.drivers.base import ExternalPose
 from skyloop.drivers.live_clock import LiveClock
 from skyloop.drivers.mavlink.options import Peer, PoseMessage
 from skyloop.drivers.mavlink.telemetry import Telemetry
-from skyloop.drivers.vehicle_session import Notice
+from skyloop.drivers.vehicle_session import VehicleEvent
 from skyloop.messages import EventKind, Severity
 from skyloop.messages.geometry import quaternion_from_euler
 from skyloop.wire.mavlink.axes import angles_of, swap, to_wire, yaw_between
@@ -31,7 +31,7 @@ _MULTIROTORS: Final = frozenset({2, 3, 4, 13, 14, 15, 29, 35})
 
 @dataclass(frozen=True, slots=True)
 class VehicleIdentity:
-    """A vehicle that is heard."""
+    """A vehicle whose heartbeats arrive."""
 
     system: int
     component: int
@@ -39,10 +39,10 @@ class VehicleIdentity:
 
 
 class VehicleSelector:
-    """Chooses the vehicle that is flown among all that are heard.
+    """Chooses the vehicle that is flown among all whose heartbeats arrive.
 
     Args:
-        system: Its system id; None: the first that is heard, and after that only that system.
+        system: Its system id; None: the first one found, and after that only that system.
         peer: Its address and port; None: any.
     """
 
@@ -50,10 +50,10 @@ class VehicleSelector:
         self.system = system
         self.chosen: VehicleIdentity | None = None
         self._wanted_peer = peer
-        self._told: set[VehicleIdentity] = set()
+        self._reported: set[VehicleIdentity] = set()
 
-    def on_message(self, message: Message, peer: Peer) -> list[Notice]:
-        """Handle any message; return notices of other vehicles."""
+    def on_message(self, message: Message, peer: Peer) -> list[VehicleEvent]:
+        """Handle any message; return events about other vehicles."""
         if message.get_type() != "HEARTBEAT" or not _is_vehicle(message):
             return []
         found = VehicleIdentity(message.get_srcSystem(), message.get_srcComponent(), peer)
@@ -63,7 +63,7 @@ class VehicleSelector:
         if self.chosen is None and suits:
             self.chosen, self.system = found, found.system
             return []
-        return self._notice_other(found)
+        return self._report_other(found)
 
     def is_chosen(self, message: Message, peer: Peer) -> bool:
         """Return whether the vehicle that is flown sent it."""
@@ -79,10 +79,10 @@ class VehicleSelector:
         """Forget the chosen vehicle: it may come back from another peer, as the same system."""
         self.chosen = None
 
-    def _notice_other(self, found: VehicleIdentity) -> list[Notice]:
-        if found in self._told or len(self._told) >= MOST_OTHERS:
+    def _report_other(self, found: VehicleIdentity) -> list[VehicleEvent]:
+        if found in self._reported or len(self._reported) >= MOST_OTHERS:
             return []
-        self._told.add(found)
+        self._reported.add(found)
         where = f" at {found.peer[0]}:{found.peer[1]}" if found.peer is not None else ""
         text = f"another vehicle answers, system {found.system}{where}: it is ignored"
         if self.chosen is not None and found.system == self.chosen.system:
@@ -90,7 +90,9 @@ class VehicleSelector:
         else:
             text += f"; ?sysid={found.system} chooses it"
         return [
-            Notice(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, {"reason": "another", "system": found.system})
+            VehicleEvent(
+                EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, {"reason": "another", "system": found.system}
+            )
         ]
 
 
@@ -141,13 +143,13 @@ def result_name(result: int) -> str:
 class CommandSender:
     """Sends commands and keeps their results.
 
-    Level-triggered: whoever wants an effect calls :meth:`request` again and again until it shows.
+    Level-triggered: a caller that wants an effect calls :meth:`request` again and again until it shows.
     """
 
     def __init__(self) -> None:
         self.target = (1, 1)  #: system and component
         self._out: list[Message] = []
-        self._said: dict[VehicleCommand, tuple[int, int]] = {}  # when last, and how often
+        self._sent: dict[VehicleCommand, tuple[int, int]] = {}  # when last, and how often
         self._answers: dict[int, tuple[int, int]] = {}  # command: result, when
 
     def request(self, command: VehicleCommand, now_ns: int, pace_s: float = 0.5) -> None:
@@ -158,12 +160,12 @@ class CommandSender:
             now_ns: The present time.
             pace_s: Between repeats [s].
         """
-        last_ns, times = self._said.get(command, (None, 0))
+        last_ns, times = self._sent.get(command, (None, 0))
         if last_ns is not None and now_ns - last_ns < nanoseconds(pace_s):
             return
         if last_ns is None or now_ns - last_ns > 4 * nanoseconds(pace_s):
             times = 0  # not a repeat of the same asking
-        self._said[command] = now_ns, times + 1
+        self._sent[command] = now_ns, times + 1
         arguments = (*command.arguments, *[0.0] * (7 - len(command.arguments)))
         self._out.append(m.MAVLink_command_long_message(*self.target, command.number, min(times, 255), *arguments))
 
@@ -180,7 +182,7 @@ class CommandSender:
     def reset(self) -> None:
         """Forget everything: the vehicle was lost."""
         self._out.clear()
-        self._said.clear()
+        self._sent.clear()
         self._answers.clear()
 
     def pop_messages(self) -> list[Message]:
@@ -306,7 +308,7 @@ def pose_message(pose: ExternalPose, kind: PoseMessage) -> Message:
     """Return a pose from outside as a message.
 
     The message has north, east, down [m] and the angles of a body whose axes are forward, right, down [rad]. Its time
-    is in microseconds of our own clock: ``TIMESYNC`` tells it to the vehicle.
+    is in microseconds of our own clock: ``TIMESYNC`` sends it to the vehicle.
 
     Args:
         pose: In our axes.

@@ -75,7 +75,7 @@ KNOWN: Final = {
 class ConnectionKind(StrEnum):
     """How the bytes travel."""
 
-    UDP_IN = "udpin"  #: listens, and answers whoever sends to it
+    UDP_IN = "udpin"  #: listens, and answers each sender
     UDP_OUT = "udpout"  #: speaks first
     TCP = "tcp"  #: connects
     SERIAL = "serial"
@@ -123,8 +123,8 @@ class MavlinkOptions:
     """A parsed address."""
 
     address: Address
-    system: int | None = None  #: of the vehicle; None: the first that is heard
-    peer: tuple[str, int] | None = None  #: where the vehicle sends from; None: where it is heard first
+    system: int | None = None  #: of the vehicle; None: the first one found
+    peer: tuple[str, int] | None = None  #: where the vehicle sends from; None: the address of its first packet
     own_system: int = 255
     rate_hz: float = 50.0  #: of attitude, position and velocity
     limits: Mapping[str, float] = field(default_factory=lambda: dict(USUAL))  #: by the names of their parameters

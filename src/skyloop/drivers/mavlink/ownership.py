@@ -87,7 +87,7 @@ class FlightOwnership:
 
         Args:
             action: What was accepted.
-            vehicle: What is known of it; None while it is not heard.
+            vehicle: What is known of it; None while nothing is received.
             alone: Whether nobody is in command: a failsafe.
             new: Whether an application newly asked for it.
         """
@@ -133,7 +133,7 @@ class FlightOwnership:
         self._from = ""
 
     def on_flight_over(self) -> None:
-        """Forget the flight: the vehicle stands, and whoever flies it next begins anew."""
+        """Forget the flight: the vehicle stands, and the next to fly it starts over."""
         self._steering, self._by_itself, self.left_to, self._from = False, False, "", ""
         self._foreign_ns, self._repeated = None, None
         self._asked.clear()

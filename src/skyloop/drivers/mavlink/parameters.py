@@ -41,7 +41,7 @@ class _PendingWrite:
     value: float
     deadline_ns: int
     done: Callable[[str | None], None]
-    said_ns: int | None = None
+    sent_ns: int | None = None
 
 
 class ParameterExchange:
@@ -56,15 +56,15 @@ class ParameterExchange:
         self.given_up = False
         self._wanted = False
         self._indices: set[int] = set()
-        self._news_ns = 0  # when something new came
+        self._progress_ns = 0  # when something new came
         self._asked_ns: int | None = None
         self._writes: list[_PendingWrite] = []
 
     def request_all(self, now_ns: int) -> None:
-        """Begin to read all of them, anew."""
+        """Begin to read all of them again."""
         self._wanted, self.complete, self.given_up = True, False, False
         self._indices.clear()
-        self.count, self._asked_ns, self._news_ns = None, None, now_ns
+        self.count, self._asked_ns, self._progress_ns = None, None, now_ns
 
     def fail_writes(self, reason: str) -> None:
         """Fail the writes under way: the vehicle was lost."""
@@ -100,7 +100,7 @@ class ParameterExchange:
             self.count = count
             if index not in self._indices:
                 self._indices.add(index)
-                self._news_ns = now_ns
+                self._progress_ns = now_ns
             self.complete = self._wanted and len(self._indices) >= count
         if name and not math.isnan(value):
             self.reported[name] = ReportedParameter(name, value, kind)
@@ -114,16 +114,16 @@ class ParameterExchange:
         if not self._wanted or self.complete or self.given_up:
             return []
         if self.count is None:
-            if now_ns - self._news_ns > GIVE_UP_NS:
+            if now_ns - self._progress_ns > GIVE_UP_NS:
                 self.given_up = True
             elif self._asked_ns is None or now_ns - self._asked_ns > LIST_NS:
                 self._asked_ns = now_ns
                 return [m.MAVLink_param_request_list_message(*self.target)]
             return []
-        if now_ns - self._news_ns > GIVE_UP_NS:
+        if now_ns - self._progress_ns > GIVE_UP_NS:
             self.given_up = True
             return []
-        if now_ns - max(self._news_ns, self._asked_ns or 0) < QUIET_NS:
+        if now_ns - max(self._progress_ns, self._asked_ns or 0) < QUIET_NS:
             return []
         self._asked_ns = now_ns
         missing = [index for index in range(self.count) if index not in self._indices][:AT_ONCE]
@@ -136,8 +136,8 @@ class ParameterExchange:
                 self._writes.remove(write)
                 reported = self.reported[write.name].value
                 write.done(f"the vehicle did not confirm it; the last value that it reported is {reported:g}")
-            elif write.said_ns is None or now_ns - write.said_ns >= WRITE_NS:
-                write.said_ns = now_ns
+            elif write.sent_ns is None or now_ns - write.sent_ns >= WRITE_NS:
+                write.sent_ns = now_ns
                 kind = self.reported[write.name].kind
                 field = to_field(write.value, kind, bytewise=self.bytewise)
                 messages.append(m.MAVLink_param_set_message(*self.target, write.name.encode(), field, kind))
@@ -146,20 +146,20 @@ class ParameterExchange:
     def _end_writes(self, name: str, value: float) -> None:
         for write in list(self._writes):
             exact = self.bytewise and is_integer(self.reported[name].kind)
-            if write.name == name and write.said_ns is not None and is_confirmed(write.value, value, exact=exact):
+            if write.name == name and write.sent_ns is not None and is_confirmed(write.value, value, exact=exact):
                 self._writes.remove(write)
                 write.done(None)
 
 
-def is_confirmed(wanted: float, told: float, *, exact: bool) -> bool:
+def is_confirmed(wanted: float, reported: float, *, exact: bool) -> bool:
     """Return whether the vehicle reports the value that was written.
 
     Args:
         wanted: As written.
-        told: As reported.
+        reported: As reported.
         exact: If not, they are compared in single precision.
     """
-    return wanted == told if exact else math.isclose(wanted, told, rel_tol=1e-6, abs_tol=1e-9)
+    return wanted == reported if exact else math.isclose(wanted, reported, rel_tol=1e-6, abs_tol=1e-9)
 
 
 @dataclass(frozen=True, slots=True)

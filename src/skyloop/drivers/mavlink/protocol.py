@@ -21,7 +21,7 @@ from skyloop.drivers.mavlink.options import ConnectionKind, MavlinkOptions, Peer
 from skyloop.drivers.mavlink.parameters import ParameterExchange
 from skyloop.drivers.mavlink.setpoints import SetpointController
 from skyloop.drivers.mavlink.telemetry import HealthMonitor, Telemetry, VehicleState, feedback_of
-from skyloop.drivers.vehicle_session import LinkTimeouts, Notice, VehicleSession
+from skyloop.drivers.vehicle_session import LinkTimeouts, VehicleEvent, VehicleSession
 from skyloop.errors import DriverError
 from skyloop.messages import AnyAction, EventKind, FlightState, LinkState, Severity, Value
 from skyloop.wire.mavlink.codec import Codec, Message
@@ -32,7 +32,7 @@ TICK_NS: Final = nanoseconds(0.02)
 HEARTBEAT_NS: Final = nanoseconds(1.0)
 DEGRADED_NS: Final = nanoseconds(1.2)  #: of silence
 LOST_NS: Final = nanoseconds(2.5)
-FIRST_WORD_NS: Final = nanoseconds(2.5)  #: a vehicle not heard by then is reported as lost
+FIRST_WORD_NS: Final = nanoseconds(2.5)  #: a vehicle without any data by then is reported as lost
 PARAMETERS_NS: Final = nanoseconds(25.0)  #: the list may take so long, then the link is up without it
 QUIET_ATTITUDE_S: Final = 0.5  #: without it, other messages make feedback
 VERSION_PACE_S: Final = 1.0
@@ -74,7 +74,7 @@ class MavlinkSession(VehicleSession):
         self._intervals = MessageIntervals({})
         self._out: list[Message] = []
         self._found_ns = 0
-        self._beaten_ns = -HEARTBEAT_NS
+        self._heartbeat_ns = -HEARTBEAT_NS
         self._old = False  # it speaks MAVLink 1
         self._signed = 0
         self._unsupported_reason = "no data from it"
@@ -82,7 +82,7 @@ class MavlinkSession(VehicleSession):
 
     @property
     def identity(self) -> VehicleIdentity | None:
-        """The vehicle that was chosen; None while none is heard."""
+        """The vehicle that was chosen; None while none is found."""
         return self._selector.chosen
 
     @property
@@ -124,17 +124,17 @@ class MavlinkSession(VehicleSession):
         self._out.append(message)
         self.due_ns = 0
 
-    def _new_notices(self) -> list[Notice]:
-        return self.setpoints.notices() if self.setpoints is not None else []
+    def _new_events(self) -> list[VehicleEvent]:
+        return self.setpoints.pop_events() if self.setpoints is not None else []
 
     def close(self) -> None:
         """End the session: parameter writes under way fail."""
         self.parameters.fail_writes("the driver was closed")
 
     def vehicle_state(self, now_ns: int) -> VehicleState | None:
-        """Return what is known of the vehicle; None while it is not heard."""
+        """Return what is known of the vehicle; None while nothing is received."""
         custom_mode = self.telemetry.custom_mode()
-        if self._heard_ns is None or self.autopilot is None or custom_mode is None:
+        if self._received_ns is None or self.autopilot is None or custom_mode is None:
             return None
         ready = self.autopilot.ready(self.telemetry, now_ns)
         return self.telemetry.state(self.autopilot.mode_of(custom_mode), ready, now_ns)
@@ -157,23 +157,23 @@ class MavlinkSession(VehicleSession):
             if first:
                 text = "the vehicle signs its messages: give its key with ?signing_key=FILE; nothing is taken without"
                 self._unreachable = text
-                self._notice(Notice(EventKind.DRIVER_ERROR, text, Severity.ERROR, {"where": "signing"}))
+                self._publish_event(VehicleEvent(EventKind.DRIVER_ERROR, text, Severity.ERROR, {"where": "signing"}))
 
     def connected(self) -> None:
         """Handle a new connection: nothing is known yet of what it brings."""
         self._unreachable = ""
 
     def _on_message(self, message: Message, peer: Peer, now_ns: int) -> None:
-        for notice in self._selector.on_message(message, peer):
-            self._notice(notice)
+        for event in self._selector.on_message(message, peer):
+            self._publish_event(event)
         if not self._selector.is_chosen(message, peer):
             return
         kind = message.get_type()
-        if self._heard_ns is None:
+        if self._received_ns is None:
             if kind != "HEARTBEAT":
                 return
             self._find(message, now_ns)
-        self._heard_ns = now_ns
+        self._received_ns = now_ns
         self._old = message.get_msgbuf()[0] == m.PROTOCOL_MARKER_V1
         if kind not in _ANSWERS:
             self.telemetry.on_message(message, now_ns)
@@ -196,10 +196,10 @@ class MavlinkSession(VehicleSession):
         elif kind == "TIMESYNC":
             self._out += self.clock.on_timesync(message, now_ns)
         elif kind == "STATUSTEXT":
-            for notice in self._health.on_text(message):
-                self._notice(notice)
-                if self.setpoints is not None and notice.data["reason"] == "prearm":
-                    self.setpoints.on_prearm_reason(notice.text)
+            for event in self._health.on_text(message):
+                self._publish_event(event)
+                if self.setpoints is not None and event.data["reason"] == "prearm":
+                    self.setpoints.on_prearm_reason(event.text)
         elif kind == "AUTOPILOT_VERSION":
             self.version = message
             self.parameters.bytewise = bool(message.capabilities & BYTEWISE)
@@ -208,7 +208,7 @@ class MavlinkSession(VehicleSession):
             if age_s is None or age_s > QUIET_ATTITUDE_S:
                 self._publish(self.clock.now(now_ns), now_ns)
             if kind == "HEARTBEAT":
-                self.due_ns = 0  # whoever waits for a mode can go on
+                self.due_ns = 0  # a caller that waits for a mode can go on
 
     def _publish(self, captured_ns: int, now_ns: int) -> None:
         vehicle = self.vehicle_state(now_ns)
@@ -234,7 +234,7 @@ class MavlinkSession(VehicleSession):
         peer = identity.peer if identity is not None else self.options.peer
         packets = self._heartbeats(peer, now_ns)
         out, self._out = self._out, []
-        if self._heard_ns is not None:
+        if self._received_ns is not None:
             out += self.clock.poll(now_ns)
             out += self._fly(now_ns)
             self._check_health(now_ns)
@@ -254,11 +254,11 @@ class MavlinkSession(VehicleSession):
     def _heartbeats(self, peer: Peer, now_ns: int) -> list[Packet]:
         """Return the heartbeat when it is due.
 
-        A vehicle that speaks MAVLink 1 gets both versions: some autopilots change over once they hear the new one.
+        A vehicle that speaks MAVLink 1 gets both versions: some autopilots change over once they receive the new one.
         """
-        if now_ns - self._beaten_ns < HEARTBEAT_NS:
+        if now_ns - self._heartbeat_ns < HEARTBEAT_NS:
             return []
-        self._beaten_ns = now_ns
+        self._heartbeat_ns = now_ns
         versions = (1, 2) if self._old and self.options.key is None else (2,)
         return [(self.codec.encode(_heartbeat(), version=version), peer) for version in versions]
 
@@ -267,8 +267,8 @@ class MavlinkSession(VehicleSession):
 
     def _check_health(self, now_ns: int) -> None:
         vehicle = self.vehicle_state(now_ns)
-        for notice in self._health.update(self.telemetry, vehicle, now_ns):
-            self._notice(notice)
+        for event in self._health.update(self.telemetry, vehicle, now_ns):
+            self._publish_event(event)
         exchange = self.parameters
         if self.link_state is not LinkState.DEGRADED or self._silent(now_ns):
             return
@@ -277,7 +277,7 @@ class MavlinkSession(VehicleSession):
             self._set_link_state(LinkState.UP)
 
     def _silent(self, now_ns: int) -> bool:
-        return self._heard_ns is None or now_ns - self._heard_ns >= DEGRADED_NS
+        return self._received_ns is None or now_ns - self._received_ns >= DEGRADED_NS
 
     def _describe_silence(self, since: str, why: str) -> str:
         system = f" of system {self._selector.system}" if self._selector.system is not None else ""
@@ -300,7 +300,7 @@ class MavlinkSession(VehicleSession):
     # Losing and finding ------------------------------------------------------------------------------------------
 
     def _lose(self, reason: str, now_ns: int) -> None:
-        self._heard_ns = None
+        self._received_ns = None
         self._selector.forget()
         self.parameters.fail_writes(reason)
         self.commands.reset()
@@ -331,7 +331,7 @@ class MavlinkSession(VehicleSession):
         self._unsupported_reason = unsupported_reason(heartbeat)
         if self._unsupported_reason:
             text = f"the vehicle answers but can't be flown: {self._unsupported_reason}"
-            self._notice(Notice(EventKind.DRIVER_ERROR, text, Severity.ERROR, {"where": "autopilot"}))
+            self._publish_event(VehicleEvent(EventKind.DRIVER_ERROR, text, Severity.ERROR, {"where": "autopilot"}))
         self.autopilot = found
         if found is None:
             return
@@ -341,7 +341,9 @@ class MavlinkSession(VehicleSession):
             self.setpoints = SetpointController(
                 found, self.commands, height_m, lambda: found.thrust_model(self.parameters.values)
             )
-            self._notice(Notice(EventKind.VEHICLE_MESSAGE, limits_text(self.limits), data={"reason": "limits"}))
+            self._publish_event(
+                VehicleEvent(EventKind.VEHICLE_MESSAGE, limits_text(self.limits), data={"reason": "limits"})
+            )
 
     def limit(self, limits: Mapping[str, float]) -> None:
         """Set the driver's own limits."""

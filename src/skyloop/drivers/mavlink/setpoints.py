@@ -26,7 +26,7 @@ from skyloop.drivers.mavlink.manoeuvres import (
 from skyloop.drivers.mavlink.microservices import CommandSender, VehicleCommand
 from skyloop.drivers.mavlink.ownership import FlightOwnership
 from skyloop.drivers.mavlink.telemetry import VehicleState
-from skyloop.drivers.vehicle_session import Notice
+from skyloop.drivers.vehicle_session import VehicleEvent
 from skyloop.errors import DriverError
 from skyloop.messages import (
     AnyAction,
@@ -59,7 +59,7 @@ HURRY_NS: Final = nanoseconds(0.008)  #: a new set-point goes out no sooner afte
 class Goal(Enum):
     """What the vehicle is to do."""
 
-    NOTHING = auto()  #: it is left to itself, and to whoever else flies it
+    NOTHING = auto()  #: it is left to itself, and to whatever else flies it
     TAKE_OFF = auto()
     FOLLOW = auto()  #: a stream of set-points, hovering included
     HOLD = auto()  #: it holds its position by itself, without a stream
@@ -98,7 +98,7 @@ class SetpointController:
         self._strayed_ns: int | None = None  # since when it is another one again
         self._settling_ns: int | None = None  # since when a take-off is up, and waits for the mode that follows
         self._cut_ns = 0
-        self._notices: list[Notice] = []
+        self._events: list[VehicleEvent] = []
 
     # What is decided ---------------------------------------------------------------------------------------------
 
@@ -113,7 +113,7 @@ class SetpointController:
 
         Args:
             action: What is asked for.
-            vehicle: What is known of the vehicle; None while it is not heard.
+            vehicle: What is known of the vehicle; None while nothing is received.
             now_ns: The present time.
             alone: Whether nobody is in command: a failsafe.
             new: Whether an application newly asked for it; False for the library's repeats.
@@ -294,9 +294,9 @@ class SetpointController:
 
     # What is sent ------------------------------------------------------------------------------------------------
 
-    def notices(self) -> list[Notice]:
+    def pop_events(self) -> list[VehicleEvent]:
         """Return what happened since the last call."""
-        notices, self._notices = self._notices, []
+        notices, self._events = self._events, []
         return notices
 
     def messages(self, vehicle: VehicleState, now_ns: int) -> list[Message]:
@@ -322,7 +322,7 @@ class SetpointController:
         return []
 
     def _flight_is_over(self) -> None:
-        """Forget the flight: whoever flies the vehicle next begins anew."""
+        """Forget the flight: the next to fly the vehicle starts over."""
         self._end()
         self.ownership.on_flight_over()
 
@@ -414,4 +414,4 @@ class SetpointController:
             self._ask_for(self._autopilot.LAND, now_ns)
 
     def _notify(self, text: str, *, reason: str) -> None:
-        self._notices.append(Notice(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, {"reason": reason}))
+        self._events.append(VehicleEvent(EventKind.VEHICLE_MESSAGE, text, Severity.WARNING, {"reason": reason}))

@@ -1,4 +1,4 @@
-"""The newest messages of the vehicle, as feedback and as notices of its health. Pure."""
+"""The newest messages of the vehicle, as feedback and as events of its health. Pure."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from skyloop.clock import nanoseconds, seconds
-from skyloop.drivers.vehicle_session import Notice
+from skyloop.drivers.vehicle_session import VehicleEvent
 from skyloop.messages import EventKind, Feedback, FlightState, Severity, Value
 from skyloop.wire.mavlink.axes import Vector, flip, swap, turned, yaw_between
 from skyloop.wire.mavlink.codec import Message
@@ -346,42 +346,42 @@ class HealthMonitor:
 
     def __init__(self) -> None:
         self._texts = Texts()
-        self._told: dict[str, bool] = {}
+        self._reported: dict[str, bool] = {}
 
-    def on_text(self, message: Message) -> list[Notice]:
+    def on_text(self, message: Message) -> list[VehicleEvent]:
         """Handle a ``STATUSTEXT``; return whole texts, marked where they say why it can't be armed."""
-        notices = []
+        events = []
         for severity, text in self._texts.on_message(message):
             if severity >= DEBUG:
                 continue
             weight = Severity.ERROR if severity <= 3 else Severity.WARNING if severity == 4 else Severity.INFO
             reason = "prearm" if text.lower().startswith(_PREARM_WORDS) else "text"
             data: dict[str, Value] = {"reason": reason, "mav_severity": severity}
-            notices.append(Notice(EventKind.VEHICLE_MESSAGE, text, weight, data))
-        return notices
+            events.append(VehicleEvent(EventKind.VEHICLE_MESSAGE, text, weight, data))
+        return events
 
-    def update(self, telemetry: Telemetry, vehicle: VehicleState | None, now_ns: int) -> list[Notice]:
+    def update(self, telemetry: Telemetry, vehicle: VehicleState | None, now_ns: int) -> list[VehicleEvent]:
         """Return what changed since the last call."""
         ready = None if vehicle is None else vehicle.ready
-        notices = self._changed("ready", ready, "the vehicle is ready to be armed", "the vehicle can't be armed now")
+        events = self._changed("ready", ready, "the vehicle is ready to be armed", "the vehicle can't be armed now")
         gps = telemetry.newest("GPS_RAW_INT", now_ns, SLOW_S)
         if gps is not None:
             good = gps.fix_type >= GOOD_FIX
-            notices += self._changed("gps", good, "the vehicle's GPS has a fix", "the vehicle's GPS has no fix")
+            events += self._changed("gps", good, "the vehicle's GPS has a fix", "the vehicle's GPS has no fix")
         for kind in _EKF:
             ekf = telemetry.newest(kind, now_ns, SLOW_S)
             if ekf is not None:
                 # A PX4 at rest assumes that it stands still, and says so; only in the air does that mean it is lost.
                 counts = kind != "ESTIMATOR_STATUS" or (vehicle is not None and vehicle.airborne)
                 good = bool(ekf.flags & _PLACE) and not (counts and ekf.flags & _LOST)
-                notices += self._changed(
+                events += self._changed(
                     "ekf", good, "the vehicle knows where it is", "the vehicle does not know where it is"
                 )
-        return notices
+        return events
 
-    def _changed(self, name: str, good: bool | None, yes: str, no: str) -> list[Notice]:
-        if good is None or self._told.get(name) is good:
+    def _changed(self, name: str, good: bool | None, yes: str, no: str) -> list[VehicleEvent]:
+        if good is None or self._reported.get(name) is good:
             return []
-        self._told[name] = good
+        self._reported[name] = good
         severity = Severity.INFO if good else Severity.WARNING
-        return [Notice(EventKind.VEHICLE_MESSAGE, yes if good else no, severity, {"reason": name, "good": good})]
+        return [VehicleEvent(EventKind.VEHICLE_MESSAGE, yes if good else no, severity, {"reason": name, "good": good})]

@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 from skyloop.clock import monotonic_ns
 from skyloop.drivers.base import Sink
 from skyloop.drivers.intrinsics import intrinsics_of
-from skyloop.drivers.live_video import Decoder, LiveVideo, Notice, Picture
+from skyloop.drivers.live_video import Decoder, LiveVideo, Picture, VideoEvent
 from skyloop.drivers.mavlink.options import FACINGS, CameraOptions
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import MissingExtraError, UsageError
@@ -81,7 +81,7 @@ class CameraReceiver:
             connect=self._connect,
             make_decoder=_make_decoder,
             show=self._show,
-            told=self._tell,
+            on_event=self._publish_event,
             wants=lambda: sink.wants(options.name),
             name="skyloop-camera",
         )
@@ -125,8 +125,8 @@ class CameraReceiver:
     def _show(self, picture: Picture) -> None:
         picture.show(self._sink, self._options.name, self._intrinsics(picture.width, picture.height))
 
-    def _tell(self, notice: Notice, text: str) -> None:
-        notice.tell(self._sink, "camera", text)
+    def _publish_event(self, event: VideoEvent, text: str) -> None:
+        event.publish(self._sink, "camera", text)
 
 
 def without_secrets(source: str) -> str:

@@ -1,4 +1,4 @@
-"""Plays a recording: on a thread by the clock, or sample by sample for whoever moves the time."""
+"""Plays a recording: on a thread by the clock, or sample by sample for a caller that moves the time."""
 
 from __future__ import annotations
 

@@ -117,7 +117,7 @@ def _world_entries(state: ParameterValues, standard: ParameterValues) -> list[_S
         type=ParameterType.BOOL,
         value=state.link,
         default=True,
-        description="whether the drone's radio works: without it nothing is heard, and commands are lost",
+        description="whether the drone's radio works: without it nothing is received, and commands are lost",
     )
     return [
         _Settable(wind, lambda before, value: replace(before, wind=replace(before.wind, mean_m_s=_vector(value)))),

@@ -6,7 +6,7 @@ from typing import Final
 
 from skyloop.clock import monotonic_ns
 from skyloop.drivers.base import Driver, Sink
-from skyloop.drivers.live_video import LiveVideo, Notice, Picture
+from skyloop.drivers.live_video import LiveVideo, Picture, VideoEvent
 from skyloop.drivers.tello.link import TelloLink
 from skyloop.drivers.tello.options import options_of
 from skyloop.drivers.tello.parameters import DroneSettings
@@ -106,8 +106,8 @@ class TelloDriver(Driver):
             camera = settings.camera
             picture.show(sink, camera, intrinsics_for(self._cameras[0], camera, picture.width))
 
-        def tell(notice: Notice, text: str) -> None:
-            notice.tell(sink, "video", text)
+        def publish_video_event(event: VideoEvent, text: str) -> None:
+            event.publish(sink, "video", text)
 
         def came(_coded: object) -> None:
             self._video_ns = monotonic_ns()
@@ -117,7 +117,7 @@ class TelloDriver(Driver):
             connect=lambda number: VideoStream(self.options, lambda: link.addresses, number, monotonic_ns),
             make_decoder=TelloVideo,
             show=show,
-            told=tell,
+            on_event=publish_video_event,
             wants=lambda: sink.wants(settings.camera),
             came=came,
             name="tello-video",

@@ -47,7 +47,7 @@ class TelloOptions:
 
     @property
     def own_ports(self) -> bool:
-        """Whether the drone must be told where to send state and video."""
+        """Whether the drone needs a command about where to send state and video."""
         return (self.state_port, self.video_port) != (STATE_PORT, VIDEO_PORT)
 
 

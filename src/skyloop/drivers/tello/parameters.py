@@ -146,7 +146,7 @@ def flip_parameter(value: str) -> Parameter:
     )
 
 
-def told_parameters(sdk: Sdk | None, serial: str) -> list[Parameter]:
+def reported_parameters(sdk: Sdk | None, serial: str) -> list[Parameter]:
     """Return what the drone reported of itself, read-only."""
     made = []
     if sdk is not None:
@@ -212,7 +212,7 @@ class DroneSettings:
             msgspec.structs.replace(setting.parameter, value=self._values[name])
             for name, setting in known_settings(sdk).items()
         ]
-        return [*scales, flip_parameter(self._flip), *kept, *told_parameters(sdk, serial)]
+        return [*scales, flip_parameter(self._flip), *kept, *reported_parameters(sdk, serial)]
 
     def write(self, name: str, value: Value) -> Value:
         """Write a parameter and return the value in force. Takes up to 0.95 s.

@@ -11,7 +11,7 @@ from skyloop.clock import nanoseconds
 from skyloop.drivers.tello.options import TelloOptions
 from skyloop.drivers.tello.setpoints import SetpointController
 from skyloop.drivers.tello.telemetry import Health, feedback_of, native_of
-from skyloop.drivers.vehicle_session import LinkTimeouts, Notice, VehicleSession, message
+from skyloop.drivers.vehicle_session import LinkTimeouts, VehicleEvent, VehicleSession, message
 from skyloop.errors import DecodeError
 from skyloop.messages import AnyAction, LinkState, Severity, Value
 from skyloop.wire.tello.commands import ENTER, Sdk, decoded, ports
@@ -132,7 +132,7 @@ TICK_NS: Final = nanoseconds(0.05)  #: between two ``rc``
 HURRY_NS: Final = nanoseconds(0.02)  #: least time between two ``rc``
 DEGRADED_NS: Final = nanoseconds(0.6)  #: of silence; states come ten times a second
 LOST_NS: Final = nanoseconds(1.5)
-FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a drone that was never heard by then is reported as lost
+FIRST_WORD_NS: Final = nanoseconds(2.0)  #: a drone without any data by then is reported as lost
 ENTER_NS: Final = nanoseconds(0.5)  #: between two ``command`` while no state comes
 ALIVE_NS: Final = nanoseconds(4.0)  #: between questions that keep the drone from landing by itself after 15 s
 DEAF: Final = 2  #: questions in a row without an answer: our commands are not received
@@ -184,7 +184,7 @@ class TelloSession(VehicleSession):
         self._quality: int | None = None
         self._rc_ns = 0
         self._flips: list[str] = []
-        self._told_ports = False
+        self._reported_ports = False
         self._answered = False  # while no state comes
         self.local = ""  #: this host's address towards the drone
         self._place = f"{options.host}, UDP port {options.port}"
@@ -224,8 +224,8 @@ class TelloSession(VehicleSession):
         self._flips.append(f"flip {direction}")
         self.due_ns = 0
 
-    def _new_notices(self) -> list[Notice]:
-        return self.setpoints.notices()
+    def _new_events(self) -> list[VehicleEvent]:
+        return self.setpoints.pop_events()
 
     def close(self) -> None:
         """End the session: requests that wait get no answer."""
@@ -241,15 +241,15 @@ class TelloSession(VehicleSession):
             self.counts["damaged"] += 1
             return
         self.counts["received"] += 1
-        begins, self._heard_ns = self._heard_ns is None, now_ns
+        begins, self._received_ns = self._received_ns is None, now_ns
         self.setpoints.watch.update(state, now_ns)
         self.setpoints.on_state(now_ns)
         if begins:
             self._begin(now_ns)
         elif self.link_state is LinkState.DEGRADED and self.ready:
             self._set_link_state(LinkState.UP)
-        for notice in self._health.notices(state):
-            self._notice(notice)
+        for event in self._health.changes(state):
+            self._publish_event(event)
         native = native_of(state)
         native.update(self._telemetry())
         feedback = feedback_of(state, self.setpoints.flight_state(), now_ns, self.options.velocity_axes, native)
@@ -261,7 +261,7 @@ class TelloSession(VehicleSession):
         if not reply:
             self.counts["damaged"] += 1
             return
-        if self._heard_ns is None:
+        if self._received_ns is None:
             self._answered = True
             self._look_at_refused_ports(reply)
             return
@@ -271,21 +271,21 @@ class TelloSession(VehicleSession):
         self.due_ns = min(self.due_ns, max(now_ns, self._rc_ns + HURRY_NS))
 
     def _look_at_refused_ports(self, reply: str) -> None:
-        if self.options.own_ports and is_error(reply) and not self._told_ports:
-            self._told_ports = True
+        if self.options.own_ports and is_error(reply) and not self._reported_ports:
+            self._reported_ports = True
             text = (
                 f"the drone answers {reply!r}: other ports than 8890 and 11111 need SDK 3.0; leave state_port and "
                 "video_port out"
             )
-            self._notice(message(text, "ports_refused", Severity.ERROR))
+            self._publish_event(message(text, "ports_refused", Severity.ERROR))
 
     def _telemetry(self) -> dict[str, Value]:
-        told: dict[str, Value] = {f"state.{name}": count for name, count in self.counts.items()}
-        told.update({f"replies.{name}": count for name, count in self.conversation.counts.items()})
+        native: dict[str, Value] = {f"state.{name}": count for name, count in self.counts.items()}
+        native.update({f"replies.{name}": count for name, count in self.conversation.counts.items()})
         if self._quality is not None:
-            told["wifi"] = self._quality
-        told.update(self._extra())
-        return told
+            native["wifi"] = self._quality
+        native.update(self._extra())
+        return native
 
     # Time ------------------------------------------------------------------------------------------------------
 
@@ -294,7 +294,7 @@ class TelloSession(VehicleSession):
         self._check_silence(now_ns)
         self.due_ns = now_ns + TICK_NS
         texts = []
-        if self._heard_ns is None and now_ns - self._entered_ns >= ENTER_NS:
+        if self._received_ns is None and now_ns - self._entered_ns >= ENTER_NS:
             self._entered_ns = now_ns
             texts.append(ENTER)
             if self.options.own_ports:
@@ -307,7 +307,7 @@ class TelloSession(VehicleSession):
         if stick is not None and (now_ns - self._rc_ns >= HURRY_NS):
             self._rc_ns = now_ns
             texts.append(stick.text)
-        if self._heard_ns is not None:
+        if self._received_ns is not None:
             self._keep_alive(now_ns)
             self._keep_video(now_ns)
             texts += self.conversation.messages(now_ns)
@@ -320,7 +320,7 @@ class TelloSession(VehicleSession):
             self.conversation.ask(Request(ALIVE, self._alive))
         elif not self.ready and not self._asking_version:
             self._asking_version = True
-            self.conversation.ask(Request("sdk?", self._version_told))
+            self.conversation.ask(Request("sdk?", self._on_version))
 
     def _alive(self, reply: str | None) -> None:
         if reply is None:
@@ -356,7 +356,7 @@ class TelloSession(VehicleSession):
     # Losing and finding ----------------------------------------------------------------------------------------
 
     def _lose(self, reason: str, now_ns: int) -> None:
-        self._heard_ns = None
+        self._received_ns = None
         self.ready = self._asking_version = False
         self.conversation.abandon()
         self.setpoints.lost(now_ns)
@@ -367,21 +367,21 @@ class TelloSession(VehicleSession):
         self._deaf, self._alive_ns, self._asked_video_ns = 0, now_ns, 0
         self.due_ns = 0
 
-    def _version_told(self, reply: str | None) -> None:
+    def _on_version(self, reply: str | None) -> None:
         self._asking_version = False
-        if self._heard_ns is None:
+        if self._received_ns is None:
             return
         if reply is None:
             self._set_link_state(LinkState.DEGRADED, "the drone sends its state, but answers no command")
             return
         self.sdk = _SDK.get(reply, Sdk.V1_3 if is_error(reply) else Sdk.V3_0)
         self.ready, self._deaf = True, 0
-        self.conversation.ask(Request("sn?", self._serial_told))
+        self.conversation.ask(Request("sn?", self._on_serial))
         for text in self.remembered.values():
             self.conversation.ask(Request(text, _whatever))
         self._set_link_state(LinkState.UP)
 
-    def _serial_told(self, reply: str | None) -> None:
+    def _on_serial(self, reply: str | None) -> None:
         if reply is not None and not is_error(reply):
             self.serial = reply
 

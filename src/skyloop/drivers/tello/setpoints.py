@@ -11,7 +11,7 @@ from typing import Final
 
 from skyloop.clock import nanoseconds
 from skyloop.drivers.tello.telemetry import FlightWatch
-from skyloop.drivers.vehicle_session import Notice, message
+from skyloop.drivers.vehicle_session import VehicleEvent, message
 from skyloop.errors import DriverError
 from skyloop.messages import (
     AnyAction,
@@ -111,18 +111,18 @@ class SetpointController:
         self.watch = FlightWatch()
         self.full = Scale()
         self.limits = Scale()
-        self.heard = False  #: whether the drone's state comes
+        self.receiving = False  #: whether the drone's state comes
         self._decision = Decision.STAY
         self._stick = LEVEL
         self._decided_ns = 0
-        self._said_ns: int | None = None  # the take-off or landing
+        self._sent_ns: int | None = None  # the take-off or landing
         self._stopped = False  # motors cut by us, until the reset
         self._stops = 0
         self._stop_ns = 0
         self._stop_done = True
-        self._was_in_air = False  # when it was heard last
+        self._was_in_air = False  # when its state came last
         self._steering = False  # this flight was begun, or taken, here: else another program may be flying it
-        self._notices: list[Notice] = []
+        self._events: list[VehicleEvent] = []
 
     @property
     def intent(self) -> tuple[object, ...]:
@@ -150,8 +150,8 @@ class SetpointController:
             What is applied: a set-point within the limits, or hover after an emergency stop.
 
         Raises:
-            DriverError: A take-off while the drone is not heard or after an emergency stop, or a reset while it is not
-                heard or its motors still run.
+            DriverError: A take-off while nothing is received or after an emergency stop, or a reset while it is not
+                received or its motors still run.
         """
         if isinstance(action, Idle):
             return action
@@ -186,7 +186,7 @@ class SetpointController:
         self._stick = LEVEL
         if decision is self._decision:
             return
-        self._decision, self._decided_ns, self._said_ns = decision, now_ns, None
+        self._decision, self._decided_ns, self._sent_ns = decision, now_ns, None
         self.watch.rising = decision is Decision.TAKE_OFF
         self.watch.sinking = decision is Decision.LAND
         self.watch.landing_answered = False
@@ -197,7 +197,7 @@ class SetpointController:
         self._stick = stick
 
     def _take_off(self, now_ns: int) -> None:
-        if not self.heard:
+        if not self.receiving:
             raise DriverError("no data from the drone: take-off is refused until the link is up")
         if self.watch.in_air:
             self._remain(LEVEL, now_ns)
@@ -209,14 +209,14 @@ class SetpointController:
         self._stick = LEVEL
         if not self._stopped:
             text = "the drone was commanded to cut its motors; reset the emergency when it is safe on the ground"
-            self._notices.append(Notice(EventKind.EMERGENCY, text, Severity.ERROR, {"reason": "user"}))
+            self._events.append(VehicleEvent(EventKind.EMERGENCY, text, Severity.ERROR, {"reason": "user"}))
         self._stopped, self._stop_done = True, False
         self._stops, self._stop_ns = 0, now_ns
 
     def _reset(self, now_ns: int) -> None:
         if not self._stopped:
             return
-        if not self.heard:
+        if not self.receiving:
             raise DriverError("no data from the drone: whether it is on the ground is not known")
         if not self._stop_done and self.watch.motors(now_ns):
             raise DriverError("the motors still run: the stop has not shown yet")
@@ -227,7 +227,7 @@ class SetpointController:
     def on_state(self, now_ns: int) -> None:
         """Handle that the watch has seen a new state."""
         phase = self.watch.phase
-        self.heard = True
+        self.receiving = True
         self._was_in_air = phase.airborne
         shown = {Decision.TAKE_OFF: FlightState.HOVERING, Decision.LAND: FlightState.LANDED}.get(self._decision)
         if phase is shown:
@@ -254,11 +254,11 @@ class SetpointController:
         elif motion == TAKEOFF and refused and self._decision is Decision.TAKE_OFF and not self.watch.phase.airborne:
             self._decide(Decision.STAY, now_ns)
             text = f"the drone refused to take off: {reply!r}"
-            self._notices.append(message(text, "takeoff_refused", Severity.WARNING, reply=reply))
+            self._events.append(message(text, "takeoff_refused", Severity.WARNING, reply=reply))
 
     def lost(self, now_ns: int) -> None:
-        """Cancel a take-off and level the sticks: the drone is not heard any more. A landing is still sent."""
-        self.heard = False
+        """Cancel a take-off and level the sticks: nothing is received any more. A landing is still sent."""
+        self.receiving = False
         if self._decision is Decision.TAKE_OFF:
             self._decide(Decision.STAY, now_ns)
         self._stick = LEVEL
@@ -267,9 +267,9 @@ class SetpointController:
 
     # What is sent ----------------------------------------------------------------------------------------------
 
-    def notices(self) -> list[Notice]:
-        """Return the notices since the last call."""
-        notices, self._notices = self._notices, []
+    def pop_events(self) -> list[VehicleEvent]:
+        """Return the events since the last call."""
+        notices, self._events = self._events, []
         return notices
 
     def motions(self, now_ns: int) -> list[str]:
@@ -280,10 +280,10 @@ class SetpointController:
             if now_ns - self._decided_ns >= TAKEOFF_NS:
                 self._decide(Decision.STAY, now_ns)
                 text = "the drone did not take off: it may refuse because of its battery, its heat or its tilt"
-                self._notices.append(message(text, "no_takeoff", Severity.WARNING))
+                self._events.append(message(text, "no_takeoff", Severity.WARNING))
                 return []
             return self._again(TAKEOFF, now_ns)
-        landed = self.heard and self.watch.phase is FlightState.LANDED
+        landed = self.receiving and self.watch.phase is FlightState.LANDED
         if self._decision is Decision.LAND and not landed:
             return self._again(LAND, now_ns)
         return []
@@ -295,14 +295,14 @@ class SetpointController:
         """
         if self._stopped or self._decision is not Decision.STAY or not self._steering:
             return None
-        if self.heard:
+        if self.receiving:
             return self._stick if self.watch.in_air else None
         return LEVEL if self._was_in_air else None
 
     def _again(self, text: str, now_ns: int) -> list[str]:
-        if self._said_ns is not None and now_ns - self._said_ns < AGAIN_NS:
+        if self._sent_ns is not None and now_ns - self._sent_ns < AGAIN_NS:
             return []
-        self._said_ns = now_ns
+        self._sent_ns = now_ns
         return [text]
 
     def _emergency(self, now_ns: int) -> list[str]:

@@ -12,7 +12,7 @@ from typing import Final
 
 from skyloop.clock import nanoseconds
 from skyloop.drivers.tello.options import VelocityAxes
-from skyloop.drivers.vehicle_session import Notice, message
+from skyloop.drivers.vehicle_session import VehicleEvent, message
 from skyloop.messages import Feedback, FlightState, Severity, Value
 from skyloop.messages.geometry import wrap_angle
 from skyloop.wire.tello.state import GROUND_CM, Pad, State, Vector
@@ -112,7 +112,7 @@ class FlightWatch:
     """Tracks the phase of flight: UNKNOWN, LANDED, TAKING_OFF, HOVERING (in the air), LANDING.
 
     ``rising`` and ``sinking``: whether a take-off or a landing was asked for and is not done. ``landing_answered``:
-    whether the drone said that it landed.
+    whether the drone answered that it landed.
     """
 
     def __init__(self) -> None:
@@ -198,11 +198,11 @@ class Health:
         self._pad = 0
         self._without = 0
 
-    def notices(self, state: State) -> list[Notice]:
+    def changes(self, state: State) -> list[VehicleEvent]:
         """Return what changed since the last call."""
         return self._temperature(state.temperature_c) + self._mission_pad(state)
 
-    def _temperature(self, range_c: tuple[float, float] | None) -> list[Notice]:
+    def _temperature(self, range_c: tuple[float, float] | None) -> list[VehicleEvent]:
         if range_c is None:
             return []
         highest = range_c[1]
@@ -213,7 +213,7 @@ class Health:
         text = f"the drone is hot: {highest:g} °C" if hot else "no longer: the drone is hot"
         return [message(text, "hot", Severity.WARNING if hot else Severity.INFO, active=hot, celsius=highest)]
 
-    def _mission_pad(self, state: State) -> list[Notice]:
+    def _mission_pad(self, state: State) -> list[VehicleEvent]:
         number = state.pad.number if state.pad is not None else 0
         self._without = 0 if number else self._without + 1
         if number == self._pad or (not number and self._without < PAD_LOST):
@@ -224,7 +224,7 @@ class Health:
         return [message(f"mission pad m{before} is out of view", "mission_pad", pad=before, in_view=False)]
 
 
-def _seen(pad: Pad) -> Notice:
+def _seen(pad: Pad) -> VehicleEvent:
     """Report a pad with its place: the drone's, in the pad's axes [m]."""
     text = f"mission pad m{pad.number} is in view"
     if pad.place_cm is None:

@@ -85,7 +85,7 @@ def intrinsics_for(front: CameraInfo, camera: str, width: int) -> Intrinsics | N
 # Datagrams to access units -------------------------------------------------------------------------------------------
 
 POLL_S: Final = 0.1
-SILENT_S: Final = 3.0  #: without a datagram for so long, the port is opened anew
+SILENT_S: Final = 3.0  #: without a datagram for so long, the port is opened again
 BURST: Final = 64
 
 
@@ -112,7 +112,7 @@ class VideoStream:
         self._connection = connection
         self._clock = clock
         self._assembly = Assembly()
-        self._heard_ns = clock()
+        self._received_ns = clock()
         self._socket = receiving_socket(options, local, options.video_port)
 
     @property
@@ -134,7 +134,7 @@ class VideoStream:
         frames: list[Coded] = []
         if select.select([self._socket], [], [], POLL_S)[0]:
             self._drain(frames)
-        if self._clock() - self._heard_ns > nanoseconds(SILENT_S):
+        if self._clock() - self._received_ns > nanoseconds(SILENT_S):
             raise TimeoutError(f"no video came for {SILENT_S:g} s")
         return frames
 
@@ -151,7 +151,7 @@ class VideoStream:
                 return
             if sender[0] != self._drone:
                 continue
-            now_ns = self._heard_ns = self._clock()
+            now_ns = self._received_ns = self._clock()
             for unit in self._assembly.feed(datagram, now_ns):
                 frames.append(Coded(unit, unit.is_key, unit.arrived_ns, now_ns, self._connection))
             if frames:
@@ -164,7 +164,7 @@ class VideoStream:
 #: encoded with 0.3 Mbit/s, a marker was found in 81 % of the pictures that are shown with 1 here, in 73 % with 2, in
 #: 67 % with 3.
 MOST_DAMAGED: Final = 2
-MOST_UNITS: Final = 120  #: kept to be decoded anew; key pictures of the drone are 30 apart
+MOST_UNITS: Final = 120  #: kept to be decoded again; key pictures of the drone are 30 apart
 _PURPOSE: Final = "the video of a Tello"
 
 

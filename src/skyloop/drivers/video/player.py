@@ -20,7 +20,7 @@ from skyloop.wire.ardrone.pave import PaveFrame
 FEEDBACK_NS: Final = 50_000_000
 POLL_S: Final = 0.02
 RETRY_S: Final = 1.0
-BEHIND_NS: Final = 250_000_000  #: further behind than this, a schedule starts anew instead of rushing to catch up
+BEHIND_NS: Final = 250_000_000  #: further behind than this, a schedule restarts instead of rushing to catch up
 GAP_S: Final = 2.0  #: a longer step between two stamps, or one backwards, is a cut in the recording
 LATE_NS: Final = 100_000_000  #: a live picture older than this is skipped for a newer one
 
@@ -243,14 +243,14 @@ class LivePlayer:
     def run(self) -> None:
         """Play until the driver is closed."""
         publisher = self._publisher
-        told = ""
+        reported = ""
         while not publisher.stop.is_set():
             try:
                 source = self._open()
             except SkyloopError as error:
                 reason = str(error)
             else:
-                told = ""
+                reported = ""
                 try:
                     if not publisher.stop.is_set():  # opening may take longer than the driver was open
                         publisher.sink.link(LinkState.UP)
@@ -262,9 +262,9 @@ class LivePlayer:
                     source.close()
             if publisher.stop.is_set():
                 return
-            if reason != told:
+            if reason != reported:
                 publisher.sink.link(LinkState.LOST, reason)
-                told = reason
+                reported = reason
             publisher.stop.wait(self._retry_s)
 
     def _play(self, source: Source) -> None:
