@@ -129,8 +129,8 @@ def process(
         ray.cloudpickle.register_pickle_by_value(module)
     options = {"max_restarts": -1, **options, "runtime_env": _runtime_env(options.get("runtime_env"))}
     actor = ray.remote(_Actor).options(**options)
-    order = _Order(code.kind, drone, settings)
-    found = Workers([actor.remote(order) for _ in range(workers)])
+    task = _Order(code.kind, drone, settings)
+    found = Workers([actor.remote(task) for _ in range(workers)])
     try:
         _await_start(found)
     except BaseException:
@@ -165,24 +165,24 @@ def _await_start(workers: Workers) -> None:
 class _Actor:
     """One worker, on a host that Ray chooses."""
 
-    def __init__(self, order: _Order) -> None:
+    def __init__(self, task: _Order) -> None:
         self._trouble = ""
         self._worker: Worker | None = None
         try:
-            self._begin(order)
+            self._begin(task)
         except SkyloopError as error:
             self._trouble = str(error)
         except Exception as error:  # noqa: BLE001  (the user's class may raise anything when it is made)
-            self._trouble = f"{order.kind.__name__}() raised {error!r}"
+            self._trouble = f"{task.kind.__name__}() raised {error!r}"
 
-    def _begin(self, order: _Order) -> None:
+    def _begin(self, task: _Order) -> None:
         from skyloop.client import connect
 
-        name = f"{order.settings.name[:32]}@{os.uname().nodename[:20]}:{os.getpid()}"
-        processor = Code(order.kind, order.settings.code).make()
-        drone = connect(order.drone, access="observe", name=name)
+        name = f"{task.settings.name[:32]}@{os.uname().nodename[:20]}:{os.getpid()}"
+        processor = Code(task.kind, task.settings.code).make()
+        drone = connect(task.drone, access="observe", name=name)
         try:
-            self._worker = Worker(drone, processor, order.settings, print)
+            self._worker = Worker(drone, processor, task.settings, print)
         except BaseException:
             drone.close()
             raise
@@ -193,7 +193,7 @@ class _Actor:
             worker.run(math.inf)
         except SkyloopError as error:
             self._trouble = str(error)
-        except BaseException as error:  # noqa: BLE001  (nobody else hears of it: the status says that it has ended)
+        except BaseException as error:  # noqa: BLE001  (nobody else learns of it: the status shows that it has ended)
             self._trouble = f"its thread raised {error!r}"
 
     def status(self) -> tuple[Status | None, str]:

@@ -59,7 +59,7 @@ def test_a_proxy_that_answers_but_sends_no_feedback_is_degraded_not_lost(
     flow(monitor, clock, range(40))
     for _ in range(30):
         clock.advance(0.1)
-        monitor.heard_ns = clock()
+        monitor.received_ns = clock()
     verdict = monitor.verdict(clock())
     assert (verdict.state, verdict.restart) == (LinkState.DEGRADED, False)
 
@@ -120,7 +120,7 @@ def test_stall_watch_asks_once_per_patience() -> None:
         clock.advance(0.1)
         asked.append(watch.stalled(True, clock()))
     assert sum(asked) == 3
-    watch.heard_ns = clock()
+    watch.received_ns = clock()
     clock.advance(0.9)
     assert not watch.stalled(True, clock())
     clock.advance(5.0)

@@ -12,7 +12,7 @@ import pytest
 
 from skyloop import aio
 from skyloop.client import Authority, AuthorityStatus, Drone
-from skyloop.client.authority import TakeoverRequest, authority_wish
+from skyloop.client.authority import TakeoverRequest, authority_request
 from skyloop.client.commands import _busy
 from skyloop.client.drone import open_drone
 from skyloop.errors import AuthorityError, UsageError
@@ -196,4 +196,4 @@ def test_with_asyncio(shared: Shared) -> None:
 )
 def test_what_can_not_be_wished_for(wish: dict[str, Any]) -> None:
     with pytest.raises(UsageError, match="must be"):
-        authority_wish(**wish)
+        authority_request(**wish)

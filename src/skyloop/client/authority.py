@@ -37,7 +37,7 @@ class Authority:
     Attributes:
         priority: 0 (highest) to 31 (lowest); a higher one pre-empts a lower one.
         wait_s: How long to wait in the queue while another application holds the authority [s].
-        for_s: How long the authority is wanted [s], up to a day; then it goes to whoever wants it. None: open.
+        for_s: How long the authority is wanted [s], up to a day; then others can get it. None: open.
         takeover: ``"now"`` pre-empts a holder of lower priority at once, ``"ask"`` asks the holder first.
         stay: Whether to stay in the queue after ``wait_s``, without the authority, instead of failing.
 
@@ -52,7 +52,7 @@ class Authority:
     stay: bool = False
 
     def __post_init__(self) -> None:
-        authority_wish(self.priority, self.for_s, self.takeover)
+        authority_request(self.priority, self.for_s, self.takeover)
         check_seconds("wait_s", self.wait_s)
 
 
@@ -91,7 +91,7 @@ class AuthorityStatus:
 
 
 class AuthorityTracker:
-    """Follows the authority of one application. Methods that return a bool tell whether the status changed."""
+    """Follows the authority of one application. Methods that return a bool return whether the status changed."""
 
     #: Feedback that names no owner may be older than the grant for this long.
     SETTLE_NS = nanoseconds(0.5)
@@ -102,7 +102,7 @@ class AuthorityTracker:
         self.wanted = False  #: the application asked for it and has not given it back
         self.pending = False  #: asked for on this connection, and not answered yet
         self.status = AuthorityStatus()
-        self.wish = RequestAuthority()  #: the last request, repeated on another connection
+        self.last_request = RequestAuthority()  #: the last request, repeated on another connection
         self.declined = ""  #: why the holder declined
         #: Whether to request it again by itself after a lost connection, or after the lease was lost by silence.
         self.renews = True
@@ -125,12 +125,12 @@ class AuthorityTracker:
         self.wanted = self.wanted and self.renews
         return self._set(AuthorityStatus("none", priority=self.status.priority))
 
-    def asked(self, wish: RequestAuthority) -> None:
+    def asked(self, request: RequestAuthority) -> None:
         """Note that the authority is being requested."""
         self.wanted = self.pending = True
-        self.wish = wish
+        self.last_request = request
         self.declined = ""
-        self.status = replace(self.status, priority=wish.priority)
+        self.status = replace(self.status, priority=request.priority)
 
     def granted(self, lease: int, now_ns: int, until_ns: int | None = None) -> bool:
         """Note a grant, known from a reply, an event or feedback.
@@ -246,7 +246,7 @@ class TakeoverQuery:
     by_id: int  #: number of the application that asks, in this run of the proxy
 
 
-def authority_wish(priority: int, for_s: float | None = None, takeover: TakeoverWay = "now") -> RequestAuthority:
+def authority_request(priority: int, for_s: float | None = None, takeover: TakeoverWay = "now") -> RequestAuthority:
     """Return the request for the authority.
 
     Args:
@@ -288,9 +288,9 @@ def answering(
         query = takeover_query(event, app_id())
         if query is None:
             return
-        said = function(query.request)
-        if said is not None:
-            answer(query.lease, query.by_id, said is True, said if isinstance(said, str) else "")
+        reply = function(query.request)
+        if reply is not None:
+            answer(query.lease, query.by_id, reply is True, reply if isinstance(reply, str) else "")
 
     return on_event
 

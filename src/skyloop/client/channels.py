@@ -201,12 +201,12 @@ class VideoChannel(Channel[Arrival]):
         del before
         counter.follow(header.seq)
         counter.add(now_ns + offset_ns - header.published_ns, header.captured_ns - offset_ns, now_ns)
-        self.watch.heard_ns = now_ns
+        self.watch.received_ns = now_ns
 
     def restart(self, now_ns: int) -> None:
         """Reset the frame number: a proxy was connected, which may count its frames from 0."""
         self.counter.last_seq = None
-        self.watch.heard_ns = now_ns
+        self.watch.received_ns = now_ns
 
     def stats(self, now_ns: int) -> ChannelStats:
         """Return the statistics at ``now_ns``."""

@@ -207,11 +207,11 @@ class CommandSender:
         with self._lock:
             return self.is_newest(action) and self._schedule.action is not action and self._connection.connected
 
-    def request(self, wish: RequestAuthority, wait_s: float, *, stay: bool = False) -> AuthorityStatus:
+    def request(self, request: RequestAuthority, wait_s: float, *, stay: bool = False) -> AuthorityStatus:
         """Request the authority and wait for it; see :meth:`skyloop.client.drone.Drone.request_authority`.
 
         Args:
-            wish: The request.
+            request: The request.
             wait_s: How long to wait in the queue [s].
             stay: Stay in the queue after ``wait_s`` instead of raising.
 
@@ -222,7 +222,7 @@ class CommandSender:
         if self._role is Role.OBSERVER:
             raise AuthorityError('this application observes: connect with access="pilot" to fly', code="observer")
         with self._lock:
-            self._authority.asked(wish)
+            self._authority.asked(request)
             self._refusal = None
             self._ask_now = True
         self._connection.poke()
@@ -268,7 +268,7 @@ class CommandSender:
             else:
                 self._connection.ask(ReleaseAuthority(), lambda _: None, ANSWER_S)
         if changed:
-            self._told()
+            self._notify()
 
     # For the connection ----------------------------------------------------------------------------------------
 
@@ -284,7 +284,7 @@ class CommandSender:
             self._schedule.clear()
             changed = self._authority.disconnected()
         if changed:
-            self._told()
+            self._notify()
 
     def feedback(self, sample: Feedback, now_ns: int) -> None:
         """Update the authority and the set-point from the vehicle's state."""
@@ -312,20 +312,20 @@ class CommandSender:
         Returns:
             When to call again at the latest [ns].
         """
-        wish, stalled, due_ns = None, False, now_ns + _LATER_NS
+        last_request, stalled, due_ns = None, False, now_ns + _LATER_NS
         with self._lock:
             authority, present = self._authority, self.is_present(now_ns)
             asks = self._ask_now or (authority.status.state == "none" and not authority.pending)
             if authority.wanted and present and asks:
                 self._ask_now = False
-                wish = authority.wish
-                authority.asked(wish)
+                last_request = authority.last_request
+                authority.asked(last_request)
             if (authority.held and present) or isinstance(self._schedule.action, EmergencyStop):
                 if self._schedule.due_ns <= now_ns:
                     stalled = self._decay(now_ns)
                 due_ns = self._schedule.due_ns
-        if wish is not None:
-            self._connection.ask(wish, self._answered, ANSWER_S)
+        if last_request is not None:
+            self._connection.ask(last_request, self._answered, ANSWER_S)
         if stalled:
             text = "the application made no call for too long: its set-point decayed to hover"
             self._emit(EventKind.FAILSAFE, text, step="hover", reason="stalled")
@@ -384,10 +384,10 @@ class CommandSender:
                 self._schedule.clear()
         if status.state == "held" and status.lease != before.lease:
             self._granted(status.lease)
-        self._told()
+        self._notify()
         self._connection.poke()
 
-    def _told(self) -> None:
+    def _notify(self) -> None:
         self.notifier.notify()
         self._changed()
 
@@ -425,10 +425,10 @@ def _busy(status: AuthorityStatus, wait_s: float, declined: str) -> str:
     waited = f" and did not give it back within {wait_s:g} s" if wait_s > 0 else ""
     expected = status.expected_wait_s
     words = f" (number {status.position} in line, expected wait {expected:.0f} s)" if expected is not None else ""
-    said = f"; {declined}" if declined else ""
+    refusal = f"; {declined}" if declined else ""
     return (
-        f"{status.holder or 'another application'} holds the authority{waited}{words}{said}: wait longer (wait_s), ask "
-        'with a higher priority (a lower number, 0 is the highest), or connect with access="observe"'
+        f"{status.holder or 'another application'} holds the authority{waited}{words}{refusal}: wait longer "
+        '(wait_s), ask with a higher priority (a lower number, 0 is the highest), or connect with access="observe"'
     )
 
 

@@ -98,7 +98,7 @@ class ActionWait:
             raise self._problem
 
     def _over(self) -> bool:
-        """Whether it is done, or waiting longer is of no use."""
+        """Whether it is done, or waiting longer can't help."""
         if type(self._action) is Position:  # a vehicle may be there and be refused to stay
             self._problem = self._why_not()
             if self._problem is not None:
@@ -117,7 +117,7 @@ class ActionWait:
         return False
 
     def _why_not(self) -> Exception | None:
-        """Why waiting longer is of no use; None if it is."""
+        """Why waiting longer can't help; None if it can."""
         name = self._action.name
         if self._closed():
             return ClosedError(f"this drone was closed while {name} was under way")

@@ -46,7 +46,7 @@ class Network:
         address: ``"10.0.0.5:7447"`` connects to an address (several with commas, with ``multicast`` among them to
             search as well); True searches by multicast; False stays on this host. None: as the variable
             ``SKYLOOP_NETWORK`` says, without which it searches by multicast.
-        keys: Folder of an identity; None: as the variable ``SKYLOOP_KEYS`` says.
+        keys: Folder of an identity; None: from the variable ``SKYLOOP_KEYS``.
     """
 
     address: bool | str | None = None
@@ -205,7 +205,7 @@ def network_settings(network: NetworkChoice = None, keys: Path | str | None = No
 
     Args:
         network: As for :func:`connect`.
-        keys: Folder of an identity, for the command line; None: as ``network`` says.
+        keys: Folder of an identity, for the command line; None: from ``network``.
 
     Raises:
         UsageError: If an address or the folder is not valid.

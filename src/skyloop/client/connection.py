@@ -44,7 +44,7 @@ class RedialPolicy:
 
 
 class _EndedError(LinkError):
-    """The proxy ended the connection before it said welcome."""
+    """The proxy ended the connection before it sent Welcome."""
 
 
 class ProxyConnection:
@@ -149,7 +149,7 @@ class ProxyConnection:
         """Send a request and wait for the answer. While the link is lost, wait for it to come back.
 
         Args:
-            body: Makes the request, anew for each attempt.
+            body: Makes the request, for each attempt again.
             timeout_s: For all of it [s].
 
         Raises:

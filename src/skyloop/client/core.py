@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, Final, Literal, Protocol, TypedDict
 
-from skyloop.client.authority import Authority, AuthorityTracker, authority_wish
+from skyloop.client.authority import Authority, AuthorityTracker, authority_request
 from skyloop.client.channels import Listener, VideoChannel
 from skyloop.client.command_schedule import CommandSchedule
 from skyloop.client.commands import CommandSender
@@ -189,7 +189,7 @@ class DroneCore:
                 self.check_open()
                 asked = authority or Authority()
                 self.commands.request(
-                    authority_wish(asked.priority, asked.for_s, asked.takeover), asked.wait_s, stay=asked.stay
+                    authority_request(asked.priority, asked.for_s, asked.takeover), asked.wait_s, stay=asked.stay
                 )
             self.state.scheduler.opened()
         except BaseException:

@@ -19,7 +19,7 @@ from skyloop.client.authority import (
     TakeoverRequest,
     TakeoverWay,
     answering,
-    authority_wish,
+    authority_request,
 )
 from skyloop.client.channels import Channel, Listener, VideoOptions
 from skyloop.client.commands import above_zero, checked, number, position_of
@@ -223,7 +223,7 @@ class Drone:
         Args:
             priority: 0 (highest) to 31 (lowest); None: as in the last request.
             wait_s: How long to wait in the queue [s].
-            for_s: How long the authority is wanted [s], up to a day; then it goes to whoever wants it. None: open.
+            for_s: How long the authority is wanted [s], up to a day; then others can get it. None: open.
             takeover: ``"now"`` pre-empts a lower holder at once, ``"ask"`` asks the holder first.
             stay: Stay in the queue after ``wait_s`` instead of raising.
 
@@ -238,8 +238,10 @@ class Drone:
             ClosedError: If the drone was closed.
         """
         self._core.check_open()
-        wish = authority_wish(self._core.commands.status.priority if priority is None else priority, for_s, takeover)
-        return self._core.commands.request(wish, wait_s, stay=stay)
+        request = authority_request(
+            self._core.commands.status.priority if priority is None else priority, for_s, takeover
+        )
+        return self._core.commands.request(request, wait_s, stay=stay)
 
     def release_authority(self) -> None:
         """Release the authority, or leave the queue, and wait until the proxy has confirmed it.

@@ -20,7 +20,7 @@ class FeedbackHistory:
         self._samples: deque[Feedback] = deque(maxlen=depth)
 
     def add(self, sample: Feedback) -> None:
-        """Add a sample; one captured before the newest (a restarted proxy's) starts the history anew."""
+        """Add a sample; one captured before the newest (a restarted proxy's) restarts the history."""
         samples = self._samples
         if samples and sample.captured_ns < samples[-1].captured_ns:
             samples.clear()

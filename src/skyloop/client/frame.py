@@ -179,7 +179,7 @@ class Arrival:
         """Return the frame, decoded on the first call.
 
         Raises:
-            DecodeError: If the pixels are not what the header says.
+            DecodeError: If the pixels are not as in the header.
             MissingExtraError: If it is a JPEG and OpenCV is not installed.
         """
         with self._lock:
@@ -208,7 +208,7 @@ class Arrival:
     def state_at_capture(self) -> tuple[Feedback | None, float | None]:
         """Return the vehicle's state at the capture and its reach [s]; see :attr:`Frame.feedback_reach_s`.
 
-        Looked up anew until there is a sample on both sides of the capture.
+        Looked up again until there is a sample on both sides of the capture.
         """
         if self._state is not None:
             return self._state
@@ -279,7 +279,7 @@ def to_bgr(header: FrameHeader, pixels: Pixels) -> NDArray[np.uint8]:
         Shape (height, width, 3), uint8; the same memory if the pixels are BGR already.
 
     Raises:
-        DecodeError: If the pixels are no JPEG of the size that the header says.
+        DecodeError: If the pixels are no JPEG of the size in the header.
         MissingExtraError: If they are a JPEG and OpenCV is not installed.
     """
     height, width = header.height, header.width

@@ -48,7 +48,7 @@ class LinkMonitor:
         self._late_ns = nanoseconds(thresholds.late_s)
         self._silent_ns = nanoseconds(thresholds.silent_s)
         self._window_ns = nanoseconds(thresholds.window_s)
-        self.heard_ns = now_ns  #: when anything valid came last
+        self.received_ns = now_ns  #: when anything valid came last
         self.feedback_ns = 0  #: when feedback came last; 0 for never
         self.received = 0  #: samples of feedback
         self.missing = 0  #: samples missing by the gaps in their numbers
@@ -58,7 +58,7 @@ class LinkMonitor:
 
     def feedback(self, seq: int, now_ns: int) -> bool:
         """Note a sample of feedback; return False if it is repeated or was overtaken by a newer one."""
-        self.heard_ns = now_ns
+        self.received_ns = now_ns
         last = self._last_seq
         if last is not None:
             if seq <= last:
@@ -76,7 +76,7 @@ class LinkMonitor:
     def verdict(self, now_ns: int) -> Verdict:
         """Return the present state and why. To be called some twenty times a second."""
         received, missing, malformed = self._window(now_ns)
-        silent_ns = now_ns - self.heard_ns
+        silent_ns = now_ns - self.received_ns
         if silent_ns > self._silent_ns:
             return Verdict(LinkState.LOST, f"no data for {silent_ns / 1e9:.1f} s", restart=True)
         if malformed >= self._limits.malformed:
@@ -112,12 +112,12 @@ class StallWatch:
             now_ns: The present time.
         """
         self._patience_ns = nanoseconds(patience_s)
-        self.heard_ns = now_ns  #: when something came on this channel last
+        self.received_ns = now_ns  #: when something came on this channel last
         self._asked_ns = now_ns
 
     def stalled(self, others_flow: bool, now_ns: int) -> bool:
         """Return whether to subscribe again now; True at most once in ``patience_s``."""
-        if not others_flow or now_ns - max(self.heard_ns, self._asked_ns) <= self._patience_ns:
+        if not others_flow or now_ns - max(self.received_ns, self._asked_ns) <= self._patience_ns:
             return False
         self._asked_ns = now_ns
         return True

@@ -293,7 +293,7 @@ class ProxySession:
         end = self._end
         if end is None:
             return
-        silent = now_ns - self.monitor.heard_ns > self._late_ns
+        silent = now_ns - self.monitor.received_ns > self._late_ns
         usual_ns = _PING_CLOCK_NS if len(self._trips) >= _FIRST else _PING_FIRST_NS
         if (silent or not self._same_clock) and now_ns - self._pinged_ns > (self._late_ns if silent else usual_ns):
             self._pinged_ns = now_ns
@@ -301,8 +301,8 @@ class ProxySession:
 
     def feedback_stalled(self, now_ns: int) -> bool:
         """Return whether feedback has stalled although the proxy answers, and should be subscribed to again."""
-        self._feedback_watch.heard_ns = self.monitor.feedback_ns
-        return self._feedback_watch.stalled(now_ns - self.monitor.heard_ns < 2 * self._late_ns, now_ns)
+        self._feedback_watch.received_ns = self.monitor.feedback_ns
+        return self._feedback_watch.stalled(now_ns - self.monitor.received_ns < 2 * self._late_ns, now_ns)
 
     def _ponged(self, answer: AnyReply | LinkError) -> None:
         if isinstance(answer, Pong) and not self._same_clock:
@@ -342,7 +342,7 @@ class ProxySession:
         if handler is None:  # a kind that no proxy sends
             self._malformed()
             return
-        self.monitor.heard_ns = now_ns
+        self.monitor.received_ns = now_ns
         handler(sample, now_ns)
 
     def frame(self, header: FrameHeader, pixels: Pixels, topic: str = "") -> None:
@@ -359,7 +359,7 @@ class ProxySession:
         if size_error(header, pixels.size):
             self._malformed()
             return
-        self.monitor.heard_ns = now_ns
+        self.monitor.received_ns = now_ns
         self._handler.frame(header, pixels, now_ns, topic)
 
     def closed(self, reason: str) -> None:

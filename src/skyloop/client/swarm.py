@@ -177,7 +177,7 @@ class Swarm:
             timeout_s: How long to wait [s].
 
         Raises:
-            SwarmError: As ``on_error`` says.
+            SwarmError: As set by ``on_error``.
             ClosedError: If the swarm was closed.
         """
         self.each(lambda drone: drone.takeoff(wait=wait, timeout_s=timeout_s), "takeoff")
@@ -190,7 +190,7 @@ class Swarm:
             timeout_s: How long to wait [s].
 
         Raises:
-            SwarmError: As ``on_error`` says.
+            SwarmError: As set by ``on_error``.
             ClosedError: If the swarm was closed.
         """
         self.each(lambda drone: drone.land(wait=wait, timeout_s=timeout_s), "land")
@@ -257,7 +257,7 @@ class Swarm:
         Raises:
             UnknownNameError: If no drone of the swarm has one of the names; nothing is sent then.
             UsageError: If a place can't be flown to; nothing is sent then.
-            SwarmError: As ``on_error`` says.
+            SwarmError: As set by ``on_error``.
             ClosedError: If the swarm was closed.
         """
         self._check_open()
@@ -283,7 +283,7 @@ class Swarm:
         """Cut the motors of all drones at once, including those set aside: they fall.
 
         Raises:
-            SwarmError: If the command could not be sent to some, whatever ``on_error`` says.
+            SwarmError: If the command could not be sent to some, whatever ``on_error`` is.
         """
         sent, errors = _try_all(self._drones, lambda drone: drone.emergency_stop())
         errors |= {name: _not_sent(self._drones[name]) for name, handed in sent.items() if not handed}
@@ -298,7 +298,7 @@ class Swarm:
     def send(self, actions: Mapping[str, AnyAction]) -> dict[str, bool]:
         """Make each action the newest set-point of the drone of its name, all sent together.
 
-        Drones that are set aside are left out. :attr:`spread` tells how far apart the first and the last command left.
+        Drones that are set aside are left out. :attr:`spread` is how far apart the first and the last command left.
 
         Args:
             actions: By name of the drone.
@@ -309,7 +309,7 @@ class Swarm:
         Raises:
             UnknownNameError: If no drone of the swarm has one of the names; nothing is sent then.
             UsageError: If an action can't be commanded or has numbers that are not finite; nothing is sent then.
-            SwarmError: As ``on_error`` says.
+            SwarmError: As set by ``on_error``.
             ClosedError: If the swarm was closed.
         """
         self._check_open()
@@ -347,7 +347,7 @@ class Swarm:
             What it returned, by name.
 
         Raises:
-            SwarmError: As ``on_error`` says.
+            SwarmError: As set by ``on_error``.
             ClosedError: If the swarm was closed.
         """
         self._check_open()
@@ -398,7 +398,7 @@ class Swarm:
             max_age_s: Oldest age since capture that is accepted [s]; a drone whose feedback is older has failed.
 
         Raises:
-            SwarmError: As ``on_error`` says.
+            SwarmError: As set by ``on_error``.
             ClosedError: If the swarm was closed.
         """
         self._check_open()
@@ -421,7 +421,7 @@ class Swarm:
 
         Raises:
             UnknownNameError: If there is no flight state of that name.
-            SwarmError: As ``on_error`` says.
+            SwarmError: As set by ``on_error``.
             ClosedError: If the swarm was closed.
         """
         self._check_open()
@@ -444,7 +444,7 @@ class Swarm:
     def ticks(self, rate_hz: float = 20.0, seconds: float | None = None) -> Iterator[Tick]:
         """Yield at a steady rate on absolute deadlines, for a loop that commands all drones.
 
-        Ends with the swarm. After an iteration that takes longer than a period the deadlines start anew from there.
+        Ends with the swarm. After an iteration that takes longer than a period the deadlines restart from there.
 
         Args:
             rate_hz: Ticks a second, 0.1 to 200.
@@ -482,7 +482,7 @@ class Swarm:
             errors: Why, by name of the drone.
 
         Raises:
-            SwarmError: As ``on_error`` says.
+            SwarmError: As set by ``on_error``.
         """
         if not errors:
             return

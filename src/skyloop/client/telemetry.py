@@ -289,8 +289,8 @@ class Receiver:
         state.newest = sample
         state.received_ns = now_ns
         # A failsafe or another owner ends the set-point, but not what a listener commands in answer to this sample.
-        news = before is None or sample.failsafe is not before.failsafe or sample.owner_id != before.owner_id
-        if news:
+        changed = before is None or sample.failsafe is not before.failsafe or sample.owner_id != before.owner_id
+        if changed:
             self._commands.feedback(sample, now_ns)
         state.on_feedback.publish(sample)  # consumers first, then the statistics
         state.notifier.notify()
@@ -298,7 +298,7 @@ class Receiver:
         counter = state.counter
         counter.follow(sample.seq)
         counter.add(now_ns + offset_ns - sample.published_ns, sample.captured_ns - offset_ns, now_ns)
-        if not news:
+        if not changed:
             self._commands.feedback(sample, now_ns)
         if sample.vehicle_link is not state.status.vehicle or (
             sample.link_reason

@@ -128,7 +128,7 @@ class Membership:
     def close(self) -> None:
         """End the membership. Idempotent.
 
-        The proxy gives its share to the other workers when it hears nothing more, or at once when the drone is closed.
+        The proxy gives its share to the other workers when nothing more comes, or at once when the drone is closed.
         """
         self._leave()
         self._ended = True
