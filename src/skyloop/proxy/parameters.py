@@ -37,43 +37,43 @@ def _own(name: str, value: float, unit: str, minimum: float, maximum: float, des
 
 #: The proxy's own parameters. ``docs/proxy.md`` shows them as a table.
 OWN: Final[tuple[Parameter, ...]] = (
-    _own("authority.ask_s", 10.0, "s", 0.0, 600.0, "A holder that is asked and does not answer keeps it for so long"),
     _own(
-        "authority.timeout_s", 2.0, "s", 0.1, 3600.0, "A holder that sent no valid command for so long loses the lease"
+        "authority.ask_s", 10.0, "s", 0.0, 600.0, "A higher priority that asks takes over after this time at the latest"
     ),
-    _own("autopilot.climb", 0.5, "m/s", 0.1, 3.0, "Climb rate of a software take-off, and at most in a software hover"),
+    _own(
+        "authority.timeout_s", 2.0, "s", 0.1, 3600.0, "A holder without a valid command for this long loses the lease"
+    ),
+    _own("autopilot.climb", 0.5, "m/s", 0.1, 3.0, "Climb rate of a software take-off, and maximum in a software hover"),
     _own("autopilot.descent", 0.4, "m/s", 0.1, 2.0, "Rate of descent of a software landing"),
-    _own("autopilot.takeoff_altitude", 1.0, "m", 0.3, 20.0, "Where a software take-off ends, below limits.altitude"),
+    _own("autopilot.takeoff_altitude", 1.0, "m", 0.3, 20.0, "Altitude of a software take-off, below limits.altitude"),
     _own("autopilot.velocity_i", 0.05, "rad/m", 0.0, 1.0, "Integral gain of the software velocity loop"),
     _own("autopilot.velocity_p", 0.15, "rad s/m", 0.0, 1.0, "Proportional gain of the software velocity loop"),
-    _own("battery.land", 0.1, "", 0.0, 1.0, "Charge below which the vehicle lands and takes no set-points; 0: never"),
+    _own("battery.land", 0.1, "", 0.0, 1.0, "Charge below which the vehicle lands and accepts no set-points; 0: never"),
     _own("battery.warn", 0.2, "", 0.0, 1.0, "Charge below which a low battery is reported; 0: never"),
     _own("command.max_age_s", 0.25, "s", 0.01, 10.0, "Older commands are refused as stale"),
-    _own(
-        "failsafe.hover_after_s", 0.5, "s", 0.05, 3600.0, "A flying vehicle hovers when nobody commanded it for so long"
-    ),
-    _own("failsafe.land_after_s", 5.0, "s", 0.1, 3600.0, "A flying vehicle lands when nobody commanded it for so long"),
+    _own("failsafe.hover_after_s", 0.5, "s", 0.05, 3600.0, "A flying vehicle hovers after this time without a command"),
+    _own("failsafe.land_after_s", 5.0, "s", 0.1, 3600.0, "A flying vehicle lands after this time without a command"),
     _own(
         "failsafe.retry_s",
         0.25,
         "s",
         0.02,
         10.0,
-        "Pace at which a failsafe that the vehicle did not take is tried again",
+        "Interval at which a failsafe step is retried until the vehicle executes it",
     ),
-    _own("limits.altitude", 5.0, "m", 0.3, 500.0, "Greatest height above ground: climbing ends there"),
-    _own("limits.climb", 1.0, "m/s", 0.05, 10.0, "Greatest speed up or down"),
-    _own("limits.speed", 2.0, "m/s", 0.05, 30.0, "Greatest horizontal speed of a velocity set-point"),
-    _own("limits.tilt", 0.35, "rad", 0.02, 1.0, "Greatest tilt of an attitude set-point, roll and pitch together"),
-    _own("limits.yaw_rate", 1.75, "rad/s", 0.05, 10.0, "Greatest yaw rate"),
+    _own("limits.altitude", 5.0, "m", 0.3, 500.0, "Maximum height above ground: climbing ends there"),
+    _own("limits.climb", 1.0, "m/s", 0.05, 10.0, "Maximum vertical speed"),
+    _own("limits.speed", 2.0, "m/s", 0.05, 30.0, "Maximum horizontal speed of a velocity set-point"),
+    _own("limits.tilt", 0.35, "rad", 0.02, 1.0, "Maximum tilt of an attitude set-point, roll and pitch together"),
+    _own("limits.yaw_rate", 1.75, "rad/s", 0.05, 10.0, "Maximum yaw rate"),
     *(
         _own(f"{BOX}.{axis}_{end}", value, "m", -FAR_M, FAR_M, f"{side} wall of the safety box; {value:g}: none")
         for axis, sides in (("x", ("West", "East")), ("y", ("South", "North")), ("z", ("Lower", "Upper")))
         for end, value, side in zip(("high", "low"), (FAR_M, -FAR_M), reversed(sides), strict=True)
     ),
-    _own("safety.deceleration", 1.0, "m/s²", 0.1, 10.0, "At which the vehicle can be relied on to stop at a wall"),
-    _own("safety.reaction_s", 0.3, "s", 0.0, 3.0, "How long it goes on before it begins to stop"),
-    Parameter(ZONES, ParameterType.TEXT, "", default="", description="No-fly zones, see below"),
+    _own("safety.deceleration", 1.0, "m/s²", 0.1, 10.0, "Deceleration with which the vehicle reliably stops at a wall"),
+    _own("safety.reaction_s", 0.3, "s", 0.0, 3.0, "Delay before the vehicle begins to stop"),
+    Parameter(ZONES, ParameterType.TEXT, "", default="", description="No-fly zones: boxes and cylinders"),
 )
 
 

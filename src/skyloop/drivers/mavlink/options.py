@@ -44,9 +44,9 @@ class OwnLimit:
 
 
 OWN_LIMITS: Final = (
-    OwnLimit(ALTITUDE, "altitude", 3.0, 0.5, 500.0, "m", "Greatest height above the place of the start"),
-    OwnLimit("limits.climb", "climb", 1.0, 0.05, 10.0, "m/s", "Greatest speed up or down"),
-    OwnLimit("limits.speed", "speed", 2.0, 0.05, 30.0, "m/s", "Greatest horizontal speed of a velocity set-point"),
+    OwnLimit(ALTITUDE, "altitude", 3.0, 0.5, 500.0, "m", "Maximum height above the take-off point"),
+    OwnLimit("limits.climb", "climb", 1.0, 0.05, 10.0, "m/s", "Maximum vertical speed"),
+    OwnLimit("limits.speed", "speed", 2.0, 0.05, 30.0, "m/s", "Maximum horizontal speed of a velocity set-point"),
     OwnLimit(TAKEOFF_ALTITUDE, "takeoff_altitude", 1.5, 0.5, 50.0, "m", "Where a take-off ends, above its start"),
 )
 USUAL: Final = {limit.name: limit.usual for limit in OWN_LIMITS}
