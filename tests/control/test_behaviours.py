@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
+import time
 from pathlib import Path
 from types import ModuleType
 
@@ -11,9 +12,11 @@ import pytest
 
 from skyloop.control import FlowHover, FlyThroughGates, GateKind, ImageServo, LandOnMarker, SeeAndAvoid
 from skyloop.control.gate_law import GatePhase
+from skyloop.control.landing_law import LandingPhase
 from skyloop.errors import UnknownNameError, UsageError
-from skyloop.messages import Annotation, Severity
+from skyloop.messages import Annotation, FlightState, Land, LinkState, Severity, Velocity
 from skyloop.stepping.rehearsal import Radio, rehearse
+from tests.client.scripted import WAIT_S, flown, scripted
 
 
 @pytest.fixture(scope="module")
@@ -103,6 +106,23 @@ def test_pictures_that_stop_make_it_hover_and_say_so() -> None:
         pilot.run(seconds=12.0)
         assert not pilot.blind
         assert ("gates: frames arrive again", Severity.INFO) in told
+
+
+def test_a_landing_goes_on_after_a_link_that_was_down_for_a_moment() -> None:
+    with scripted() as proxy, flown(proxy) as drone:
+        landing = LandOnMarker(drone)
+        landing._landing_law.phase = LandingPhase.DOWN
+        proxy.stop()
+        until = time.monotonic() + WAIT_S
+        while drone.link.application is not LinkState.LOST:
+            assert time.monotonic() < until
+            time.sleep(0.005)
+        landing.steer(Velocity())
+        proxy.start()
+        drone.wait(lambda _: drone.authority.state == "held", WAIT_S)
+        landing.steer(Velocity())
+        proxy.until_commanded(Land())
+        proxy.state = FlightState.LANDED
 
 
 def test_what_makes_no_sense_is_refused() -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from skyloop.control.behaviour import Behaviour
 from skyloop.control.landing_law import LandingLaw, LandingPhase, LandingSettings
 from skyloop.errors import UsageError
-from skyloop.messages import FlightState, Polyline, Text
+from skyloop.messages import FlightState, Land, Polyline, Text
 from skyloop.messages.annotation import Colour, Shape
 from skyloop.vision import MarkerDetector
 
@@ -103,6 +103,6 @@ class LandOnMarker(Behaviour):
     def steer(self, wanted: Velocity | Attitude) -> None:
         """Send velocities until the law is down; then let the vehicle's own landing stop the motors."""
         if self.phase is LandingPhase.DOWN:
-            self.drone.land(wait=False)
+            self.drone.command(Land())  # each step anew: a link that is down for a moment ends no landing
         else:
             super().steer(wanted)
