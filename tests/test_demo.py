@@ -128,7 +128,7 @@ def test_headless_flight_is_good() -> None:
     share = re.search(r"in view since first seen\D+([\d.]+)%", done.stdout)
     assert share is not None, done.stdout
     assert float(share[1]) >= 90
-    first = re.search(r"first picture after\D+([\d.]+) s", done.stdout)
+    first = re.search(r"first frame after\D+([\d.]+) s", done.stdout)
     assert first is not None
     assert float(first[1]) < 30.0
 

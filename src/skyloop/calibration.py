@@ -61,7 +61,7 @@ class Calibration(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fiel
         """For pictures of another size that show the same, by scaling. Raises :class:`UsageError` for another shape."""
         if not self.fits(width, height):
             raise UsageError(
-                f"the calibration is for pictures of {self.width}x{self.height}, and {width}x{height} is no such shape"
+                f"the calibration is for {self.width}x{self.height} or the same aspect ratio, got {width}x{height}"
             )
         across, down = width / self.width, height / self.height
         return Intrinsics(

@@ -101,7 +101,7 @@ def test_pictures_of_two_sizes(run: Run, tmp_path: Path, pictures: list[str]) ->
     assert "320x240" in ended.err
     broken = tmp_path / "broken.png"
     broken.write_bytes(b"no picture")
-    assert "can't be read as a picture" in run("camera", "calibrate", str(broken), "-o", str(tmp_path / "x.json")).err
+    assert "can't be read as an image" in run("camera", "calibrate", str(broken), "-o", str(tmp_path / "x.json")).err
 
 
 def test_a_vehicle_that_shows_a_board_calibrates(run: Run, tmp_path: Path, pictures: list[str]) -> None:

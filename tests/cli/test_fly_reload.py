@@ -103,7 +103,7 @@ def test_an_error_hovers_until_the_file_is_mended(
     process = start("fly", str(mine), "--on", "alpha", "--reload")
     looker.wait("flying", timeout_s=30.0)
     save(mine, MINE.replace("self.drone.velocity(left=self.SPEED)", "raise RuntimeError('in on_feedback')"))
-    process.until("the controller failed: hovering; save the file to go on")
+    process.until("the controller failed: hovering; save the file to continue")
     assert "RuntimeError: in on_feedback" in process.text
     looker.wait("hovering", timeout_s=30.0)
     save(mine, MINE.replace("before.calls", "before.nothing"))
@@ -122,7 +122,7 @@ def test_an_error_in_on_frame_hovers_too(start: Callable[..., Process], tmp_path
     path.write_text(FRAMES)
     process = start("fly", str(path), "--on", "sim://?world=empty&speed=4&wind=0", "--reload", "--seconds", "8")
     process.until("RuntimeError: in on_frame")
-    process.until("hovering; save the file to go on")
+    process.until("hovering; save the file to continue")
     process.until("landing")
     assert process.wait() == 1, "the time was over before it was mended"
 

@@ -64,7 +64,7 @@ def test_what_cannot_be_is_told(run: Run, file: Path, bravo: str, arguments: tup
 def test_a_drone_without_a_camera(run: Run, file: Path, alpha: Process) -> None:
     ended = run("process", str(file), "--drone", "alpha")
     assert ended.code == 1
-    assert "no camera: this vehicle gives no pictures" in ended.err
+    assert "this vehicle has no camera" in ended.err
 
 
 @pytest.mark.daily

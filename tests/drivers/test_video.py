@@ -71,7 +71,7 @@ def play(uri: str, *, keep_pixels: bool = False, timeout_s: float = 20.0) -> Rec
 def test_all_240_pictures_of_a_real_drone_come_in_order() -> None:
     sink = play(f"video://{recorded(LONG)}?{FAST}")
     assert sink.frame_counts == {"front": 240}
-    assert sink.links == [(LinkState.UP, ""), (LinkState.CLOSED, "end of the recording after 240 pictures")]
+    assert sink.links == [(LinkState.UP, ""), (LinkState.CLOSED, "end of the recording after 240 frames")]
     assert {(frame.width, frame.height, frame.intrinsics) for frame in sink.frames} == {(640, 360, None)}
     newest = sink.newest
     assert newest is not None

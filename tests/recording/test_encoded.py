@@ -265,7 +265,7 @@ def test_a_recording_whose_key_picture_is_gone_says_so(kept: Path, tmp_path: Pat
     recording = Recording.open(kept)
     pictures = list(recording.pictures("alpha", "front"))
     broken = type(pictures[1])(**{f: getattr(pictures[1], f) for f in pictures[1].__slots__} | {"group": None})
-    with pytest.raises(FileFormatError, match="frame 2 of front can't be decoded: pictures that it builds on"):
+    with pytest.raises(FileFormatError, match="frame 2 of front can't be decoded: frames that it builds on"):
         broken.pixels()
     with pytest.raises(UnknownNameError):
         recording.pictures("alpha", "bottom")

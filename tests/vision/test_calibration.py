@@ -156,7 +156,7 @@ def test_files_there_and_back(tmp_path: Path) -> None:
     half = FILE.intrinsics_for(320, 240)
     assert (half.fx, half.cx, half.cy) == pytest.approx((250.0, 159.75, 119.75))
     assert FILE.intrinsics_for(640, 480) == FILE.intrinsics
-    with pytest.raises(UsageError, match="no such shape"):
+    with pytest.raises(UsageError, match="same aspect ratio"):
         FILE.intrinsics_for(640, 360)
     with pytest.raises(UsageError, match="written"):
         FILE.save(tmp_path / "no" / "front.json")

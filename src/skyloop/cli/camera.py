@@ -77,11 +77,11 @@ def board(
     typer.echo(f"wrote {output}: {columns} × {rows} squares of {square_mm:g} mm, {size} with its margin")
 
 
-@camera.command(short_help="Calibrate by pictures of a board", epilog=f"{_EXAMPLE}calibrate alpha -o front.json")
+@camera.command(short_help="Calibrate by images of a board", epilog=f"{_EXAMPLE}calibrate alpha -o front.json")
 def calibrate(
     source: Annotated[
         list[str],
-        typer.Argument(metavar="SOURCE...", help="A running proxy or a vehicle's address; or files: pictures, a video"),
+        typer.Argument(metavar="SOURCE...", help="A running proxy or a vehicle's address; or files: images, a video"),
     ],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="To write")] = Path("camera.json"),
     camera: Annotated[
@@ -116,8 +116,8 @@ def calibrate(
             search.run(vehicle.pictures(), vehicle.draw)
     collector = search.collector
     if collector is None:
-        raise UsageError("no picture came")
-    _print(f"{search.looked} pictures looked at, {len(collector.views)} views of the board taken")
+        raise UsageError("no frame came")
+    _print(f"{search.looked} images searched, {len(collector.views)} views of the board taken")
     found, rejected = fit(collector.views, *collector.size, model=model.value, camera=camera or "")
     found.save(output)
     _report(found, rejected, output)
@@ -161,7 +161,7 @@ class _Search:
         elif self.every:
             collector.views.append(view)
         elif collector.offer(view):
-            seen = f"{len(view.pixels)} corners, {collector.coverage:.0%} of the picture covered"
+            seen = f"{len(view.pixels)} corners, {collector.coverage:.0%} of the image covered"
             _print(f"view {len(collector.views)}: {seen}")
 
 
@@ -173,7 +173,7 @@ def _board(columns: int, rows: int, square_mm: float, kind: Kind, dictionary: st
 
 def _report(found: Calibration, rejected: list[BoardView], output: Path) -> None:
     for view in rejected:
-        _print(f"taken out, as it does not go with the others: {view.name}")
+        _print(f"left out, as it does not fit the others: {view.name}")
     sure = "" if found.fx_deviation is None else f" ± {found.fx_deviation:.1f}"
     assert found.rms_px is not None
     assert found.coverage is not None
@@ -230,7 +230,7 @@ def _from_picture(cv: Any, name: str) -> Any:
     if image_size(content) is None or not why_not_decoded(content):  # others are left to OpenCV's own limit
         picture = cv.imdecode(np.frombuffer(content, np.uint8), cv.IMREAD_COLOR) if content else None
     if picture is None:
-        raise UsageError(f"{name} can't be read as a picture")
+        raise UsageError(f"{name} can't be read as an image")
     return picture
 
 
@@ -242,7 +242,7 @@ def _from_video(cv: Any, name: str) -> Iterator[Picture]:
             if not read:
                 break
             number += 1
-            yield f"{name}, picture {number}", picture
+            yield f"{name}, frame {number}", picture
     finally:
         video.release()
     if not number:
@@ -273,7 +273,7 @@ class _Vehicle:
         end = time.monotonic() + self._seconds
         try:
             for frame in self._drone.frames(self._camera, timeout_s=_PATIENCE_S):
-                yield f"picture {frame.seq}", frame
+                yield f"frame {frame.seq}", frame
                 if time.monotonic() > end:
                     _print(f"{self._seconds:g} s are over")
                     return

@@ -149,6 +149,6 @@ def _status(drone: Drone, follower: FollowMarker) -> Text:
         f"{score.ranges[-1][1] + follower.distance_m:.2f} m away" if score.ranges else "",
         "" if feedback.altitude_m is None else f"altitude {feedback.altitude_m:.2f} m",
         "" if feedback.battery is None else f"battery {feedback.battery:.0%}",
-        "" if frame is None else f"picture {frame.age_s * 1e3:.0f} ms old",
+        "" if frame is None else f"frame {frame.age_s * 1e3:.0f} ms old",
     ]
     return Text("  ·  ".join(part for part in parts if part), style="cyan", no_wrap=True, overflow="ellipsis")

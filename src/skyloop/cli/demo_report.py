@@ -131,7 +131,7 @@ class DemoReport:
             ("range error, by the camera", _spread_text(self.estimated)),
             ("range error, truly", _spread_text(self.true)),
             ("collisions", str(self.collisions)),
-            ("first picture after", "–" if self.first_picture_s is None else f"{self.first_picture_s:.1f} s"),
+            ("first frame after", "–" if self.first_picture_s is None else f"{self.first_picture_s:.1f} s"),
         ]
         for name, channel in self.channels.items():
             rows += _channel_rows(name, channel)

@@ -70,7 +70,7 @@ class Flight:
                 summary = self._controller.run(seconds=left, until=lambda: reloader.waiting)
             except Exception as error:  # noqa: BLE001  the user's code may raise anything
                 self._report(what_failed(error))
-                self._report("the controller failed: hovering; save the file to go on, Ctrl-C lands")
+                self._report("the controller failed: hovering; save the file to continue, Ctrl-C lands")
                 if not self._await_mended(reloader, make, deadline):
                     return False
                 continue

@@ -114,7 +114,7 @@ def report(
     _print(f"{target}: {target.stat().st_size / 1e6:.1f} MB")
 
 
-@log.command(short_help="Samples and pictures for other programs", epilog=f"{_EXAMPLE}export flight.mcap --to csv")
+@log.command(short_help="Samples and frames for other programs", epilog=f"{_EXAMPLE}export flight.mcap --to csv")
 def export(
     file: File,
     to: Annotated[Form, typer.Option("--to", help="csv and parquet: a file for each channel")] = Form.CSV,
@@ -127,7 +127,7 @@ def export(
         list[str] | None, typer.Option(metavar="NAME", help="Only this one, e.g. feedback; may be repeated")
     ] = None,
     camera: Annotated[str | None, typer.Option(metavar="NAME", help="For mp4 (default: the first)")] = None,
-    burn_time: Annotated[bool, typer.Option("--burn-time", help="For mp4: write the time into the pictures")] = False,
+    burn_time: Annotated[bool, typer.Option("--burn-time", help="For mp4: write the time into the frames")] = False,
 ) -> None:
     """Write the samples as tables, or a camera's frames as a video with their own times."""
     from skyloop.recording.review import export as ways

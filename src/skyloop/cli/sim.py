@@ -85,7 +85,7 @@ def sim(
     ] = None,
     video_port: Annotated[
         int | None,
-        typer.Option(metavar="P", min=1, max=65000, help="Of arducopter and px4: where the camera's pictures are sent"),
+        typer.Option(metavar="P", min=1, max=65000, help="Of arducopter and px4: where the camera's video is sent"),
     ] = None,
     fault_seed: Annotated[
         int | None, typer.Option(metavar="S", min=0, help="Of the firmware: the same one, the same faults [0]")

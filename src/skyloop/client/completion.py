@@ -126,7 +126,7 @@ class ActionWait:
             return AuthorityError(f"{name}: {status.holder or 'another application'} took over the authority")
         if type(self._action) is Position and self._commands.lapsed(self._action):
             return RefusedError(
-                f"{name} was ended on the way, by a failsafe or a lost link: ask anew", code="not_fresh"
+                f"{name} was ended on the way, by a failsafe or a lost link: send the command again", code="not_fresh"
             )
         if type(self._action) is Position and status.state == "held" and not self._commands.is_newest(self._action):
             return RefusedError(f"{name} was ended on the way: another command took its place", code="replaced")

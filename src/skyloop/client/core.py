@@ -337,7 +337,7 @@ class DroneCore:
         self.check_open()
         channels = self.state.channels
         if not channels:
-            raise UnsupportedError("no camera: this vehicle gives no pictures")
+            raise UnsupportedError("this vehicle has no camera")
         channel = next(iter(channels.values())) if camera is None else channels.get(camera)
         if channel is None:
             raise UnknownNameError("camera", str(camera), channels)

@@ -125,7 +125,7 @@ class Gate(Protocol):
     hint: str
 
     def person(self, scope: Scope) -> Person | None:
-        """Return who sent this request; None if nobody whom it lets in."""
+        """Return who sent this request; None if it is not let in."""
 
 
 class OpenGate:

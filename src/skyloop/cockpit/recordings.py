@@ -144,10 +144,10 @@ class Recordings:
         """
         if number not in self._running:
             raise UnknownNameError("running recording", number, self._running)
-        told = self._entry(number)
+        entry = self._entry(number)
         running = self._running.pop(number)
         await asyncio.to_thread(running.recorder.close)
-        return {**told, **_progress(running.recorder.status)}
+        return {**entry, **_progress(running.recorder.status)}
 
     async def listing(self) -> Json:
         """Return the running recordings, and those in the folder, the newest first."""
@@ -236,7 +236,7 @@ class Recordings:
         known = {(path.name, size, at_ns): path for at_ns, path, size in newest}
         self._known = {key: self._known.get(key) or describe(path) for key, path in known.items()}
         rows = self._known.items()
-        return [{"name": name, "size": size, **msgspec.structs.asdict(told)} for (name, size, _), told in rows]
+        return [{"name": name, "size": size, **msgspec.structs.asdict(entry)} for (name, size, _), entry in rows]
 
     def _make_folder(self) -> None:
         try:

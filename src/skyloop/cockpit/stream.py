@@ -253,7 +253,7 @@ class PageSocket:
             writing.cancel()
 
     async def _write(self) -> None:
-        with suppress(WebSocketDisconnect):  # the receiving side notices it too
+        with suppress(WebSocketDisconnect):  # the receiving side detects it too
             while True:
                 await self._socket.send_text(encode_json(await self._outbox.get()).decode())
 

@@ -148,11 +148,11 @@ class RecordingSink:
         """Keep an encoded picture, and note a problem if the first one is no key picture or it is no Annex B."""
         now_ns = monotonic_ns()
         with self._changed:
-            self._check_time(f"picture of {camera}", captured_ns, now_ns)
+            self._check_time(f"encoded frame of {camera}", captured_ns, now_ns)
             if not key and all(seen.camera != camera for seen in self.pictures):
-                self.problems.append(f"picture of {camera}: the first one is no key picture")
+                self.problems.append(f"encoded frame of {camera}: the first one is no key picture")
             if not data.startswith((b"\0\0\1", b"\0\0\0\1")):
-                self.problems.append(f"picture of {camera}: not H.264 in Annex B form")
+                self.problems.append(f"encoded frame of {camera}: not H.264 in Annex B form")
             self.pictures.append(SeenPicture(camera, data, captured_ns, width, height, key, intrinsics))
             self._notify()
 

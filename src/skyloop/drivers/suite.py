@@ -282,14 +282,14 @@ class DriverSuite:
         """Encoded pictures come and have the announced cameras' names and sizes."""
         cameras = {camera.name: camera for camera in self.new_driver().capabilities().cameras if camera.stream}
         if not cameras:
-            raise unittest.SkipTest("the vehicle has no camera whose pictures can be had as they come")
+            raise unittest.SkipTest("the vehicle has no camera with an encoded stream")
         with self.opened(watch=set(), record=True) as (_, sink):
             some = sink.wait(lambda: len(sink.pictures) >= 5, self.frame_timeout_s)
-            assert some, f"{len(sink.pictures)} pictures came as they were encoded within {self.frame_timeout_s} s"
+            assert some, f"{len(sink.pictures)} encoded frames arrived within {self.frame_timeout_s} s"
             pictures = list(sink.pictures)
         for picture in pictures:
             camera = cameras.get(picture.camera)
-            assert camera is not None, f"pictures of camera {picture.camera!r}, which announces no stream"
+            assert camera is not None, f"encoded frames of camera {picture.camera!r}, which announces no stream"
             assert (picture.width, picture.height) == (camera.width, camera.height), (
                 f"{picture.camera}: {picture.width}×{picture.height} came, {camera.width}×{camera.height} is announced"
             )

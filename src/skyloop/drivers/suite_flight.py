@@ -15,7 +15,7 @@ from skyloop.messages.geometry import wrap_angle
 if TYPE_CHECKING:
     from skyloop.drivers.suite import DriverSuite
 
-NEAR_RAD = 0.3  #: so near is a vehicle turned to where it was told to look
+NEAR_RAD = 0.3  #: so near is a vehicle turned to the commanded heading
 #: How far the vehicle went from the first sample to the second, with sign; None if it does not report it.
 Measure = Callable[[Feedback, Feedback], float | None]
 

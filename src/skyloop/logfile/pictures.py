@@ -79,7 +79,7 @@ class Picture:
         if self.record.format != H264:
             return decode_image(self.compressed, what, grey=grey)
         if self.group is None:
-            raise FileFormatError(f"{what} can't be decoded: pictures that it builds on are missing")
+            raise FileFormatError(f"{what} can't be decoded: frames that it builds on are missing")
         group, place = self.group
         return group.pixels(place, what)
 

@@ -285,7 +285,7 @@ class CommandHandler:
         """Do what a refused set-point leaves to be done: the one before it must not go on."""
         try:
             self._executor.execute(action, now_ns, new=False)
-        except Exception as error:  # noqa: BLE001  it is reported, and the refusal is told
+        except Exception as error:  # noqa: BLE001  both the error and the refusal are published
             self._vehicle.driver_failed("apply", error)
 
     def _stop_motors(self, session: Session, command: Command, now_ns: int) -> tuple[AnyAction, int]:

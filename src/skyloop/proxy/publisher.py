@@ -272,8 +272,8 @@ class VehiclePublisher:
         self._counts[f"streams.{camera}.received"] += 1
         if len(data) > MAX_ENCODED:
             self._counts[f"streams.{camera}.too_large"] += 1
-            why = f"a picture of {camera} as it came has {len(data)} bytes, at most {MAX_ENCODED} are handed on"
-            self._fail("stream", f"{why}: the stream goes on with the next key picture that is smaller")
+            why = f"an encoded frame of {camera} has {len(data)} bytes, at most {MAX_ENCODED} are relayed"
+            self._fail("stream", f"{why}: the stream resumes with the next smaller key frame")
             return
         if intrinsics is None:
             intrinsics = self._nominal_intrinsics(camera, width, height)
@@ -282,7 +282,7 @@ class VehiclePublisher:
         try:
             packet = encode(sample)
         except (ValueError, TypeError, OverflowError) as error:
-            self._fail("stream", f"a picture of {camera} as it came cannot be published: {error}")
+            self._fail("stream", f"an encoded frame of {camera} can't be published: {error}")
             return
         missed = self._publish(stream(camera), packet)
         self._counts[f"streams.{camera}.published"] += 1

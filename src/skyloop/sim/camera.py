@@ -169,7 +169,7 @@ class CameraModel:
         bent = (np.asarray(pixels, dtype=np.float64) - (self.cx, self.cy)) / (self.fx, self.fy)
         straight = undistort(bent, self.distortion) if self.distorted else bent
         if straight is None:
-            raise UsageError(f"camera {self.name!r}: distortion {self.distortion} folds the picture before its edge")
+            raise UsageError(f"camera {self.name!r}: distortion {self.distortion} folds the image before its edge")
         return straight
 
 

@@ -172,7 +172,7 @@ class BoardFinder:
         """
         pixels = np.asarray(image)
         if pixels.dtype != np.uint8 or pixels.ndim not in (2, 3) or pixels.size == 0:
-            raise UsageError(f"a picture is uint8 and (h, w, 3) or (h, w), not {pixels.dtype} and {pixels.shape}")
+            raise UsageError(f"the image must be uint8, (h, w, 3) or (h, w), got {pixels.dtype} {pixels.shape}")
         grey = self._cv.cvtColor(pixels, self._cv.COLOR_BGR2GRAY) if pixels.ndim == 3 else np.ascontiguousarray(pixels)
         return self._find_charuco(grey, name) if self._detector is not None else self._find_chessboard(grey, name)
 

@@ -111,11 +111,11 @@ def undistort(
     if intrinsics is None:
         intrinsics = getattr(image, "intrinsics", None)
     if intrinsics is None:
-        raise UsageError("the picture carries no intrinsics: give the camera's as intrinsics=Intrinsics(fx, …)")
+        raise UsageError("the image has no intrinsics: give the camera's as intrinsics=Intrinsics(fx, …)")
     pixels = np.asarray(image)
     if pixels.dtype != np.uint8 or pixels.ndim not in (2, 3) or pixels.size == 0:
         raise UsageError(
-            f"the picture has shape {pixels.shape} and type {pixels.dtype} and must be uint8, (h, w, 3) or (h, w)"
+            f"the image has shape {pixels.shape} and type {pixels.dtype} and must be uint8, (h, w, 3) or (h, w)"
         )
     if not 0.0 <= balance <= 1.0:
         raise UsageError(f"balance is {balance!r} and must be from 0 to 1")

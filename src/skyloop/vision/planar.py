@@ -127,12 +127,12 @@ def checked(
     if intrinsics is None:
         intrinsics = getattr(image, "intrinsics", None)
     if intrinsics is None:
-        raise UsageError("the picture carries no intrinsics: give the camera's as intrinsics=Intrinsics(fx, …)")
+        raise UsageError("the image has no intrinsics: give the camera's as intrinsics=Intrinsics(fx, …)")
     pixels = np.asarray(image)
     grey = pixels.ndim == 2 and not colour
     if pixels.dtype != np.uint8 or not (grey or (pixels.ndim == 3 and pixels.shape[2] == 3)):
         wanted = "(h, w, 3)" if colour else "(h, w, 3) or (h, w)"
-        raise UsageError(f"the picture has shape {pixels.shape} and type {pixels.dtype} and must be uint8, {wanted}")
+        raise UsageError(f"the image has shape {pixels.shape} and type {pixels.dtype} and must be uint8, {wanted}")
     if pixels.size == 0:
-        raise UsageError("the picture is empty")
+        raise UsageError("the image is empty")
     return pixels, intrinsics

@@ -210,7 +210,7 @@ def test_a_host_that_does_not_answer_is_told(monkeypatch: pytest.MonkeyPatch) ->
             each.setblocking(False)
             each.connect_ex(full.getsockname())
         with watching(f"rtsp://{HOST}:{full.getsockname()[1]}/live") as (_, sink):
-            is_told(sink, "no answer, or no picture, within 1 s")
+            is_told(sink, "no answer, or no frame, within 1 s")
 
 
 def test_a_host_without_an_address_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -239,7 +239,7 @@ def test_a_server_that_never_answers_is_told_and_does_not_hold_up_the_closing(
         assert not told(sink)
         monkeypatch.setattr(camera, "OPEN_S", 1.0)
         with watching(f"rtsp://{HOST}:{port.port}/live") as (_, sink):
-            is_told(sink, "no answer, or no picture, within 1 s")
+            is_told(sink, "no answer, or no frame, within 1 s")
 
 
 def test_answers_that_are_noise_are_told() -> None:
@@ -269,12 +269,12 @@ def test_a_stream_that_becomes_noise_is_told_and_seen_again_when_it_is_none() ->
     ):
         shows(sink, 3)
         projector.spoilt.set()
-        is_told(sink, "no picture that can be decoded")
+        is_told(sink, "nothing that came could be decoded")
         projector.spoilt.clear()
         shows(sink, 3)
         numbers = [number_of(frame.pixels) for frame in sink.frames]
     assert numbers == sorted(numbers)
-    (event,) = [event for event in sink.events if "no picture" in event.text]
+    (event,) = [event for event in sink.events if "could be decoded" in event.text]
     assert event.kind is EventKind.DRIVER_ERROR
 
 

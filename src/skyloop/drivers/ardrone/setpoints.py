@@ -273,8 +273,8 @@ class SetpointController:
 
     def pop_events(self) -> list[VehicleEvent]:
         """Return the events since the last call."""
-        notices, self._events = self._events, []
-        return notices
+        events, self._events = self._events, []
+        return events
 
     def messages(self, now_ns: int) -> list[AtMessage]:
         """Return the commands of this tick: ``PCMD``, and ``REF`` unless nothing is wanted of take-off and landing.

@@ -32,7 +32,7 @@ MOST_STEP_S: Final = 0.1
 WAY_M_S: Final = 1.0  #: on the way to a place, where no speed is given
 WAY_TURN_RAD_S: Final = 0.8
 WAY_M_S2: Final = 0.8  #: at its beginning and its end
-LEASH_S: Final = 1.5  #: so far ahead of the vehicle, by time at the speed of the way, is the place that it is told
+LEASH_S: Final = 1.5  #: so far ahead of the vehicle, by time at the speed of the way, is the place that it is sent
 LEASH_M: Final = 0.3  #: and at least this
 
 Target = tuple[int, int]  #: system and component
@@ -97,7 +97,7 @@ class VelocitySetpoint:
 class PositionSetpoint:
     """Flies straight to a place and stays there.
 
-    Autopilots fly to a position as fast as their own parameters let them. So what they are told moves to the place, at
+    Autopilots fly to a place as fast as their own parameters let them. So the place that is sent moves to the goal, at
     the speed of the action at most, and stays near the vehicle.
 
     Args:
@@ -108,7 +108,7 @@ class PositionSetpoint:
 
     def __init__(self, action: Position) -> None:
         self.action = action
-        self._at: Vector | None = None  # what the vehicle is told: north, east, down
+        self._at: Vector | None = None  # what the vehicle is sent: north, east, down
         self._speed_m_s = 0.0
         self._yaw: float | None = None  # clockwise from north
         self._keep_yaw: float | None = None  # where none is asked for
@@ -140,7 +140,7 @@ class PositionSetpoint:
         )
 
     def _move(self, at: Vector, vehicle: Vector, step_s: float) -> None:
-        """Move what it is told towards the place."""
+        """Move what it is sent towards the place."""
         goal, most = swap(*self.action.place), self.action.speed or WAY_M_S
         left = math.dist(at, goal)
         self._speed_m_s = min(most, self._speed_m_s + WAY_M_S2 * step_s, math.sqrt(2.0 * WAY_M_S2 * left))

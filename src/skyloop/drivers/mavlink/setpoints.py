@@ -221,7 +221,7 @@ class SetpointController:
         elif isinstance(action, Position):
             if isinstance(self._setpoint, PositionSetpoint) and self.goal is Goal.FOLLOW:
                 self._setpoint.replace(action)
-                return action  # what it is told moves step by step: there is nothing to hurry for
+                return action  # what it is sent moves step by step: there is nothing to hurry for
             self._follow(PositionSetpoint(action))
         else:
             if not (isinstance(self._setpoint, AttitudeSetpoint) and self.goal is Goal.FOLLOW):
@@ -296,8 +296,8 @@ class SetpointController:
 
     def pop_events(self) -> list[VehicleEvent]:
         """Return what happened since the last call."""
-        notices, self._events = self._events, []
-        return notices
+        events, self._events = self._events, []
+        return events
 
     def messages(self, vehicle: VehicleState, now_ns: int) -> list[Message]:
         """Return the set-points that are due now; commands go to the command sender."""

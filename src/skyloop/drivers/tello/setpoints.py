@@ -269,8 +269,8 @@ class SetpointController:
 
     def pop_events(self) -> list[VehicleEvent]:
         """Return the events since the last call."""
-        notices, self._events = self._events, []
-        return notices
+        events, self._events = self._events, []
+        return events
 
     def motions(self, now_ns: int) -> list[str]:
         """Return the commands due now that are answered seconds later."""

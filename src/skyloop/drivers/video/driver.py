@@ -32,7 +32,7 @@ class VideoDriver(Driver):
         return Capabilities(
             vehicle="video",
             cameras=(self._camera_info(),),
-            description=f"pictures of {self.options.path}",
+            description=f"frames of {self.options.path}",
             why_not=f"{self.uri} is a recording or a camera, not a vehicle: there is nothing to fly",
         )
 

@@ -82,7 +82,7 @@ class ContainerStream:
             )
         except Exception as error:
             if clock() - begun_ns >= nanoseconds(open_s):  # which FFmpeg takes for damage, in the midst of a handshake
-                raise TimeoutError(f"no answer, or no picture, within {open_s:g} s") from error
+                raise TimeoutError(f"no answer, or no frame, within {open_s:g} s") from error
             raise _os_error(error) from error
         try:
             self._context, self._packets = self._chosen()
@@ -133,7 +133,7 @@ class ContainerStream:
         if context is None:
             raise ConnectionError("what comes is in a codec that is not known here")
         if not (context.width and context.height):
-            raise ConnectionError("the stream has no picture size: it is damaged, or no video")
+            raise ConnectionError("the stream has no frame size: it is damaged, or no video")
         limit_memory(context)
         return context, self._container.demux(videos[0])
 
@@ -203,7 +203,7 @@ class LiveDecoder:
     def _note_failure(self, coded: Coded) -> None:
         self._failing_ns = coded.arrived_ns if self._failing_ns is None else self._failing_ns
         if coded.arrived_ns - self._failing_ns > nanoseconds(HOPELESS_S):
-            raise UnsupportedError(f"for {HOPELESS_S:g} s, what comes is no picture that can be decoded")
+            raise UnsupportedError(f"for {HOPELESS_S:g} s, nothing that came could be decoded")
         self.damaged += 1
 
 

@@ -222,7 +222,7 @@ class FilePlayer:
             publisher.sink.link(LinkState.LOST, "no picture of the recording can be decoded")
             return False
         if not self._loop:
-            publisher.sink.link(LinkState.CLOSED, f"end of the recording after {publisher.shown} pictures")
+            publisher.sink.link(LinkState.CLOSED, f"end of the recording after {publisher.shown} frames")
         return self._loop
 
 

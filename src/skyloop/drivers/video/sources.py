@@ -134,7 +134,7 @@ class ContainerSource:
         self.fps = float(self._stream.average_rate or self._stream.guessed_rate or DEFAULT_FPS)
         if not (self.width and self.height):
             self._container.close()
-            raise FileFormatError(f"{name}: its picture size is missing: it is damaged or cut off")
+            raise FileFormatError(f"{name}: its frame size is missing: it is damaged or cut off")
 
     def images(self, late: Late | None = None) -> Iterator[DecodedImage]:
         """See :meth:`Source.images`."""

@@ -61,7 +61,7 @@ def decide_place(
         if problem:
             return PlaceDecision(None, (), Refusal.OUT_OF_RANGE, problem)
     speed, limit = _fastest(at, place, limits)
-    if new and action.speed is not None and action.speed > speed:  # told once: the direction turns near the place
+    if new and action.speed is not None and action.speed > speed:  # reported once: the direction turns near the place
         clamps.append(Clamp(limit, action.speed, speed))
     turn_rate = limits.yaw_rate
     if action.turn_rate is not None and action.turn_rate > turn_rate:

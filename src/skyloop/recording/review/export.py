@@ -228,7 +228,7 @@ def _burn(image: NDArray[np.uint8], seconds: float) -> None:
     try:
         import cv2
     except ImportError as error:
-        raise MissingExtraError("burning the time into pictures", "vision", cause=str(error)) from None
+        raise MissingExtraError("burning the time into frames", "vision", cause=str(error)) from None
     minutes, rest = divmod(abs(seconds), 60.0)
     text = f"{'-' if seconds < 0 else ''}{int(minutes):02d}:{rest:06.3f}"
     scale = max(0.35, image.shape[0] / 720)

@@ -96,7 +96,7 @@ class MujocoRenderer:
         if out is None:
             out = np.empty(shape, np.uint8)
         elif out.shape != shape or out.dtype != np.uint8:
-            raise UsageError(f"out is {out.dtype} of shape {out.shape}; this camera's picture is uint8 of {shape}")
+            raise UsageError(f"out is {out.dtype} of shape {out.shape}; this camera's image is uint8 of {shape}")
         raster = self._raster(model)
         self._put(state, pose.drone)
         context = self._context(raster.width, raster.height)

@@ -67,7 +67,7 @@ class PlanarRenderer:
         if out is None:
             out = np.empty(shape, np.uint8)
         elif out.shape != shape or out.dtype != np.uint8:
-            raise UsageError(f"out is {out.dtype} of shape {out.shape}; this camera's picture is uint8 of {shape}")
+            raise UsageError(f"out is {out.dtype} of shape {out.shape}; this camera's image is uint8 of {shape}")
         if self.quality is Quality.BEST:
             large = self._draw(state, pose, _doubled(model), samples=1)
             small = cv2.resize(large, (model.width, model.height), interpolation=cv2.INTER_AREA)
