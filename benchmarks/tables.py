@@ -93,10 +93,12 @@ def network_table(results: Network) -> Table:
 
 def path_table(results: Network) -> Table:
     """Return the path's own figures, and how many bytes a sample takes on it."""
-    rows = [["passed on at most", f"{results.megabytes_per_s:.0f} MB/s"]]
+    rows = [["maximum throughput", f"{results.megabytes_per_s:.0f} MB/s"]]
     late = max(case.relay.p99_us for case in results.cases)
     typical = max(case.relay.median_us for case in results.cases)
-    rows.append(["late by its own doing", f"{typical:.0f} µs (99th percentile {late:.0f}), in the worst case"])
+    rows.append(
+        ["delay added by the emulation itself", f"{typical:.0f} µs (99th percentile {late:.0f}), in the worst case"]
+    )
     if results.wire is not None:
         wire = results.wire
         rows += [
@@ -111,7 +113,7 @@ def swarm_table(results: Sequence[Swarm]) -> Table:
     """Return a row for each run."""
     rows = [
         [
-            f"{run.drones} by {run.users}, {run.observers} looking on",
+            f"{run.drones} by {run.users}, {run.observers} observers",
             f"{run.seconds:g} s",
             _spread(run.command),
             _spread(run.feedback),
@@ -127,7 +129,7 @@ def swarm_table(results: Sequence[Swarm]) -> Table:
     ]
     columns = [
         *("drones, users", "flown", "command", "feedback", "at observers", "commands/s", "frames/s"),
-        *("failsafes taken", "after", "needless", "processor"),
+        *("failsafes executed", "after", "needless", "processor"),
     ]
     return Table("Delays in ms: median (99th percentile)", columns, rows)
 
@@ -172,12 +174,16 @@ def units_table(units: Units) -> Table:
         ["a proxy with its pilot, each second", f"{units.proxy_us_per_s / 1e3:.1f} ms", f"{units.proxy_mb:.0f} MB"],
         ["a pilot, each second and drone", f"{units.pilot_us_per_s / 1e3:.1f} ms", ""],
         ["feedback sent to one more observer", f"{units.feedback_sent_us:.0f} µs", f"{units.feedback_bytes:.0f} bytes"],
-        ["feedback taken in by an observer", f"{units.feedback_received_us:.0f} µs", f"{units.observer_mb:.0f} MB"],
-        ["a frame made a JPEG, once for all", f"{units.jpeg_us:.0f} µs", f"{units.frame_bytes:.0f} bytes"],
+        ["feedback received by an observer", f"{units.feedback_received_us:.0f} µs", f"{units.observer_mb:.0f} MB"],
+        ["a frame encoded as JPEG, once for all clients", f"{units.jpeg_us:.0f} µs", f"{units.frame_bytes:.0f} bytes"],
         ["a frame sent to one observer", f"{units.frame_sent_us:.0f} µs", ""],
-        ["a frame taken in and decoded", f"{units.frame_received_us:.0f} µs", ""],
-        ["feedback passed on by a router, to one", f"{units.feedback_routed_us:.0f} µs", f"{units.router_mb:.0f} MB"],
-        ["a frame passed on by a router, to one", f"{units.frame_routed_us:.0f} µs", ""],
+        ["a frame received and decoded", f"{units.frame_received_us:.0f} µs", ""],
+        [
+            "feedback forwarded by a router, to one client",
+            f"{units.feedback_routed_us:.0f} µs",
+            f"{units.router_mb:.0f} MB",
+        ],
+        ["a frame forwarded by a router, to one client", f"{units.frame_routed_us:.0f} µs", ""],
         ["a command", "", f"{units.command_bytes:.0f} bytes"],
     ]
     return Table("What one costs", ["what", "processor", "memory or wire"], rows)
@@ -191,14 +197,14 @@ def needs_table(fleet: Fleet, found: Needs) -> Table:
         ["cores for observers", f"{found.observer_cores:.1f}", f"{fleet.drones * fleet.observers} of them"],
         ["cores for each site's router", f"{found.router_cores:.2f}", f"{fleet.sites} of them"],
         ["cores for the router in the middle", f"{found.middle_cores:.2f}", ""],
-        ["cores in all", str(found.cores), f"so that none is busier than {fleet.busy:.0%}"],
+        ["cores in all", str(found.cores), f"with a load of at most {fleet.busy:.0%}"],
         ["memory of proxies", f"{found.proxy_memory_gb:.0f} GB", ""],
         ["memory of observers", f"{found.observer_memory_gb:.0f} GB", ""],
         ["link of one drone, out", f"{found.drone_uplink:.2f} Mbit/s", "feedback and one video"],
         ["link of one drone, in", f"{found.drone_downlink:.3f} Mbit/s", "commands"],
         ["link of a site", f"{found.site_link:.0f} Mbit/s", "each way, as half of the observers are elsewhere"],
         ["liveliness tokens", str(found.tokens), "one a proxy, one a connection"],
-        ["links without routers", f"{found.mesh_links:,}", "if each process called each: so none does"],
+        ["links without routers", f"{found.mesh_links:,}", "if each process connected to each other one, so none does"],
     ]
     return Table(f"{fleet.drones} drones at {fleet.sites} sites", ["what", "needed", ""], rows)
 

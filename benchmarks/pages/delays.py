@@ -69,7 +69,7 @@ def machine(results: delays.Delays) -> str:
     packages = ", ".join(f"{name} {version}" for name, version in where.packages.items())
     text = f"{where} ({packages}); {results.seconds:g} s for each contender with each size."
     if where.load is None or where.load > IDLE_LOAD:
-        text += "\n\n**The machine had other work at the same time**: the medians say something, the tails little."
+        text += "\n\n**The machine had other work at the same time**: the medians are meaningful, the tails less so."
     return text
 
 

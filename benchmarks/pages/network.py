@@ -73,7 +73,7 @@ def machine(where: Machine, seconds: float) -> str:
     """The machine in a sentence, how long was measured, and a warning if it was not alone."""
     text = f"{where}; {seconds:g} s for each case."
     if where.load is None or where.load > IDLE_LOAD:
-        text += "\n\n**The machine had other work at the same time**: the medians say something, the tails little."
+        text += "\n\n**The machine had other work at the same time**: the medians are meaningful, the tails less so."
     return text
 
 

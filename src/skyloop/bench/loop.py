@@ -30,7 +30,7 @@ _LATE_S: Final = 20.0
 
 #: The stages by the moment in which each ends.
 STAGES: Final = {
-    "published": "the driver has the picture → the proxy has stamped it",
+    "published": "the driver has the image → the proxy has stamped it",
     "delivered": "→ the application's receiving thread has the frame",
     "controller": "→ the controller's on_frame is called in its own thread",
     "sent": "→ its drone.velocity() has been checked, encoded and stamped",
