@@ -135,7 +135,7 @@ def test_who_takes_over_keeps_the_drone(start: Callable[..., Process], alpha: Pr
     with skyloop.connect("alpha", access="observe") as drone:
         drone.wait("flying", timeout_s=30.0)
     with skyloop.connect("alpha", authority=skyloop.Authority(priority=1), name="other") as other:
-        process.until("other took over: the drone is left to them")
+        process.until("other took over: the drone is left to it")
         assert process.wait() == 0
         assert "landing" not in process.text
         other.land()
@@ -146,7 +146,7 @@ def test_nobody_flies_while_somebody_does(run: Run, alpha: Process, write: Write
     with skyloop.connect("alpha", name="the pilot"):
         ended = run("fly", write(GOOD), "--on", "alpha", "--seconds", "1")
         assert ended.code == 1
-        assert ended.err.startswith("skyloop: the pilot holds the authority over alpha: wait in line with --wait")
+        assert ended.err.startswith("skyloop: the pilot holds the authority over alpha: wait in the queue with --wait")
         assert len(ended.err.splitlines()) == 1
         assert run("fly", write(GOOD), "--on", "alpha", "--wait", "0.05", "--seconds", "1").code == 1
         higher = run("fly", write(GOOD), "--on", "alpha", "--priority", "3", "--seconds", "0.1")

@@ -127,7 +127,7 @@ def test_a_line_with_expected_waits_moves_up(shared: Shared) -> None:
         held(bob)
         wait_until(lambda: carol.authority.position == 1, "carol moved up")
         assert carol.authority.expected_wait_s == pytest.approx(30.0, abs=10.0)
-        line = r"bob holds the authority \(number 2 in line, expected wait \d+ s\)"
+        line = r"bob holds the authority \(number 2 in the queue, expected wait \d+ s\)"
         with pytest.raises(AuthorityError, match=line):
             open_drone(shared.server.dial, app="dave")
 

@@ -65,7 +65,7 @@ def test_without_being_asked_nothing_leaves_the_host(proxy: Callable[..., Proces
     with skyloop.connect("alpha", access="observe") as drone:
         assert drone.link.application is LinkState.UP
         assert internet_sockets(alpha.pid) == []
-    with pytest.raises(UnknownNameError, match="only this host was looked at"):
+    with pytest.raises(UnknownNameError, match="only this host was searched"):
         skyloop.connect("bravo")
 
 

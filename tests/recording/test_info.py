@@ -95,7 +95,7 @@ def test_what_was_lost_and_what_is_wrong_is_said(log: Log, tmp_path: Path) -> No
     ended = log("info", path)
     assert ended.code == 0
     assert "cut off: it ends within a record" in ended.out
-    assert "skyloop log recover mends it" in ended.out
+    assert "skyloop log recover repairs it" in ended.out
     assert "alpha: 2 of video.front left out by the recorder" in ended.out
 
 

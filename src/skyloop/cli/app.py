@@ -54,7 +54,7 @@ COMMANDS: Final = {
         "Run a class of yours on a drone's frames",
         "process detector.py --drone alpha",
     ),
-    "log": Entry("log", "log", "Look at recordings, export, compare and mend them", "log info flight.mcap"),
+    "log": Entry("log", "log", "Inspect, export, compare and repair recordings", "log info flight.mcap"),
     "keys": Entry("keys", "keys", "Who may join the network: make, issue, revoke keys", "keys issue jane --role pilot"),
     "camera": Entry("camera", "camera", "Print a board, and calibrate a camera by it", "camera calibrate alpha"),
     "cockpit": Entry("cockpit", "cockpit", "A page in the browser to watch and fly drones", "cockpit --port 8000"),

@@ -26,9 +26,9 @@ def cockpit(
     tls_key: Annotated[Path | None, typer.Option(metavar="FILE", help="Its key, PEM")] = None,
     client_ca: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Let in whose certificate this authority signed; its OU is the role"),
+        typer.Option(metavar="FILE", help="Admit clients with a certificate of this authority; its OU is the role"),
     ] = None,
-    role: Annotated[Role, typer.Option(help="Of everybody who asks, without tokens or certificates")] = Role.PILOT,
+    role: Annotated[Role, typer.Option(help="Of every client, without tokens or certificates")] = Role.PILOT,
     hostname: Annotated[
         list[str] | None, typer.Option(metavar="NAME", help="A name by which browsers reach this machine; repeatable")
     ] = None,

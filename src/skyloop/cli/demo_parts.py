@@ -34,7 +34,7 @@ def land(drone: Drone, console: Console) -> None:
     """Land, unless somebody else flies the drone."""
     status = drone.authority
     if status.state != "held":
-        console.print(f"[yellow]{status.holder or 'somebody else'} took over: the drone is left to them[/]")
+        console.print(f"[yellow]{status.holder or 'another application'} took over: the drone is left to it[/]")
         return
     console.print("landing")
     drone.land()

@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from skyloop.control import Controller
     from skyloop.control.reloading import Reloader
 
-ADVICE = "wait in line with --wait SECONDS, or take over with a higher --priority (a lower number, 0 is the highest)"
+ADVICE = (
+    "wait in the queue with --wait SECONDS, or take over with a higher --priority (a lower number, 0 is the highest)"
+)
 
 
 def fly(
@@ -36,7 +38,9 @@ def fly(
         float | None, typer.Option(metavar="S", min=0.0, help="How long; until Ctrl-C if not given")
     ] = None,
     priority: Annotated[int, typer.Option(metavar="P", min=0, max=31, help="0 is the highest, 31 the lowest")] = 16,
-    wait: Annotated[float, typer.Option(metavar="S", min=0.0, help="How long to wait in line for the authority")] = 0.0,
+    wait: Annotated[
+        float, typer.Option(metavar="S", min=0.0, help="Longest wait in the queue for the authority")
+    ] = 0.0,
     takeoff: Annotated[bool, typer.Option(help="Take off first, or leave that to the controller")] = True,
     reload: Annotated[
         bool, typer.Option("--reload", help="Reload the file when it is saved; after an error hover until then")
@@ -102,7 +106,7 @@ def _land(drone: Drone) -> None:
     if not drone.feedback().state.airborne:
         return
     if drone.authority.state in ("queued", "preempted"):
-        _print(f"{drone.authority.holder or 'somebody else'} took over: the drone is left to them")
+        _print(f"{drone.authority.holder or 'another application'} took over: the drone is left to it")
         return
     _print("landing")
     try:

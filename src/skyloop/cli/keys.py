@@ -95,7 +95,7 @@ def show(
             typer.echo(f"skyloop: {warning}", err=True)
 
 
-@keys.command(short_help="Shut somebody out", epilog=f"{_EXAMPLE}revoke jane")
+@keys.command(short_help="Revoke a key", epilog=f"{_EXAMPLE}revoke jane")
 def revoke(
     name: Annotated[str, typer.Argument(metavar="NAME", help="Whose key was lost, or who left")],
     directory: Directory = None,

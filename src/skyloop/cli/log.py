@@ -184,7 +184,7 @@ def compare(
         _print(f"{output}: {output.stat().st_size / 1e3:.0f} kB")
 
 
-@log.command(short_help="Mend a recording that was cut off", epilog=f"{_EXAMPLE}recover flight.mcap")
+@log.command(short_help="Repair a recording that was cut off", epilog=f"{_EXAMPLE}recover flight.mcap")
 def recover(
     file: File,
     output: Annotated[
@@ -198,7 +198,7 @@ def recover(
     with _progress("looking") as progress:
         wrong = mending.problems(recording, progress)
     if not wrong and output is None:
-        _print(f"{file} is whole: there is nothing to mend")
+        _print(f"{file} is whole: there is nothing to repair")
         return
     target = output or file.with_name(f"{file.stem}-recovered.mcap")
     with _progress("mending") as progress:

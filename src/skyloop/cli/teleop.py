@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from skyloop.client import Drone
     from skyloop.cockpit.child import CockpitProcess
 
-ADVICE = "wait in line with --wait SECONDS, take over with a higher --priority, or observe: skyloop watch"
+ADVICE = "wait in the queue with --wait SECONDS, take over with a higher --priority, or observe: skyloop watch"
 PERIOD_S: Final = 0.05  #: how often a moved stick is sent again; sooner at each press
 REFRESH_S: Final = 0.125
 EVENTS_SHOWN: Final = 3
@@ -29,7 +29,9 @@ def teleop(
     speed: Annotated[float, typer.Option(metavar="M/S", min=0.05, max=10.0, help="Of a key that is held")] = 0.5,
     turn: Annotated[float, typer.Option(metavar="RAD/S", min=0.05, max=6.0, help="Turning, of a key held")] = 0.8,
     priority: Annotated[int, typer.Option(metavar="P", min=0, max=31, help="0 is the highest, 31 the lowest")] = 16,
-    wait: Annotated[float, typer.Option(metavar="S", min=0.0, help="How long to wait in line for the authority")] = 0.0,
+    wait: Annotated[
+        float, typer.Option(metavar="S", min=0.0, help="Longest wait in the queue for the authority")
+    ] = 0.0,
     cockpit: Annotated[bool, typer.Option("--cockpit", help="Serve a page beside it that shows the video")] = False,
 ) -> None:
     """Fly by keys, with the drone's state live. It hovers when no key is held, and lands at the end.

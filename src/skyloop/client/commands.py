@@ -424,7 +424,7 @@ class CommandSender:
 def _busy(status: AuthorityStatus, wait_s: float, declined: str) -> str:
     waited = f" and did not give it back within {wait_s:g} s" if wait_s > 0 else ""
     expected = status.expected_wait_s
-    words = f" (number {status.position} in line, expected wait {expected:.0f} s)" if expected is not None else ""
+    words = f" (number {status.position} in the queue, expected wait {expected:.0f} s)" if expected is not None else ""
     refusal = f"; {declined}" if declined else ""
     return (
         f"{status.holder or 'another application'} holds the authority{waited}{words}{refusal}: wait longer "

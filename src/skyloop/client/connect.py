@@ -197,7 +197,7 @@ class Connector(Protocol):
 
 
 NETWORK_VARIABLE: Final = "SKYLOOP_NETWORK"
-_HINT: Final = "; only this host was looked at (network=True, or the variable SKYLOOP_NETWORK, looks further)"
+_HINT: Final = "; only this host was searched (network=True, or the variable SKYLOOP_NETWORK, searches further)"
 
 
 def network_settings(network: NetworkChoice = None, keys: Path | str | None = None) -> FabricSettings | None:

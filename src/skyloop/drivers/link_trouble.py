@@ -58,7 +58,7 @@ def serial_trouble(error: OSError, port: str, advice: str, devices: Path = Path(
     try:
         status = path.stat()
     except PermissionError:
-        return LinkTrouble(f"{port} can't be looked at", f"let this user enter {path.parent}")
+        return LinkTrouble(f"{port} can't be accessed", f"let this user enter {path.parent}")
     except OSError:
         there = sorted(str(found) for pattern in _PORTS for found in devices.glob(pattern))[:_MOST_PORTS]
         known = f"; ports that are there: {', '.join(there)}" if there else ""

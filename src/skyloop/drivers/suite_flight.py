@@ -137,7 +137,7 @@ class Flight:
         """
         suite, start = self.suite, self.sink.newest
         assert start is not None
-        assert start.position_m is not None, "a vehicle that takes positions tells its own"
+        assert start.position_m is not None, "a vehicle that takes positions reports its own"
         x, y, z = start.position_m
         turn = 0.0 if start.yaw_rad is None else start.yaw_rad + suite.turn
         away = Position(x + suite.distance, y - suite.distance, z + suite.distance, turn, speed=suite.speed)

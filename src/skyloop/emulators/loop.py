@@ -105,7 +105,7 @@ class Loop:
         try:
             call()
         except Exception:  # noqa: BLE001  a drone that dies of one datagram helps nobody
-            _log.exception("the emulated firmware met an error and goes on")
+            _log.exception("the emulated firmware met an error and continues")
 
     def _wake(self) -> None:
         with suppress(OSError):  # full: it is awake already

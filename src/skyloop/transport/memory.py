@@ -87,7 +87,7 @@ class MemoryServer(TransportServer):
         """
         with self._lock:
             if self._thread is None:
-                raise LinkError(f"nobody serves {self.address}: start the transport server first")
+                raise LinkError(f"nothing serves {self.address}: start the transport server first")
             client = MemoryClient(self, Peer(next(self._ids), "this process"), handler, self._faults)
             self._clients[client.peer.id] = client
             self._inbox.put((client, _What.JOINED, ""))

@@ -43,7 +43,7 @@ def _granted(effect: authority.Granted, context: EventContext) -> EventDraft:
 
 def _queued(effect: authority.Queued, context: EventContext) -> EventDraft:
     data: dict[str, Value] = {"priority": effect.priority, "position": effect.position}
-    text = f"{context.name(effect.app_id)} waits for the authority, number {effect.position} in line"
+    text = f"{context.name(effect.app_id)} waits for the authority, number {effect.position} in the queue"
     if effect.wait_ns is not None:
         data["wait_s"] = seconds(effect.wait_ns)
         text += f", for about {seconds(effect.wait_ns):.0f} s"

@@ -112,9 +112,9 @@ def notes(recording: Recording) -> list[str]:
     """Describe what is wrong with the file."""
     found = []
     if recording.cut:
-        found.append(f"cut off: {recording.cut} (skyloop log recover mends it)")
+        found.append(f"cut off: {recording.cut} (skyloop log recover repairs it)")
     elif recording.end is None:
-        found.append("mended, or never closed: what the recorder had not written yet when it was stopped is missing")
+        found.append("repaired, or never closed: what the recorder had not written yet when it was stopped is missing")
     return [*found, *recording.damaged]
 
 

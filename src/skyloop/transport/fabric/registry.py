@@ -209,7 +209,7 @@ class ConnectionRegistry:
             address = f"{sender.who} at {request.host[:64] or '?'}"
             problem = self._no_place(sender.who)
             if problem:
-                self._turn_away(f"{address} was not let in: {problem}")
+                self._turn_away(f"{address} was not admitted: {problem}")
                 return problem
             self._last_id += 1
             peer = Peer(self._last_id, f"{address} (pid {request.pid})")
