@@ -218,4 +218,5 @@ def test_everything_is_typed(kind: type) -> None:
     for name, method in vars(kind).items():
         if inspect.isfunction(method) and (name == "__init__" or not name.startswith("_")):
             options = [one for one in inspect.signature(method).parameters.values() if one.kind is one.VAR_KEYWORD]
-            assert all("Unpack[" in str(one.annotation) or one.annotation == "str" for one in options), f"{kind.__name__}.{name}"
+            typed = ["Unpack[" in str(one.annotation) or one.annotation == "str" for one in options]
+            assert all(typed), f"{kind.__name__}.{name}"
