@@ -276,7 +276,11 @@ def test_a_bad_file_is_told_when_opened(
 
 
 def test_without_pyav_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in [name for name in sys.modules if name.startswith(("skyloop.drivers.video", "av."))]:
+    for name in [
+        name
+        for name in sys.modules
+        if name.startswith(("skyloop.drivers.video", "skyloop.drivers.pave_decoder", "av."))
+    ]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'skyloop\[video\]'"):

@@ -277,7 +277,11 @@ def test_what_cannot_work_is_said() -> None:
 
 
 def test_without_pyav_it_names_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in [name for name in sys.modules if name == "av" or name.startswith(("av.", "skyloop.drivers.video"))]:
+    for name in [
+        name
+        for name in sys.modules
+        if name == "av" or name.startswith(("av.", "skyloop.drivers.pave_decoder", "skyloop.drivers.video"))
+    ]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(MissingExtraError, match=r"the video of an AR.Drone 2 needs .* pip install 'skyloop\[video\]'"):
