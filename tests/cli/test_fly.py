@@ -157,7 +157,7 @@ def test_nobody_flies_while_somebody_does(run: Run, alpha: Process, write: Write
 def test_a_controller_of_frames_needs_a_camera(run: Run, alpha: Process, write: Write) -> None:
     ended = run("fly", write(LOOKING), "--on", "alpha", "--no-takeoff")
     assert ended.code == 1
-    assert ended.err.startswith("skyloop: no camera")
+    assert ended.err.startswith("skyloop: this vehicle has no camera")
     assert "Traceback" not in ended.err
 
 
