@@ -46,7 +46,7 @@ class Recorder:
     def hover(self) -> None:
         self.hovers += 1
 
-    def tell(self, kind: EventKind, text: str, severity: Severity) -> None:
+    def emit(self, kind: EventKind, text: str, severity: Severity) -> None:
         self.told.append((text, severity))
 
     def annotate(self, frame: Frame, shapes: list[Any], source: str) -> None:

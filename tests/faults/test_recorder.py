@@ -227,4 +227,4 @@ def test_numbers_of_the_vehicle_that_are_none_are_not_known(rig: Rig) -> None:
     files.until(lambda: any(one.captured_ns == 1 for one in came), "it came")
     (sample,) = [one for one in came if one.captured_ns == 1]
     assert (sample.yaw_rad, sample.altitude_m, sample.velocity_m_s) == (None, 2.0, None)
-    files.until(lambda: any("yaw, velocity came as NaN" in one.text for one in events), "it is told")
+    files.until(lambda: any("yaw_rad, velocity_m_s came as NaN" in one.text for one in events), "it is told")
