@@ -14,6 +14,7 @@ from skyloop.client import Drone, Swarm
 from skyloop.client.drone import open_drone
 from skyloop.drivers.registry import make_driver
 from skyloop.emulators.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
+from skyloop.emulators.mavlink.places import ORIGIN_LATITUDE_DEG, ORIGIN_LONGITUDE_DEG
 from skyloop.errors import NoAnswerError, RefusedError, SwarmError, UnknownNameError, UsageError
 from skyloop.messages import Applied, Feedback, FlightState, Hover, Velocity
 from skyloop.proxy import Proxy
@@ -79,6 +80,35 @@ def test_there_and_back(vehicle: str) -> None:
         drone.wait("flying", WAIT_S)
         drone.hover()
         drone.wait("hovering", LONG_S)
+
+
+@pytest.mark.parametrize("vehicle", [*KINDS])
+def test_a_place_on_the_earth(vehicle: str) -> None:
+    with flown(vehicle) as drone:
+        drone.wait(lambda feedback: feedback.origin is not None, LONG_S)
+        feedback = drone.feedback()
+        origin, (x, y, z) = feedback.origin, place(feedback)
+        assert origin is not None
+        assert (origin.latitude_deg, origin.longitude_deg) == pytest.approx(
+            (ORIGIN_LATITUDE_DEG, ORIGIN_LONGITUDE_DEG), abs=2e-6
+        ), "the emulated earth is a little rounder than the autopilot's: 0.2 m at most here"
+        latitude_deg, longitude_deg, altitude_m = origin.place_of((x + 2.0, y + 1.0, z + 0.5))
+        drone.go_to(latitude_deg=latitude_deg, longitude_deg=longitude_deg, altitude_m=altitude_m, timeout_s=LONG_S)
+        assert math.dist(place(drone.feedback()), (x + 2.0, y + 1.0, z + 0.5)) <= 0.25
+        height_m = place(drone.feedback())[2]
+        latitude_deg, longitude_deg, _ = origin.place_of((x, y, z))
+        drone.go_to(latitude_deg=latitude_deg, longitude_deg=longitude_deg, timeout_s=LONG_S)
+        assert math.dist(place(drone.feedback()), (x, y, height_m)) <= 0.35, "at the height that it had"
+        with pytest.raises(UsageError, match=r"must be within 100000 m of the origin"):
+            drone.go_to(latitude_deg=0.0, longitude_deg=0.0)
+
+
+def test_a_vehicle_that_does_not_know_its_place_on_the_earth_refuses_latitudes() -> None:
+    with (
+        flown(SIM) as drone,
+        pytest.raises(RefusedError, match="does not report its place on the earth"),
+    ):
+        drone.go_to(latitude_deg=47.0, longitude_deg=8.0)
 
 
 @pytest.mark.parametrize("vehicle", [SIM, *KINDS])

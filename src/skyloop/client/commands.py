@@ -13,7 +13,7 @@ from skyloop.client.channels import Emit
 from skyloop.client.command_schedule import CommandSchedule
 from skyloop.client.connection import ProxyConnection, Scheduler
 from skyloop.client.statistics import ChannelCounter
-from skyloop.errors import AuthorityError, LinkError, NoAnswerError, UsageError
+from skyloop.errors import AuthorityError, LinkError, NoAnswerError, RefusedError, UsageError
 from skyloop.messages import (
     ACTION_NAMES,
     AnswerTakeover,
@@ -28,6 +28,7 @@ from skyloop.messages import (
     Feedback,
     Land,
     Position,
+    Refusal,
     Refused,
     ReleaseAuthority,
     RequestAuthority,
@@ -35,7 +36,9 @@ from skyloop.messages import (
     encode,
 )
 from skyloop.messages.config import MAX_REASON
+from skyloop.messages.earth import is_on_earth
 
+_OLD_PLACE_S: Final = 2.0  #: older, a place on the earth is not converted by it
 ANSWER_S: Final = 2.0  #: how long the proxy may take to answer a request for the authority
 _LATER_NS: Final = 1_000_000_000
 _ACTIONS: Final = frozenset(ACTION_NAMES)
@@ -473,6 +476,48 @@ def position_of(x: object, y: object, z: object, yaw: object = None, speed: obje
     )
     checked(place)
     return place
+
+
+def place_of(
+    local: tuple[object, object, object],
+    earth: tuple[object, object, object],
+    newest: Feedback | None,
+    age_s: float,
+) -> tuple[object, object, object]:
+    """Return x, y, z of a place that is given in either way.
+
+    Args:
+        local: x, y, z in world axes [m], or three times None.
+        earth: Latitude and longitude [°] and altitude above mean sea level [m], or three times None; None for the
+            altitude alone: the present height.
+        newest: The newest feedback.
+        age_s: Its age [s].
+
+    Raises:
+        UsageError: If both ways or neither are given, or something is no number or not on the earth.
+        RefusedError: If the vehicle's place on the earth is not known.
+    """
+    if all(one is None for one in earth):
+        if any(one is None for one in local):
+            raise UsageError("go_to needs x, y and z, or latitude_deg and longitude_deg with or without altitude_m")
+        return local
+    if any(one is not None for one in local):
+        raise UsageError("go_to takes x, y, z or latitude_deg, longitude_deg, altitude_m, not some of both")
+    latitude_deg, longitude_deg = number("latitude_deg", earth[0]), number("longitude_deg", earth[1])
+    if not is_on_earth(latitude_deg, longitude_deg):
+        raise UsageError(
+            f"latitude_deg is {latitude_deg:g} and longitude_deg {longitude_deg:g}: they must be within 89.9 and 180"
+        )
+    origin = None if newest is None else newest.origin
+    if newest is None or origin is None or newest.position_m is None or age_s > _OLD_PLACE_S:
+        raise RefusedError(
+            "position: the vehicle does not report its place on the earth (it needs a 3-D fix by satellites, and a "
+            "driver that passes it on): fly it by x, y, z",
+            code=Refusal.WRONG_STATE,
+        )
+    z = newest.position_m[2] if earth[2] is None else number("altitude_m", earth[2]) - origin.altitude_m
+    x, y, _ = origin.position_of(latitude_deg, longitude_deg, origin.altitude_m)
+    return x, y, z
 
 
 def above_zero(name: str, value: object) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
@@ -22,7 +23,7 @@ from skyloop.client.authority import (
     authority_request,
 )
 from skyloop.client.channels import Channel, Listener, VideoOptions
-from skyloop.client.commands import above_zero, checked, number, position_of
+from skyloop.client.commands import above_zero, checked, number, place_of, position_of
 from skyloop.client.completion import is_there
 from skyloop.client.core import DOWN, UP, DroneCore, DroneOptions
 from skyloop.client.frame import Arrival, Frame
@@ -345,9 +346,12 @@ class Drone:
     def go_to(
         self,
         *,
-        x: float,
-        y: float,
-        z: float,
+        x: float | None = None,
+        y: float | None = None,
+        z: float | None = None,
+        latitude_deg: float | None = None,
+        longitude_deg: float | None = None,
+        altitude_m: float | None = None,
         yaw: float | None = None,
         speed: float | None = None,
         wait: bool = True,
@@ -357,14 +361,19 @@ class Drone:
     ) -> None:
         """Fly straight to a place, and stay there.
 
-        World axes, those of ``Feedback.position``. ArduPilot and PX4 do it natively, elsewhere the proxy flies by
-        velocity. Unlike a velocity it does not decay when the application falls silent: the vehicle stops there. The
-        place is held until the next command, also after a time-out. Nothing keeps it away from obstacles.
+        World axes are those of ``Feedback.position_m``. Where the vehicle knows its place on the earth
+        (``Feedback.origin``), latitude and longitude may be given instead; they are converted when this is called.
+        ArduPilot and PX4 fly there natively, elsewhere the proxy does it by velocity. Unlike a velocity it does not
+        decay when the application falls silent: the vehicle stops there. The place is held until the next command, also
+        after a time-out. Nothing keeps it away from obstacles.
 
         Args:
             x: East [m].
             y: North [m].
             z: Up [m].
+            latitude_deg: [°], north positive; in place of x, y and z.
+            longitude_deg: [°], east positive.
+            altitude_m: Above mean sea level [m]; None: the present height.
             yaw: Counter-clockwise from x, turned to on the way [rad]; None: keep the present one.
             speed: Greatest speed on the way [m/s]; None: as fast as ``limits.speed`` and ``limits.climb`` allow, which
                 hold in any case.
@@ -377,6 +386,7 @@ class Drone:
             NoAnswerError: If the vehicle is not there in time; names its state and, if known, the reason.
             RefusedError: If the proxy refuses it, as where the position is not known, the place is outside of the
                 safety box or in a no-fly zone, or a zone is in the way; or if a failsafe or another command ends it.
+                Also if latitude and longitude are given and the vehicle does not report its place on the earth.
             UnsupportedError: If neither the vehicle nor its proxy can fly to a place.
             LinkError: Without ``wait``, if the link is down; the vehicle does not fly there later either.
             AuthorityError: If the authority is not held, or another application takes it over meanwhile.
@@ -384,7 +394,10 @@ class Drone:
             UsageError: If a number is not finite or makes no sense, or if called with ``wait`` from an inline callback;
                 nothing is sent.
         """
-        place = position_of(x, y, z, yaw, speed)
+        newest = self._state.newest
+        age_s = math.inf if newest is None else self.age_s(newest)
+        local = place_of((x, y, z), (latitude_deg, longitude_deg, altitude_m), newest, age_s)
+        place = position_of(*local, yaw, speed)
         near_m, near_rad = above_zero("tolerance_m", tolerance_m), above_zero("tolerance_rad", tolerance_rad)
         self._core.complete(place, lambda feedback: is_there(place, feedback, near_m, near_rad), wait, timeout_s)
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 
+from skyloop.messages.earth import EarthOrigin
 from skyloop.messages.kinds import Failsafe, FlightState, LinkState
 from skyloop.messages.numbers import Count, Finite, TimeNs
 
@@ -55,6 +56,11 @@ class Feedback(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
     link_reason: LinkText = ""  #: why the hop proxy–vehicle is as it is; empty while it is up
     link_remedy: LinkText = ""  #: what a person can do about it
     others: LinkText | None = None  #: why the proxy leaves the vehicle alone: another controller flies it
+
+    @property
+    def origin(self) -> EarthOrigin | None:
+        """Where the world axes begin on the earth; None where the vehicle does not know its place on it."""
+        return EarthOrigin.of(self.native)
 
     @property
     def rotation(self) -> NDArray[np.float64]:

@@ -358,3 +358,49 @@ def test_an_arducopter_that_assumes_its_place_is_lost_at_rest_too() -> None:
 def test_the_limits_in_force_are_told_at_the_start() -> None:
     bench = Bench(Vehicle(PX4), options("mavlink://udpin:127.0.0.1:14540?parameters=no&speed=4&altitude=12")).found()
     assert any(text.startswith("limits: 4 m/s, 1 m/s up and down, 12 m high") for text in bench.texts)
+
+
+def gps(fix: int) -> m.MAVLink_gps_raw_int_message:
+    return m.MAVLink_gps_raw_int_message(0, fix, 0, 0, 0, 0, 0, 0, 0, 9)
+
+
+def on_earth(bench: Bench, latitude_e7: int, longitude_e7: int, up_m: float) -> m.MAVLink_global_position_int_message:
+    up_mm = round((488.0 + up_m) * 1000)
+    boot_ms = bench.vehicle.boot_ms
+    return m.MAVLink_global_position_int_message(boot_ms, latitude_e7, longitude_e7, up_mm, 0, 0, 0, 0, 0)
+
+
+@AUTOPILOTS
+def test_where_its_axes_begin_on_the_earth_is_known_with_a_fix(autopilot: int) -> None:
+    bench = Bench(Vehicle(autopilot))
+    bench.found()
+    metres_per_e7 = 0.011131884502145034 if autopilot == ARDUPILOT else math.radians(1e-7) * 6_371_000.0
+    boot_ms = bench.vehicle.boot_ms
+    # It flies north at 10 m/s, and reported the one place 0.1 s before the other.
+    local = m.MAVLink_local_position_ned_message(boot_ms - 100, 99.0, 50.0, -20.0, 10.0, 0.0, 0.0)
+    north_e7, east_e7 = round(100.0 / metres_per_e7), round(50.0 / metres_per_e7)
+
+    def told(fix: int) -> None:
+        bench.hear(gps(fix), local, on_earth(bench, north_e7, east_e7, 20.0))
+        bench.hear(m.MAVLink_attitude_message(boot_ms, 0, 0, 0, 0, 0, 0))
+
+    told(2)
+    assert bench.newest.origin is None, "an origin that was given to it may be anywhere"
+    told(3)
+    origin = bench.newest.origin
+    assert origin is not None
+    assert (origin.latitude_deg, origin.longitude_deg) == pytest.approx((0.0, 0.0), abs=2e-7)
+    assert origin.altitude_m == pytest.approx(488.0)
+    assert origin.position_of(north_e7 / 1e7, east_e7 / 1e7, 508.0) == pytest.approx((50.0, 100.0, 20.0), abs=0.02)
+
+
+def test_places_of_different_times_are_not_taken_together() -> None:
+    bench = Bench(Vehicle(ARDUPILOT))
+    bench.found()
+    before = bench.newest.origin
+    late = m.MAVLink_local_position_ned_message(bench.vehicle.boot_ms - 700, 99.0, 50.0, -20.0, 10.0, 0.0, 0.0)
+    bench.hear(gps(3), late, on_earth(bench, 90_000, 0, 20.0))
+    bench.hear(m.MAVLink_attitude_message(bench.vehicle.boot_ms, 0, 0, 0, 0, 0, 0))
+    origin = bench.newest.origin
+    assert before is None
+    assert origin is None or origin.latitude_deg < 1e-3, "only what came together before"

@@ -142,6 +142,7 @@ class AutopilotProfile(ABC):
     NEEDS_STICKS: ClassVar[frozenset[str]]  #: modes that need somebody at a remote control
     LEAD_S: ClassVar[float]  #: set-points must flow for so long before GUIDED is entered
     BYTEWISE: ClassVar[bool]  #: how parameters are written, unless its capabilities say otherwise
+    EARTH_RADIUS_M: ClassVar[float]  #: of the sphere by which it converts latitude and longitude
     SAFETY_NETS: ClassVar[tuple[_SafetyNet, ...]]
 
     @abstractmethod
@@ -192,6 +193,7 @@ class ArduCopterProfile(AutopilotProfile):
     """ArduCopter."""
 
     NAME = "ArduCopter"
+    EARTH_RADIUS_M = math.degrees(111_318.845_021_45)  # AP_Math/definitions.h: LATLON_TO_M, for 1e-7 °
     GUIDED = "GUIDED"
     HOLD = "BRAKE"
     LAND = "LAND"
@@ -277,6 +279,7 @@ class Px4Profile(AutopilotProfile):
     """PX4."""
 
     NAME = "PX4"
+    EARTH_RADIUS_M = 6_371_000.0  # lib/geo/geo.h: CONSTANTS_RADIUS_OF_EARTH
     GUIDED = "OFFBOARD"
     HOLD = "AUTO.LOITER"
     LAND = "AUTO.LAND"

@@ -220,6 +220,9 @@ class MavlinkSession(VehicleSession):
                 native["mavlink.ready"] = vehicle.ready
         if self.clock.round_trip_s is not None:
             native["link.round_trip_s"] = self.clock.round_trip_s
+        origin = None if self.autopilot is None else self.telemetry.origin(self.autopilot.EARTH_RADIUS_M, now_ns)
+        if origin is not None:
+            native.update(origin.native())
         state = self.setpoints.state(vehicle) if self.setpoints is not None else observed_state(vehicle)
         feedback = feedback_of(self.telemetry, state, captured_ns, now_ns, native)
         self._pending.append(lambda sink: sink.feedback(feedback))

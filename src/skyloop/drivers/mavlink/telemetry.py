@@ -11,6 +11,7 @@ from typing import Final
 from skyloop.clock import nanoseconds, seconds
 from skyloop.drivers.vehicle_session import VehicleEvent
 from skyloop.messages import EventKind, Feedback, FlightState, Severity, Value
+from skyloop.messages.earth import EarthOrigin
 from skyloop.wire.mavlink.axes import Vector, flip, swap, turned, yaw_between
 from skyloop.wire.mavlink.codec import Message
 from skyloop.wire.mavlink.modes import Landed, ModeFlag, SystemState
@@ -65,6 +66,7 @@ class Telemetry:
         self.counts: Counter[str] = Counter()
         self._newest: dict[str, tuple[Message, int]] = {}
         self._ground_down: float | None = None  # "down" of the ground, from the origin [m]
+        self._on_earth: tuple[Vector, Message] | None = None  # east, north, up from the origin; the same on the earth
 
     def on_message(self, message: Message, now_ns: int) -> None:
         """Keep a message of the vehicle that is flown."""
@@ -75,6 +77,7 @@ class Telemetry:
             local = self.newest("LOCAL_POSITION_NED", now_ns, 0.5)
             if local is not None and math.isfinite(local.z):
                 self._ground_down = local.z + message.relative_alt / 1000.0
+                self._on_earth = _at_the_same_time(local, message) or self._on_earth
 
     def newest(self, kind: str, now_ns: int, max_age_s: float = math.inf) -> Message | None:
         """Return the newest message of a kind.
@@ -156,6 +159,22 @@ class Telemetry:
         message = self.newest("LOCAL_POSITION_NED", now_ns, FLOWING_S)
         return None if message is None else finite(message.x, message.y, message.z)
 
+    def origin(self, radius_m: float, now_ns: int) -> EarthOrigin | None:
+        """Return where its axes begin on the earth; None without a 3-D fix by satellites, and before both places came.
+
+        Without a fix an autopilot may have been given an origin that is anywhere, as for motion capture.
+
+        Args:
+            radius_m: The earth's, as this autopilot has it [m].
+            now_ns: The present time.
+        """
+        gps = self.newest("GPS_RAW_INT", now_ns, SLOW_S)
+        if gps is None or gps.fix_type < GOOD_FIX or self._on_earth is None:
+            return None
+        (east, north, up), message = self._on_earth
+        here = EarthOrigin(message.lat / 1e7, message.lon / 1e7, message.alt / 1000.0, radius_m)
+        return EarthOrigin(*here.place_of((-east, -north, -up)), radius_m)
+
     def velocity(self, now_ns: int) -> Vector | None:
         """Return the velocity north, east, down [m/s]."""
         message = self.newest("LOCAL_POSITION_NED", now_ns, FLOWING_S)
@@ -205,6 +224,7 @@ class Telemetry:
 
 
 _DOWN: Final = 25  #: MAV_SENSOR_ROTATION_PITCH_270
+_APART_S: Final = 0.5  #: farther apart two places are not taken together
 _AGED: Final = frozenset(
     {
         "HEARTBEAT",
@@ -216,6 +236,15 @@ _AGED: Final = frozenset(
         "GPS_RAW_INT",
     }
 )
+
+
+def _at_the_same_time(local: Message, world: Message) -> tuple[Vector, Message] | None:
+    """Return a place on the earth with that from the origin [m], moved on by its velocity to the same moment."""
+    later_s = (world.time_boot_ms - local.time_boot_ms) / 1000.0
+    if abs(later_s) > _APART_S:
+        return None
+    there = finite(local.x + local.vx * later_s, local.y + local.vy * later_s, local.z + local.vz * later_s)
+    return None if there is None else (swap(*there), world)
 
 
 def _in_range(sensor: Message) -> bool:
