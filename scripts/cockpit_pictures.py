@@ -24,10 +24,11 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Literal
 
 import browser
 from PIL import Image
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page, ViewportSize, sync_playwright
 
 import skyloop
 from skyloop.cockpit.child import CockpitProcess
@@ -36,12 +37,13 @@ from skyloop.control.waypoint import Waypoint, reached, velocity_to
 
 PICTURES = Path(__file__).parents[1] / "docs" / "pictures"
 MARKER_ID = 7
-DESK = {"width": 1440, "height": 900}
-WALL = {"width": 1680, "height": 1020}
-PHONE = {"width": 390, "height": 844}
+DESK: ViewportSize = {"width": 1440, "height": 900}
+WALL: ViewportSize = {"width": 1680, "height": 1020}
+PHONE: ViewportSize = {"width": 390, "height": 844}
 MOST_BYTES = 300_000
 ROUND_M = 1.1
-SCHEMES = ("dark", "light")
+Scheme = Literal["dark", "light"]
+SCHEMES: tuple[Scheme, ...] = ("dark", "light")
 #: The colours of the page that mean something, as six hexadecimal digits each.
 INKS = """() => {
   const names = ["accent", "ok", "warn", "bad", "stop", "target", "series-1", "series-2"];
@@ -108,7 +110,8 @@ def asked() -> None:
     command = ["sim", "--name", "alpha", "--seed", "4"]
     command += [word for option in ("width=640", "fps=15", "position=1") for word in ("--option", option)]
     with flight(command, []) as (chromium, address):
-        for name, size, scheme in (("dark", DESK, "dark"), ("phone", PHONE, "light")):
+        views: list[tuple[str, ViewportSize, Scheme]] = [("dark", DESK, "dark"), ("phone", PHONE, "light")]
+        for name, size, scheme in views:
             page = open_page(chromium, f"{address}#alpha", size, scheme)
             page.get_by_role("button", name="Take control").click()
             page.locator('.pane[data-mine="true"]').wait_for()
@@ -183,7 +186,7 @@ def flight(command: list[str], fliers: list[Fly]) -> Iterator[tuple[Browser, str
         yield opened, cockpit.address()
 
 
-def open_page(chromium: Browser, address: str, size: dict[str, int], scheme: str) -> Page:
+def open_page(chromium: Browser, address: str, size: ViewportSize, scheme: Scheme) -> Page:
     for context in chromium.contexts:
         context.close()
     context = chromium.new_context(viewport=size, color_scheme=scheme, has_touch=size is PHONE)
