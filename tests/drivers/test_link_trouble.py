@@ -12,7 +12,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from skyloop.drivers.link_trouble import serial_trouble, trouble_of
+from skyloop.drivers.link_reasons import serial_trouble, trouble_of
 from skyloop.drivers.name_lookup import NameLookup
 
 DENIED = OSError(errno.EACCES, "Permission denied")

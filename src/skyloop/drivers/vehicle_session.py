@@ -9,7 +9,7 @@ from typing import ClassVar, Final, TypeAlias
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.drivers.base import Sink
-from skyloop.drivers.link_trouble import LinkTrouble, trouble_of
+from skyloop.drivers.link_reasons import LinkTrouble, trouble_of
 from skyloop.messages import AnyAction, EventKind, LinkState, Severity, Value
 
 REPORT_AGAIN_NS: Final = nanoseconds(2.0)  #: least time between two reasons that are reported while nothing is received

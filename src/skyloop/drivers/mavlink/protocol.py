@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Final, TypeAlias
 
 from skyloop.clock import nanoseconds
-from skyloop.drivers.link_trouble import LinkTrouble, serial_trouble, trouble_of
+from skyloop.drivers.link_reasons import LinkTrouble, serial_trouble, trouble_of
 from skyloop.drivers.mavlink.autopilots import AutopilotProfile, profile_of
 from skyloop.drivers.mavlink.microservices import (
     CommandSender,
