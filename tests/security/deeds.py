@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
+from itertools import count
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,6 +42,7 @@ PUSH = Velocity(0.111)  #: a command that nobody else gives
 LIE = 0.123  #: a battery that the vehicle never reports
 PARAMETER = "limits.tilt"
 TILT = 0.0567
+_NUMBERS = count(10**6)
 
 
 class Deed(NamedTuple):
@@ -52,8 +54,9 @@ class Deed(NamedTuple):
 
 
 def _command(rig: Rig, action: Velocity | EmergencyStop) -> Command:
-    """Young, newer than all of jane's, and of her lease."""
-    return Command(10**6, rig.jane.lease, 10**6, rig.bench.clock(), action)
+    """Young, newer than all of jane's and than those tried before, and of her lease."""
+    number = next(_NUMBERS)
+    return Command(number, rig.jane.lease, number, rig.bench.clock(), action)
 
 
 def _of_jane(rig: Rig) -> dict[str, str]:
