@@ -128,6 +128,7 @@ def test_it_must_be_reset_first() -> None:
         ReachEnv().step(np.zeros(4, np.float32))
 
 
+@pytest.mark.slow
 def test_a_short_run_learns() -> None:
     learn = runpy.run_path(str(EXAMPLE))["learn"]
     curve = learn(10)

@@ -25,6 +25,7 @@ from tests.client.scripted import WAIT_S
 
 SIM = "sim://?world=empty&seed=2&wind=0&noise=0&cameras=none&position=1"
 KINDS = {kind.value: kind for kind in Kind}
+AUTOPILOTS = [pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS]
 LONG_S = 60.0
 
 
@@ -52,7 +53,7 @@ def place(feedback: Feedback) -> tuple[float, float, float]:
     return feedback.position_m
 
 
-@pytest.mark.parametrize("vehicle", [SIM, SIM + "&native=velocity", SIM + "&native=attitude", *KINDS])
+@pytest.mark.parametrize("vehicle", [SIM, SIM + "&native=velocity", SIM + "&native=attitude", *AUTOPILOTS])
 def test_there_and_back(vehicle: str) -> None:
     with flown(vehicle) as drone:
         native = "position" in drone.capabilities.actions
@@ -82,7 +83,7 @@ def test_there_and_back(vehicle: str) -> None:
         drone.wait("hovering", LONG_S)
 
 
-@pytest.mark.parametrize("vehicle", [*KINDS])
+@pytest.mark.parametrize("vehicle", AUTOPILOTS)
 def test_a_place_on_the_earth(vehicle: str) -> None:
     with flown(vehicle) as drone:
         drone.wait(lambda feedback: feedback.origin is not None, LONG_S)
@@ -111,7 +112,7 @@ def test_a_vehicle_that_does_not_know_its_place_on_the_earth_refuses_latitudes()
         drone.go_to(latitude_deg=47.0, longitude_deg=8.0)
 
 
-@pytest.mark.parametrize("vehicle", [SIM, *KINDS])
+@pytest.mark.parametrize("vehicle", [SIM, *AUTOPILOTS])
 def test_walls_hold_for_the_place_and_on_the_way(vehicle: str) -> None:
     with flown(vehicle) as drone:
         x, y, z = place(drone.feedback())

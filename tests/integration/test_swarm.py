@@ -322,6 +322,7 @@ def test_an_exception_in_the_block_lands_all_and_is_told_what_else_failed(field:
     assert "alpha: RefusedError" in raised.value.__notes__[0]
 
 
+@pytest.mark.slow
 def test_one_that_can_not_land_does_not_keep_the_others_from_it(field: Field, monkeypatch: pytest.MonkeyPatch) -> None:
     land = Drone.land
 

@@ -77,7 +77,6 @@ def test_the_marker_follower_flies_it_unchanged_with_and_without_loss(
         eventually(lambda: drone.feedback().state is FlightState.LANDED, "it stands again")
 
 
-@pytest.mark.daily
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_killed_pilot_leaves_it_hovering_and_then_landing(
     firmware: Firmware, proxy: Callable[..., Process], start: Callable[..., Process], kind: str

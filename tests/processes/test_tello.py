@@ -83,7 +83,6 @@ def test_it_finds_and_follows_the_marker_with_a_tenth_of_the_datagrams_lost(
         eventually(lambda: drone.feedback().state is FlightState.LANDED, "it stands again")
 
 
-@pytest.mark.daily
 def test_a_killed_pilot_leaves_it_hovering_and_then_landing(
     firmware: Firmware, proxy: Callable[..., Process], start: Callable[..., Process], addresses: Addresses
 ) -> None:
