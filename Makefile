@@ -33,9 +33,9 @@ $(VENV)/.installed-dev: $(VENV)/.installed requirements-dev.txt requirements-dev
 demo: $(VENV)/.installed
 	@$(BIN)/skyloop demo $(ARGS)
 
-# As many tests at a time as the machine has cores: most wait more than they compute. ARGS select from all tests.
+# Twice as many tests at a time as the machine has cores: most wait more than they compute. ARGS select from all tests.
 test: $(VENV)/.installed-dev
-	$(BIN)/python -m pytest --numprocesses auto $(or $(ARGS),-m "not slow" --durations 10 --durations-min 3)
+	$(BIN)/python -m pytest --numprocesses $(shell $(PYTHON) -c 'import os; print(2 * (os.cpu_count() or 1))') $(or $(ARGS),-m "not slow" --durations 10 --durations-min 3)
 
 test-all: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest --numprocesses auto $(ARGS)
