@@ -14,7 +14,7 @@ from skyloop.client import Drone, Swarm
 from skyloop.client.drone import open_drone
 from skyloop.drivers.registry import make_driver
 from skyloop.emulators.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
-from skyloop.emulators.mavlink.places import ORIGIN_LATITUDE_DEG, ORIGIN_LONGITUDE_DEG
+from skyloop.emulators.mavlink.places import ORIGIN
 from skyloop.errors import NoAnswerError, RefusedError, SwarmError, UnknownNameError, UsageError
 from skyloop.messages import Applied, Feedback, FlightState, Hover, Velocity
 from skyloop.proxy import Proxy
@@ -90,9 +90,9 @@ def test_a_place_on_the_earth(vehicle: str) -> None:
         feedback = drone.feedback()
         origin, (x, y, z) = feedback.origin, place(feedback)
         assert origin is not None
-        assert (origin.latitude_deg, origin.longitude_deg) == pytest.approx(
-            (ORIGIN_LATITUDE_DEG, ORIGIN_LONGITUDE_DEG), abs=2e-6
-        ), "the emulated earth is a little rounder than the autopilot's: 0.2 m at most here"
+        assert (origin.latitude_deg, origin.longitude_deg) == pytest.approx(ORIGIN[:2], abs=2e-6), (
+            "the emulated earth is a little rounder than the autopilot's: 0.2 m at most here"
+        )
         latitude_deg, longitude_deg, altitude_m = origin.place_of((x + 2.0, y + 1.0, z + 0.5))
         drone.go_to(latitude_deg=latitude_deg, longitude_deg=longitude_deg, altitude_m=altitude_m, timeout_s=LONG_S)
         assert math.dist(place(drone.feedback()), (x + 2.0, y + 1.0, z + 0.5)) <= 0.25

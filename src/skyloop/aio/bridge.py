@@ -6,14 +6,18 @@ import asyncio
 import contextlib
 import inspect
 import threading
-from collections.abc import Awaitable, Callable
-from typing import Any, TypeVar
+from abc import ABC, abstractmethod
+from collections.abc import Awaitable, Callable, Generator
+from contextlib import AbstractAsyncContextManager
+from types import TracebackType
+from typing import Any, Generic, TypeVar
 
 from skyloop.client.mailbox import Notifier
 from skyloop.drivers.uri import parse_uri
 from skyloop.errors import UsageError
 
 T = TypeVar("T")
+Opened = TypeVar("Opened", bound=AbstractAsyncContextManager[Any, Any])
 #: A callback of an asyncio application, a function or a coroutine function. It runs on the event loop.
 Callback = Callable[[T], object] | Callable[[T], Awaitable[object]]
 
@@ -87,3 +91,25 @@ async def in_thread(function: Callable[[], T], *, abandoned: Callable[[T], objec
 
     threading.Thread(target=work, name="skyloop-aio", daemon=True).start()
     return await future
+
+
+class Opening(ABC, Generic[Opened]):
+    """What is awaited for a drone or a swarm, or entered with ``async with`` so that it ends with the block."""
+
+    _opened: Opened | None = None
+
+    @abstractmethod
+    async def _connect(self) -> Opened: ...
+
+    def __await__(self) -> Generator[Any, None, Opened]:
+        return self._connect().__await__()
+
+    async def __aenter__(self) -> Opened:
+        self._opened = await self._connect()
+        return self._opened
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if self._opened is not None:
+            await self._opened.__aexit__(kind, error, traceback)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import inspect
-from collections.abc import AsyncIterator, Awaitable, Callable, Generator, Iterable
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
 from types import TracebackType
 from typing import Any, Unpack
 
 from skyloop import client
-from skyloop.aio.bridge import Callback, LoopNotifier, in_thread, on_loop, reject_in_step
+from skyloop.aio.bridge import Callback, LoopNotifier, Opening, in_thread, on_loop, reject_in_step
 from skyloop.client.authority import TakeoverAnswer, TakeoverWay
 from skyloop.client.channels import VideoOptions
 from skyloop.client.connect import ConnectOptions
@@ -37,7 +37,7 @@ from skyloop.messages import (
 from skyloop.messages.annotation import Shape
 
 
-class connect:  # noqa: N801  (used like the function skyloop.connect)
+class connect(Opening["Drone"]):  # noqa: N801  (used like the function skyloop.connect)
     """Connect to a drone: ``async with connect(target, …) as drone``, or ``drone = await connect(…)``.
 
     Raises what :func:`skyloop.connect` raises, and :class:`UsageError` for a stepped replay (``speed=max``), whose time
@@ -53,20 +53,6 @@ class connect:  # noqa: N801  (used like the function skyloop.connect)
         """
         self._target = target
         self._options = options
-        self._drone: Drone | None = None
-
-    def __await__(self) -> Generator[Any, None, Drone]:
-        return self._connect().__await__()
-
-    async def __aenter__(self) -> Drone:
-        self._drone = await self._connect()
-        return self._drone
-
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        if self._drone is not None:
-            await self._drone.__aexit__(kind, error, traceback)
 
     async def _connect(self) -> Drone:
         reject_in_step(self._target)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Awaitable, Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping, Sequence
 from types import TracebackType
-from typing import Any, TypeVar, Unpack
+from typing import TypeVar, Unpack
 
 from skyloop import client
-from skyloop.aio.bridge import in_thread, reject_in_step
+from skyloop.aio.bridge import Opening, in_thread, reject_in_step
 from skyloop.aio.drone import Drone
 from skyloop.client.authority import TakeoverWay
 from skyloop.client.connect import ConnectOptions, Missing, Target
@@ -20,7 +20,7 @@ from skyloop.messages import AnyAction, Feedback
 T = TypeVar("T")
 
 
-class swarm:  # noqa: N801  (used like the function skyloop.swarm)
+class swarm(Opening["Swarm"]):  # noqa: N801  (used like the function skyloop.swarm)
     """Connect to several drones at the same time: ``async with swarm(…) as drones``, or ``drones = await swarm(…)``.
 
     Raises what :func:`skyloop.swarm` raises, and :class:`UsageError` for a stepped replay; see :class:`connect`.
@@ -45,20 +45,6 @@ class swarm:  # noqa: N801  (used like the function skyloop.swarm)
         self._on_error: OnError = on_error
         self._missing: Missing = missing
         self._options = options
-        self._swarm: Swarm | None = None
-
-    def __await__(self) -> Generator[Any, None, Swarm]:
-        return self._connect().__await__()
-
-    async def __aenter__(self) -> Swarm:
-        self._swarm = await self._connect()
-        return self._swarm
-
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        if self._swarm is not None:
-            await self._swarm.__aexit__(kind, error, traceback)
 
     async def _connect(self) -> Swarm:
         for target in self._targets:

@@ -454,7 +454,7 @@ def checked(action: AnyAction) -> AnyAction:
     return action
 
 
-def position_of(x: object, y: object, z: object, yaw: object = None, speed: object = None) -> Position:
+def position_action(x: object, y: object, z: object, yaw: object = None, speed: object = None) -> Position:
     """Return the action that flies to a place.
 
     Args:
@@ -478,7 +478,7 @@ def position_of(x: object, y: object, z: object, yaw: object = None, speed: obje
     return place
 
 
-def place_of(
+def in_world_axes(
     local: tuple[object, object, object],
     earth: tuple[object, object, object],
     newest: Feedback | None,

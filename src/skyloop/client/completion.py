@@ -17,7 +17,7 @@ from skyloop.messages.geometry import wrap_angle
 AT_REST_M_S: Final = 0.3  #: a vehicle that is slower than this at its place has arrived
 _STALE_NS: Final = 100_000_000  #: feedback received sooner after a command may be older than it
 #: Refusals of one packet, not of what was asked for: the next repeat is younger, and newer.
-_OF_ONE_PACKET: Final = (Refusal.STALE, Refusal.OUT_OF_SEQUENCE)
+OF_ONE_PACKET: Final = (Refusal.STALE, Refusal.OUT_OF_SEQUENCE)
 
 
 def is_there(target: Position, feedback: Feedback, tolerance_m: float, tolerance_rad: float) -> bool:
@@ -134,7 +134,7 @@ class ActionWait:
         if refusal is None or not self._concerns(refusal):
             return None
         reason = refusal.data.get("reason")
-        if type(self._action) is Position and reason not in _OF_ONE_PACKET:
+        if type(self._action) is Position and reason not in OF_ONE_PACKET:
             unsupported = reason == Refusal.UNSUPPORTED
             return UnsupportedError(refusal.text) if unsupported else RefusedError(refusal.text, code=str(reason))
         if reason == Refusal.UNSUPPORTED:

@@ -23,7 +23,7 @@ from skyloop.client.authority import (
     authority_request,
 )
 from skyloop.client.channels import Channel, Listener, VideoOptions
-from skyloop.client.commands import above_zero, checked, number, place_of, position_of
+from skyloop.client.commands import above_zero, checked, in_world_axes, number, position_action
 from skyloop.client.completion import is_there
 from skyloop.client.core import DOWN, UP, DroneCore, DroneOptions
 from skyloop.client.frame import Arrival, Frame
@@ -396,8 +396,8 @@ class Drone:
         """
         newest = self._state.newest
         age_s = math.inf if newest is None else self.age_s(newest)
-        local = place_of((x, y, z), (latitude_deg, longitude_deg, altitude_m), newest, age_s)
-        place = position_of(*local, yaw, speed)
+        local = in_world_axes((x, y, z), (latitude_deg, longitude_deg, altitude_m), newest, age_s)
+        place = position_action(*local, yaw, speed)
         near_m, near_rad = above_zero("tolerance_m", tolerance_m), above_zero("tolerance_rad", tolerance_rad)
         self._core.complete(place, lambda feedback: is_there(place, feedback, near_m, near_rad), wait, timeout_s)
 

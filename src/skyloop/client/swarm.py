@@ -15,7 +15,7 @@ from typing import Final, Literal, Self, TypeVar, get_args
 import numpy as np
 
 from skyloop.client.authority import AuthorityStatus, TakeoverWay
-from skyloop.client.commands import above_zero, checked, number, position_of
+from skyloop.client.commands import above_zero, checked, number, position_action
 from skyloop.client.drone import Drone
 from skyloop.client.statistics import DEPTH, Distribution, distribution
 from skyloop.client.telemetry import Wanted, as_predicate
@@ -573,7 +573,7 @@ def _place(name: str, numbers: Sequence[float], speed: float | None) -> Position
     if not 3 <= len(numbers) <= 4:
         raise UsageError(f"the place of {name} is {numbers!r:.60} and must be x, y, z [m], and if wanted the yaw [rad]")
     x, y, z, yaw = (*numbers, None)[:4]
-    return position_of(x, y, z, yaw, speed)
+    return position_action(x, y, z, yaw, speed)
 
 
 def _wait_open(drones: Mapping[str, Drone]) -> None:

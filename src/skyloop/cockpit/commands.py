@@ -16,6 +16,7 @@ LATE_S: Final = 0.5  #: a command that may be older is refused: the person no lo
 #: An emergency stop may be this late: as long as the page shows it as pending.
 STOP_LATE_S: Final = 2.0
 AHEAD_S: Final = 0.05  #: what clocks may differ by beyond what the page stated; as for commands of programs
+SETTLED_NS: Final = 50_000_000  #: feedback captured so soon after a command may still be from before it [ns]
 
 
 class Command(msgspec.Struct, frozen=True, tag_field="do", forbid_unknown_fields=True, kw_only=True):

@@ -19,9 +19,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 from starlette.websockets import WebSocket
 
-from skyloop.client.commands import position_of
+from skyloop.client.commands import position_action
+from skyloop.client.completion import OF_ONE_PACKET
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
 from skyloop.cockpit.commands import (
+    SETTLED_NS,
     Alive,
     Answer,
     AnyCommand,
@@ -44,7 +46,7 @@ from skyloop.cockpit.stream import PageSocket
 from skyloop.cockpit.takeover import QueuePosition, TakeoverDialog
 from skyloop.control.waypoint import Waypoint, lacking, reached
 from skyloop.errors import AuthorityError, DecodeError, LinkError, RefusedError, SkyloopError
-from skyloop.messages import EventKind, FlightState, Land, LinkState, Position, Refusal, Takeoff
+from skyloop.messages import EventKind, FlightState, Land, LinkState, Position, Takeoff
 
 if TYPE_CHECKING:
     from skyloop.cockpit.pilot_connection import PilotConnection
@@ -60,10 +62,7 @@ GOTO_PERIOD_S: Final = 0.05  #: between looks whether it is there
 _REFUSE_AGAIN_S: Final = 1.0  # the same refusal of sticks, which come twenty times a second
 _UP: Final = frozenset({FlightState.HOVERING, FlightState.FLYING})
 _DOWN: Final = frozenset({FlightState.LANDED})
-_SETTLED_NS: Final = 50_000_000  # feedback captured so soon after a command may still be from before it
 _TAKEOFF_NS: Final = 1_000_000_000  # a take-off is repeated for so long, in case packets are lost
-#: Refusals of one packet, not of what was asked for: the next repeat is younger, and newer.
-_OF_ONE_PACKET: Final = (Refusal.STALE, Refusal.OUT_OF_SEQUENCE)
 _numbers = itertools.count(1)
 
 Json = dict[str, Any]
@@ -180,16 +179,20 @@ class ControlSession:
             SkyloopError: What the drone raises; :class:`LinkError` if it was not sent.
         """
         pilot = self._held()
+        self._send_now(pilot, act, command)
+        self._acknowledge(command)
+        if until:
+            self._awaited, self._repeated = (command.do, until, pilot.proxy_now_ns + SETTLED_NS), False
+        else:
+            self._send({"type": "done", "do": command.do})
+
+    def _send_now(self, pilot: PilotConnection, act: Callable[[PilotConnection], bool], command: AnyCommand) -> None:
+        """End what the page flew before, and send a command; :class:`LinkError` if it was not sent."""
         self._end_flight()
         if not act(pilot):
             with suppress(SkyloopError):
                 pilot.idle()  # or it would be done after all when the link is back soon
             raise LinkError(f"{command.do} was not sent: the link to the proxy is {pilot.link.application}")
-        self._acknowledge(command)
-        if until:
-            self._awaited, self._repeated = (command.do, until, pilot.proxy_now_ns + _SETTLED_NS), False
-        else:
-            self._send({"type": "done", "do": command.do})
 
     def _fly(self, command: Fly) -> None:
         pilot = self._held()
@@ -206,12 +209,8 @@ class ControlSession:
         if not pilot.feedback().state.airborne:
             raise RefusedError("it can't be flown to a place: it is not in the air, take off first")
         goal = Waypoint(command.x, command.y, command.z, command.yaw)
-        place = position_of(goal.x, goal.y, goal.z, goal.yaw, GOTO_M_S)
-        self._end_flight()
-        if not pilot.command(place):
-            with suppress(SkyloopError):
-                pilot.idle()  # or it would fly there after all when the link is back soon
-            raise LinkError(f"{command.do} was not sent: the link to the proxy is {pilot.link.application}")
+        place = position_action(goal.x, goal.y, goal.z, goal.yaw, GOTO_M_S)
+        self._send_now(pilot, lambda pilot: pilot.command(place), command)
         self._station.goals[self.app] = goal
         self._goto = self._start_job(self._follow(pilot, place, goal))
         self._acknowledge(command)
@@ -456,7 +455,7 @@ class ControlSession:
             return
         self._takeover.on_event(event, pilot)
         ours = event.kind is EventKind.COMMAND_REFUSED and event.app == self.app
-        if not ours or self._refused_command == self._commands or event.data.get("reason") in _OF_ONE_PACKET:
+        if not ours or self._refused_command == self._commands or event.data.get("reason") in OF_ONE_PACKET:
             return  # its repeats are refused too: nothing new
         self._refused_command = self._commands
         self._awaited = None

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 from starlette.websockets import WebSocket
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
-from skyloop.cockpit.commands import Alive, LandAll, StopAll, decode_fleet_command, late_s, untimely
+from skyloop.cockpit.commands import SETTLED_NS, Alive, LandAll, StopAll, decode_fleet_command, late_s, untimely
 from skyloop.cockpit.stream import PageSocket
 from skyloop.errors import DecodeError, LinkError, SkyloopError
 from skyloop.messages import HIGHEST_PRIORITY, FlightState, Land, LinkState
@@ -22,7 +22,6 @@ LANDING_S: Final = 60.0  #: as long as a landing is repeated
 BEGIN_S: Final = 2.0  #: a landing for which there is no connection by then is not begun
 _POLL_S: Final = 0.05
 _REPEAT_S: Final = 2.0  # an emergency stop is repeated for at most so long by its connection, which is kept as long
-_SETTLED_NS: Final = 50_000_000  # feedback captured so soon after a command may still be from before it
 
 Json = dict[str, Any]
 
@@ -101,7 +100,7 @@ class FleetSession:
             if seconds(monotonic_ns() - begun_ns) > BEGIN_S:
                 raise LinkError(f"there was no connection within {BEGIN_S:g} s")
             await asyncio.to_thread(pilot.acquire, HIGHEST_PRIORITY)
-            from_ns = pilot.proxy_now_ns + _SETTLED_NS
+            from_ns = pilot.proxy_now_ns + SETTLED_NS
             if not pilot.command(Land()):
                 raise LinkError(f"the link to the proxy is {pilot.link.application}")
             self._send({"type": "each", **subject, "state": "sent", "why": ""})

@@ -14,7 +14,7 @@ from skyloop.emulators.mavlink.flight import FlightControl
 from skyloop.emulators.mavlink.links import Port
 from skyloop.emulators.mavlink.manoeuvres import Manoeuvres
 from skyloop.emulators.mavlink.parameters import ParameterTable
-from skyloop.emulators.mavlink.places import ORIGIN_ALTITUDE_M, on_earth, place_of
+from skyloop.emulators.mavlink.places import ORIGIN, on_earth, place_of
 from skyloop.emulators.mavlink.services import answers
 from skyloop.emulators.mavlink.streams import MAX_INTERVAL_US
 from skyloop.emulators.mavlink.telemetry import MAKERS
@@ -414,7 +414,7 @@ class Autopilot(ABC):
     def _datum(self, frame: int) -> float | None:
         """Return how high the altitude 0 of a frame is above the flight's origin [m]; None for an unknown frame."""
         if frame in self.ABOVE_SEA:
-            return -ORIGIN_ALTITUDE_M
+            return -ORIGIN.altitude_m
         return self.home[2] if frame in self.ABOVE_HOME else None
 
     def _place(self, arguments: Arguments, frame: int) -> Vector | None:

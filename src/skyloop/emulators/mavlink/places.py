@@ -5,28 +5,21 @@ from __future__ import annotations
 import math
 from typing import Final
 
+from skyloop.messages.earth import EarthOrigin
 from skyloop.wire.mavlink.axes import Vector
 
-ORIGIN_LATITUDE_DEG: Final = 47.397742
-ORIGIN_LONGITUDE_DEG: Final = 8.545594
-ORIGIN_ALTITUDE_M: Final = 488.0  #: above mean sea level
-_METRES_PER_DEG: Final = 111_320.0
-_EAST_METRES_PER_DEG: Final = _METRES_PER_DEG * math.cos(math.radians(ORIGIN_LATITUDE_DEG))
+ORIGIN: Final = EarthOrigin(47.397742, 8.545594, 488.0, math.degrees(111_320.0))
 
 
 def geodetic(place: Vector) -> tuple[int, int, int]:
     """Return latitude and longitude [1e-7 degrees] and altitude above mean sea level [mm]."""
-    east, north, up = place
-    latitude = ORIGIN_LATITUDE_DEG + north / _METRES_PER_DEG
-    longitude = ORIGIN_LONGITUDE_DEG + east / _EAST_METRES_PER_DEG
-    return round(latitude * 1e7), round(longitude * 1e7), round((ORIGIN_ALTITUDE_M + up) * 1000)
+    latitude_deg, longitude_deg, altitude_m = ORIGIN.place_of(place)
+    return round(latitude_deg * 1e7), round(longitude_deg * 1e7), round(altitude_m * 1000)
 
 
 def place_of(latitude_deg: float, longitude_deg: float, up: float) -> Vector:
     """Return east, north, up of a latitude and longitude, at a height above the origin [m]."""
-    north = (latitude_deg - ORIGIN_LATITUDE_DEG) * _METRES_PER_DEG
-    east = (longitude_deg - ORIGIN_LONGITUDE_DEG) * _EAST_METRES_PER_DEG
-    return east, north, up
+    return ORIGIN.position_of(latitude_deg, longitude_deg, ORIGIN.altitude_m + up)
 
 
 def on_earth(latitude_deg: float, longitude_deg: float) -> bool:

@@ -20,7 +20,7 @@ from skyloop.emulators.mavlink.autopilot import (
 from skyloop.emulators.mavlink.flight import USUAL, Speeds
 from skyloop.emulators.mavlink.links import Port
 from skyloop.emulators.mavlink.parameters import ParameterTable
-from skyloop.emulators.mavlink.places import ORIGIN_ALTITUDE_M, place_of
+from skyloop.emulators.mavlink.places import ORIGIN, place_of
 from skyloop.emulators.mavlink.setpoints import (
     BODY,
     WORLD,
@@ -233,7 +233,7 @@ class Px4(Autopilot):
         """Take off, armed or not, standing or flying."""
         amsl = arguments[6]
         above = self.home[2] + self.parameters["MIS_TAKEOFF_ALT"]
-        height = amsl - ORIGIN_ALTITUDE_M if math.isfinite(amsl) else above
+        height = amsl - ORIGIN.altitude_m if math.isfinite(amsl) else above
         self._manoeuvres.begin_rise(max(0.5, height))
         self._set_mode("AUTO.TAKEOFF")
         return ACCEPTED
@@ -287,7 +287,7 @@ class Px4(Autopilot):
         elif self._waiting_at is not None and (higher or math.isfinite(arguments[3])):
             east, north, _ = self._waiting_at.place or here
         if higher:
-            up = altitude - ORIGIN_ALTITUDE_M
+            up = altitude - ORIGIN.altitude_m
         yaw = yaw_between(arguments[3]) if math.isfinite(arguments[3]) else None
         self._waiting_at = Target((east, north, up), yaw=yaw)
         return ACCEPTED
@@ -298,7 +298,7 @@ class Px4(Autopilot):
         elif not all(map(math.isfinite, arguments[4:7])):
             return DENIED
         else:
-            place = place_of(arguments[4], arguments[5], arguments[6] - ORIGIN_ALTITUDE_M)
+            place = place_of(arguments[4], arguments[5], arguments[6] - ORIGIN.altitude_m)
         if not self.has_origin:
             return TEMPORARILY_REJECTED
         self._home_at(place)

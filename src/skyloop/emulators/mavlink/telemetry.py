@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import ClassVar, Final, Protocol
 
 from skyloop.emulators.mavlink.flight import FlightControl
-from skyloop.emulators.mavlink.places import ORIGIN_ALTITUDE_M, geodetic
+from skyloop.emulators.mavlink.places import ORIGIN, geodetic
 from skyloop.messages import FlightState
 from skyloop.messages.geometry import quaternion_from_euler
 from skyloop.sim.host import Report
@@ -161,14 +161,14 @@ def _raw_imu(a: AutopilotState) -> Message:
 def _hud(a: AutopilotState) -> Message:
     east, north, up = a.flight.velocity
     heading = round(math.degrees(yaw_between(a.flight.yaw)) % 360.0) % 360
-    altitude = ORIGIN_ALTITUDE_M + a.flight.place[2]
+    altitude = ORIGIN.altitude_m + a.flight.place[2]
     return m.MAVLink_vfr_hud_message(0.0, math.hypot(east, north), heading, 50, altitude, up)
 
 
 def _altitude(a: AutopilotState) -> Message:
     up = a.flight.place[2]
     relative = up - a.home[2]
-    return m.MAVLink_altitude_message(a.boot_ms * 1000, up, ORIGIN_ALTITUDE_M + up, up, relative, up, math.nan)
+    return m.MAVLink_altitude_message(a.boot_ms * 1000, up, ORIGIN.altitude_m + up, up, relative, up, math.nan)
 
 
 def _time(a: AutopilotState) -> Message:
