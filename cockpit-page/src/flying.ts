@@ -29,6 +29,12 @@ export interface InputView {
   sticks: Sticks;
 }
 
+/** What has the focus may name keys of its own (`data-keys`), as the map its arrows: these don't fly meanwhile, all others do. */
+const ownKeys = (): Set<string> | null => {
+  const named = (document.activeElement as HTMLElement | null)?.dataset["keys"];
+  return named === undefined ? null : new Set(named.split(" "));
+};
+
 const TAKES_KEYS = "input, select, textarea, [contenteditable]";
 
 export class Flying {
@@ -49,7 +55,7 @@ export class Flying {
     window.addEventListener("blur", () => this.rest());
     window.addEventListener("pagehide", () => this.rest());
     document.addEventListener("visibilitychange", () => document.hidden && this.rest());
-    document.addEventListener("focusin", () => this.typing() && this.keys.clear());
+    document.addEventListener("focusin", () => (this.typing() || ownKeys() !== null) && this.keys.clear());
     setInterval(() => this.round(), STEER_MS);
   }
 
@@ -72,7 +78,7 @@ export class Flying {
     }
     if (event.code === "Escape" && this.cabin.escape()) event.preventDefault();
     const modified = event.ctrlKey || event.altKey || event.metaKey;
-    const press = { code: event.code, repeat: event.repeat, modified, typing: this.typing() };
+    const press = { code: event.code, repeat: event.repeat, modified, typing: this.typing() || (ownKeys()?.has(event.code) ?? false) };
     const meant = this.keys.down(press);
     if (meant === null) return;
     if (meant === "stick") {

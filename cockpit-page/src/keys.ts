@@ -41,6 +41,7 @@ export const KEY_MAP: readonly { keys: string[]; does: string }[] = [
   { keys: ["A", "D"], does: "Left, right" },
   { keys: ["↑", "↓"], does: "Up, down" },
   { keys: ["←", "→"], does: "Turn left, right" },
+  { keys: ["Tab"], does: "To the map: there arrows move a cursor, Enter acts at it, + and − zoom, 0 shows all, Del removes" },
   { keys: ["?"], does: "This list; Esc closes it" },
 ];
 

@@ -24,6 +24,7 @@ import { LastingSocket } from "./socket.js";
 import { Strip } from "./strip.js";
 import { Thumbs } from "./thumbs.js";
 import { Stage } from "./video.js";
+import { WaypointTool } from "./waypoint.js";
 import { type Body, othersOf, type Scene } from "./world.js";
 
 export interface PaneHost {
@@ -73,6 +74,7 @@ export class Pane {
   private readonly strip: Strip;
   private readonly thumbs: Thumbs;
   private readonly map: MapView;
+  private readonly waypoint: WaypointTool;
   private readonly space = h("div", { class: "filling" });
   private readonly plots: Plots;
   private readonly events = new Events();
@@ -95,7 +97,13 @@ export class Pane {
       understood: () => this.pilot?.understood(),
     });
     this.thumbs = new Thumbs((sticks) => host.push(name, sticks));
-    this.map = new MapView(() => this.world(), (x, y, z) => this.pilot?.goTo(x, y, z));
+    this.waypoint = new WaypointTool({
+      own: () => this.state?.position ?? null,
+      speeds: () => null,
+      problem: () => "",
+      goTo: (x, y, z) => this.pilot?.goTo(x, y, z),
+    });
+    this.map = new MapView(() => this.world(), this.waypoint, this.waypoint.element);
     this.plots = new Plots(this.history, now_s);
     this.parameters = new Parameters(name, (parameter, value) => this.pilot?.write(parameter, value));
     this.decks = {
@@ -209,7 +217,7 @@ export class Pane {
       this.stage.cameras(message.cameras);
       setHidden(this.endReplay, this.pilot === null || !message.uri.startsWith("replay:"));
       setAttribute(this.element, "data-recording", String(this.isRecording));
-      this.map.watchOnly(this.isRecording);
+      setHidden(this.waypoint.element, this.isRecording);
     } else {
       this.state = message;
       this.absent = "";
@@ -268,7 +276,9 @@ export class Pane {
     const [mine, placed] = [(pilot?.mine ?? false) && !isOld && !recording, (live?.position ?? null) !== null];
     const inAir = live?.airborne ?? false;
     const nowhere = recording ? "A recording: nothing flies here." : isOld ? "What is shown is old." : !placed ? "Position not known." : !mine ? "Take control to fly to a place." : "It must be in the air to fly to a place.";
-    this.map.allow(mine && placed && inAir, nowhere);
+    const can = mine && placed && inAir;
+    this.waypoint.allow(can);
+    this.map.allow(can ? "" : nowhere);
     this.parameters.allow(mine, recording ? "As they were recorded." : "Take control to change them.");
     const shown = over ? [] : !this.connected ? [this.absent || `no data about ${this.name} from the cockpit: what is shown is old`] : (state?.alarms ?? []);
     setText(this.alarms, shown.join(" · "));

@@ -10,10 +10,14 @@ export interface Body {
   roll: number;
   pitch: number;
   yaw: number | null;
+  /** Where it was, if that is shown. */
+  trail?: Trail;
+  /** The name of its colour on the map, if it has one of its own. */
+  ink?: string;
 }
 
 export interface Scene {
-  /** The drone of this pane; null while its position is not known. */
+  /** The drone that the map is about; null while its position is not known, and on a map of several. */
   own: Body | null;
   /** Where it really is, as the simulator or motion capture reports it. */
   truth: Body | null;

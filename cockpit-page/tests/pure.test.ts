@@ -19,6 +19,8 @@ import { lineText } from "../src/strip.js";
 import { parse, rangeText } from "../src/values.js";
 import { othersOf } from "../src/world.js";
 import { around, gridStep, toMetres, toPixels, zoomed } from "../src/view.js";
+import { arrow, nearest } from "../src/maptool.js";
+import { leg } from "../src/waypoint.js";
 
 const near = (value: number, wanted: number): void => assert.ok(Math.abs(value - wanted) < 1e-9, `${value} is not ${wanted}`);
 const push = (sticks: Partial<Sticks>): Sticks => ({ ...CENTRED, ...sticks });
@@ -292,4 +294,15 @@ test("the place in the line, with what was answered", () => {
   assert.equal(waits({ asked: true, declined: "" }), "follow.py keeps it for now · you are number 2 in line");
   assert.equal(waits({ asked: true, declined: "landing" }), "follow.py keeps it for now: “landing” · you are number 2 in line");
   assert.equal(waits({}, "none"), "");
+});
+
+test("what lies under a pointer, and how far a waypoint is", () => {
+  const bodies = [{ name: "a", position: [0, 0, 1] }, { name: "b", position: [0.3, 0, 1] }];
+  assert.equal(nearest([0.2, 0], 0.25, bodies)?.name, "b");
+  assert.equal(nearest([2, 0], 0.25, bodies), null);
+  assert.deepEqual(arrow("ArrowUp"), [0, 1]);
+  assert.equal(arrow("KeyW"), null);
+  assert.deepEqual(leg([0, 0, 1], [3, 4, 1], { along: 2, up: 1 }), { distance_m: 5, time_s: 2.5 });
+  assert.deepEqual(leg([0, 0, 1], [0, 0, 3], { along: 2, up: 1 }), { distance_m: 2, time_s: 2 });
+  assert.equal(leg([0, 0, 1], [0, 0, 3], null).time_s, null);
 });

@@ -369,7 +369,7 @@ def test_gamepad(deck: Deck) -> None:
         page.until(lambda: drone.feedback().state is FlightState.HOVERING, "it hovers when the gamepad goes away")
 
 
-def test_a_click_on_the_map_is_a_waypoint(deck: Deck) -> None:
+def test_a_waypoint_is_previewed_and_flown_to(deck: Deck) -> None:
     deck.proxy("place")
     page = deck.page("place")
     with observe("place") as drone:
@@ -380,6 +380,9 @@ def test_a_click_on_the_map_is_a_waypoint(deck: Deck) -> None:
         assert box is not None
         start = drone.feedback().position_m
         canvas.click(position={"x": box["width"] * 0.75, "y": box["height"] / 2})
+        page.wait_for_text(".preview", "m straight")
+        assert drone.feedback().state is FlightState.HOVERING, "choosing moves nothing"
+        page.press("Enter")
         page.wait_for_text(".notice", "waypoint is reached")
         there = drone.feedback().position_m
         assert start is not None

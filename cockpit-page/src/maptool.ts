@@ -1,0 +1,57 @@
+// What a tool of the map is: it draws over the map, and gets presses and keys with places in metres. One is in use at a time.
+
+import type { Body } from "./world.js";
+
+/** From metres, world axes, to pixels of the map; a height is ignored. */
+export type Project = (place: readonly number[]) => [number, number];
+
+/** The page's colours by name. */
+export type Ink = Readonly<Record<string, string>>;
+
+/** A place of the map under a pointer, or under the cursor of the keyboard. */
+export interface Spot {
+  /** East and north [m]. */
+  place: [number, number];
+  /** The same on the map [pixels]. */
+  pixel: [number, number];
+  /** What is no farther than this counts as under it [m]. */
+  reach_m: number;
+  /** The drone or target that is under it, the nearest first; null for none. */
+  under: Body | null;
+}
+
+export interface MapTool {
+  /** What a press does now, in a few words: shown below the map. */
+  readonly hint: string;
+  draw(pen: CanvasRenderingContext2D, project: Project, ink: Ink): void;
+  /** A pointer goes down. True: what moves it from now on is the tool's, and the map keeps its view. */
+  press(spot: Spot): boolean;
+  /** A pointer that the tool has taken moves. */
+  move(spot: Spot): void;
+  /** A pointer goes up: one that the tool has taken, or one that was pressed and lifted at the same place (`click`). */
+  lift(spot: Spot, click: boolean): void;
+  /** A key, while the map has the focus; the cursor is at `spot`. True: it meant something, and the map ignores it. */
+  key(event: KeyboardEvent, spot: Spot): boolean;
+  /** Another tool, or none, is used from now on. */
+  dropped?(): void;
+}
+
+/** Keys that the map takes while it has the focus; all others fly, as everywhere. */
+export const MAP_KEYS: ReadonlySet<string> = new Set(["ArrowUp", "ArrowDown", "ArrowLeft", "ArrowRight", "Enter", "NumpadEnter", "Equal", "NumpadAdd", "Minus", "NumpadSubtract", "Digit0", "Delete", "Backspace"]);
+
+const ARROWS: Readonly<Record<string, readonly [number, number]>> = { ArrowUp: [0, 1], ArrowDown: [0, -1], ArrowLeft: [-1, 0], ArrowRight: [1, 0] };
+
+/** How far an arrow key moves the cursor, east and north, in steps; null for another key. */
+export const arrow = (code: string): readonly [number, number] | null => ARROWS[code] ?? null;
+
+/** What is nearest to a place within a reach [m]; null for nothing. */
+export function nearest<T extends { position: readonly number[] }>(place: readonly [number, number], reach_m: number, all: readonly T[]): T | null {
+  let best: T | null = null;
+  let least = reach_m;
+  for (const one of all) {
+    const off = Math.hypot((one.position[0] as number) - place[0], (one.position[1] as number) - place[1]);
+    if (off > least) continue;
+    [best, least] = [one, off];
+  }
+  return best;
+}

@@ -1,0 +1,144 @@
+// The map's tool when there is no other: a press chooses a place, and "Fly there" flies to it.
+//
+// Choosing moves nothing: where it is, how far and how long is shown first, and what speaks against it.
+
+import { h, setDisabled, setHidden, setText, setTone } from "./dom.js";
+import { figure, lasting } from "./format.js";
+import { flag, label } from "./maplayers.js";
+import type { Ink, MapTool, Project, Spot } from "./maptool.js";
+import type { Vector } from "./model.js";
+
+/** Greatest speeds of the drone [m/s]. */
+export interface Speeds {
+  along: number;
+  up: number;
+}
+
+export interface Leg {
+  distance_m: number;
+  /** At the greatest speeds; null where they are not known. */
+  time_s: number | null;
+}
+
+/** The straight way between two places. */
+export function leg(from: Vector, to: Vector, speeds: Speeds | null): Leg {
+  const [along, up] = [Math.hypot(to[0] - from[0], to[1] - from[1]), Math.abs(to[2] - from[2])];
+  return { distance_m: Math.hypot(along, up), time_s: speeds && Math.max(along / speeds.along, up / speeds.up) };
+}
+
+export interface WaypointHost {
+  /** Where the drone is; null while that is not known. */
+  own(): Vector | null;
+  speeds(): Speeds | null;
+  /** Why it may not fly to a place, in words; empty if it may. */
+  problem(from: Vector, to: Vector): string;
+  goTo(x: number, y: number, z: number): void;
+}
+
+export class WaypointTool implements MapTool {
+  readonly element: HTMLElement;
+  readonly hint = "Press a place on the map to choose it. Nothing flies before “Fly there”.";
+  private readonly inputs = ["x", "y", "z"].map((name) => h("input", { type: "number", step: "0.1", "aria-label": `Waypoint ${name} in metres`, placeholder: name, oninput: () => this.typed() }));
+  private readonly go = h("button", { type: "submit", class: "small primary" }, "Fly there");
+  private readonly clear = h("button", { type: "button", class: "small", "aria-label": "Forget the waypoint", hidden: true, onclick: () => this.choose(null) }, "×");
+  private readonly preview = h("p", { class: "note preview", role: "status", hidden: true });
+  private chosen: Vector | null = null;
+  private can = false;
+
+  constructor(private readonly host: WaypointHost) {
+    const form = h("form", { class: "waypoint", "aria-label": "Waypoint", novalidate: true, onsubmit: (event: Event) => this.submit(event) }, ...this.inputs, this.go, this.clear);
+    this.element = h("div", {}, form, this.preview);
+  }
+
+  /** Whether the drone could fly somewhere now. */
+  allow(can: boolean): void {
+    this.can = can;
+    this.show();
+  }
+
+  draw(pen: CanvasRenderingContext2D, project: Project, ink: Ink): void {
+    const { chosen } = this;
+    if (!chosen) return;
+    const own = this.host.own();
+    const tone = own && this.host.problem(own, chosen) ? "bad" : "accent";
+    const [x, y] = project(chosen);
+    if (own) {
+      pen.beginPath();
+      pen.moveTo(...project(own));
+      pen.lineTo(x, y);
+      pen.setLineDash([2, 4]);
+      pen.strokeStyle = ink[tone] ?? "";
+      pen.lineWidth = 2;
+      pen.stroke();
+      pen.setLineDash([]);
+    }
+    flag({ pen, ink, at: project }, chosen, tone === "bad" ? "×" : "?", tone);
+    label({ pen, ink }, x + 13, y, `${figure(chosen[2], 1)} m high`);
+    this.show();
+  }
+
+  press(): boolean {
+    return false;
+  }
+
+  move(): void {}
+
+  lift(spot: Spot, click: boolean): void {
+    const own = this.host.own();
+    if (!click || !own) return;
+    const height = this.chosen?.[2] ?? own[2];
+    this.choose([round(spot.place[0]), round(spot.place[1]), round(height)]);
+    if (this.can) this.go.focus({ preventScroll: true }); // Enter flies there now; the keys that fly still do
+  }
+
+  key(event: KeyboardEvent, spot: Spot): boolean {
+    if (event.code === "Delete" || event.code === "Backspace") this.choose(null);
+    else if (event.code === "Enter" || event.code === "NumpadEnter") this.lift(spot, true);
+    else return false;
+    return true;
+  }
+
+  dropped(): void {
+    this.choose(null);
+  }
+
+  private choose(place: Vector | null): void {
+    this.chosen = place;
+    this.inputs.forEach((input, axis) => (input.value = place ? String(place[axis]) : ""));
+    this.show();
+  }
+
+  /** A field was written; what is left empty stays as it is. */
+  private typed(): void {
+    const own = this.host.own();
+    const some = this.inputs.some((input) => input.value !== "");
+    this.chosen = own && some ? (this.inputs.map((input, axis) => (input.value === "" ? round(own[axis] as number) : Number(input.value))) as Vector) : null;
+    this.show();
+  }
+
+  private show(): void {
+    const [own, place] = [this.host.own(), this.chosen];
+    setHidden(this.preview, !place);
+    setHidden(this.clear, !place);
+    const problem = own && place ? this.host.problem(own, place) : "";
+    setDisabled(this.go, !this.can || !place || !own || problem !== "");
+    if (!own || !place) return;
+    const { distance_m, time_s } = leg(own, place, this.host.speeds());
+    const climb = place[2] - own[2];
+    const height = Math.abs(climb) < 0.1 ? "at this height" : `${figure(Math.abs(climb), 1)} m ${climb > 0 ? "up" : "down"}`;
+    const time = time_s === null ? "" : ` · about ${lasting(Math.max(1, time_s))}`;
+    setTone(this.preview, problem ? "bad" : "quiet");
+    setText(this.preview, problem ? `Not there: ${problem}` : `${figure(distance_m, 1)} m straight, ${height}${time}`);
+  }
+
+  private submit(event: Event): void {
+    event.preventDefault();
+    const place = this.chosen;
+    if (!place || this.go.disabled) return;
+    this.go.blur();
+    this.choose(null);
+    this.host.goTo(...place);
+  }
+}
+
+const round = (metres: number): number => Math.round(metres * 100) / 100;
