@@ -30,7 +30,7 @@ class Card {
     const recorded = isRecording(row);
     const lost = row.links.application === "lost";
     const over = recorded && (lost || row.links.vehicle === "closed"); // as every recording is some time
-    setTone(this.element, over ? "quiet" : lost ? "bad" : row.alarms.length ? "warn" : row.airborne ? "ok" : "quiet");
+    setTone(this.element, over ? "quiet" : lost ? "bad" : row.alarms.some((alarm) => alarm.severity === "critical") ? "bad" : row.alarms.length ? "warn" : row.airborne ? "ok" : "quiet");
     setText(this.state, over ? "recording over" : lost ? "lost" : row.airborne && row.altitude !== null ? `${words(row.state)} · ${figure(row.altitude, 1)} m` : words(row.state));
     this.battery.show(lost ? null : row.battery);
     setText(this.owner, recorded ? "recording, nothing flies" : row.owner === null ? "nobody has control" : `${row.owner} has control`);
@@ -40,7 +40,7 @@ class Card {
     const links = `link to the proxy ${application}, to the vehicle ${vehicle}`;
     setAttribute(this.linked, "title", links);
     setHidden(this.recording, !row.recording);
-    setText(this.alarms, over ? "" : row.alarms.join(" · "));
+    setText(this.alarms, over ? "" : row.alarms.map((alarm) => alarm.text).join(" · "));
     setHidden(this.alarms, over || row.alarms.length === 0);
     setAttribute(this.main, "aria-label", `Open ${row.name}: ${this.state.textContent}, ${this.owner.textContent}, ${links}`);
     setAttribute(this.element, "data-open", String(open));

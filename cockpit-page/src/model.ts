@@ -14,6 +14,15 @@ export interface Links {
   reason: string;
 }
 
+/** Something that is wrong with a drone now. */
+export interface Alarm {
+  /** What it is about, the same while it lasts: `battery`, `vehicle_link`, `video_age.front`, … */
+  id: string;
+  /** It may rise while it lasts. */
+  severity: "warning" | "critical";
+  text: string;
+}
+
 /** A row of the overview. */
 export interface DroneRow {
   name: string;
@@ -26,7 +35,7 @@ export interface DroneRow {
   owner: string | null;
   me: boolean;
   links: Links;
-  alarms: string[];
+  alarms: Alarm[];
   cameras: Camera[];
   can_fly: boolean;
   why_not: string;
@@ -92,7 +101,7 @@ export interface State {
   owner: string | null;
   authority: { holder: string | null; priority: number | null; lease: number; me: boolean };
   channels: Record<string, Channel>;
-  alarms: string[];
+  alarms: Alarm[];
   values: Record<string, number | null>;
   set_points: { action: string; values: Record<string, number | null>; age_s: number | null } | null;
   truth: Place | null;

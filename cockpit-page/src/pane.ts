@@ -280,7 +280,7 @@ export class Pane {
     this.waypoint.allow(can);
     this.map.allow(can ? "" : nowhere);
     this.parameters.allow(mine, recording ? "As they were recorded." : "Take control to change them.");
-    const shown = over ? [] : !this.connected ? [this.absent || `no data about ${this.name} from the cockpit: what is shown is old`] : (state?.alarms ?? []);
+    const shown = over ? [] : !this.connected ? [this.absent || `no data about ${this.name} from the cockpit: what is shown is old`] : (state?.alarms ?? []).map((alarm) => alarm.text);
     setText(this.alarms, shown.join(" · "));
     setHidden(this.alarms, shown.length === 0);
     setAttribute(this.element, "data-lost", String(!live || isOld));

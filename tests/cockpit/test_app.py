@@ -124,7 +124,7 @@ def test_telemetry_flows(client: TestClient, drone: FakeDrone) -> None:
         assert feedback["age_s"] >= 0
         assert state["link"]["vehicle"] == state["links"]["vehicle"] == "lost"
         assert state["authority"] == {"holder": "demo", "priority": 16, "lease": 3, "me": False}
-        assert "link to the vehicle lost" in state["alarms"]
+        assert state["alarms"] == [{"id": "vehicle_link", "severity": "critical", "text": "link to the vehicle lost"}]
 
 
 def test_commands_and_logs_are_heard_while_somebody_looks(client: TestClient, drone: FakeDrone) -> None:
@@ -177,7 +177,7 @@ def test_overview_shows_all_drones() -> None:
         assert (one["name"], one["state"], one["airborne"], one["position"]) == ("alpha", "unknown", False, None)
         assert (two["name"], two["state"], two["airborne"], two["position"]) == ("beta", "flying", True, [1, 2, 3])
         assert (two["owner"], two["me"], two["recording"]) == ("demo", False, False)
-        assert two["alarms"] == ["battery low: 5%"]
+        assert two["alarms"] == [{"id": "battery", "severity": "critical", "text": "battery critical: 5%"}]
         assert two["links"]["application"] == "up"
         assert two["cameras"][1] == {"name": "bottom", "width": 64, "height": 48}
         assert second.receive_json()["drones"][0]["name"] == "alpha"
@@ -187,7 +187,7 @@ def test_overview_shows_all_drones() -> None:
         while not (row := first.receive_json()["drones"][0])["alarms"]:
             assert time.monotonic() < deadline
         assert row["links"]["application"] == "lost"
-        assert row["alarms"] == ["link to the proxy lost: killed"]
+        assert [alarm["text"] for alarm in row["alarms"]] == ["link to the proxy lost: killed"]
 
 
 def test_stale_video_is_an_alarm(client: TestClient, drone: FakeDrone) -> None:
@@ -200,7 +200,7 @@ def test_stale_video_is_an_alarm(client: TestClient, drone: FakeDrone) -> None:
         assert head["captured_ns"] == str(old.captured_ns)
         drone.newest = flying()
         state = follow(socket, lambda state: state["alarms"])
-        assert "video of front is 3." in state["alarms"][0]
+        assert "video of front is 3." in state["alarms"][0]["text"]
 
 
 def wait_for_acknowledgements(client: TestClient, count: int) -> None:

@@ -479,7 +479,7 @@ def test_after_a_proxys_death_nobody_has_control_until_the_person_takes_it_again
         message: dict[str, Any] = {"type": ""}
         while message["type"] != "state" or message["links"]["application"] != "lost":
             message = telemetry.receive_json()
-        assert message["alarms"][0].startswith("link to the proxy lost")
+        assert message["alarms"][0]["text"].startswith("link to the proxy lost")
         assert message["set_points"] is None, "what is applied now is not known"
         pilot.say("takeoff")
         pilot.wait("refused", do="takeoff")

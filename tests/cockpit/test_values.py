@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import json
 import math
-from types import SimpleNamespace
 from typing import Any
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 
 from skyloop.cockpit.api import parameter_values
 from skyloop.cockpit.telemetry import encode_json
 from skyloop.cockpit.values import (
-    alarms,
     feedback_values,
     flat_values,
     motion_values,
@@ -25,11 +22,9 @@ from skyloop.cockpit.values import (
 )
 from skyloop.messages import (
     Attitude,
-    Failsafe,
     Feedback,
     FlightState,
     Hover,
-    LinkState,
     Parameter,
     ParameterType,
     Value,
@@ -37,42 +32,9 @@ from skyloop.messages import (
 )
 
 
-def link(application: str = "up", vehicle: str = "up", reason: str = "", remedy: str = "") -> Any:
-    hops = {"application": LinkState(application), "vehicle": LinkState(vehicle)}
-    return SimpleNamespace(**hops, reason=reason, remedy=remedy)
-
-
 def flying(**values: Any) -> Feedback:
     known: dict[str, Any] = {"captured_ns": 1, "state": FlightState.FLYING, "battery": 0.8}
     return Feedback(**(known | values))
-
-
-@pytest.mark.parametrize(
-    ("given", "told"),
-    [
-        ((link(), flying(), 0.1, {}), []),
-        ((link(), None, None, {}), []),
-        ((link("lost", "up", "killed"), flying(battery=0.01), 9.0, {}), ["link to the proxy lost: killed"]),
-        ((link("closed"), None, None, {}), ["link to the proxy lost"]),
-        ((link("up", "lost", "radio"), flying(), 0.1, {}), ["link to the vehicle lost: radio"]),
-        ((link("up", "lost", "radio", "plug it in"), None, None, {}), ["link to the vehicle lost: radio: plug it in"]),
-        ((link("up", "connecting", "waiting"), None, None, {}), ["no vehicle yet: waiting"]),
-        ((link("up", "closed", "end of the recording"), flying(battery=0.01), 9.0, {"front": 9.0}), []),
-        ((link("degraded"), flying(), 0.1, {}), ["link to the proxy degraded"]),
-        ((link(), flying(state=FlightState.EMERGENCY), 0.1, {}), ["emergency: the motors are off"]),
-        ((link(), flying(failsafe=Failsafe.HOVER), 0.1, {}), ["failsafe: hovering by itself"]),
-        ((link(), flying(failsafe=Failsafe.LAND), 0.1, {}), ["failsafe: landing by itself"]),
-        ((link(), flying(battery=0.19), 0.1, {}), ["battery low: 19%"]),
-        ((link(), flying(), 2.5, {}), ["feedback is 2.5 s old"]),
-        ((link(), flying(), 0.1, {"front": 0.3, "bottom": 4.0}), ["video of bottom is 4.0 s old"]),
-        (
-            (link(), flying(state=FlightState.EMERGENCY, battery=0.1), 0.1, {}),
-            ["emergency: the motors are off", "battery low: 10%"],
-        ),
-    ],
-)
-def test_alarms(given: tuple[Any, Any, Any, Any], told: list[str]) -> None:
-    assert alarms(*given) == told
 
 
 @given(some.floats())

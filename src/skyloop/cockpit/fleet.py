@@ -13,6 +13,7 @@ from collections.abc import Callable, Collection, Coroutine
 from typing import TYPE_CHECKING, Any, Final
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
+from skyloop.cockpit.alarms import Alarm, AlarmSeverity
 from skyloop.cockpit.discovery import Finder, Found
 from skyloop.cockpit.feeds import PeriodicBroadcast
 from skyloop.cockpit.station import Station
@@ -202,7 +203,7 @@ def _silent(name: str, problem: str) -> dict[str, Any]:
         "cameras": [],
         "me": False,
         "links": {"application": "lost", "vehicle": "connecting", "reason": problem, "remedy": ""},
-        "alarms": [problem],
+        "alarms": [Alarm("application_link", AlarmSeverity.CRITICAL, problem)],
         "recording": False,
         "replay": False,
         **dict.fromkeys(unknown),

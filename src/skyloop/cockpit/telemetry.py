@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from skyloop.clock import Clock, monotonic_ns, seconds
+from skyloop.cockpit.alarms import Alarm, alarms
 from skyloop.cockpit.values import (
     Json,
-    alarms,
     channel_values,
     event_values,
     feedback_values,
@@ -93,8 +93,8 @@ class TelemetryView:
         now_ns = self._clock() + self._station.drone.clock_offset_ns
         return [event_values(number_, event, now_ns) for number_, event in events]
 
-    def alarms(self, feedback: Feedback | None) -> list[str]:
-        """Return what a person must know at once."""
+    def alarms(self, feedback: Feedback | None) -> list[Alarm]:
+        """Return what a person must know at once, the most severe first."""
         drone = self._station.drone
         age_s = None if feedback is None else self._age_s(feedback.captured_ns)
         ages = {name: feed.age_s for name, feed in self._station.cameras.items()}

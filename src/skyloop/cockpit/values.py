@@ -1,4 +1,4 @@
-"""Feedback, commands, statistics and alarms as plain JSON values, in SI units and radians.
+"""Feedback, commands and statistics as plain JSON values, in SI units and radians.
 
 What is not known is null.
 """
@@ -7,20 +7,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from skyloop.clock import seconds
-from skyloop.messages import ACTION_NAMES, AnyAction, Event, Failsafe, Feedback, FlightState, LinkState, Value
+from skyloop.messages import ACTION_NAMES, AnyAction, Event, Feedback, Value
 
 if TYPE_CHECKING:
-    from skyloop.client import LinkStatus
     from skyloop.client.statistics import ChannelStats
 
 Json = dict[str, Any]
 
-BATTERY_LOW: Final = 0.2  #: as ``battery.warn`` of a proxy, unless that was written
-STALE_VIDEO_S: Final = 1.0
-STALE_FEEDBACK_S: Final = 1.0
 MAX_TEXT = 1000  #: characters of an event that pages get: there may be hundreds for a new one
 
 #: The page's names of feedback's numbers.
@@ -39,8 +35,6 @@ _VECTORS = {
     "acceleration": ("acceleration_m_s2", ("x", "y", "z")),
     "position": ("position_m", ("x", "y", "z")),
 }
-
-_BROKEN: Final = (LinkState.LOST, LinkState.CLOSED)
 
 
 def number(value: float | None) -> float | None:
@@ -207,51 +201,3 @@ def _numbers(name: str, value: Value) -> dict[str, float | None]:
 def _fields(action: AnyAction) -> Iterator[tuple[str, float]]:
     for name in action.__struct_fields__:
         yield name, getattr(action, name)
-
-
-def alarms(
-    link: LinkStatus,
-    feedback: Feedback | None,
-    feedback_age_s: float | None,
-    video_age_s: Mapping[str, float],
-    battery_low: float = BATTERY_LOW,
-) -> list[str]:
-    """Return what a person must know at once, in words; the worst first.
-
-    Args:
-        link: The state of both hops.
-        feedback: The newest, None for none.
-        feedback_age_s: Its age [s].
-        video_age_s: Age of what is shown [s], by camera that somebody watches.
-        battery_low: Charge below which the battery is low, 0 to 1.
-    """
-    if link.application in _BROKEN:
-        # Nothing else is known any more: what came before is out of date.
-        return [_because("link to the proxy lost", link.reason)]
-    if link.vehicle is LinkState.CLOSED:
-        return []  # a recording that is over, as every recording is some time: nothing is wrong
-    found = []
-    if feedback is not None and feedback.state is FlightState.EMERGENCY:
-        found.append("emergency: the motors are off")
-    if link.vehicle is LinkState.LOST:
-        found.append(_because("link to the vehicle lost", link.reason, link.remedy))
-    elif link.vehicle is LinkState.CONNECTING:
-        found.append(_because("no vehicle yet", link.reason, link.remedy))
-    if feedback is not None and feedback.failsafe is not Failsafe.NONE:
-        done = "landing" if feedback.failsafe is Failsafe.LAND else "hovering"
-        found.append(f"failsafe: {done} by itself")
-    if feedback is not None and feedback.battery is not None and feedback.battery < battery_low:
-        found.append(f"battery low: {feedback.battery:.0%}")
-    for hop, state in (("proxy", link.application), ("vehicle", link.vehicle)):
-        if state is LinkState.DEGRADED:
-            found.append(_because(f"link to the {hop} degraded", link.reason))
-    if feedback_age_s is not None and feedback_age_s > STALE_FEEDBACK_S:
-        found.append(f"feedback is {feedback_age_s:.1f} s old")
-    for camera, age_s in video_age_s.items():
-        if age_s > STALE_VIDEO_S:
-            found.append(f"video of {camera} is {age_s:.1f} s old")
-    return found
-
-
-def _because(what: str, *more: str) -> str:
-    return ": ".join((what, *filter(None, more)))

@@ -1,0 +1,123 @@
+"""What a person must know of a drone at once: decided from links, feedback and ages. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+
+from skyloop.messages import Failsafe, Feedback, FlightState, LinkState
+
+if TYPE_CHECKING:
+    from skyloop.client import LinkStatus
+
+_BROKEN: Final = (LinkState.LOST, LinkState.CLOSED)
+
+
+class AlarmSeverity(StrEnum):
+    """How urgent an alarm is."""
+
+    WARNING = "warning"
+    CRITICAL = "critical"
+
+
+class Alarm(msgspec.Struct, frozen=True):
+    """One thing that is wrong now.
+
+    Args:
+        id: What it is about, the same while it lasts: a page remembers by it that a person has acknowledged it.
+        severity: It may rise while it lasts, as from a degraded link to a lost one.
+        text: In words, with the figure of now.
+    """
+
+    id: str
+    severity: AlarmSeverity
+    text: str
+
+
+class Thresholds(msgspec.Struct, frozen=True):
+    """From where on something is an alarm: charges from 0 to 1, ages in seconds; 0: never."""
+
+    battery_low: float = 0.2
+    battery_critical: float = 0.15
+    feedback_age_s: float = 1.0
+    video_age_s: float = 1.0
+
+
+USUAL: Final = Thresholds()
+
+
+def alarms(
+    link: LinkStatus,
+    feedback: Feedback | None,
+    feedback_age_s: float | None,
+    video_age_s: Mapping[str, float],
+    thresholds: Thresholds = USUAL,
+) -> list[Alarm]:
+    """Return what a person must know at once, the most severe first.
+
+    Args:
+        link: The state of both hops.
+        feedback: The newest, None for none.
+        feedback_age_s: Its age [s].
+        video_age_s: Age of what is shown [s], by camera that somebody watches.
+        thresholds: From where on a charge or an age is an alarm.
+    """
+    if link.application in _BROKEN:
+        # Nothing else is known any more: what came before is out of date.
+        return [_critical("application_link", _because("link to the proxy lost", link.reason))]
+    if link.vehicle is LinkState.CLOSED:
+        return []  # a recording that is over, as every recording is some time: nothing is wrong
+    found = [*_of_flight(feedback, thresholds), *_of_links(link), *_of_ages(feedback_age_s, video_age_s, thresholds)]
+    return sorted(found, key=lambda alarm: alarm.severity is not AlarmSeverity.CRITICAL)
+
+
+def _of_flight(feedback: Feedback | None, thresholds: Thresholds) -> Iterator[Alarm]:
+    if feedback is None:
+        return
+    if feedback.state is FlightState.EMERGENCY:
+        yield _critical("emergency", "emergency: the motors are off")
+    if feedback.failsafe is Failsafe.LAND:
+        yield _critical("failsafe", "failsafe: landing by itself")
+    elif feedback.failsafe is not Failsafe.NONE:
+        yield _warning("failsafe", "failsafe: hovering by itself")
+    charge = feedback.battery
+    if charge is not None and charge < thresholds.battery_critical:
+        yield _critical("battery", f"battery critical: {charge:.0%}")
+    elif charge is not None and charge < thresholds.battery_low:
+        yield _warning("battery", f"battery low: {charge:.0%}")
+
+
+def _of_links(link: LinkStatus) -> Iterator[Alarm]:
+    if link.vehicle is LinkState.LOST:
+        yield _critical("vehicle_link", _because("link to the vehicle lost", link.reason, link.remedy))
+    elif link.vehicle is LinkState.CONNECTING:
+        yield _warning("vehicle_link", _because("no vehicle yet", link.reason, link.remedy))
+    for hop, name, state in (
+        ("application_link", "proxy", link.application),
+        ("vehicle_link", "vehicle", link.vehicle),
+    ):
+        if state is LinkState.DEGRADED:
+            yield _warning(hop, _because(f"link to the {name} degraded", link.reason))
+
+
+def _of_ages(feedback_age_s: float | None, video_age_s: Mapping[str, float], thresholds: Thresholds) -> Iterator[Alarm]:
+    if feedback_age_s is not None and 0 < thresholds.feedback_age_s < feedback_age_s:
+        yield _critical("feedback_age", f"feedback is {feedback_age_s:.1f} s old")
+    for camera, age_s in video_age_s.items():
+        if 0 < thresholds.video_age_s < age_s:
+            yield _warning(f"video_age.{camera}", f"video of {camera} is {age_s:.1f} s old")
+
+
+def _critical(what: str, text: str) -> Alarm:
+    return Alarm(what, AlarmSeverity.CRITICAL, text)
+
+
+def _warning(what: str, text: str) -> Alarm:
+    return Alarm(what, AlarmSeverity.WARNING, text)
+
+
+def _because(what: str, *more: str) -> str:
+    return ": ".join((what, *filter(None, more)))

@@ -1,0 +1,86 @@
+"""Which alarms a drone has, as tables."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from skyloop.cockpit.alarms import Thresholds, alarms
+from skyloop.cockpit.telemetry import encode_json
+from skyloop.messages import Failsafe, Feedback, FlightState, LinkState
+
+
+def link(application: str = "up", vehicle: str = "up", reason: str = "", remedy: str = "") -> Any:
+    hops = {"application": LinkState(application), "vehicle": LinkState(vehicle)}
+    return SimpleNamespace(**hops, reason=reason, remedy=remedy)
+
+
+def flying(**values: Any) -> Feedback:
+    known: dict[str, Any] = {"captured_ns": 1, "state": FlightState.FLYING, "battery": 0.8}
+    return Feedback(**(known | values))
+
+
+LOST = ("application_link", "critical", "link to the proxy lost")
+GONE = ("vehicle_link", "critical", "link to the vehicle lost: radio")
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ((link(), flying(), 0.1, {}), []),
+        ((link(), None, None, {}), []),
+        ((link("lost", "up", "killed"), flying(battery=0.01), 9.0, {}), [(*LOST[:2], f"{LOST[2]}: killed")]),
+        ((link("closed"), None, None, {}), [LOST]),
+        ((link("up", "lost", "radio"), flying(), 0.1, {}), [GONE]),
+        ((link("up", "lost", "radio", "plug it in"), None, None, {}), [(*GONE[:2], f"{GONE[2]}: plug it in")]),
+        (
+            (link("up", "connecting", "waiting"), None, None, {}),
+            [("vehicle_link", "warning", "no vehicle yet: waiting")],
+        ),
+        ((link("up", "closed", "end of the recording"), flying(battery=0.01), 9.0, {"front": 9.0}), []),
+        ((link("degraded"), flying(), 0.1, {}), [("application_link", "warning", "link to the proxy degraded")]),
+        (
+            (link(vehicle="degraded", reason="slow"), flying(), 0.1, {}),
+            [("vehicle_link", "warning", "link to the vehicle degraded: slow")],
+        ),
+        (
+            (link(), flying(state=FlightState.EMERGENCY), 0.1, {}),
+            [("emergency", "critical", "emergency: the motors are off")],
+        ),
+        ((link(), flying(failsafe=Failsafe.HOVER), 0.1, {}), [("failsafe", "warning", "failsafe: hovering by itself")]),
+        ((link(), flying(failsafe=Failsafe.LAND), 0.1, {}), [("failsafe", "critical", "failsafe: landing by itself")]),
+        ((link(), flying(battery=0.19), 0.1, {}), [("battery", "warning", "battery low: 19%")]),
+        ((link(), flying(battery=0.14), 0.1, {}), [("battery", "critical", "battery critical: 14%")]),
+        ((link(), flying(), 2.5, {}), [("feedback_age", "critical", "feedback is 2.5 s old")]),
+        (
+            (link(), flying(), 0.1, {"front": 0.3, "bottom": 4.0}),
+            [("video_age.bottom", "warning", "video of bottom is 4.0 s old")],
+        ),
+        (
+            (link("degraded"), flying(state=FlightState.EMERGENCY, battery=0.18), 2.0, {}),
+            [
+                ("emergency", "critical", "emergency: the motors are off"),
+                ("feedback_age", "critical", "feedback is 2.0 s old"),
+                ("battery", "warning", "battery low: 18%"),
+                ("application_link", "warning", "link to the proxy degraded"),
+            ],
+        ),
+    ],
+)
+def test_alarms(given: tuple[Any, Any, Any, Any], told: list[tuple[str, str, str]]) -> None:
+    assert [(alarm.id, alarm.severity, alarm.text) for alarm in alarms(*given)] == told
+
+
+def test_thresholds_are_the_drones_and_zero_is_never() -> None:
+    late = (link(), flying(battery=0.3), 1.5, {"front": 2.5})
+    told = alarms(*late, Thresholds(battery_low=0.5, battery_critical=0.35, feedback_age_s=2.0, video_age_s=2.0))
+    assert [(alarm.id, alarm.severity) for alarm in told] == [("battery", "critical"), ("video_age.front", "warning")]
+    never = Thresholds(battery_low=0.0, battery_critical=0.0, feedback_age_s=0.0, video_age_s=0.0)
+    assert alarms(link(), flying(battery=0.0), 1e6, {"front": 1e6}, never) == []
+
+
+def test_an_alarm_is_an_object_for_pages() -> None:
+    told = encode_json(alarms(link("degraded"), None, None, {}))
+    assert told == b'[{"id":"application_link","severity":"warning","text":"link to the proxy degraded"}]'
