@@ -9,15 +9,16 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import pytest
 
 from skyloop.cockpit.child import CockpitProcess
+from tests.cockpit import firefox
 from tests.processes.conftest import Process
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
+    from playwright.sync_api import Browser, Page, Playwright
 
 CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
@@ -166,19 +167,25 @@ def runtime() -> Iterator[None]:
 
 
 @contextmanager
-def browser_and_cockpit() -> Iterator[tuple[Browser, str]]:
-    """Chromium, and the address of a cockpit that shows every proxy as it comes."""
-    from playwright.sync_api import sync_playwright
-
+def _chromium(playwright: Playwright) -> Iterator[Browser]:
     arguments = ["--enable-unsafe-swiftshader"]  # three dimensions without a graphics card
     if os.geteuid() == 0:
         arguments.append("--no-sandbox")  # Chromium has no sandbox for the superuser
+    browser = playwright.chromium.launch(executable_path=CHROMIUM, args=arguments)
+    yield browser
+    browser.close()
+
+
+@contextmanager
+def browser_and_cockpit(name: Literal["chromium", "firefox"] = "chromium") -> Iterator[tuple[Browser, str]]:
+    """A browser, and the address of a cockpit that shows every proxy as it comes."""
+    from playwright.sync_api import sync_playwright
+
     with (
         runtime(),
         tempfile.TemporaryDirectory(prefix="skyloop-recordings-") as folder,
         CockpitProcess(recordings=Path(folder)) as cockpit,
         sync_playwright() as playwright,
+        _chromium(playwright) if name == "chromium" else firefox.launch(playwright) as browser,
     ):
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=arguments)
         yield browser, cockpit.address()
-        browser.close()

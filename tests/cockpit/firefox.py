@@ -1,0 +1,141 @@
+"""Firefox, for the tests of the page: driven by Playwright as Chromium is.
+
+Playwright speaks WebDriver BiDi to an unpatched Firefox (channel ``moz-firefox``), but sends commands that Firefox does
+not have, and gives up at the first. So ``launch`` has Playwright start this module in place of Firefox: it starts
+Firefox, passes every message on, and confirms the commands of ``OMITTED`` itself. What they would have set is a
+preference of the browser instead. A test opens it by ``browser.browser_and_cockpit("firefox")`` and is then the same as
+in Chromium; ``fingers.on`` moves fingers in both. Start a browser once per file, as it takes seconds.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import re
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from itertools import count
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.asyncio.server import ServerConnection, serve, unix_serve
+from websockets.sync.client import unix_connect
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Playwright
+
+FIREFOX = next((path for name in ("firefox-esr", "firefox") if (path := shutil.which(name))), None)
+OMITTED = frozenset({"emulation.setMediaFeaturesOverride"})
+PREFERENCES: Mapping[str, str | float | bool] = {
+    "dom.w3c_touch_events.enabled": 1,
+    "webgl.force-enabled": True,
+}
+_SECOND = "SKYLOOP_TEST_BIDI"  #: in the environment: the path of the socket of a second client, beside Playwright
+_SECOND_IDS = 1 << 40  #: the numbers of its commands begin here
+_sockets: dict[Browser, str] = {}  #: where the second client of each reaches it
+_OPTIONS: dict[str, Any] = {"max_size": None, "compression": None, "ping_interval": None}
+
+
+@contextmanager
+def launch(playwright: Playwright, preferences: Mapping[str, str | float | bool] = {}) -> Iterator[Browser]:
+    """Firefox with these preferences besides ``PREFERENCES``, gone at the end.
+
+    ``ui.primaryPointerCapabilities=1`` is a screen that is touched,
+    ``layout.css.prefers-color-scheme.content-override=0`` a dark system, 1 a light one.
+    """
+    with tempfile.TemporaryDirectory(prefix="skyloop-firefox-") as folder:
+        program = Path(folder) / "firefox"
+        program.write_text(f'#!/bin/sh\nexec "{sys.executable}" "{__file__}" "$@"\n')
+        program.chmod(0o700)
+        browser = playwright.firefox.launch(
+            channel="moz-firefox",
+            executable_path=program,
+            firefox_user_prefs={**PREFERENCES, **preferences},
+            env={**os.environ, _SECOND: f"{folder}/bidi", "HOME": folder},
+        )
+        _sockets[browser] = f"{folder}/bidi"
+        yield browser
+        del _sockets[browser]
+        browser.close()
+
+
+@contextmanager
+def bidi(browser: Browser) -> Iterator[Callable[..., dict[str, Any]]]:
+    """Sends what Playwright has no call for, and returns its result (https://w3c.github.io/webdriver-bidi)."""
+    with unix_connect(_sockets[browser], uri="ws://localhost", compression=None, max_size=None) as socket:
+        numbers = count(_SECOND_IDS)
+
+        def call(method: str, **parameters: Any) -> dict[str, Any]:
+            socket.send(json.dumps({"id": next(numbers), "method": method, "params": parameters}))
+            answer = json.loads(socket.recv(timeout=10.0))
+            if answer["type"] != "success":
+                raise RuntimeError(f"{method}: {answer['error']}: {answer['message']}")
+            result: dict[str, Any] = answer["result"]
+            return result
+
+        yield call
+
+
+class _Relay:
+    """Passes messages on between Playwright, a second client, and Firefox."""
+
+    def __init__(self, address: str) -> None:
+        self._address = address
+        self._firefox: ClientConnection | None = None
+        self._second: ServerConnection | None = None
+
+    async def playwright(self, client: ServerConnection) -> None:
+        async with connect(self._address, **_OPTIONS) as self._firefox:
+            down = asyncio.create_task(self._answers(self._firefox, client))
+            async for text in client:
+                command = json.loads(text)
+                if command["method"] in OMITTED:
+                    await client.send(json.dumps({"type": "success", "id": command["id"], "result": {}}))
+                else:
+                    await self._firefox.send(text)
+            down.cancel()
+
+    async def second(self, client: ServerConnection) -> None:
+        self._second = client
+        async for text in client:
+            assert self._firefox is not None, "Playwright opens the session"
+            await self._firefox.send(text)
+
+    async def _answers(self, firefox: ClientConnection, client: ServerConnection) -> None:
+        async for text in firefox:
+            number = json.loads(text).get("id")
+            to = self._second if isinstance(number, int) and number >= _SECOND_IDS else client
+            if to is not None:
+                await to.send(text)
+
+
+async def main() -> None:
+    """Firefox, and where Playwright looks for it."""
+    assert FIREFOX is not None, "no Firefox here"
+    process = await asyncio.create_subprocess_exec(FIREFOX, *sys.argv[1:], stderr=asyncio.subprocess.PIPE)
+    assert process.stderr is not None
+    async for line in process.stderr:
+        if found := re.search(rb"WebDriver BiDi listening on (ws://\S+)", line):
+            relay = _Relay(f"{found[1].decode()}/session")
+            break
+        sys.stderr.buffer.write(line)
+    else:
+        sys.exit("Firefox did not start")
+    async with (
+        serve(relay.playwright, "127.0.0.1", 0, **_OPTIONS) as server,
+        unix_serve(relay.second, os.environ[_SECOND], **_OPTIONS),
+    ):
+        port = next(iter(server.sockets)).getsockname()[1]
+        print(f"WebDriver BiDi listening on ws://127.0.0.1:{port}", file=sys.stderr, flush=True)
+        async for line in process.stderr:
+            sys.stderr.buffer.write(line)
+        await process.wait()
+
+
+if __name__ == "__main__":
+    asyncio.run(main())

@@ -1,0 +1,89 @@
+"""The page in Firefox: what a person does first, by keys, and that fingers arrive. The rest is tested in Chromium."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+
+import skyloop
+from skyloop.messages import FlightState
+from tests.cockpit import fingers
+from tests.cockpit.browser import Deck, DronePage, browser_and_cockpit
+from tests.cockpit.firefox import FIREFOX
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
+pytest.importorskip("playwright.sync_api", reason="the tests of the page need: pip install playwright")
+pytestmark = [
+    pytest.mark.process,
+    pytest.mark.skipif(FIREFOX is None, reason="no Firefox here (Debian: apt install firefox-esr)"),
+]
+
+
+@pytest.fixture(scope="module")
+def open_cockpit() -> Iterator[tuple[Browser, str]]:
+    with browser_and_cockpit("firefox") as opened:
+        yield opened
+
+
+@pytest.fixture
+def deck(open_cockpit: tuple[Browser, str]) -> Iterator[Deck]:
+    deck = Deck(*open_cockpit)
+    yield deck
+    deck.end()
+
+
+def test_a_person_logs_in_and_flies_by_keys(open_cockpit: tuple[Browser, str], deck: Deck, tmp_path: Path) -> None:
+    tokens = tmp_path / "tokens"
+    tokens.write_text("pilot 0123456789abcdefP ann\n")
+    tokens.chmod(0o600)
+    deck.proxy("fox")
+    address = deck.cockpit("--token-file", str(tokens), "--recordings", str(tmp_path))
+    browser, _ = open_cockpit
+    with browser.new_context() as context, skyloop.connect("fox", access="observe", name="test") as drone:
+        page = DronePage(context.new_page(), "fox")
+        page.page.goto(f"{address}#fox")
+        page.page.get_by_label("Token").fill("0123456789abcdefP")
+        page.page.get_by_role("button", name="Enter").click()
+        page.pane.wait_for()
+        page.problems.clear()  # that nobody was logged in yet
+        page.wait_for_new_picture()
+        page.take_off()
+        with page.holding("w"):
+            page.until(lambda: (drone.feedback().velocity_m_s or (0,))[0] > 0.3, "it flies forward")
+        page.until(lambda: drone.feedback().state is FlightState.HOVERING, "it hovers when the key is released")
+        page.press("l")
+        page.wait_for_text(".pill", "landed")
+    assert page.problems == []
+
+
+HEARD = """
+window.heard = [];
+for (const type of ["pointerdown", "pointermove", "pointerup"])
+  addEventListener(type, (event) => heard.push([type, event.pointerType, event.clientX, event.clientY]), true);
+"""
+
+
+def test_fingers_arrive(deck: Deck) -> None:
+    deck.proxy("touched")
+    page = deck.page("touched", has_touch=True)
+    page.page.evaluate(HEARD)
+    with fingers.on(page.page) as hand:
+        hand.put("left", 100, 700)
+        hand.put("right", 300, 700)
+        hand.put("left", 100, 690)
+        hand.lift("left")
+    page.until(lambda: page.page.evaluate("heard.length") >= 5, "both fingers came and went")
+    expected = [
+        ["pointerdown", "touch", 100, 700],
+        ["pointerdown", "touch", 300, 700],
+        ["pointermove", "touch", 100, 690],
+        ["pointerup", "touch", 100, 690],
+        ["pointerup", "touch", 300, 700],
+    ]
+    assert page.page.evaluate("heard") == expected
+    assert page.problems == []
