@@ -10,13 +10,14 @@ from typer.testing import CliRunner
 
 import skyloop
 from skyloop.cli import app as cli
+from skyloop.cli.commands import COMMANDS, Task
 from skyloop.errors import LinkError, ParameterError, UnknownNameError
 from tests.cli.conftest import Run
 
 runner = CliRunner(env={"COLUMNS": "80", "TERM": "dumb"})
 
 
-@pytest.mark.parametrize("command", cli.COMMANDS)
+@pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_has_help_with_an_example_in_80_columns(command: str) -> None:
     result = runner.invoke(cli.build([command]), [command, "--help"], prog_name="skyloop")
     assert result.exit_code == 0
@@ -24,22 +25,32 @@ def test_every_command_has_help_with_an_example_in_80_columns(command: str) -> N
     assert max(map(len, result.output.splitlines())) <= 80
 
 
-def test_the_list_of_commands_says_of_each_what_it_does() -> None:
+@pytest.mark.parametrize("columns", [40, 60, 80])
+def test_help_fits_the_terminal_and_shows_no_types(columns: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", str(columns))
+    for words in ([], *([command] for command in COMMANDS)):
+        result = runner.invoke(cli.build(), [*words, "--help"], prog_name="skyloop", env={"COLUMNS": str(columns)})
+        assert [line for line in result.output.splitlines() if len(line) > columns or "<" in line] == [], words
+
+
+def test_the_list_of_commands_says_of_each_what_it_does_by_task() -> None:
     result = runner.invoke(cli.build(), ["--help"], prog_name="skyloop")
     assert result.exit_code == 0
-    for command, entry in cli.COMMANDS.items():
+    titles = [line.removesuffix(":") for line in result.output.splitlines() if line[:1] != " " and line.endswith(":")]
+    assert titles == ["Options", *Task]
+    for command, entry in COMMANDS.items():
         assert any(line.split() == [command, *entry.summary.split()] for line in result.output.splitlines()), (
             f"{command} is cut off, or not there"
         )
 
 
-@pytest.mark.parametrize("command", cli.COMMANDS)
+@pytest.mark.parametrize("command", COMMANDS)
 def test_every_example_is_made_of_words_that_the_command_knows(command: str) -> None:
     """The words are parsed; the command itself is not called."""
     import typer
 
     group = typer.main.get_command(cli.build([command]))
-    _, *words = cli.COMMANDS[command].example.split()
+    _, *words = COMMANDS[command].example.split()
     own = group.get_command(None, command)  # type: ignore[attr-defined]
     own.make_context(command, words)
 
@@ -52,7 +63,7 @@ def test_without_a_word_help_is_shown(run: Run) -> None:
     ended = run()
     assert ended == run("--help")
     assert (ended.code, ended.err) == (0, "")
-    assert "Commands:" in ended.out
+    assert "\nFly:\n  demo " in ended.out
 
 
 @pytest.mark.parametrize(

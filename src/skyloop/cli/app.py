@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from importlib import import_module
-from typing import Annotated, Any, Final, NamedTuple
+from typing import Annotated, Any, Final
 
 import typer
 
+from skyloop.cli.commands import COMMANDS
+from skyloop.cli.plain_help import Command, Group, width
 from skyloop.errors import ParameterError, SkyloopError
 
 FAILED: Final = 1
@@ -16,73 +18,39 @@ USAGE_ERROR: Final = 2
 INTERRUPTED: Final = 130  #: 128 + SIGINT, as shells count
 
 
-class Entry(NamedTuple):
-    """One command: where its function is, its line in the list of commands, and how it is called."""
+class ByTask(Group):
+    """All commands in the order of the table, those with commands of their own among them."""
 
-    module: str
-    function: str
-    summary: str  # up to 60 characters, so that the list fits into 80 columns
-    example: str
-    settings: Mapping[str, Any] = {}
-
-
-COMMANDS: Final = {
-    "demo": Entry("demo", "demo", "A simulated drone finds a marker and follows it", "demo --seconds 30"),
-    "sim": Entry(
-        "sim", "sim", "Simulated drones in one world, with a proxy each", "sim --drones 3 --world room --seed 1"
-    ),
-    "proxy": Entry("proxy", "proxy", "Serve one vehicle under a name", "proxy sim:// --name alpha"),
-    "router": Entry(
-        "router", "router", "Join proxies and programs of several networks", "router --connect other-site.example:7447"
-    ),
-    "list": Entry("listing", "list_proxies", "The running proxies and who flies", "list"),
-    "fly": Entry("fly", "fly", "Fly a controller from a Python file", "fly my_controller.py --on alpha --seconds 30"),
-    "teleop": Entry("teleop", "teleop", "Fly a drone by the keys of the terminal", "teleop alpha --speed 0.5"),
-    "watch": Entry("watch", "watch", "What a drone does, live in the terminal", "watch alpha"),
-    "param": Entry(
-        "param",
-        "param",
-        "List, show or write a vehicle's parameters",
-        "param alpha limits.tilt 0.2",
-        {"ignore_unknown_options": True},  # a value may begin with a minus
-    ),
-    "audit": Entry("audit", "audit", "Who flew which drone when", "audit alpha --last 20"),
-    "record": Entry("record", "record", "Record drones to an MCAP file", "record alpha -o flight.mcap"),
-    "process": Entry(
-        "process",
-        "process",
-        "Run a class of yours on a drone's frames",
-        "process detector.py --drone alpha",
-    ),
-    "log": Entry("log", "log", "Inspect, export, compare and repair recordings", "log info flight.mcap"),
-    "keys": Entry("keys", "keys", "Who may join the network: make, issue, revoke keys", "keys issue jane --role pilot"),
-    "camera": Entry("camera", "camera", "Print a board, and calibrate a camera by it", "camera calibrate alpha"),
-    "cockpit": Entry("cockpit", "cockpit", "A page in the browser to watch and fly drones", "cockpit --port 8000"),
-    "doctor": Entry(
-        "doctor", "doctor", "What of this machine works, what to install", "doctor mavlink://tcp:127.0.0.1:5760"
-    ),
-    "bench": Entry("bench", "bench", "Measure the delays of each channel", "bench delays --seconds 30"),
-}
+    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002  as Typer calls it
+        """Return the names of the commands in the order of the help."""
+        return [name for name in COMMANDS if name in self.commands]
 
 
 def build(names: Iterable[str] = COMMANDS) -> typer.Typer:
     """Return the command line with these commands; only their modules are imported."""
     app = typer.Typer(
         name="skyloop",
+        cls=ByTask,
         add_completion=False,
         pretty_exceptions_enable=False,
-        rich_markup_mode=None,  # plain help fits better into 80 columns, and starts faster
-        context_settings={"help_option_names": ["-h", "--help"]},
+        rich_markup_mode=None,  # plain help fits narrow terminals and pipes, and starts faster
+        context_settings={"help_option_names": ["-h", "--help"], "terminal_width": width()},
     )
     app.callback()(_skyloop)
     for name in names:
         entry = COMMANDS[name]
         function = getattr(import_module(f"skyloop.cli.{entry.module}"), entry.function)
-        example = f"Example: skyloop {entry.example}"
+        shown: dict[str, Any] = {
+            "short_help": entry.summary,
+            "epilog": f"Example: skyloop {entry.example}",
+            "rich_help_panel": entry.task.value,
+        }
         if isinstance(function, typer.Typer):  # a command with commands of its own
-            app.add_typer(function, name=name, short_help=entry.summary, epilog=example)
+            for info in function.registered_commands:
+                info.cls = Command
+            app.add_typer(function, name=name, cls=Group, **shown)
             continue
-        app.command(name, short_help=entry.summary, epilog=example, context_settings=dict(entry.settings))(function)
+        app.command(name, cls=Command, context_settings=dict(entry.settings), **shown)(function)
     return app
 
 

@@ -21,7 +21,7 @@ HEAD = ("DRONE", "WHO", "IDENTITY", "PRIORITY", "FROM", "TO", "TAKE-OFFS", "HOW 
 
 
 def audit(
-    name: Annotated[str | None, typer.Argument(metavar="[NAME]", help="One proxy's; else those of all")] = None,
+    name: Annotated[str | None, typer.Argument(metavar="NAME", help="One proxy's; else those of all")] = None,
     file: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Of a proxy that was started with --audit FILE")
     ] = None,

@@ -27,10 +27,10 @@ KINDS: Final = {
 def param(
     name: Annotated[str, typer.Argument(metavar="NAME", help="A running proxy; skyloop list shows them")],
     key: Annotated[
-        str | None, typer.Argument(metavar="[KEY]", help="A parameter, or the first part of several: limits")
+        str | None, typer.Argument(metavar="KEY", help="A parameter, or the first part of several: limits")
     ] = None,
     value: Annotated[
-        str | None, typer.Argument(metavar="[VALUE]", help="Its new value; needs the authority for a moment")
+        str | None, typer.Argument(metavar="VALUE", help="Its new value; needs the authority for a moment")
     ] = None,
     priority: Annotated[
         int, typer.Option(metavar="P", min=0, max=31, help="Of a writer: 0 is the highest, 31 the lowest")

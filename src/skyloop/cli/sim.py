@@ -58,7 +58,10 @@ def sim(
     keys: KeysOption = None,
     firmware: Annotated[
         Firmware | None,
-        typer.Option(help="Be a real drone for other programs instead, e.g. --firmware px4 --lose 0.1"),
+        typer.Option(
+            metavar="KIND",
+            help="Be a real drone for other programs instead: ardrone1, ardrone2, arducopter, px4 or tello",
+        ),
     ] = None,
     bind: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help=f"Of the firmware: where it listens [{LOOPBACK}]")

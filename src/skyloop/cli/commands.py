@@ -1,0 +1,100 @@
+"""The commands of ``skyloop``, by what one wants to do: a line for each. A new command is one more line here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from enum import StrEnum
+from typing import Any, Final, NamedTuple
+
+
+class Task(StrEnum):
+    """What one wants to do, in the order in which ``skyloop --help`` shows it."""
+
+    FLY = "Fly"
+    SEE = "See"
+    SHARE = "Share"
+    RECORD = "Record"
+    SET_UP = "Set up"
+    MEASURE = "Measure"
+
+
+class Entry(NamedTuple):
+    """One command: where its function is, its line in the list of commands, and how it is called."""
+
+    task: Task
+    module: str
+    function: str
+    summary: str  # up to 60 characters, so that the list fits into 80 columns
+    example: str
+    settings: Mapping[str, Any] = {}
+
+
+COMMANDS: Final = {
+    "demo": Entry(Task.FLY, "demo", "demo", "A simulated drone finds a marker and follows it", "demo --seconds 30"),
+    "sim": Entry(
+        Task.FLY,
+        "sim",
+        "sim",
+        "Simulated drones in one world, with a proxy each",
+        "sim --drones 3 --world room --seed 1",
+    ),
+    "fly": Entry(
+        Task.FLY,
+        "fly",
+        "fly",
+        "Fly a controller from a Python file",
+        "fly my_controller.py --on alpha --seconds 30",
+    ),
+    "teleop": Entry(
+        Task.FLY, "teleop", "teleop", "Fly a drone by the keys of the terminal", "teleop alpha --speed 0.5"
+    ),
+    "list": Entry(Task.SEE, "listing", "list_proxies", "The running proxies and who flies", "list"),
+    "watch": Entry(Task.SEE, "watch", "watch", "What a drone does, live in the terminal", "watch alpha"),
+    "cockpit": Entry(
+        Task.SEE, "cockpit", "cockpit", "A page in the browser to watch and fly drones", "cockpit --port 8000"
+    ),
+    "process": Entry(
+        Task.SEE,
+        "process",
+        "process",
+        "Run a class of yours on a drone's frames",
+        "process detector.py --drone alpha",
+    ),
+    "proxy": Entry(Task.SHARE, "proxy", "proxy", "Serve one vehicle under a name", "proxy sim:// --name alpha"),
+    "router": Entry(
+        Task.SHARE,
+        "router",
+        "router",
+        "Join proxies and programs of several networks",
+        "router --connect other-site.example:7447",
+    ),
+    "keys": Entry(
+        Task.SHARE,
+        "keys",
+        "keys",
+        "Who may join the network: make, issue, revoke keys",
+        "keys issue jane --role pilot",
+    ),
+    "audit": Entry(Task.SHARE, "audit", "audit", "Who flew which drone when", "audit alpha --last 20"),
+    "record": Entry(Task.RECORD, "record", "record", "Record drones to an MCAP file", "record alpha -o flight.mcap"),
+    "log": Entry(Task.RECORD, "log", "log", "Inspect, export, compare and repair recordings", "log info flight.mcap"),
+    "doctor": Entry(
+        Task.SET_UP,
+        "doctor",
+        "doctor",
+        "What of this machine works, what to install",
+        "doctor mavlink://tcp:127.0.0.1:5760",
+    ),
+    "param": Entry(
+        Task.SET_UP,
+        "param",
+        "param",
+        "List, show or write a vehicle's parameters",
+        "param alpha limits.tilt 0.2",
+        {"ignore_unknown_options": True},  # a value may begin with a minus
+    ),
+    "camera": Entry(
+        Task.SET_UP, "camera", "camera", "Print a board, and calibrate a camera by it", "camera calibrate alpha"
+    ),
+    "bench": Entry(Task.MEASURE, "bench", "bench", "Measure the delays of each channel", "bench delays --seconds 30"),
+}
