@@ -1,9 +1,8 @@
 // A battery, drawn and in words.
 
 import { h, setAttribute, setText, setTone, svg } from "./dom.js";
+import type { Alarm } from "./model.js";
 
-const LOW = 0.2;
-const MIDDLING = 0.4;
 
 export class Battery {
   readonly element: HTMLElement;
@@ -14,12 +13,13 @@ export class Battery {
     const picture = svg("svg", { viewBox: "0 0 26 12", width: 26, height: 12, "aria-hidden": "true" });
     picture.append(svg("rect", { class: "battery-case", x: 0.75, y: 0.75, width: 21.5, height: 10.5, rx: 2.5 }), svg("rect", { class: "battery-tip", x: 23.5, y: 4, width: 2, height: 4, rx: 1 }), this.level);
     this.element = h("div", { class: "battery", role: "meter", "aria-label": "Battery", "aria-valuemin": 0, "aria-valuemax": 100, "aria-valuenow": 0 }, picture, this.text);
-    this.show(null);
+    this.show(null, []);
   }
 
-  /** `share` from 0 to 1; null where it is not known. */
-  show(share: number | null): void {
-    setTone(this.element, share === null ? "quiet" : share < LOW ? "bad" : share < MIDDLING ? "warn" : "ok");
+  /** `share` from 0 to 1; null where it is not known. Whether it is low is for the drone's alarms to say. */
+  show(share: number | null, alarms: readonly Alarm[]): void {
+    const severity = alarms.find((alarm) => alarm.id === "battery")?.severity;
+    setTone(this.element, share === null ? "quiet" : severity === "critical" ? "bad" : severity === "warning" ? "warn" : "ok");
     this.level.setAttribute("width", (18 * Math.max(0, Math.min(1, share ?? 0))).toFixed(1));
     setText(this.text, share === null ? "–" : `${(share * 100).toFixed(0)} %`);
     setAttribute(this.element, "aria-valuenow", ((share ?? 0) * 100).toFixed(0));

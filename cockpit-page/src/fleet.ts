@@ -32,7 +32,7 @@ class Card {
     const over = recorded && (lost || row.links.vehicle === "closed"); // as every recording is some time
     setTone(this.element, over ? "quiet" : lost ? "bad" : row.alarms.some((alarm) => alarm.severity === "critical") ? "bad" : row.alarms.length ? "warn" : row.airborne ? "ok" : "quiet");
     setText(this.state, over ? "recording over" : lost ? "lost" : row.airborne && row.altitude !== null ? `${words(row.state)} · ${figure(row.altitude, 1)} m` : words(row.state));
-    this.battery.show(lost ? null : row.battery);
+    this.battery.show(lost ? null : row.battery, row.alarms);
     setText(this.owner, recorded ? "recording, nothing flies" : row.owner === null ? "nobody has control" : `${row.owner} has control`);
     const [application, vehicle] = [row.links.application, row.links.vehicle];
     setTone(this.hops[0] as Element, over ? "quiet" : (LINKS[application] ?? "quiet"));

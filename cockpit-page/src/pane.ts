@@ -267,7 +267,7 @@ export class Pane {
     const flight = live ? words(live.flight) : "not known";
     setText(this.flight, over ? "recording over" : live && isOld ? `was ${flight}` : flight);
     setTone(this.pill, live && !isOld && !over ? (FLIGHT_TONES[live.flight] ?? "quiet") : "quiet");
-    this.battery.show(live?.battery ?? null);
+    this.battery.show(live?.battery ?? null, live?.alarms ?? []);
     this.instruments.update(live, this.connected && !isOld, pilot?.round_trip_s ?? null);
     if (live) this.channels.update(live);
     if (this.connected && state && !live) this.instruments.lost(state);

@@ -21,11 +21,13 @@ from skyloop.client.feedback_history import FeedbackHistory
 from skyloop.client.frame import Arrival, Frame
 from skyloop.client.statistics import ChannelStats, Distribution
 from skyloop.cockpit.access import Gate, OpenGate
+from skyloop.cockpit.alarms import USUAL
 from skyloop.cockpit.app import create_app
 from skyloop.cockpit.discovery import Found
 from skyloop.cockpit.fleet import Fleet
 from skyloop.cockpit.recordings import Recordings
 from skyloop.cockpit.security import own_names
+from skyloop.cockpit.thresholds import PARAMETERS
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import LinkError, NoAnswerError
@@ -46,6 +48,7 @@ from skyloop.messages import (
     LinkState,
     LogEntry,
     Role,
+    Value,
     Velocity,
 )
 from skyloop.proxy.proxy import Proxy
@@ -86,6 +89,7 @@ class FakeDrone:
         self.link = SimpleNamespace(application=LinkState.UP, vehicle=LinkState.UP, reason="", remedy="")
         delay = Distribution(0.0002, 0.0009, 0.002, 0.0003, 100)
         self.stats = {"feedback": ChannelStats(count=100, rate_hz=32.0, delay_s=delay, age_s=0.01)}
+        self.config: dict[str, Value] = {name: getattr(USUAL, field) for field, name in PARAMETERS.items()}
         self.newest: Feedback | None = None
         self.told: list[Event] = []
         self.processors: dict[str, list[Any]] = {"front": [], "bottom": []}

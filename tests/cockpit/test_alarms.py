@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from skyloop.cockpit.alarms import Thresholds, alarms
+from skyloop.cockpit.alarms import USUAL, Thresholds, alarms
 from skyloop.cockpit.telemetry import encode_json
-from skyloop.messages import Failsafe, Feedback, FlightState, LinkState
+from skyloop.cockpit.thresholds import PARAMETERS, thresholds_of
+from skyloop.errors import UnknownNameError
+from skyloop.messages import Failsafe, Feedback, FlightState, LinkState, Value
+from skyloop.proxy.parameters import OWN
 
 
 def link(application: str = "up", vehicle: str = "up", reason: str = "", remedy: str = "") -> Any:
@@ -84,3 +88,21 @@ def test_thresholds_are_the_drones_and_zero_is_never() -> None:
 def test_an_alarm_is_an_object_for_pages() -> None:
     told = encode_json(alarms(link("degraded"), None, None, {}))
     assert told == b'[{"id":"application_link","severity":"warning","text":"link to the proxy degraded"}]'
+
+
+class Config(dict[str, Value]):
+    def __missing__(self, name: str) -> Value:
+        raise UnknownNameError("parameter", name, self)
+
+
+def test_the_usual_thresholds_are_the_proxys_defaults() -> None:
+    assert thresholds_of(Config({parameter.name: parameter.value for parameter in OWN})) == USUAL
+
+
+@pytest.mark.parametrize("value", [True, "much", (1.0,), math.nan, math.inf])
+def test_what_is_no_number_of_a_driver_is_no_threshold(value: Value) -> None:
+    assert thresholds_of(Config(dict.fromkeys(PARAMETERS.values(), value))) == USUAL
+
+
+def test_an_older_proxy_without_them_has_the_usual_ones() -> None:
+    assert thresholds_of(Config({"battery.warn": 0.4})) == Thresholds(battery_low=0.4)

@@ -21,6 +21,7 @@ from skyloop.messages import (
     Applied,
     CameraInfo,
     Capabilities,
+    EventKind,
     LinkState,
     LogEntry,
     Points,
@@ -201,6 +202,16 @@ def test_stale_video_is_an_alarm(client: TestClient, drone: FakeDrone) -> None:
         drone.newest = flying()
         state = follow(socket, lambda state: state["alarms"])
         assert "video of front is 3." in state["alarms"][0]["text"]
+
+
+def test_thresholds_of_alarms_are_read_anew_when_a_parameter_is_written(client: TestClient, drone: FakeDrone) -> None:
+    drone.newest = flying(battery=0.3)
+    with telemetry(client) as socket:
+        assert follow(socket, lambda _: True)["alarms"] == []
+        drone.config["battery.warn"] = 0.4
+        drone.tell("battery.warn is 0.4", EventKind.PARAMETER_CHANGED)
+        drone.newest = flying(battery=0.3)
+        follow(socket, lambda state: "battery low: 30%" in [alarm["text"] for alarm in state["alarms"]])
 
 
 def wait_for_acknowledgements(client: TestClient, count: int) -> None:

@@ -10,6 +10,7 @@ from skyloop.clock import monotonic_ns, seconds
 from skyloop.cockpit.discovery import Found
 from skyloop.cockpit.feeds import CameraFeed, EventFeed, LogFeed, PeriodicBroadcast
 from skyloop.cockpit.telemetry import TelemetryView
+from skyloop.cockpit.thresholds import ThresholdReader
 from skyloop.control.waypoint import Waypoint
 from skyloop.errors import LinkError, SkyloopError
 
@@ -39,6 +40,7 @@ class Station:
         self.cameras: dict[str, CameraFeed] = {}
         self.goals: dict[str, Waypoint] = {}  #: where pages fly it to, by the name of the application that does
         self.pilots: set[PilotConnection] = set()  #: pilots' connections of pages
+        self.thresholds = ThresholdReader(drone)
         self.view = TelemetryView(self)
         self.broadcast = PeriodicBroadcast(1.0 / TELEMETRY_HZ, self.view.state, self.log_feed.want)
         self._stopper: asyncio.Task[PilotConnection] | None = None
@@ -143,6 +145,7 @@ class Station:
         self.broadcast.close()
         self.log_feed.want(False)
         self.event_feed.close()
+        self.thresholds.close()
         for feed in self.cameras.values():
             feed.close()
         if self._stopper is not None:

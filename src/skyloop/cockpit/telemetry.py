@@ -98,7 +98,8 @@ class TelemetryView:
         drone = self._station.drone
         age_s = None if feedback is None else self._age_s(feedback.captured_ns)
         ages = {name: feed.age_s for name, feed in self._station.cameras.items()}
-        return alarms(drone.link, feedback, age_s, {name: age for name, age in ages.items() if age is not None})
+        shown = {name: age for name, age in ages.items() if age is not None}
+        return alarms(drone.link, feedback, age_s, shown, self._station.thresholds.newest())
 
     def holder(self, feedback: Feedback | None) -> str | None:
         """Return who has the authority.
