@@ -186,6 +186,8 @@ class Driver(ABC):
 
     #: Whether somebody else may fly the vehicle too. If so, a vehicle found in the air is theirs and is left alone.
     shared = True
+    #: Parameters that any pilot may write, whoever holds the authority: those that move nothing that flies.
+    parameters_without_authority: frozenset[str] = frozenset()
 
     def __init__(self, uri: VehicleUri) -> None:
         """Store the address. A subclass reads its options here, and does no I/O."""

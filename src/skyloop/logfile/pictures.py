@@ -52,6 +52,11 @@ class Picture:
         """
         return compressed(self.message, self.record)
 
+    @property
+    def can_be_decoded(self) -> bool:
+        """Whether the images that it builds on are known: false for H.264 without the key frame before it."""
+        return self.record.format != H264 or self.group is not None
+
     def pixels(self) -> NDArray[np.uint8]:
         """Decode the frame: BGR, shape (height, width, 3), uint8.
 

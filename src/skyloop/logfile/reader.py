@@ -252,6 +252,8 @@ class Recording:
         drone: str,
         channels: Collection[Channel],
         progress: Progress | None = None,
+        *,
+        from_ns: int = 0,
     ) -> Iterator[Item | Picture]:
         """Return samples as :meth:`items` does, with each frame as a :class:`Picture`: its record with its image.
 
@@ -259,8 +261,10 @@ class Recording:
             drone: The drone's name.
             channels: Which ones.
             progress: Called with the share that was read, 0 to 1.
+            from_ns: Log time to start from, Unix time [ns].
         """
-        return self._paired(self._topics(drone, channels), _image_topics(drone, self.cameras(drone)), progress)
+        images = _image_topics(drone, self.cameras(drone))
+        return self._paired(self._topics(drone, channels), images, progress, from_ns)
 
     def pictures(self, drone: str, camera: str, progress: Progress | None = None) -> Iterator[Picture]:
         """Return the frames of one camera.
@@ -299,11 +303,11 @@ class Recording:
                 yield Entry(channel.topic, record.log_time, record.publish_time, record.sequence, record.data)
 
     def _paired(
-        self, topics: dict[str, Topic], images: dict[str, _Kind], progress: Progress | None
+        self, topics: dict[str, Topic], images: dict[str, _Kind], progress: Progress | None, from_ns: int = 0
     ) -> Iterator[Item | Picture]:
         """Yield samples of some topics, with frames as pictures in place of their records."""
         pairs = _Pairs()
-        for entry in self.entries([*topics, *images], progress=progress):
+        for entry in self.entries([*topics, *images], from_ns=from_ns, progress=progress):
             topic = topics.get(entry.topic)
             value = None if topic is None else self.decoded(entry, topic.channel)
             if topic is None:

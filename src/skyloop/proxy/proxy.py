@@ -134,7 +134,9 @@ class Proxy:
         self.parameters = Parameters(driver.parameters, driver.set_parameter)
         self.workers = ProcessorWorkers(server_end, self.events, self._counters, self.publisher.cameras)
         self._relay = Relay(driver, server_end, self.publisher, self.events, self._counters)
-        self._parameter_requests = ParameterRequests(self.parameters, self.handler, self.publisher, self.events)
+        self._parameter_requests = ParameterRequests(
+            self.parameters, self.handler, self.publisher, self.events, driver.parameters_without_authority
+        )
         self._requests = RequestDispatcher(
             server_end,
             self._counters,

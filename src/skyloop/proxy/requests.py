@@ -24,6 +24,7 @@ from skyloop.messages import (
     Refused,
     Reply,
     Request,
+    Role,
     SetParameter,
     Severity,
     Value,
@@ -147,11 +148,26 @@ def _refusal(code: str) -> Refusal:
 
 
 class ParameterRequests:
-    """Answers what applications ask about parameters, and lets their values take effect. May wait for the vehicle."""
+    """Answers what applications ask about parameters, and lets their values take effect. May wait for the vehicle.
+
+    Args:
+        parameters: The store.
+        handler: Knows who holds the authority, and gets new settings.
+        publisher: Reports a driver that fails.
+        events: Where changes are published.
+        free: Parameters that any pilot may write without the authority. They change by themselves: each is read anew,
+            and a change is no event.
+    """
 
     def __init__(
-        self, parameters: Parameters, handler: CommandHandler, publisher: VehiclePublisher, events: EventPublisher
+        self,
+        parameters: Parameters,
+        handler: CommandHandler,
+        publisher: VehiclePublisher,
+        events: EventPublisher,
+        free: frozenset[str] = frozenset(),
     ) -> None:
+        self._free = free
         self._parameters = parameters
         self._handler = handler
         self._publisher = publisher
@@ -171,6 +187,8 @@ class ParameterRequests:
 
     def get(self, _session: Session, request: GetParameter, _now_ns: int) -> AnyReply:
         """Answer with one parameter as last known. Raises :class:`UnknownNameError`."""
+        if request.name in self._free:
+            self.read_driver()
         return ParameterValue(self._parameters.get(request.name))
 
     def page(self, _session: Session, request: ListParameters, _now_ns: int) -> AnyReply:
@@ -180,6 +198,8 @@ class ParameterRequests:
 
     def set(self, session: Session, request: SetParameter, _now_ns: int) -> AnyReply:
         """Write one for the holder of the authority. Raises what :meth:`Parameters.set` raises."""
+        if request.name in self._free and session.role is Role.PILOT:
+            return ParameterValue(self._parameters.set(request.name, request.value))
         if not self._handler.holds(session, request.lease):
             code = Refusal.FOREIGN_LEASE if request.lease else Refusal.NO_AUTHORITY
             return Refused(code, "writing a parameter needs the authority: request it, and name its lease")

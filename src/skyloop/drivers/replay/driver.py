@@ -8,8 +8,9 @@ from typing import Final
 from skyloop.clock import Clock
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.replay.options import options_of
+from skyloop.drivers.replay.playback import NAMES, Playback
 from skyloop.drivers.replay.player import Player, StepPlayer
-from skyloop.drivers.replay.publisher import ReplayPublisher
+from skyloop.drivers.replay.publisher import PREFIX, ReplayPublisher
 from skyloop.drivers.replay.source import ReplaySource, capabilities_of
 from skyloop.drivers.uri import VehicleUri
 from skyloop.errors import SkyloopError, UsageError
@@ -24,6 +25,7 @@ from skyloop.messages import (
     LinkState,
     Parameter,
     Severity,
+    Value,
 )
 
 _CLOSE_S: Final = 2.0
@@ -37,6 +39,7 @@ class ReplayDriver(Driver):
     """
 
     shared = False
+    parameters_without_authority = NAMES  # they move the replay, and nothing that flies
 
     def __init__(self, uri: VehicleUri) -> None:
         super().__init__(uri)
@@ -45,7 +48,7 @@ class ReplayDriver(Driver):
         self.clock: Clock | None = None
         self.steps: StepPlayer | None = None
         self._capabilities: Capabilities | None = None
-        self._stop = threading.Event()
+        self._playback: Playback | None = None
         self._thread: threading.Thread | None = None
         self._publisher: ReplayPublisher | None = None
 
@@ -60,13 +63,18 @@ class ReplayDriver(Driver):
         return self._capabilities
 
     def parameters(self) -> list[Parameter]:
-        """Return the parameters recorded so far, read-only, with the prefix ``recorded.``."""
-        publisher = self._publisher
-        return (
-            []
-            if publisher is None
-            else sorted(publisher.parameters.copy().values(), key=lambda parameter: parameter.name)
-        )
+        """Return those that move the replay, and the recorded ones so far, read-only, prefixed with ``recorded.``."""
+        playback, publisher = self._playback, self._publisher
+        if playback is None or publisher is None:
+            return []
+        recorded = sorted(publisher.parameters.copy().values(), key=lambda parameter: parameter.name)
+        return [*recorded, *playback.parameters()]
+
+    def set_parameter(self, name: str, value: Value) -> Value:
+        """Move, hold or slow down the replay; see :class:`skyloop.drivers.replay.playback.Playback`."""
+        if self._playback is None or name.startswith(PREFIX):
+            return super().set_parameter(name, value)
+        return self._playback.set(name, value)
 
     def failsafe(self, action: Hover | Land) -> bool:  # noqa: ARG002
         """Return True: nothing flies."""
@@ -92,9 +100,9 @@ class ReplayDriver(Driver):
         if self.stepped:
             self._open_steps(source, sink)
             return
-        player = Player(source, sink, self._stop, speed=self.options.speed, loop=self.options.loop)
+        self._playback = Playback(source.seconds, self.options.speed)
+        player = Player(source, sink, self._playback, loop=self.options.loop)
         self._publisher = player.publisher
-        self._stop.clear()
         cameras = tuple(camera.name for camera in self.capabilities().cameras) if self.options.wait else ()
         self._thread = threading.Thread(
             target=self._run, args=(player, sink, cameras), name="skyloop-replay", daemon=True
@@ -107,12 +115,14 @@ class ReplayDriver(Driver):
                 f'{self.uri}: speed=max is in step with one application: call skyloop.connect("{self.uri}") there, '
                 "or give a number, such as speed=10, to serve everybody"
             )
-        self.steps = StepPlayer(source, sink, self.clock)
+        self._playback = Playback(source.seconds, in_step=True)
+        self.steps = StepPlayer(source, sink, self.clock, self._playback)
         self._publisher = self.steps.publisher
         self.steps.begin()
 
     def _close(self) -> None:
-        self._stop.set()
+        if self._playback is not None:
+            self._playback.stop()
         if self.steps is not None:
             self.steps.close()
         if self._thread is not None and self._thread is not threading.current_thread():

@@ -13,6 +13,7 @@ from skyloop.files import expand
 
 KNOWN: Final = {"speed", "loop", "drone", "start", "wait"}
 MAX: Final = "max"
+SPEEDS: Final = (0.01, 1000.0)  #: slowest and fastest, in seconds of the recording in a second
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +43,7 @@ def options_of(uri: VehicleUri) -> ReplayOptions:
     options = ReplayOptions(
         path=expand(uri.place),
         drone=uri.options.get("drone"),
-        speed=1.0 if stepped else uri.number("speed", 1.0, minimum=0.01, maximum=1000.0),
+        speed=1.0 if stepped else uri.number("speed", 1.0, minimum=SPEEDS[0], maximum=SPEEDS[1]),
         stepped=stepped,
         loop=uri.flag("loop"),
         start_s=uri.number("start", 0.0, minimum=0.0, maximum=1e6),

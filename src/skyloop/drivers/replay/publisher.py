@@ -9,7 +9,8 @@ import msgspec
 
 from skyloop.clock import Clock, seconds
 from skyloop.drivers.base import Sink
-from skyloop.drivers.replay.source import TimedSample, Timeline
+from skyloop.drivers.replay.playback import PAUSED, POSITION, SPEED, Playback
+from skyloop.drivers.replay.source import Moment, TimedSample, Timeline
 from skyloop.errors import SkyloopError
 from skyloop.logfile.pictures import Picture
 from skyloop.messages import (
@@ -33,7 +34,7 @@ _LINKS: Final = frozenset({LinkState.UP, LinkState.DEGRADED, LinkState.LOST})
 PREFIX: Final = "recorded."  #: of the names of recorded parameters
 
 
-def _nothing() -> None:
+def _nothing(_: int) -> None:
     """Publish nothing: nobody wants this camera's frames."""
 
 
@@ -43,15 +44,19 @@ class ReplayPublisher:
     Args:
         sink: The proxy's.
         clock: The replay's.
+        playback: Gets the position of what is published.
+        first_ns: Where the recording begins, on its own clock.
     """
 
-    def __init__(self, sink: Sink, clock: Clock) -> None:
+    def __init__(self, sink: Sink, clock: Clock, playback: Playback, first_ns: int) -> None:
         self.frames = 0  #: published so far, those that nobody wanted included
         self.damaged = 0
         self.loops = 0
         self.parameters: dict[str, Parameter] = {}
         self._sink = sink
         self._clock = clock
+        self._playback = playback
+        self._first_ns = first_ns
         self._link = LinkState.CONNECTING
         self._newest_ns: dict[str, int] = {}  # capture times never go backwards, from one pass to the next either
         self._command: dict[str, Value] = {}
@@ -62,19 +67,19 @@ class ReplayPublisher:
             self._link = state
             self._sink.link(state, reason)
 
-    def prepare(self, sample: TimedSample, timeline: Timeline, begin_ns: int) -> Callable[[], None]:
+    def prepare(self, sample: TimedSample, timeline: Timeline) -> Callable[[], None]:
         """Do the slow part now and return a function that publishes the sample once it is due.
 
         Args:
             sample: What to publish.
             timeline: Maps its time to the replay's clock.
-            begin_ns: Where the replay began, on the recording's clock.
         """
         value = sample.value
         if isinstance(value, Feedback):
-            return lambda: self.feedback(value, timeline, seconds(sample.at_ns - begin_ns))
+            return lambda: self.feedback(value, timeline, sample.at_ns)
         if isinstance(value, Picture):
-            return self._picture(value, timeline)
+            show = self._decoded(value) if self._sink.wants(value.camera) else _nothing
+            return lambda: self._picture(value, show, timeline)
         if isinstance(value, Event):
             return lambda: self._event(value)
         if isinstance(value, Applied):
@@ -86,13 +91,51 @@ class ReplayPublisher:
         name = PREFIX + parameter.name
         self.parameters[name] = msgspec.structs.replace(parameter, name=name, read_only=True)
 
-    def feedback(self, feedback: Feedback, timeline: Timeline, position_s: float) -> None:
-        """Publish the vehicle's block as it was; the recorded proxy's becomes native telemetry."""
+    def still(self, moment: Moment) -> Callable[[], None]:
+        """Return a function that publishes a moment as it is now: its state and its pictures, with one capture time.
+
+        It may be called again and again, while the replay is paused; each picture is decoded once.
+
+        Args:
+            moment: What to show. Its command and its parameters are those in force from now on.
+        """
+        self._command = {} if moment.command is None else described(moment.command)
+        for parameter in moment.parameters:
+            self.parameter(parameter)
+        decoded: dict[str, Callable[[int], None]] = {}
+
+        def publish() -> None:
+            now_ns = self._clock()
+            if moment.state is not None:
+                at_capture = Timeline(1.0, moment.state.captured_ns, now_ns)
+                self.feedback(moment.state, at_capture, moment.at_ns)
+            for name, picture in moment.pictures.items():
+                if self._sink.wants(name):
+                    if name not in decoded:
+                        decoded[name] = self._decoded(picture)
+                    decoded[name](self._captured(name, now_ns, Timeline(1.0, now_ns, now_ns)))
+
+        return publish
+
+    def feedback(self, feedback: Feedback, timeline: Timeline, at_ns: int) -> None:
+        """Publish the vehicle's block as it was; the recorded proxy's becomes native telemetry.
+
+        Args:
+            feedback: As it was recorded.
+            timeline: Maps its time to the replay's clock.
+            at_ns: The position in the recording, on its own clock.
+        """
         if feedback.vehicle_link in _LINKS:
             self.link(feedback.vehicle_link, "as recorded")
+        playback = self._playback
+        playback.position_s = seconds(max(0, at_ns - self._first_ns))
         native: dict[str, Value] = {
             **(feedback.native or {}),
-            "replay.position_s": position_s,
+            POSITION: playback.position_s,
+            "replay.duration_s": playback.duration_s,
+            SPEED: playback.speed,
+            PAUSED: playback.paused,
+            "replay.jumps": playback.jumps,
             "replay.loops": self.loops,
             "replay.owner": feedback.owner or "",
             "replay.failsafe": feedback.failsafe.value,
@@ -116,21 +159,23 @@ class ReplayPublisher:
             )
         )
 
-    def _picture(self, picture: Picture, timeline: Timeline) -> Callable[[], None]:
+    def _picture(self, picture: Picture, show: Callable[[int], None], timeline: Timeline) -> None:
         self.frames += 1
-        if not self._sink.wants(picture.camera):
-            return _nothing
+        show(self._captured(picture.camera, picture.header.captured_ns, timeline))
+
+    def _decoded(self, picture: Picture) -> Callable[[int], None]:
+        """Decode a picture and return what publishes it with a capture time; a damaged one becomes an event."""
         try:
             pixels, encoding = picture.as_recorded()
         except SkyloopError as error:
             self.damaged += 1
             text = str(error)
-            return lambda: self._sink.event(EventKind.DRIVER_ERROR, text, Severity.WARNING, where="frame")
+            return lambda _: self._sink.event(EventKind.DRIVER_ERROR, text, Severity.WARNING, where="frame")
         height, width = pixels.shape[:2]
-        return lambda: self._sink.frame(
+        return lambda captured_ns: self._sink.frame(
             picture.camera,
             pixels,
-            self._captured(picture.camera, picture.header.captured_ns, timeline),
+            captured_ns,
             width=width,
             height=height,
             encoding=encoding,

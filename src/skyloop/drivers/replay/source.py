@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-from itertools import takewhile
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import chain, takewhile
 from typing import Final
 
-from skyloop.clock import nanoseconds
+from skyloop.clock import nanoseconds, seconds
 from skyloop.logfile.layout import Channel, DroneRecord
 from skyloop.logfile.pictures import Picture
 from skyloop.logfile.reader import Item, Recording
@@ -28,17 +31,72 @@ class TimedSample:
     value: Sample
 
 
+@dataclass(slots=True)
+class Moment:
+    """What was known of a drone at one time of its recording, and what comes after it."""
+
+    at_ns: int
+    state: Feedback | None = None  #: of the time at which the pictures were captured, or else the newest
+    pictures: dict[str, Picture] = field(default_factory=dict)  #: the newest of each camera
+    command: Applied | None = None
+    parameters: list[Parameter] = field(default_factory=list)  #: that came shortly before
+    following: Iterator[TimedSample] = field(default_factory=lambda: iter(()))
+
+    def shows(self, cameras: list[str]) -> bool:
+        """Whether there is a state, and a picture of each camera that can be decoded."""
+        found = {name for name, picture in self.pictures.items() if picture.can_be_decoded}
+        return self.state is not None and found.issuperset(cameras)
+
+
+#: How many parts of the file, of about half a second each, are read before the one with the time sought, until there
+#: is a picture of each camera. One that sent nothing for longer than that shows nothing.
+_PARTS_BEFORE: Final = (1, 4, 16)
+_KEPT_STATES: Final = 500  #: of those before the time sought, to find the one of the pictures
+
+
 class ReplaySource:
     """A drone's recording, from ``start_s`` after its begin on."""
 
     def __init__(self, recording: Recording, drone: DroneRecord, start_s: float = 0.0) -> None:
         self._recording = recording
         self._drone = drone
-        self.begin_ns = 0  #: on the clock of the recorded proxy
+        self._cameras = recording.cameras(drone.name)
+        self._known_ns: dict[int, int] = {}  # when the first sample of a part of the file was known
+        self.begin_ns = 0  #: where the replay begins, on the clock of the recorded proxy
         timed = (sample.at_ns for sample in self.samples() if not isinstance(sample.value, Parameter))
-        first_ns = next(timed, None)
-        if first_ns is not None:
-            self.begin_ns = first_ns + nanoseconds(start_s)
+        self.first_ns = next(timed, 0)  #: the recording's own begin
+        if self.first_ns:
+            self.begin_ns = self.first_ns + nanoseconds(start_s)
+
+    @property
+    def seconds(self) -> float:
+        """How long the recording is, from its first sample of this drone to the last."""
+        return seconds(max(0, self.end_ns - self.first_ns))
+
+    @cached_property
+    def end_ns(self) -> int:
+        """Time of the last sample."""
+        parts = self._recording.found.pieces
+        for back in (1, 4, 16, 256, len(parts)):
+            newest_ns = max((sample.at_ns for sample in self._timed(self._log_ns(len(parts) - back))), default=0)
+            if newest_ns or back >= len(parts):
+                return max(newest_ns, self.first_ns)
+        return self.first_ns
+
+    def moment(self, at_ns: int) -> Moment:
+        """Return what was known at a time, without reading what is far from it.
+
+        Args:
+            at_ns: On the clock of the recorded proxy.
+        """
+        parts = range(len(self._recording.found.pieces))
+        part = bisect_right(parts, at_ns, key=self._first_known_ns) - 1
+        moment = Moment(at_ns)
+        for back in _PARTS_BEFORE:
+            moment = self._moment(at_ns, self._log_ns(part - back))
+            if moment.shows(self._cameras) or part <= back:
+                break
+        return moment
 
     @property
     def empty(self) -> bool:
@@ -62,14 +120,64 @@ class ReplaySource:
 
     def samples(self) -> Iterator[TimedSample]:
         """Yield everything in the order in which it was received; times never go backwards."""
+        for sample in self._timed(0):
+            if isinstance(sample.value, Parameter):  # those from before the begin are still in force
+                yield TimedSample(max(sample.at_ns, self.begin_ns), sample.value)
+            elif sample.at_ns >= self.begin_ns:
+                yield sample
+
+    # Inside ----------------------------------------------------------------------------------------------------
+
+    def _timed(self, log_ns: int) -> Iterator[TimedSample]:
+        """Yield what was received at a log time or later."""
         course = Course()
-        for found in self._recording.items_and_pictures(self._drone.name, CHANNELS):
+        for found in self._recording.items_and_pictures(self._drone.name, CHANNELS, from_ns=log_ns):
             value = found.value if isinstance(found, Item) else found
-            at_ns = course.follow(value)
-            if isinstance(value, Parameter):  # those from before the begin are still in force
-                yield TimedSample(max(at_ns, self.begin_ns), value)
-            elif at_ns >= self.begin_ns:
-                yield TimedSample(at_ns, value)
+            yield TimedSample(course.follow(value), value)
+
+    def _log_ns(self, part: int) -> int:
+        """Return the log time at which a part of the file begins: where to read from."""
+        return self._recording.found.pieces[part].start_ns if part > 0 else 0
+
+    def _first_known_ns(self, part: int) -> int:
+        """Return the time of the first sample that has one in a part of the file or after it."""
+        if part not in self._known_ns:
+            timed = (sample.at_ns for sample in self._timed(self._log_ns(part)) if sample.at_ns)
+            self._known_ns[part] = next(timed, _NEVER_NS)
+        return self._known_ns[part]
+
+    def _moment(self, at_ns: int, log_ns: int) -> Moment:
+        """Collect what is known at a time from what was received since ``log_ns``."""
+        moment = Moment(at_ns)
+        states: deque[Feedback] = deque(maxlen=_KEPT_STATES)
+        samples = self._timed(log_ns)
+        for sample in samples:
+            value = sample.value
+            if sample.at_ns > at_ns:
+                moment.following = chain((sample,), samples)
+                break
+            if isinstance(value, Feedback):
+                states.append(value)
+            elif isinstance(value, Picture):
+                moment.pictures[value.camera] = value
+            elif isinstance(value, Applied):
+                moment.command = value
+            elif isinstance(value, Parameter):
+                moment.parameters.append(value)
+        moment.state = _state_of(states, moment.pictures)
+        return moment
+
+
+_NEVER_NS: Final = 1 << 63
+
+
+def _state_of(states: Collection[Feedback], pictures: Mapping[str, Picture]) -> Feedback | None:
+    """Return the state at the capture of the newest picture: picture and state are to be of one instant."""
+    if not states:
+        return None
+    newest_ns = max(state.captured_ns for state in states)
+    seen_ns = max((picture.header.captured_ns for picture in pictures.values()), default=newest_ns)
+    return min(states, key=lambda state: abs(state.captured_ns - seen_ns))
 
 
 def capabilities_of(recording: Recording, drone: DroneRecord) -> Capabilities:
@@ -114,7 +222,7 @@ def _camera(recording: Recording, drone: str, name: str, known: CameraInfo | Non
 
 
 class Timeline:
-    """Maps the clock of the recording to the clock of its replay. Pure.
+    """Maps the clock of the recording to the clock of its replay, and back. Pure.
 
     Args:
         speed: Seconds of the recording in a second.
@@ -133,6 +241,20 @@ class Timeline:
         passed_ns = recorded_ns - self._begin_ns
         return self._origin_ns + (passed_ns if self._speed == 1.0 else round(passed_ns / self._speed))
 
+    def recorded(self, now_ns: int) -> int:
+        """Return the time on the recording's clock [ns]; the inverse of :meth:`at`."""
+        passed_ns = now_ns - self._origin_ns
+        return self._begin_ns + (passed_ns if self._speed == 1.0 else round(passed_ns * self._speed))
+
     def put_off(self, ns: int) -> None:
         """Delay everything still to come [ns]."""
         self._origin_ns += ns
+
+    def set_speed(self, speed: float, now_ns: int) -> None:
+        """Go on at another speed from now on."""
+        self._begin_ns, self._origin_ns = self.recorded(now_ns), now_ns
+        self._speed = speed
+
+    def restart(self, begin_ns: int, origin_ns: int) -> None:
+        """Go on from another time of the recording, at the same speed."""
+        self._begin_ns, self._origin_ns = begin_ns, origin_ns

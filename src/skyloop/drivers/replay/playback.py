@@ -1,0 +1,154 @@
+"""Where a replay is and how fast it goes: set through parameters by whoever watches it, followed by its player."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from typing import Final
+
+from skyloop.drivers.replay.options import SPEEDS
+from skyloop.errors import ParameterError, UnknownNameError
+from skyloop.messages import Parameter, ParameterType, Refusal, Value
+
+POSITION: Final = "replay.position_s"
+SPEED: Final = "replay.speed"
+PAUSED: Final = "replay.paused"
+NAMES: Final = frozenset({POSITION, SPEED, PAUSED})
+
+_IN_STEP: Final = (
+    "with speed=max the replay is in step with its application, which must not miss anything: give a number, such as "
+    "speed=1, for one that can be paused, moved and slowed down"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What the player is to follow next."""
+
+    paused: bool
+    speed: float
+    position_s: float | None = None  #: where to go; None: on from where it is
+
+
+class Playback:
+    """Position, speed and pause of a replay. Thread-safe.
+
+    Args:
+        duration_s: How long the recording is.
+        speed: Seconds of the recording in a second.
+        in_step: Whether its application moves it (``speed=max``): then nothing can be written.
+    """
+
+    def __init__(self, duration_s: float, speed: float = 1.0, *, in_step: bool = False) -> None:
+        self.duration_s = duration_s
+        self.position_s = 0.0  #: in the recording; set by the player
+        self.over = False  #: it has reached the end; set by the player
+        self.jumps = 0  #: how often the position was changed other than by playing; set by the player
+        self.stopped = False
+        self._default_speed = speed
+        self._in_step = in_step
+        self._lock = threading.Lock()
+        self._wanted = Wanted(False, speed)
+        self._changed = threading.Event()
+
+    @property
+    def paused(self) -> bool:
+        """Whether it is to stand still."""
+        return self._wanted.paused
+
+    @property
+    def speed(self) -> float:
+        """Seconds of the recording in a second."""
+        return self._wanted.speed
+
+    # Those who watch -------------------------------------------------------------------------------------------
+
+    def parameters(self) -> list[Parameter]:
+        """Return the parameters with their present values."""
+        with self._lock:
+            wanted = self._wanted
+        position_s = self.position_s if wanted.position_s is None else wanted.position_s
+        return [
+            Parameter(PAUSED, ParameterType.BOOL, wanted.paused, default=False, description="holds the replay"),
+            Parameter(
+                POSITION,
+                ParameterType.FLOAT,
+                min(position_s, self.duration_s),
+                "s",
+                0.0,
+                self.duration_s,
+                description="position in the recording; written, the replay goes there",
+            ),
+            Parameter(
+                SPEED,
+                ParameterType.FLOAT,
+                wanted.speed,
+                "",
+                *SPEEDS,
+                self._default_speed,
+                description="seconds of the recording in a second",
+            ),
+        ]
+
+    def set(self, name: str, value: Value) -> Value:
+        """Write a parameter; the player follows at once. To go on from the end is to start over.
+
+        Returns:
+            The value that is in force.
+
+        Raises:
+            UnknownNameError: There is no such parameter.
+            ParameterError: The value is out of range, or the replay is in step with its application.
+        """
+        if name not in NAMES:
+            raise UnknownNameError("parameter of a replay", name, NAMES)
+        if self._in_step:
+            raise ParameterError(f"{name} can't be written: {_IN_STEP}", code=Refusal.READ_ONLY)
+        if name == PAUSED:
+            if not isinstance(value, bool):
+                raise ParameterError(f"{name} is true or false, not {value!r}", code=Refusal.WRONG_TYPE)
+            at_end = self.over or self.position_s >= self.duration_s
+            self._want(paused=value, position_s=0.0 if at_end and not value else None)
+            return value
+        low, high = (0.0, self.duration_s) if name == POSITION else SPEEDS
+        if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+            raise ParameterError(f"{name} is from {low:g} to {high:g}, not {value!r}", code=Refusal.OUT_OF_RANGE)
+        if name == POSITION:
+            self._want(position_s=float(value))
+        else:
+            self._want(speed=float(value))
+        return float(value)
+
+    def stop(self) -> None:
+        """End the player."""
+        self.stopped = True
+        self._changed.set()
+
+    # The player ------------------------------------------------------------------------------------------------
+
+    @property
+    def changed(self) -> bool:
+        """Whether something was written since :meth:`take`, or the player is to end."""
+        return self._changed.is_set()
+
+    def wait(self, timeout_s: float | None) -> None:
+        """Wait for that long [s], or until something is written."""
+        self._changed.wait(timeout_s)
+
+    def take(self) -> Wanted:
+        """Return what is wanted now; a position is given once."""
+        with self._lock:
+            wanted, self._wanted = self._wanted, Wanted(self._wanted.paused, self._wanted.speed)
+            if not self.stopped:
+                self._changed.clear()
+        return wanted
+
+    def _want(self, *, paused: bool | None = None, speed: float | None = None, position_s: float | None = None) -> None:
+        with self._lock:
+            now = self._wanted
+            self._wanted = Wanted(
+                now.paused if paused is None else paused,
+                now.speed if speed is None else speed,
+                now.position_s if position_s is None else position_s,
+            )
+            self._changed.set()
