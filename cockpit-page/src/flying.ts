@@ -2,9 +2,10 @@
 
 import { connected, GamepadReader } from "./gamepad.js";
 import { type Deed, Keys, stopKeys } from "./keys.js";
+import { isModalOpen } from "./modal.js";
 import type { Sticks } from "./model.js";
 import { type Pilot, STEER_MS } from "./pilot.js";
-import { CENTRED, isCentred, merge, PACES, type Pace, ramp, scale } from "./sticks.js";
+import { CENTRED, isCentred, Latch, merge, PACES, type Pace, ramp, scale } from "./sticks.js";
 
 /** Which drone the keys fly, and what else they do. */
 export interface Cabin {
@@ -16,8 +17,6 @@ export interface Cabin {
   act(deed: Deed): void;
   /** The emergency stop is held by keys or gamepad: of the drone that is seen, or of all; null: released. */
   hold(which: "one" | "all" | null): void;
-  /** Escape: close what is open. Whether anything was. */
-  escape(): boolean;
   /** What the inputs look like now. */
   inputs(view: InputView): void;
 }
@@ -43,6 +42,7 @@ export class Flying {
   thumbs: Sticks = { ...CENTRED };
   private readonly keys = new Keys();
   private readonly pad = new GamepadReader();
+  private readonly thumbLatch = new Latch();
   private ramped: Sticks = { ...CENTRED };
   private flown: Pilot | null = null;
   private held = false;
@@ -76,7 +76,7 @@ export class Flying {
       if (!event.repeat) this.stop("keys", stops);
       return;
     }
-    if (event.code === "Escape" && this.cabin.escape()) event.preventDefault();
+    if (isModalOpen()) return;
     const modified = event.ctrlKey || event.altKey || event.metaKey;
     const press = { code: event.code, repeat: event.repeat, modified, typing: this.typing() || (ownKeys()?.has(event.code) ?? false) };
     const meant = this.keys.down(press);
@@ -109,6 +109,10 @@ export class Flying {
     const selected = this.cabin.selected();
     const reading = this.pad.read(connected());
     const focused = document.hasFocus() && !document.hidden;
+    const modal = isModalOpen();
+    // What is held while a dialog is open counts only after it was let go.
+    if (modal) for (const held of [this.pad, this.thumbLatch]) held.reset();
+    if (modal) this.keys.clear();
     // A drone without data is not flown; it is flown again only after keys and sticks were released.
     const mine = (selected?.mine ?? false) && (selected?.isLive ?? false);
     if (this.held && !mine) this.keys.clear();
@@ -117,12 +121,13 @@ export class Flying {
     if (reading.lost) this.rest();
     this.flown = selected;
     this.held = mine;
-    if (focused) for (const deed of reading.deeds) this.cabin.act(deed);
+    if (focused && !modal) for (const deed of reading.deeds) this.cabin.act(deed);
     if (focused && reading.stops && this.stopping === null) this.stop("pad", "one");
     if (!reading.stops && this.stopping === "pad") this.stop("pad", null);
     const held = this.keys.sticks();
     this.ramped = ramp(this.ramped, held, STEER_MS / 1000);
-    const sticks = focused ? merge(this.ramped, reading.sticks, this.thumbs) : { ...CENTRED };
+    const thumbs = this.thumbLatch.pass(this.thumbs);
+    const sticks = focused && !modal ? merge(this.ramped, reading.sticks, thumbs) : { ...CENTRED };
     for (const pilot of this.cabin.pilots()) {
       pilot.steer(pilot === selected && !isCentred(sticks) ? scale(sticks, this.pace) : CENTRED);
     }

@@ -3,13 +3,14 @@
 import { h, setAttribute, setText, setTone } from "./dom.js";
 import type { Flying, InputView } from "./flying.js";
 import { GAMEPAD_MAP, KEY_MAP } from "./keys.js";
+import { Modal } from "./modal.js";
 import { isCentred, PACES } from "./sticks.js";
 
 type Row = { keys: string[]; does: string };
 
 export class Help {
-  readonly element: HTMLDialogElement;
-  readonly chip = h("button", { type: "button", class: "small inputs", "data-tone": "quiet", onclick: () => this.toggle() });
+  readonly modal: Modal;
+  readonly chip = h("button", { type: "button", class: "small inputs", "data-tone": "quiet", onclick: () => this.modal.open() });
   private readonly keys = h("span", {}, "Keys");
   private readonly dot = h("i", { class: "dot" });
   private readonly pad = h("p", { class: "note", role: "status" });
@@ -25,27 +26,12 @@ export class Help {
       paces.append(button);
     });
     this.chip.append(this.dot, this.keys);
-    this.element = h(
-      "dialog",
-      { class: "help", "aria-label": "Keys and gamepad" },
-      h("header", {}, h("h2", {}, "Keys and gamepad"), h("button", { type: "button", class: "bare", "aria-label": "Close", onclick: () => this.element.close() }, "×")),
+    this.modal = new Modal("Keys and gamepad", "help", [
       h("div", { class: "help-columns" }, table("Keyboard", KEY_MAP), table("Gamepad", GAMEPAD_MAP)),
       this.pad,
-      h("p", { class: "note" }, "They fly the drone that is marked, while you have control of it. It hovers when keys and sticks are released, when this page loses the focus or its connection, and when the gamepad goes away. The emergency stop needs no control: it is held for 0.8 s, and works while you type, too."),
+      h("p", { class: "note" }, "They fly the drone that is marked, while you have control of it. It hovers when keys and sticks are released, when this page loses the focus or its connection, when the gamepad goes away, and while a dialog as this one is open. The emergency stop needs no control: it is held for 0.8 s, and works while you type and in dialogs, too."),
       h("div", { class: "pace" }, h("span", {}, "Pace"), paces),
-    );
-  }
-
-  toggle(): void {
-    if (this.element.open) this.element.close();
-    else this.element.show(); // not modal: the controls stay in reach
-  }
-
-  /** Whether it was open. */
-  close(): boolean {
-    const open = this.element.open;
-    this.element.close();
-    return open;
+    ]);
   }
 
   update(view: InputView, mine: boolean): void {

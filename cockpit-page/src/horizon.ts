@@ -4,6 +4,7 @@
 import { setAttribute, setText, svg, unique } from "./dom.js";
 import { degrees, figure, type Known, heading, headingText, plain } from "./format.js";
 import type { State } from "./model.js";
+import { unit } from "./units.js";
 
 const PITCH = 3.1; // units of the drawing per degree
 const [LEFT, RIGHT, TOP, BOTTOM] = [56, 264, 6, 186];
@@ -14,6 +15,7 @@ const DESCRIBED_MS = 2000;
 class Tape {
   readonly group = svg("g", { class: "tape" });
   private readonly box: SVGTextElement;
+  private readonly caption: SVGTextElement;
   private readonly labels: { text: SVGTextElement; line: SVGLineElement }[] = [];
 
   constructor(
@@ -22,7 +24,8 @@ class Tape {
     private readonly step: number,
     private readonly unit_px: number,
     private readonly name: (value: number) => string,
-    caption: string,
+    /** Of lengths and speeds: the scale is the person's. */
+    private readonly of: "length" | "speed" | null = null,
   ) {
     const { x, y, width, height } = from;
     const id = unique("tape");
@@ -37,29 +40,35 @@ class Tape {
       ? { x: x + 1, y: midY - 12, width: width - 2, height: 24, rx: 4, class: "tape-box" }
       : { x: midX - 22, y: y + 1, width: 44, height: height - 2, rx: 4, class: "tape-box" };
     this.box = svg("text", { x: midX, y: midY + 0.5, class: "tape-value", "text-anchor": "middle", "dominant-baseline": "central" });
+    this.caption = svg("text", { x: midX, y: y + height + 11, class: "tape-caption", "text-anchor": "middle" });
     this.group.append(
       svg("defs", {}, svg("clipPath", { id }, svg("rect", { x, y, width, height, rx: 5 }))),
       svg("rect", { x, y, width, height, rx: 5, class: "tape-well" }),
       marks,
       svg("rect", well),
       this.box,
-      svg("text", { x: midX, y: y + height + 11, class: "tape-caption", "text-anchor": "middle" }, caption),
+      this.caption,
     );
   }
 
-  show(value: Known, shown: string): void {
-    setText(this.box, shown);
+  /** `value` in SI units or degrees, shown in the person's with so many decimals, or as `text`. */
+  show(si: Known, decimals: number, text?: string): void {
+    const { factor, name } = this.of ? unit(this.of) : { factor: 1, name: "" };
+    const value = si === null || si === undefined ? si : si * factor;
+    const [step, unit_px] = factor === 1 ? [this.step, this.unit_px] : [4 * this.step, this.unit_px / 4];
+    setText(this.box, text ?? figure(value, decimals));
+    setText(this.caption, name);
     this.group.classList.toggle("unknown", value === null || value === undefined);
     if (value === null || value === undefined) return;
     const { x, y, width, height } = this.from;
-    const base = Math.round(value / this.step);
-    this.labels.forEach(({ text, line }, number) => {
-      const at = (base + number - 5) * this.step;
-      const away = (at - value) * this.unit_px;
+    const base = Math.round(value / step);
+    this.labels.forEach(({ text: label, line }, number) => {
+      const at = (base + number - 5) * step;
+      const away = (at - value) * unit_px;
       const [px, py] = this.vertical ? [x + width / 2, y + height / 2 - away] : [x + width / 2 + away, y + height / 2];
-      text.setAttribute("transform", `translate(${px.toFixed(1)} ${py.toFixed(1)})`);
-      setText(text, this.name(at));
-      const half = (this.step * this.unit_px) / 2; // a line between each two
+      label.setAttribute("transform", `translate(${px.toFixed(1)} ${py.toFixed(1)})`);
+      setText(label, this.name(at));
+      const half = (step * unit_px) / 2; // a line between each two
       const ends = this.vertical ? [x + width / 2 - 5, py - half, x + width / 2 + 5, py - half] : [px + half, y + height / 2 - 4, px + half, y + height / 2 + 4];
       ["x1", "y1", "x2", "y2"].forEach((key, place) => line.setAttribute(key, (ends[place] as number).toFixed(1)));
     });
@@ -91,9 +100,9 @@ export class Horizon {
     this.roll.append(this.pitch);
     const box = { x: LEFT, y: TOP, width: RIGHT - LEFT, height: BOTTOM - TOP, rx: 8 };
     const middle = svg("g", { transform: `translate(${MID_X} ${MID_Y})` }, this.roll);
-    this.speed = new Tape(true, { x: 0, y: TOP, width: 50, height: BOTTOM - TOP }, 0.5, 64, plain, "m/s");
-    this.altitude = new Tape(true, { x: 270, y: TOP, width: 50, height: BOTTOM - TOP }, 0.5, 64, plain, "m");
-    this.heading = new Tape(false, { x: LEFT, y: BOTTOM + 6, width: RIGHT - LEFT, height: 24 }, 15, 2.4, compassName, "");
+    this.speed = new Tape(true, { x: 0, y: TOP, width: 50, height: BOTTOM - TOP }, 0.5, 64, plain, "speed");
+    this.altitude = new Tape(true, { x: 270, y: TOP, width: 50, height: BOTTOM - TOP }, 0.5, 64, plain, "length");
+    this.heading = new Tape(false, { x: LEFT, y: BOTTOM + 6, width: RIGHT - LEFT, height: 24 }, 15, 2.4, compassName);
     this.element = svg(
       "svg",
       { class: "horizon", viewBox: "0 0 320 218", role: "img", "aria-label": "Artificial horizon: attitude not known" },
@@ -116,9 +125,9 @@ export class Horizon {
       this.pitch.setAttribute("transform", `translate(0 ${(-degrees(pitch) * PITCH).toFixed(2)})`);
       this.pointer.setAttribute("transform", `rotate(${(-degrees(roll)).toFixed(2)} ${MID_X} ${MID_Y})`);
     }
-    this.speed.show(state?.speed, figure(state?.speed, 1));
-    this.altitude.show(state?.altitude, figure(state?.altitude, 2));
-    this.heading.show(yaw === null ? null : heading(yaw), headingText(yaw));
+    this.speed.show(state?.speed, 1);
+    this.altitude.show(state?.altitude, 2);
+    this.heading.show(yaw === null ? null : heading(yaw), 0, headingText(yaw));
     this.describe(roll, pitch, yaw);
   }
 

@@ -4,10 +4,10 @@ import { h, setHidden, setText, setTone, type Tone } from "./dom.js";
 import { degrees, duration, figure, headingText, words } from "./format.js";
 import { Horizon } from "./horizon.js";
 import type { Authority, State } from "./model.js";
+import { inUnit, unit } from "./units.js";
 
 const LINK_TONES: Readonly<Record<string, Tone>> = { up: "ok", degraded: "warn", connecting: "busy", lost: "bad", closed: "bad" };
 const FIGURES = ["Altitude", "Climb", "Speed", "Heading", "Roll", "Nose up"] as const;
-const UNITS = ["m", "m/s", "m/s", "°", "°", "°"] as const;
 const SLOW_S = 0.25;
 
 class Hop {
@@ -28,6 +28,7 @@ export class Instruments {
   readonly element: HTMLElement;
   private readonly horizon = new Horizon();
   private readonly outputs = FIGURES.map((name) => h("output", { "data-figure": name }, "–"));
+  private readonly units = FIGURES.map(() => h("span", {}));
   private readonly page = new Hop("page");
   private readonly application = new Hop("application");
   private readonly vehicle = new Hop("vehicle");
@@ -40,7 +41,7 @@ export class Instruments {
       "section",
       { class: "side", "aria-label": "Instruments" },
       this.horizon.element,
-      h("dl", { class: "figures" }, ...FIGURES.map((name, place) => h("div", {}, h("dt", {}, name), h("dd", {}, this.outputs[place] as Node, h("span", {}, UNITS[place] as string))))),
+      h("dl", { class: "figures" }, ...FIGURES.map((name, place) => h("div", {}, h("dt", {}, name), h("dd", {}, this.outputs[place] as Node, this.units[place] as Node)))),
       this.command,
       h("ol", { class: "hops", "aria-label": "Links, from this page to the vehicle" }, node("Page"), this.page.element, node("Cockpit"), this.application.element, node("Proxy"), this.vehicle.element, node("Vehicle")),
       this.reason,
@@ -51,13 +52,15 @@ export class Instruments {
     this.horizon.update(state);
     const [roll, pitch] = [state?.attitude?.roll ?? null, state?.attitude?.pitch ?? null];
     const values = [
-      figure(state?.altitude, 2),
-      figure(state?.velocity?.[2], 2),
-      figure(state?.speed, 2),
+      figure(inUnit("length", state?.altitude), 2),
+      figure(inUnit("speed", state?.velocity?.[2]), 2),
+      figure(inUnit("speed", state?.speed), 2),
       headingText(state?.attitude?.yaw),
       figure(roll === null ? null : degrees(roll), 1),
       figure(pitch === null ? null : -degrees(pitch), 1),
     ];
+    const [length, speed] = [unit("length").name, unit("speed").name];
+    [length, speed, speed, "°", "°", "°"].forEach((name, place) => setText(this.units[place] as Element, name));
     this.outputs.forEach((output, place) => setText(output, values[place] as string));
     setText(this.command, commandText(state));
     this.links(state, connected, round_trip_s);

@@ -1,11 +1,9 @@
 // The map of keys. By place on the keyboard, not by letter: the same on every layout.
 
 import type { Sticks } from "./model.js";
-import { CENTRED } from "./sticks.js";
+import { type Axis, CENTRED } from "./sticks.js";
 
 export type Deed = "takeoff" | "hover" | "land" | "take" | "release" | "question" | "help";
-
-type Axis = keyof Sticks;
 
 const STICKS: Readonly<Record<string, [Axis, 1 | -1]>> = {
   KeyW: ["forward", 1],
@@ -78,7 +76,7 @@ export class Keys {
   down(press: Press): Deed | "stick" | null {
     if (press.modified || press.typing) return null;
     if (press.code in STICKS) {
-      this.held.add(press.code);
+      if (!press.repeat) this.held.add(press.code); // once cleared, a key counts when it is pressed again
       return "stick";
     }
     return press.repeat ? null : (DEEDS[press.code] ?? null);

@@ -15,10 +15,12 @@ import type { Deed } from "./keys.js";
 import { session } from "./login.js";
 import type { DroneRow, Session, Sticks } from "./model.js";
 import { Pane } from "./pane.js";
+import { keepInReach } from "./modal.js";
 import { RecordingList } from "./recordings.js";
 import { Safety } from "./safety.js";
+import { SettingsDialog } from "./settingsdialog.js";
 import { LastingSocket } from "./socket.js";
-import { themeButton } from "./theme.js";
+import { followTheme } from "./theme.js";
 
 const DRAW_MS = 45;
 /** The list of drones comes twice a second; when it is older than this it is grey [ms]. */
@@ -49,20 +51,21 @@ class Page {
   ) {
     this.help = new Help(() => this.flying);
     this.safety = who.role === "pilot" ? new Safety((handlers) => new LastingSocket("/ws/control", handlers), new ServerClock(), this.countdown) : null;
-    const theme = themeButton(() => this.repaint());
+    const settings = new SettingsDialog();
+    followTheme(() => this.repaint());
+    for (const element of [this.safety?.element, this.safety?.message, this.countdown.element]) keepInReach(element ?? null);
     const person = h("span", { class: "person", title: who.name || who.role || "" }, who.name ? `${who.name} · ${who.role}` : (who.role ?? ""));
     const leave = who.login ? h("button", { type: "button", class: "small", onclick: () => void post("/api/logout").finally(() => location.reload()) }, "Log out") : null;
     const brand = h("h1", { class: "brand" }, h("img", { src: "/static/icon.svg", alt: "", width: 24, height: 24 }), "Skyloop");
-    const bar = h("header", { class: "bar" }, brand, h("span", { class: "spring" }), person, leave, this.help.chip, theme, this.safety?.element ?? null);
+    const bar = h("header", { class: "bar" }, brand, h("span", { class: "spring" }), person, leave, this.help.chip, settings.button, this.safety?.element ?? null);
     const recordings = new RecordingList(() => [...this.panes.keys()], (name) => this.open(name, true), who.role === "pilot");
     this.main.append(this.empty);
-    root.replaceChildren(bar, this.lost, this.safety?.message ?? "", h("div", { class: "deckhouse" }, this.fleet.element, this.main, recordings.element), this.help.element, this.countdown.element);
+    root.replaceChildren(bar, this.lost, this.safety?.message ?? "", h("div", { class: "deckhouse" }, this.fleet.element, this.main, recordings.element), this.help.modal.element, settings.modal.element, this.countdown.element);
     this.flying = new Flying({
       pilots: () => [...this.panes.values()].flatMap((pane) => pane.pilot ?? []),
       selected: () => this.selected?.pilot ?? null,
       act: (deed) => this.act(deed),
       hold: (which) => this.safety?.hold(which),
-      escape: () => this.help.close(),
       inputs: (view) => this.inputs(view),
     });
     for (const name of decodeURIComponent(location.hash.slice(1)).split(",")) if (name) this.open(name, false);
@@ -124,7 +127,7 @@ class Page {
         select: (one) => this.select(one),
         close: (one) => this.close(one),
         push: (one, sticks) => this.push(one, sticks),
-        help: () => this.help.toggle(),
+        help: () => this.help.modal.open(),
         aimed: (one) => one === this.chosen && this.aim(),
         countdown: this.countdown,
       });
@@ -185,7 +188,7 @@ class Page {
   }
 
   private act(deed: Deed): void {
-    if (deed === "help") this.help.toggle();
+    if (deed === "help") this.help.modal.open();
     else if (deed === "question") [this.selected, ...this.panes.values()].find((pane) => pane?.isAsked)?.act(deed);
     else this.selected?.act(deed);
   }

@@ -11,6 +11,16 @@ export const RAMP_S = 0.3;
 
 const AXES = ["forward", "left", "up", "yaw_rate"] as const;
 
+export type Axis = keyof Sticks;
+
+/** What each direction of two sticks flies, in the modes of remote controls: up and right are positive. */
+export const STICK_MODES: Readonly<Record<"1" | "2" | "3" | "4", Readonly<Record<"left" | "right", { x: "left" | "yaw_rate"; y: "forward" | "up" }>>>> = {
+  "1": { left: { x: "yaw_rate", y: "forward" }, right: { x: "left", y: "up" } },
+  "2": { left: { x: "yaw_rate", y: "up" }, right: { x: "left", y: "forward" } },
+  "3": { left: { x: "left", y: "forward" }, right: { x: "yaw_rate", y: "up" } },
+  "4": { left: { x: "left", y: "up" }, right: { x: "yaw_rate", y: "forward" } },
+};
+
 /** Nothing within the band, all of the range beyond it: the output has no step at its edge. */
 export function deadBand(value: number, band: number = DEAD_BAND): number {
   if (!Number.isFinite(value)) return 0;

@@ -1,21 +1,16 @@
-// Dark or light: as the system is set, until the user chooses.
+// Dark or light: as the system is set, unless the person chose.
 
-import { h, memory, svg } from "./dom.js";
+import { settings } from "./settings.js";
 
-export function themeButton(changed: () => void): HTMLElement {
-  const root = document.documentElement;
+/** Keeps the page's colours as they are set; `changed` after each change, for what is painted. */
+export function followTheme(changed: () => void): void {
   const system = window.matchMedia("(prefers-color-scheme: light)");
   const apply = (): void => {
-    root.dataset["theme"] = memory.get("theme") ?? (system.matches ? "light" : "dark");
+    const chosen = settings.get("theme");
+    document.documentElement.dataset["theme"] = chosen === "system" ? (system.matches ? "light" : "dark") : chosen;
     changed();
   };
   apply();
   system.addEventListener("change", apply);
-  const picture = svg("svg", { viewBox: "0 0 20 20", width: 16, height: 16, "aria-hidden": "true" });
-  picture.append(svg("circle", { cx: 10, cy: 10, r: 7.2, fill: "none", stroke: "currentColor", "stroke-width": 1.6 }), svg("path", { d: "M10 2.8a7.2 7.2 0 0 1 0 14.4z", fill: "currentColor" }));
-  const turn = (): void => {
-    memory.set("theme", root.dataset["theme"] === "light" ? "dark" : "light");
-    apply();
-  };
-  return h("button", { type: "button", class: "small square", "aria-label": "Switch between dark and light", onclick: turn }, picture);
+  settings.on("theme", apply);
 }

@@ -1,0 +1,64 @@
+// A modal dialog: the rest of the page rests, the focus stays within and returns, Escape closes it. What must be in reach
+// whatever is open, as the emergency stop, moves into it meanwhile: outside, the browser would let nobody press it.
+
+import { h } from "./dom.js";
+import { t } from "./language/index.js";
+
+const kept: HTMLElement[] = [];
+/** Where each of them belongs, while a dialog has it. */
+const homes = new Map<HTMLElement, Comment>();
+
+/** This element is in reach, and above, whatever is open. */
+export function keepInReach(element: HTMLElement | null): void {
+  if (element) kept.push(element);
+}
+
+/** Whether one is open: keys and sticks then fly nothing. */
+export const isModalOpen = (): boolean => document.querySelector("dialog:modal") !== null;
+
+export class Modal {
+  readonly element: HTMLDialogElement;
+  private readonly reach = h("div", { class: "modal-reach" });
+
+  constructor(
+    title: string,
+    style: string,
+    content: readonly (Node | string)[],
+    private readonly closed: () => void = () => undefined,
+  ) {
+    const close = h("button", { type: "button", class: "bare close", autofocus: true, "aria-label": t.modal.close, onclick: () => this.element.close() }, "×");
+    const head = h("header", {}, h("h2", {}, title), close);
+    this.element = h("dialog", { class: `modal ${style}`, "aria-label": title }, this.reach, head, ...content);
+    this.element.addEventListener("close", () => this.end());
+    this.element.addEventListener("click", (event) => event.target === this.element && this.element.close());
+  }
+
+  get isOpen(): boolean {
+    return this.element.open;
+  }
+
+  /** Any other is closed. */
+  open(): void {
+    if (this.element.open) return;
+    for (const other of document.querySelectorAll<HTMLDialogElement>("dialog:modal")) other.close();
+    for (const element of kept) {
+      if (!homes.has(element)) {
+        homes.set(element, document.createComment(""));
+        element.replaceWith(homes.get(element) as Comment);
+      }
+      this.reach.append(element);
+    }
+    this.element.showModal();
+  }
+
+  close(): void {
+    this.element.close();
+  }
+
+  private end(): void {
+    this.closed();
+    if (isModalOpen()) return; // this one made way for another, which has what is kept
+    for (const [element, home] of homes) home.replaceWith(element);
+    homes.clear();
+  }
+}

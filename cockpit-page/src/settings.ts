@@ -1,0 +1,64 @@
+// What the person chose for this browser: remembered in it, and the same in all of its tabs.
+
+import { memory } from "./dom.js";
+
+const CHOICES = {
+  theme: ["system", "dark", "light"],
+  /** Of what is shown; everything that is sent, and every parameter, is in SI units. */
+  units: ["metric", "imperial"],
+  sound: ["on", "off"],
+  /** What the two sticks of a gamepad and on a touch screen do: see `STICK_MODES`. */
+  mode: ["1", "2", "3", "4"],
+  language: ["en", "pseudo"],
+} as const;
+
+const STANDARD: Values = { theme: "system", units: "metric", sound: "on", mode: "2", language: "en" };
+
+export type Name = keyof typeof CHOICES;
+export type Values = { -readonly [Key in Name]: (typeof CHOICES)[Key][number] };
+
+interface Store {
+  get(name: string): string | null;
+  set(name: string, value: string): void;
+}
+
+export class Settings {
+  private readonly values: Values = { ...STANDARD };
+  private readonly listeners = new Map<Name, Set<() => void>>();
+
+  constructor(private readonly store: Store) {
+    this.reread();
+  }
+
+  get<Key extends Name>(name: Key): Values[Key] {
+    return this.values[name];
+  }
+
+  set<Key extends Name>(name: Key, value: Values[Key]): void {
+    this.store.set(name, value);
+    this.change(name, value);
+  }
+
+  /** Called after each change, here or in another tab. Returns what ends it. */
+  on(name: Name, listener: () => void): () => void {
+    const listeners = this.listeners.get(name) ?? new Set();
+    this.listeners.set(name, listeners.add(listener));
+    return () => listeners.delete(listener);
+  }
+
+  /** Another tab may have changed them. What is stored and not allowed, or not at all, is the standard. */
+  reread(): void {
+    for (const name of Object.keys(CHOICES) as Name[]) {
+      const stored = this.store.get(name);
+      this.change(name, (CHOICES[name] as readonly string[]).includes(stored ?? "") ? (stored as Values[Name]) : STANDARD[name]);
+    }
+  }
+
+  private change<Key extends Name>(name: Key, value: Values[Key]): void {
+    if (this.values[name] === value) return;
+    this.values[name] = value;
+    for (const listener of this.listeners.get(name) ?? []) listener();
+  }
+}
+
+export const settings = new Settings(memory);

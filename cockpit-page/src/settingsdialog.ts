@@ -1,0 +1,51 @@
+// What the person chooses for this browser.
+
+import { h, setText, unique } from "./dom.js";
+import { LANGUAGE_NAMES, t } from "./language/index.js";
+import { Modal } from "./modal.js";
+import { type Name, settings, type Values } from "./settings.js";
+import { STICK_MODES } from "./sticks.js";
+
+export class SettingsDialog {
+  readonly button: HTMLButtonElement;
+  readonly modal: Modal;
+
+  constructor() {
+    const mode = h("p", { class: "note" });
+    const languages = Object.keys(LANGUAGE_NAMES);
+    this.modal = new Modal(t.settings.title, "settings", [
+      choice("theme", t.settings.theme, t.settings.themes),
+      choice("units", t.settings.units, t.settings.unit, h("p", { class: "note" }, t.settings.unitsNote)),
+      choice("sound", t.settings.sound, t.settings.sounds),
+      choice("mode", t.settings.mode, t.settings.modes, mode),
+      languages.length > 1 ? choice("language", t.settings.language, LANGUAGE_NAMES, h("p", { class: "note" }, t.settings.languageNote)) : "",
+      h("p", { class: "note" }, t.settings.note),
+    ]);
+    const describe = (): void => setText(mode, modeText(settings.get("mode")));
+    describe();
+    settings.on("mode", describe);
+    this.button = h("button", { type: "button", class: "small square", "aria-label": t.settings.title, title: t.settings.title, onclick: () => this.modal.open() }, "⚙");
+    window.addEventListener("storage", () => settings.reread());
+  }
+}
+
+/** What each stick does, in words. */
+export function modeText(mode: Values["mode"]): string {
+  const { left, right } = STICK_MODES[mode];
+  const words = ({ x, y }: (typeof STICK_MODES)["1"]["left"]): string => t.settings.and(t.settings.stick[y], t.settings.stick[x]);
+  return t.settings.modeNote(words(left), words(right));
+}
+
+function choice<Key extends Name>(name: Key, title: string, labels: Readonly<Record<string, string>>, ...more: Node[]): HTMLElement {
+  const group = unique(name);
+  const radios = Object.entries(labels).map(([value, label]) => {
+    const radio = h("input", { type: "radio", name: group, value, onchange: () => settings.set(name, value as Values[Key]) });
+    return h("label", {}, radio, label);
+  });
+  const show = (): void => {
+    for (const radio of radios) (radio.firstChild as HTMLInputElement).checked = (radio.firstChild as HTMLInputElement).value === settings.get(name);
+  };
+  show();
+  settings.on(name, show);
+  return h("fieldset", { class: "choice" }, h("legend", {}, title), h("div", { class: "segments" }, ...radios), ...more);
+}

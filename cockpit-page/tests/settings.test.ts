@@ -1,0 +1,39 @@
+// What the person chose, and the words of the page.
+
+import assert from "node:assert/strict";
+import { test } from "node:test";
+import { en } from "../src/language/en.js";
+import { accented, pseudo } from "../src/language/pseudo.js";
+import { Settings } from "../src/settings.js";
+import { STICK_MODES } from "../src/sticks.js";
+
+const store = (stored: Record<string, string> = {}) => ({ stored, get: (name: string) => stored[name] ?? null, set: (name: string, value: string) => void (stored[name] = value) });
+
+test("settings: remembered, announced once, and the standard for what is not allowed", () => {
+  const kept = store({ theme: "light", units: "cubits" });
+  const settings = new Settings(kept);
+  assert.equal(settings.get("theme"), "light");
+  assert.equal(settings.get("units"), "metric");
+  let told = 0;
+  const end = settings.on("units", () => (told += 1));
+  settings.set("units", "imperial");
+  settings.set("units", "imperial");
+  assert.deepEqual([told, kept.stored["units"]], [1, "imperial"]);
+  kept.stored["units"] = "metric"; // in another tab
+  settings.reread();
+  assert.deepEqual([told, settings.get("units")], [2, "metric"]);
+  end();
+  settings.set("units", "imperial");
+  assert.equal(told, 2);
+});
+
+test("each mode of the sticks flies each direction once", () => {
+  for (const { left, right } of Object.values(STICK_MODES)) assert.deepEqual([left.x, left.y, right.x, right.y].sort(), ["forward", "left", "up", "yaw_rate"]);
+});
+
+test("the language for tests has all that English has, marked", () => {
+  assert.equal(accented("Land"), "⟦Láñd⟧");
+  const words = pseudo(en);
+  assert.equal(words.modal.close, accented(en.modal.close));
+  assert.equal(words.settings.modeNote("a", "b"), accented(en.settings.modeNote("a", "b")));
+});

@@ -1,0 +1,85 @@
+"""Dialogs, settings and the gamepad on the cockpit's page, in Chromium."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import pytest
+
+import skyloop
+from skyloop.messages import FlightState
+from tests.cockpit.browser import CHROMIUM, Deck, browser_and_cockpit
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
+pytest.importorskip("playwright.sync_api", reason="the tests of the page need: pip install playwright")
+pytestmark = [
+    pytest.mark.process,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here (Debian: apt install chromium)"),
+]
+
+
+@pytest.fixture(scope="module")
+def open_cockpit() -> Iterator[tuple[Browser, str]]:
+    with browser_and_cockpit() as opened:
+        yield opened
+
+
+@pytest.fixture
+def deck(open_cockpit: tuple[Browser, str]) -> Iterator[Deck]:
+    deck = Deck(*open_cockpit)
+    yield deck
+    deck.end()
+
+
+def test_nothing_flies_while_a_dialog_is_open_but_the_emergency_stop_works(deck: Deck) -> None:
+    deck.proxy("modal")
+    page = deck.page("modal")
+    with skyloop.connect("modal", access="observe", name="test") as drone:
+        page.take_off()
+        chip = page.page.locator(".bar .inputs")
+        chip.click()
+        dialog = page.page.get_by_role("dialog", name="Keys and gamepad")
+        dialog.wait_for()
+        assert dialog.get_by_role("button", name="Close").evaluate("button => button === document.activeElement")
+        page.page.keyboard.down("w")
+        page.press("l", "h")
+        for _ in range(20):
+            assert drone.next_feedback().state is FlightState.HOVERING
+        for _ in range(12):
+            page.press("Tab")
+            within = "document.activeElement.closest('dialog') !== null || document.activeElement === document.body"
+            assert page.page.evaluate(within), "the focus stays in it"
+        page.press("Escape")
+        page.until(lambda: not dialog.is_visible(), "it is closed")
+        assert chip.evaluate("chip => chip === document.activeElement"), "the focus returns"
+        for _ in range(10):
+            assert drone.next_feedback().state is FlightState.HOVERING, "what was held counts when it is pressed again"
+        page.page.keyboard.up("w")
+        page.press("?")
+        dialog.wait_for()
+        assert dialog.get_by_role("button", name="Land all").is_visible(), "in reach whatever is open"
+        with page.holding("Control", "Enter"):
+            page.page.locator("dialog .counting").wait_for()
+            page.until(lambda: drone.feedback().state is FlightState.EMERGENCY, "the motors are off")
+        page.press("Escape")
+        page.page.locator(".bar .safety").wait_for()
+    assert page.problems == []
+
+
+def test_settings_are_used_at_once_and_remembered(deck: Deck) -> None:
+    deck.proxy("set")
+    page = deck.page("set", color_scheme="dark")
+    assert page.page.locator("html").get_attribute("data-theme") == "dark"
+    page.page.get_by_role("button", name="Settings").click()
+    for name in ("Imperial", "Light", "Mode 1"):
+        page.page.get_by_role("radio", name=name).check()
+    assert "Left stick: forward and back, turn." in (page.page.locator(".settings").text_content() or "")
+    page.press("Escape")
+    for _ in ("now", "when it is loaded again"):
+        page.until(lambda: "ft/s" in page.says(".figures"), "speeds are in feet")
+        assert page.page.locator("html").get_attribute("data-theme") == "light"
+        page.page.reload()
+    assert page.problems == []
