@@ -1,7 +1,7 @@
 """Fly a square, an eight and a helix by position, and tell how far off each was. Extra [sim].
 
 python examples/fly_a_path.py          # in simulated time, with noise, delay, loss and gusts of 1 m/s: a few seconds
-python examples/fly_a_path.py alpha    # a running proxy: skyloop sim --name alpha --world empty --option position=1
+python examples/fly_a_path.py alpha    # a running proxy: skyloop sim --name alpha --world empty
 """
 
 import sys
@@ -27,11 +27,8 @@ def main(*target: str) -> None:
         (-1, 1, 1),
         Waypoint(-1, -1, 1, yaw=0.0),
     ]
-    with (
-        skyloop.connect(*target)
-        if target
-        else rehearse("sim://?world=empty&position=1&cameras=none", radio=Radio()) as drone
-    ):
+    simulated = "sim://?world=empty&cameras=none"
+    with skyloop.connect(*target) if target else rehearse(simulated, radio=Radio()) as drone:
         if not target:
             drone.config["sim.gust"] = 1.0  # the standard deviation of the wind along each horizontal axis [m/s]
         drone.takeoff()

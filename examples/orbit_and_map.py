@@ -36,7 +36,7 @@ class Map(OrbitPlace):
         self.drone.annotate(frame, shapes)
 
 
-def main(target: str = "sim://?position=1&cameras=front&fps=15", size_m: float | str = 0.25) -> None:
+def main(target: str = "sim://?cameras=front&fps=15", size_m: float | str = 0.25) -> None:
     with skyloop.connect(target) as drone:
         drone.takeoff()
         survey = Map(drone, float(size_m), laps=1.2)

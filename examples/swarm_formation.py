@@ -1,6 +1,6 @@
 """One program, several drones: they take off together, fly in a V, in a circle, and behind one of them.
 
-skyloop sim --drones 3 --name drone --option position=1 --option cameras=none   # three drones in one world
+skyloop sim --drones 3 --name drone --option cameras=none   # three drones in one world
 python examples/swarm_formation.py "drone*"
 """
 
@@ -18,9 +18,7 @@ def main(*targets: str, seconds: float = 6.0) -> None:
         drones.takeoff()
         drones.wait_all("hovering", timeout_s=15)
         formation = Formation(drones, apart_m=0.6)
-        middle = [
-            sum(axis) / len(drones) for axis in zip(*(f.position_m for f in drones.feedback().values()), strict=True)
-        ]
+        middle = formation.middle()
         for shape, yaw in ((vee(len(drones), 1.0), 0.0), (circle(len(drones), 1.2), math.pi / 2)):
             report = formation.fly_to(placed(shape, at=middle, yaw=yaw), speed_m_s=0.8)
             print(f"{report.seconds:.1f} s, at most {max(report.errors_m.values()):.2f} m from the places")

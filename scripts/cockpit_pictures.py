@@ -76,7 +76,7 @@ def one() -> None:
             drone.land(wait=False)
 
     command = ["sim", "--name", "alpha", "--seed", "4"]
-    command += [word for option in ("width=640", "fps=15", "position=1") for word in ("--option", option)]
+    command += [word for option in ("width=640", "fps=15") for word in ("--option", option)]
     with flight(command, [follow]) as (chromium, address):
         for scheme in SCHEMES:
             page = open_page(chromium, f"{address}#alpha", DESK, scheme)
@@ -96,7 +96,7 @@ def swarm() -> None:
     names = [f"d{number}" for number in (1, 2, 3)]
     command = ["sim", "--drones", "3", "--name", "d", "--seed", "1"]
     # Small pictures: three renderers and a browser share this machine.
-    command += [word for option in ("width=320", "fps=10", "position=1") for word in ("--option", option)]
+    command += [word for option in ("width=320", "fps=10") for word in ("--option", option)]
     fliers = [rounds(name, number) for number, name in enumerate(names)]
     with flight(command, fliers) as (chromium, address):
         for scheme in SCHEMES:
@@ -108,7 +108,7 @@ def swarm() -> None:
 def asked() -> None:
     """A person flies, and a program asks for the drone."""
     command = ["sim", "--name", "alpha", "--seed", "4"]
-    command += [word for option in ("width=640", "fps=15", "position=1") for word in ("--option", option)]
+    command += [word for option in ("width=640", "fps=15") for word in ("--option", option)]
     with flight(command, []) as (chromium, address):
         views: list[tuple[str, ViewportSize, Scheme]] = [("dark", DESK, "dark"), ("phone", PHONE, "light")]
         for name, size, scheme in views:

@@ -44,7 +44,7 @@ class Result(NamedTuple):
 def fly(make: Callable[[Drone], Flyer], seed: int, gust_m_s: float = 0.0, radio: Radio | None = None) -> Result:
     """One flight in simulated time; of a square from the first corner on."""
     to_path, across = TrackingError(), TrackingError()
-    with rehearse(f"sim://?world=empty&position=1&cameras=none&seed={seed}", radio=radio or Radio(seed=seed)) as drone:
+    with rehearse(f"sim://?world=empty&cameras=none&seed={seed}", radio=radio or Radio(seed=seed)) as drone:
         drone.config["sim.wind"] = (0.0, 0.0, 0.0)
         drone.config["sim.gust"] = gust_m_s
         drone.takeoff()

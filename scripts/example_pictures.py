@@ -74,7 +74,7 @@ def follow_marker(folder: Path) -> None:
 
 
 def fly_a_path(folder: Path) -> None:
-    with flight(folder, "alpha", "--world", "empty", "--option", "position=1", "--option", "cameras=none"):
+    with flight(folder, "alpha", "--world", "empty", "--option", "cameras=none"):
         run("fly_a_path", "alpha")
     keep("fly_a_path", film(folder / "flight.mcap", HALL))
 
@@ -99,7 +99,7 @@ def shared_drone(folder: Path) -> None:
 
 def swarm_formation(folder: Path) -> None:
     names = [f"drone{number}" for number in (1, 2, 3)]
-    with flight(folder, *names, "--world", "empty", "--option", "position=1", "--option", "cameras=none"):
+    with flight(folder, *names, "--world", "empty", "--option", "cameras=none"):
         run("swarm_formation", "drone*")
     keep("swarm_formation", film(folder / "flight.mcap", replace(HALL, focal_px=240.0)))
 
@@ -129,7 +129,7 @@ def land_on_platform(folder: Path) -> None:
 
 def orbit_and_map(folder: Path) -> None:
     """The flight, and each place where it took a marker to be."""
-    with flight(folder, "alpha", "--option", "position=1", *FRONT):
+    with flight(folder, "alpha", *FRONT):
         run("orbit_and_map", "alpha")
     flown = Recording.open(folder / "flight.mcap")
     written = [

@@ -72,7 +72,7 @@ def test_a_marker_that_is_carried_about_is_placed_in_the_world_from_a_flight() -
     from skyloop.vision import MarkerDetector
 
     detector, errors = MarkerDetector("4x4_50", 0.3), []
-    with rehearse("sim://?cameras=front&position=1&seed=1&fps=5") as drone:
+    with rehearse("sim://?cameras=front&seed=1&fps=5") as drone:
         drone.takeoff()
         drone.velocity(yaw_rate=0.6)
         for frame in drone.frames():

@@ -275,7 +275,7 @@ export class Pane {
     this.strip.update(vehicle, state, pilot, isOld, recording);
     const [mine, placed] = [(pilot?.mine ?? false) && !isOld && !recording, (live?.position ?? null) !== null];
     const inAir = live?.airborne ?? false;
-    const nowhere = recording ? "A recording: nothing flies here." : isOld ? "What is shown is old." : !placed ? "Position not known." : !mine ? "Take control to fly to a place." : "It must be in the air to fly to a place.";
+    const nowhere = recording ? "A recording: nothing flies here." : isOld ? "What is shown is old." : !placed ? "It does not report its position: simulate it without position=none, or give it motion capture or GPS." : !mine ? "Take control to fly to a place." : "It must be in the air to fly to a place.";
     const can = mine && placed && inAir;
     this.waypoint.allow(can);
     this.map.allow(can ? "" : nowhere);

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from skyloop.errors import MissingExtraError, UsageError
 from skyloop.messages import CameraInfo, Feedback
+from skyloop.messages.feedback import NO_POSITION, POSITION_SOURCES
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import RigidTransform, Rotation
@@ -53,7 +54,7 @@ def body_in_world(feedback: Feedback, position: ArrayLike | None = None) -> Rigi
     """
     place = feedback.position_m if position is None else position
     if place is None:
-        raise UsageError("the vehicle does not report its position: give the one that you know")
+        raise UsageError(f"{NO_POSITION}: give the one that you know, or {POSITION_SOURCES}")
     return transform(place, _rotation(feedback))
 
 

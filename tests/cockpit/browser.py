@@ -24,7 +24,7 @@ CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
 )
 PATIENCE_S = 10.0
-WATCHED = "sim://?world=empty&cameras=front&width=320&fps=15&position=1"
+WATCHED = "sim://?world=empty&cameras=front&width=320&fps=15"
 
 
 class Deck:

@@ -28,7 +28,7 @@ pytestmark = [
     pytest.mark.process,
     pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here (Debian: apt install chromium)"),
 ]
-SMALL = "sim://?world=empty&cameras=&position=1"
+SMALL = "sim://?world=empty&cameras="
 
 
 @pytest.fixture(scope="module")

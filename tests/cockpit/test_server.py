@@ -265,7 +265,7 @@ def test_tokens_over_tls(certificates: Path, tokens: Path) -> None:
 @pytest.mark.daily
 @pytest.mark.process
 def test_page_of_a_real_drone(tmp_path: Path) -> None:
-    with connect("sim://?cameras=front&width=64&fps=10&position=1") as drone, CockpitProcess(drone.name) as page:
+    with connect("sim://?cameras=front&width=64&fps=10") as drone, CockpitProcess(drone.name) as page:
         own = page.address().rstrip("/")
         streams = f"{own.replace('http', 'ws')}/ws/drones/{drone.name}"
         with open_socket(f"{streams}/telemetry", origin=Origin(own)) as telemetry:

@@ -17,7 +17,7 @@ from skyloop.errors import UsageError
 from skyloop.messages import Feedback
 from skyloop.stepping.rehearsal import Radio, rehearse
 
-CALM = "sim://?world=empty&position=1&cameras=none&wind=0"
+CALM = "sim://?world=empty&cameras=none&wind=0"
 
 
 def truth(feedback: Feedback) -> np.ndarray:
@@ -158,8 +158,8 @@ def test_the_same_place_twice_is_no_way() -> None:
 
 
 def test_what_it_cannot_do_is_said() -> None:
-    with rehearse("sim://?world=empty&cameras=none") as drone:
-        with pytest.raises(UsageError, match="does not report its position; give it a source"):
+    with rehearse("sim://?world=empty&cameras=none&position=none") as drone:
+        with pytest.raises(UsageError, match=r"does not report its position: .*give the controller a source"):
             FollowPath(drone, Circle((0, 0, 1), 0.5)).run(seconds=1.0)
         with pytest.raises(UsageError, match="no waypoint"):
             Waypoints(drone, [])
@@ -186,7 +186,7 @@ def test_what_cannot_be_rehearsed(uri: str) -> None:
 def test_pictures_come_in_simulated_time() -> None:
     pytest.importorskip("cv2", reason="pictures are drawn with OpenCV")
     radio = Radio(drop=0.0, picture_delay_s=0.1)
-    with rehearse("sim://?cameras=front&position=1&fps=10", radio=radio) as drone:
+    with rehearse("sim://?cameras=front&fps=10", radio=radio) as drone:
         frames = drone.frames()
         first, second = next(frames), next(frames)
         frames.close()  # type: ignore[attr-defined]

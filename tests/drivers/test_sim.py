@@ -152,7 +152,7 @@ def test_nothing_is_drawn_for_nobody() -> None:
 
 
 def test_the_truth_comes_with_the_feedback() -> None:
-    with opened(f"sim://?cameras=none&speed=4&position=1&{CALM}") as (driver, sink):
+    with opened(f"sim://?cameras=none&speed=4&{CALM}") as (driver, sink):
         in_the_air(driver, sink)
         newest = sink.newest
     assert newest is not None
@@ -164,7 +164,7 @@ def test_the_truth_comes_with_the_feedback() -> None:
 
 
 def test_without_truth_feedback_holds_what_a_drone_knows() -> None:
-    with opened("sim://?cameras=none&truth=0") as (_, sink):
+    with opened("sim://?cameras=none&truth=0&position=none") as (_, sink):
         newest = sink.newest
     assert newest is not None
     assert newest.native is not None

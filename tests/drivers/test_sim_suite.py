@@ -30,4 +30,4 @@ class TestSimThatTakesAttitudesOnly(SimSuite):
 
 
 class TestSimThatKnowsItsPlace(SimSuite):
-    uri = "sim://?seed=4&speed=10&rate=100&position=1&cameras=bottom&native=takeoff,land,velocity"
+    uri = "sim://?seed=4&speed=10&rate=100&cameras=bottom&native=takeoff,land,velocity"

@@ -86,7 +86,7 @@ def test_a_recording_tells_two_controllers_apart(start: Start, tmp_path: Path) -
 
 
 def test_one_program_and_a_swarm(start: Start, sim: Start) -> None:
-    sim("--drones", "3", "--name", "drone", "--world", "empty", "--option", "position=1", "--option", "cameras=none")
+    sim("--drones", "3", "--name", "drone", "--world", "empty", "--option", "cameras=none")
     process = example(start, "swarm_formation", "drone*")
     process.until("set-points left within", 80.0)
     assert process.wait(60.0) == 0

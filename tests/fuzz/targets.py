@@ -147,8 +147,8 @@ def files(data: bytes) -> None:
     """Files that people edit: worlds, calibrations, zones, tables of keys and of tokens."""
     from skyloop.calibration import load_calibration
     from skyloop.drivers.uri import parse_uri
-    from skyloop.proxy.core.safety import parse_zones
     from skyloop.sim.world_file import load_world
+    from skyloop.zones import parse_zones
 
     kind, data = data[:1], data[1:]
     if kind == b"w":

@@ -23,7 +23,7 @@ from skyloop.sim.options import SimOptions
 from skyloop.transport.memory import MemoryServer
 from tests.client.scripted import WAIT_S
 
-SIM = "sim://?world=empty&seed=2&wind=0&noise=0&cameras=none&position=1"
+SIM = "sim://?world=empty&seed=2&wind=0&noise=0&cameras=none"
 KINDS = {kind.value: kind for kind in Kind}
 AUTOPILOTS = [pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS]
 LONG_S = 60.0
@@ -83,6 +83,16 @@ def test_there_and_back(vehicle: str) -> None:
         drone.wait("hovering", LONG_S)
 
 
+def test_a_simulated_room_is_not_left() -> None:
+    with flown("sim://?cameras=none") as drone:
+        here = place(drone.feedback())
+        assert drone.config["safety.room"] == "box -4 -3 0 4 3 3"
+        for x, y, z in ((50.0, 0.0, -3.0), (0.0, 0.0, -0.5), (0.0, 3.5, 1.0)):
+            with pytest.raises(RefusedError, match=r"outside of the room, box .* \(safety\.room\)"):
+                drone.go_to(x=x, y=y, z=z, timeout_s=LONG_S)
+        assert math.dist(place(drone.feedback()), here) < 0.3
+
+
 @pytest.mark.parametrize("vehicle", AUTOPILOTS)
 def test_a_place_on_the_earth(vehicle: str) -> None:
     with flown(vehicle) as drone:
@@ -133,7 +143,7 @@ def test_walls_hold_for_the_place_and_on_the_way(vehicle: str) -> None:
 def test_an_application_that_is_gone_on_the_way_gets_the_failsafe() -> None:
     with flown(SIM) as drone:
         x, y, z = place(drone.feedback())
-        drone.go_to(x=x + 50.0, y=y, z=z, speed=1.0, wait=False)
+        drone.go_to(x=x + 12.0, y=y, z=z, speed=1.0, wait=False)
         drone.wait(lambda feedback: place(feedback)[0] > x + 0.5, WAIT_S)
         drone.release_authority()
         drone.wait("hovering", WAIT_S)

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import skyloop.proxy.core
+import skyloop.zones
 
 ALLOWED = {
     "__future__",
@@ -21,10 +22,11 @@ ALLOWED = {
     "skyloop.errors",
     "skyloop.messages",
     "skyloop.proxy.core",
+    "skyloop.zones",
     "typing",
 }
 CLOCKS = {"monotonic_ns", "Clock", "ManualClock"}
-FILES = sorted(Path(skyloop.proxy.core.__file__).parent.glob("*.py"))
+FILES = [*sorted(Path(skyloop.proxy.core.__file__).parent.glob("*.py")), Path(skyloop.zones.__file__)]
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)

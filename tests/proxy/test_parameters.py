@@ -96,7 +96,9 @@ def test_anything_is_checked_or_refused(parameter: Parameter, value: Value) -> N
 
 def test_the_defaults_of_the_proxys_own_are_allowed_and_named_well() -> None:
     for parameter in OWN:
-        assert check(parameter, parameter.value) == parameter.value == parameter.default
+        if not parameter.read_only:
+            assert check(parameter, parameter.value) == parameter.value
+        assert parameter.value == parameter.default
         assert parameter.name.islower()
         assert parameter.description
     assert len({parameter.name for parameter in OWN}) == len(OWN)

@@ -22,12 +22,14 @@ from skyloop.messages import (
 )
 from skyloop.proxy.core.limits import Limits
 from skyloop.proxy.core.places import PlaceDecision, decide_place
-from skyloop.proxy.core.safety import Box, Cylinder, Safety
+from skyloop.zones import Box, Cylinder, Space
 from tests.proxy.fake import ALL, App, Bench
 
 NOW = 100 * NS_PER_S
 LIMITS = Limits(climb=1.0, yaw_rate=1.5, speed=2.0, altitude=5.0)
-ROOM = Safety(Box((-4.0, -4.0, 0.0), (4.0, 4.0, 3.0)), (Cylinder(2.0, 0.0, 0.5, 0.0, 3.0),))
+BOXED = Space(None, Box((-4.0, -4.0, 0.0), (4.0, 4.0, 3.0)), (Cylinder(2.0, 0.0, 0.5, 0.0, 3.0),))
+ROOM = Space(Box((-4.0, -4.0, 0.0), (4.0, 4.0, 9.0)))
+ANYWHERE = Space()
 SOFTWARE = ALL - {"position"}
 
 
@@ -43,11 +45,11 @@ START = at(0.0, 0.0, 1.0)
 
 
 def test_both_speeds_are_filled_in() -> None:
-    decided = decide_place(Position(3.0, 0.0, 1.0, 0.5), LIMITS, None, START, NOW, new=True)
+    decided = decide_place(Position(3.0, 0.0, 1.0, 0.5), LIMITS, ANYWHERE, START, NOW, new=True)
     assert decided.action == Position(3.0, 0.0, 1.0, 0.5, 2.0, 1.5)
     assert decided.clamps == ()
     slow = Position(3.0, 0.0, 1.0, None, 0.3, 0.2)
-    assert decide_place(slow, LIMITS, None, START, NOW, new=True).action == slow
+    assert decide_place(slow, LIMITS, ANYWHERE, START, NOW, new=True).action == slow
 
 
 @pytest.mark.parametrize(
@@ -60,21 +62,21 @@ def test_both_speeds_are_filled_in() -> None:
     ],
 )
 def test_the_speed_keeps_to_the_limits_across_and_upwards(asked: Position, speed: float, limit: str) -> None:
-    decided = decide_place(asked, LIMITS, None, START, NOW, new=True)
+    decided = decide_place(asked, LIMITS, ANYWHERE, START, NOW, new=True)
     assert decided.action is not None
     assert decided.action.speed == pytest.approx(speed)
     (clamp,) = decided.clamps
     assert (clamp.limit, clamp.asked, clamp.applied) == (limit, 9.0, decided.action.speed)
-    assert decide_place(asked, LIMITS, None, START, NOW, new=False).clamps == (), "repeats are not told again"
+    assert decide_place(asked, LIMITS, ANYWHERE, START, NOW, new=False).clamps == (), "repeats are not told again"
 
 
 @pytest.mark.parametrize(
     ("asked", "feedback", "reason", "words"),
     [
         (Position(0.0, 0.0, 1.0, speed=-1.0), START, Refusal.OUT_OF_RANGE, "speed is -1"),
-        (Position(1.0, 0.0, 1.0), None, Refusal.WRONG_STATE, "does not tell its position"),
+        (Position(1.0, 0.0, 1.0), None, Refusal.WRONG_STATE, "does not report its position"),
         (Position(1.0, 0.0, 1.0), at(0, 0, 1, position_m=None), Refusal.WRONG_STATE, "motion capture"),
-        (Position(1.0, 0.0, 1.0), at(0, 0, 1, yaw_rad=None), Refusal.WRONG_STATE, "does not tell its yaw"),
+        (Position(1.0, 0.0, 1.0), at(0, 0, 1, yaw_rad=None), Refusal.WRONG_STATE, "does not report its yaw"),
         (Position(1.0, 0.0, 1.0), at(0, 0, 1, captured_ns=NOW - 3 * NS_PER_S), Refusal.WRONG_STATE, "3.0 s old"),
         (Position(0.0, 0.0, 7.0), START, Refusal.OUT_OF_RANGE, "z is 7 m, and at most 5.00 m is allowed"),
         (Position(0.0, 0.0, 6.0), at(0, 0, 1, altitude_m=2.0), Refusal.OUT_OF_RANGE, "at most 4.00 m"),
@@ -85,30 +87,56 @@ def test_the_speed_keeps_to_the_limits_across_and_upwards(asked: Position, speed
     ],
 )
 def test_what_is_refused_and_why(asked: Position, feedback: Feedback | None, reason: Refusal, words: str) -> None:
-    decided = decide_place(asked, LIMITS, ROOM, feedback, NOW, new=True)
+    decided = decide_place(asked, LIMITS, BOXED, feedback, NOW, new=True)
     assert (decided.action, decided.refusal) == (None, reason)
     assert words in decided.why
+
+
+@pytest.mark.parametrize(
+    ("asked", "feedback", "words"),
+    [
+        (Position(50.0, 0.0, -3.0), START, "outside of the room, box -4 -4 0 4 4 9 [m] (safety.room)"),
+        (Position(0.0, 0.0, -0.2), START, "outside of the room"),
+        (Position(0.0, 0.0, 8.0), START, "at most 5.00 m is allowed"),
+    ],
+)
+def test_a_known_room_is_not_left(asked: Position, feedback: Feedback, words: str) -> None:
+    for new in (True, False) if "room" in words else (True,):
+        decided = decide_place(asked, LIMITS, ROOM, feedback, NOW, new=new)
+        assert (decided.action, decided.refusal) == (None, Refusal.OUT_OF_RANGE)
+        assert words in decided.why
+
+
+def test_no_place_below_the_ground_is_flown_to() -> None:
+    into = decide_place(Position(2.0, 0.0, -3.0), LIMITS, ANYWHERE, START, NOW, new=True)
+    assert (into.action, into.refusal) == (None, Refusal.OUT_OF_RANGE)
+    assert "z is -3 m, which is 3.00 m below the ground under the vehicle" in into.why
+    hill = at(0.0, 0.0, -4.0, altitude_m=2.0)  # it took off farther up
+    assert decide_place(Position(2.0, 0.0, -5.0), LIMITS, ANYWHERE, hill, NOW, new=True).action is not None
+    assert decide_place(Position(2.0, 0.0, -7.0), LIMITS, ANYWHERE, hill, NOW, new=True).action is None
+    unknown = at(0.0, 0.0, 1.0, altitude_m=None)
+    assert decide_place(Position(2.0, 0.0, -3.0), LIMITS, ANYWHERE, unknown, NOW, new=True).action is not None
 
 
 def test_an_old_position_is_waited_for_a_moment() -> None:
     old = at(0, 0, 1, captured_ns=NOW - NS_PER_S)
     for new in (True, False):
-        assert decide_place(Position(1.0, 0.0, 1.0), LIMITS, ROOM, old, NOW, new=new) == PlaceDecision()
+        assert decide_place(Position(1.0, 0.0, 1.0), LIMITS, BOXED, old, NOW, new=new) == PlaceDecision()
 
 
 def test_repeats_are_lowered_to_a_lower_ceiling_and_drift_past_a_zone_is_not_refused() -> None:
-    decided = decide_place(Position(0.0, 0.0, 4.0), Limits(altitude=3.0), None, START, NOW, new=False)
+    decided = decide_place(Position(0.0, 0.0, 4.0), Limits(altitude=3.0), ANYWHERE, START, NOW, new=False)
     assert decided.action is not None
     assert decided.action.z == pytest.approx(3.0)
     assert [clamp.limit for clamp in decided.clamps] == ["limits.altitude"]
     past = Position(3.5, 0.1, 1.0)
-    assert decide_place(past, LIMITS, ROOM, START, NOW, new=False).action is not None
+    assert decide_place(past, LIMITS, BOXED, START, NOW, new=False).action is not None
     inside = Position(2.1, 0.1, 1.0)
-    assert decide_place(inside, LIMITS, ROOM, START, NOW, new=False).refusal is Refusal.OUT_OF_RANGE
+    assert decide_place(inside, LIMITS, BOXED, START, NOW, new=False).refusal is Refusal.OUT_OF_RANGE
 
 
 def test_a_zone_that_the_vehicle_is_in_can_be_left() -> None:
-    decided = decide_place(Position(0.0, 0.0, 1.0), LIMITS, ROOM, at(2.1, 0.0, 1.0), NOW, new=True)
+    decided = decide_place(Position(0.0, 0.0, 1.0), LIMITS, BOXED, at(2.1, 0.0, 1.0), NOW, new=True)
     assert decided.action is not None
 
 
@@ -133,9 +161,9 @@ def test_a_zone_is_in_the_way_if_a_place_of_the_way_is_in_it(
 def test_what_is_flown_keeps_to_each_limit(
     start: tuple[float, float, float], end: tuple[float, float, float], speed: float
 ) -> None:
-    assume(math.dist(start, end) > 0.1)
+    assume(math.dist(start, end) > 0.1 and end[2] >= 0.0)
     limits = Limits(climb=0.7, speed=1.3, altitude=100.0)
-    action = decide_place(Position(*end, speed=speed), limits, None, at(*start), NOW, new=True).action
+    action = decide_place(Position(*end, speed=speed), limits, ANYWHERE, at(*start), NOW, new=True).action
     assert action is not None
     assert action.speed is not None
     away = math.dist(start, end)
@@ -192,7 +220,7 @@ def test_a_vehicle_without_a_position_is_refused_with_the_reason() -> None:
         pilot.command(Position(3.0, 0.0, 1.0))
         (event,) = pilot.told(EventKind.COMMAND_REFUSED)
         assert event.data["reason"] == Refusal.WRONG_STATE
-        assert "the vehicle does not tell its position" in event.text
+        assert "the vehicle does not report its position" in event.text
         assert bench.driver.told == [Hover()]
 
 

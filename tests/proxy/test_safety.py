@@ -12,11 +12,12 @@ from hypothesis import strategies as st
 from skyloop.clock import NS_PER_S
 from skyloop.errors import ParameterError
 from skyloop.messages import AnyAction, Attitude, EventKind, Feedback, Hover, Refused, SetParameter, Value, Velocity
-from skyloop.proxy.core.safety import BOX, MARGIN_M, ZONES, Box, Cylinder, Safety, check_written, parse_zones, safety_of
+from skyloop.proxy.core.safety import MARGIN_M, Safety, check_written, safety_of
 from skyloop.stepping.rehearsal import Radio, rehearse
+from skyloop.zones import BOX, ROOM, ZONES, Box, Cylinder, parse_zones, space_of
 from tests.proxy.fake import Bench
 
-ROOM = Safety(Box((-2.0, -2.0, 0.0), (2.0, 2.0, 3.0)), deceleration=1.0, reaction_s=0.3)
+BOXED = Safety(Box((-2.0, -2.0, 0.0), (2.0, 2.0, 3.0)), deceleration=1.0, reaction_s=0.3)
 PILLAR = Safety(None, (Cylinder(2.0, 0.0, 0.5, 0.0, 2.0),))
 NOW = 10 * NS_PER_S
 
@@ -34,54 +35,54 @@ def clamp(safety: Safety, action: AnyAction, feedback: Feedback) -> tuple[Any, l
 
 def test_far_from_all_walls_nothing_changes() -> None:
     action = Velocity(0.5, 0.5, 0.2, 1.0)
-    assert ROOM.clamp(action, at(0, 0, 1.5), NOW) == (action, (), True)
-    assert ROOM.clamp(action, at(0, 0, 1.5), NOW)[0] is action
-    assert ROOM.clamp(Hover(), at(5, 0), NOW)[0] == Hover()
+    assert BOXED.clamp(action, at(0, 0, 1.5), NOW) == (action, (), True)
+    assert BOXED.clamp(action, at(0, 0, 1.5), NOW)[0] is action
+    assert BOXED.clamp(Hover(), at(5, 0), NOW)[0] == Hover()
 
 
 def test_the_speed_allowed_is_the_one_that_can_be_stopped() -> None:
     for distance in (0.01, 0.5, 3.0):
-        v = ROOM.allowed_speed(distance, 0.3)
+        v = BOXED.allowed_speed(distance, 0.3)
         assert v * 0.3 + v * v / 2 == pytest.approx(distance)
-    assert ROOM.allowed_speed(0.0, 0.3) == ROOM.allowed_speed(-1.0, 0.3) == 0.0
+    assert BOXED.allowed_speed(0.0, 0.3) == BOXED.allowed_speed(-1.0, 0.3) == 0.0
 
 
 def test_what_runs_along_the_wall_stays() -> None:
-    allowed, limits = clamp(ROOM, Velocity(2.0, 0.4, 0.1, 0.5), at(1.5, 0.0))
-    assert allowed.forward == pytest.approx(ROOM.allowed_speed(0.5, 0.3))
+    allowed, limits = clamp(BOXED, Velocity(2.0, 0.4, 0.1, 0.5), at(1.5, 0.0))
+    assert allowed.forward == pytest.approx(BOXED.allowed_speed(0.5, 0.3))
     assert (allowed.left, allowed.up, allowed.yaw_rate) == pytest.approx((0.4, 0.1, 0.5))
     assert limits == [BOX]
 
 
 def test_axes_are_the_world_s() -> None:
-    allowed, _ = clamp(ROOM, Velocity(left=-2.0), at(1.9, 0.0, yaw=math.pi / 2))  # looks north, its right is the east
-    assert allowed.left == pytest.approx(-ROOM.allowed_speed(0.1, 0.3))
-    assert clamp(ROOM, Velocity(forward=1.0), at(1.9, 0.0, yaw=math.pi))[1] == []
+    allowed, _ = clamp(BOXED, Velocity(left=-2.0), at(1.9, 0.0, yaw=math.pi / 2))  # looks north, its right is the east
+    assert allowed.left == pytest.approx(-BOXED.allowed_speed(0.1, 0.3))
+    assert clamp(BOXED, Velocity(forward=1.0), at(1.9, 0.0, yaw=math.pi))[1] == []
 
 
 def test_an_old_position_costs_way() -> None:
     late = at(1.0, 0.0, captured_ns=NOW - NS_PER_S // 5)
-    assert clamp(ROOM, Velocity(2.0), late)[0].forward == pytest.approx(ROOM.allowed_speed(1.0, 0.5))
+    assert clamp(BOXED, Velocity(2.0), late)[0].forward == pytest.approx(BOXED.allowed_speed(1.0, 0.5))
 
 
 def test_who_is_too_fast_is_braked() -> None:
-    most = ROOM.allowed_speed(0.2, 0.3)
-    braked, _ = clamp(ROOM, Velocity(2.0), at(1.8, 0.0, velocity_m_s=(1.5, 0.0, 0.0)))
+    most = BOXED.allowed_speed(0.2, 0.3)
+    braked, _ = clamp(BOXED, Velocity(2.0), at(1.8, 0.0, velocity_m_s=(1.5, 0.0, 0.0)))
     assert braked.forward == pytest.approx(most - 0.5 * (1.5 - most))
-    assert clamp(ROOM, Velocity(), at(1.8, 0.0, velocity_m_s=(1.5, 0.0, 0.0)))[1] == [], "it does not ask to go there"
+    assert clamp(BOXED, Velocity(), at(1.8, 0.0, velocity_m_s=(1.5, 0.0, 0.0)))[1] == [], "it does not ask to go there"
 
 
 def test_outside_it_may_only_come_back() -> None:
     outside = at(2.5, 0.0)
-    assert clamp(ROOM, Velocity(1.0, yaw_rate=0.3), outside) == (Velocity(-0.5, yaw_rate=0.3), [BOX])
-    assert clamp(ROOM, Velocity(left=1.0), outside)[0] == Velocity(), "along the wall is not back"
-    assert clamp(ROOM, Velocity(-1.0, 0.5), outside) == (Velocity(-1.0, 0.5), [])
-    assert clamp(ROOM, Velocity(yaw_rate=1.0), outside) == (Velocity(yaw_rate=1.0), [])
+    assert clamp(BOXED, Velocity(1.0, yaw_rate=0.3), outside) == (Velocity(-0.5, yaw_rate=0.3), [BOX])
+    assert clamp(BOXED, Velocity(left=1.0), outside)[0] == Velocity(), "along the wall is not back"
+    assert clamp(BOXED, Velocity(-1.0, 0.5), outside) == (Velocity(-1.0, 0.5), [])
+    assert clamp(BOXED, Velocity(yaw_rate=1.0), outside) == (Velocity(yaw_rate=1.0), [])
     just = at(2.0 + MARGIN_M / 2, 0.0)
-    assert clamp(ROOM, Velocity(left=1.0), just) == (Velocity(left=1.0), []), "that little is noise"
+    assert clamp(BOXED, Velocity(left=1.0), just) == (Velocity(left=1.0), []), "that little is noise"
     corner = at(2.5, 2.5)
-    assert clamp(ROOM, Velocity(-1.0), corner) == (Velocity(-1.0), [])
-    assert clamp(ROOM, Velocity(-1.0, 0.2), corner)[0] == Velocity(left=-0.5)
+    assert clamp(BOXED, Velocity(-1.0), corner) == (Velocity(-1.0), [])
+    assert clamp(BOXED, Velocity(-1.0, 0.2), corner)[0] == Velocity(left=-0.5)
 
 
 def test_safety_are_gone_round() -> None:
@@ -106,15 +107,15 @@ def test_safety_are_gone_round() -> None:
 
 def test_a_tilt_is_turned_into_one_that_brakes() -> None:
     slow = at(0.0, 0.0, velocity_m_s=(0.2, 0.0, 0.0))
-    assert clamp(ROOM, Attitude(pitch=0.2), slow)[1] == []
+    assert clamp(BOXED, Attitude(pitch=0.2), slow)[1] == []
     fast = at(1.5, 0.0, velocity_m_s=(1.5, 0.0, 0.0))
-    braked, limits = clamp(ROOM, Attitude(roll=0.1, pitch=0.2, yaw_rate=0.4), fast)
+    braked, limits = clamp(BOXED, Attitude(roll=0.1, pitch=0.2, yaw_rate=0.4), fast)
     assert limits == [BOX]
     assert braked.pitch == pytest.approx(-math.atan(1.0 / 9.80665), abs=1e-3)
     assert (braked.roll, braked.yaw_rate) == pytest.approx((0.1, 0.4))
-    assert clamp(ROOM, Attitude(pitch=0.2), at(2.5, 0.0))[0].pitch < 0.0, "outside it is led back"
-    assert clamp(ROOM, Attitude(climb=1.0), at(0.0, 0.0, 2.9))[0].climb == pytest.approx(ROOM.allowed_speed(0.1, 0.3))
-    assert clamp(ROOM, Attitude(pitch=0.2), at(2.0, 0.0))[0].pitch == pytest.approx(0.0), "without a known speed"
+    assert clamp(BOXED, Attitude(pitch=0.2), at(2.5, 0.0))[0].pitch < 0.0, "outside it is led back"
+    assert clamp(BOXED, Attitude(climb=1.0), at(0.0, 0.0, 2.9))[0].climb == pytest.approx(BOXED.allowed_speed(0.1, 0.3))
+    assert clamp(BOXED, Attitude(pitch=0.2), at(2.0, 0.0))[0].pitch == pytest.approx(0.0), "without a known speed"
 
 
 @pytest.mark.parametrize(
@@ -127,7 +128,7 @@ def test_a_tilt_is_turned_into_one_that_brakes() -> None:
     ],
 )
 def test_without_a_position_nothing_is_enforced(feedback: Feedback | None) -> None:
-    assert ROOM.clamp(Velocity(2.0), feedback, NOW) == (Velocity(2.0), (), False)
+    assert BOXED.clamp(Velocity(2.0), feedback, NOW) == (Velocity(2.0), (), False)
 
 
 @given(
@@ -138,7 +139,7 @@ def test_without_a_position_nothing_is_enforced(feedback: Feedback | None) -> No
 def test_an_obedient_vehicle_never_leaves_the_box_nor_enters_the_zone(
     start: tuple[float, float, float], yaw: float, asked: list[tuple[float, float, float]]
 ) -> None:
-    safety = Safety(ROOM.box, (Cylinder(1.4, 0.0, 0.5, 0.0, 3.0), Box((-3.0, -3.0, 0.0), (-2.5, 3.0, 3.0))))
+    safety = Safety(BOXED.box, (Cylinder(1.4, 0.0, 0.5, 0.0, 3.0), Box((-3.0, -3.0, 0.0), (-2.5, 3.0, 3.0))))
     x, y, z = start
     for forward, left, up in asked:
         for _ in range(15):
@@ -194,12 +195,32 @@ def test_nothing_is_looked_at_unless_it_is_asked_for() -> None:
         f"{BOX}.{axis}_{end}": far for axis in "xyz" for end, far in (("low", -1e4), ("high", 1e4))
     }
     values |= {"safety.deceleration": 2.0, "safety.reaction_s": 0.1}
-    assert safety_of(values.__getitem__, "") is None
-    only = safety_of(values.__getitem__, "cylinder 0 0 1 0 1")
+
+    def safety(zones: str = "", room: str = "", **walls: float) -> Safety | None:
+        number = (values | {f"{BOX}.{wall}": at for wall, at in walls.items()}).__getitem__
+        return safety_of(number, space_of(number, {ZONES: zones, ROOM: room}.__getitem__))
+
+    assert safety() is None
+    assert safety(room="box -1 -1 0 1 1 2") is None, "a room refuses places and shortens nothing"
+    only = safety("cylinder 0 0 1 0 1")
     assert only == Safety(None, (Cylinder(0.0, 0.0, 1.0, 0.0, 1.0),), 2.0, 0.1)
-    boxed = safety_of((values | {f"{BOX}.z_low": 0.3}).__getitem__, "")
+    boxed = safety(z_low=0.3)
     assert boxed is not None
     assert boxed.box == Box((-1e4, -1e4, 0.3), (1e4, 1e4, 1e4))
+
+
+@pytest.mark.parametrize(
+    ("text", "room"),
+    [
+        ("box -1 -2 0 1 2 3", Box((-1.0, -2.0, 0.0), (1.0, 2.0, 3.0))),
+        ("", None),
+        ("a hall", None),
+        ("cylinder 0 0 1 0 1", None),
+        ("box 0 0 0 1 1 1; box 2 2 2 3 3 3", None),
+    ],
+)
+def test_a_room_is_what_a_driver_reports_as_one_box(text: str, room: Box | None) -> None:
+    assert space_of(lambda _: 1e4, {ZONES: "", ROOM: text}.__getitem__).room == room
 
 
 def test_the_proxy_enforces_what_is_written_and_tells(bench: Bench) -> None:
@@ -244,7 +265,7 @@ def test_the_proxy_enforces_what_is_written_and_tells(bench: Bench) -> None:
     ids=["straight", "into a corner", "by tilt"],
 )
 def test_the_simulated_drone_stops_at_the_wall(action: Velocity | Attitude, beyond_m: float) -> None:
-    with rehearse("sim://?world=empty&position=1&cameras=none&wind=0", radio=Radio(seed=1)) as drone:
+    with rehearse("sim://?world=empty&cameras=none&wind=0", radio=Radio(seed=1)) as drone:
         walls = {"x_high": 2.0, "y_high": 1.0, "z_high": 1.6}
         for name, place in walls.items():
             drone.config[f"{BOX}.{name}"] = place

@@ -25,7 +25,7 @@ from tests.processes.conftest import Process
 from tests.recording import files
 
 pytestmark = pytest.mark.process
-SIM = "sim://?world=empty&cameras=front&position=yes&wind=0"
+SIM = "sim://?world=empty&cameras=front&wind=0"
 Proxy = Callable[..., Process]
 
 

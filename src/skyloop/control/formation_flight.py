@@ -72,6 +72,14 @@ class Formation:
         self._settings = settings or WaypointSettings()
         self._closest_m = math.inf
 
+    def middle(self) -> Vector:
+        """Return the mean of the drones' positions, world axes [m].
+
+        Raises:
+            UsageError: A drone does not report its position, is on the ground, or none is active.
+        """
+        return _vector(_positions(self._ready()).mean(axis=0))
+
     def fly_to(
         self, slots: ArrayLike, *, speed_m_s: float = 0.6, yaw: float | None = None, timeout_s: float | None = None
     ) -> FormationReport:

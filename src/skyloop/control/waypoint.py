@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from skyloop.errors import UsageError
 from skyloop.messages import Feedback, Vector, Velocity
+from skyloop.messages.feedback import NO_POSITION, POSITION_SOURCES
 from skyloop.messages.geometry import wrap_angle
 
 
@@ -61,9 +62,9 @@ class WaypointSettings:
 
 
 def lacking(feedback: Feedback) -> str:
-    """Return why a vehicle can't be flown to a position, or an empty string if it can."""
+    """Return why a vehicle can't be flown to a position and what helps, or an empty string if it can."""
     if feedback.position_m is None:
-        return "the vehicle does not report its position"
+        return f"{NO_POSITION}: {POSITION_SOURCES}"
     return "the vehicle does not report its yaw" if feedback.yaw_rad is None else ""
 
 

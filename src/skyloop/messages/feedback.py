@@ -19,6 +19,13 @@ Vector = tuple[Finite, Finite, Finite]
 MAX_LINK_TEXT = 300  #: characters of a text about the link to the vehicle
 LinkText = Annotated[str, msgspec.Meta(max_length=MAX_LINK_TEXT)]
 
+NO_POSITION = "the vehicle does not report its position"
+#: What lets a vehicle know its position, for people who read the line above.
+POSITION_SOURCES = (
+    "let it know its position: a simulated drone reports it unless started with position=none, a MAVLink vehicle with "
+    "GPS, optical flow or motion capture (docs/motion-capture.md)"
+)
+
 #: A value of a vehicle's native telemetry, of a parameter or of an event's particulars.
 Value = bool | int | float | str | tuple[float, ...]
 

@@ -128,6 +128,7 @@ class CommandHandler:
         with self._lock:
             self.checks.limits = settings.limits
             self.checks.safety = settings.safety
+            self.checks.space = settings.space
             self.checks.max_age_ns = settings.max_age_ns
             self.authority.timeout_ns = settings.authority_timeout_ns
             self.authority.ask_ns = settings.authority_ask_ns

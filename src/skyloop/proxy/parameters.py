@@ -21,7 +21,8 @@ from skyloop.messages.codec import MAX_BODY
 from skyloop.proxy.core.autopilot import AutopilotSettings
 from skyloop.proxy.core.failsafe import FailsafeSettings
 from skyloop.proxy.core.limits import Limits
-from skyloop.proxy.core.safety import BOX, FAR_M, ZONES, Safety, check_written, safety_of
+from skyloop.proxy.core.safety import Safety, check_written, safety_of
+from skyloop.zones import BOX, FAR_M, ROOM, ZONES, Space, space_of
 
 MAX_TEXT: Final = 1024  #: characters of a text value
 MAX_PARAMETER: Final = 8192  #: bytes of one encoded parameter: a driver's larger one is left out
@@ -76,6 +77,14 @@ OWN: Final[tuple[Parameter, ...]] = (
     ),
     _own("safety.deceleration", 1.0, "m/s²", 0.1, 10.0, "Deceleration with which the vehicle reliably stops at a wall"),
     _own("safety.reaction_s", 0.3, "s", 0.0, 3.0, "Delay before the vehicle begins to stop"),
+    Parameter(
+        ROOM,
+        ParameterType.TEXT,
+        "",
+        default="",
+        read_only=True,
+        description="Walls of the room as a box, where the vehicle knows them: a simulated one does",
+    ),
     Parameter(ZONES, ParameterType.TEXT, "", default="", description="No-fly zones: boxes and cylinders"),
 )
 
@@ -149,6 +158,7 @@ class FlightSettings:
 
     limits: Limits
     safety: Safety | None  #: the safety box and zones; None: there are none
+    space: Space  #: where it may fly
     failsafe: FailsafeSettings
     autopilot: AutopilotSettings
     max_age_ns: int  #: of a command
@@ -197,10 +207,9 @@ class Parameters:
         return own
 
     def text(self, name: str) -> str:
-        """The value in force of one of the proxy's own parameters that is a text."""
-        value = self._own[name].value
-        assert isinstance(value, str)
-        return value
+        """The value in force of one of the proxy's own parameters that is a text, the driver's where it has it too."""
+        value = self.get(name).value
+        return value if isinstance(value, str) else ""
 
     def flight_settings(self) -> FlightSettings:
         """Return what the values in force ask of the flight."""
@@ -227,9 +236,11 @@ class Parameters:
             velocity_i=number("autopilot.velocity_i"),
             tilt=limits.tilt,
         )
+        space = space_of(number, self.text)
         return FlightSettings(
             limits,
-            safety_of(number, self.text(ZONES)),
+            safety_of(number, space),
+            space,
             failsafe,
             autopilot,
             max_age_ns=nanoseconds(number("command.max_age_s")),

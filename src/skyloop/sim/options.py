@@ -47,7 +47,7 @@ class SimOptions:
     renderer: str = "planar"
     quality: str = "smooth"
     native: frozenset[str] = EVERY_ACTION
-    position: bool = False
+    position: bool = True
     truth: bool = True
     rate_hz: float = 40.0
     parameters: VehicleParameters = STANDARD_VEHICLE

@@ -65,7 +65,7 @@ class Radio:
 
 
 @contextmanager
-def rehearse(uri: str = "sim://?position=1&cameras=none", *, radio: Radio | None = None) -> Iterator[Drone]:
+def rehearse(uri: str = "sim://?cameras=none", *, radio: Radio | None = None) -> Iterator[Drone]:
     """Connect as a pilot to a drone of a simulated world.
 
     Only the thread of the ``with`` block may wait. Frames are rendered at their exposure, without real time.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
@@ -30,7 +31,7 @@ from skyloop.sim.camera import CameraModel
 from skyloop.sim.host import Report, SimHost
 from skyloop.sim.parameters import LIMIT_RANGES, Limits
 from skyloop.sim.reports import Occurrence, OccurrenceKind
-from skyloop.sim.world import Wind
+from skyloop.sim.world import Wind, World
 
 if TYPE_CHECKING:
     from skyloop.sim.camera_pipeline import Camera
@@ -69,7 +70,7 @@ class SimDriver(Driver):
         self._link = True
         self._setpoints: SetpointController | None = None
         self._cameras: tuple[Camera, ...] = ()
-        self._world_wind: Wind | None = None
+        self._world: World | None = None
 
     def capabilities(self) -> Capabilities:
         """Return the actions and cameras that the address asks for."""
@@ -126,8 +127,10 @@ class SimDriver(Driver):
     # Parameters ------------------------------------------------------------------------------------------------
 
     def parameters(self) -> list[Parameter]:
-        """Return limits, cameras, battery, wind and the radio link, with their values in force."""
-        return table.describe(self._present(), self._standard())
+        """Return limits, cameras, battery, wind, the radio link and the room, with their values in force."""
+        world = self._known_world()
+        room = [] if world is None else [table.room(world.room)]
+        return [*table.describe(self._present(), self._standard()), *room]
 
     def set_parameter(self, name: str, value: Value) -> Value:
         """Write a parameter. The wind is the whole world's.
@@ -150,13 +153,15 @@ class SimDriver(Driver):
         return table.ParameterValues(Limits(), self.options.cameras, self._usual_wind(), self.options.battery)
 
     def _usual_wind(self) -> Wind:
-        if self._world_wind is None:
-            try:
-                world = self.host.simulation.world if self.host is not None else self.options.load_world()
-            except SkyloopError:
-                return Wind()  # open() raises what is wrong with the world
-            self._world_wind = self.options.blowing(world.wind)
-        return self._world_wind
+        world = self._known_world()
+        return Wind() if world is None else self.options.blowing(world.wind)
+
+    def _known_world(self) -> World | None:
+        """Return the world; None if it can't be loaded, which :meth:`open` says why."""
+        if self._world is None:
+            with suppress(SkyloopError):
+                self._world = self.host.simulation.world if self.host is not None else self.options.load_world()
+        return self._world
 
     def _write(self, before: table.ParameterValues, after: table.ParameterValues) -> None:
         host = self.host if self._sink is not None else None

@@ -6,8 +6,9 @@ Options: ``world`` its name or file (``room``); ``seed`` (0); ``speed`` seconds 
 charge at the start, 0 to 1 (1); ``renderer`` what draws the pictures, ``planar`` or ``mujoco`` (``planar``);
 ``quality`` of the planar ones, ``fast``, ``smooth`` or ``best`` (``smooth``); ``native`` the actions that the vehicle
 itself takes, the others being left to the proxy (all); ``position`` whether the vehicle knows its position, as with an
-indoor positioning system (0); ``truth`` whether feedback carries the true state too (1); ``rate`` of feedback
-[1/s] (40); ``vehicle`` whose response it has, ``quadrotor`` or ``ardrone``, as identified (``quadrotor``).
+indoor positioning system (1; ``none`` for one without); ``truth`` whether feedback carries the true state too (1);
+``rate`` of feedback [1/s] (40); ``vehicle`` whose response it has, ``quadrotor`` or ``ardrone``, as identified
+(``quadrotor``).
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ def options_of(uri: VehicleUri) -> SimOptions:
         renderer=renderer,
         quality=quality,
         native=_native(options.get("native")),
-        position=uri.flag("position"),
+        position=options.get("position") != "none" and uri.flag("position", default=True),
         truth=uri.flag("truth", default=True),
         rate_hz=uri.number("rate", 40.0, minimum=1.0, maximum=200.0),
         parameters=VEHICLES[vehicle],

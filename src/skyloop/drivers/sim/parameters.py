@@ -10,7 +10,8 @@ from skyloop.errors import ParameterError, UnknownNameError
 from skyloop.messages import Parameter, ParameterType, Refusal, Value
 from skyloop.sim.camera import CameraModel
 from skyloop.sim.parameters import LIMIT_RANGES, Limits
-from skyloop.sim.world import Wind
+from skyloop.sim.world import Room, Wind
+from skyloop.zones import ROOM, Box
 
 #: Parameter, field of :class:`Limits`, unit, description.
 _LIMITS: Final = (
@@ -50,6 +51,14 @@ class _Settable:
 def describe(state: ParameterValues, standard: ParameterValues) -> list[Parameter]:
     """Return all parameters with their present values; ``standard`` holds the defaults."""
     return [entry.parameter for entry in _table(state, standard).values()]
+
+
+def room(room: Room) -> Parameter:
+    """Return the parameter that names the room's walls, by which the proxy refuses places beyond them."""
+    x, y, z = room.size_m
+    walls = str(Box((-x / 2, -y / 2, 0.0), (x / 2, y / 2, z)))
+    text = "walls of the simulated room, as a box"
+    return Parameter(ROOM, ParameterType.TEXT, walls, "m", default=walls, read_only=True, description=text)
 
 
 def with_value(state: ParameterValues, standard: ParameterValues, name: str, value: Value) -> ParameterValues:

@@ -35,6 +35,7 @@ from skyloop.proxy.core.limits import Ceiling, Clamp, Limits
 from skyloop.proxy.core.ownership import Ownership, Whose
 from skyloop.proxy.core.places import decide_place
 from skyloop.proxy.core.safety import Safety
+from skyloop.zones import Space
 
 MAX_AHEAD_S: Final = 0.05  #: how far in the future a command's time may lie: the error of the clocks' offset
 _MAX_AHEAD_NS: Final = nanoseconds(MAX_AHEAD_S)
@@ -150,6 +151,7 @@ class CommandChecks:
     ) -> None:
         self.limits = Limits()
         self.safety: Safety | None = None  #: the safety box and zones; None: there are none
+        self.space = Space()  #: the same and the room, for what is flown by position
         self.max_age_ns = 0
         self._authority = authority
         self._ladder = ladder
@@ -213,7 +215,7 @@ class CommandChecks:
         if policy is StatePolicy.HOVER or kind is Hover:
             action, clamps = self._hover_below_ceiling(state, feedback)
         elif type(action) is Position:
-            place = decide_place(action, self.limits, self.safety, feedback, now_ns, new=new)
+            place = decide_place(action, self.limits, self.space, feedback, now_ns, new=new)
             if place.action is None:  # what was flown before is not wanted any more either
                 instead = _HOVER_ACTION if Hover in self._supported else None
                 return Decision(instead, place.refusal, place.why, new)  # without a refusal: until it is known again

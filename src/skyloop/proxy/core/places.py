@@ -7,8 +7,10 @@ from typing import Final, NamedTuple
 
 from skyloop.clock import NS_PER_S, seconds
 from skyloop.messages import Feedback, Position, Refusal
+from skyloop.messages.feedback import NO_POSITION, POSITION_SOURCES
 from skyloop.proxy.core.limits import SLACK_M, Clamp, Limits
-from skyloop.proxy.core.safety import STALE_NS, Safety, Vec3
+from skyloop.proxy.core.safety import STALE_NS
+from skyloop.zones import Space, Vec3
 
 LOST_NS: Final = 2 * NS_PER_S  #: a position that is older is not waited for
 _NO_WAY_M: Final = 0.05  #: so near the place there is no direction that the limits could be applied to
@@ -24,14 +26,14 @@ class PlaceDecision(NamedTuple):
 
 
 def decide_place(
-    action: Position, limits: Limits, safety: Safety | None, feedback: Feedback | None, now_ns: int, *, new: bool
+    action: Position, limits: Limits, space: Space, feedback: Feedback | None, now_ns: int, *, new: bool
 ) -> PlaceDecision:
     """Decide what becomes of a command to fly to a place.
 
     Args:
         action: what is asked for; finite.
         limits: those in force.
-        safety: the safety box and zones; None: there are none.
+        space: where it may fly.
         feedback: the newest sample; None: none came yet.
         now_ns: the time now, on the clock of ``feedback.captured_ns`` [ns].
         new: whether an application newly asked for it: a repeat is not refused for what is in the way, as the vehicle
@@ -56,10 +58,12 @@ def decide_place(
             clamps.append(Clamp("limits.altitude", z, z - above))
             z -= above
     place = (x, y, z)
-    if safety is not None:
-        problem = safety.problem_at(place) or (safety.problem_between(at, place) if new else "")
-        if problem:
-            return PlaceDecision(None, (), Refusal.OUT_OF_RANGE, problem)
+    problem = space.problem_at(place) or (space.problem_between(at, place) if new else "")
+    if problem:
+        return PlaceDecision(None, (), Refusal.OUT_OF_RANGE, problem)
+    if new and feedback.altitude_m is not None and (below := at[2] - feedback.altitude_m - z) > SLACK_M:
+        why = f"z is {z:g} m, which is {below:.2f} m below the ground under the vehicle"
+        return PlaceDecision(None, (), Refusal.OUT_OF_RANGE, f"{why}: choose a place above it")
     speed, limit = _fastest(at, place, limits)
     if new and action.speed is not None and action.speed > speed:  # reported once: the direction turns near the place
         clamps.append(Clamp(limit, action.speed, speed))
@@ -75,12 +79,9 @@ def decide_place(
 def _why_unknown(feedback: Feedback | None, now_ns: int) -> str:
     """Why the vehicle can't be flown to a place now, and what helps; empty if it can."""
     if feedback is None or feedback.position_m is None:
-        return (
-            "the vehicle does not tell its position: fly it by velocity, or let it know its place (GPS, optical flow, "
-            "or motion capture by tell_pose, where the vehicle takes that)"
-        )
+        return f"{NO_POSITION}: fly it by velocity, or {POSITION_SOURCES}"
     if feedback.yaw_rad is None:
-        return "the vehicle does not tell its yaw: fly it by velocity"
+        return "the vehicle does not report its yaw: fly it by velocity"
     age_ns = now_ns - feedback.captured_ns
     if age_ns > LOST_NS:
         return (

@@ -1,0 +1,236 @@
+"""Where a vehicle may fly: a room's walls, the safety box, and the no-fly zones; all upright, in world axes. Pure.
+
+World axes are x east, y north, z up [m]. What a vehicle does near such a wall is decided in the proxy.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+from skyloop.errors import ParameterError
+from skyloop.messages import Refusal
+
+FAR_M: Final = 10_000.0  #: a wall of the safety box that far away is none
+MAX_ZONES: Final = 32
+BOX: Final = "safety.box"  #: the parameters of the box begin so
+ZONES: Final = "safety.zones"
+ROOM: Final = "safety.room"
+
+_SHAPES: Final = {"box": 6, "cylinder": 5}
+
+Vec3 = tuple[float, float, float]
+
+
+class Wall(NamedTuple):
+    """A plane: the unit vector towards it, world axes, and how far it is [m]; below 0 the vehicle is beyond it."""
+
+    normal: Vec3
+    distance: float
+    name: str  #: of the parameter
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """An upright box along the world's axes."""
+
+    low: Vec3
+    high: Vec3
+
+    def walls_inside(self, place: Vec3) -> Iterator[Wall]:
+        """Those of a box that is to be kept in."""
+        for axis in range(3):
+            for sign, distance in ((-1.0, place[axis] - self.low[axis]), (1.0, self.high[axis] - place[axis])):
+                normal = [0.0, 0.0, 0.0]
+                normal[axis] = sign
+                yield Wall((normal[0], normal[1], normal[2]), distance, BOX)
+
+    def wall_outside(self, place: Vec3) -> Wall:
+        """The one of a box that is to be kept out of."""
+        nearest = tuple(max(low, min(high, at)) for low, high, at in zip(self.low, self.high, place, strict=True))
+        way = (nearest[0] - place[0], nearest[1] - place[1], nearest[2] - place[2])
+        distance = math.hypot(*way)
+        if distance > 0.0:
+            return Wall((way[0] / distance, way[1] / distance, way[2] / distance), distance, ZONES)
+        return max(
+            (Wall((-n[0], -n[1], -n[2]), -d, ZONES) for n, d, _ in self.walls_inside(place)),
+            key=lambda wall: wall.distance,
+        )
+
+    def holds(self, place: Vec3) -> bool:
+        """Whether a place is within it, or on its surface."""
+        return all(low <= at <= high for low, high, at in zip(self.low, self.high, place, strict=True))
+
+    def is_in_the_way(self, start: Vec3, end: Vec3) -> bool:
+        """Whether the straight way between two places leads through it."""
+        first, last = 0.0, 1.0
+        for low, high, at, to in zip(self.low, self.high, start, end, strict=True):
+            first, last = _within(low, high, at, to, first, last)
+        return first <= last
+
+    def __str__(self) -> str:
+        return f"box {_numbers(*self.low, *self.high)}"
+
+
+@dataclass(frozen=True, slots=True)
+class Cylinder:
+    """An upright cylinder."""
+
+    x: float
+    y: float
+    radius: float
+    low: float
+    high: float
+
+    def wall_outside(self, place: Vec3) -> Wall:
+        """The one of a cylinder that is to be kept out of."""
+        east, north = self.x - place[0], self.y - place[1]
+        off = math.hypot(east, north)
+        aside = (east / off, north / off) if off > 0.0 else (1.0, 0.0)
+        across, along = off - self.radius, max(self.low - place[2], place[2] - self.high)
+        up = 1.0 if place[2] < (self.low + self.high) / 2 else -1.0
+        if across > 0.0 and along > 0.0:
+            distance = math.hypot(across, along)
+            share = across / distance
+            return Wall((aside[0] * share, aside[1] * share, up * along / distance), distance, ZONES)
+        if across >= along:
+            return Wall((aside[0], aside[1], 0.0), across, ZONES)
+        return Wall((0.0, 0.0, up), along, ZONES)
+
+    def holds(self, place: Vec3) -> bool:
+        """Whether a place is within it, or on its surface."""
+        return math.hypot(place[0] - self.x, place[1] - self.y) <= self.radius and self.low <= place[2] <= self.high
+
+    def is_in_the_way(self, start: Vec3, end: Vec3) -> bool:
+        """Whether the straight way between two places leads through it."""
+        first, last = _within(self.low, self.high, start[2], end[2], 0.0, 1.0)
+        if first > last:
+            return False
+        x, y, across, along = start[0] - self.x, start[1] - self.y, end[0] - start[0], end[1] - start[1]
+        length = across * across + along * along
+        nearest = 0.0 if length == 0.0 else -(x * across + y * along) / length  # of the whole line, as a share of it
+        share = max(first, min(last, nearest))
+        return math.hypot(x + share * across, y + share * along) <= self.radius
+
+    def __str__(self) -> str:
+        return f"cylinder {_numbers(self.x, self.y, self.radius, self.low, self.high)}"
+
+
+Zone = Box | Cylinder
+
+
+@dataclass(frozen=True, slots=True)
+class Space:
+    """Where a vehicle may fly.
+
+    Attributes:
+        room: The walls that it can't pass, where they are known; None: they are not.
+        box: The safety box; None: there is none.
+        zones: The no-fly zones.
+    """
+
+    room: Box | None = None
+    box: Box | None = None
+    zones: tuple[Zone, ...] = ()
+
+    def problem_at(self, place: Vec3) -> str:
+        """Return why a place can't be flown to, and what can, in words for a person; empty if it can."""
+        if self.room is not None and not self.room.holds(place):
+            return f"the place is outside of the room, {self.room} [m] ({ROOM})"
+        if self.box is not None and not self.box.holds(place):
+            return f"the place is outside of the safety box, {self.box} [m] ({BOX})"
+        for zone in self.zones:
+            if zone.holds(place):
+                return f"the place is in a no-fly zone, {zone} [m] ({ZONES}): choose a place outside of it"
+        return ""
+
+    def problem_between(self, start: Vec3, end: Vec3) -> str:
+        """Return what is in the straight way between two places, in words for a person; empty if nothing is.
+
+        A zone that the way begins in may be left.
+        """
+        for zone in self.zones:
+            if not zone.holds(start) and zone.is_in_the_way(start, end):
+                return f"a no-fly zone is in the straight way there, {zone} [m] ({ZONES}): fly round it, place by place"
+        return ""
+
+
+def space_of(number: Callable[[str], float], text: Callable[[str], str]) -> Space:
+    """Return where parameters allow a vehicle to fly.
+
+    Args:
+        number: Returns the value of a parameter that is a number, by its name.
+        text: Returns the value of one that is a text.
+
+    Raises:
+        ParameterError: The zones can't be read.
+    """
+    low = (number(f"{BOX}.x_low"), number(f"{BOX}.y_low"), number(f"{BOX}.z_low"))
+    high = (number(f"{BOX}.x_high"), number(f"{BOX}.y_high"), number(f"{BOX}.z_high"))
+    is_box = max(low) > -FAR_M or min(high) < FAR_M
+    return Space(_room(text(ROOM)), Box(low, high) if is_box else None, parse_zones(text(ZONES)))
+
+
+def _room(text: str) -> Box | None:
+    try:
+        zones = parse_zones(text)
+    except ParameterError:
+        return None  # a driver with another notion of this name
+    return zones[0] if len(zones) == 1 and isinstance(zones[0], Box) else None
+
+
+def parse_zones(text: str) -> tuple[Zone, ...]:
+    """Read zones as they are written, with semicolons between them.
+
+    Args:
+        text: ``box x y z x y z`` (two corners) or ``cylinder x y radius z_low z_high``, world axes [m].
+
+    Raises:
+        ParameterError: it can't be read, or there are too many.
+    """
+    zones = [_parse_zone(part) for part in text.split(";") if part.strip()]
+    if len(zones) > MAX_ZONES:
+        raise _wrong(f"{len(zones)} zones are given, at most {MAX_ZONES} are possible")
+    return tuple(zones)
+
+
+def _parse_zone(text: str) -> Zone:
+    shape, *words = re.split(r"[\s,]+", text.strip())
+    if shape not in _SHAPES:
+        raise _wrong(f"a zone is a box or a cylinder, not {shape!r:.40}")
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        raise _wrong(f"what follows {shape} must be numbers, not {' '.join(words)!r:.60}") from None
+    if len(numbers) != _SHAPES[shape] or not all(math.isfinite(number) for number in numbers):
+        raise _wrong(f"a {shape} has {_SHAPES[shape]} finite numbers, not {len(numbers)} as in {text.strip()!r:.60}")
+    if shape == "box":
+        pairs = list(zip(numbers[:3], numbers[3:], strict=True))
+        low, high = [min(pair) for pair in pairs], [max(pair) for pair in pairs]
+        if any(a == b for a, b in pairs):
+            raise _wrong(f"a box must have an extent along each axis: {text.strip()!r:.60}")
+        return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+    x, y, radius, bottom, top = numbers
+    if radius <= 0.0 or bottom >= top:
+        raise _wrong(f"a cylinder has a radius above 0 and its low end below its high one: {text.strip()!r:.60}")
+    return Cylinder(x, y, radius, bottom, top)
+
+
+def _wrong(why: str) -> ParameterError:
+    form = "box x y z x y z; cylinder x y radius z_low z_high"
+    return ParameterError(f"{ZONES}: {why}; it looks like {form!r} [m]", code=Refusal.OUT_OF_RANGE)
+
+
+def _within(low: float, high: float, at: float, to: float, first: float, last: float) -> tuple[float, float]:
+    """The part of a way from ``at`` to ``to``, of that between the shares ``first`` and ``last``, between two walls."""
+    if at == to:
+        return (first, last) if low <= at <= high else (1.0, 0.0)
+    one, other = (low - at) / (to - at), (high - at) / (to - at)
+    return max(first, min(one, other)), min(last, max(one, other))
+
+
+def _numbers(*numbers: float) -> str:
+    return " ".join(f"{number:g}" for number in numbers)
