@@ -7,7 +7,7 @@ ARGS   ?=
 LOCKED ?=
 PIP    := $(BIN)/python -m pip install --quiet --disable-pip-version-check $(if $(LOCKED),--constraint requirements-dev.lock)
 
-.PHONY: help demo test test-all explore check chaos fuzz format coverage page pictures lock clean
+.PHONY: help demo test test-all explore check chaos docs fuzz format coverage page pictures lock clean
 help:
 	@echo "make demo [ARGS='--seconds 30 --headless']   a simulated drone that flies by its camera"
 	@echo "make test [ARGS='-k authority']              the tests of every day, 5 minutes; with ARGS, those that they select of all"
@@ -16,6 +16,7 @@ help:
 	@echo "make check                                   lint, format, types, import contracts"
 	@echo "make chaos [ARGS='--seconds 180']            drones flown while processes die, stall, starve and are flooded"
 	@echo "make fuzz [ARGS='--seconds 60 recording']    decoders, file readers and servers against hostile input"
+	@echo "make docs                                    the documentation as a site: build/site/index.html"
 	@echo "make page                                    the cockpit's page anew from its sources, where node and npm are"
 	@echo "make format | coverage | pictures | lock | clean"
 
@@ -73,8 +74,17 @@ coverage: $(VENV)/.installed-dev
 lock: $(VENV)/.installed-dev
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
 	(sed '/^\#/!d' requirements-dev.lock; $(BIN)/uv pip compile --quiet --universal --upgrade --python-version 3.11 --extra all \
-	  --no-annotate --no-header --no-emit-index-url --no-emit-find-links pyproject.toml requirements-dev.txt) >.lock.new
+	  --no-annotate --no-header --no-emit-index-url --no-emit-find-links pyproject.toml requirements-dev.txt requirements-docs.txt) >.lock.new
 	mv .lock.new requirements-dev.lock
+
+$(VENV)/.installed-docs: $(VENV)/.installed-dev requirements-docs.txt
+	$(PIP) --requirement requirements-docs.txt
+	@touch $@
+
+# A warning is an error, such as a link that leads nowhere.
+docs: $(VENV)/.installed-docs
+	$(BIN)/python -m sphinx --quiet --jobs auto --fail-on-warning --keep-going --doctree-dir build/site-cache docs build/site
+	@echo "build/site/index.html"
 
 page:
 	cd cockpit-page && npm ci --no-audit --no-fund && npm run check && npm test && npm run build

@@ -7,7 +7,7 @@
         async for frame in drone.frames():
             drone.velocity(forward=0.3)
 
-They wrap :class:`skyloop.client.Drone` and :class:`skyloop.client.Swarm`, which work on threads of their own and are
+They wrap :class:`skyloop.Drone` and :class:`skyloop.Swarm`, which work on threads of their own and are
 available as :attr:`Drone.sync` and :attr:`Swarm.sync`. Cancelling a call ends the waiting; what it was waiting for is
 not undone.
 """

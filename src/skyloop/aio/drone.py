@@ -41,7 +41,7 @@ class connect(Opening["Drone"]):  # noqa: N801  (used like the function skyloop.
     """Connect to a drone: ``async with connect(target, …) as drone``, or ``drone = await connect(…)``.
 
     Raises what :func:`skyloop.connect` raises, and :class:`UsageError` for a stepped replay (``speed=max``), whose time
-    advances only while its application waits in calls of :class:`skyloop.client.Drone`.
+    advances only while its application waits in calls of :class:`skyloop.Drone`.
     """
 
     def __init__(self, target: str, **options: Unpack[ConnectOptions]) -> None:
@@ -86,7 +86,7 @@ class Config:
 class Drone:
     """A connected vehicle, made by :class:`connect`.
 
-    Methods have the names, arguments, results and errors of :class:`skyloop.client.Drone`; those that wait are
+    Methods have the names, arguments, results and errors of :class:`skyloop.Drone`; those that wait are
     coroutines. Callbacks, plain or coroutine functions, run on the event loop that was running when they were added.
     """
 
@@ -151,12 +151,12 @@ class Drone:
 
     @property
     def clock_offset_ns(self) -> int:
-        """The proxy's clock less this process's [ns]; see :attr:`skyloop.client.Drone.clock_offset_ns`."""
+        """The proxy's clock less this process's [ns]; see :attr:`skyloop.Drone.clock_offset_ns`."""
         return self.sync.clock_offset_ns
 
     @property
     def clock_uncertainty_ns(self) -> int:
-        """Largest error of ``clock_offset_ns`` [ns]; see :attr:`skyloop.client.Drone.clock_uncertainty_ns`."""
+        """Largest error of ``clock_offset_ns`` [ns]; see :attr:`skyloop.Drone.clock_uncertainty_ns`."""
         return self.sync.clock_uncertainty_ns
 
     def age_s(self, sample: Feedback | client.Frame) -> float:
@@ -164,7 +164,7 @@ class Drone:
         return self.sync.age_s(sample)
 
     async def stats(self) -> client.Stats:
-        """Return statistics by channel; see :attr:`skyloop.client.Drone.stats`."""
+        """Return statistics by channel; see :attr:`skyloop.Drone.stats`."""
         return await in_thread(lambda: self.sync.stats)
 
     def recent_events(self) -> list[Event]:
@@ -174,11 +174,11 @@ class Drone:
     # Commands --------------------------------------------------------------------------------------------------
 
     async def takeoff(self, *, wait: bool = True, timeout_s: float = 15.0) -> None:
-        """Take off, then hover; see :meth:`skyloop.client.Drone.takeoff`."""
+        """Take off, then hover; see :meth:`skyloop.Drone.takeoff`."""
         await in_thread(lambda: self.sync.takeoff(wait=wait, timeout_s=timeout_s))
 
     async def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> None:
-        """Land at the present position; see :meth:`skyloop.client.Drone.land`."""
+        """Land at the present position; see :meth:`skyloop.Drone.land`."""
         await in_thread(lambda: self.sync.land(wait=wait, timeout_s=timeout_s))
 
     def hover(self) -> bool:
@@ -216,7 +216,7 @@ class Drone:
         tolerance_m: float = 0.2,
         tolerance_rad: float = 0.15,
     ) -> None:
-        """Fly straight to a place, and stay there; see :meth:`skyloop.client.Drone.go_to`."""
+        """Fly straight to a place, and stay there; see :meth:`skyloop.Drone.go_to`."""
         await in_thread(
             lambda: self.sync.go_to(
                 x=x,
@@ -266,13 +266,13 @@ class Drone:
         position_std_m: float | None = None,
         attitude_std_rad: float | None = None,
     ) -> bool:
-        """Send the vehicle its own pose, measured from outside; see :meth:`skyloop.client.Drone.send_external_pose`."""
+        """Send the vehicle its own pose, measured from outside; see :meth:`skyloop.Drone.send_external_pose`."""
         return self.sync.send_external_pose(
             position, quaternion, at_ns=at_ns, position_std_m=position_std_m, attitude_std_rad=attitude_std_rad
         )
 
     def emit(self, kind: EventKind, text: str, severity: Severity = Severity.INFO, **data: str) -> None:
-        """Emit an event of this application's own; see :meth:`skyloop.client.Drone.emit`."""
+        """Emit an event of this application's own; see :meth:`skyloop.Drone.emit`."""
         self.sync.emit(kind, text, severity, **data)
 
     async def request_authority(
@@ -284,7 +284,7 @@ class Drone:
         takeover: TakeoverWay = "now",
         stay: bool = False,
     ) -> client.AuthorityStatus:
-        """Ask for the authority and wait for it; see :meth:`skyloop.client.Drone.request_authority`."""
+        """Ask for the authority and wait for it; see :meth:`skyloop.Drone.request_authority`."""
         return await in_thread(
             lambda: self.sync.request_authority(priority, wait_s=wait_s, for_s=for_s, takeover=takeover, stay=stay)
         )
@@ -294,7 +294,7 @@ class Drone:
     ) -> Listener:
         """Call ``function`` when another application asks for the authority that this one holds.
 
-        See :meth:`skyloop.client.Drone.on_takeover`; here it runs on the event loop and may be a coroutine function.
+        See :meth:`skyloop.Drone.on_takeover`; here it runs on the event loop and may be a coroutine function.
         """
         return Listener(self.sync.on_takeover(on_loop(function)))
 
@@ -305,7 +305,7 @@ class Drone:
     # Reading ---------------------------------------------------------------------------------------------------
 
     def feedback(self, *, max_age_s: float | None = None) -> Feedback:
-        """Return the newest feedback; see :meth:`skyloop.client.Drone.feedback`."""
+        """Return the newest feedback; see :meth:`skyloop.Drone.feedback`."""
         return self.sync.feedback(max_age_s=max_age_s)
 
     async def next_feedback(self, timeout_s: float = 1.0) -> Feedback:
@@ -313,7 +313,7 @@ class Drone:
         return await in_thread(lambda: self.sync.next_feedback(timeout_s))
 
     def frame(self, camera: str | None = None, *, max_age_s: float | None = None) -> client.Frame | None:
-        """Return the newest frame without waiting; see :meth:`skyloop.client.Drone.frame`.
+        """Return the newest frame without waiting; see :meth:`skyloop.Drone.frame`.
 
         A JPEG is decoded on the event loop; :meth:`next_frame` and :meth:`frames` decode on another thread.
         """
@@ -324,7 +324,7 @@ class Drone:
         return await in_thread(lambda: self.sync.next_frame(camera, timeout_s=timeout_s))
 
     async def wait(self, state: Wanted, timeout_s: float = 10.0) -> Feedback:
-        """Wait until the newest feedback is as wanted; see :meth:`skyloop.client.Drone.wait`.
+        """Wait until the newest feedback is as wanted; see :meth:`skyloop.Drone.wait`.
 
         A predicate is called on another thread.
         """
@@ -338,7 +338,7 @@ class Drone:
         Args:
             camera: Name of the camera; None: the vehicle's first.
             timeout_s: How long to wait for each frame [s].
-            **how: As for :meth:`skyloop.client.Drone.frames`.
+            **how: As for :meth:`skyloop.Drone.frames`.
 
         Raises:
             NoAnswerError: If no frame comes within ``timeout_s``.
@@ -365,7 +365,7 @@ class Drone:
                     yield frame
 
     def result(self, processor: str, *, max_age_s: float | None = None) -> client.Result | None:
-        """Return a processor's newest result without waiting; see :meth:`skyloop.client.Drone.result`."""
+        """Return a processor's newest result without waiting; see :meth:`skyloop.Drone.result`."""
         return self.sync.result(processor, max_age_s=max_age_s)
 
     async def results(
@@ -426,7 +426,7 @@ class Drone:
     def on_result(
         self, function: Callback[client.Result], processor: str | None = None, *, max_age_s: float | None = None
     ) -> Listener:
-        """Call ``function`` with results, on the event loop; see :meth:`skyloop.client.Drone.on_result`."""
+        """Call ``function`` with results, on the event loop; see :meth:`skyloop.Drone.on_result`."""
         return Listener(self.sync.on_result(on_loop(function), processor, max_age_s=max_age_s))
 
     def on_frame(
@@ -443,9 +443,9 @@ class Drone:
         Args:
             function: A plain function.
             camera: Name of the camera; None: the vehicle's first.
-            depth: As for :meth:`skyloop.client.Drone.on_frame`.
-            inline: As for :meth:`skyloop.client.Drone.on_frame`.
-            **how: As for :meth:`skyloop.client.Drone.frames`.
+            depth: As for :meth:`skyloop.Drone.on_frame`.
+            inline: As for :meth:`skyloop.Drone.on_frame`.
+            **how: As for :meth:`skyloop.Drone.frames`.
 
         Raises:
             UsageError: If it is a coroutine function.
@@ -457,7 +457,7 @@ class Drone:
         return self.sync.on_frame(function, camera, depth=depth, inline=inline, **how)
 
     def annotate(self, frame: client.Frame, shapes: Iterable[Shape], source: str | None = None) -> bool:
-        """Publish shapes drawn over a frame; see :meth:`skyloop.client.Drone.annotate`."""
+        """Publish shapes drawn over a frame; see :meth:`skyloop.Drone.annotate`."""
         return self.sync.annotate(frame, shapes, source)
 
     @property

@@ -60,7 +60,7 @@ class swarm(Opening["Swarm"]):  # noqa: N801  (used like the function skyloop.sw
 class Swarm:
     """Drones by name, made by :class:`swarm`; ``drones["alpha"]`` is one :class:`Drone`, and iterating gives all.
 
-    Methods have the names, arguments, results and errors of :class:`skyloop.client.Swarm`. All commands but
+    Methods have the names, arguments, results and errors of :class:`skyloop.Swarm`. All commands but
     :meth:`emergency_stop` are coroutines, and so is :meth:`feedback`: what ``on_error`` says may be a landing. One
     task at a time awaits them; :meth:`emergency_stop` may be called at any time.
     """
@@ -126,7 +126,7 @@ class Swarm:
     # Commands --------------------------------------------------------------------------------------------------
 
     async def takeoff(self, *, wait: bool = True, timeout_s: float = 15.0) -> None:
-        """Take off with all active drones at the same time; see :meth:`skyloop.client.Swarm.takeoff`."""
+        """Take off with all active drones at the same time; see :meth:`skyloop.Swarm.takeoff`."""
         await in_thread(lambda: self.sync.takeoff(wait=wait, timeout_s=timeout_s))
 
     async def land(self, *, wait: bool = True, timeout_s: float = 20.0) -> None:
@@ -142,7 +142,7 @@ class Swarm:
         timeout_s: float = 60.0,
         tolerance_m: float = 0.2,
     ) -> None:
-        """Fly each drone straight to its own place; see :meth:`skyloop.client.Swarm.go_to`."""
+        """Fly each drone straight to its own place; see :meth:`skyloop.Swarm.go_to`."""
         await in_thread(
             lambda: self.sync.go_to(places, speed=speed, wait=wait, timeout_s=timeout_s, tolerance_m=tolerance_m)
         )
@@ -198,7 +198,7 @@ class Swarm:
         return await in_thread(lambda: self.sync.command(action))
 
     async def send(self, actions: Mapping[str, AnyAction]) -> dict[str, bool]:
-        """Make each action the newest set-point of the drone of its name; see :meth:`skyloop.client.Swarm.send`."""
+        """Make each action the newest set-point of the drone of its name; see :meth:`skyloop.Swarm.send`."""
         return await in_thread(lambda: self.sync.send(actions))
 
     async def each(self, function: Callable[[Drone], Awaitable[T]], what: str = "") -> dict[str, T]:
@@ -236,7 +236,7 @@ class Swarm:
         takeover: TakeoverWay = "now",
         stay: bool = False,
     ) -> dict[str, client.AuthorityStatus]:
-        """Ask for the authority over all active drones; see :meth:`skyloop.client.Drone.request_authority`."""
+        """Ask for the authority over all active drones; see :meth:`skyloop.Drone.request_authority`."""
         return await in_thread(
             lambda: self.sync.request_authority(priority, wait_s=wait_s, for_s=for_s, takeover=takeover, stay=stay)
         )
@@ -248,15 +248,15 @@ class Swarm:
     # Reading ---------------------------------------------------------------------------------------------------
 
     async def feedback(self, *, max_age_s: float | None = None) -> dict[str, Feedback]:
-        """Return the newest feedback of each active drone, by name; see :meth:`skyloop.client.Swarm.feedback`."""
+        """Return the newest feedback of each active drone, by name; see :meth:`skyloop.Swarm.feedback`."""
         return await in_thread(lambda: self.sync.feedback(max_age_s=max_age_s))
 
     async def wait_all(self, wanted: Wanted, timeout_s: float = 10.0) -> dict[str, Feedback]:
-        """Wait until all active drones are as wanted at the same time; see :meth:`skyloop.client.Swarm.wait_all`."""
+        """Wait until all active drones are as wanted at the same time; see :meth:`skyloop.Swarm.wait_all`."""
         return await in_thread(lambda: self.sync.wait_all(wanted, timeout_s))
 
     async def ticks(self, rate_hz: float = 20.0, seconds: float | None = None) -> AsyncIterator[Tick]:
-        """Yield at a steady rate on absolute deadlines; see :meth:`skyloop.client.Swarm.ticks`.
+        """Yield at a steady rate on absolute deadlines; see :meth:`skyloop.Swarm.ticks`.
 
         Args:
             rate_hz: Ticks a second, 0.1 to 200.

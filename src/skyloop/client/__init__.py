@@ -1,4 +1,4 @@
-"""The application's side: :func:`connect` returns a :class:`Drone`."""
+"""The application's side: :func:`skyloop.connect` returns a :class:`skyloop.Drone`."""
 
 from skyloop.client.authority import Authority, AuthorityState, AuthorityStatus, TakeoverRequest
 from skyloop.client.channels import Listener

@@ -221,7 +221,7 @@ class VideoChannel(Channel[Arrival]):
 
 
 class VideoOptions(TypedDict, total=False):
-    """How frames are requested; see :meth:`skyloop.client.Drone.frames`."""
+    """How frames are requested; see :meth:`skyloop.Drone.frames`."""
 
     encoding: VideoEncoding
     quality: int

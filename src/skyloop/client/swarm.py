@@ -244,8 +244,8 @@ class Swarm:
     ) -> None:
         """Fly each drone straight to its own place, all at the same time; see :meth:`Drone.go_to`.
 
-        Nothing keeps the drones apart on the way: :class:`skyloop.control.Formation` plans ways that do. Drones that
-        are set aside are left out.
+        Nothing keeps the drones apart on the way: :class:`skyloop.control.formation_flight.Formation` plans ways that
+        do. Drones that are set aside are left out.
 
         Args:
             places: By name of the drone: x, y, z in its world axes [m], and if wanted the yaw [rad].

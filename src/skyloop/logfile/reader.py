@@ -55,7 +55,7 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """One sample of a drone. ``value`` is of the channel's type in :data:`skyloop.logfile.layout.TYPES`."""
+    """One sample of a drone. ``value`` is of the channel's type in ``skyloop.logfile.layout.TYPES``."""
 
     channel: Channel
     camera: str  #: of frames; else empty

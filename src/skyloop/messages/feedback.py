@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+#: Three finite numbers, along x, y and z.
 Vector = tuple[Finite, Finite, Finite]
 
 MAX_LINK_TEXT = 300  #: characters of a text about the link to the vehicle

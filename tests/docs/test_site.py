@@ -1,0 +1,37 @@
+"""The documentation site shows every page and every public name; `make docs` builds it and checks its links."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+import skyloop
+from tests.docs.pages import ROOT
+
+DOCS = ROOT / "docs"
+REFERENCE = {path.stem: path.read_text() for path in (DOCS / "api").glob("*.rst")}
+_TOCTREE = re.compile(r"^:::\{toctree\}\n(.*?)^:::$", re.MULTILINE | re.DOTALL)
+
+
+def listed() -> list[str]:
+    """The pages of the site's navigation."""
+    lines = "\n".join(_TOCTREE.findall((DOCS / "index.md").read_text())).splitlines()
+    return [line.strip() for line in lines if line.strip() and not line.startswith(":")]
+
+
+def test_the_navigation_has_each_page_once() -> None:
+    pages = [path for suffix in ("md", "rst") for path in DOCS.rglob(f"*.{suffix}")]
+    names = [str(path.relative_to(DOCS).with_suffix("")) for path in pages]
+    assert sorted(listed()) == sorted(name for name in names if name != "index")
+
+
+@pytest.mark.parametrize("name", [name for name in vars(skyloop)["__all__"] if name != "__version__"])
+def test_the_reference_has_each_name_that_skyloop_offers(name: str) -> None:
+    assert re.search(rf"\b{name}\b", REFERENCE["skyloop"])
+
+
+def test_what_other_packages_leave_out_is_shown_with_skyloop() -> None:
+    left_out = ",".join(re.findall(r":exclude-members: (.+)", "\n".join(REFERENCE.values())))
+    for name in filter(None, (name.strip() for name in left_out.split(","))):
+        assert re.search(rf"^\.\. auto(class|function):: {name}$", REFERENCE["skyloop"], re.MULTILINE), name
