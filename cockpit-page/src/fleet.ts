@@ -1,12 +1,10 @@
 // All drones that were found, each in a card: a click opens one alone, its second button opens it beside the others.
 
 import { Battery } from "./battery.js";
-import { count, figure, words } from "./format.js";
-import { h, setAttribute, setHidden, setText, setTone, type Tone } from "./dom.js";
+import { count } from "./format.js";
+import { h, setAttribute, setHidden, setText, setTone } from "./dom.js";
 import type { DroneRow } from "./model.js";
-import { isRecording } from "./safety.js";
-
-const LINKS: Readonly<Record<string, Tone>> = { up: "ok", degraded: "warn", connecting: "busy", lost: "bad", closed: "bad" };
+import { byName, describe } from "./row.js";
 
 class Card {
   readonly element: HTMLElement;
@@ -27,22 +25,17 @@ class Card {
   }
 
   update(row: DroneRow, open: boolean): void {
-    const recorded = isRecording(row);
-    const lost = row.links.application === "lost";
-    const over = recorded && (lost || row.links.vehicle === "closed"); // as every recording is some time
-    setTone(this.element, over ? "quiet" : lost ? "bad" : row.alarms.some((alarm) => alarm.severity === "critical") ? "bad" : row.alarms.length ? "warn" : row.airborne ? "ok" : "quiet");
-    setText(this.state, over ? "recording over" : lost ? "lost" : row.airborne && row.altitude !== null ? `${words(row.state)} · ${figure(row.altitude, 1)} m` : words(row.state));
-    this.battery.show(lost ? null : row.battery, row.alarms);
-    setText(this.owner, recorded ? "recording, nothing flies" : row.owner === null ? "nobody has control" : `${row.owner} has control`);
-    const [application, vehicle] = [row.links.application, row.links.vehicle];
-    setTone(this.hops[0] as Element, over ? "quiet" : (LINKS[application] ?? "quiet"));
-    setTone(this.hops[1] as Element, over ? "quiet" : (LINKS[vehicle] ?? "quiet"));
-    const links = `link to the proxy ${application}, to the vehicle ${vehicle}`;
+    const { tone, state, holder, alarm, battery, hops, links } = describe(row);
+    setTone(this.element, tone);
+    setText(this.state, state);
+    this.battery.show(battery, row.alarms);
+    setText(this.owner, holder);
+    this.hops.forEach((hop, place) => setTone(hop, hops[place] ?? "quiet"));
     setAttribute(this.linked, "title", links);
     setHidden(this.recording, !row.recording);
-    setText(this.alarms, over ? "" : row.alarms.map((alarm) => alarm.text).join(" · "));
-    setHidden(this.alarms, over || row.alarms.length === 0);
-    setAttribute(this.main, "aria-label", `Open ${row.name}: ${this.state.textContent}, ${this.owner.textContent}, ${links}`);
+    setText(this.alarms, alarm);
+    setHidden(this.alarms, alarm === "");
+    setAttribute(this.main, "aria-label", `Open ${row.name}: ${state}, ${holder}, ${links}`);
     setAttribute(this.element, "data-open", String(open));
     setAttribute(this.beside, "aria-pressed", String(open));
     setAttribute(this.beside, "aria-label", open ? `Close ${row.name}` : `Show ${row.name} beside the others`);
@@ -68,7 +61,7 @@ export class FleetList {
       card.element.remove();
       this.cards.delete(name);
     }
-    rows.forEach((row, place) => {
+    [...rows].sort(byName).forEach((row, place) => {
       let card = this.cards.get(row.name);
       if (!card) {
         card = new Card(row.name, this.open);

@@ -4,6 +4,8 @@ import "uplot/dist/uPlot.min.css";
 import "./style/base.css";
 import "./style/layout.css";
 import "./style/parts.css";
+import "./style/overview.css";
+import { hashOf, namesOf, OVERVIEW } from "./address.js";
 import { post } from "./api.js";
 import { ServerClock } from "./clock.js";
 import { h, setAttribute, setHidden, setText } from "./dom.js";
@@ -14,13 +16,15 @@ import { Countdown } from "./hold.js";
 import type { Deed } from "./keys.js";
 import { session } from "./login.js";
 import type { DroneRow, Session, Sticks } from "./model.js";
+import { OverviewView } from "./overview.js";
 import { Pane } from "./pane.js";
 import { keepInReach } from "./modal.js";
 import { RecordingList } from "./recordings.js";
-import { Safety } from "./safety.js";
+import { isRecording, Safety } from "./safety.js";
 import { SettingsDialog } from "./settingsdialog.js";
 import { LastingSocket } from "./socket.js";
 import { followTheme } from "./theme.js";
+import type { Own } from "./tile.js";
 
 const DRAW_MS = 45;
 /** The list of drones comes twice a second; when it is older than this it is grey [ms]. */
@@ -32,7 +36,14 @@ class Page {
   private chosen: string | null = null;
   private readonly fleet = new FleetList((name, alone) => this.open(name, alone));
   private readonly main = h("main", { id: "panes", tabindex: -1, "aria-label": "Opened drones" });
-  private readonly empty = h("p", { class: "empty nobody" }, "No drone is opened. Choose one of the list.");
+  private readonly overview = new OverviewView((name) => this.enter(name), (name) => this.own(name));
+  /** Back to the overview. */
+  private readonly all = h("button", { type: "button", class: "small all-drones", onclick: () => this.leave() }, "All drones");
+  private readonly deckhouse: HTMLElement;
+  /** Nobody has chosen yet what to see: the only drone is opened by itself. */
+  private undecided = namesOf(location.hash).length === 0 && location.hash !== OVERVIEW;
+  /** Overviews in a row with one and the same only drone. */
+  private lonely = 0;
   private readonly lostAge = h("span", { "aria-hidden": "true" });
   private readonly lost = h("div", { class: "banner lost", role: "alert", "data-tone": "bad", hidden: true }, "No answer from the cockpit: what is shown is old. Reconnecting…", this.lostAge);
   private readonly countdown = new Countdown();
@@ -57,10 +68,10 @@ class Page {
     const person = h("span", { class: "person", title: who.name || who.role || "" }, who.name ? `${who.name} · ${who.role}` : (who.role ?? ""));
     const leave = who.login ? h("button", { type: "button", class: "small", onclick: () => void post("/api/logout").finally(() => location.reload()) }, "Log out") : null;
     const brand = h("h1", { class: "brand" }, h("img", { src: "/static/icon.svg", alt: "", width: 24, height: 24 }), "Skyloop");
-    const bar = h("header", { class: "bar" }, brand, h("span", { class: "spring" }), person, leave, this.help.chip, settings.button, this.safety?.element ?? null);
-    const recordings = new RecordingList(() => [...this.panes.keys()], (name) => this.open(name, true), who.role === "pilot");
-    this.main.append(this.empty);
-    root.replaceChildren(bar, this.lost, this.safety?.message ?? "", h("div", { class: "deckhouse" }, this.fleet.element, this.main, recordings.element), this.help.modal.element, settings.modal.element, this.countdown.element);
+    const bar = h("header", { class: "bar" }, brand, this.all, h("span", { class: "spring" }), person, leave, this.help.chip, settings.button, this.safety?.element ?? null);
+    const recordings = new RecordingList(() => this.recorded, (name) => this.enter(name), who.role === "pilot");
+    this.deckhouse = h("div", { class: "deckhouse" }, this.fleet.element, this.overview.element, this.main, this.overview.side, recordings.element);
+    root.replaceChildren(bar, this.lost, this.safety?.message ?? "", this.deckhouse, this.help.modal.element, settings.modal.element, this.countdown.element);
     this.flying = new Flying({
       pilots: () => [...this.panes.values()].flatMap((pane) => pane.pilot ?? []),
       selected: () => this.selected?.pilot ?? null,
@@ -68,7 +79,13 @@ class Page {
       hold: (which) => this.safety?.hold(which),
       inputs: (view) => this.inputs(view),
     });
-    for (const name of decodeURIComponent(location.hash.slice(1)).split(",")) if (name) this.open(name, false);
+    this.route();
+    window.addEventListener("popstate", () => this.route());
+    // The address says what is shown, so a link within the page must not change it.
+    document.querySelector<HTMLElement>(".skip")?.addEventListener("click", (event) => {
+      event.preventDefault();
+      (this.inOverview ? this.overview.element : this.main).focus();
+    });
     new LastingSocket("/ws/overview", {
       message: (data) => this.see(JSON.parse(data as string) as { now_s: number; drones: DroneRow[] }),
       state: (open, code) => this.linked(open, code),
@@ -80,6 +97,7 @@ class Page {
       if (now_ms - drawn_ms < DRAW_MS) return;
       drawn_ms = now_ms;
       this.age(now_ms);
+      this.overview.tick(now_ms);
       for (const pane of this.panes.values()) pane.tick(now_ms);
     };
     requestAnimationFrame(draw);
@@ -95,16 +113,27 @@ class Page {
     this.listed_ms = now_ms - (this.clock.age_s(now_s, now_ms) ?? 0) * 1000;
     this.rows = rows;
     this.safety?.know(rows);
-    const only = rows[0];
-    if (this.panes.size === 0 && rows.length === 1 && only) this.open(only.name, true);
+    this.overview.update(rows, now_s);
     this.fleet.update(rows, new Set(this.panes.keys()));
+    this.openOnly(rows);
   }
+
+  /** Open the only drone, unless others come right after it; the way back leads to the overview. */
+  private openOnly(rows: readonly DroneRow[]): void {
+    const only = rows[0];
+    if (!this.undecided || !only) return;
+    this.lonely = rows.length === 1 ? this.lonely + 1 : 0;
+    if (rows.length > 1) this.undecided = false;
+    else if (this.lonely > 1 || this.first) this.enter(only.name);
+    this.first = false;
+  }
+  private first = true;
 
   /** The list of drones is grey when it is old. */
   private age(now_ms: number): void {
     const old_ms = now_ms - this.listed_ms;
     setHidden(this.lost, old_ms <= OLD_LIST_MS);
-    setAttribute(this.fleet.element, "data-old", String(old_ms > OLD_LIST_MS));
+    for (const part of [this.fleet.element, this.overview.element, this.overview.side]) setAttribute(part, "data-old", String(old_ms > OLD_LIST_MS));
     if (old_ms > OLD_LIST_MS) setText(this.lostAge, `${(old_ms / 1000).toFixed(0)} s`);
   }
 
@@ -113,8 +142,61 @@ class Page {
     if (code === 4401) location.reload(); // the session has ended: log in again
   }
 
+  private get inOverview(): boolean {
+    return this.deckhouse.dataset["view"] === "overview";
+  }
+
+  /** What a recording that is begun now records. */
+  private get recorded(): string[] {
+    return this.inOverview ? this.rows.filter((row) => !isRecording(row)).map((row) => row.name) : [...this.panes.keys()];
+  }
+
+  /** What this page itself has to do with a drone. */
+  private own(name: string): Own {
+    const pane = this.panes.get(name);
+    return pane?.isAsked ? "asked" : pane?.pilot?.mine ? "held" : "";
+  }
+
+  /** From the overview to one drone; the browser's Back leads back. */
+  private enter(name: string): void {
+    if (this.inOverview) {
+      history.replaceState(null, "", OVERVIEW);
+      history.pushState(null, "", hashOf([name]));
+    }
+    this.open(name, true);
+  }
+
+  /** To the overview. */
+  private leave(): void {
+    if (!this.inOverview) history.pushState(null, "", OVERVIEW);
+    this.route();
+  }
+
+  /** Show what the address says: those drones, or all. */
+  private route(): void {
+    const names = namesOf(location.hash);
+    if (names.length === 0) this.showAll();
+    else names.forEach((name, place) => (place === 0 || !this.panes.has(name)) && this.open(name, place === 0));
+  }
+
+  /** What this page flies stays as it is meanwhile, and no key flies what isn't seen. */
+  private showAll(): void {
+    for (const [name, pane] of [...this.panes]) if (!pane.pilot?.mine) this.drop(name, pane);
+    this.view(true);
+    this.select(null);
+  }
+
+  private view(overview: boolean): void {
+    setAttribute(this.deckhouse, "data-view", overview ? "overview" : "panes");
+    this.overview.shown = overview;
+    setHidden(this.main, overview);
+    setHidden(this.fleet.element, overview);
+    setHidden(this.all, overview);
+  }
+
   /** `alone`: instead of those that are open; else beside them, or closed if it is open. */
   private open(name: string, alone: boolean): void {
+    this.undecided = false;
     if (!alone && this.panes.has(name)) {
       this.close(name);
       return;
@@ -143,7 +225,11 @@ class Page {
     const pane = this.panes.get(name);
     if (pane) this.drop(name, pane);
     if (this.chosen === name) this.select([...this.panes.keys()][0] ?? null);
-    this.arrange();
+    if (this.panes.size > 0) this.arrange();
+    else {
+      history.replaceState(null, "", OVERVIEW);
+      this.showAll();
+    }
   }
 
   private drop(name: string, pane: Pane): void {
@@ -167,8 +253,8 @@ class Page {
 
   private arrange(): void {
     setAttribute(this.main, "data-count", String(this.panes.size));
-    setHidden(this.empty, this.panes.size > 0);
-    history.replaceState(null, "", `#${[...this.panes.keys()].map(encodeURIComponent).join(",")}`);
+    this.view(false);
+    history.replaceState(null, "", hashOf([...this.panes.keys()]));
     this.fleet.update(this.rows, new Set(this.panes.keys()));
     this.select(this.chosen);
   }
@@ -199,6 +285,7 @@ class Page {
   }
 
   private repaint(): void {
+    this.overview?.repaint();
     for (const pane of this.panes.values()) pane.repaint();
   }
 }

@@ -60,15 +60,25 @@ class Deck:
 
     def page(self, *names: str, prepare: str = "", **options: Any) -> DronePage:
         """The page with these drones opened, once it shows the last of them. ``prepare``: a script that runs first."""
-        context = self._browser.new_context(viewport={"width": 1280, "height": 860}, **options)
-        self._contexts.append(context)
-        if prepare:
-            context.add_init_script(prepare)
-        page = context.new_page()
+        page = self._new_page(prepare, options)
         shown = DronePage(page, names[-1])
         page.goto(f"{self.address}#{','.join(names)}")
         page.locator(f'.pane[data-drone="{names[-1]}"][data-lost="false"]').wait_for(timeout=PATIENCE_S * 1000)
         return shown
+
+    def overview(self, **options: Any) -> DronePage:
+        """The page with all drones."""
+        page = self._new_page("", options)
+        shown = DronePage(page, "")
+        page.goto(f"{self.address}#/")
+        return shown
+
+    def _new_page(self, prepare: str, options: dict[str, Any]) -> Page:
+        context = self._browser.new_context(**{"viewport": {"width": 1280, "height": 860}, **options})
+        self._contexts.append(context)
+        if prepare:
+            context.add_init_script(prepare)
+        return context.new_page()
 
     def end(self) -> None:
         for context in self._contexts:

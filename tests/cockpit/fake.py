@@ -97,6 +97,7 @@ class FakeDrone:
         self.annotation_listeners: list[Any] = []
         self.command_listeners: list[Any] = []
         self.log_listeners: list[Any] = []
+        self.requests: list[tuple[str, dict[str, Any]]] = []  #: cameras that were subscribed to, and how
         self.clock_offset_ns = 0
         self.closed = False
         self._size = width, height
@@ -125,7 +126,8 @@ class FakeDrone:
     def close(self) -> None:
         self.closed = True
 
-    def on_frame(self, function: Callable[[Frame], None], camera: str) -> Listening:
+    def on_frame(self, function: Callable[[Frame], None], camera: str, **how: Any) -> Listening:
+        self.requests.append((camera, how))
         return Listening(self.processors[camera], function)
 
     # What a test does ------------------------------------------------------------------------------------------

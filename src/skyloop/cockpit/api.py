@@ -198,7 +198,7 @@ class Api:
         See :class:`skyloop.cockpit.stream.PageCounts`; ``frames_encoded`` counts the cameras that are there now.
         """
         counts = self._counts
-        feeds = [feed for station in self._fleet.stations.values() for feed in station.cameras.values()]
+        feeds = [feed for station in self._fleet.stations.values() for feed in station.feeds]
         return _json(
             {
                 "pages": counts.pages,

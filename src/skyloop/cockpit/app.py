@@ -5,6 +5,7 @@
 ``/api/…``                              see :mod:`skyloop.cockpit.api`
 ``/ws/overview``                        to the page: all drones, twice a second
 ``/ws/control``                         from the page: commands to all drones; to the page: what became of them
+``/ws/video``                           to the page: small frames of all cameras that it shows; back: which, and ``ack``
 ``/ws/drones/NAME/telemetry``           to the page: ``vehicle``, then ``state`` with new events, as JSON
 ``/ws/drones/NAME/video/CAMERA``        to the page: frames (binary) and drawings (JSON); back: ``{"ack": n}``
 ``/ws/drones/NAME/control``             from the page: commands; to the page: what became of them, who has control
@@ -36,6 +37,7 @@ from skyloop.cockpit.fleet import Fleet, Overview
 from skyloop.cockpit.fleet_control import FleetSession
 from skyloop.cockpit.recordings import Recordings
 from skyloop.cockpit.security import NOT_ALLOWED, Guard, Names, person_of
+from skyloop.cockpit.small_video import SmallVideoSender
 from skyloop.cockpit.station import Station
 from skyloop.cockpit.stream import UNKNOWN, BroadcastSender, PageCounts, TelemetrySender, VideoSender
 from skyloop.messages import Role
@@ -82,6 +84,11 @@ class Cockpit:
         """Send all drones to a page."""
         await socket.accept()
         await BroadcastSender(socket, self._overview.broadcast).run()
+
+    async def small_video(self, socket: WebSocket) -> None:
+        """Send small video of many drones to a page."""
+        await socket.accept()
+        await SmallVideoSender(socket, self._fleet.stations, self.counts).run()
 
     async def all_drones(self, socket: WebSocket) -> None:
         """Accept a pilot's commands to all drones."""
@@ -160,6 +167,7 @@ def create_app(
             Route("/", cockpit.page),
             *api.routes(),
             WebSocketRoute("/ws/overview", cockpit.overview),
+            WebSocketRoute("/ws/video", cockpit.small_video),
             WebSocketRoute("/ws/control", cockpit.all_drones),
             WebSocketRoute("/ws/drones/{name}/telemetry", cockpit.telemetry),
             WebSocketRoute("/ws/drones/{name}/video/{camera}", cockpit.video),

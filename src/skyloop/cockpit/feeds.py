@@ -7,11 +7,12 @@ commanded. Everything here but the callbacks given to the drone runs on the even
 from __future__ import annotations
 
 import asyncio
+import struct
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Generic, Protocol, TypeVar
 
 import msgspec
 
@@ -31,10 +32,13 @@ MAX_WAYPOINTS = 256  #: of one path that are shown
 WAYPOINTS = "waypoints"  #: name under which a controller logs where it flies to
 MOCAP_S = 0.5  #: a pose of motion capture that is older is not shown
 
+_LENGTH: Final = struct.Struct(">I")
 _KEPT_NS = round(KEPT_S * 1e9)
 
 Wake = Callable[[], None]
 _encode = msgspec.json.Encoder().encode
+#: One thread for all cameras: encoding for many pages must not take the cores that fly.
+_ENCODER: Final = ThreadPoolExecutor(1, thread_name_prefix="jpeg")
 
 
 class _Cancellable(Protocol):
@@ -109,8 +113,6 @@ class CameraFeed:
         self._wakes: set[Wake] = set()
         self._serial = 0
         self._jpeg: tuple[int, asyncio.Future[bytes]] | None = None
-        # One thread: encoding for many pages must not take the cores that fly.
-        self._pool = ThreadPoolExecutor(1, thread_name_prefix=f"jpeg-{camera}")
 
     @property
     def wanted(self) -> bool:
@@ -145,16 +147,15 @@ class CameraFeed:
         """Return the picture as a JPEG file; it is encoded once for all pages, on a thread."""
         if self._jpeg is None or self._jpeg[0] != picture.serial:
             loop = asyncio.get_running_loop()
-            self._jpeg = picture.serial, loop.run_in_executor(self._pool, to_jpeg, picture.frame)
+            self._jpeg = picture.serial, loop.run_in_executor(_ENCODER, to_jpeg, picture.frame)
             self.encoded += 1
         return await asyncio.shield(self._jpeg[1])
 
     def close(self) -> None:
-        """Unsubscribe from the camera, and end the thread."""
+        """Unsubscribe from the camera."""
         if self._listener is not None:
             self._listener.cancel()
             self._listener = None
-        self._pool.shutdown(wait=False, cancel_futures=True)
 
     def _put(self, frame: Frame) -> None:
         if self._listener is None:  # cancelled while this was on its way
@@ -336,18 +337,28 @@ class LogFeed:
             self._waypoints = self._clock(), places
 
 
-def to_jpeg(frame: Frame) -> bytes:
+def to_jpeg(frame: Frame, quality: int = JPEG_QUALITY) -> bytes:
     """Encode a frame (BGR) as a JPEG file.
+
+    Args:
+        frame: The frame.
+        quality: 1 to 100.
 
     Raises:
         ValueError: OpenCV could not.
     """
     import cv2
 
-    done, data = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    done, data = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
         raise ValueError(f"frame {frame.seq} of {frame.camera} could not be made a JPEG")
     return bytes(data.data)
+
+
+def pack(head: dict[str, Any], *jpegs: bytes) -> bytes:
+    """Return a binary message: length of the head (4 bytes, big-endian), the head as JSON, the JPEG files."""
+    text = _encode(head)
+    return b"".join((_LENGTH.pack(len(text)), text, *jpegs))
 
 
 def call_soon(loop: asyncio.AbstractEventLoop, function: Callable[..., None], *arguments: Any) -> None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 from skyloop.clock import monotonic_ns, seconds
 from skyloop.cockpit.discovery import Found
 from skyloop.cockpit.feeds import CameraFeed, EventFeed, LogFeed, PeriodicBroadcast
+from skyloop.cockpit.small_feed import SmallFeed
 from skyloop.cockpit.telemetry import TelemetryView
 from skyloop.cockpit.thresholds import ThresholdReader
 from skyloop.control.waypoint import Waypoint
@@ -38,6 +39,7 @@ class Station:
         self.event_feed = EventFeed(drone)
         self.log_feed = LogFeed(drone)
         self.cameras: dict[str, CameraFeed] = {}
+        self.small: dict[tuple[str, int], SmallFeed] = {}  #: by camera and width [pixels]
         self.goals: dict[str, Waypoint] = {}  #: where pages fly it to, by the name of the application that does
         self.pilots: set[PilotConnection] = set()  #: pilots' connections of pages
         self.thresholds = ThresholdReader(drone)
@@ -54,13 +56,25 @@ class Station:
     @property
     def in_use(self) -> bool:
         """Whether a page shows it."""
-        return self.broadcast.wanted or any(feed.wanted for feed in self.cameras.values())
+        return self.broadcast.wanted or any(feed.wanted for feed in self.feeds)
+
+    @property
+    def feeds(self) -> list[CameraFeed | SmallFeed]:
+        """The feeds of all cameras, in all sizes."""
+        return [*self.cameras.values(), *self.small.values()]
 
     def camera(self, name: str) -> CameraFeed | None:
         """Return the feed of a camera; None if the vehicle has none of that name."""
         if name not in self.cameras and any(info.name == name for info in self.drone.capabilities.cameras):
             self.cameras[name] = CameraFeed(self.drone, name)
         return self.cameras.get(name)
+
+    def small_video(self, name: str, width: int) -> SmallFeed | None:
+        """Return the feed of a camera scaled down to a width [pixels]; None if the vehicle has none of that name."""
+        camera = next((info for info in self.drone.capabilities.cameras if info.name == name), None)
+        if (name, width) not in self.small and camera is not None:
+            self.small[name, width] = SmallFeed(self.drone, camera, width)
+        return self.small.get((name, width))
 
     # Pilots ----------------------------------------------------------------------------------------------------
 
@@ -146,7 +160,7 @@ class Station:
         self.log_feed.want(False)
         self.event_feed.close()
         self.thresholds.close()
-        for feed in self.cameras.values():
+        for feed in self.feeds:
             feed.close()
         if self._stopper is not None:
             await self._end(self._stopper)

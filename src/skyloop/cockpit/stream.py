@@ -7,8 +7,6 @@ Telemetry: the newest state about twenty times a second, as far as the socket ta
 from __future__ import annotations
 
 import asyncio
-import json
-import struct
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -17,7 +15,7 @@ from typing import Any, Final
 import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from skyloop.cockpit.feeds import CameraFeed, EventFeed, PeriodicBroadcast
+from skyloop.cockpit.feeds import CameraFeed, EventFeed, PeriodicBroadcast, pack
 from skyloop.cockpit.station import Station
 from skyloop.cockpit.telemetry import encode_json
 
@@ -25,7 +23,6 @@ DRAWN_BYTES = 65_536  #: of drawings that are sent to a page with one frame: abo
 MAX_WAITING: Final = 256  #: answers to a page that does not read; what comes on top is not sent
 MAX_COUNTED = 256  #: sources of drawings that are named in the counts
 
-_LENGTH = struct.Struct(">I")
 _BAD_MESSAGE = 1008
 UNKNOWN = 4404  #: close code: no such drone or camera
 
@@ -39,12 +36,6 @@ class PageCounts:
     frames_acknowledged: int = 0
     frames_skipped: int = 0  #: not sent because the page still had one to draw
     sources: set[str] = field(default_factory=set)  #: of drawings that were sent
-
-
-def pack_frame(head: dict[str, Any], jpeg: bytes) -> bytes:
-    """Return a binary message: length of the head (4 bytes, big-endian), the head as JSON, the JPEG file."""
-    text = json.dumps(head, separators=(",", ":")).encode()
-    return _LENGTH.pack(len(text)) + text + jpeg
 
 
 class VideoSender:
@@ -121,7 +112,7 @@ class VideoSender:
             "height": frame.shape[0],
         }
         self._waiting, self._sent, self._sent_ns = True, picture.serial, frame.captured_ns
-        await self._socket.send_bytes(pack_frame(head, jpeg))
+        await self._socket.send_bytes(pack(head, jpeg))
         self._counts.frames_sent += 1
         self._counts.frames_skipped += skipped
 

@@ -97,9 +97,11 @@ class TelemetryView:
         """Return what a person must know at once, the most severe first."""
         drone = self._station.drone
         age_s = None if feedback is None else self._age_s(feedback.captured_ns)
-        ages = {name: feed.age_s for name, feed in self._station.cameras.items()}
-        shown = {name: age for name, age in ages.items() if age is not None}
-        return alarms(drone.link, feedback, age_s, shown, self._station.thresholds.newest())
+        ages: dict[str, float] = {}  # by camera, the youngest of what is shown of it
+        for feed in self._station.feeds:
+            if (feed_s := feed.age_s) is not None:
+                ages[feed.camera] = min(feed_s, ages.get(feed.camera, feed_s))
+        return alarms(drone.link, feedback, age_s, ages, self._station.thresholds.newest())
 
     def holder(self, feedback: Feedback | None) -> str | None:
         """Return who has the authority.

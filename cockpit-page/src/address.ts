@@ -1,0 +1,20 @@
+// What the page shows, as its address says it: `#alpha,beta` those two drones, `#/` all of them. Pure.
+
+/** The address of the overview; no drone can have this name. */
+export const OVERVIEW = "#/";
+
+/** The drones that an address names; none: the overview. */
+export function namesOf(hash: string): string[] {
+  const text = hash.replace(/^#/, "");
+  if (text.startsWith("/")) return [];
+  const names = text.split(",").map((name) => {
+    try {
+      return decodeURIComponent(name);
+    } catch {
+      return name; // typed by hand
+    }
+  });
+  return [...new Set(names.filter(Boolean))];
+}
+
+export const hashOf = (names: readonly string[]): string => (names.length ? `#${names.map(encodeURIComponent).join(",")}` : OVERVIEW);

@@ -1,0 +1,153 @@
+// All drones: a tile for each, or a line in a table when they are many, and one map of them all.
+
+import { h, memory, setAttribute, setHidden, setText } from "./dom.js";
+import { count } from "./format.js";
+import { Trail } from "./history.js";
+import { MapView } from "./map.js";
+import type { DroneRow } from "./model.js";
+import { byName, found } from "./row.js";
+import { isRecording } from "./safety.js";
+import { SmallVideo } from "./smallvideo.js";
+import { DroneTable } from "./table.js";
+import { type Own, Tile } from "./tile.js";
+import type { Scene } from "./world.js";
+
+/** So many have a tile each; more are a table, unless the user chose otherwise. */
+export const MOST_TILES = 12;
+const SEARCH_FROM = 7;
+/** Positions come twice a second: to draw the map more often than this shows nothing more, and costs. */
+const MAP_MS = 240;
+const AGE_MS = 240;
+const MARGIN = "80px";
+
+type Kind = "tiles" | "table";
+
+export class OverviewView {
+  readonly element: HTMLElement;
+  /** The map, and what is beside the drones. */
+  readonly side: HTMLElement;
+  private readonly video = new SmallVideo();
+  private readonly tiles = new Map<string, Tile>();
+  private readonly list = h("ul", { class: "tiles" });
+  private readonly table: DroneTable;
+  private readonly map = new MapView(() => this.scene());
+  private readonly trails = new Map<string, Trail>();
+  private readonly none = h("p", { class: "empty nobody" }, "No drone found yet. ", h("span", {}, "Start one: "), h("code", {}, "skyloop sim"));
+  private readonly unfound = h("p", { class: "empty" }, "No drone fits these words.");
+  private readonly counted = h("span", { class: "count" });
+  private readonly search = h("input", { type: "search", placeholder: "Search", "aria-label": "Search drones by name, state, control or alarm", oninput: () => this.show() });
+  private readonly kinds: Readonly<Record<Kind, HTMLButtonElement>>;
+  private readonly sight = new IntersectionObserver((entries) => this.look(entries), { rootMargin: MARGIN });
+  private rows: readonly DroneRow[] = [];
+  private visible = false;
+  private drawn_ms = 0;
+  private aged_ms = 0;
+
+  constructor(
+    private readonly open: (name: string) => void,
+    private readonly own: (name: string) => Own,
+  ) {
+    this.table = new DroneTable(open, () => this.show());
+    const choice = (kind: Kind, title: string): HTMLButtonElement => h("button", { type: "button", class: "tab", onclick: () => this.choose(kind) }, title);
+    this.kinds = { tiles: choice("tiles", "Tiles"), table: choice("table", "Table") };
+    const kinds = h("span", { class: "tabs", role: "group", "aria-label": "Shown as" }, ...Object.values(this.kinds));
+    this.element = h("main", { class: "overview", id: "overview", tabindex: -1, "aria-label": "All drones" }, h("header", { class: "overview-head" }, h("h2", {}, "Drones", this.counted), this.search, kinds), this.list, this.table.element, this.none, this.unfound);
+    this.side = h("section", { class: "overview-map", "aria-label": "Map of all drones" }, this.map.element);
+    this.map.allow("");
+    window.addEventListener("resize", () => this.visible && this.tiles.forEach((tile) => tile.look()));
+  }
+
+  /** Whether it is what the page shows; if not, it asks for no pictures and draws nothing. */
+  set shown(shown: boolean) {
+    this.visible = shown;
+    setHidden(this.element, !shown);
+    setHidden(this.side, !shown);
+    this.video.run(shown);
+    if (shown) this.show();
+  }
+
+  update(rows: readonly DroneRow[], now_s: number): void {
+    this.rows = [...rows].sort(byName);
+    for (const name of this.trails.keys()) if (!rows.some((row) => row.name === name)) this.trails.delete(name);
+    for (const { name, position } of rows) {
+      if (!this.trails.has(name)) this.trails.set(name, new Trail());
+      if (position) this.trails.get(name)?.add(now_s, position);
+    }
+    if (this.visible) this.show();
+  }
+
+  tick(now_ms: number): void {
+    if (!this.visible) return;
+    if (now_ms - this.drawn_ms >= MAP_MS) {
+      this.drawn_ms = now_ms;
+      this.map.draw(now_ms);
+    }
+    if (now_ms - this.aged_ms < AGE_MS) return;
+    this.aged_ms = now_ms;
+    for (const tile of this.tiles.values()) tile.age(now_ms);
+  }
+
+  /** Colours have changed. */
+  repaint(): void {
+    this.map.repaint();
+  }
+
+  private get kind(): Kind {
+    const chosen = memory.get("overview");
+    return chosen === "tiles" || chosen === "table" ? chosen : this.rows.length > MOST_TILES ? "table" : "tiles";
+  }
+
+  private choose(kind: Kind): void {
+    memory.set("overview", kind);
+    this.show();
+  }
+
+  private show(): void {
+    const { kind, rows } = this;
+    const wanted = rows.length >= SEARCH_FROM && this.search.value ? rows.filter((row) => found(row, this.search.value)) : rows;
+    setText(this.counted, rows.length ? String(rows.length) : "");
+    setAttribute(this.counted, "aria-label", count(rows.length, "drone"));
+    setHidden(this.search, rows.length < SEARCH_FROM);
+    setHidden(this.none, rows.length > 0);
+    setHidden(this.unfound, rows.length === 0 || wanted.length > 0);
+    for (const [name, button] of Object.entries(this.kinds)) setAttribute(button, "aria-pressed", String(name === kind));
+    setHidden(this.list, kind !== "tiles" || wanted.length === 0);
+    setHidden(this.table.element, kind !== "table" || wanted.length === 0);
+    setAttribute(this.list, "data-count", String(Math.min(wanted.length, MOST_TILES)));
+    if (kind === "table") this.table.update(wanted, this.own);
+    this.arrange(kind === "tiles" ? wanted : []);
+  }
+
+  private arrange(rows: readonly DroneRow[]): void {
+    const names = new Set(rows.map((row) => row.name));
+    for (const [name, tile] of this.tiles) {
+      if (names.has(name)) continue;
+      this.sight.unobserve(tile.element);
+      tile.close();
+      this.tiles.delete(name);
+    }
+    rows.forEach((row, place) => {
+      let tile = this.tiles.get(row.name);
+      if (!tile) {
+        tile = new Tile(row.name, this.video, () => this.open(row.name));
+        this.tiles.set(row.name, tile);
+        this.sight.observe(tile.element);
+      }
+      if (this.list.children[place] !== tile.element) this.list.insertBefore(tile.element, this.list.children[place] ?? null);
+      tile.update(row, this.own(row.name));
+    });
+  }
+
+  private look(entries: readonly IntersectionObserverEntry[]): void {
+    for (const entry of entries) this.tiles.get((entry.target as HTMLElement).dataset["drone"] ?? "")?.sight(entry.isIntersecting);
+  }
+
+  private scene(): Scene {
+    const others = this.rows.flatMap((row) => {
+      const { name, position, yaw } = row;
+      const trail = this.trails.get(name);
+      return position === null || isRecording(row) ? [] : [{ name, position, roll: 0, pitch: 0, yaw, ink: "accent", ...(trail ? { trail } : {}) }];
+    });
+    return { own: null, truth: null, others, targets: [], waypoints: [], trail: new Trail() };
+  }
+}

@@ -1,0 +1,80 @@
+// A drone of the overview in words, for tiles, table and list alike. Pure.
+
+import type { Tone } from "./dom.js";
+import { figure, words } from "./format.js";
+import type { DroneRow } from "./model.js";
+import { isRecording } from "./safety.js";
+import { inUnit, unit } from "./units.js";
+
+export interface Described {
+  tone: Tone;
+  state: string;
+  /** Who has control. */
+  holder: string;
+  /** What is wrong with it, the most severe first; empty if nothing is. */
+  alarm: string;
+  alarmTone: Tone;
+  /** Charge, 0 to 1; null while it is not known. */
+  battery: number | null;
+  /** The links to the proxy and to the vehicle. */
+  hops: readonly [Tone, Tone];
+  links: string;
+  /** It is a recording that is over: that nothing moves is no fault. */
+  over: boolean;
+  lost: boolean;
+}
+
+const LINKS: Readonly<Record<string, Tone>> = { up: "ok", degraded: "warn", connecting: "busy", lost: "bad", closed: "bad" };
+
+/** In the unit that the person chose. */
+export const height = (altitude_m: number | null): string => (altitude_m === null ? "–" : `${figure(inUnit("length", altitude_m), 1)} ${unit("length").name}`);
+
+export function describe(row: DroneRow): Described {
+  const recorded = isRecording(row);
+  const [application, vehicle] = [row.links.application, row.links.vehicle];
+  const lost = application === "lost";
+  const over = recorded && (lost || vehicle === "closed"); // as every recording is some time
+  const critical = row.alarms.some((alarm) => alarm.severity === "critical");
+  const flight = row.airborne && row.altitude !== null ? `${words(row.state)} · ${height(row.altitude)}` : words(row.state);
+  return {
+    tone: over ? "quiet" : lost || critical ? "bad" : row.alarms.length ? "warn" : row.airborne ? "ok" : "quiet",
+    state: over ? "recording over" : lost ? "lost" : flight,
+    holder: recorded ? "recording, nothing flies" : row.owner === null ? "nobody has control" : `${row.owner} has control`,
+    alarm: over ? "" : row.alarms.map((alarm) => alarm.text).join(" · "),
+    alarmTone: critical || lost ? "bad" : "warn",
+    battery: lost ? null : row.battery,
+    hops: over ? ["quiet", "quiet"] : [LINKS[application] ?? "quiet", LINKS[vehicle] ?? "quiet"],
+    links: `link to the proxy ${application}, to the vehicle ${vehicle}`,
+    over,
+    lost,
+  };
+}
+
+const natural = new Intl.Collator("en", { numeric: true });
+/** By name, as people count: drone2 before drone10. */
+export const byName = (a: { name: string }, b: { name: string }): number => natural.compare(a.name, b.name);
+
+/** Whether all words that were typed are somewhere in what is shown of it. */
+export function found(row: DroneRow, search: string): boolean {
+  const { state, holder, alarm } = describe(row);
+  const text = [row.name, row.vehicle, state, holder, alarm].join(" ").toLowerCase();
+  return search.toLowerCase().split(/\s+/).every((word) => text.includes(word));
+}
+
+export type Column = "name" | "state" | "altitude" | "battery" | "holder" | "alarm";
+
+/** The rows in the order of a column; equal ones by name, and what is not known last, whichever way. */
+export function sorted(rows: readonly DroneRow[], column: Column, down: boolean): DroneRow[] {
+  const value = (row: DroneRow): string | number | null => {
+    if (column === "name") return row.name;
+    if (column === "altitude" || column === "battery") return row[column];
+    return describe(row)[column] || null;
+  };
+  const order = (a: DroneRow, b: DroneRow): number => {
+    const [x, y] = [value(a), value(b)];
+    if (x === null || y === null) return x === y ? byName(a, b) : x === null ? 1 : -1;
+    const by = typeof x === "number" && typeof y === "number" ? x - y : natural.compare(String(x), String(y));
+    return (down ? -by : by) || byName(a, b);
+  };
+  return [...rows].sort(order);
+}

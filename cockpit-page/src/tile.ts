@@ -1,0 +1,118 @@
+// One drone of the overview, small: what it sees, how it is, who has it. A click opens it.
+
+import { Battery } from "./battery.js";
+import { h, setAttribute, setHidden, setText, setTone } from "./dom.js";
+import { duration } from "./format.js";
+import type { DroneRow } from "./model.js";
+import { describe } from "./row.js";
+import type { Sink, SmallHead, SmallVideo } from "./smallvideo.js";
+
+const STALE_S = 1;
+/** A picture is a little smaller than its place: that is hardly seen, and costs less. */
+const SHARE = 0.9;
+/** When a tile's width differs by more than this share, another size of picture is asked for. */
+const OTHER = 0.15;
+
+/** What this page itself has to do with a drone that is not opened. */
+export type Own = "" | "held" | "asked";
+export const OWN_WORDS: Readonly<Record<Own, string>> = { "": "", held: "This page has control", asked: "Asked for control: open it to answer" };
+
+export class Tile implements Sink {
+  readonly element: HTMLElement;
+  private readonly canvas = h("canvas", { class: "tile-video", "aria-hidden": "true", width: 4, height: 3 });
+  private readonly pen = this.canvas.getContext("2d", { alpha: false });
+  private readonly nothing = h("span", { class: "tile-nothing" });
+  private readonly battery = new Battery();
+  private readonly hops = [h("i", { class: "dot" }), h("i", { class: "dot" })];
+  private readonly links = h("span", { class: "card-links" }, ...this.hops);
+  private readonly recording = h("span", { class: "rec", title: "being recorded" }, "REC");
+  private readonly state = h("span", { class: "tile-state" });
+  private readonly holder = h("span", { class: "tile-holder" });
+  private readonly alarm = h("span", { class: "tile-alarm" });
+  private readonly main: HTMLButtonElement;
+  private camera = "";
+  private seen = false;
+  private asked_px = 0;
+  private shown: { age_s: number; received_ms: number } | null = null;
+  private over = false;
+  private frames = 0;
+
+  constructor(
+    readonly name: string,
+    private readonly video: SmallVideo,
+    open: () => void,
+  ) {
+    const top = h("span", { class: "tile-top" }, h("b", {}, name), this.recording, this.links);
+    const picture = h("span", { class: "tile-picture" }, this.canvas, this.nothing, top, this.alarm);
+    const text = h("span", { class: "tile-text" }, h("span", { class: "tile-line" }, this.state, this.battery.element), this.holder);
+    this.main = h("button", { type: "button", class: "tile-main", onclick: open }, picture, text);
+    this.element = h("li", { class: "tile", "data-drone": name }, this.main);
+  }
+
+  update(row: DroneRow, own: Own): void {
+    const { tone, state, holder, alarm, alarmTone, battery, hops, links, over, lost } = describe(row);
+    this.over = over;
+    setTone(this.element, tone);
+    setText(this.state, state);
+    setText(this.holder, OWN_WORDS[own] || holder);
+    setAttribute(this.holder, "data-own", own);
+    this.battery.show(battery, row.alarms);
+    this.hops.forEach((hop, place) => setTone(hop, hops[place] ?? "quiet"));
+    setAttribute(this.links, "title", links);
+    setHidden(this.recording, !row.recording);
+    setText(this.alarm, alarm);
+    setTone(this.alarm, alarmTone);
+    setHidden(this.alarm, alarm === "");
+    setAttribute(this.element, "data-lost", String(lost && !over));
+    setAttribute(this.main, "aria-label", `Open ${row.name}: ${[state, this.holder.textContent, links, alarm].filter(Boolean).join(", ")}`);
+    const camera = row.cameras[0]?.name ?? "";
+    if (camera !== this.camera) {
+      this.rest();
+      this.camera = camera;
+      this.look();
+    }
+  }
+
+  /** Whether it is on the screen; what is not gets no pictures. */
+  sight(seen: boolean): void {
+    if (seen === this.seen) return;
+    this.seen = seen;
+    if (seen) this.look();
+    else this.rest();
+  }
+
+  /** Ask for pictures of the size that it has now. */
+  look(): void {
+    const width_px = Math.round(this.canvas.clientWidth * Math.min(2, window.devicePixelRatio || 1) * SHARE);
+    if (!this.seen || this.camera === "" || width_px === 0 || Math.abs(width_px - this.asked_px) <= OTHER * this.asked_px) return;
+    this.asked_px = width_px;
+    this.video.show(this.name, this.camera, width_px, this);
+  }
+
+  draw(head: SmallHead, picture: ImageBitmap, received_ms: number): void {
+    if (this.canvas.width !== head.width) this.canvas.width = head.width;
+    if (this.canvas.height !== head.height) this.canvas.height = head.height;
+    this.pen?.drawImage(picture, 0, 0);
+    this.shown = { age_s: head.age_s, received_ms };
+    this.frames += 1;
+    this.element.dataset["frames"] = String(this.frames);
+  }
+
+  /** Show when its picture is old, or none came. */
+  age(now_ms: number): void {
+    const age_s = this.shown && this.shown.age_s + (now_ms - this.shown.received_ms) / 1000;
+    const stale = age_s !== null && age_s > STALE_S && !this.over;
+    setAttribute(this.element, "data-stale", String(stale));
+    setText(this.nothing, this.camera === "" ? "No camera" : age_s === null ? "No picture yet" : stale ? `Picture ${duration(age_s)} old` : "");
+  }
+
+  close(): void {
+    this.rest();
+    this.element.remove();
+  }
+
+  private rest(): void {
+    this.asked_px = 0;
+    if (this.camera !== "") this.video.hide(this.name, this.camera);
+  }
+}
