@@ -1,10 +1,12 @@
 // Keys, gamepad and thumbs fly the selected drone; nothing else of the page does.
 
-import { connected, GamepadReader } from "./gamepad.js";
+import { GamepadReader, plugged } from "./gamepad.js";
 import { type Deed, Keys, stopKeys } from "./keys.js";
 import { isModalOpen } from "./modal.js";
 import type { Sticks } from "./model.js";
+import { padMaps } from "./paddialog.js";
 import { type Pilot, STEER_MS } from "./pilot.js";
+import { settings } from "./settings.js";
 import { CENTRED, isCentred, Latch, merge, PACES, type Pace, ramp, scale } from "./sticks.js";
 
 /** Which drone the keys fly, and what else they do. */
@@ -40,8 +42,10 @@ export class Flying {
   pace: Pace = PACES[1] as Pace;
   /** What thumbs on the screen do. */
   thumbs: Sticks = { ...CENTRED };
+  /** The gamepad commands nothing, as its buttons are being assigned. */
+  padSilent = false;
   private readonly keys = new Keys();
-  private readonly pad = new GamepadReader();
+  private readonly pad = new GamepadReader(padMaps);
   private readonly thumbLatch = new Latch();
   private ramped: Sticks = { ...CENTRED };
   private flown: Pilot | null = null;
@@ -56,6 +60,7 @@ export class Flying {
     window.addEventListener("pagehide", () => this.rest());
     document.addEventListener("visibilitychange", () => document.hidden && this.rest());
     document.addEventListener("focusin", () => (this.typing() || ownKeys() !== null) && this.keys.clear());
+    settings.on("mode", () => this.rest()); // another tab may change it in flight
     setInterval(() => this.round(), STEER_MS);
   }
 
@@ -107,7 +112,7 @@ export class Flying {
 
   private round(): void {
     const selected = this.cabin.selected();
-    const reading = this.pad.read(connected());
+    const reading = this.pad.read(plugged()[0] ?? null, settings.get("mode"));
     const focused = document.hasFocus() && !document.hidden;
     const modal = isModalOpen();
     // What is held while a dialog is open counts only after it was let go.
@@ -122,8 +127,8 @@ export class Flying {
     this.flown = selected;
     this.held = mine;
     if (focused && !modal) for (const deed of reading.deeds) this.cabin.act(deed);
-    if (focused && reading.stops && this.stopping === null) this.stop("pad", "one");
-    if (!reading.stops && this.stopping === "pad") this.stop("pad", null);
+    if (focused && reading.stops && !this.padSilent && this.stopping === null) this.stop("pad", "one");
+    if ((!reading.stops || this.padSilent) && this.stopping === "pad") this.stop("pad", null);
     const held = this.keys.sticks();
     this.ramped = ramp(this.ramped, held, STEER_MS / 1000);
     const thumbs = this.thumbLatch.pass(this.thumbs);

@@ -1,9 +1,10 @@
-// A gamepad of the standard mapping (https://w3c.github.io/gamepad/#remapping), read once per round. Pure but for
-// `connected`.
+// A gamepad, read once per round. Pure but for `plugged`.
 
 import type { Deed } from "./keys.js";
 import type { Sticks } from "./model.js";
-import { CENTRED, deadBand, Latch } from "./sticks.js";
+import { PAD_DEEDS, type PadDeed, type PadMap, type PadMaps, type Source, sourcesOf, STANDARD_MAP, sticksOf } from "./padmap.js";
+import type { Values } from "./settings.js";
+import { type Axis, CENTRED, Latch } from "./sticks.js";
 
 /** As much of a Gamepad as is read. */
 export interface Pad {
@@ -19,58 +20,51 @@ export interface PadReading {
   deeds: Deed[];
   /** Its name; null without one. */
   name: string | null;
-  /** Both bumpers are pressed, which is to be held. */
+  /** The buttons of the emergency stop are pressed, which is to be held. */
   stops: boolean;
   /** It was there a moment ago. */
   lost: boolean;
 }
 
-const [A, B, LEFT_BUMPER, RIGHT_BUMPER, START] = [0, 1, 4, 5, 9];
-
-/** The first gamepad that browsers know how to read. */
-export function connected(): Pad | null {
+/** The gamepads that are there: the one that flies first. */
+export function plugged(): Pad[] {
   // Without a secure context there may be no such function.
-  return navigator.getGamepads?.().find((pad) => pad?.connected && pad.mapping === "standard") ?? null;
+  return (navigator.getGamepads?.() ?? []).filter((pad): pad is Gamepad => pad?.connected ?? false).sort((a, b) => Number(b.mapping === "standard") - Number(a.mapping === "standard"));
 }
+
+/** What its axes fly: as they were assigned, else by the mode if browsers know its layout, else nothing. */
+export function sources(pad: Pad, map: PadMap, mode: Values["mode"]): Readonly<Record<Axis, Source | null>> {
+  const none = { forward: null, left: null, up: null, yaw_rate: null };
+  return map.sources ?? (pad.mapping === "standard" ? sourcesOf(mode) : none);
+}
+
+export const pressedOf = (pad: Pad): number[] => pad.buttons.flatMap(({ pressed }, button) => (pressed ? [button] : []));
 
 export class GamepadReader {
   private readonly latch = new Latch();
-  private before: Deed[] = [];
+  private before: PadDeed[] = [];
   private there = false;
+
+  constructor(private readonly maps: Pick<PadMaps, "get">) {}
 
   /** Ask for centred sticks before they count, as when control begins. */
   reset(): void {
     this.latch.reset();
   }
 
-  read(pad: Pad | null): PadReading {
+  read(pad: Pad | null, mode: Values["mode"]): PadReading {
+    const map = pad && (this.maps.get(pad.id) ?? (pad.mapping === "standard" ? STANDARD_MAP : null));
     const lost = pad === null && this.there;
     this.there = pad !== null;
-    if (pad === null) {
+    if (pad === null || map === null) {
       this.before = [];
       this.latch.reset();
       return { sticks: { ...CENTRED }, deeds: [], name: null, stops: false, lost };
     }
-    const pressed = this.pressed(pad);
-    const deeds = pressed.filter((deed) => !this.before.includes(deed));
+    const pressed = PAD_DEEDS.filter((deed) => map.buttons[deed].length > 0 && map.buttons[deed].every((button) => pad.buttons[button]?.pressed));
+    const deeds = pressed.filter((deed): deed is Exclude<PadDeed, "stop"> => deed !== "stop" && !this.before.includes(deed));
     this.before = pressed;
-    const axis = (number: number): number => deadBand(-(pad.axes[number] ?? 0));
-    // Axes of sticks: right and down are positive.
-    const sticks = { yaw_rate: axis(0), up: axis(1), left: axis(2), forward: axis(3) };
-    for (const name of Object.keys(sticks) as (keyof Sticks)[]) sticks[name] += 0; // no negative zero
-    return { sticks: this.latch.pass(sticks), deeds, name: pad.id, stops: this.is(pad, LEFT_BUMPER) && this.is(pad, RIGHT_BUMPER), lost: false };
-  }
-
-  private is(pad: Pad, button: number): boolean {
-    return pad.buttons[button]?.pressed ?? false;
-  }
-
-  private pressed(pad: Pad): Deed[] {
-    const is = (button: number): boolean => this.is(pad, button);
-    const deeds: Deed[] = [];
-    if (is(START)) deeds.push("takeoff");
-    if (is(A)) deeds.push("hover");
-    if (is(B)) deeds.push("land");
-    return deeds;
+    const sticks = sticksOf(pad.axes, sources(pad, map, mode), map.curves);
+    return { sticks: this.latch.pass(sticks), deeds, name: pad.id, stops: pressed.includes("stop"), lost: false };
   }
 }

@@ -2,15 +2,20 @@
 
 import { h, setAttribute, setText, setTone } from "./dom.js";
 import type { Flying, InputView } from "./flying.js";
-import { GAMEPAD_MAP, KEY_MAP } from "./keys.js";
+import { plugged } from "./gamepad.js";
+import { KEY_MAP } from "./keys.js";
+import { t } from "./language/index.js";
 import { Modal } from "./modal.js";
+import { PadDialog, padRows } from "./paddialog.js";
 import { isCentred, PACES } from "./sticks.js";
 
 type Row = { keys: string[]; does: string };
 
 export class Help {
   readonly modal: Modal;
-  readonly chip = h("button", { type: "button", class: "small inputs", "data-tone": "quiet", onclick: () => this.modal.open() });
+  readonly chip = h("button", { type: "button", class: "small inputs", "data-tone": "quiet", onclick: () => this.open() });
+  readonly mapping: PadDialog;
+  private readonly gamepad = h("div", {});
   private readonly keys = h("span", {}, "Keys");
   private readonly dot = h("i", { class: "dot" });
   private readonly pad = h("p", { class: "note", role: "status" });
@@ -26,12 +31,18 @@ export class Help {
       paces.append(button);
     });
     this.chip.append(this.dot, this.keys);
+    this.mapping = new PadDialog((silent) => (flying().padSilent = silent));
     this.modal = new Modal("Keys and gamepad", "help", [
-      h("div", { class: "help-columns" }, table("Keyboard", KEY_MAP), table("Gamepad", GAMEPAD_MAP)),
-      this.pad,
+      h("div", { class: "help-columns" }, table("Keyboard", KEY_MAP), this.gamepad),
+      h("div", { class: "pad-line" }, this.pad, h("button", { type: "button", class: "small", onclick: () => this.mapping.open() }, t.pad.open)),
       h("p", { class: "note" }, "They fly the drone that is marked, while you have control of it. It hovers when keys and sticks are released, when this page loses the focus or its connection, when the gamepad goes away, and while a dialog as this one is open. The emergency stop needs no control: it is held for 0.8 s, and works while you type and in dialogs, too."),
       h("div", { class: "pace" }, h("span", {}, "Pace"), paces),
     ]);
+  }
+
+  open(): void {
+    this.gamepad.replaceChildren(table("Gamepad", padRows(plugged()[0] ?? null)));
+    this.modal.open();
   }
 
   update(view: InputView, mine: boolean): void {

@@ -43,15 +43,6 @@ export const KEY_MAP: readonly { keys: string[]; does: string }[] = [
   { keys: ["?"], does: "This list; Esc closes it" },
 ];
 
-export const GAMEPAD_MAP: readonly { keys: string[]; does: string }[] = [
-  { keys: ["LB", "RB"], does: "Hold both: motors off" },
-  { keys: ["Start"], does: "Take off" },
-  { keys: ["A"], does: "Hover" },
-  { keys: ["B"], does: "Land" },
-  { keys: ["Right stick"], does: "Forward, back, left, right" },
-  { keys: ["Left stick"], does: "Up, down, turn" },
-];
-
 export interface Press {
   code: string;
   repeat: boolean;

@@ -71,7 +71,7 @@ class Page {
     const bar = h("header", { class: "bar" }, brand, this.all, h("span", { class: "spring" }), person, leave, this.help.chip, settings.button, this.safety?.element ?? null);
     const recordings = new RecordingList(() => this.recorded, (name) => this.enter(name), who.role === "pilot");
     this.deckhouse = h("div", { class: "deckhouse" }, this.fleet.element, this.overview.element, this.main, this.overview.side, recordings.element);
-    root.replaceChildren(bar, this.lost, this.safety?.message ?? "", this.deckhouse, this.help.modal.element, settings.modal.element, this.countdown.element);
+    root.replaceChildren(bar, this.lost, this.safety?.message ?? "", this.deckhouse, this.help.modal.element, this.help.mapping.modal.element, settings.modal.element, this.countdown.element);
     this.flying = new Flying({
       pilots: () => [...this.panes.values()].flatMap((pane) => pane.pilot ?? []),
       selected: () => this.selected?.pilot ?? null,
@@ -209,7 +209,7 @@ class Page {
         select: (one) => this.select(one),
         close: (one) => this.close(one),
         push: (one, sticks) => this.push(one, sticks),
-        help: () => this.help.modal.open(),
+        help: () => this.help.open(),
         aimed: (one) => one === this.chosen && this.aim(),
         countdown: this.countdown,
       });
@@ -274,7 +274,7 @@ class Page {
   }
 
   private act(deed: Deed): void {
-    if (deed === "help") this.help.modal.open();
+    if (deed === "help") this.help.open();
     else if (deed === "question") [this.selected, ...this.panes.values()].find((pane) => pane?.isAsked)?.act(deed);
     else this.selected?.act(deed);
   }

@@ -83,3 +83,56 @@ def test_settings_are_used_at_once_and_remembered(deck: Deck) -> None:
         assert page.page.locator("html").get_attribute("data-theme") == "light"
         page.page.reload()
     assert page.problems == []
+
+
+PAD = """
+window.pad = {id: "Test pad", mapping: "standard", connected: true, axes: [0, 0, 0, 0],
+              buttons: Array.from({length: 17}, () => ({pressed: false}))};
+navigator.getGamepads = () => [window.pad];
+"""
+
+
+def test_a_gamepad_is_mapped_and_commands_nothing_meanwhile(deck: Deck) -> None:
+    deck.proxy("mapped")
+    page = deck.page("mapped", prepare=PAD)
+
+    def axes(*values: float) -> None:
+        page.page.evaluate("axes => { window.pad.axes = axes; }", list(values))
+
+    def button(number: int, pressed: bool) -> None:
+        page.page.evaluate("([one, pressed]) => { window.pad.buttons[one].pressed = pressed; }", [number, pressed])
+
+    with skyloop.connect("mapped", access="observe", name="test") as drone:
+        page.take_off()
+        page.press("?")
+        page.page.get_by_role("button", name="Map the gamepad").click()
+        dialog = page.page.get_by_role("dialog", name="Gamepad", exact=True)
+        dialog.get_by_text("Test pad").wait_for()
+        button(1, True)  # B lands, otherwise
+        axes(0, 0, 0, -1)
+        dialog.locator(".pad-button[data-pressed=true]").wait_for()
+        button(1, False)
+        axes(0, 0, 0, 0)
+        dialog.get_by_role("button", name="Assign: Forward").click()
+        axes(0, -1, 0, 0)
+        forward = dialog.locator("[data-axis=forward]")
+        page.until(lambda: "Left stick ↑" in (forward.text_content() or ""), "it is assigned")
+        dialog.get_by_role("button", name="Assign: Land").click()
+        for pressed in (True, False):
+            page.page.wait_for_timeout(100)
+            button(7, pressed)
+        page.until(lambda: "RT" in (dialog.locator("[data-deed=land]").text_content() or ""), "it is assigned")
+        for _ in range(10):
+            assert drone.next_feedback().state is FlightState.HOVERING
+        page.press("Escape")
+        page.until(lambda: not dialog.is_visible(), "it is closed")
+        for _ in range(10):
+            assert drone.next_feedback().state is FlightState.HOVERING, "a stick must be centred first"
+        axes(0, 0, 0, 0)
+        page.page.wait_for_timeout(200)
+        axes(0, -1, 0, 0)
+        page.until(lambda: (drone.feedback().velocity_m_s or (0,))[0] > 0.3, "the left stick flies forward")
+        axes(0, 0, 0, 0)
+        button(7, True)
+        page.wait_for_text(".pill", "landed")
+    assert page.problems == []
