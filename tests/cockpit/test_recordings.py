@@ -54,7 +54,12 @@ def listing(client: TestClient) -> dict[str, Any]:
 
 def test_a_recording_is_started_watched_and_stopped(nodes: Nodes, folder: Path) -> None:
     with serve(nodes, folder, record=FakeRecorder) as client:
-        assert listing(client) == {"folder": str(folder), "running": [], "past": []}
+        assert listing(client) == {
+            "folder": str(folder),
+            "running": [],
+            "past": [],
+            "trash": {"count": 0, "bytes": 0},
+        }
         assert not folder.exists(), "made when it is needed"
         started = post(client, "recordings", {"drones": ["alpha", "beta"]})
         assert started.status_code == 201
@@ -163,7 +168,7 @@ def test_a_replay_shows_up_and_can_be_ended(nodes: Nodes, folder: Path) -> None:
     (folder / "flight.mcap").touch()
     played: list[Path] = []
 
-    def replay(path: Path) -> Drone:
+    def replay(path: Path, drone: str | None) -> Drone:
         played.append(path)
         nodes.nodes.append(gamma)
         return gamma.connect("cockpit", access="observe")

@@ -2,7 +2,7 @@
 
 ======================================  ==================================================================
 ``/``, ``/static/…``                    the page
-``/api/…``                              see :mod:`skyloop.cockpit.api`
+``/api/…``                              see :mod:`skyloop.cockpit.api` and :mod:`skyloop.cockpit.recordings_api`
 ``/ws/overview``                        to the page: all drones, twice a second
 ``/ws/control``                         from the page: commands to all drones; to the page: what became of them
 ``/ws/video``                           to the page: small frames of all cameras that it shows; back: which, and ``ack``
@@ -36,6 +36,7 @@ from skyloop.cockpit.control_session import ControlSession
 from skyloop.cockpit.fleet import Fleet, Overview
 from skyloop.cockpit.fleet_control import FleetSession
 from skyloop.cockpit.recordings import Recordings
+from skyloop.cockpit.recordings_api import RecordingsApi
 from skyloop.cockpit.security import NOT_ALLOWED, Guard, Names, person_of
 from skyloop.cockpit.small_video import SmallVideoSender
 from skyloop.cockpit.station import Station
@@ -161,11 +162,12 @@ def create_app(
         admission: Counts the connections.
     """
     cockpit = Cockpit(fleet, recordings, static)
-    api = Api(fleet, recordings, gate, cockpit.counts, names.scheme, admission or Admission())
+    api = Api(fleet, gate, cockpit.counts, names.scheme, admission or Admission())
     return Starlette(
         routes=[
             Route("/", cockpit.page),
             *api.routes(),
+            *RecordingsApi(fleet, recordings).routes(),
             WebSocketRoute("/ws/overview", cockpit.overview),
             WebSocketRoute("/ws/video", cockpit.small_video),
             WebSocketRoute("/ws/control", cockpit.all_drones),

@@ -18,8 +18,10 @@ from urllib.parse import quote
 
 import msgspec
 
+from skyloop.cockpit import recording_files, timeline
+from skyloop.cockpit.recording_files import Mark, Notes
 from skyloop.cockpit.reports import Reports
-from skyloop.errors import RefusedError, UnknownNameError, UsageError
+from skyloop.errors import FileFormatError, RefusedError, UnknownNameError, UsageError
 from skyloop.logfile.listing import ENDING, Described, describe
 from skyloop.messages import Refusal
 
@@ -32,6 +34,7 @@ Json = dict[str, Any]
 REPLAY_S: Final = 20.0
 MAX_CHILDREN: Final = 8  #: recordings at one time, and as many replays: each is a process
 MOST_LISTED: Final = 500
+NOTE_SHOWN: Final = 200  #: characters of a note in the list
 
 
 class Recorder(Protocol):
@@ -61,15 +64,29 @@ def start_recorder(drones: Sequence[str], folder: Path) -> Recorder:
     return record(drones, folder)
 
 
-def start_replay(path: Path) -> Drone:
+def start_replay(path: Path, drone: str | None = None) -> Drone:
     """Start a private proxy that plays a file, and connect to it.
+
+    Args:
+        path: The file.
+        drone: Which of the recorded ones; None for the first.
 
     Raises:
         SkyloopError: It can't start.
     """
     from skyloop.client import connect
 
-    return connect(f"replay://{quote(str(path))}", access="observe", name="cockpit", timeout_s=REPLAY_S)
+    which = "" if drone is None else f"?drone={quote(drone)}"
+    return connect(f"replay://{quote(str(path))}{which}", access="observe", name="cockpit", timeout_s=REPLAY_S)
+
+
+@dataclass(frozen=True, slots=True)
+class Replay:
+    """A recording that is played again."""
+
+    drone: Drone  #: the observer that keeps its proxy running
+    path: Path
+    recorded: str | None  #: the drone's name in the recording; None: the first
 
 
 class Recordings:
@@ -85,13 +102,16 @@ class Recordings:
         self,
         folder: Path,
         record: Callable[[Sequence[str], Path], Recorder] = start_recorder,
-        replay: Callable[[Path], Drone] = start_replay,
+        replay: Callable[[Path, str | None], Drone] = start_replay,
     ) -> None:
         self.folder = folder
-        self.replays: dict[str, Drone] = {}  #: by the name of the proxy
+        self.replays: dict[str, Replay] = {}  #: by the name of the proxy
         self._record = record
         self._replay = replay
         self._reports = Reports()
+        self._timelines = Reports(timeline.child_command, "time line")
+        self._made: dict[tuple[Path, float, str | None], str] = {}  # time lines, the newest last
+        self._changing = asyncio.Lock()
         self._starting = asyncio.Lock()
         self._looking = asyncio.Lock()
         self._running: dict[str, Running] = {}
@@ -154,7 +174,8 @@ class Recordings:
         running = [self._entry(number) for number in self._running]
         async with self._looking:  # many who ask at one time cost as much as one
             past = await asyncio.to_thread(self._past)
-        return {"folder": str(self.folder), "running": running, "past": past}
+            trash = await asyncio.to_thread(recording_files.trash_of, self.folder)
+        return {"folder": str(self.folder), "running": running, "past": past, "trash": trash}
 
     async def report(self, name: str, drone: str | None = None) -> str:
         """Return the page that ``skyloop log report`` makes.
@@ -167,11 +188,94 @@ class Recordings:
             UnknownNameError: There is no such file.
             SkyloopError: What :meth:`skyloop.cockpit.reports.Reports.make` raises.
         """
-        path = await asyncio.to_thread(self._path, name)
-        return await self._reports.make(path, drone)
+        return await self._reports.make(await self.path(name), drone)
 
-    async def replay(self, name: str) -> str:
+    def mark(self, number: str, text: str) -> tuple[str, ...]:
+        """Check a mark for a running recording, and return the drones that it is for.
+
+        Raises:
+            UnknownNameError: No such recording runs.
+            UsageError: It is too long.
+        """
+        if number not in self._running:
+            raise UnknownNameError("running recording", number, self._running)
+        recording_files.check_mark(text)
+        return self._running[number].drones
+
+    # Files -----------------------------------------------------------------------------------------------------
+
+    async def path(self, name: str) -> Path:
+        """Return where a recording is.
+
+        Raises:
+            UnknownNameError: There is no such file, or it is being recorded.
+        """
+        return await asyncio.to_thread(self._path, name)
+
+    async def rename(self, name: str, new: str) -> str:
+        """Rename a recording, and return its name.
+
+        Raises:
+            UnknownNameError: There is no such file.
+            RefusedError: It is in use, or there is a file of that name.
+            UsageError: It can't be a name.
+        """
+        recording_files.check_name(new)
+        return await self._change(name, lambda path: recording_files.rename(path, new))
+
+    async def delete(self, name: str) -> str:
+        """Move a recording to the trash, and return its name there.
+
+        Raises:
+            UnknownNameError: There is no such file.
+            RefusedError: It is in use.
+        """
+        return await self._change(name, recording_files.throw_away)
+
+    async def restore(self, name: str) -> str:
+        """Bring a recording back from the trash, and return its name.
+
+        Raises:
+            UnknownNameError: It is not in the trash.
+            RefusedError: There is a file of that name.
+        """
+        async with self._changing:
+            return await asyncio.to_thread(recording_files.bring_back, self.folder, name)
+
+    async def empty_trash(self) -> None:
+        """Delete what is in the trash, for good."""
+        async with self._changing:
+            await asyncio.to_thread(recording_files.empty_trash, self.folder)
+
+    async def notes(self, name: str) -> Notes:
+        """Return what people wrote about a recording.
+
+        Raises:
+            UnknownNameError: There is no such file.
+            FileFormatError: The notes can't be read.
+        """
+        return await asyncio.to_thread(recording_files.read_notes, await self.path(name))
+
+    async def write_note(self, name: str, text: str) -> Notes:
+        """Write the note of a recording; see :func:`skyloop.cockpit.recording_files.write_text`."""
+        return await self._annotate(name, lambda path: recording_files.write_text(path, text))
+
+    async def add_mark(self, name: str, at_s: float, text: str) -> Notes:
+        """Add a mark to a recording; see :func:`skyloop.cockpit.recording_files.add_mark`."""
+        return await self._annotate(name, lambda path: recording_files.add_mark(path, at_s, text))
+
+    async def remove_mark(self, name: str, mark: Mark) -> Notes:
+        """Remove a mark from a recording; see :func:`skyloop.cockpit.recording_files.remove_mark`."""
+        return await self._annotate(name, lambda path: recording_files.remove_mark(path, mark))
+
+    # Replays ---------------------------------------------------------------------------------------------------
+
+    async def replay(self, name: str, recorded: str | None = None) -> str:
         """Play a recording again.
+
+        Args:
+            name: The file's, in the folder.
+            recorded: Which of the recorded drones; None for the first.
 
         Returns:
             The name of the proxy.
@@ -181,12 +285,35 @@ class Recordings:
             RefusedError: :data:`MAX_CHILDREN` replays run already.
             SkyloopError: The replay can't start.
         """
-        path = (await asyncio.to_thread(self._path, name)).absolute()
+        path = (await self.path(name)).absolute()
         async with self._starting:
             _check_number("replays run", "end", len(self.replays))
-            drone = await asyncio.to_thread(self._replay, path)
-            self.replays[drone.name] = drone
+            drone = await asyncio.to_thread(self._replay, path, recorded)
+            self.replays[drone.name] = Replay(drone, path, recorded)
             return drone.name
+
+    async def replayed(self, name: str) -> Json:
+        """Return what a replay's bar shows of its recording.
+
+        Args:
+            name: Of the proxy.
+
+        Returns:
+            The file's name, what :func:`skyloop.cockpit.timeline.timeline` returns, and the notes, as JSON values.
+
+        Raises:
+            UnknownNameError: No such replay was started here.
+            SkyloopError: What :meth:`skyloop.cockpit.reports.Reports.make` raises.
+        """
+        if name not in self.replays:
+            raise UnknownNameError("replay", name, self.replays)
+        replay = self.replays[name]
+        key = replay.path, replay.path.stat().st_mtime, replay.recorded
+        if key not in self._made:
+            made = await self._timelines.make(replay.path, replay.recorded)
+            self._made = {**dict(list(self._made.items())[1 - MAX_CHILDREN :]), key: made}
+        notes = await asyncio.to_thread(recording_files.read_notes, replay.path)
+        return {"recording": replay.path.name, "notes": notes, "timeline": msgspec.Raw(self._made[key].encode())}
 
     async def end_replay(self, name: str) -> None:
         """End a replay.
@@ -196,12 +323,12 @@ class Recordings:
         """
         if name not in self.replays:
             raise UnknownNameError("replay", name, self.replays)
-        await asyncio.to_thread(self.replays.pop(name).close)
+        await asyncio.to_thread(self.replays.pop(name).drone.close)
 
     async def close(self) -> None:
         """Close all files and end all replays."""
         ends = [running.recorder.close for running in self._running.values()]
-        ends += [drone.close for drone in self.replays.values()]
+        ends += [replay.drone.close for replay in self.replays.values()]
         self._running, self.replays = {}, {}
         await asyncio.gather(*(asyncio.to_thread(end) for end in ends), return_exceptions=True)
 
@@ -210,6 +337,22 @@ class Recordings:
     def _entry(self, number: str) -> Json:
         running = self._running[number]
         return {"id": number, "drones": list(running.drones), **_progress(running.recorder.status)}
+
+    async def _change(self, name: str, change: Callable[[Path], str]) -> str:
+        """Move a file that nobody here writes or plays."""
+        async with self._starting, self._changing:
+            for running in self._running.values():
+                if name in (Path(file).name for file in running.recorder.status.files):
+                    raise RefusedError(f"{name} is being recorded: stop that first", code=Refusal.BUSY)
+            path = (await self.path(name)).absolute()
+            for played, replay in self.replays.items():
+                if replay.path == path:
+                    raise RefusedError(f"{name} is being replayed as {played}: end that first", code=Refusal.BUSY)
+            return await asyncio.to_thread(change, path)
+
+    async def _annotate(self, name: str, write: Callable[[Path], Notes]) -> Notes:
+        async with self._changing:
+            return await asyncio.to_thread(write, await self.path(name))
 
     def _path(self, name: str) -> Path:
         known = {path.name: path for path in self._files()}
@@ -235,14 +378,25 @@ class Recordings:
         newest = sorted(found, reverse=True)[:MOST_LISTED]
         known = {(path.name, size, at_ns): path for at_ns, path, size in newest}
         self._known = {key: self._known.get(key) or describe(path) for key, path in known.items()}
-        rows = self._known.items()
-        return [{"name": name, "size": size, **msgspec.structs.asdict(entry)} for (name, size, _), entry in rows]
+        return [
+            {"name": name, "size": size, **msgspec.structs.asdict(entry), **_noted(self.folder / name)}
+            for (name, size, _), entry in self._known.items()
+        ]
 
     def _make_folder(self) -> None:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise UsageError(f"the folder of recordings {self.folder} can't be made: {error.strerror}") from None
+
+
+def _noted(path: Path) -> Json:
+    """Return the beginning of what people wrote about a recording, for its row."""
+    try:
+        notes = recording_files.read_notes(path)
+    except FileFormatError as error:
+        return {"note": str(error), "marks": 0}
+    return {"note": notes.text[:NOTE_SHOWN], "marks": len(notes.marks)}
 
 
 def _check_number(what: str, end: str, running: int) -> None:

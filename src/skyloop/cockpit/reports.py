@@ -36,14 +36,16 @@ def child_command(file: Path, target: Path, drone: str | None) -> Sequence[str]:
 
 
 class Reports:
-    """Makes reports. On the event loop.
+    """Makes reports, or whatever else a child makes of a recording. On the event loop.
 
     Args:
         command: Makes the command line of a child, in place of :func:`child_command`.
+        what: Is made, for error messages.
     """
 
-    def __init__(self, command: Command | None = None) -> None:
+    def __init__(self, command: Command | None = None, what: str = "report") -> None:
         self._command = command or child_command
+        self._what = what
         self._turn = asyncio.Lock()
         self._wanted = 0  # being made, or waited for
 
@@ -55,7 +57,7 @@ class Reports:
             drone: Which of the recorded ones; None for the only one.
 
         Returns:
-            The page that ``skyloop log report`` makes.
+            What the child made: the page that ``skyloop log report`` makes.
 
         Raises:
             RefusedError: Too many requests wait already.
@@ -64,7 +66,7 @@ class Reports:
         """
         if self._wanted > MAX_WAITING:
             raise RefusedError(
-                f"a report is being made and {self._wanted - 1} wait, which is all that may: try again in a while",
+                f"a {self._what} is being made and {self._wanted - 1} wait, which is all that may: try again later",
                 code=Refusal.BUSY,
             )
         self._wanted += 1
@@ -91,14 +93,14 @@ class Reports:
                         pass
                     await child.wait()
             except TimeoutError:
-                raise LinkError(f"the report of {file.name} was not made within {REPORT_S:g} s") from None
+                raise LinkError(f"the {self._what} of {file.name} was not made within {REPORT_S:g} s") from None
             finally:
                 if child.returncode is None:
                     child.kill()
                     await asyncio.shield(child.wait())
             if child.returncode or not target.exists():
                 lines = errors.decode(errors="replace").strip().splitlines()
-                raise UsageError(lines[-1] if lines else f"no report of {file.name} could be made")
+                raise UsageError(lines[-1] if lines else f"no {self._what} of {file.name} could be made")
             return await asyncio.to_thread(target.read_text, encoding="utf-8")
 
 

@@ -107,7 +107,7 @@ class Playback:
         if name == PAUSED:
             if not isinstance(value, bool):
                 raise ParameterError(f"{name} is true or false, not {value!r}", code=Refusal.WRONG_TYPE)
-            at_end = self.over or self.position_s >= self.duration_s
+            at_end = (self.over or self.position_s >= self.duration_s) and self._wanted.position_s is None
             self._want(paused=value, position_s=0.0 if at_end and not value else None)
             return value
         low, high = (0.0, self.duration_s) if name == POSITION else SPEEDS

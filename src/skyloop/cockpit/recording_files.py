@@ -1,0 +1,267 @@
+"""The files of the folder of recordings: renamed, noted about, thrown into the trash and brought back. Blocking.
+
+Beside ``flight.mcap`` lies what people wrote about it, ``flight.notes.json``; what was thrown away is in the folder
+``trash``, until that is emptied. Nothing here overwrites a file.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import unicodedata
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from skyloop import files
+from skyloop.errors import RefusedError, UnknownNameError, UsageError
+from skyloop.logfile.listing import ENDING
+from skyloop.messages import Refusal
+
+TRASH: Final = "trash"
+NOTES_ENDING: Final = ".notes.json"
+MAX_NAME: Final = 100  #: characters
+MAX_NAME_BYTES: Final = 200  #: file systems take 255, with what is put before and after a name
+MAX_TEXT: Final = 4000  #: characters of a note
+MAX_MARK: Final = 200  #: characters of a mark
+MAX_MARKS: Final = 200  #: of a recording
+MAX_AT_S: Final = 1e6
+_MOST_BYTES: Final = 1 << 20  #: of a file of notes
+_NOT_IN_NAMES: Final = frozenset('/\\<>:"|?*')  #: separators, and what other systems don't take
+
+
+class Mark(msgspec.Struct, frozen=True):
+    """A place in a recording to come back to."""
+
+    at_s: float  #: position in the recording, as ``replay.position_s``
+    text: str = ""
+
+
+class Notes(msgspec.Struct, frozen=True):
+    """What people wrote about a recording."""
+
+    text: str = ""
+    marks: tuple[Mark, ...] = ()
+
+
+def check_name(text: str) -> str:
+    """Return the name of a recording's file as a person gave it, with its ending.
+
+    Args:
+        text: With or without ``.mcap``.
+
+    Raises:
+        UsageError: It can't be a name here, with the reason.
+    """
+    name = unicodedata.normalize("NFC", text).strip()
+    name = name.removesuffix(ENDING).rstrip()
+    for character in name:
+        if character in _NOT_IN_NAMES:
+            raise UsageError(f"a name can't have {character!r} in it: letters, digits, spaces and -_.,()+ are fine")
+        if unicodedata.category(character)[0] == "C":
+            raise UsageError(f"a name can't have the character U+{ord(character):04X} in it, which is not visible")
+    if not name:
+        raise UsageError("a name is needed")
+    if name[0] in ".-":
+        raise UsageError(f"a name can't begin with {name[0]!r}")
+    if len(name) > MAX_NAME or len(name.encode()) > MAX_NAME_BYTES:
+        raise UsageError(f"a name has at most {MAX_NAME} characters ({MAX_NAME_BYTES} bytes), not {len(name)}")
+    return name + ENDING
+
+
+def notes_path(path: Path) -> Path:
+    """Return where the notes of a recording are."""
+    return path.with_name(path.name.removesuffix(ENDING) + NOTES_ENDING)
+
+
+def read_notes(path: Path) -> Notes:
+    """Return what was written about a recording.
+
+    Raises:
+        FileFormatError: The file of notes can't be read.
+    """
+    if not notes_path(path).exists():
+        return Notes()
+    return files.read_json(notes_path(path), Notes, "notes about a recording", _MOST_BYTES)
+
+
+def write_text(path: Path, text: str) -> Notes:
+    """Write the note of a recording; an empty one is removed.
+
+    Raises:
+        UsageError: It is too long, or can't be written.
+        FileFormatError: The present file of notes can't be read: it is not overwritten.
+    """
+    if len(text) > MAX_TEXT:
+        raise UsageError(f"a note has at most {MAX_TEXT} characters, not {len(text)}")
+    return _write(path, msgspec.structs.replace(read_notes(path), text=text.strip()))
+
+
+def add_mark(path: Path, at_s: float, text: str) -> Notes:
+    """Add a mark to a recording.
+
+    Raises:
+        UsageError: It is nowhere, or too long, or one too many.
+        FileFormatError: As :func:`write_text`.
+    """
+    if not (math.isfinite(at_s) and 0.0 <= at_s <= MAX_AT_S):
+        raise UsageError(f"a mark is at 0 to {MAX_AT_S:g} s of the recording, not at {at_s!r}")
+    check_mark(text)
+    notes = read_notes(path)
+    if len(notes.marks) >= MAX_MARKS:
+        raise UsageError(f"this recording has {MAX_MARKS} marks, which is all that it can have: remove one first")
+    marks = sorted((*notes.marks, Mark(round(at_s, 3), text.strip())), key=lambda mark: mark.at_s)
+    return _write(path, msgspec.structs.replace(notes, marks=tuple(marks)))
+
+
+def remove_mark(path: Path, mark: Mark) -> Notes:
+    """Remove a mark from a recording.
+
+    Raises:
+        UnknownNameError: It has no such mark.
+        FileFormatError: As :func:`write_text`.
+    """
+    notes = read_notes(path)
+    if mark not in notes.marks:
+        raise UnknownNameError("mark", f"{mark.at_s:g} s {mark.text}", [f"{m.at_s:g} s {m.text}" for m in notes.marks])
+    marks = list(notes.marks)
+    marks.remove(mark)
+    return _write(path, msgspec.structs.replace(notes, marks=tuple(marks)))
+
+
+def check_mark(text: str) -> None:
+    """Check a mark's text.
+
+    Raises:
+        UsageError: It is too long.
+    """
+    if len(text) > MAX_MARK:
+        raise UsageError(f"a mark has at most {MAX_MARK} characters, not {len(text)}")
+
+
+def rename(path: Path, name: str) -> str:
+    """Rename a recording, and its notes.
+
+    Returns:
+        The new name.
+
+    Raises:
+        UsageError: It can't be a name here, or the file can't be moved.
+        RefusedError: There is a file of that name.
+    """
+    target = path.with_name(check_name(name))
+    if target != path:
+        _move(path, target)
+    return target.name
+
+
+def throw_away(path: Path) -> str:
+    """Move a recording, and its notes, to the trash.
+
+    Returns:
+        Its name there, which has a number if another one of its name is there.
+
+    Raises:
+        UsageError: It can't be moved.
+    """
+    trash = path.parent / TRASH
+    try:
+        trash.mkdir(exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"the folder {trash} can't be made: {error.strerror}") from None
+    for target in _numbered(trash / path.name):
+        if not target.exists() and not notes_path(target).exists():
+            _move(path, target)
+            return target.name
+    raise AssertionError("there are endless numbers")
+
+
+def bring_back(folder: Path, name: str) -> str:
+    """Move a recording, and its notes, from the trash back into the folder.
+
+    Raises:
+        UnknownNameError: It is not in the trash.
+        RefusedError: There is a file of that name in the folder.
+        UsageError: It can't be moved.
+    """
+    thrown = {path.name: path for path in _recordings(folder / TRASH)}
+    if name not in thrown:
+        raise UnknownNameError("recording in the trash", name, thrown)
+    _move(thrown[name], folder / name)
+    return name
+
+
+def trash_of(folder: Path) -> dict[str, int]:
+    """Return how many recordings are in the trash, and how many bytes they take."""
+    sizes = []
+    for path in _recordings(folder / TRASH):
+        with suppress(OSError):
+            sizes.append(path.stat().st_size)
+    return {"count": len(sizes), "bytes": sum(sizes)}
+
+
+def empty_trash(folder: Path) -> None:
+    """Delete what is in the trash, for good.
+
+    Raises:
+        UsageError: A file can't be deleted.
+    """
+    for path in list(_recordings(folder / TRASH)):
+        try:
+            path.unlink(missing_ok=True)
+            notes_path(path).unlink(missing_ok=True)
+        except OSError as error:
+            raise UsageError(f"{path} can't be deleted: {error.strerror}") from None
+
+
+def _recordings(folder: Path) -> Iterator[Path]:
+    with suppress(FileNotFoundError, NotADirectoryError):
+        yield from (path for path in folder.iterdir() if path.suffix == ENDING)
+
+
+def _numbered(path: Path) -> Iterator[Path]:
+    yield path
+    number = 2
+    while True:
+        yield path.with_name(f"{path.name.removesuffix(ENDING)} ({number}){ENDING}")
+        number += 1
+
+
+def _write(path: Path, notes: Notes) -> Notes:
+    if notes == Notes():
+        notes_path(path).unlink(missing_ok=True)
+    else:
+        files.write(notes_path(path), msgspec.json.format(msgspec.json.encode(notes), indent=2) + b"\n")
+    return notes
+
+
+def _move(path: Path, target: Path) -> None:
+    """Move a recording and its notes, and overwrite nothing."""
+    if notes_path(target).exists():
+        raise RefusedError(f"there are notes of a recording {target.name} already", code=Refusal.BUSY)
+    try:
+        _move_one(path, target)
+        if notes_path(path).exists():
+            _move_one(notes_path(path), notes_path(target))
+    except FileExistsError:
+        raise RefusedError(
+            f"there is a recording {target.name} already: choose another name", code=Refusal.BUSY
+        ) from None
+    except OSError as error:
+        raise UsageError(f"{path.name} can't be moved: {error.strerror}") from None
+
+
+def _move_one(path: Path, target: Path) -> None:
+    try:
+        os.link(path, target, follow_symlinks=False)  # unlike a renaming this never overwrites
+    except FileExistsError:
+        raise
+    except OSError:  # a file system without hard links
+        if target.exists():
+            raise FileExistsError from None
+        path.rename(target)
+    else:
+        path.unlink()

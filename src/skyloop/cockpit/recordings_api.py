@@ -1,0 +1,236 @@
+"""Requests about recordings and replays: observers read, watch and download, pilots change."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import msgspec
+from starlette.requests import Request
+from starlette.responses import FileResponse, HTMLResponse, Response
+from starlette.routing import Route
+
+from skyloop.cockpit.answers import answer_json, answered, body_of, check_json, while_wanted
+from skyloop.cockpit.recording_files import Mark
+from skyloop.drivers.replay.playback import PAUSED, POSITION, SPEED
+from skyloop.errors import UnknownNameError, UsageError
+
+if TYPE_CHECKING:
+    from skyloop.cockpit.fleet import Fleet
+    from skyloop.cockpit.recordings import Recordings
+    from skyloop.cockpit.station import Station
+
+#: A report is a page of its own, with its script in it: it runs without this page's rights.
+_REPORT_POLICY: Final = (
+    "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
+    "img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+_MOST_CHARACTERS: Final = 16_384  #: of any text in a request; what it is for has its own limit, and says so
+_Text = Annotated[str, msgspec.Meta(max_length=_MOST_CHARACTERS)]
+
+
+class _Wanted(msgspec.Struct):
+    drones: Annotated[list[str], msgspec.Meta(max_length=64)]
+
+
+class _Name(msgspec.Struct):
+    name: _Text
+
+
+class _Words(msgspec.Struct):
+    text: _Text
+
+
+class _Mark(msgspec.Struct):
+    at_s: float
+    text: _Text = ""
+
+
+class _Replay(msgspec.Struct):
+    drone: _Text | None = None
+
+
+class _Playback(msgspec.Struct):
+    position_s: float | None = None
+    speed: float | None = None
+    paused: bool | None = None
+
+
+class RecordingsApi:
+    """The routes below ``/api/recordings`` and ``/api/replays``.
+
+    Args:
+        fleet: The drones.
+        recordings: Of the same drones.
+    """
+
+    def __init__(self, fleet: Fleet, recordings: Recordings) -> None:
+        self._fleet = fleet
+        self._recordings = recordings
+
+    def routes(self) -> list[Route]:
+        """Return the routes."""
+        one = "/api/recordings/{name}"
+        return [
+            Route("/api/recordings", self.recordings, methods=["GET"]),
+            Route("/api/recordings", self.record, methods=["POST"]),
+            Route("/api/recordings/{number}/stop", self.stop, methods=["POST"]),
+            Route("/api/recordings/{number}/mark", self.mark, methods=["POST"]),
+            Route(f"{one}/file", self.file),
+            Route(f"{one}/report", self.report),
+            Route(f"{one}/notes", self.notes, methods=["GET"]),
+            Route(f"{one}/notes", self.write_note, methods=["POST"]),
+            Route(f"{one}/marks", self.add_mark, methods=["POST"]),
+            Route(f"{one}/marks/remove", self.remove_mark, methods=["POST"]),
+            Route(f"{one}/rename", self.rename, methods=["POST"]),
+            Route(f"{one}/delete", self.delete, methods=["POST"]),
+            Route(f"{one}/replay", self.replay, methods=["POST"]),
+            Route("/api/trash/{name}/restore", self.restore, methods=["POST"]),
+            Route("/api/trash/empty", self.empty_trash, methods=["POST"]),
+            Route("/api/replays/{name}", self.replayed, methods=["GET"]),
+            Route("/api/replays/{name}", self.play, methods=["POST"]),
+            Route("/api/replays/{name}/stop", self.end_replay, methods=["POST"]),
+        ]
+
+    # Recording -------------------------------------------------------------------------------------------------
+
+    @answered
+    async def recordings(self, _: Request) -> Response:
+        """Answer with the recordings, running and past."""
+        return answer_json(await self._recordings.listing())
+
+    @answered
+    async def record(self, request: Request) -> Response:
+        """Start a recording."""
+        wanted = await body_of(request, _Wanted)
+        for name in wanted.drones:
+            self._station(name)
+        return answer_json(await self._recordings.start(wanted.drones), 201)
+
+    @answered
+    async def stop(self, request: Request) -> Response:
+        """Stop a recording."""
+        check_json(request)
+        return answer_json(await self._recordings.stop(request.path_params["number"]))
+
+    @answered
+    async def mark(self, request: Request) -> Response:
+        """Put a mark into a running recording: a log entry of each of its drones."""
+        text = (await body_of(request, _Words)).text
+        drones = self._recordings.mark(request.path_params["number"], text)
+        for name in drones:
+            if name in self._fleet.stations:
+                self._fleet.stations[name].drone.log.text(text.strip(), name="mark")
+        return answer_json({"drones": drones})
+
+    # Files -----------------------------------------------------------------------------------------------------
+
+    @answered
+    async def file(self, request: Request) -> Response:
+        """Answer with a recording's file, or the range of it that is asked for."""
+        path = await self._recordings.path(request.path_params["name"])
+        return FileResponse(path, filename=path.name, media_type="application/octet-stream")
+
+    @answered
+    async def report(self, request: Request) -> Response:
+        """Answer with the report on a recording, as a page."""
+        report = self._recordings.report(request.path_params["name"], request.query_params.get("drone"))
+        page = await while_wanted(request, report)
+        return HTMLResponse(page, headers={"content-security-policy": _REPORT_POLICY})
+
+    @answered
+    async def notes(self, request: Request) -> Response:
+        """Answer with what people wrote about a recording."""
+        return answer_json(await self._recordings.notes(request.path_params["name"]))
+
+    @answered
+    async def write_note(self, request: Request) -> Response:
+        """Write the note of a recording."""
+        text = (await body_of(request, _Words)).text
+        return answer_json(await self._recordings.write_note(request.path_params["name"], text))
+
+    @answered
+    async def add_mark(self, request: Request) -> Response:
+        """Add a mark to a recording."""
+        mark = await body_of(request, _Mark)
+        return answer_json(await self._recordings.add_mark(request.path_params["name"], mark.at_s, mark.text), 201)
+
+    @answered
+    async def remove_mark(self, request: Request) -> Response:
+        """Remove a mark from a recording."""
+        mark = await body_of(request, _Mark)
+        name = request.path_params["name"]
+        return answer_json(await self._recordings.remove_mark(name, Mark(mark.at_s, mark.text)))
+
+    @answered
+    async def rename(self, request: Request) -> Response:
+        """Rename a recording."""
+        name = (await body_of(request, _Name)).name
+        return answer_json({"name": await self._recordings.rename(request.path_params["name"], name)})
+
+    @answered
+    async def delete(self, request: Request) -> Response:
+        """Move a recording to the trash."""
+        check_json(request)
+        return answer_json({"name": await self._recordings.delete(request.path_params["name"])})
+
+    @answered
+    async def restore(self, request: Request) -> Response:
+        """Bring a recording back from the trash."""
+        check_json(request)
+        return answer_json({"name": await self._recordings.restore(request.path_params["name"])})
+
+    @answered
+    async def empty_trash(self, request: Request) -> Response:
+        """Delete what is in the trash."""
+        check_json(request)
+        await self._recordings.empty_trash()
+        return answer_json({})
+
+    # Replays ---------------------------------------------------------------------------------------------------
+
+    @answered
+    async def replay(self, request: Request) -> Response:
+        """Play a recording again."""
+        wanted = await body_of(request, _Replay)
+        name = await self._recordings.replay(request.path_params["name"], wanted.drone)
+        self._fleet.want(name)
+        await self._fleet.look()
+        return answer_json({"drone": name}, 201)
+
+    @answered
+    async def replayed(self, request: Request) -> Response:
+        """Answer with what is known of the recording that a replay plays."""
+        return answer_json(await while_wanted(request, self._recordings.replayed(request.path_params["name"])))
+
+    @answered
+    async def play(self, request: Request) -> Response:
+        """Pause a replay, let it go on, move it, change its speed. The answer comes when the replay has been told."""
+        wanted = await body_of(request, _Playback)
+        name = request.path_params["name"]
+        station = self._station(name)
+        if not station.drone.uri.startswith("replay:"):
+            raise UsageError(f"{name} is no replay: it can't be paused or moved")
+        values: dict[str, Any] = {SPEED: wanted.speed, POSITION: wanted.position_s}
+        # Held before it is moved, moved before it goes on: or it would play where it was, or is not to begin.
+        values = {PAUSED: True, **values} if wanted.paused else {**values, PAUSED: wanted.paused}
+        pilot = await station.stopper()  # a pilot's connection without the authority, which this does not need
+        for parameter, value in values.items():
+            if value is not None:
+                await asyncio.to_thread(pilot.config.__setitem__, parameter, value)
+        return answer_json({"drone": name})
+
+    @answered
+    async def end_replay(self, request: Request) -> Response:
+        """End a replay."""
+        check_json(request)
+        name = request.path_params["name"]
+        await self._recordings.end_replay(name)
+        self._fleet.let_go(name)
+        return answer_json({"drone": name})
+
+    def _station(self, name: str) -> Station:
+        stations = self._fleet.stations
+        if name not in stations:
+            raise UnknownNameError("drone", name, stations)
+        return stations[name]
