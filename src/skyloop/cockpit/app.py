@@ -24,9 +24,8 @@ from typing import Final
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import FileResponse, PlainTextResponse, Response
+from starlette.responses import Response
 from starlette.routing import Mount, Route, WebSocketRoute
-from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
 from skyloop.cockpit.access import Gate
@@ -35,6 +34,7 @@ from skyloop.cockpit.api import Api
 from skyloop.cockpit.control_session import ControlSession
 from skyloop.cockpit.fleet import Fleet, Overview
 from skyloop.cockpit.fleet_control import FleetSession
+from skyloop.cockpit.page_files import PageFiles
 from skyloop.cockpit.recordings import Recordings
 from skyloop.cockpit.recordings_api import RecordingsApi
 from skyloop.cockpit.security import NOT_ALLOWED, Guard, Names, person_of
@@ -58,7 +58,7 @@ class Cockpit:
 
     def __init__(self, fleet: Fleet, recordings: Recordings, static: Path) -> None:
         self.counts = PageCounts()
-        self._page = static / "index.html"
+        self.files = PageFiles(static)
         self._fleet = fleet
         self._recordings = recordings
         self._overview = Overview(fleet, recordings)
@@ -77,9 +77,7 @@ class Cockpit:
 
     async def page(self, _: Request) -> Response:
         """Answer with the page."""
-        if not self._page.is_file():
-            return PlainTextResponse(f"The page is not built: there is no {self._page}. Run make in the sources.", 503)
-        return FileResponse(self._page)
+        return await self.files.page()
 
     async def overview(self, socket: WebSocket) -> None:
         """Send all drones to a page."""
@@ -174,7 +172,7 @@ def create_app(
             WebSocketRoute("/ws/drones/{name}/telemetry", cockpit.telemetry),
             WebSocketRoute("/ws/drones/{name}/video/{camera}", cockpit.video),
             WebSocketRoute("/ws/drones/{name}/control", cockpit.control),
-            Mount("/static", StaticFiles(directory=static, check_dir=False)),
+            Mount("/static", cockpit.files),
         ],
         middleware=[Middleware(Guard, names=names, gate=gate)],
         lifespan=cockpit.lifespan,
