@@ -5,7 +5,10 @@ import "./style/base.css";
 import "./style/layout.css";
 import "./style/parts.css";
 import "./style/overview.css";
+import "./style/alarms.css";
 import { hashOf, namesOf, OVERVIEW } from "./address.js";
+import { AlarmBook } from "./alarms.js";
+import { AlarmSound } from "./alarmsound.js";
 import { post } from "./api.js";
 import { ServerClock } from "./clock.js";
 import { h, setAttribute, setHidden, setText } from "./dom.js";
@@ -49,6 +52,12 @@ class Page {
   private readonly countdown = new Countdown();
   private readonly safety: Safety | null;
   private readonly clock = new ServerClock();
+  /** Of the whole list: heard in the overview, once each. */
+  private readonly listed = new AlarmBook();
+  private readonly sound = new AlarmSound(() => [
+    { name: "", raised: this.listed.raised, loudest: this.inOverview ? this.listed.loudest : null, repeats: false },
+    ...[...this.panes.values()].map((pane) => pane.alarmSource),
+  ]);
   private listed_ms = performance.now();
   /** How much of each pane is on the screen [pixels²]. */
   private readonly seen = new Map<string, number>();
@@ -68,10 +77,10 @@ class Page {
     const person = h("span", { class: "person", title: who.name || who.role || "" }, who.name ? `${who.name} · ${who.role}` : (who.role ?? ""));
     const leave = who.login ? h("button", { type: "button", class: "small", onclick: () => void post("/api/logout").finally(() => location.reload()) }, "Log out") : null;
     const brand = h("h1", { class: "brand" }, h("img", { src: "/static/icon.svg", alt: "", width: 24, height: 24 }), "Skyloop");
-    const bar = h("header", { class: "bar" }, brand, this.all, h("span", { class: "spring" }), person, leave, this.help.chip, settings.button, this.safety?.element ?? null);
+    const bar = h("header", { class: "bar" }, brand, this.all, h("span", { class: "spring" }), person, leave, this.sound.button, this.help.chip, settings.button, this.safety?.element ?? null);
     const recordings = new RecordingList(() => this.recorded, (name) => this.enter(name), who.role === "pilot");
     this.deckhouse = h("div", { class: "deckhouse" }, this.fleet.element, this.overview.element, this.main, this.overview.side, recordings.element);
-    root.replaceChildren(bar, this.lost, this.safety?.message ?? "", this.deckhouse, this.help.modal.element, this.help.mapping.modal.element, settings.modal.element, this.countdown.element);
+    root.replaceChildren(bar, h("div", { class: "over page-over" }, h("div", { class: "stack" }, this.lost, this.safety?.message ?? "")), this.deckhouse, this.help.modal.element, this.help.mapping.modal.element, settings.modal.element, this.countdown.element);
     this.flying = new Flying({
       pilots: () => [...this.panes.values()].flatMap((pane) => pane.pilot ?? []),
       selected: () => this.selected?.pilot ?? null,
@@ -113,6 +122,8 @@ class Page {
     this.listed_ms = now_ms - (this.clock.age_s(now_s, now_ms) ?? 0) * 1000;
     this.rows = rows;
     this.safety?.know(rows);
+    const alarms = rows.filter((row) => !isRecording(row)).flatMap(({ name, alarms }) => alarms.map((alarm) => ({ ...alarm, id: `${name}/${alarm.id}` })));
+    this.listed.update(alarms, now_ms);
     this.overview.update(rows, now_s);
     this.fleet.update(rows, new Set(this.panes.keys()));
     this.openOnly(rows);

@@ -1,5 +1,7 @@
 // One drone, opened: everything that is seen of it and done with it.
 
+import { AlarmBanner, AlarmBook } from "./alarms.js";
+import type { AlarmSource } from "./alarmsound.js";
 import { errorText, post } from "./api.js";
 import { Battery } from "./battery.js";
 import { Channels } from "./channels.js";
@@ -14,7 +16,7 @@ import type { Countdown } from "./hold.js";
 import { Instruments } from "./instruments.js";
 import type { Deed } from "./keys.js";
 import { MapView } from "./map.js";
-import type { DroneRow, State, Sticks, Vehicle } from "./model.js";
+import type { Alarm, DroneRow, State, Sticks, Vehicle } from "./model.js";
 import { Parameters } from "./parameters.js";
 import { Pilot } from "./pilot.js";
 import { Plots } from "./plots.js";
@@ -40,6 +42,8 @@ export interface PaneHost {
 }
 
 const NOTICE_MS = 9000;
+/** So long the first connection may take before it is an alarm that there is none. */
+const CONNECT_MS = 1500;
 const FLIGHT_TONES: Readonly<Record<string, Tone>> = { landed: "quiet", unknown: "quiet", emergency: "bad", landing: "busy", taking_off: "busy", hovering: "ok", flying: "ok" };
 const now_s = (): number => performance.now() / 1000;
 
@@ -64,10 +68,14 @@ export class Pane {
   private readonly endReplay = h("button", { type: "button", class: "small", hidden: true, onclick: () => void this.stopReplay() }, "End replay");
   private readonly flight = h("span", {}, "no feedback yet");
   private readonly pill = h("p", { class: "pill", role: "status", "aria-label": "Flight state", "data-tone": "quiet" }, h("i", { class: "dot" }), this.flight);
-  private readonly alarms = h("div", { class: "banner alarms", role: "alert", "data-tone": "bad" });
+  private readonly alarmBook = new AlarmBook();
+  private readonly alarms = new AlarmBanner(this.alarmBook);
+  private readonly opened_ms = performance.now();
+  private wasConnected = false;
   private readonly oldAge = h("b", { "aria-hidden": "true" });
   private readonly oldWhat = h("span", {});
-  private readonly old = h("p", { class: "banner old", role: "alert", "data-tone": "warn", hidden: true }, h("span", {}, "Old"), this.oldAge, this.oldWhat);
+  private readonly oldSeen = h("button", { type: "button", class: "small", "aria-label": "OK: acknowledge that it is old", onclick: () => this.alarmBook.acknowledge("old", performance.now()) && this.update() }, "OK");
+  private readonly old = h("p", { class: "banner old", role: "alert", "data-tone": "warn", hidden: true }, h("span", {}, "Old"), this.oldAge, this.oldWhat, this.oldSeen);
   private readonly notice = h("p", { class: "banner notice", role: "alert", "data-tone": "warn" });
   private readonly stage: Stage;
   private readonly instruments = new Instruments();
@@ -145,6 +153,12 @@ export class Pane {
     return { name: this.name, result: pilot.result("stop"), stop: () => pilot.act("stop") };
   }
 
+  /** What is to be heard of it. What was recorded is no alarm now. */
+  get alarmSource(): AlarmSource {
+    const { raised, loudest } = this.alarmBook;
+    return { name: this.name, raised, loudest: this.isRecording ? null : loudest, repeats: true };
+  }
+
   selected(selected: boolean): void {
     setAttribute(this.element, "data-selected", String(selected));
   }
@@ -180,9 +194,9 @@ export class Pane {
 
   private build(): HTMLElement {
     const close = h("button", { type: "button", class: "bare close", "aria-label": `Close ${this.name}`, onclick: () => this.host.close(this.name) }, "×");
-    const head = h("header", { class: "pane-head" }, h("h2", {}, this.name), this.kind, this.endReplay, this.pill, this.battery.element, close);
+    const head = h("header", { class: "pane-head" }, h("h2", {}, this.name), this.kind, this.endReplay, this.alarms.chip, this.pill, this.battery.element, close);
     const body = h("div", { class: "pane-body" }, this.stage.element, this.decks.space.element, this.instruments.element, this.decks.plots.element, this.decks.lists.element, this.channels.element);
-    const element = h("article", { class: "pane", "data-drone": this.name, "aria-label": `Drone ${this.name}`, tabindex: -1 }, head, this.old, this.alarms, this.notice, body, this.thumbs.element, this.strip.element);
+    const element = h("article", { class: "pane", "data-drone": this.name, "aria-label": `Drone ${this.name}`, tabindex: -1 }, head, h("div", { class: "over" }, h("div", { class: "stack" }, this.old, this.alarms.element, this.notice)), this.alarms.voice, body, this.thumbs.element, this.strip.element);
     element.addEventListener("pointerdown", () => this.host.select(this.name), { capture: true });
     element.addEventListener("focusin", () => this.host.select(this.name));
     return element;
@@ -206,6 +220,7 @@ export class Pane {
 
   private linked(open: boolean, code: number): void {
     this.connected = open;
+    this.wasConnected ||= open;
     if (open) this.events.restart();
     this.absent = code === 4404 ? `${this.name} is not there; it is shown when it comes back` : "";
     this.update();
@@ -222,6 +237,7 @@ export class Pane {
       this.state = message;
       this.absent = "";
       this.dated(message);
+      this.alarmBook.update(this.found(), performance.now()); // also while nobody sees the page, and nothing is drawn
       this.history.add(now_s(), message.values);
       const place = message.position ?? message.truth?.position;
       if (place) this.trail.add(now_s(), place);
@@ -280,13 +296,25 @@ export class Pane {
     this.waypoint.allow(can);
     this.map.allow(can ? "" : nowhere);
     this.parameters.allow(mine, recording ? "As they were recorded." : "Take control to change them.");
-    const shown = over ? [] : !this.connected ? [this.absent || `no data about ${this.name} from the cockpit: what is shown is old`] : (state?.alarms ?? []).map((alarm) => alarm.text);
-    setText(this.alarms, shown.join(" · "));
-    setHidden(this.alarms, shown.length === 0);
+    this.alarmBook.update(this.found(), performance.now());
+    this.alarms.show();
+    setHidden(this.oldSeen, !this.alarmBook.open.some((alarm) => alarm.id === "old"));
     setAttribute(this.element, "data-lost", String(!live || isOld));
     setAttribute(this.element, "data-old", String(isOld || (!live && !over)));
     setAttribute(this.element, "data-mine", String(mine));
     this.host.aimed(this.name);
+  }
+
+  /** What is wrong now: as the drone says, and between the cockpit and this page. */
+  private found(): Alarm[] {
+    const { state } = this;
+    if (this.isRecording && (!this.connected || state?.links.application === "lost" || state?.links.vehicle === "closed")) return []; // it is over
+    const severity = state?.airborne || this.pilot?.mine ? "critical" : "warning";
+    const old: Alarm[] = this.isOld ? [{ id: "old", severity, text: "what is shown is old" }] : [];
+    if (this.connected) return [...old, ...(state?.alarms ?? [])];
+    if (this.absent) return [{ id: "absent", severity, text: this.absent }];
+    if (!this.wasConnected && performance.now() - this.opened_ms < CONNECT_MS) return [];
+    return [...old, { id: "page_link", severity, text: `no data about ${this.name} from the cockpit: what is shown is old` }];
   }
 
   private notify(text: string, tone: Tone): void {

@@ -26,6 +26,10 @@ def flying(**values: Any) -> Feedback:
     return Feedback(**(known | values))
 
 
+def landed(**values: Any) -> Feedback:
+    return flying(state=FlightState.LANDED, **values)
+
+
 LOST = ("application_link", "critical", "link to the proxy lost")
 GONE = ("vehicle_link", "critical", "link to the vehicle lost: radio")
 
@@ -36,9 +40,13 @@ GONE = ("vehicle_link", "critical", "link to the vehicle lost: radio")
         ((link(), flying(), 0.1, {}), []),
         ((link(), None, None, {}), []),
         ((link("lost", "up", "killed"), flying(battery=0.01), 9.0, {}), [(*LOST[:2], f"{LOST[2]}: killed")]),
-        ((link("closed"), None, None, {}), [LOST]),
+        ((link("closed"), None, None, {}), [("application_link", "warning", "link to the proxy lost")]),
         ((link("up", "lost", "radio"), flying(), 0.1, {}), [GONE]),
-        ((link("up", "lost", "radio", "plug it in"), None, None, {}), [(*GONE[:2], f"{GONE[2]}: plug it in")]),
+        ((link("up", "lost", "radio", "plug it in"), flying(), 0.1, {}), [(*GONE[:2], f"{GONE[2]}: plug it in")]),
+        ((link("up", "lost", "radio"), landed(), 0.1, {}), [(GONE[0], "warning", GONE[2])]),
+        ((link("lost"), landed(), 9.0, {}), [(LOST[0], "warning", LOST[2])]),
+        ((link(), landed(battery=0.05), 0.1, {}), [("battery", "warning", "battery critical: 5%")]),
+        ((link(), landed(), 2.5, {}), [("feedback_age", "warning", "feedback is 2.5 s old")]),
         (
             (link("up", "connecting", "waiting"), None, None, {}),
             [("vehicle_link", "warning", "no vehicle yet: waiting")],
@@ -66,9 +74,9 @@ GONE = ("vehicle_link", "critical", "link to the vehicle lost: radio")
             (link("degraded"), flying(state=FlightState.EMERGENCY, battery=0.18), 2.0, {}),
             [
                 ("emergency", "critical", "emergency: the motors are off"),
-                ("feedback_age", "critical", "feedback is 2.0 s old"),
                 ("battery", "warning", "battery low: 18%"),
                 ("application_link", "warning", "link to the proxy degraded"),
+                ("feedback_age", "warning", "feedback is 2.0 s old"),
             ],
         ),
     ],

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
@@ -13,6 +13,7 @@ from skyloop.messages import Failsafe, Feedback, FlightState, LinkState
 if TYPE_CHECKING:
     from skyloop.client import LinkStatus
 
+_Make = Callable[[str, str], "Alarm"]
 _BROKEN: Final = (LinkState.LOST, LinkState.CLOSED)
 
 
@@ -65,16 +66,23 @@ def alarms(
         video_age_s: Age of what is shown [s], by camera that somebody watches.
         thresholds: From where on a charge or an age is an alarm.
     """
+    # On the ground there is time: only what is, or was when last heard of, in the air is urgent.
+    urgent = _critical if feedback is not None and feedback.state.airborne else _warning
     if link.application in _BROKEN:
         # Nothing else is known any more: what came before is out of date.
-        return [_critical("application_link", _because("link to the proxy lost", link.reason))]
+        return [urgent("application_link", _because("link to the proxy lost", link.reason))]
     if link.vehicle is LinkState.CLOSED:
         return []  # a recording that is over, as every recording is some time: nothing is wrong
-    found = [*_of_flight(feedback, thresholds), *_of_links(link), *_of_ages(feedback_age_s, video_age_s, thresholds)]
+    found = [*_of_flight(feedback, thresholds, urgent), *_of_links(link, urgent)]
+    if feedback_age_s is not None and 0 < thresholds.feedback_age_s < feedback_age_s:
+        found.append(urgent("feedback_age", f"feedback is {feedback_age_s:.1f} s old"))
+    for camera, age_s in video_age_s.items():
+        if 0 < thresholds.video_age_s < age_s:
+            found.append(_warning(f"video_age.{camera}", f"video of {camera} is {age_s:.1f} s old"))
     return sorted(found, key=lambda alarm: alarm.severity is not AlarmSeverity.CRITICAL)
 
 
-def _of_flight(feedback: Feedback | None, thresholds: Thresholds) -> Iterator[Alarm]:
+def _of_flight(feedback: Feedback | None, thresholds: Thresholds, urgent: _Make) -> Iterator[Alarm]:
     if feedback is None:
         return
     if feedback.state is FlightState.EMERGENCY:
@@ -85,14 +93,14 @@ def _of_flight(feedback: Feedback | None, thresholds: Thresholds) -> Iterator[Al
         yield _warning("failsafe", "failsafe: hovering by itself")
     charge = feedback.battery
     if charge is not None and charge < thresholds.battery_critical:
-        yield _critical("battery", f"battery critical: {charge:.0%}")
+        yield urgent("battery", f"battery critical: {charge:.0%}")
     elif charge is not None and charge < thresholds.battery_low:
         yield _warning("battery", f"battery low: {charge:.0%}")
 
 
-def _of_links(link: LinkStatus) -> Iterator[Alarm]:
+def _of_links(link: LinkStatus, urgent: _Make) -> Iterator[Alarm]:
     if link.vehicle is LinkState.LOST:
-        yield _critical("vehicle_link", _because("link to the vehicle lost", link.reason, link.remedy))
+        yield urgent("vehicle_link", _because("link to the vehicle lost", link.reason, link.remedy))
     elif link.vehicle is LinkState.CONNECTING:
         yield _warning("vehicle_link", _because("no vehicle yet", link.reason, link.remedy))
     for hop, name, state in (
@@ -101,14 +109,6 @@ def _of_links(link: LinkStatus) -> Iterator[Alarm]:
     ):
         if state is LinkState.DEGRADED:
             yield _warning(hop, _because(f"link to the {name} degraded", link.reason))
-
-
-def _of_ages(feedback_age_s: float | None, video_age_s: Mapping[str, float], thresholds: Thresholds) -> Iterator[Alarm]:
-    if feedback_age_s is not None and 0 < thresholds.feedback_age_s < feedback_age_s:
-        yield _critical("feedback_age", f"feedback is {feedback_age_s:.1f} s old")
-    for camera, age_s in video_age_s.items():
-        if 0 < thresholds.video_age_s < age_s:
-            yield _warning(f"video_age.{camera}", f"video of {camera} is {age_s:.1f} s old")
 
 
 def _critical(what: str, text: str) -> Alarm:

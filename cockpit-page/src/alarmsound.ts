@@ -1,0 +1,124 @@
+// Alarms that are heard and felt: a tone where the browser allows it, and a vibration where there is a motor for it.
+
+import { h, memory, setAttribute, setText, setTone, svg } from "./dom.js";
+import type { Alarm } from "./model.js";
+
+type Severity = Alarm["severity"];
+
+const LOOK_MS = 250;
+/** A critical alarm is repeated until it is acknowledged; a warning is heard once. */
+export const REPEAT_MS = 2500;
+const VIBRATIONS: Readonly<Record<Severity, number[]>> = { warning: [180], critical: [400, 150, 400, 150, 400] };
+/** Frequency [Hz] and start [s] of each tone. */
+const TONES: Readonly<Record<Severity, readonly (readonly [number, number])[]>> = {
+  warning: [[660, 0], [660, 0.22]],
+  critical: [[988, 0], [740, 0.16], [988, 0.32], [740, 0.48], [988, 0.64]],
+};
+const TONE_S = 0.13;
+const VOLUME = 0.25;
+
+/** Where alarms come from: a drone that is open, or all of the list. */
+export interface AlarmSource {
+  name: string;
+  /** How often an alarm came, or got worse. */
+  raised: number;
+  /** The most severe that nobody has acknowledged. */
+  loudest: Severity | null;
+  /** Whether somebody can acknowledge it there, and so it may go on until then. */
+  repeats: boolean;
+}
+
+/** When something is to be heard. Pure. */
+export class Ringing {
+  private raised = new Map<string, number>();
+  private next_ms = 0;
+
+  due(sources: readonly AlarmSource[], now_ms: number): Severity | null {
+    const fresh = sources.filter(({ name, raised }) => raised > (this.raised.get(name) ?? 0));
+    this.raised = new Map(sources.map(({ name, raised }) => [name, raised]));
+    const repeated = now_ms >= this.next_ms ? sources.filter(({ repeats, loudest }) => repeats && loudest === "critical") : [];
+    const heard = [...fresh, ...repeated].map(({ loudest }) => loudest);
+    const due = heard.includes("critical") ? "critical" : heard.includes("warning") ? "warning" : null;
+    if (due === "critical") this.next_ms = now_ms + REPEAT_MS;
+    return due;
+  }
+}
+
+export class AlarmSound {
+  /** Switches the sound off and on, and says when the browser forbids it. */
+  readonly button: HTMLButtonElement;
+  private readonly text = h("span", { class: "sound-text" });
+  private readonly ringing = new Ringing();
+  private readonly wave = svg("path", { d: "M11.5 5.2a4 4 0 0 1 0 5.6M13.6 3a7 7 0 0 1 0 10", fill: "none", stroke: "currentColor", "stroke-width": 1.5, "stroke-linecap": "round" });
+  private context: AudioContext | null = null;
+
+  constructor(private readonly sources: () => readonly AlarmSource[]) {
+    const picture = svg("svg", { viewBox: "0 0 16 16", width: 16, height: 16, "aria-hidden": "true" }, svg("path", { d: "M2 6v4h2.6L9 13.4V2.6L4.6 6z", fill: "currentColor" }), this.wave);
+    this.button = h("button", { type: "button", class: "small sound", onclick: () => this.mute(!this.isMuted) }, picture, this.text);
+    // Browsers allow sound only after the first touch of the page.
+    for (const touch of ["pointerdown", "keydown"]) window.addEventListener(touch, () => this.wake(), { capture: true });
+    setInterval(() => this.look(), LOOK_MS);
+    this.show();
+  }
+
+  private get isMuted(): boolean {
+    return memory.get("alarms-muted") === "true";
+  }
+
+  private get isBlocked(): boolean {
+    return this.context?.state !== "running";
+  }
+
+  private mute(muted: boolean): void {
+    memory.set("alarms-muted", String(muted));
+    this.show();
+    if (!muted) this.play("warning"); // so that one knows what it is like
+  }
+
+  private look(): void {
+    const due = this.ringing.due(this.sources(), performance.now());
+    this.show();
+    if (due === null) return;
+    // Before the first touch a browser forbids this too, and complains.
+    if (navigator.userActivation?.hasBeenActive ?? true) navigator.vibrate?.(VIBRATIONS[due]);
+    if (!this.isMuted) this.play(due);
+  }
+
+  private wake(): void {
+    try {
+      this.context ??= new AudioContext();
+      void this.context.resume().then(() => this.show());
+    } catch {
+      // No sound on this machine: the button says that it is blocked.
+    }
+  }
+
+  private play(severity: Severity): void {
+    const { context } = this;
+    if (context === null || this.isBlocked) return;
+    for (const [frequency, start_s] of TONES[severity]) {
+      const at_s = context.currentTime + start_s;
+      const [tone, volume] = [context.createOscillator(), context.createGain()];
+      tone.type = "square";
+      tone.frequency.value = frequency;
+      volume.gain.setValueAtTime(0, at_s);
+      volume.gain.linearRampToValueAtTime(VOLUME, at_s + 0.01); // without a click
+      volume.gain.setValueAtTime(VOLUME, at_s + TONE_S - 0.02);
+      volume.gain.linearRampToValueAtTime(0, at_s + TONE_S);
+      tone.connect(volume).connect(context.destination);
+      tone.start(at_s);
+      tone.stop(at_s + TONE_S);
+    }
+  }
+
+  private show(): void {
+    const [muted, blocked] = [this.isMuted, this.isBlocked];
+    const state = muted ? "Muted" : blocked ? "Touch for sound" : "";
+    setText(this.text, state);
+    setTone(this.button, !muted && blocked ? "warn" : "quiet");
+    this.wave.setAttribute("visibility", muted || blocked ? "hidden" : "visible");
+    setAttribute(this.button, "aria-pressed", String(!muted));
+    setAttribute(this.button, "aria-label", muted ? "Alarms' sound: muted" : blocked ? "Alarms' sound: the browser blocks it until the page is touched" : "Alarms' sound: on");
+    setAttribute(this.button, "title", muted ? "Alarms are muted" : blocked ? "The browser blocks sound until you touch the page" : "Alarms are heard: press to mute them");
+  }
+}
