@@ -26,11 +26,53 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Mapping
+from enum import StrEnum
 from functools import partial
+from typing import Final, Self
+
+
+class Hint(StrEnum):
+    """What may be done about an error. ``str(error)`` ends with it in Python's words; the command line has its own."""
+
+    SEARCH_NETWORK = "search the network"
+    NAME_NETWORK = "name the network"
+    REACH_BY_NETWORK = "reach it over the network"
+    OBSERVE = "observe meanwhile"
+    FLY = "connect as a pilot"
+
+
+_IN_PYTHON: Final = {
+    Hint.SEARCH_NETWORK: (
+        "only this host was searched (network=True, or the variable SKYLOOP_NETWORK, searches further)"
+    ),
+    Hint.NAME_NETWORK: "give network=True as well, or set SKYLOOP_NETWORK",
+    Hint.REACH_BY_NETWORK: "a program may reach it over the network (network=True) from anywhere",
+    Hint.OBSERVE: 'connect with access="observe" to watch meanwhile',
+    Hint.FLY: 'connect with access="pilot" to fly',
+}
 
 
 class SkyloopError(Exception):
-    """Base of all errors that Skyloop raises on purpose."""
+    """Base of all errors that Skyloop raises on purpose.
+
+    Attributes:
+        hint: What may be done about it, for programs that word it themselves; None: nothing but what is said.
+    """
+
+    hint: Hint | None = None
+
+    def with_hint(self, hint: Hint) -> Self:
+        """Add a hint, and return this error."""
+        self.hint = hint
+        return self
+
+    @property
+    def reason(self) -> str:
+        """What is wrong, without the hint."""
+        return super().__str__()
+
+    def __str__(self) -> str:
+        return self.reason if self.hint is None else f"{self.reason}; {_IN_PYTHON[self.hint]}"
 
 
 class UsageError(SkyloopError, ValueError):
@@ -71,11 +113,13 @@ class UnknownNameError(UsageError, KeyError):
         self.message = f"no {kind} named {name!r}; {hint}"
         super().__init__(self.message)
 
-    def __str__(self) -> str:  # KeyError would show the repr of the message
+    @property
+    def reason(self) -> str:  # KeyError would show the repr of the message
+        """What is wrong, without the hint."""
         return self.message
 
     def __reduce__(self) -> tuple[object, ...]:  # errors of worker processes come back pickled
-        return type(self), (self.kind, self.name, self.known)
+        return type(self), (self.kind, self.name, self.known), {"hint": self.hint}
 
 
 class FileFormatError(UsageError):

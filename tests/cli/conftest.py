@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import tempfile
@@ -29,8 +30,10 @@ Run = Callable[..., Ended]
 
 
 @pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Iterator[Run]:
+def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
     """Runs a command in this process, as ``skyloop ARGUMENTS`` would."""
+    for variable in ("SKYLOOP_NETWORK", "SKYLOOP_KEYS"):  # --network and --keys set them for the whole process
+        monkeypatch.setenv(variable, os.environ.get(variable, ""))
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     path = list(sys.path)
 

@@ -69,19 +69,25 @@ def test_without_a_word_help_is_shown(run: Run) -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["proxi"], "Did you mean 'proxy'"),
-        (["list", "--jsn"], "--json"),
-        (["proxy"], "Missing argument"),
-        (["sim", "--drones", "0"], "--drones"),
-        (["sim", "--drones", "many"], "--drones"),
-        (["fly", "x.py", "--priority", "32"], "--priority"),
-        (["cockpit", "alpha", "--port", "70000"], "--port"),
+        (["proxi"], "skyloop: no command proxi; did you mean 'proxy'"),
+        (["list", "--jsn"], "skyloop list: no option --jsn; did you mean --json?"),
+        (["proxy"], "skyloop proxy: URI is missing"),
+        (["sim", "--drones", "0"], "skyloop sim: --drones: "),
+        (["sim", "--drones", "many"], "skyloop sim: --drones: "),
+        (["sim", "--drones"], "--drones needs a value"),
+        (["sim", "--firmware", "foo"], "skyloop sim: --firmware: 'foo' is none of 'ardrone1'"),
+        (["fly", "x.py", "--priority", "32"], "skyloop fly: --priority: "),
+        (["cockpit", "alpha", "--port", "70000"], "skyloop cockpit: --port: "),
+        (["watch", "a", "b"], "skyloop watch: more words than are needed: b\nUsage: skyloop watch [OPTIONS] NAME\n"),
+        (["log", "inf"], "skyloop log: no command inf; did you mean 'info'?"),
     ],
 )
 def test_a_wrong_word_ends_with_2_and_says_what_would_be_right(run: Run, words: list[str], said: str) -> None:
     ended = run(*words)
     assert (ended.code, ended.out) == (2, "")
     assert said in ended.err
+    for word in ("Input", "Error", "Invalid", "pydantic", "Traceback", "(s)"):
+        assert word not in ended.err
 
 
 @pytest.mark.parametrize(

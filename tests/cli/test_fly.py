@@ -70,7 +70,7 @@ def landed(name: str = "alpha") -> bool:
 @pytest.mark.daily
 @pytest.mark.process
 def test_a_controller_flies_and_lands(run: Run, alpha: Process, write: Write) -> None:
-    ended = run("fly", write(GOOD), "--on", "alpha", "--seconds", "0.4")
+    ended = run("fly", write(GOOD), "--drone", "alpha", "--seconds", "0.4")
     assert ended.code == 0, ended.err
     said = ended.err.splitlines()
     assert said[0] == "taking off with alpha"
@@ -82,7 +82,7 @@ def test_a_controller_flies_and_lands(run: Run, alpha: Process, write: Write) ->
 @pytest.mark.process
 def test_a_controller_that_raises_is_landed_and_its_traceback_shown(run: Run, alpha: Process, write: Write) -> None:
     path = write(RAISING)
-    ended = run("fly", path, "--on", "alpha", "--seconds", "20")
+    ended = run("fly", path, "--drone", "alpha", "--seconds", "20")
     assert ended.code == 1
     assert f'File "{path}", line 7, in on_feedback' in ended.err
     assert f'File "{path}", line 10, in helper' in ended.err
@@ -95,7 +95,7 @@ def test_a_controller_that_raises_is_landed_and_its_traceback_shown(run: Run, al
 @pytest.mark.process
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_lands(start: Callable[..., Process], alpha: Process, write: Write, number: signal.Signals) -> None:
-    process = start("fly", write(GOOD), "--on", "alpha")
+    process = start("fly", write(GOOD), "--drone", "alpha")
     process.until("taking off")
     with skyloop.connect("alpha", access="observe") as drone:
         drone.wait("flying", timeout_s=30.0)
@@ -111,7 +111,7 @@ def test_ctrl_c_while_landing_leaves_it_to_the_proxy(
     start: Callable[..., Process], alpha: Process, write: Write
 ) -> None:
     with skyloop.connect("alpha", access="observe") as drone:
-        process = start("fly", write(GOOD), "--on", "alpha")
+        process = start("fly", write(GOOD), "--drone", "alpha")
         drone.wait("flying", timeout_s=30.0)
         process.signal(signal.SIGINT)
         process.until("landing")
@@ -123,7 +123,7 @@ def test_ctrl_c_while_landing_leaves_it_to_the_proxy(
 @pytest.mark.process
 def test_without_takeoff_the_controller_is_left_to_do_it(run: Run, alpha: Process, write: Write) -> None:
     path = write(GOOD.replace("self.drone.velocity(forward=0.2)", "assert feedback.state == 'landed'; self.stop()"))
-    ended = run("fly", path, "--on", "alpha", "--no-takeoff")
+    ended = run("fly", path, "--drone", "alpha", "--no-takeoff")
     assert ended.code == 0, ended.err
     assert "taking off" not in ended.err
     assert "landing" not in ended.err
@@ -131,7 +131,9 @@ def test_without_takeoff_the_controller_is_left_to_do_it(run: Run, alpha: Proces
 
 @pytest.mark.process
 def test_who_takes_over_keeps_the_drone(start: Callable[..., Process], alpha: Process, write: Write) -> None:
-    process = start("fly", write(GOOD + "    def on_authority(self, status):\n        self.stop()\n"), "--on", "alpha")
+    process = start(
+        "fly", write(GOOD + "    def on_authority(self, status):\n        self.stop()\n"), "--drone", "alpha"
+    )
     with skyloop.connect("alpha", access="observe") as drone:
         drone.wait("flying", timeout_s=30.0)
     with skyloop.connect("alpha", authority=skyloop.Authority(priority=1), name="other") as other:
@@ -144,18 +146,18 @@ def test_who_takes_over_keeps_the_drone(start: Callable[..., Process], alpha: Pr
 @pytest.mark.process
 def test_nobody_flies_while_somebody_does(run: Run, alpha: Process, write: Write) -> None:
     with skyloop.connect("alpha", name="the pilot"):
-        ended = run("fly", write(GOOD), "--on", "alpha", "--seconds", "1")
+        ended = run("fly", write(GOOD), "--drone", "alpha", "--seconds", "1")
         assert ended.code == 1
         assert ended.err.startswith("skyloop: the pilot holds the authority over alpha: wait in the queue with --wait")
         assert len(ended.err.splitlines()) == 1
-        assert run("fly", write(GOOD), "--on", "alpha", "--wait", "0.05", "--seconds", "1").code == 1
-        higher = run("fly", write(GOOD), "--on", "alpha", "--priority", "3", "--seconds", "0.1")
+        assert run("fly", write(GOOD), "--drone", "alpha", "--wait", "0.05", "--seconds", "1").code == 1
+        higher = run("fly", write(GOOD), "--drone", "alpha", "--priority", "3", "--seconds", "0.1")
         assert higher.code == 0, higher.err
 
 
 @pytest.mark.process
 def test_a_controller_of_frames_needs_a_camera(run: Run, alpha: Process, write: Write) -> None:
-    ended = run("fly", write(LOOKING), "--on", "alpha", "--no-takeoff")
+    ended = run("fly", write(LOOKING), "--drone", "alpha", "--no-takeoff")
     assert ended.code == 1
     assert ended.err.startswith("skyloop: this vehicle has no camera")
     assert "Traceback" not in ended.err
@@ -164,11 +166,11 @@ def test_a_controller_of_frames_needs_a_camera(run: Run, alpha: Process, write: 
 @pytest.mark.process
 def test_a_recording_serves_a_controller_that_only_looks(run: Run, write: Write) -> None:
     video = f"video://{recorded('ardrone2/video-8s.pave')}"
-    ended = run("fly", write(LOOKING), "--on", video, "--seconds", "20")
+    ended = run("fly", write(LOOKING), "--drone", video, "--seconds", "20")
     assert ended.code == 0, ended.err
     assert "5 frames" in ended.err
     assert "taking off" not in ended.err
-    flying = run("fly", write(GOOD), "--on", video, "--seconds", "20")
+    flying = run("fly", write(GOOD), "--drone", video, "--seconds", "20")
     assert flying.code == 1
     assert "velocity is not possible" in flying.err
     assert "line 6, in on_feedback" in flying.err
@@ -186,15 +188,15 @@ def test_a_recording_serves_a_controller_that_only_looks(run: Run, write: Write)
     ],
 )
 def test_a_wrong_target_is_told_in_one_line(run: Run, alpha: Process, write: Write, address: str, said: str) -> None:
-    ended = run("fly", write(GOOD), "--on", address)
+    ended = run("fly", write(GOOD), "--drone", address)
     assert ended.code == 2, ended.err
     assert said in ended.err
     assert len(ended.err.splitlines()) == 1
 
 
 def test_a_wrong_file_is_told_before_anything_is_connected(run: Run, write: Write) -> None:
-    assert run("fly", "none.py", "--on", "nobody").err.startswith("skyloop: there is no file none.py")
-    assert run("fly", write("x = 1"), "--on", "nobody").code == 2
+    assert run("fly", "none.py", "--drone", "nobody").err.startswith("skyloop: there is no file none.py")
+    assert run("fly", write("x = 1"), "--drone", "nobody").code == 2
     assert "choose one with --class" in run("fly", write(GOOD + GOOD.replace("Good", "Better"))).err
     assert "did you mean 'Good'" in run("fly", write(GOOD), "--class", "Goof").err
 

@@ -78,7 +78,7 @@ def test_a_saved_file_takes_over_without_a_command_being_missed(
 ) -> None:
     seen: list[Applied] = []
     with looker.on_command(seen.append, inline=True):
-        process = start("fly", str(mine), "--on", "alpha", "--reload")
+        process = start("fly", str(mine), "--drone", "alpha", "--reload")
         looker.wait(lambda _: 0.1 in speeds(seen), 20.0)
         save(mine, MINE.replace("0.1", "0.2"))
         process.until("reloaded Mine")
@@ -100,7 +100,7 @@ def test_a_saved_file_takes_over_without_a_command_being_missed(
 def test_an_error_hovers_until_the_file_is_mended(
     start: Callable[..., Process], looker: skyloop.Drone, mine: Path
 ) -> None:
-    process = start("fly", str(mine), "--on", "alpha", "--reload")
+    process = start("fly", str(mine), "--drone", "alpha", "--reload")
     looker.wait("flying", timeout_s=30.0)
     save(mine, MINE.replace("self.drone.velocity(left=self.SPEED)", "raise RuntimeError('in on_feedback')"))
     process.until("the controller failed: hovering; save the file to continue")
@@ -120,7 +120,7 @@ def test_an_error_hovers_until_the_file_is_mended(
 def test_an_error_in_on_frame_hovers_too(start: Callable[..., Process], tmp_path: Path) -> None:
     path = tmp_path / "mine.py"
     path.write_text(FRAMES)
-    process = start("fly", str(path), "--on", "sim://?world=empty&speed=4&wind=0", "--reload", "--seconds", "8")
+    process = start("fly", str(path), "--drone", "sim://?world=empty&speed=4&wind=0", "--reload", "--seconds", "8")
     process.until("RuntimeError: in on_frame")
     process.until("hovering; save the file to continue")
     process.until("landing")
@@ -133,7 +133,7 @@ def test_an_error_in_on_authority_is_told_and_the_drone_left_to_who_took_over(
 ) -> None:
     path = tmp_path / "mine.py"
     path.write_text(AUTHORITY)
-    process = start("fly", str(path), "--on", "alpha", "--reload")
+    process = start("fly", str(path), "--drone", "alpha", "--reload")
     looker.wait("flying", timeout_s=30.0)
     with skyloop.connect("alpha", authority=skyloop.Authority(priority=1), name="other") as other:
         process.until("RuntimeError: in on_authority")
@@ -144,6 +144,6 @@ def test_an_error_in_on_authority_is_told_and_the_drone_left_to_who_took_over(
 
 @pytest.mark.process
 def test_without_an_error_it_ends_after_its_time(run: Run, alpha: Process, mine: Path) -> None:
-    ended = run("fly", str(mine), "--on", "alpha", "--seconds", "0.3", "--reload")
+    ended = run("fly", str(mine), "--drone", "alpha", "--seconds", "0.3", "--reload")
     assert ended.code == 0, ended.err
     assert "until time" in ended.err

@@ -106,7 +106,7 @@ def test_without_a_lab_the_way_to_one_is_told(run: Run, tmp_path: Path, command:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--keys", "KEYS/alpha"], "give --network as well"),
+        (["--keys", "KEYS/alpha"], "give --network multicast as well"),
         (["--network", "--keys", "KEYS/jane"], "a proxy needs some of --role proxy"),
         (["--network", "--keys", "KEYS/bravo"], "not for the name 'alpha'"),
         (["--network", "--keys", "KEYS/nobody"], "there is no folder"),

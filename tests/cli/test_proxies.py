@@ -74,7 +74,7 @@ def test_a_stopped_proxy_is_told_by_every_command(
     silent = f"the proxy at local:alpha (pid {alpha.pid}) was reached but did not answer"
     with stopped(alpha):
         assert silent in run("list").out
-        for words in (["param", "alpha"], ["watch", "alpha"], ["fly", str(tmp_path / "mine.py"), "--on", "alpha"]):
+        for words in (["param", "alpha"], ["watch", "alpha"], ["fly", str(tmp_path / "mine.py"), "--drone", "alpha"]):
             ended = run(*words)
             assert ended.code == 1
             assert silent in ended.err

@@ -41,7 +41,7 @@ def test_options_of_the_network_need_the_network(run: Run, option: tuple[str, ..
     for command in (("proxy", "sim://"), ("sim",)):
         ended = run(*command, *option)
         assert ended.code == 2
-        assert f"{option[0]} is for the network: give --network as well" in ended.err
+        assert f"{option[0]} is for the network: give --network multicast as well" in ended.err
 
 
 def test_firmware_is_no_proxy(run: Run) -> None:

@@ -172,7 +172,7 @@ def test_a_stopped_proxy_is_lost_and_recovers_when_it_goes_on(far: Callable[...,
 
 
 def test_options_of_the_network_need_the_network(far: Callable[..., Process]) -> None:
-    wrong = far("--listen", "127.0.0.1:0", until="--listen is for the network: give --network as well")
+    wrong = far("--listen", "127.0.0.1:0", until="--listen is for the network: give --network multicast as well")
     assert wrong.wait() == 2
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from collections.abc import Iterable
 from importlib import import_module
@@ -9,10 +10,14 @@ from typing import Annotated, Any, Final
 
 import typer
 
+from skyloop.cli import wording
 from skyloop.cli.commands import COMMANDS
+from skyloop.cli.naming import with_place
 from skyloop.cli.plain_help import Command, Group, width
 from skyloop.errors import ParameterError, SkyloopError
 
+_log = logging.getLogger(__name__)
+VERBOSE: Final = "--verbose"  #: works before and behind any command
 FAILED: Final = 1
 USAGE_ERROR: Final = 2
 INTERRUPTED: Final = 130  #: 128 + SIGINT, as shells count
@@ -56,19 +61,38 @@ def build(names: Iterable[str] = COMMANDS) -> typer.Typer:
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit: with 2 for a wrong word or value, 1 for what failed, 0 for what worked."""
-    given = sys.argv[1:] if arguments is None else arguments
+    given = with_place(sys.argv[1:] if arguments is None else arguments)
+    if VERBOSE in given:
+        given.remove(VERBOSE)
+        log_to_stderr()
     run(build([given[0]] if given and given[0] in COMMANDS else COMMANDS), given or ["--help"])
 
 
 def run(app: typer.Typer, arguments: list[str], name: str = "skyloop") -> None:
     """Run a command line under its name, and exit as :func:`main` does."""
     try:
-        app(arguments, prog_name=name)
+        code = app(arguments, prog_name=name, standalone_mode=False)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
+    except typer.Abort:
+        print(f"{name}: nothing was done", file=sys.stderr)
+        sys.exit(FAILED)
+    except wording.WordError as error:
+        print(wording.of_word(error, name), file=sys.stderr)
+        sys.exit(USAGE_ERROR)
     except SkyloopError as error:
-        print(f"{name}: {error}", file=sys.stderr)
+        _log.debug("the command failed", exc_info=error)
+        print(f"{name}: {wording.of(error)}", file=sys.stderr)
         sys.exit(USAGE_ERROR if isinstance(error, ValueError | ParameterError) else FAILED)
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def log_to_stderr() -> None:
+    """Log all that Skyloop reports of itself to standard error, with the time and the thread."""
+    logging.basicConfig(
+        level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s [%(threadName)s] %(message)s", stream=sys.stderr
+    )
+    logging.getLogger("skyloop").setLevel(logging.DEBUG)
 
 
 def _show_version(wanted: bool) -> None:
@@ -82,6 +106,9 @@ def _show_version(wanted: bool) -> None:
 def _skyloop(
     version: Annotated[
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+    verbose: Annotated[
+        bool, typer.Option(VERBOSE, help="Log details to standard error; also behind any command.")
     ] = False,
 ) -> None:
     """Fly small drones by their cameras: simulated ones, real ones, several at once.

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import msgspec
 import typer
 
+from skyloop.cli.completion import drone_names
+from skyloop.cli.naming import DroneOption, one_drone
 from skyloop.cli.text import columns
 from skyloop.errors import UnknownNameError, UsageError
 
@@ -21,7 +23,10 @@ HEAD = ("DRONE", "WHO", "IDENTITY", "PRIORITY", "FROM", "TO", "TAKE-OFFS", "HOW 
 
 
 def audit(
-    name: Annotated[str | None, typer.Argument(metavar="NAME", help="One proxy's; else those of all")] = None,
+    name: Annotated[
+        str | None, typer.Argument(metavar="[NAME]", help="One drone's; else those of all", autocompletion=drone_names)
+    ] = None,
+    drone: DroneOption = None,
     file: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Of a proxy that was started with --audit FILE")
     ] = None,
@@ -31,6 +36,7 @@ def audit(
     """Show who held the authority over a drone, from when to when, and how it ended. The times are local."""
     from skyloop.proxy.audit import read, tenures
 
+    name = one_drone(name, drone) if name is not None or drone is not None else None
     entries, bad = [], 0
     for path in _files(name, file):
         found, torn = read(path)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Self
 
 import typer
 
+from skyloop.cli.naming import DroneOption, KeysOption, NetworkOption, join_network, one_drone
 from skyloop.errors import NoAnswerError, UnknownNameError, UsageError
 from skyloop.files import read_bytes
 from skyloop.messages.image_header import image_size, why_not_decoded
@@ -80,9 +81,12 @@ def board(
 @camera.command(short_help="Calibrate by images of a board", epilog=f"{_EXAMPLE}calibrate alpha -o front.json")
 def calibrate(
     source: Annotated[
-        list[str],
-        typer.Argument(metavar="SOURCE...", help="A running proxy or a vehicle's address; or files: images, a video"),
-    ],
+        list[str] | None,
+        typer.Argument(
+            metavar="NAME|FILE...", help="A running proxy's NAME or a vehicle's address; or files: images, a video"
+        ),
+    ] = None,
+    drone: DroneOption = None,
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FILE", help="To write")] = Path("camera.json"),
     camera: Annotated[
         str | None, typer.Option(metavar="NAME", help="Of the vehicle's cameras [default: the first]")
@@ -96,6 +100,8 @@ def calibrate(
     kind: KindOption = Kind.CHARUCO,
     dictionary: Dictionary = "4x4_50",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Write over an existing file")] = False,
+    network: NetworkOption = None,
+    keys: KeysOption = None,
 ) -> None:
     """Find a camera's focal length, principal point and distortion, and write them as JSON.
 
@@ -105,14 +111,16 @@ def calibrate(
     from skyloop.vision.board import BoardFinder
     from skyloop.vision.calibrating import calibrate as fit
 
+    join_network(network, keys)
+    named = source or [one_drone(None, drone)]
     if output.exists() and not overwrite:
         raise UsageError(f"{output} exists: give another name, or --overwrite")
     search = _Search(BoardFinder(_board(columns, rows, square_mm, kind, dictionary)), views)
-    if _are_files(source):
-        search.every = all(_is_picture(name) for name in source)
-        search.run(_from_files(source))
+    if _are_files(named):
+        search.every = all(_is_picture(name) for name in named)
+        search.run(_from_files(named))
     else:
-        with _Vehicle(source[0], camera, seconds) as vehicle:
+        with _Vehicle(named[0], camera, seconds) as vehicle:
             search.run(vehicle.pictures(), vehicle.draw)
     collector = search.collector
     if collector is None:

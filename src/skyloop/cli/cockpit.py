@@ -7,14 +7,21 @@ from typing import Annotated
 
 import typer
 
+from skyloop.cli.completion import drone_names
+from skyloop.cli.naming import DronesOption, KeysOption, NetworkOption, drones, join_network
 from skyloop.messages import Role
 
 
 def cockpit(
     names: Annotated[
         list[str] | None,
-        typer.Argument(metavar="NAME", help="Running proxies; without names: all, as they come and go"),
+        typer.Argument(
+            metavar="NAME...",
+            help="Running proxies; without names: all, as they come and go",
+            autocompletion=drone_names,
+        ),
     ] = None,
+    drone: DronesOption = None,
     port: Annotated[int, typer.Option(metavar="PORT", min=0, max=65535, help="Of the page; 0 takes a free one")] = 0,
     host: Annotated[
         str, typer.Option(metavar="ADDRESS", help="To listen on; beyond loopback tokens or certificates are needed")
@@ -35,11 +42,8 @@ def cockpit(
     recordings: Annotated[Path, typer.Option(metavar="FOLDER", help="Of recordings, made when needed")] = Path(
         "recordings"
     ),
-    network: Annotated[
-        str | None,
-        typer.Option(metavar="WHERE", help="Drones there too: multicast, or addresses with commas [SKYLOOP_NETWORK]"),
-    ] = None,
-    keys: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder of an identity [SKYLOOP_KEYS]")] = None,
+    network: NetworkOption = None,
+    keys: KeysOption = None,
 ) -> None:
     """Serve a page to watch and fly drones: video, instruments, map, plots, parameters, recordings. Until Ctrl-C.
 
@@ -49,5 +53,6 @@ def cockpit(
     from skyloop.cockpit import Access, serve_cockpit
 
     access = Access(host, token_file, tls_cert, tls_key, client_ca, role, tuple(hostname or ()))
-    settings = network_settings(network, keys)
-    serve_cockpit(names or (), port=port, access=access, recordings=recordings, network=settings)
+    join_network(network, keys)
+    settings = network_settings()
+    serve_cockpit(drones(names, drone, needed=False), port=port, access=access, recordings=recordings, network=settings)

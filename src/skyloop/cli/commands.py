@@ -43,11 +43,13 @@ COMMANDS: Final = {
         "fly",
         "fly",
         "Fly a controller from a Python file",
-        "fly my_controller.py --on alpha --seconds 30",
+        "fly my_controller.py --drone alpha --seconds 30",
     ),
     "teleop": Entry(
         Task.FLY, "teleop", "teleop", "Fly a drone by the keys of the terminal", "teleop alpha --speed 0.5"
     ),
+    "land": Entry(Task.FLY, "ending", "land", "Land a drone, or --all of them", "land alpha"),
+    "stop": Entry(Task.FLY, "ending", "stop", "Emergency stop: cut a drone's motors, or --all", "stop alpha"),
     "list": Entry(Task.SEE, "listing", "list_proxies", "The running proxies and who flies", "list"),
     "watch": Entry(Task.SEE, "watch", "watch", "What a drone does, live in the terminal", "watch alpha"),
     "cockpit": Entry(
@@ -66,7 +68,7 @@ COMMANDS: Final = {
         "router",
         "router",
         "Join proxies and programs of several networks",
-        "router --connect other-site.example:7447",
+        "router --network other-site.example:7447",
     ),
     "keys": Entry(
         Task.SHARE,

@@ -32,7 +32,7 @@ EXTRAS: Final = (
 
 def doctor(
     address: Annotated[
-        str, typer.Argument(metavar="ADDRESS", help="Of a vehicle to check instead; nothing is flown")
+        str, typer.Argument(metavar="[ADDRESS]", help="Of a vehicle to check instead; nothing is flown")
     ] = "",
 ) -> None:
     """Check Python, the local transport, the optional parts, the drivers and the running proxies; or one vehicle.

@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
+from skyloop.cli.completion import python_files
 from skyloop.cli.flight import Flight
+from skyloop.cli.naming import DroneOption, KeysOption, NetworkOption, OptionalNameArgument, join_network, one_drone
 from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
@@ -26,11 +28,16 @@ ADVICE = (
 
 def fly(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="A Python file with a class derived from skyloop.Controller")
+        Path,
+        typer.Argument(
+            metavar="FILE",
+            help="A Python file with a class derived from skyloop.Controller",
+            autocompletion=python_files,
+        ),
     ],
-    on: Annotated[
-        str, typer.Option(metavar="NAME", help="A running proxy, or a vehicle's address such as sim://")
-    ] = "sim://",
+    name: OptionalNameArgument = None,
+    drone: DroneOption = None,
+    on: Annotated[str | None, typer.Option(metavar="NAME", hidden=True)] = None,  # as it was named before
     class_name: Annotated[
         str | None, typer.Option("--class", metavar="CLASS", help="Which one, if the file has several")
     ] = None,
@@ -45,13 +52,20 @@ def fly(
     reload: Annotated[
         bool, typer.Option("--reload", help="Reload the file when it is saved; after an error hover until then")
     ] = False,
+    network: NetworkOption = None,
+    keys: KeysOption = None,
 ) -> None:
-    """Take off, run a controller, land. Ctrl-C lands too, and so does an error in the controller without --reload."""
+    """Take off, run a controller, land. Without NAME a simulated drone flies.
+
+    Ctrl-C lands too, and so does an error in the controller without --reload.
+    """
     from skyloop.cli.piloting import connect_pilot
     from skyloop.client import Authority
     from skyloop.control.loading import load_controller
     from skyloop.control.reloading import Reloader
 
+    join_network(network, keys)
+    target = one_drone(name, drone or on, default="sim://")
     if reload:  # a neighbour saved twice within a second would come from Python's cache
         sys.dont_write_bytecode = True
     controller_class = load_controller(file, class_name)
@@ -59,10 +73,10 @@ def fly(
     for number in (signal.SIGINT, signal.SIGTERM):  # the first is ignored where a shell runs this in the background
         signal.signal(number, _interrupt)
     authority = Authority(priority=priority, wait_s=wait)
-    with connect_pilot(on, ADVICE, name=file.name[:64], authority=authority) as drone:
-        controller = make(controller_class, drone)
-        worked = _run(Flight(drone, controller, _print), drone, seconds, reloader, takeoff=takeoff)
-        _land(drone)
+    with connect_pilot(target, ADVICE, name=file.name[:64], authority=authority) as flown:
+        controller = make(controller_class, flown)
+        worked = _run(Flight(flown, controller, _print), flown, seconds, reloader, takeoff=takeoff)
+        _land(flown)
     if not worked:
         raise typer.Exit(1)
 

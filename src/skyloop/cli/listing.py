@@ -5,12 +5,12 @@ from __future__ import annotations
 import platform
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 import typer
 
+from skyloop.cli.naming import KeysOption, NetworkOption, join_network
 from skyloop.cli.text import columns
 from skyloop.errors import SkyloopError
 
@@ -40,11 +40,8 @@ class Row(msgspec.Struct, frozen=True):
 
 def list_proxies(
     json: Annotated[bool, typer.Option("--json", help="For programs: one JSON array")] = False,
-    network: Annotated[
-        str | None,
-        typer.Option(metavar="WHERE", help="Look there too: multicast, or addresses with commas [SKYLOOP_NETWORK]"),
-    ] = None,
-    keys: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder of an identity [SKYLOOP_KEYS]")] = None,
+    network: NetworkOption = None,
+    keys: KeysOption = None,
 ) -> None:
     """Show the running proxies, where they run, what they fly, in which state, and who holds the authority.
 
@@ -52,7 +49,8 @@ def list_proxies(
     """
     from skyloop.client.connect import network_settings
 
-    settings = network_settings(network, keys)
+    join_network(network, keys)
+    settings = network_settings()
     rows = running(settings)
     if json:
         typer.echo(msgspec.json.encode(rows).decode())

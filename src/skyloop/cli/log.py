@@ -72,7 +72,7 @@ def info(
 
 @log.command("list", short_help="The recordings of a folder", epilog=f"{_EXAMPLE}list flights")
 def list_recordings(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where the recordings are")] = Path(),
+    folder: Annotated[Path, typer.Argument(metavar="[FOLDER]", help="Where the recordings are")] = Path(),
     json: Annotated[bool, typer.Option("--json", help="For programs: one JSON array")] = False,
 ) -> None:
     """The recordings of a folder: which drones, when and for how long. What is wrong with a file stands in its row."""

@@ -2,30 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
+from skyloop.cli.completion import network_places
+from skyloop.cli.naming import MULTICAST
 from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
     from skyloop.transport.base import TransportServer
     from skyloop.transport.fabric import FabricSettings
 
-NetworkOption = Annotated[
-    bool, typer.Option("--network", help="Serve to the network as well; without it nothing leaves this host")
+ServeOption = Annotated[
+    str | None,
+    typer.Option(
+        "--network",
+        metavar="WHERE",
+        help="Serve there too: multicast, or routers' addresses with commas; else nothing leaves this host",
+        autocompletion=network_places,
+    ),
 ]
 ListenOption = Annotated[
     list[str] | None,
     typer.Option(metavar="ADDR", help="Of the network: where to listen, e.g. 10.0.0.5:7447 [all, any free port]"),
 ]
-ConnectOption = Annotated[
-    list[str] | None, typer.Option(metavar="ADDR", help="Of the network: a router to join; may be repeated")
-]
+#: As routers were given before ``--network`` took their addresses.
+ConnectOption = Annotated[list[str] | None, typer.Option(metavar="ADDR", hidden=True)]
 MulticastOption = Annotated[
-    bool, typer.Option("--multicast/--no-multicast", help="Of the network: be found by UDP multicast on this segment")
+    bool,
+    typer.Option(
+        "--multicast/--no-multicast", help="Of the network: be found by UDP multicast, where --network names it"
+    ),
 ]
 KeysOption = Annotated[
     Path | None, typer.Option(metavar="DIR", help="Of the network: folder of this proxy's identity [SKYLOOP_KEYS]")
@@ -40,7 +50,7 @@ MakeEnd = Callable[[str, str], "TransportServer"]
 
 
 def settings_of(
-    network: bool,
+    network: str | None,
     listen: list[str] | None,
     connect: list[str] | None,
     multicast: bool,
@@ -51,15 +61,35 @@ def settings_of(
     Raises:
         UsageError: An option needs ``--network``, or is not valid.
     """
-    if not network:
+    if network is None:
         given = {"--listen": listen, "--connect": connect, "--keys": keys, "--no-multicast": not multicast}
         for option, value in given.items():
             if value:
-                raise UsageError(f"{option} is for the network: give --network as well")
+                raise UsageError(f"{option} is for the network: give --network {MULTICAST} as well")
         return None
+    return places(network, listen, connect, multicast, keys)
+
+
+def places(
+    network: str, listen: Sequence[str] | None, connect: Sequence[str] | None, multicast: bool, keys: Path | None
+) -> FabricSettings:
+    """Return the settings of a network that is named as ``--network`` names it.
+
+    Raises:
+        UsageError: An address or the folder is not valid, or no place is named.
+    """
     from skyloop.transport.fabric.environment import settings
 
-    return settings(listen=tuple(listen or ()), connect=tuple(connect or ()), multicast=multicast, keys=keys)
+    words = [word.strip() for word in network.split(",") if word.strip()]
+    if not words:
+        raise UsageError("--network names no place: give multicast, or addresses with commas")
+    routers = [word for word in words if word.lower() != MULTICAST]
+    return settings(
+        listen=tuple(listen or ()),
+        connect=(*routers, *(connect or ())),
+        multicast=multicast and len(routers) < len(words),
+        keys=keys,
+    )
 
 
 def server_ends(settings: FabricSettings | None, group: str | None = None) -> MakeEnd:

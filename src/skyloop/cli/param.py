@@ -7,6 +7,8 @@ from typing import Annotated, Final
 import msgspec
 import typer
 
+from skyloop.cli.completion import parameter_names
+from skyloop.cli.naming import DroneOption, KeysOption, NameArgument, NetworkOption, join_network, one_drone
 from skyloop.cli.text import columns
 from skyloop.errors import UsageError
 from skyloop.messages import Parameter, ParameterType, Value
@@ -25,19 +27,32 @@ KINDS: Final = {
 
 
 def param(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="A running proxy; skyloop list shows them")],
+    name: NameArgument = None,
     key: Annotated[
-        str | None, typer.Argument(metavar="KEY", help="A parameter, or the first part of several: limits")
+        str | None,
+        typer.Argument(
+            metavar="[KEY]", help="A parameter, or the first part of several: limits", autocompletion=parameter_names
+        ),
     ] = None,
     value: Annotated[
-        str | None, typer.Argument(metavar="VALUE", help="Its new value; needs the authority for a moment")
+        str | None, typer.Argument(metavar="[VALUE]", help="Its new value; needs the authority for a moment")
     ] = None,
+    drone: DroneOption = None,
     priority: Annotated[
         int, typer.Option(metavar="P", min=0, max=31, help="Of a writer: 0 is the highest, 31 the lowest")
     ] = 31,
     json: Annotated[bool, typer.Option("--json", help="For programs: a JSON array of parameters")] = False,
+    network: NetworkOption = None,
+    keys: KeysOption = None,
 ) -> None:
     """List the parameters of a vehicle, show one, or write one."""
+    if drone is not None:  # the words before are KEY and VALUE then
+        if value is not None and name != drone:
+            raise UsageError(f"NAME {name} and --drone {drone} name two drones: give one of them")
+        if name != drone:
+            name, key, value = drone, name, key
+    join_network(network, keys)
+    name = one_drone(name, drone)
     found = _write(name, key, value, priority) if key is not None and value is not None else _read(name, key)
     if json:
         typer.echo(msgspec.json.encode([msgspec.structs.asdict(each) for each in found]).decode())

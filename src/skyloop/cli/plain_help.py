@@ -32,7 +32,10 @@ def width() -> int:
 
 
 class Command(TyperCommand):
-    """A command whose help names its arguments as they are typed: ``NAME``, ``[NAME]`` where it may be left out."""
+    """A command whose help names its arguments as they are typed: ``NAME``, ``[NAME]`` where it may be left out.
+
+    An argument's ``metavar`` is shown as it is: NAME is optional for Typer, as ``--drone`` may take its place.
+    """
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """Return the parts of the usage line."""
@@ -78,7 +81,7 @@ def argument_words(command: Any, ctx: Any) -> list[str]:
         if param.param_type_name != "argument" or getattr(param, "hidden", False):
             continue
         word = _word(param)
-        words.append(word if param.required or word.startswith("[") else f"[{word}]")
+        words.append(word if param.required or param.metavar else f"[{word}]")
     return words
 
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Final, NoReturn
 import msgspec
 import typer
 
+from skyloop.cli.naming import AnyNameArgument, DroneOption, KeysOption, NetworkOption, join_network, one_drone
 from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
@@ -28,7 +29,8 @@ def process(
     target: Annotated[
         str, typer.Argument(metavar="CLASS", help="module:Class, FILE.py or FILE.py:Class, with process(self, frame)")
     ],
-    drone: Annotated[str, typer.Option(metavar="NAME", help="A running proxy, or a vehicle's address")],
+    drone_name: AnyNameArgument = None,
+    drone: DroneOption = None,
     camera: Annotated[str | None, typer.Option(metavar="CAMERA", help="Whose frames; the first if not given")] = None,
     name: Annotated[
         str | None, typer.Option(metavar="NAME", help="Of the processor; the class's in small letters if not given")
@@ -51,6 +53,8 @@ def process(
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="For programs: a JSON object each second")] = False,
     child: Annotated[bool, typer.Option("--child", hidden=True)] = False,
+    network: NetworkOption = None,
+    keys: KeysOption = None,
 ) -> None:
     """Take the newest frames of a drone, and publish what a class of yours finds in them. Read-only.
 
@@ -59,6 +63,8 @@ def process(
     """
     from skyloop.processing import Settings, load_processor
 
+    join_network(network, keys)
+    drone = one_drone(drone_name, drone)
     code = load_processor(target)
     settings = Settings(name if name is not None else code.name, code.mark, camera, share, max_age, max_fps, stuck)
     for number in (signal.SIGINT, signal.SIGTERM):

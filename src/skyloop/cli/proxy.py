@@ -12,7 +12,7 @@ from skyloop.cli.network import (
     KeysOption,
     ListenOption,
     MulticastOption,
-    NetworkOption,
+    ServeOption,
     key_changes,
     server_ends,
     settings_of,
@@ -26,7 +26,7 @@ def proxy(
     group: Annotated[
         str | None, typer.Option(metavar="GROUP", help="A group of users whose members may connect too")
     ] = None,
-    network: NetworkOption = False,
+    network: ServeOption = None,
     listen: ListenOption = None,
     connect: ConnectOption = None,
     multicast: MulticastOption = True,
@@ -38,7 +38,7 @@ def proxy(
 ) -> None:
     """Serve one vehicle to applications, until Ctrl-C, which lands it first.
 
-    They are of this host, and with --network of others too.
+    Applications are of this host, and with --network of others too.
     """
     from skyloop.drivers.uri import parse_uri
     from skyloop.proxy.serve import serve

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Final, NoReturn, cast
 
 import typer
 
+from skyloop.cli.naming import DronesOption, KeysOption, NamesArgument, NetworkOption, drones, join_network
 from skyloop.errors import SkyloopError
 
 if TYPE_CHECKING:
@@ -24,7 +25,8 @@ LINE_EVERY_S: Final = 1.0  # in a pipe
 
 
 def record(
-    names: Annotated[list[str], typer.Argument(metavar="NAME", help="Running proxies; skyloop list shows them")],
+    names: NamesArgument = None,
+    drone: DronesOption = None,
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="PATH", help="A file, or a folder to choose a name in")
     ] = Path(),
@@ -41,12 +43,14 @@ def record(
         ),
     ] = "auto",
     quality: Annotated[int, typer.Option(min=1, max=100, help="Of JPEG")] = 90,
-    rotate_mb: Annotated[float | None, typer.Option(metavar="MB", help="A new file after so much")] = None,
-    rotate_s: Annotated[float | None, typer.Option(metavar="S", help="A new file after so long")] = None,
-    min_free_mb: Annotated[float, typer.Option(metavar="MB", help="Room to leave on the disk")] = 256.0,
-    buffer_mb: Annotated[float, typer.Option(metavar="MB", help="What may wait for a slow disk")] = 64.0,
+    rotate_mb: Annotated[float | None, typer.Option(metavar="MB", min=1.0, help="A new file after so much")] = None,
+    rotate_s: Annotated[float | None, typer.Option(metavar="S", min=1.0, help="A new file after so long")] = None,
+    min_free_mb: Annotated[float, typer.Option(metavar="MB", min=0.0, help="Room to leave on the disk")] = 256.0,
+    buffer_mb: Annotated[float, typer.Option(metavar="MB", min=1.0, help="What may wait for a slow disk")] = 64.0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Write over an existing file")] = False,
     seconds: Annotated[float | None, typer.Option(metavar="S", min=0.0, help="How long; else until Ctrl-C")] = None,
+    network: NetworkOption = None,
+    keys: KeysOption = None,
 ) -> None:
     """Record drones to an MCAP file until Ctrl-C. It only looks on: any application may fly meanwhile.
 
@@ -54,8 +58,9 @@ def record(
     """
     from skyloop.recording import record as start
 
+    join_network(network, keys)
     recorder = start(
-        names,
+        drones(names, drone),
         output,
         channels=None if channels is None else [name.strip() for name in channels.split(",")],
         encoding=cast("VideoEncoding", encoding),  # which is checked there

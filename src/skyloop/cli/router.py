@@ -9,13 +9,24 @@ from typing import Annotated
 
 import typer
 
-from skyloop.cli.network import ConnectOption, KeysOption, ListenOption, MulticastOption
+from skyloop.cli.completion import network_places
+from skyloop.cli.naming import MULTICAST
+from skyloop.cli.network import ConnectOption, KeysOption, ListenOption, MulticastOption, places
 
 PORT = 7447
 _POLL_S = 0.2
 
 
 def router(
+    network: Annotated[
+        str,
+        typer.Option(
+            "--network",
+            metavar="WHERE",
+            help="What to join: multicast, or other routers' addresses with commas",
+            autocompletion=network_places,
+        ),
+    ] = MULTICAST,
     listen: ListenOption = None,
     connect: ConnectOption = None,
     multicast: MulticastOption = True,
@@ -31,13 +42,10 @@ def router(
     """
     from skyloop.transport.fabric import config
     from skyloop.transport.fabric.config import Part
-    from skyloop.transport.fabric.environment import settings
     from skyloop.transport.fabric.session import Session, acquire, release, renewed
 
     everywhere = f"{config.all_interfaces()}:{PORT}"
-    chosen = settings(
-        listen=tuple(listen or (everywhere,)), connect=tuple(connect or ()), multicast=multicast, keys=keys
-    )
+    chosen = places(network, listen or [everywhere], connect, multicast, keys)
     if chosen.identity is not None:
         chosen.identity.require_router()
     if print_config:

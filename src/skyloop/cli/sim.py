@@ -17,7 +17,7 @@ from skyloop.cli.network import (
     ListenOption,
     MakeEnd,
     MulticastOption,
-    NetworkOption,
+    ServeOption,
     key_changes,
     server_ends,
     settings_of,
@@ -51,7 +51,7 @@ def sim(
         list[str] | None,
         typer.Option(metavar="KEY=VALUE", help="Any other option of sim://, e.g. cameras=front; may be repeated"),
     ] = None,
-    network: NetworkOption = False,
+    network: ServeOption = None,
     listen: ListenOption = None,
     connect: ConnectOption = None,
     multicast: MulticastOption = True,
@@ -124,7 +124,7 @@ def sim(
         warn_if_open(network_settings, names)
         _serve_proxies(uri, options, names, server_ends(network_settings), key_changes(network_settings))
         return
-    if network:
+    if network is not None:
         raise UsageError("--network is for proxies, and with --firmware there is none: give --bind ADDRESS instead")
     _refuse_for_firmware(name, uri)
     from skyloop.emulators.ardrone import Faults

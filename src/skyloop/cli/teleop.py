@@ -11,6 +11,7 @@ from rich.live import Live
 from rich.text import Text
 
 from skyloop.cli.keyboard import KEY_MAP, Deflection, Keyboard, Order, Sticks
+from skyloop.cli.naming import AnyNameArgument, DroneOption, KeysOption, NetworkOption, join_network, one_drone
 from skyloop.errors import AuthorityError, SkyloopError
 
 if TYPE_CHECKING:
@@ -25,7 +26,8 @@ GAINS: Final = (0.25, 0.5, 1.0, 2.0, 4.0)  #: that + and - step through
 
 
 def teleop(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="A running proxy, or an address such as sim://")],
+    name: AnyNameArgument = None,
+    drone: DroneOption = None,
     speed: Annotated[float, typer.Option(metavar="M/S", min=0.05, max=10.0, help="Of a key that is held")] = 0.5,
     turn: Annotated[float, typer.Option(metavar="RAD/S", min=0.05, max=6.0, help="Turning, of a key held")] = 0.8,
     priority: Annotated[int, typer.Option(metavar="P", min=0, max=31, help="0 is the highest, 31 the lowest")] = 16,
@@ -33,6 +35,8 @@ def teleop(
         float, typer.Option(metavar="S", min=0.0, help="Longest wait in the queue for the authority")
     ] = 0.0,
     cockpit: Annotated[bool, typer.Option("--cockpit", help="Serve a page beside it that shows the video")] = False,
+    network: NetworkOption = None,
+    keys: KeysOption = None,
 ) -> None:
     """Fly by keys, with the drone's state live. It hovers when no key is held, and lands at the end.
 
@@ -41,12 +45,14 @@ def teleop(
     from skyloop.cli.piloting import connect_pilot
     from skyloop.client import Authority
 
+    join_network(network, keys)
+    target = one_drone(name, drone)
     keyboard = Keyboard()
     authority = Authority(priority=priority, wait_s=wait)
-    with connect_pilot(name, ADVICE, name="skyloop teleop", authority=authority) as drone:
-        page = _page(drone) if cockpit else None
+    with connect_pilot(target, ADVICE, name="skyloop teleop", authority=authority) as flown:
+        page = _page(flown) if cockpit else None
         try:
-            Teleop(drone, speed, turn, "" if page is None else page.address()).run(keyboard)
+            Teleop(flown, speed, turn, "" if page is None else page.address()).run(keyboard)
         except (KeyboardInterrupt, EOFError):
             pass  # as good as Q: the end of the block lands it
         finally:

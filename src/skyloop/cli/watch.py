@@ -16,6 +16,7 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
+from skyloop.cli.naming import DroneOption, KeysOption, NameArgument, NetworkOption, join_network, one_drone
 from skyloop.messages import Event, Failsafe, Feedback, Severity
 
 if TYPE_CHECKING:
@@ -28,7 +29,8 @@ COLOURS: Final = {Severity.INFO: "cyan", Severity.WARNING: "yellow", Severity.ER
 
 
 def watch(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="A running proxy; skyloop list shows them")],
+    name: NameArgument = None,
+    drone: DroneOption = None,
     seconds: Annotated[
         float | None, typer.Option(metavar="S", min=0.0, help="How long; until Ctrl-C if not given")
     ] = None,
@@ -36,6 +38,8 @@ def watch(
     json: Annotated[
         bool, typer.Option("--json", help="For programs: a JSON object a line, one a second and one an event")
     ] = False,
+    network: NetworkOption = None,
+    keys: KeysOption = None,
 ) -> None:
     """Show state, attitude, authority, links, channels and events of a drone, live. Read-only.
 
@@ -43,17 +47,18 @@ def watch(
     """
     from skyloop.client import connect
 
-    with connect(name, access="observe", name="skyloop watch") as drone:
+    join_network(network, keys)
+    with connect(one_drone(name, drone), access="observe", name="skyloop watch") as watched:
         duration_s = math.inf if seconds is None else seconds
-        if video and drone.capabilities.cameras:
-            drone.frame()  # the first call asks for them
+        if video and watched.capabilities.cameras:
+            watched.frame()  # the first call asks for them
         try:
             if json:
-                _lines(drone, duration_s, _state_json, _event_json)
+                _lines(watched, duration_s, _state_json, _event_json)
             elif sys.stdout.isatty():
-                _live(drone, duration_s)
+                _live(watched, duration_s)
             else:
-                _lines(drone, duration_s, state_line, event_line)
+                _lines(watched, duration_s, state_line, event_line)
         except KeyboardInterrupt:
             pass  # how it is meant to end
 

@@ -13,7 +13,7 @@ from skyloop.client.channels import Emit
 from skyloop.client.command_schedule import CommandSchedule
 from skyloop.client.connection import ProxyConnection, Scheduler
 from skyloop.client.statistics import ChannelCounter
-from skyloop.errors import AuthorityError, LinkError, NoAnswerError, RefusedError, UsageError
+from skyloop.errors import AuthorityError, Hint, LinkError, NoAnswerError, RefusedError, UsageError
 from skyloop.messages import (
     ACTION_NAMES,
     AnswerTakeover,
@@ -223,7 +223,7 @@ class CommandSender:
             NoAnswerError: If the proxy does not answer the request.
         """
         if self._role is Role.OBSERVER:
-            raise AuthorityError('this application observes: connect with access="pilot" to fly', code="observer")
+            raise AuthorityError("this application observes", code="observer").with_hint(Hint.FLY)
         with self._lock:
             self._authority.asked(request)
             self._refusal = None
@@ -239,7 +239,7 @@ class CommandSender:
         self.release(wait=False)
         if refusal is not None:
             raise AuthorityError(f"the authority was refused: {refusal.message}", code=refusal.code.value)
-        raise AuthorityError(_busy(status, wait_s, self._authority.declined), code="busy")
+        raise AuthorityError(_busy(status, wait_s, self._authority.declined), code="busy").with_hint(Hint.OBSERVE)
 
     def answer(self, lease: int, app_id: int, grant: bool, reason: str) -> None:
         """Answer an application that asks for the authority. Does not wait; an answer that is too late changes nothing.
@@ -397,9 +397,7 @@ class CommandSender:
     def _not_ours(self, action: AnyAction) -> AuthorityError:
         status = self.status
         if self._role is Role.OBSERVER:
-            return AuthorityError(
-                f'{action.name}: this application observes; connect with access="pilot" to fly', code="observer"
-            )
+            return AuthorityError(f"{action.name}: this application observes", code="observer").with_hint(Hint.FLY)
         if status.state == "preempted":
             return AuthorityError(
                 f"{action.name}: {status.holder or 'another application'} took over the authority; "
@@ -430,8 +428,8 @@ def _busy(status: AuthorityStatus, wait_s: float, declined: str) -> str:
     words = f" (number {status.position} in the queue, expected wait {expected:.0f} s)" if expected is not None else ""
     refusal = f"; {declined}" if declined else ""
     return (
-        f"{status.holder or 'another application'} holds the authority{waited}{words}{refusal}: wait longer "
-        '(wait_s), ask with a higher priority (a lower number, 0 is the highest), or connect with access="observe"'
+        f"{status.holder or 'another application'} holds the authority{waited}{words}{refusal}: wait longer, "
+        "or ask with a higher priority (a lower number, 0 is the highest)"
     )
 
 

@@ -18,7 +18,7 @@ from skyloop.client.connection import Scheduler
 from skyloop.client.core import Access, DroneCore, OnExit
 from skyloop.client.drone import Drone
 from skyloop.client.swarm import OnError, Swarm, check_policy, in_parallel
-from skyloop.errors import LinkError, SwarmError, UnknownNameError, UsageError
+from skyloop.errors import Hint, LinkError, SwarmError, UnknownNameError, UsageError
 from skyloop.transport.base import ClientHandler, Dialer, TransportClient, check_name
 
 if TYPE_CHECKING:
@@ -197,7 +197,6 @@ class Connector(Protocol):
 
 
 NETWORK_VARIABLE: Final = "SKYLOOP_NETWORK"
-_HINT: Final = "; only this host was searched (network=True, or the variable SKYLOOP_NETWORK, searches further)"
 
 
 def network_settings(network: NetworkChoice = None, keys: Path | str | None = None) -> FabricSettings | None:
@@ -273,8 +272,7 @@ def _hinting(near: Dialer) -> Dialer:
         try:
             return near(handler)
         except UnknownNameError as error:
-            error.message += _HINT
-            raise
+            raise error.with_hint(Hint.SEARCH_NETWORK) from None
 
     return dialer
 

@@ -20,6 +20,7 @@ MAX_MESSAGE: Final = 1 << 27  #: bytes of one frame that are taken from others
 #: Bytes of one message that a proxy takes, as frames go the other way; more is dropped before it is put together.
 MAX_MESSAGE_UP: Final = 1 << 18
 _ENCRYPTED: Final = ("quic/", "tls/")
+_PROTOCOLS: Final = (*_ENCRYPTED, "tcp/", "udp/", "ws/", "unixsock-stream/", "serial/", "unixpipe/", "vsock/")
 _RETRY: Final = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
 
 
@@ -117,6 +118,8 @@ def endpoints_of(addresses: Iterable[str], settings: FabricSettings) -> list[str
     found: list[str] = []
     for address in addresses:
         if "/" in address:
+            if not address.startswith(_PROTOCOLS):
+                raise UsageError(f"{address!r} is no network address: it looks like 10.0.0.5:7447 or tcp/10.0.0.5:7447")
             if settings.tls is not None and not address.startswith(_ENCRYPTED):
                 raise UsageError(f"with keys nothing travels unencrypted: {address!r} must begin with quic/ or tls/")
             found.append(address)

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import Final
 
-from skyloop.errors import UsageError
+from skyloop.errors import Hint, UsageError
 from skyloop.transport.fabric import config
 from skyloop.transport.fabric.settings import FabricSettings, secured
 
@@ -52,7 +52,7 @@ def _choose(network: NetworkChoice, keys: Path | str | None) -> FabricSettings |
         requested = MULTICAST if requested else ""
     if requested.strip().lower() in _OFF:
         if keys is not None and network is None:
-            raise UsageError(f"keys are for the network: give network=True as well, or set {NETWORK_VARIABLE}")
+            raise UsageError("keys are for the network").with_hint(Hint.NAME_NETWORK)
         return None
     words = [word.strip() for word in requested.split(",") if word.strip()]
     connect = tuple(word for word in words if word.lower() not in _ON)

@@ -6,6 +6,7 @@ import atexit
 import json
 import logging
 import platform
+import re
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -27,6 +28,9 @@ LINGER_S: Final = (
 REOPEN_S: Final = 2.0  #: how long an address may take to be free again
 _BORROWED: Final = 1000  # times to try again what another thread is just using …
 _BORROWED_S: Final = 0.001  # … after so long
+#: In Zenoh's errors: where in its sources one arose, and what it adds to an endpoint's address.
+_PLACE: Final = re.compile(r" at (?:/|[A-Za-z]:\\\\)\S+?\.rs:\d+\.?")
+_ENDPOINT: Final = re.compile(r"((?:tcp|udp|quic)/[^?\s]+)\?\w+=\w+")
 _ATTEMPTS: Final = 5  # to get a free port before somebody else has it
 
 
@@ -98,8 +102,14 @@ class Session:
             except zenoh_module.ZError as error:
                 # Another process may have taken the port that was found free: only then is another attempt of any use.
                 if attempt == _ATTEMPTS - 1 or not any(each.endswith(":0") for each in self.settings.listen or (":0",)):
-                    raise LinkError(f"cannot join the network: {error}") from None
+                    raise LinkError(f"cannot join the network: {reason_of(error)}") from None
         raise AssertionError("unreachable")
+
+
+def reason_of(error: BaseException) -> str:
+    """Return what an error of Zenoh says, without the places in its sources and the endpoints' inner form."""
+    text = _PLACE.sub("", str(error))
+    return _ENDPOINT.sub(r"\1", text).replace("failed to lookup address information", "the host's name is not known")
 
 
 class _Pool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 from typing import TYPE_CHECKING, Any
 
-from skyloop.errors import UnsupportedError
+from skyloop.errors import Hint, UnsupportedError
 from skyloop.transport.base import Dialer
 
 if TYPE_CHECKING:
@@ -75,5 +75,5 @@ def _check_platform() -> None:
     if sys.platform != "linux":
         raise UnsupportedError(
             f"the local transport needs Linux (sealed shared memory and SOCK_SEQPACKET), and this is {sys.platform}: "
-            "run proxy and application on Linux; a program may reach it over the network (network=True) from anywhere"
-        )
+            "run proxy and application on Linux"
+        ).with_hint(Hint.REACH_BY_NETWORK)

@@ -1,0 +1,150 @@
+"""``skyloop land`` and ``skyloop stop``: the end of a flight from any terminal, of one drone or of all."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from skyloop.cli import wording
+from skyloop.cli.naming import DronesOption, KeysOption, NamesArgument, NetworkOption, drones, join_network
+from skyloop.errors import LinkError, NoAnswerError, SkyloopError, UsageError
+
+if TYPE_CHECKING:
+    from skyloop.client import Drone
+
+FRESH_S: Final = 1.0  #: as old as a state may be that is believed
+LANDING_S: Final = 60.0  #: as long as a landing is waited for
+STOPPING_S: Final = 3.0  #: as long as a stop is repeated until the vehicle reports it
+_REPEAT_S: Final = 0.1
+_MOST_AT_ONCE: Final = 64
+LEAVE: Final = "take over with --priority 0, or ask them"
+
+AllOption = Annotated[bool, typer.Option("--all", help="Every drone that runs here, or on the --network")]
+
+
+def land(
+    names: NamesArgument = None,
+    drone: DronesOption = None,
+    every: AllOption = False,
+    priority: Annotated[
+        int | None,
+        typer.Option(metavar="P", min=0, max=31, help="0, the highest, takes over [default: 16; with --all: 0]"),
+    ] = None,
+    network: NetworkOption = None,
+    keys: KeysOption = None,
+) -> None:
+    """Land drones, and wait until they have landed.
+
+    A drone that another application flies is left to it, and named, unless --priority is higher (a lower number). With
+    --all everything lands that does not fly with the highest priority itself. Exit code 1 if one has not landed.
+    """
+    from skyloop.messages import DEFAULT_PRIORITY, HIGHEST_PRIORITY
+
+    chosen = _chosen(names, drone, every, network, keys)
+    wanted = (HIGHEST_PRIORITY if every else DEFAULT_PRIORITY) if priority is None else priority
+    _each(chosen, lambda name: _land(name, wanted), "NOT landed")
+
+
+def stop(
+    names: NamesArgument = None,
+    drone: DronesOption = None,
+    every: AllOption = False,
+    yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask: the motors are cut at once")] = False,
+    network: NetworkOption = None,
+    keys: KeysOption = None,
+) -> None:
+    """Emergency stop: cut the motors at once. The drones FALL.
+
+    It works whoever flies, and asks before, except with --yes. Exit code 1 if one has not confirmed it.
+    """
+    chosen = _chosen(names, drone, every, network, keys)
+    if not yes:
+        if not sys.stdin.isatty():
+            raise UsageError("an emergency stop asks before: give --yes where nobody can answer")
+        typer.confirm(f"Cut the motors of {', '.join(chosen)}? What flies FALLS.", abort=True, err=True)
+    _each(chosen, _stop, "NOT stopped")
+
+
+def _chosen(
+    names: list[str] | None, others: list[str] | None, every: bool, network: str | None, keys: Path | None
+) -> list[str]:
+    join_network(network, keys)
+    if not every:
+        return drones(names, others)
+    if names or others:
+        raise UsageError("--all is every drone: give it alone, or names")
+    from skyloop.client.connect import running_names
+
+    found = running_names()
+    if not found:
+        raise LinkError("no drone is found: none runs on this host, or can be reached over the --network")
+    return found
+
+
+def _each(names: Sequence[str], end: Callable[[str], str], failed: str) -> None:
+    """End all flights at the same time, and print a line for each as soon as it has ended."""
+
+    def attempt(name: str) -> tuple[str, bool]:
+        try:
+            return f"{name}: {end(name)}", True
+        except SkyloopError as error:
+            return f"{name}: {failed}: {wording.of(error)}", False
+
+    worked = True
+    with ThreadPoolExecutor(max_workers=min(_MOST_AT_ONCE, len(names))) as pool:
+        for line, good in pool.map(attempt, names):
+            typer.echo(line, err=not good)
+            worked &= good
+    if not worked:
+        raise typer.Exit(1)
+
+
+def _land(name: str, priority: int) -> str:
+    from skyloop.cli.piloting import connect_pilot
+    from skyloop.client import Authority, connect
+
+    with connect(name, access="observe", name="skyloop land") as seen:
+        if not seen.capabilities.actions:
+            return "takes no commands: it shows a recording or a camera"
+        if _on_the_ground(seen):
+            return "landed already"
+    authority = Authority(priority=priority)
+    with connect_pilot(name, LEAVE, name="skyloop land", authority=authority) as flown:
+        flown.land(timeout_s=LANDING_S)
+    return "landed"
+
+
+def _stop(name: str) -> str:
+    """Cut the motors. It needs no authority: the lowest priority takes it from nobody, and waits for nothing."""
+    from skyloop.client import Authority, connect
+    from skyloop.messages import LOWEST_PRIORITY, FlightState
+
+    authority = Authority(priority=LOWEST_PRIORITY, stay=True)
+    with connect(name, name="skyloop stop", authority=authority, on_exit="hover") as drone:
+        if not drone.capabilities.actions:
+            return "takes no commands: it shows a recording or a camera"
+        end_s = time.monotonic() + STOPPING_S
+        while time.monotonic() < end_s:
+            drone.emergency_stop()
+            time.sleep(_REPEAT_S)
+            if drone.feedback().state is FlightState.EMERGENCY:
+                return "motors off"
+        if _on_the_ground(drone):
+            return "motors off, on the ground"
+    raise NoAnswerError(f"sent for {STOPPING_S:g} s, and the vehicle has not confirmed it")
+
+
+def _on_the_ground(drone: Drone) -> bool:
+    """Whether a state that is not old says so."""
+    from skyloop.messages import FlightState
+
+    try:
+        return drone.feedback(max_age_s=FRESH_S).state is FlightState.LANDED
+    except NoAnswerError:
+        return False

@@ -1,0 +1,142 @@
+"""How a command line names drones and the network: the same words and the same help for every command.
+
+A drone is named by NAME; ``--drone NAME`` means the same everywhere. The network is ``--network WHERE``.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from skyloop.cli.completion import drone_names, network_places
+from skyloop.errors import UsageError
+
+MULTICAST: Final = "multicast"
+NETWORK_VARIABLE: Final = "SKYLOOP_NETWORK"
+KEYS_VARIABLE: Final = "SKYLOOP_KEYS"
+
+NameArgument = Annotated[
+    str | None,
+    typer.Argument(
+        metavar="NAME",
+        help="A running proxy's, as skyloop list shows them",
+        autocompletion=drone_names,
+        show_default=False,
+    ),
+]
+AnyNameArgument = Annotated[
+    str | None,
+    typer.Argument(
+        metavar="NAME",
+        help="A running proxy's, or a vehicle's address such as sim://",
+        autocompletion=drone_names,
+        show_default=False,
+    ),
+]
+OptionalNameArgument = Annotated[
+    str | None,
+    typer.Argument(
+        metavar="[NAME]",
+        help="A running proxy's, or a vehicle's address; without: sim://",
+        autocompletion=drone_names,
+        show_default=False,
+    ),
+]
+NamesArgument = Annotated[
+    list[str] | None,
+    typer.Argument(metavar="NAME...", help="Running proxies; skyloop list shows them", autocompletion=drone_names),
+]
+DroneOption = Annotated[
+    str | None, typer.Option("--drone", metavar="NAME", help="The same as NAME", autocompletion=drone_names)
+]
+DronesOption = Annotated[
+    list[str] | None,
+    typer.Option("--drone", metavar="NAME", help="The same as NAME; repeatable", autocompletion=drone_names),
+]
+NetworkOption = Annotated[
+    str | None,
+    typer.Option(
+        "--network",
+        metavar="WHERE",
+        help=f"Search there too: multicast, or addresses with commas [{NETWORK_VARIABLE}]",
+        autocompletion=network_places,
+    ),
+]
+KeysOption = Annotated[
+    Path | None,
+    typer.Option("--keys", metavar="DIR", help=f"Of the network: folder of an identity [{KEYS_VARIABLE}]"),
+]
+
+
+def one_drone(name: str | None, drone: str | None, default: str | None = None) -> str:
+    """Return the drone that a command is about.
+
+    Args:
+        name: As NAME.
+        drone: As ``--drone``.
+        default: Where neither is given; None: one must be.
+
+    Raises:
+        UsageError: None is named, or two are.
+    """
+    if name is not None and drone is not None and name != drone:
+        raise UsageError(f"NAME {name} and --drone {drone} name two drones: give one of them")
+    chosen = name or drone or default
+    if chosen is None:
+        raise UsageError(f"no drone is named: give its NAME, or --drone NAME; {_running()}")
+    return chosen
+
+
+def drones(names: Sequence[str] | None, others: Sequence[str] | None, *, needed: bool = True) -> list[str]:
+    """Return the drones that a command is about, each once.
+
+    Args:
+        names: As NAME.
+        others: As ``--drone``.
+        needed: Whether at least one must be named.
+
+    Raises:
+        UsageError: None is named and one is needed.
+    """
+    chosen = list(dict.fromkeys([*(names or ()), *(others or ())]))
+    if needed and not chosen:
+        raise UsageError(f"no drone is named: give its NAME, or --drone NAME; {_running()}")
+    return chosen
+
+
+def _running() -> str:
+    found = drone_names("")
+    return f"running: {', '.join(found)}" if found else "none is running: skyloop sim starts a simulated one"
+
+
+def join_network(network: str | None, keys: Path | None) -> None:
+    """Search the network as the options say, in this process and those that it starts.
+
+    Raises:
+        UsageError: An address or the folder is not valid, or keys are given without a network.
+    """
+    if network is None and keys is None:
+        return
+    from skyloop.client.connect import network_settings
+
+    network_settings(network, keys)  # refuses what is not valid
+    for variable, value in ((NETWORK_VARIABLE, network), (KEYS_VARIABLE, keys)):
+        if value is not None:
+            os.environ[variable] = str(value)
+
+
+def with_place(arguments: Sequence[str]) -> list[str]:
+    """Return the words of a command line with ``multicast`` behind a ``--network`` that names no place."""
+    words: list[str] = []
+    for index, word in enumerate(arguments):
+        words.append(word)
+        if word == "--":
+            return [*words, *arguments[index + 1 :]]
+        following = arguments[index + 1] if index + 1 < len(arguments) else "--"
+        if word == "--network" and (following.startswith("-") or "://" in following):
+            words.append(MULTICAST)
+    return words

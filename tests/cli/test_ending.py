@@ -1,0 +1,89 @@
+"""``skyloop land`` and ``skyloop stop``, with real proxies: of a drone of one's own, of others, and of all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+import skyloop
+from tests.cli.conftest import FAST_SIM, Run
+from tests.processes.conftest import Process, eventually
+
+pytestmark = [pytest.mark.process, pytest.mark.daily]
+
+
+@pytest.fixture
+def swarm(start: Callable[..., Process]) -> Process:
+    """Two drones, b1 and b2."""
+    options = [f"--option={word}" for word in ("cameras=none", "wind=0")]
+    process = start("sim", "--drones", "2", "--name", "b", "--world", "empty", "--speed", "6", *options)
+    process.until("ready")
+    process.until("b2")
+    return process
+
+
+def state(name: str) -> str:
+    with skyloop.connect(name, access="observe") as drone:
+        return drone.feedback().state.value
+
+
+@pytest.mark.usefixtures("alpha")
+def test_a_drone_on_the_ground_has_landed_already(run: Run) -> None:
+    assert run("land", "alpha") == (0, "alpha: landed already\n", "")
+    ended = run("land", "--drone", "nobody")
+    assert ended.code == 1
+    assert ended.err.startswith("nobody: NOT landed: no proxy named 'nobody'")
+
+
+@pytest.mark.usefixtures("alpha")
+def test_a_drone_of_another_is_left_to_it_unless_the_priority_is_higher(run: Run) -> None:
+    with skyloop.connect("alpha", name="the pilot", on_exit="hover") as drone:
+        drone.takeoff()
+        ended = run("land", "alpha")
+        assert ended.code == 1
+        assert "alpha: NOT landed: the pilot holds the authority over alpha: take over with --priority 0" in ended.err
+        assert drone.feedback().state.airborne
+        assert run("land", "alpha", "--priority", "0") == (0, "alpha: landed\n", "")
+        assert not drone.feedback().state.airborne
+
+
+def test_all_land_and_all_stop(run: Run, swarm: Process, alpha: Process) -> None:
+    assert swarm.pid != alpha.pid
+    with skyloop.connect("b1", name="one", on_exit="hover") as one, skyloop.connect("b2", on_exit="hover") as two:
+        one.takeoff()
+        two.takeoff()
+        ended = run("land", "--all")
+        assert (ended.code, ended.err) == (0, "")
+        assert ended.out.splitlines() == ["alpha: landed already", "b1: landed", "b2: landed"]
+        eventually(lambda: one.authority.state == "held", "the authority comes back")
+        one.takeoff()
+        refused = run("stop", "b1")
+        assert (refused.code, refused.err) == (
+            2,
+            "skyloop: an emergency stop asks before: give --yes where nobody can answer\n",
+        )
+        assert one.feedback().state.airborne
+        ended = run("stop", "--all", "--yes")
+        assert ended.code == 0
+        assert "b1: motors off\n" in ended.out
+        eventually(lambda: state("b1") == "emergency", "its motors are off")
+    assert run("land", "--all", "b1").err == "skyloop: --all is every drone: give it alone, or names\n"
+
+
+def test_no_drone_at_all_is_told(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("skyloop.transport.local.list_names", list)
+    for command in (["land", "--all"], ["stop", "--all", "--yes"]):
+        ended = run(*command)
+        assert ended.code == 1
+        assert ended.err.startswith("skyloop: no drone is found")
+
+
+def test_a_stop_is_asked_for(run: Run, alpha: Process, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert FAST_SIM
+    assert alpha.pid
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
+    monkeypatch.setattr("typer.confirm", lambda text, **_: asked.append(text))
+    asked: list[str] = []
+    assert run("stop", "alpha").code == 0
+    assert asked == ["Cut the motors of alpha? What flies FALLS."]
