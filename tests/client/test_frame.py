@@ -57,6 +57,18 @@ def test_a_frame_is_the_received_memory_and_knows_its_origin() -> None:
     assert frame.feedback_reach_s is None
 
 
+def test_a_frame_shows_itself_in_a_notebook() -> None:
+    cv2 = pytest.importorskip("cv2")
+    frame: Any = arrival(header(), pixels()).frame()
+    for image in (frame, frame[1:4, ::2], frame[:, :, 0], frame.T[0]):
+        encoded = image._repr_png_()
+        assert encoded is not None
+        shown = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_UNCHANGED)
+        assert np.array_equal(shown, np.asarray(image))
+    assert frame[0, 0]._repr_png_() is None, "a pixel is no picture"
+    assert frame[:0]._repr_png_() is None
+
+
 def test_what_is_derived_is_plain() -> None:
     frame = arrival(header(), pixels()).frame()
     own = frame.copy()

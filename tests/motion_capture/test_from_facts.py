@@ -49,7 +49,7 @@ def test_the_poses_that_the_server_sends_come_out(address: str) -> None:
     seen: list[BodyPose] = []
     with mocap(address, {"alpha": body, "beta": hidden}) as capture:
         capture.wait("alpha", 20.0)
-        with capture.on_pose(seen.append):
+        with capture.on_pose(seen.append, inline=True):
             wait_until(lambda: len(seen) >= ENOUGH, "poses came")
         assert capture.state("beta") is TrackState.WAITING, "it is hidden"
         assert capture.unknown == set()

@@ -50,7 +50,7 @@ def test_the_recorded_poses_come_out_in_our_axes(server: Process) -> None:
     seen: list[BodyPose] = []
     with connect(server) as capture:
         pose = capture.wait("alpha")
-        with capture.on_pose(seen.append):
+        with capture.on_pose(seen.append, inline=True):
             wait_until(lambda: len(seen) >= ENOUGH, "poses came")
         assert capture.state("alpha") is TrackState.TRACKED
         assert capture.unknown == set()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import pytest
 import skyloop
 from skyloop.cockpit.values import mocap_values
 from skyloop.control import FollowPath, Polyline
-from skyloop.errors import UnknownNameError, UnsupportedError, UsageError
+from skyloop.errors import ClosedError, UnknownNameError, UnsupportedError, UsageError
 from skyloop.messages import LogEntry
 from skyloop.motion_capture import BodyPose, TrackState
 from skyloop.transport.testing import wait_until
@@ -60,7 +61,7 @@ def test_poses_are_told_with_the_drone_at_most_so_often(proxy: Proxy) -> None:
         skyloop.mocap("sim://", {"alpha": "alpha"}) as capture,
         drone.on_log(entries.append, inline=True),
     ):
-        with capture.on_pose(poses.append), capture.link(drone, max_hz=10.0) as linked:
+        with capture.on_pose(poses.append, inline=True), capture.link(drone, max_hz=10.0) as linked:
             wait_until(lambda: len(entries) >= 5, "poses were told")
             linked.close()
             linked.close()
@@ -118,12 +119,29 @@ def test_a_listener_must_be_a_function_and_one_that_fails_costs_only_itself(
             wait_until(lambda: seen, "the other one was called")
 
         others: list[BodyPose] = []
-        registration = capture.on_pose(others.append)  # without a block
+        listener = capture.on_pose(others.append)  # without a block
         wait_until(lambda: others, "it is called from then on")
-        registration.close()
-        registration.close()
+        listener.cancel()
+        listener.cancel()
+        assert (listener.delivered, listener.errors) == (len(others), 0)
         count, before = len(others), len(seen)
         with capture.on_pose(seen.append):
             wait_until(lambda: len(seen) > before + 1, "others go on")
-        assert len(others) <= count + 1, "one may have been under way"
-    assert "a motion capture listener failed" in caplog.text
+        assert len(others) == count
+        blocked, freed = threading.Event(), threading.Event()
+
+        def slow(_: BodyPose) -> None:
+            blocked.set()
+            freed.wait(10.0)
+
+        with capture.on_pose(slow) as waiting:
+            wait_until(blocked.is_set, "it is called")
+            before = len(seen)
+            with capture.on_pose(seen.append):
+                wait_until(lambda: waiting.dropped > 3 and len(seen) > before, "it delays nobody and its drops count")
+            freed.set()
+        with pytest.raises(UsageError, match="depth is 0"):
+            capture.on_pose(print, depth=0)
+    assert "motion capture's pose callback raised RuntimeError('on purpose')" in caplog.text
+    with pytest.raises(ClosedError):
+        capture.on_pose(print)

@@ -207,7 +207,7 @@ def test_several_sensors_of_a_tracker_are_refused_with_what_to_do() -> None:
 def test_a_sensor_that_is_named_is_the_body_and_no_other(option: str, body: str, sensor: int) -> None:
     seen: list[BodyPose] = []
     with listening(streaming(0, 1)) as address, mocap(address + option, {"alpha": body}) as capture:
-        with capture.on_pose(seen.append):
+        with capture.on_pose(seen.append, inline=True):
             wait_until(lambda: len(seen) >= 50, "poses came")
         assert capture.unknown == {f"{TRACKER}:{1 - sensor}"}
     place, _ = pose(1)
@@ -231,7 +231,11 @@ def test_a_sensor_that_turns_up_in_flight_loses_the_body_and_says_why() -> None:
             connection.sendall(server.frame(number) + (server.frame(number, 1) if both.is_set() else b""))
             time.sleep(0.01)
 
-    with listening(answer) as address, mocap(address, {"alpha": TRACKER}) as capture, capture.on_event(events.append):
+    with (
+        listening(answer) as address,
+        mocap(address, {"alpha": TRACKER}) as capture,
+        capture.on_event(events.append, inline=True),
+    ):
         capture.wait("alpha")
         both.set()
         wait_until(lambda: capture.state("alpha") is TrackState.LOST, "it was lost")
@@ -245,7 +249,7 @@ def test_a_server_that_is_restarted_is_found_again() -> None:
         first = stack.enter_context(running("0"))
         port = first.text.split("ready ")[1].split()[0]
         capture = stack.enter_context(mocap(f"vrpn://127.0.0.1:{port}", {"alpha": TRACKER}))
-        stack.enter_context(capture.on_event(events.append))
+        stack.enter_context(capture.on_event(events.append, inline=True))
         capture.wait("alpha")
         first.end()
         wait_until(lambda: capture.state("alpha") is TrackState.LOST, "it was lost")
@@ -280,7 +284,11 @@ def test_a_connection_that_falls_silent_is_replaced(monkeypatch: pytest.MonkeyPa
         while connection.recv(1000):
             pass
 
-    with listening(answer) as address, mocap(address, {"alpha": TRACKER}) as capture, capture.on_event(events.append):
+    with (
+        listening(answer) as address,
+        mocap(address, {"alpha": TRACKER}) as capture,
+        capture.on_event(events.append, inline=True),
+    ):
         capture.wait("alpha")
         wait_until(lambda: len(connections) >= 2, "it was connected to again")
         capture.wait("alpha")

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import struct
 import threading
 import time
 import weakref
+import zlib
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final, Literal, NoReturn
 
@@ -27,6 +29,7 @@ else:
     _Base = np.ndarray
 
 _CHANNELS: Final = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
+_PNG_LEVEL: Final = 1  #: of compression: a notebook's pictures are shown at once, and rarely kept
 _ATTRIBUTES: Final = frozenset(
     {"camera", "seq", "captured_ns", "published_ns", "received_ns", "intrinsics", "header", "age_s"}
     | {"feedback", "feedback_reach_s"}
@@ -106,6 +109,10 @@ class Frame(_Base):
         """
         return self.view(np.ndarray).copy(order)
 
+    def _repr_png_(self) -> bytes | None:
+        """Return the picture as PNG, with which a notebook shows it; None for a part that is no picture."""
+        return png(np.asarray(self))
+
     def __array_wrap__(self, array: Any, context: Any = None, return_scalar: bool = False) -> Any:
         """Return results of arithmetic as plain arrays or numbers."""
         plain = np.asarray(array)
@@ -117,6 +124,29 @@ class Frame(_Base):
                 f"this array was derived from a frame and has no {name}: only the frame as it was delivered knows it"
             )
         raise AttributeError(f"a frame has no attribute {name!r}")
+
+
+def png(image: NDArray[Any]) -> bytes | None:
+    """Encode an image as PNG.
+
+    Args:
+        image: BGR of shape (height, width, 3), or grey of shape (height, width); uint8.
+
+    Returns:
+        None if it is anything else, or has no pixels.
+    """
+    grey = image.ndim == 2
+    if image.dtype != np.uint8 or not image.size or not (grey or (image.ndim == 3 and image.shape[2] == 3)):
+        return None
+    height, width = image.shape[:2]
+    rows = np.zeros((height, 1 + width * (1 if grey else 3)), np.uint8)  # each begins with the kind of its filter: none
+    rows[:, 1:] = (image if grey else image[:, :, ::-1]).reshape(height, -1)
+    head = struct.pack(">IIBBBBB", width, height, 8, 0 if grey else 2, 0, 0, 0)
+    parts = ((b"IHDR", head), (b"IDAT", zlib.compress(rows.tobytes(), _PNG_LEVEL)), (b"IEND", b""))
+    chunks = (
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in parts
+    )
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
 
 
 class Arrival:

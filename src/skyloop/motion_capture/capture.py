@@ -5,10 +5,12 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from types import TracebackType
-from typing import TYPE_CHECKING, Final, Protocol, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Protocol, Self, TypeVar
 
+from skyloop.client.channels import Channel, Listener
 from skyloop.clock import monotonic_ns, nanoseconds
 from skyloop.control.position import Fix
 from skyloop.errors import ClosedError, NoAnswerError, UnknownNameError, UsageError
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
     from skyloop.client import Drone
 
 LOOK_S: Final = 0.05  #: period of the check whether a body is lost
+EVENT_DEPTH: Final = 256  #: how many events wait for a slow callback
 MAX_UNKNOWN: Final = 1000  #: limit of the names of unrequested bodies that are remembered
 T = TypeVar("T")
 _log = logging.getLogger("skyloop")
@@ -54,31 +57,12 @@ class Source(Protocol):
 MakeSource = Callable[[System, Iterable[str], Callable[[RawFrame], None], Callable[[str], None]], Source]
 
 
-class Registration:
-    """A callback's registration, until :meth:`close`. A context manager."""
-
-    def __init__(self, end: Callable[[], None]) -> None:
-        """Store what removes the callback."""
-        self._end = end
-
-    def close(self) -> None:
-        """Remove the callback. Idempotent."""
-        self._end()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.close()
-
-
 class MotionCapture:
     """Poses of the bodies that a motion capture system tracks. A context manager; created by :func:`skyloop.mocap`.
 
-    Every method may be called from any thread. Callbacks run on the receiving thread (events also on a thread that
-    checks for lost bodies) and must be quick; one that raises is logged and does not affect the others.
+    Every method may be called from any thread. Callbacks have a thread of their own; with ``inline=True`` they run on
+    the receiving thread (events also on a thread that checks for lost bodies) and must be quick. One that raises is
+    counted and logged and does not affect the others.
 
     Attributes:
         system: The system.
@@ -110,8 +94,9 @@ class MotionCapture:
         self._tracks = {name: Track(name, may_freeze=system.kind == "sim") for name in bodies}
         self._reported = dict.fromkeys(bodies, TrackState.WAITING)
         self._calibrations: dict[str, Calibration] = {}
-        self._pose_listeners: list[OnPose] = []
-        self._event_listeners: list[OnEvent] = []
+        self._poses: Channel[BodyPose] = Channel()
+        self._events: Channel[TrackEvent] = Channel()
+        self._listeners: list[Listener[Any]] = []
         self._changed = threading.Condition()
         self._ended = threading.Event()
         self._source = make(system, self._names, self._take, self._trouble)
@@ -143,6 +128,8 @@ class MotionCapture:
         self._source.close()
         if self._watch.ident is not None:
             self._watch.join()
+        for listener in list(self._listeners):
+            listener.cancel()
         with self._changed:
             for track in self._tracks.values():
                 track.end()
@@ -200,56 +187,57 @@ class MotionCapture:
             f"{self.system.address} does not track {self.bodies[name]!r} (for {name}) within {timeout_s:g} s{others}"
         )
 
-    def on_pose(self, function: OnPose) -> Registration:
-        """Call a function with each pose of each body, on the receiving thread.
+    def on_pose(self, function: OnPose, *, depth: int = 1, inline: bool = False) -> Listener[BodyPose]:
+        """Call ``function`` with the newest pose of any body.
+
+        Like every ``on_...`` method of a drone it returns a :class:`skyloop.client.Listener`, whose ``cancel()`` or end
+        of its ``with`` block ends it.
 
         Args:
-            function: Must return quickly.
-
-        Returns:
-            Closing it, or the end of its ``with`` block, removes the callback.
+            function: Called on a thread of its own; poses that newer ones overtake are dropped and counted.
+            depth: How many poses may wait for it, such as one for each body.
+            inline: Call it on the receiving thread instead, with every pose. It must be quick and must not wait.
 
         Raises:
-            UsageError: The function can't be called.
+            UsageError: The function can't be called, or ``depth`` is less than 1.
+            ClosedError: This motion capture was closed.
         """
-        self._listen(pose=function)
-        return Registration(lambda: self._listen_no_more(pose=function))
+        return self._listen(self._poses, function, "pose", depth, inline)
 
-    def on_event(self, function: OnEvent) -> Registration:
-        """Call a function whenever a body is found or lost, or the system has trouble.
+    def on_event(self, function: OnEvent, *, inline: bool = False) -> Listener[TrackEvent]:
+        """Call ``function`` whenever a body is found or lost, or the system has trouble.
+
+        Returns and raises as :meth:`on_pose`.
 
         Args:
-            function: Must return quickly.
-
-        Returns:
-            Closing it, or the end of its ``with`` block, removes the callback.
-
-        Raises:
-            UsageError: The function can't be called.
+            function: Called on a thread of its own; up to 256 events wait for it.
+            inline: Call it on the thread that found the change instead.
         """
-        self._listen(event=function)
-        return Registration(lambda: self._listen_no_more(event=function))
+        return self._listen(self._events, function, "event", EVENT_DEPTH, inline)
 
-    def _listen(self, pose: OnPose | None = None, event: OnEvent | None = None) -> None:
-        """Add callbacks as :meth:`on_pose` and :meth:`on_event` do, until :meth:`_listen_no_more`.
+    def _listen(
+        self, channel: Channel[T], function: Callable[[T], object], name: str, depth: int, inline: bool
+    ) -> Listener[T]:
+        self._check_open()
+        if not callable(function):
+            raise UsageError(f"{function!r:.80} can't be called: a function with one argument is needed")
+        if isinstance(depth, bool) or not isinstance(depth, int) or depth < 1:
+            raise UsageError(f"depth is {depth!r} and must be a whole number of at least 1")
+        listener = Listener(
+            function,
+            channel,
+            _reported_by_the_log,
+            name=f"motion capture's {name} callback",
+            depth=depth,
+            inline=inline,
+            on_cancel=self._cancelled,
+        )
+        self._listeners.append(listener)
+        return listener
 
-        Raises:
-            UsageError: A function can't be called.
-        """
-        for function in (pose, event):
-            if function is not None and not callable(function):
-                raise UsageError(f"{function!r:.80} can't be called: a function with one argument is needed")
-        if pose is not None:
-            self._pose_listeners.append(pose)
-        if event is not None:
-            self._event_listeners.append(event)
-
-    def _listen_no_more(self, pose: OnPose | None = None, event: OnEvent | None = None) -> None:
-        """Remove callbacks. Idempotent."""
-        if pose in self._pose_listeners:
-            self._pose_listeners.remove(pose)
-        if event in self._event_listeners:
-            self._event_listeners.remove(event)
+    def _cancelled(self, listener: Listener[Any]) -> None:
+        with suppress(ValueError):
+            self._listeners.remove(listener)
 
     # For drones and controllers ---------------------------------------------------------------------------------
 
@@ -305,7 +293,7 @@ class MotionCapture:
             raise UsageError(f"{name} flies: a calibration needs it at rest on the ground")
         poses: list[BodyPose] = []
         self._calibrations.pop(name, None)
-        with self.on_pose(lambda pose: poses.append(pose) if pose.body == name else None):
+        with self.on_pose(lambda pose: poses.append(pose) if pose.body == name else None, inline=True):
             if self._ended.wait(seconds):
                 self._check_open()
         feedback = drone.feedback()
@@ -338,7 +326,7 @@ class MotionCapture:
             self._changed.notify_all()
         if pose is not None:
             self._report(track)
-            _call(self._pose_listeners, pose)
+            self._poses.publish(pose)
 
     def _trouble(self, text: str) -> None:
         self._publish_event("", TrackState.LOST, text)
@@ -363,7 +351,7 @@ class MotionCapture:
 
     def _publish_event(self, body: str, state: TrackState, text: str) -> None:
         _log.log(logging.WARNING if state is TrackState.LOST else logging.INFO, "motion capture: %s", text)
-        _call(self._event_listeners, TrackEvent(monotonic_ns(), body, state, text))
+        self._events.publish(TrackEvent(monotonic_ns(), body, state, text))
 
     def _track(self, name: str) -> Track:
         if name not in self._tracks:
@@ -375,13 +363,8 @@ class MotionCapture:
             raise ClosedError("this motion capture was closed")
 
 
-def _call(listeners: list[Callable[[T], object]], sample: T) -> None:
-    """Call all callbacks; log the exceptions that they raise."""
-    for function in list(listeners):
-        try:
-            function(sample)
-        except Exception:  # noqa: BLE001  the user's code may raise anything
-            _log.exception("a motion capture listener failed")
+def _reported_by_the_log(name: str, error: Exception) -> None:
+    """Add nothing to what a listener logs: a motion capture has no events for programs' errors."""
 
 
 class Linked:
@@ -400,9 +383,11 @@ class Linked:
         self._period_ns = nanoseconds(1.0 / max_hz)
         self._to_vehicle = to_vehicle
         self._due_ns = 0
+        self._listeners: list[Listener[Any]] = []
 
     def __enter__(self) -> Self:
-        self._capture._listen(self._pose, self._event)
+        self._listeners.append(self._capture.on_pose(self._pose, inline=True))
+        self._listeners.append(self._capture.on_event(self._event, inline=True))
         return self
 
     def __exit__(
@@ -412,7 +397,8 @@ class Linked:
 
     def close(self) -> None:
         """Stop logging. Idempotent."""
-        self._capture._listen_no_more(self._pose, self._event)
+        while self._listeners:
+            self._listeners.pop().cancel()
 
     def _pose(self, pose: BodyPose) -> None:
         if pose.body != self._drone.name or pose.captured_ns < self._due_ns:
