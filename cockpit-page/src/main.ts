@@ -21,7 +21,7 @@ import { session } from "./login.js";
 import type { DroneRow, Session, Sticks } from "./model.js";
 import { OverviewView } from "./overview.js";
 import { Pane } from "./pane.js";
-import { keepInReach } from "./modal.js";
+import { keepInReach } from "./reach.js";
 import { RecordingList } from "./recordings.js";
 import { isRecording, Safety } from "./safety.js";
 import { SettingsDialog } from "./settingsdialog.js";

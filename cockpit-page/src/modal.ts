@@ -1,17 +1,9 @@
 // A modal dialog: the rest of the page rests, the focus stays within and returns, Escape closes it. What must be in reach
-// whatever is open, as the emergency stop, moves into it meanwhile: outside, the browser would let nobody press it.
+// whatever is open moves into it meanwhile.
 
 import { h } from "./dom.js";
 import { t } from "./language/index.js";
-
-const kept: HTMLElement[] = [];
-/** Where each of them belongs, while a dialog has it. */
-const homes = new Map<HTMLElement, Comment>();
-
-/** This element is in reach, and above, whatever is open. */
-export function keepInReach(element: HTMLElement | null): void {
-  if (element) kept.push(element);
-}
+import { lend, takeBack } from "./reach.js";
 
 /** Whether one is open: keys and sticks then fly nothing. */
 export const isModalOpen = (): boolean => document.querySelector("dialog:modal") !== null;
@@ -41,13 +33,7 @@ export class Modal {
   open(): void {
     if (this.element.open) return;
     for (const other of document.querySelectorAll<HTMLDialogElement>("dialog:modal")) other.close();
-    for (const element of kept) {
-      if (!homes.has(element)) {
-        homes.set(element, document.createComment(""));
-        element.replaceWith(homes.get(element) as Comment);
-      }
-      this.reach.append(element);
-    }
+    lend(this.reach);
     this.element.showModal();
   }
 
@@ -56,9 +42,7 @@ export class Modal {
   }
 
   private end(): void {
+    takeBack(this.reach);
     this.closed();
-    if (isModalOpen()) return; // this one made way for another, which has what is kept
-    for (const [element, home] of homes) home.replaceWith(element);
-    homes.clear();
   }
 }

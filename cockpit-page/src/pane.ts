@@ -4,6 +4,7 @@ import { AlarmBanner, AlarmBook } from "./alarms.js";
 import type { AlarmSource } from "./alarmsound.js";
 import { errorText, post } from "./api.js";
 import { Battery } from "./battery.js";
+import { CameraControls } from "./cameracontrols.js";
 import { Channels } from "./channels.js";
 import { ServerClock } from "./clock.js";
 import { STALE_MS } from "./commands.js";
@@ -88,6 +89,7 @@ export class Pane {
   private readonly events = new Events();
   private readonly channels = new Channels();
   private readonly parameters: Parameters;
+  private readonly controls: CameraControls;
   private scene: SceneView | null = null;
   private readonly decks: Record<"space" | "plots" | "lists", Deck>;
   private noticed_ms = Number.NEGATIVE_INFINITY;
@@ -98,7 +100,8 @@ export class Pane {
     private readonly host: PaneHost,
   ) {
     const base = `/ws/drones/${encodeURIComponent(name)}`;
-    this.stage = new Stage(name);
+    this.controls = new CameraControls(name, (parameter, value) => this.pilot?.write(parameter, value));
+    this.stage = new Stage(name, this.controls);
     this.strip = new Strip(name, (deed) => this.act(deed), (id, grant, reason) => this.pilot?.answer(id, grant, reason), {
       countdown: host.countdown,
       deadly: () => (this.target === null ? null : { what: `Motors of ${name} off`, act: () => this.target?.stop() }),
@@ -206,12 +209,12 @@ export class Pane {
     return {
       changed: () => this.update(),
       refused: (command, why) => {
-        if (command === "set" && this.parameters.refused(why)) return;
+        if (command === "set" && [this.parameters, this.controls.parameters].some((list) => list.refused(why))) return;
         if (command === "fly" && this.isOld) return; // the whole pane shows that
         this.notify(command ? `${words(command)}: ${why}` : why, "warn");
       },
       done: (command, name, value) => {
-        if (command === "set" && name !== undefined && value !== undefined) this.parameters.done(name, value);
+        if (command === "set" && name !== undefined && value !== undefined) for (const list of [this.parameters, this.controls.parameters]) list.done(name, value);
         if (command === "stop") this.notify("emergency stop sent", "bad");
         if (command === "goto") this.notify("the waypoint is reached", "ok");
       },
@@ -295,7 +298,7 @@ export class Pane {
     const can = mine && placed && inAir;
     this.waypoint.allow(can);
     this.map.allow(can ? "" : nowhere);
-    this.parameters.allow(mine, recording ? "As they were recorded." : "Take control to change them.");
+    for (const list of [this.parameters, this.controls.parameters]) list.allow(mine, recording ? "As they were recorded." : "Take control to change them.");
     this.alarmBook.update(this.found(), performance.now());
     this.alarms.show();
     setHidden(this.oldSeen, !this.alarmBook.open.some((alarm) => alarm.id === "old"));

@@ -1,9 +1,16 @@
 // Parameters: read when they are shown, written with the drone's own answer beside them.
 
 import { get, errorText } from "./api.js";
-import { h, setDisabled, setHidden, setText, setTone } from "./dom.js";
+import { h, setAttribute, setDisabled, setHidden, setText, setTone } from "./dom.js";
 import type { Parameter, Value } from "./model.js";
 import { parse, rangeText, valueText } from "./values.js";
+
+/** Only some of them: what is said where there are none, and the name of the list. */
+export interface Choice {
+  has(name: string): boolean;
+  none: string;
+  title: string;
+}
 
 type Editor = HTMLInputElement | HTMLSelectElement;
 
@@ -20,6 +27,7 @@ export class Parameters {
   private readonly words = h("input", { type: "search", placeholder: "Filter", "aria-label": "Filter parameters by words", oninput: () => this.filter() });
   private readonly list = h("div", { class: "parameters", tabindex: 0, role: "region", "aria-label": "Parameters" });
   private readonly note = h("p", { class: "note" }, "");
+  private readonly empty = h("p", { class: "empty" }, "No parameters");
   private rows = new Map<string, Row>();
   private writing: string | null = null;
   private can = false;
@@ -27,9 +35,11 @@ export class Parameters {
   constructor(
     private readonly drone: string,
     private readonly write: (name: string, value: Value) => void,
+    private readonly choice: Choice | null = null,
   ) {
     const again = h("button", { type: "button", class: "small", onclick: () => void this.load() }, "Read again");
-    this.element = h("div", { class: "filling" }, h("div", { class: "filters" }, this.words, again), this.note, this.list);
+    if (choice) setAttribute(this.list, "aria-label", choice.title);
+    this.element = h("div", { class: "filling" }, choice ? null : h("div", { class: "filters" }, this.words, again), this.note, this.list);
   }
 
   /** Whether they can be written now; `why` not. */
@@ -45,7 +55,7 @@ export class Parameters {
       const parameters = await get<Parameter[]>(`/api/drones/${encodeURIComponent(this.drone)}/parameters`);
       this.rows = new Map(parameters.map((parameter) => [parameter.name, this.row(parameter)]));
       this.list.replaceChildren(...[...this.rows.values()].map((row) => row.element));
-      if (!parameters.length) this.list.append(h("p", { class: "empty" }, "No parameters"));
+      this.list.append(this.empty);
       this.filter();
     } catch (error) {
       this.list.replaceChildren(h("p", { class: "empty" }, `Not read: ${errorText(error)}`));
@@ -121,11 +131,17 @@ export class Parameters {
     setDisabled(row.button, !may || row.editor.value === valueText(row.parameter.value));
   }
 
-  private filter(): void {
+  /** Show those that were asked for. */
+  filter(): void {
     const needle = this.words.value.trim().toLowerCase();
+    let some = false;
     for (const { parameter, element } of this.rows.values()) {
-      element.hidden = !`${parameter.name} ${parameter.description}`.toLowerCase().includes(needle);
+      const fits = `${parameter.name} ${parameter.description}`.toLowerCase().includes(needle) && (this.choice?.has(parameter.name) ?? true);
+      element.hidden = !fits;
+      some ||= fits;
     }
+    setText(this.empty, this.choice?.none ?? "No parameters");
+    setHidden(this.empty, some);
   }
 }
 

@@ -1,11 +1,13 @@
 // One camera: shows the newest frame, its age, and draws what was published about it.
 
+import type { CameraControls } from "./cameracontrols.js";
 import { fit, h, setAttribute, setHidden, setText, setTone } from "./dom.js";
 import { contain, draw } from "./drawing.js";
 import { duration } from "./format.js";
 import type { Camera, Drawing, FrameHead } from "./model.js";
 import { NewestFrame, type Received, unpack } from "./newest.js";
 import { LastingSocket } from "./socket.js";
+import { VideoTools } from "./videotools.js";
 
 const REACH_NS = 300_000_000n; // drawings of a frame further away than this are not shown
 const LATE_S = 0.25;
@@ -23,7 +25,8 @@ export class VideoView {
   overlay = true;
   /** It was recorded, and the recording is over. */
   over = false;
-  private readonly canvas: HTMLCanvasElement;
+  readonly canvas: HTMLCanvasElement;
+  private readonly tools: VideoTools;
   private readonly sheet = h("canvas", { class: "overlay", "aria-hidden": "true" });
   private readonly age = h("span");
   private readonly ageChip = h("p", { class: "chip age", "data-tone": "quiet" }, h("i", { class: "dot" }), this.age);
@@ -34,14 +37,15 @@ export class VideoView {
   private frames: NewestFrame<ImageBitmap> | null = null;
   private shown: Shown | null = null;
   private arrivals: number[] = [];
-  private readonly hide = (): void => this.reopen();
+  private readonly hide = (): void => this.wantedChanged();
 
   constructor(
-    private readonly drone: string,
+    readonly drone: string,
     readonly camera: Camera,
   ) {
     this.canvas = h("canvas", { class: "video", role: "img", width: camera.width, height: camera.height });
     this.element = h("figure", { class: "camera", "data-camera": camera.name }, this.canvas, this.sheet, this.ageChip, this.rate, this.nothing);
+    this.tools = new VideoTools(this);
     // A page that nobody sees asks for no pictures.
     document.addEventListener("visibilitychange", this.hide);
     this.reopen();
@@ -49,6 +53,7 @@ export class VideoView {
 
   close(): void {
     document.removeEventListener("visibilitychange", this.hide);
+    this.tools.close();
     this.socket?.close();
     this.frames?.end();
   }
@@ -81,18 +86,28 @@ export class VideoView {
     const pen = this.sheet.getContext("2d");
     if (!pen || !this.shown) return;
     pen.clearRect(0, 0, this.sheet.width, this.sheet.height);
-    if (!this.overlay) return;
+    if (this.overlay) this.paint(pen, this.sheet, density);
+  }
+
+  /** Draw what was published about the picture that is shown, as far as the box lets it. */
+  paint(pen: CanvasRenderingContext2D, box: HTMLCanvasElement, density: number): void {
+    if (!this.shown) return;
     for (const drawing of this.drawings.values()) {
       const apart = this.shown.captured - BigInt(drawing.captured_ns);
-      if (apart < REACH_NS && apart > -REACH_NS) draw(pen, drawing.shapes, contain(drawing.width, drawing.height, this.sheet, density));
+      if (apart < REACH_NS && apart > -REACH_NS) draw(pen, drawing.shapes, contain(drawing.width, drawing.height, box, density));
     }
+  }
+
+  /** Pictures are asked for while somebody sees them: on the page, in a window apart, or in a clip later. */
+  wantedChanged(): void {
+    if ((this.socket !== null) !== (!document.hidden || this.tools.wanted)) this.reopen();
   }
 
   private reopen(): void {
     this.socket?.close();
     this.frames?.end();
     this.socket = null;
-    if (document.hidden) return;
+    if (document.hidden && !this.tools.wanted) return;
     const socket = new LastingSocket(`/ws/drones/${encodeURIComponent(this.drone)}/video/${encodeURIComponent(this.camera.name)}`, {
       message: (data) => this.onMessage(data),
     });
@@ -121,6 +136,7 @@ export class VideoView {
     this.shown = { ...head, captured: BigInt(head.captured_ns), received_ms };
     this.arrivals.push(received_ms);
     this.redraw();
+    this.tools.shown();
   }
 }
 
@@ -135,8 +151,12 @@ export class Stage {
   private known = "";
   private told_ms = 0;
 
-  constructor(private readonly drone: string) {
-    this.element = h("section", { class: "stage", "aria-label": "Cameras" }, h("header", { class: "deck-head" }, this.choices, this.overlay), this.pictures);
+  constructor(
+    private readonly drone: string,
+    private readonly controls: CameraControls,
+  ) {
+    const head = h("header", { class: "deck-head" }, this.choices, h("div", { class: "choices" }, this.overlay, controls.button));
+    this.element = h("section", { class: "stage", "aria-label": "Cameras" }, head, this.pictures, controls.element);
     this.pictures.append(this.nothing);
   }
 
@@ -190,6 +210,7 @@ export class Stage {
 
   private arrange(): void {
     setAttribute(this.pictures, "data-count", String(this.views.size));
+    this.controls.of([...this.choices.children].map((button) => button.getAttribute("data-camera") ?? ""), new Set(this.views.keys()));
     setHidden(this.nothing, this.views.size > 0);
   }
 

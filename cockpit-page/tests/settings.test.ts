@@ -2,10 +2,12 @@
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
+import { isOfCamera } from "../src/cameracontrols.js";
 import { en } from "../src/language/en.js";
 import { accented, pseudo } from "../src/language/pseudo.js";
 import { Settings } from "../src/settings.js";
 import { STICK_MODES } from "../src/sticks.js";
+import { fileName } from "../src/videotools.js";
 
 const store = (stored: Record<string, string> = {}) => ({ stored, get: (name: string) => stored[name] ?? null, set: (name: string, value: string) => void (stored[name] = value) });
 
@@ -36,4 +38,10 @@ test("the language for tests has all that English has, marked", () => {
   const words = pseudo(en);
   assert.equal(words.modal.close, accented(en.modal.close));
   assert.equal(words.settings.modeNote("a", "b"), accented(en.settings.modeNote("a", "b")));
+});
+
+test("a photo is named by drone, camera and capture; controls are those of the cameras that are shown", () => {
+  assert.equal(fileName("lab/alpha", "front", new Date(0)), "lab_alpha-front-1970-01-01T00-00-00.000Z");
+  const of = (name: string): boolean => isOfCamera(name, ["front", "down"], new Set(["front"]));
+  assert.deepEqual(["camera.front.gain", "camera.down.gain", "camera.fps", "limits.speed"].map(of), [true, false, true, false]);
 });

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+import cv2
 import pytest
 
 import skyloop
@@ -135,4 +138,43 @@ def test_a_gamepad_is_mapped_and_commands_nothing_meanwhile(deck: Deck) -> None:
         axes(0, 0, 0, 0)
         button(7, True)
         page.wait_for_text(".pill", "landed")
+    assert page.problems == []
+
+
+def test_pictures_are_saved_shown_on_the_full_screen_and_controlled(deck: Deck, tmp_path: Path) -> None:
+    deck.proxy("film")
+    page = deck.page("film")
+    page.wait_for_new_picture()
+    camera = page.pane.locator(".camera")
+    with page.page.expect_download() as photo:
+        camera.get_by_role("button", name="Save a photo").click()
+    name = photo.value.suggested_filename
+    assert re.fullmatch(r"film-front-\d{4}-\d\d-\d\dT\d\d-\d\d-\d\d\.\d{3}Z\.png", name)
+    photo.value.save_as(tmp_path / name)
+    picture = cv2.imread(str(tmp_path / name))
+    assert picture is not None
+    assert picture.shape == (240, 320, 3), "as large as it came"
+    assert picture.std() > 1
+    record = camera.get_by_role("button", name="Record a clip")
+    record.click()
+    page.until(lambda: "Recording 0:01" in page.says(".clip-mark"), "a second of it")
+    assert record.get_attribute("aria-pressed") == "true"
+    with page.page.expect_download() as clip:
+        record.click()
+    assert clip.value.suggested_filename.endswith((".webm", ".mp4"))
+    clip.value.save_as(tmp_path / "clip")
+    assert (tmp_path / "clip").stat().st_size > 1000
+    assert not page.pane.locator(".clip-mark").is_visible()
+    camera.get_by_role("button", name="on the full screen").click()
+    page.until(lambda: camera.evaluate("camera => document.fullscreenElement === camera"), "it is full")
+    camera.get_by_role("button", name="Motors off").wait_for()  # in reach there, too
+    page.page.evaluate("document.exitFullscreen()")
+    page.page.locator(".bar .safety").wait_for()
+    page.take_control()
+    page.pane.get_by_role("button", name="Controls").click()
+    gain = page.pane.locator('.camera-controls [data-parameter="camera.front.gain"]')
+    gain.locator("input").fill("0.5")
+    gain.get_by_role("button", name="Set").click()
+    page.until(lambda: "written" in (gain.locator(".answer").text_content() or ""), "the drone has it")
+    assert page.pane.locator('.camera-controls [data-parameter="limits.speed"]').is_hidden()
     assert page.problems == []

@@ -1,0 +1,40 @@
+// What must be seen and pressed whatever is open, as the emergency stop. A modal dialog and a full screen leave the rest of
+// the page out of reach, so while one of them is there, these elements move into it.
+
+const kept: HTMLElement[] = [];
+/** Where each of them belongs, while it is elsewhere. */
+const homes = new Map<HTMLElement, Comment>();
+/** The newest has them. */
+const hosts: HTMLElement[] = [];
+
+export function keepInReach(element: HTMLElement | null): void {
+  if (element) kept.push(element);
+}
+
+/** Until `takeBack`, or until another one has them. */
+export function lend(host: HTMLElement): void {
+  hosts.push(host);
+  arrange();
+}
+
+export function takeBack(host: HTMLElement): void {
+  const place = hosts.indexOf(host);
+  if (place >= 0) hosts.splice(place, 1);
+  arrange();
+}
+
+function arrange(): void {
+  const host = hosts.at(-1);
+  for (const element of kept) {
+    if (host && element.parentElement !== host) {
+      if (!homes.has(element)) {
+        homes.set(element, document.createComment(""));
+        element.replaceWith(homes.get(element) as Comment);
+      }
+      host.append(element);
+    } else if (!host) {
+      homes.get(element)?.replaceWith(element);
+      homes.delete(element);
+    }
+  }
+}
