@@ -104,6 +104,13 @@ def swarm_formation(folder: Path) -> None:
     keep("swarm_formation", film(folder / "flight.mcap", replace(HALL, focal_px=240.0)))
 
 
+def three_routes(folder: Path) -> None:
+    names = [f"drone{number}" for number in (1, 2, 3)]
+    with flight(folder, *names, "--option", "cameras=none"):
+        run("three_routes", "drone*")
+    keep("three_routes", film(folder / "flight.mcap", replace(HALL, focal_px=240.0)))
+
+
 # Behaviours, each in the world that it is for -------------------------------------------------------------------------
 
 
@@ -239,6 +246,7 @@ MAKERS: dict[str, Callable[[Path], None]] = {
         detector_on_another_host,
         shared_drone,
         swarm_formation,
+        three_routes,
         approach,
         fly_gates,
         land_on_platform,

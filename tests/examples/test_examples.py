@@ -99,6 +99,15 @@ def test_one_program_and_a_swarm(start: Start, sim: Start) -> None:
             assert drone.wait("landed", 10.0).owner is None
 
 
+def test_three_routes_at_once(start: Start, sim: Start) -> None:
+    sim("--drones", "3", "--name", "drone", "--option", "cameras=none", "--speed", "3")
+    process = example(start, "three_routes", "drone*")
+    process.until("drone3: square", 90.0)
+    assert process.wait(60.0) == 0
+    assert len(re.findall(r"drone\d: square at [\d.]+ m done", process.text)) == 3
+    assert process.text.count("error") == 0
+
+
 def test_several_people_and_one_drone(start: Start, sim: Start) -> None:
     sim("--name", "alpha", "--world", "empty", "--option", "cameras=none")
     look = example(start, "shared_drone", "alpha", "look", "60")

@@ -45,6 +45,9 @@ COMMANDS: Final = {
         "Fly a controller from a Python file",
         "fly my_controller.py --drone alpha --seconds 30",
     ),
+    "route": Entry(
+        Task.FLY, "route", "route", "Check and fly routes of waypoints", "route fly tour.route.json --drone alpha"
+    ),
     "teleop": Entry(
         Task.FLY, "teleop", "teleop", "Fly a drone by the keys of the terminal", "teleop alpha --speed 0.5"
     ),

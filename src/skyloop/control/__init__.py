@@ -14,6 +14,9 @@ from skyloop.control.path import Circle, FunctionPath, Lemniscate, Path, Polylin
 from skyloop.control.path_following import FollowPath, TrackingError, Waypoints
 from skyloop.control.path_law import PathLaw, PathSettings
 from skyloop.control.position import DeadReckoning, Fix, PositionSource
+from skyloop.control.route import Look, Photo, Route, RouteWaypoint, Wait, load_route, save_route
+from skyloop.control.route_check import Finding, RouteCheck
+from skyloop.control.route_flight import FlyRoute
 from skyloop.control.waypoint import Waypoint
 
 __all__ = [
@@ -24,10 +27,12 @@ __all__ = [
     "Controller",
     "DeadReckoning",
     "FIVE_GATES",
+    "Finding",
     "Fix",
     "FixedYaw",
     "FlowHover",
     "FlyThroughGates",
+    "FlyRoute",
     "FollowMarker",
     "FollowPath",
     "FunctionPath",
@@ -35,19 +40,27 @@ __all__ = [
     "ImageServo",
     "LandOnMarker",
     "Lemniscate",
+    "Look",
     "LookAt",
     "OrbitMarker",
     "OrbitPlace",
     "Path",
     "PathLaw",
     "PathSettings",
+    "Photo",
     "Polyline",
     "PositionSource",
+    "Route",
+    "RouteCheck",
+    "RouteWaypoint",
     "RunSummary",
     "SeeAndAvoid",
     "Spline",
     "TrackingError",
+    "Wait",
     "Waypoint",
     "Waypoints",
     "YawMode",
+    "load_route",
+    "save_route",
 ]

@@ -52,6 +52,7 @@ OWN: Final[tuple[Parameter, ...]] = (
     _own("autopilot.takeoff_altitude", 1.0, "m", 0.3, 20.0, "Altitude of a software take-off, below limits.altitude"),
     _own("autopilot.velocity_i", 0.05, "rad/m", 0.0, 1.0, "Integral gain of the software velocity loop"),
     _own("autopilot.velocity_p", 0.15, "rad s/m", 0.0, 1.0, "Proportional gain of the software velocity loop"),
+    _own("battery.flight_time", 600.0, "s", 10.0, 36000.0, "Flight time of a full battery, for the check of routes"),
     _own("battery.land", 0.1, "", 0.0, 1.0, "Charge below which the vehicle lands and accepts no set-points; 0: never"),
     _own("battery.warn", 0.2, "", 0.0, 1.0, "Charge below which a low battery is reported; 0: never"),
     _own("command.max_age_s", 0.25, "s", 0.01, 10.0, "Older commands are refused as stale"),

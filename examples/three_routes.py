@@ -1,0 +1,44 @@
+"""Three drones, each along a route of its own: checked first, then flown at the same time, and landed.
+
+skyloop sim --drones 3 --name drone --option cameras=none   # three drones in one world
+python examples/three_routes.py "drone*"
+"""
+
+import sys
+import threading
+
+import skyloop
+from skyloop.control import FlyRoute, Route, RouteWaypoint, Wait
+
+
+def tour(height: float, x: float, y: float) -> Route:
+    """A square of 0.8 m above one place, at a height of its own: so no two drones meet. World axes [m]."""
+    corners = [(x, y), (x + 0.8, y), (x + 0.8, y + 0.8), (x, y + 0.8)]
+    places = [RouteWaypoint(a, b, height, look_at=(x + 0.4, y + 0.4), actions=(Wait(0.3),)) for a, b in corners]
+    return Route(waypoints=tuple(places), name=f"square at {height:g} m", speed=0.6, end="return")
+
+
+def main(*targets: str) -> None:
+    with skyloop.swarm(*targets) as drones:
+        drones.wait_all(lambda feedback: feedback.position_m is not None, timeout_s=10)
+        flights = []
+        for number, drone in enumerate(drones):
+            x, y, _ = drone.feedback().position_m or (0.0, 0.0, 0.0)
+            flights.append(FlyRoute(drone, tour(0.8 + 0.5 * number, x, y)))
+        for flight in flights:
+            for finding in (found := flight.check()).findings:
+                print(flight.drone.name, finding.severity, finding.waypoint, finding.reason)
+            if not found.ok:
+                sys.exit("a route can't be flown: see above")
+        drones.takeoff()
+        running = [threading.Thread(target=flight.run, args=(120.0,)) for flight in flights]
+        for thread in running:
+            thread.start()
+        for thread in running:
+            thread.join()
+        for flight in flights:
+            print(f"{flight.drone.name}: {flight.law.route.name} {flight.law.state} {flight.law.problem}")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:] or ("drone*",))

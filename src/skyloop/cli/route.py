@@ -1,0 +1,135 @@
+"""``skyloop route``: checks and flies routes of waypoints."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import msgspec
+import typer
+
+from skyloop.errors import UsageError
+
+if TYPE_CHECKING:
+    from skyloop.control import FlyRoute, Route, RouteCheck
+    from skyloop.control.route_law import Progress
+
+KEYS = "P pauses, R resumes, S skips the waypoint, Ctrl-C lands"
+
+route = typer.Typer(help="Check and fly routes of waypoints (NAME.route.json).", rich_markup_mode=None)
+
+FileArgument = Annotated[Path, typer.Argument(metavar="FILE", help="A route: NAME.route.json")]
+DroneOption = Annotated[
+    str, typer.Option("--drone", metavar="NAME", help="A running proxy, or a vehicle's address such as sim://")
+]
+
+
+@route.command()
+def check(
+    file: FileArgument,
+    drone: DroneOption = "sim://",
+    as_json: Annotated[bool, typer.Option("--json", help="What was found as JSON")] = False,
+) -> None:
+    """Show what speaks against a route: legs, heights, speeds, zones, battery. Exit code 1 if it can't be flown."""
+    from skyloop.client import connect
+    from skyloop.control import load_route
+    from skyloop.control.route_flight import check_for
+
+    plan = load_route(file)
+    with connect(drone, access="observe") as watched:
+        found = check_for(watched, plan)
+    if as_json:
+        typer.echo(msgspec.json.encode(found).decode())
+    else:
+        typer.echo(_summary(plan, found))
+    if not found.ok:
+        raise typer.Exit(1)
+
+
+@route.command()
+def fly(
+    file: FileArgument,
+    drone: DroneOption = "sim://",
+    photos: Annotated[Path, typer.Option(metavar="DIR", help="Where photos are saved")] = Path("photos"),
+    priority: Annotated[int, typer.Option(metavar="P", min=0, max=31, help="0 is the highest, 31 the lowest")] = 16,
+    wait: Annotated[
+        float, typer.Option(metavar="S", min=0.0, help="Longest wait in the queue for the authority")
+    ] = 0.0,
+    land: Annotated[bool, typer.Option(help="Land at the end, or hover until this program has ended")] = True,
+) -> None:
+    """Check a route, take off, fly it, land. Ctrl-C lands. In a terminal P pauses, R resumes, S skips."""
+    from skyloop.cli.fly import ADVICE, _interrupt, _land
+    from skyloop.cli.piloting import connect_pilot
+    from skyloop.client import Authority
+    from skyloop.control import FlyRoute, load_route
+
+    plan = load_route(file)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _interrupt)
+    authority = Authority(priority=priority, wait_s=wait)
+    with connect_pilot(drone, ADVICE, name=file.name[:64], authority=authority) as flown:
+        flight = FlyRoute(flown, plan, folder=photos, on_progress=lambda step: _show(plan, step))
+        found = flight.check()
+        _print(_summary(plan, found))
+        if not found.ok:
+            raise UsageError(f"{file} can't be flown like this: see above")
+        try:
+            if not flown.feedback().state.airborne:
+                _print(f"taking off with {flown.name}")
+                flown.takeoff()
+            _run(flight)
+        except KeyboardInterrupt:
+            _print("stopped by Ctrl-C")
+            land = True
+        if land:
+            _land(flown)
+    for path in flight.photos:
+        _print(f"photo {path}")
+    if flight.law.state != "done":
+        raise typer.Exit(1)
+
+
+def _run(flight: FlyRoute) -> None:
+    """Fly, with the terminal's keys where there is one."""
+    with ExitStack() as stack:
+        pressed = None
+        if sys.stdin.isatty():
+            from skyloop.cli.keyboard import Keyboard
+
+            keyboard = stack.enter_context(Keyboard())
+            pressed = keyboard.keys
+            _print(KEYS)
+        acts = {"p": flight.pause, "r": flight.resume, "s": flight.skip}
+
+        def look() -> bool:
+            for key in pressed(0.0) if pressed is not None else ():
+                if key.lower() in acts:
+                    acts[key.lower()]()
+            return pressed is None and flight.law.state == "paused"  # nobody is there who could resume it
+
+        flight.run(until=look)
+    if flight.law.state == "paused":
+        _print(f"paused: {flight.law.problem or 'as asked'}")
+
+
+def _show(plan: Route, step: Progress) -> None:
+    _print(f"{step.waypoint}/{len(plan.waypoints)} {step.kind.removeprefix('route.').replace('_', ' ')}: {step.text}")
+
+
+def _summary(plan: Route, found: RouteCheck) -> str:
+    left = "" if found.battery_left is None else f", battery {found.battery_left:.0%} at the end"
+    lines = [
+        f"{plan.name or 'route'}: {len(plan.waypoints)} waypoints, {found.length_m:.1f} m, "
+        f"about {found.seconds:.0f} s{left}"
+    ]
+    for one in found.findings:
+        where = "route" if one.waypoint is None else f"waypoint {one.waypoint}"
+        lines.append(f"{one.severity}: {where}: {one.reason}")
+    return "\n".join(lines)
+
+
+def _print(text: str) -> None:
+    typer.echo(text, err=True)

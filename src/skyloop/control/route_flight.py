@@ -1,0 +1,203 @@
+"""Flies routes: the controller for programs, and the photos of any flight along a route."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from skyloop.clock import nanoseconds
+from skyloop.control.controller import Controller, RunSummary
+from skyloop.control.route import Route
+from skyloop.control.route_check import RouteCheck, check_route, conditions_of
+from skyloop.control.route_law import PHOTO_S, Command, Effect, Progress, RouteLaw, RouteState, TakePhoto
+from skyloop.errors import LinkError, NoAnswerError, SkyloopError, UsageError
+from skyloop.files import write
+from skyloop.messages import AnyAction, Event, EventKind, Feedback, Land, Position, Refusal, Severity
+from skyloop.vision.opencv import opencv
+
+if TYPE_CHECKING:
+    from skyloop.client import Drone
+
+PHOTOS: Final = "photos"  #: the folder that photos are saved to where none is named
+LOG: Final = "route"  #: under this name the progress is logged on the drone
+WAYPOINTS: Final = "waypoints"  #: and under this one the places that are left, for maps
+_QUALITY: Final = 92
+_LOG_S: Final = 4.0  #: maps forget places that were logged longer than 10 s ago
+_OF_ONE_PACKET: Final = (Refusal.STALE, Refusal.OUT_OF_SEQUENCE)
+
+
+class FlyRoute(Controller):
+    """Flies along a route, does what is to be done at its waypoints, and returns from :meth:`run` at its end.
+
+    The vehicle must be airborne when :meth:`run` is called. Each step is an event of kind ``vehicle_message`` with
+    ``data["route"]`` as ``route.waypoint_reached``, and is logged on the drone. When the proxy refuses a leg or a
+    failsafe ends it, the route pauses with the reason, and :meth:`resume` goes on. :meth:`pause`, :meth:`resume`,
+    :meth:`skip` and :meth:`end` may be called from any thread; they take effect with the next feedback.
+
+    Attributes:
+        law: The course: its state, waypoint and problem.
+        photos: What was saved.
+    """
+
+    def __init__(
+        self,
+        drone: Drone,
+        route: Route,
+        *,
+        folder: str | Path = PHOTOS,
+        on_progress: Callable[[Progress], None] | None = None,
+    ) -> None:
+        """Initialise the controller.
+
+        Args:
+            drone: The drone to fly.
+            route: The route; check it first (:meth:`check`).
+            folder: Where photos are saved; made when it is needed.
+            on_progress: Called with each step, on the thread that runs the controller.
+        """
+        super().__init__(drone)
+        self.law = RouteLaw(route)
+        self.photos: list[Path] = []
+        self._folder = Path(folder)
+        self._on_progress = on_progress
+        self._asked: list[Callable[[], list[Effect]]] = []
+        self._refused: str | None = None
+        self._action: AnyAction | None = None
+        self._logged_ns: int | None = None
+
+    def check(self) -> RouteCheck:
+        """Return what speaks against the route now, by the drone's newest feedback and its parameters."""
+        return check_for(self.drone, self.law.route)
+
+    def run(self, seconds: float | None = None, until: Callable[[], bool] | None = None) -> RunSummary:
+        """Fly the route; see :meth:`skyloop.Controller.run`.
+
+        Raises:
+            UsageError: The vehicle does not report its position, or is on the ground.
+        """
+        with self.drone.on_event(self._on_event, inline=True):
+            return super().run(seconds, until)
+
+    def pause(self) -> None:
+        """Hover until :meth:`resume`."""
+        self._asked.append(self.law.pause)
+
+    def resume(self) -> None:
+        """Fly on to the waypoint that comes next."""
+        self._asked.append(self.law.resume)
+
+    def skip(self) -> None:
+        """Leave the present waypoint out."""
+        self._asked.append(self.law.skip)
+
+    def end(self) -> None:
+        """Hover, and return from :meth:`run`."""
+        self._asked.append(self.law.stop)
+
+    def on_feedback(self, feedback: Feedback) -> None:
+        """Take the next step.
+
+        Raises:
+            UsageError: The route has not begun, and the vehicle does not report its position or is on the ground.
+        """
+        law = self.law
+        if law.state is RouteState.READY:
+            self._carry_out(law.start(feedback))
+        while self._asked:
+            self._carry_out(self._asked.pop(0)())
+        refused, self._refused = self._refused, None
+        if refused is None and self._action is not None and self.drone._core.commands.lapsed(self._action):
+            refused = "it was ended on the way, by a failsafe or a lost link"
+        if refused is not None:
+            self._carry_out(law.pause(refused))
+        self._carry_out(law.update(feedback, feedback.captured_ns))
+        if law.over:
+            self.stop()
+        elif self._logged_ns is None or feedback.captured_ns - self._logged_ns >= nanoseconds(_LOG_S):
+            self._logged_ns = feedback.captured_ns
+            self.drone.log.array(WAYPOINTS, [one.position for one in law.route.waypoints[law.index :]])
+
+    def _carry_out(self, effects: list[Effect]) -> None:
+        for effect in effects:
+            if isinstance(effect, Command):
+                self._action = effect.action if isinstance(effect.action, Position) else None
+                if isinstance(effect.action, Land):
+                    self.drone.land(wait=False)
+                else:
+                    self.drone.command(effect.action)
+            elif isinstance(effect, TakePhoto):
+                threading.Thread(target=self._photograph, args=(effect,), name="skyloop-photo", daemon=True).start()
+            else:
+                self._tell(effect)
+
+    def _photograph(self, wanted: TakePhoto) -> None:
+        try:
+            self.photos.append(save_photo(self.drone, self._folder, wanted))
+        except SkyloopError as error:
+            self.law.photo_done(str(error))
+        else:
+            self.law.photo_done()
+
+    def _tell(self, step: Progress) -> None:
+        text = f"{step.kind}: {step.text}"
+        bad = step.kind == "route.paused" and bool(self.law.problem)
+        self._logged_ns = None  # what is left has changed
+        severity = Severity.WARNING if bad else Severity.INFO
+        self.drone.emit(EventKind.VEHICLE_MESSAGE, text, severity, route=step.kind, waypoint=str(step.waypoint))
+        self.drone.log.text(text, name=LOG)
+        if self._on_progress is not None:
+            self._on_progress(step)
+
+    def _on_event(self, event: Event) -> None:
+        own = event.kind is EventKind.COMMAND_REFUSED and event.app == self.drone._core.app
+        if own and self._action is not None and event.data.get("reason") not in _OF_ONE_PACKET:
+            self._refused = event.text
+
+
+def check_for(drone: Drone, route: Route, *, wait_s: float = 2.0) -> RouteCheck:
+    """Check a route against a drone's newest feedback and its parameters. Waits for the proxy's answer.
+
+    Args:
+        drone: The drone; connected as an observer is enough.
+        route: The route.
+        wait_s: How long a position is waited for, as after connecting.
+
+    Raises:
+        LinkError: The proxy does not answer.
+    """
+    feedback = None
+    with suppress(LinkError):  # nothing came yet: that is a finding
+        if wait_s > 0.0:
+            with suppress(NoAnswerError):
+                drone.wait(lambda newest: newest.position_m is not None, wait_s)
+        feedback = drone.feedback()
+    values = {parameter.name: parameter.value for parameter in drone.config.parameters()}
+    return check_route(route, conditions_of(feedback, values))
+
+
+def save_photo(drone: Drone, folder: Path, wanted: TakePhoto) -> Path:
+    """Save the next frame as a JPEG named by the time, the waypoint and the camera. Waits for it.
+
+    Raises:
+        SkyloopError: No frame came in time, the vehicle has no such camera, or the file can't be written.
+    """
+    camera = wanted.camera or next((info.name for info in drone.capabilities.cameras), None)
+    if camera is None:
+        raise UsageError("the vehicle has no camera")
+    frame = drone.next_frame(camera, timeout_s=PHOTO_S)
+    cv2 = opencv("saving photos")
+    done, jpeg = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    if not done:
+        raise UsageError(f"frame {frame.seq} of {camera} could not be made a JPEG")
+    moment = datetime.now().astimezone().strftime("%Y%m%dT%H%M%S")
+    path = folder / f"{moment}-waypoint{wanted.waypoint}-{camera}.jpg"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{folder} can't be made: {error.strerror or error}") from None
+    write(path, jpeg.tobytes())
+    return path

@@ -1,0 +1,249 @@
+"""The course of a route: what comes next, from the newest feedback. Pure: no clock, no thread; times are arguments.
+
+Programs, the command line and the cockpit's page all fly routes by this state machine.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final
+
+from skyloop.clock import nanoseconds, seconds
+from skyloop.control.route import Action, Look, Photo, Route, RouteWaypoint, Wait
+from skyloop.control.waypoint import Waypoint, lacking, reached
+from skyloop.errors import UsageError
+from skyloop.messages import Feedback, Hover, Land, Position
+from skyloop.messages.geometry import wrap_angle
+
+TURN_S: Final = 15.0  #: a turn that takes longer is given up
+PHOTO_S: Final = 5.0  #: so long a photo is waited for
+SLOWEST: Final = 3.0  #: a leg may take so many times what it takes at its speed,
+EXTRA_S: Final = 20.0  #: and this more [s]; then the route pauses
+_NEAR_RAD: Final = 0.12
+
+
+class RouteState(StrEnum):
+    """Where a route is."""
+
+    READY = "ready"
+    FLYING = "flying"  #: to the next waypoint
+    ACTING = "acting"  #: at a waypoint
+    PAUSED = "paused"
+    DONE = "done"
+    STOPPED = "stopped"
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """Send this to the vehicle, newly."""
+
+    action: Position | Hover | Land
+
+
+@dataclass(frozen=True, slots=True)
+class TakePhoto:
+    """Save a frame that is captured from now on, then call :meth:`RouteLaw.photo_done`."""
+
+    waypoint: int  #: from 1 on
+    camera: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """Something to tell: its kind is ``route.started``, ``route.waypoint_reached``, ``route.paused`` and so on."""
+
+    kind: str
+    waypoint: int  #: the next, or the present one; from 1 on
+    text: str
+
+
+Effect = Command | TakePhoto | Progress
+
+
+class RouteLaw:
+    """The course of one flight along a route. Its methods return what is to be done now, in this order.
+
+    Args:
+        route: The route.
+
+    Attributes:
+        state: Where it is.
+        index: The waypoint that is flown to, or that it is at, from 0 on; beyond the last one it flies back.
+        problem: Why it paused by itself; empty if it did not.
+    """
+
+    def __init__(self, route: Route) -> None:
+        self.route = route
+        self.state = RouteState.READY
+        self.index = 0
+        self.problem = ""
+        self._goals: list[RouteWaypoint] = list(route.waypoints)
+        self._step = 0  # the action that is done at the waypoint
+        self._arrived = False  # at the waypoint: its actions have begun
+        self._since_ns: int | None = None  # when the present action began
+        self._deadline_ns: int | None = None
+        self._photo: str | None = None  # what became of the photo: empty for saved; None: not known yet
+
+    @property
+    def over(self) -> bool:
+        """Whether nothing comes any more."""
+        return self.state in (RouteState.DONE, RouteState.STOPPED)
+
+    @property
+    def is_under_way(self) -> bool:
+        """Whether it commands the vehicle now."""
+        return self.state in (RouteState.FLYING, RouteState.ACTING)
+
+    # What somebody wants ----------------------------------------------------------------------------------------
+
+    def start(self, feedback: Feedback) -> list[Effect]:
+        """Begin at the first waypoint.
+
+        Raises:
+            UsageError: The vehicle is on the ground, or its position is not known.
+        """
+        problem = lacking(feedback)
+        if problem or feedback.position_m is None:
+            raise UsageError(f"the route can't be flown: {problem}")
+        if not feedback.state.airborne:
+            raise UsageError(f"the route can't be flown: the vehicle is {feedback.state.value}, take off first")
+        if self.route.end == "return":
+            x, y, _ = feedback.position_m
+            self._goals.append(RouteWaypoint(x, y, self._goals[-1].z))
+        return [self._tell("started", f"{len(self.route.waypoints)} waypoints"), *self._fly()]
+
+    def pause(self, why: str = "") -> list[Effect]:
+        """Hover until :meth:`resume`; ``why`` is told if it was not a person who asked."""
+        if not self.is_under_way:
+            return []
+        self.state, self.problem = RouteState.PAUSED, why
+        return [Command(Hover()), self._tell("paused", why or "as asked")]
+
+    def resume(self) -> list[Effect]:
+        """Fly on, straight to the waypoint that comes next."""
+        if self.state is not RouteState.PAUSED:
+            return []
+        return [self._tell("resumed", f"to {self._what()}"), *self._fly()]
+
+    def skip(self) -> list[Effect]:
+        """Leave the present waypoint out; a paused route stays paused."""
+        if self.over or self.state is RouteState.READY:
+            return []
+        told = self._tell("skipped", self._what())
+        return [told, *self._next(fly=self.is_under_way)]
+
+    def stop(self) -> list[Effect]:
+        """Hover, and fly no farther."""
+        if self.over:
+            return []
+        under_way = self.is_under_way
+        self.state = RouteState.STOPPED
+        return [*([Command(Hover())] if under_way else []), self._tell("stopped", "as asked")]
+
+    def photo_done(self, problem: str = "") -> None:
+        """Tell what became of the photo; may be called from any thread."""
+        self._photo = problem
+
+    # What the vehicle does --------------------------------------------------------------------------------------
+
+    def update(self, feedback: Feedback, now_ns: int) -> list[Effect]:
+        """Go on, by the newest feedback.
+
+        Args:
+            feedback: The newest.
+            now_ns: The time, on the clock of ``feedback.captured_ns``.
+        """
+        if not self.is_under_way:
+            return []
+        if not feedback.state.airborne:
+            self.state, self.problem = RouteState.STOPPED, f"the vehicle is {feedback.state.value}"
+            return [self._tell("stopped", self.problem)]
+        if lacking(feedback):
+            return []  # the proxy lets it hover meanwhile
+        if self.state is RouteState.FLYING:
+            return self._on_the_way(feedback, now_ns)
+        return self._act(feedback, now_ns)
+
+    def _on_the_way(self, feedback: Feedback, now_ns: int) -> list[Effect]:
+        goal = self._goals[self.index].goal
+        assert feedback.position_m is not None
+        if self._deadline_ns is None:
+            planned_s = math.dist(feedback.position_m, goal.position) / self.route.speed_to(self.index)
+            self._deadline_ns = now_ns + nanoseconds(SLOWEST * planned_s + EXTRA_S)
+        if not reached(goal, feedback):
+            if now_ns <= self._deadline_ns:
+                return []
+            return self.pause(f"{self._what()} was not reached in time")
+        first, self._arrived = not self._arrived, True
+        self.state, self._since_ns = RouteState.ACTING, None
+        told = [self._tell("waypoint_reached", self._what())] if first else []
+        return [*told, *self._act(feedback, now_ns)]
+
+    def _act(self, feedback: Feedback, now_ns: int) -> list[Effect]:
+        """Do the actions of the waypoint, one after the other."""
+        effects: list[Effect] = []
+        while self._step < len(self._actions):
+            action = self._actions[self._step]
+            if self._since_ns is None:
+                self._since_ns = now_ns
+                effects += self._begin(action)
+            done, problem = self._done(action, feedback, seconds(now_ns - self._since_ns))
+            if not done:
+                return effects
+            if isinstance(action, Photo) or problem:
+                effects.append(self._tell(_name(action), problem or "saved"))
+            self._step, self._since_ns = self._step + 1, None
+        return [*effects, *self._next()]
+
+    @property
+    def _actions(self) -> tuple[Action, ...]:
+        return self._goals[self.index].actions
+
+    def _begin(self, action: Action) -> list[Effect]:
+        here = self._goals[self.index]
+        if isinstance(action, Look):
+            return [Command(Position(*here.position, self._yaw(action), self.route.speed_to(self.index)))]
+        if isinstance(action, Photo):
+            self._photo = None
+            return [TakePhoto(self.index + 1, action.camera)]
+        return []
+
+    def _done(self, action: Action, feedback: Feedback, for_s: float) -> tuple[bool, str]:
+        """Whether an action is done, and what went wrong with it."""
+        if isinstance(action, Wait):
+            return for_s >= action.seconds, ""
+        if isinstance(action, Look):
+            left = abs(wrap_angle(self._yaw(action) - (feedback.yaw_rad or 0.0)))
+            return (True, "") if left <= _NEAR_RAD else (for_s > TURN_S, "the turn took too long")
+        if self._photo is not None:
+            return True, self._photo
+        return for_s > PHOTO_S, "no frame came in time"
+
+    def _yaw(self, look: Look) -> float:
+        return self._goals[self.index].yaw_to(look.at) if look.at is not None else look.yaw or 0.0
+
+    def _next(self, *, fly: bool = True) -> list[Effect]:
+        self.index, self._step, self._arrived, self._since_ns = self.index + 1, 0, False, None
+        if self.index < len(self._goals):
+            return self._fly() if fly else []
+        self.index = len(self._goals) - 1
+        self.state = RouteState.DONE
+        return [Command(Hover() if self.route.end == "hover" else Land()), self._tell("done", self.route.end)]
+
+    def _fly(self) -> list[Effect]:
+        goal: Waypoint = self._goals[self.index].goal
+        self.state, self.problem, self._deadline_ns, self._since_ns = RouteState.FLYING, "", None, None
+        return [Command(Position(*goal.position, goal.yaw, self.route.speed_to(self.index)))]
+
+    def _what(self) -> str:
+        last = len(self.route.waypoints)
+        return "the start" if self.index >= last else f"waypoint {self.index + 1} of {last}"
+
+    def _tell(self, what: str, text: str) -> Progress:
+        return Progress(f"route.{what}", min(self.index + 1, len(self.route.waypoints)), text)
+
+
+def _name(action: Action) -> str:
+    return "photo" if isinstance(action, Photo) else "look" if isinstance(action, Look) else "wait"

@@ -1,0 +1,118 @@
+"""Routes are flown: in simulated time by the controller, refused legs and photos included."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+import skyloop
+from skyloop.control import FlyRoute, Photo, Route, RouteWaypoint, Wait
+from skyloop.control.route_flight import check_for, save_photo
+from skyloop.control.route_law import Progress, TakePhoto
+from skyloop.errors import UnknownNameError, UsageError
+from skyloop.messages import Event, EventKind
+from skyloop.stepping.rehearsal import rehearse
+
+CALM = "sim://?world=empty&cameras=none&wind=0"
+TRIANGLE = Route(
+    waypoints=(
+        RouteWaypoint(1.0, 0.0, 1.0, actions=(Wait(1.0), Photo())),
+        RouteWaypoint(0.5, 1.0, 1.4, look_at=(0.5, 9.0)),
+        RouteWaypoint(0.0, 0.0, 1.0),
+    ),
+    speed=0.8,
+    end="return",
+)
+
+
+def test_a_route_of_three_waypoints(tmp_path: Path) -> None:
+    told: list[Progress] = []
+    events: list[Event] = []
+    with rehearse(CALM) as drone:
+        drone.on_event(events.append, inline=True)
+        flight = FlyRoute(drone, TRIANGLE, folder=tmp_path, on_progress=told.append)
+        assert flight.check().ok
+        with pytest.raises(UsageError, match="landed, take off first"):
+            flight.run(seconds=1.0)
+        drone.takeoff()
+        estimate = flight.check()
+        summary = flight.run(seconds=90.0)
+        assert summary.reason == "stopped"
+        drone.wait("landed", 20.0)
+        assert math.hypot(*(drone.feedback().position_m or ())[:2]) < 0.4
+    steps = [(one.kind.removeprefix("route."), one.waypoint) for one in told]
+    assert steps == [
+        ("started", 1),
+        ("waypoint_reached", 1),
+        ("photo", 1),
+        ("waypoint_reached", 2),
+        ("waypoint_reached", 3),
+        ("waypoint_reached", 3),
+        ("done", 3),
+    ]
+    assert "no camera" in told[2].text
+    assert 0.5 * estimate.seconds < summary.seconds < 1.5 * estimate.seconds
+    own = [event.data for event in events if event.kind is EventKind.VEHICLE_MESSAGE and "route" in event.data]
+    assert {"route": "route.waypoint_reached", "waypoint": "2"} in own
+
+
+def test_a_refused_leg_pauses_with_the_reason_and_can_be_skipped() -> None:
+    told: list[Progress] = []
+    route = Route(waypoints=tuple(RouteWaypoint(x, 0.0, 1.0) for x in (0.5, 3.0, 0.0)), speed=1.0)
+    with rehearse(CALM) as drone:
+        drone.config["safety.zones"] = "cylinder 2 0 0.5 0 3"
+        drone.takeoff()
+
+        def go_on(step: Progress) -> None:
+            told.append(step)
+            if step.kind == "route.paused":
+                flight.skip()
+                flight.resume()
+
+        flight = FlyRoute(drone, route, on_progress=go_on)
+        assert [one.waypoint for one in flight.check().findings] == [2, 3]
+        flight.run(seconds=60.0)
+        assert flight.law.state == "done"
+    paused = [step for step in told if step.kind == "route.paused"]
+    assert [step.waypoint for step in paused] == [2]
+    assert "a no-fly zone is in the straight way there" in paused[0].text
+
+
+def test_it_is_paused_and_ended_from_another_place() -> None:
+    with rehearse(CALM) as drone:
+        drone.takeoff()
+        flight = FlyRoute(drone, TRIANGLE)
+
+        def pause(step: Progress) -> None:
+            flight.pause()
+
+        flight._on_progress = pause
+        flight.run(until=lambda: flight.law.state == "paused")
+        assert drone.feedback().state.airborne
+        flight._on_progress = None
+        flight.end()
+        flight.run(seconds=5.0)
+        assert flight.law.state == "stopped"
+
+
+def test_a_vehicle_without_a_position_is_told_how_to_get_one() -> None:
+    with rehearse(f"{CALM}&position=none") as drone:
+        drone.takeoff()
+        [finding] = check_for(drone, TRIANGLE).findings
+        assert "position=none" in finding.reason
+        with pytest.raises(UsageError, match="position=none"):
+            FlyRoute(drone, TRIANGLE).run(seconds=1.0)
+
+
+def test_photos_are_named_by_time_waypoint_and_camera(tmp_path: Path) -> None:
+    with skyloop.connect("sim://?cameras=front&width=64&fps=20", access="observe") as drone:
+        path = save_photo(drone, tmp_path / "new", TakePhoto(2, None))
+        assert path.read_bytes()[:3] == b"\xff\xd8\xff"
+        assert path.name.endswith("-waypoint2-front.jpg")
+        with pytest.raises(UnknownNameError, match="rear"):
+            save_photo(drone, tmp_path, TakePhoto(1, "rear"))
+        (tmp_path / "file").touch()
+        with pytest.raises(UsageError, match="can't be made"):
+            save_photo(drone, tmp_path / "file", TakePhoto(1, None))
