@@ -4,10 +4,21 @@ import { get, post, errorText } from "./api.js";
 import { h, setText } from "./dom.js";
 import type { Session } from "./model.js";
 
+/** The code to pair with that an address has after its `#`; null for any other address. Pure. */
+export const pairingCode = (hash: string): string | null => /^#pair=([\w-]{16,64})$/.exec(hash)?.[1] ?? null;
+
 /** Resolves when the user is logged in. What is needed until then is shown in `place`. */
 export async function session(place: HTMLElement): Promise<Session> {
+  // It works once: it is not kept in the address, nor in the browser's history.
+  let code = pairingCode(location.hash);
+  if (code !== null) history.replaceState(null, "", location.pathname);
   for (;;) {
     try {
+      if (code !== null) {
+        const token = code;
+        code = null;
+        await post("/api/login", { token });
+      }
       const found = await get<Session>("/api/session");
       if (found.role !== null) return found;
       if (!found.login) {

@@ -5,7 +5,7 @@ import { test } from "node:test";
 import type { Authority, FrameHead, Question } from "../src/model.js";
 import { NewestFrame, unpack } from "../src/newest.js";
 import { Pilot } from "../src/pilot.js";
-import { FIRST_PAUSE_MS, type Handlers, LastingSocket, LONGEST_PAUSE_MS, type Wire } from "../src/socket.js";
+import { FIRST_PAUSE_MS, type Handlers, LastingSocket, LONGEST_PAUSE_MS, REFUSED_PAUSE_MS, type Wire } from "../src/socket.js";
 import { ServerClock } from "../src/clock.js";
 import { CENTRED } from "../src/sticks.js";
 
@@ -120,7 +120,7 @@ test("a socket comes back, with longer and longer pauses, and short ones again a
   assert.deepEqual(states.slice(-2), [true, false]);
   later();
   wires.at(-1)?.end(4403);
-  assert.equal(pauses.at(-1), LONGEST_PAUSE_MS, "not allowed: no hurry");
+  assert.equal(pauses.at(-1), REFUSED_PAUSE_MS, "not allowed: no hurry");
 });
 
 test("nothing is sent or kept while it is not open; closed is closed", () => {

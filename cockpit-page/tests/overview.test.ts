@@ -3,6 +3,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 import { hashOf, namesOf, OVERVIEW } from "../src/address.js";
+import { pairingCode } from "../src/login.js";
 import type { DroneRow } from "../src/model.js";
 import { byName, describe, found, sorted } from "../src/row.js";
 import { unpackAll } from "../src/smallvideo.js";
@@ -61,4 +62,10 @@ test("frames of several cameras in one message; one that is cut off is refused",
   assert.deepEqual(split.map(({ head, jpeg }) => [head.drone, [...jpeg]]), [["a", [1, 2]], ["b", [3, 4, 5]]]);
   assert.throws(() => unpackAll(message({ ack: 7, frames }, [1, 2], [3, 4])), /cut off/);
   assert.throws(() => unpackAll(new Uint8Array([0, 0, 1, 0, 1]).buffer), /cut off/);
+});
+
+test("only an address with a whole code pairs", () => {
+  const code = "0dXbq3T2mW0uJm3iT5nIYbWfZ0b0v8_-";
+  assert.equal(pairingCode(`#pair=${code}`), code);
+  for (const hash of ["", "#pair=", "#pair=short", `#pair=${code}<b>`, `#alpha,pair=${code}`]) assert.equal(pairingCode(hash), null, hash);
 });

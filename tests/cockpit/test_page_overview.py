@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 import skyloop
+from skyloop.cockpit.addresses import bind
 from skyloop.messages import FlightState
 from tests.cockpit.browser import CHROMIUM, PATIENCE_S, Deck, DronePage, browser_and_cockpit
 from tests.processes.conftest import Process
@@ -24,6 +26,7 @@ pytestmark = [
 ]
 
 NAMES = ["d1", "d2", "d3"]
+BACK_S = 3.0
 SMALL = ("cameras=front", "width=160", "height=120", "fps=10", "position=1")
 
 
@@ -107,3 +110,20 @@ def test_no_key_flies_what_is_not_seen_and_all_land(deck: Deck) -> None:
             3 * PATIENCE_S,
         )
     assert page.problems == []
+
+
+def test_the_page_is_back_soon_after_its_cockpit(deck: Deck) -> None:
+    with bind("127.0.0.1", 0) as free:
+        port = str(free.getsockname()[1])
+    first = deck.own_cockpit("--port", port)
+    page = deck.overview()
+    page.page.locator(".tile").nth(2).wait_for()
+    first.end()
+    page.page.locator('.overview[data-old="true"]').wait_for()
+    deck.own_cockpit("--port", port)
+    started_s = time.monotonic()
+    page.page.locator('.overview[data-old="false"]').wait_for()
+    page.page.locator(".tile").nth(2).wait_for()
+    shown = frames(page, "d1")
+    page.until(lambda: frames(page, "d1") > shown, "pictures again")
+    assert time.monotonic() - started_s < BACK_S

@@ -144,6 +144,12 @@ def served(**options: Any) -> Iterator[str]:
     assert not thread.is_alive()
 
 
+def on_loopback(address: str) -> str:
+    """The address of a server that listens everywhere, as this machine alone reaches it."""
+    scheme, _, port = address.rpartition(":")
+    return f"{scheme.partition('://')[0]}://127.0.0.1:{port}"
+
+
 def ask(address: str, path: str, token: str | None = None, tls: ssl.SSLContext | None = None) -> Any:
     request = urllib.request.Request(f"{address}{path}")
     if token is not None:
@@ -154,7 +160,7 @@ def ask(address: str, path: str, token: str | None = None, tls: ssl.SSLContext |
 
 def test_tokens_on_the_network(tokens: Path) -> None:
     with served(access=Access("0.0.0.0", token_file=tokens)) as address:
-        here = address.replace("0.0.0.0", "127.0.0.1")
+        here = on_loopback(address)
         assert ask(here, "/api/session")["login"]
         assert ask(here, "/api/session", PILOT) == {"role": "pilot", "name": "ann", "login": True, "hint": ""}
         assert ask(here, "/api/drones", OBSERVER) == []
@@ -230,7 +236,7 @@ def test_certificates(certificates: Path) -> None:
     )
     with served(access=access) as address:
         assert address.startswith("https://")
-        here = address.replace("0.0.0.0", "127.0.0.1")
+        here = on_loopback(address)
         for name, person in (("pilot", ("pilot", "Ann")), ("observer", ("observer", "Bob")), ("nobody", (None, ""))):
             told = ask(here, "/api/session", tls=visitor(certificates, name))
             assert (told["role"], told["name"]) == person

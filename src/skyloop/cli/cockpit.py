@@ -22,9 +22,15 @@ def cockpit(
         ),
     ] = None,
     drone: DronesOption = None,
-    port: Annotated[int, typer.Option(metavar="PORT", min=0, max=65535, help="Of the page; 0 takes a free one")] = 0,
+    port: Annotated[
+        int | None,
+        typer.Option(
+            metavar="PORT", min=0, max=65535, help="Of the page; 0 takes a free one [8420, or the next free one]"
+        ),
+    ] = None,
     host: Annotated[
-        str, typer.Option(metavar="ADDRESS", help="To listen on; beyond loopback tokens or certificates are needed")
+        str,
+        typer.Option(metavar="ADDRESS", help="To listen on; beyond loopback --pair, tokens or certificates are needed"),
     ] = "127.0.0.1",
     token_file: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Who may come in: lines of ROLE TOKEN [NAME]")
@@ -36,6 +42,9 @@ def cockpit(
         typer.Option(metavar="FILE", help="Admit clients with a certificate of this authority; its OU is the role"),
     ] = None,
     role: Annotated[Role, typer.Option(help="Of every client, without tokens or certificates")] = Role.PILOT,
+    pair: Annotated[
+        bool, typer.Option("--pair", help="Let in, in --role, each browser that opens the shown link or QR code, once")
+    ] = False,
     hostname: Annotated[
         list[str] | None, typer.Option(metavar="NAME", help="A name by which browsers reach this machine; repeatable")
     ] = None,
@@ -52,7 +61,7 @@ def cockpit(
     from skyloop.client.connect import network_settings
     from skyloop.cockpit import Access, serve_cockpit
 
-    access = Access(host, token_file, tls_cert, tls_key, client_ca, role, tuple(hostname or ()))
+    access = Access(host, token_file, tls_cert, tls_key, client_ca, role, tuple(hostname or ()), pair)
     join_network(network, keys)
     settings = network_settings()
     serve_cockpit(drones(names, drone, needed=False), port=port, access=access, recordings=recordings, network=settings)

@@ -44,7 +44,9 @@ def follow(
     ] = False,
     world: Annotated[str, typer.Option(help="A world's name or file")] = "room",
     seed: Annotated[int, typer.Option(min=0, help="Decides the marker's walk, the noise and the wind")] = 0,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Of the page; 0 takes a free one")] = 0,
+    port: Annotated[
+        int | None, typer.Option(min=0, max=65535, help="Of the page; 0 takes a free one [8420, or the next free one]")
+    ] = None,
     browser: Annotated[bool, typer.Option(help="Open the page in the browser")] = False,
     name: Annotated[str, typer.Option(help="Who flies, for those who watch")] = "demo",
 ) -> None:
@@ -59,7 +61,7 @@ def follow(
                 raise UsageError(f"--{given} stands before {context.invoked_subcommand}: give its options after it")
         return
     console = Console(highlight=False)
-    report = _Demo(console, name, seconds).fly(_address(world, seed), None if headless else port, browser)
+    report = _Demo(console, name, seconds).fly(_address(world, seed), not headless, port, browser)
     console.print(report.table())
     if headless and not report.good(ENOUGH_IN_VIEW):
         console.print(f"[bold red]{report.verdict(ENOUGH_IN_VIEW)}[/]")
@@ -81,8 +83,8 @@ class _Demo:
     _stopped: bool = False
     _on_stop: Callable[[], None] | None = None
 
-    def fly(self, uri: str, port: int | None, browser: bool) -> DemoReport:
-        """``port`` None: no page. Raises the errors of connecting and of take-off."""
+    def fly(self, uri: str, page_shown: bool, port: int | None, browser: bool) -> DemoReport:
+        """``port`` None: the default one of pages. Raises the errors of connecting and of take-off."""
         from skyloop.client import connect
         from skyloop.cockpit.child import CockpitProcess
         from skyloop.control.follow import FollowMarker
@@ -92,7 +94,7 @@ class _Demo:
             drone = stack.enter_context(connect(uri, name=self.name))
             stack.enter_context(interrupted_by_signals(self._stop))
             self.console.print(f"[bold]{uri}[/] is up as [bold]{drone.name}[/]")
-            page = None if port is None else stack.enter_context(CockpitProcess(drone.name, port))
+            page = stack.enter_context(CockpitProcess(drone.name, port)) if page_shown else None
             drone.next_frame(timeout_s=_FIRST_PICTURE_S)
             report.first_picture_s = time.monotonic() - self.started_s
             if page is not None:

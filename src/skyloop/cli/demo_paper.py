@@ -54,7 +54,12 @@ def paper(
     ] = None,
     headless: Annotated[bool, typer.Option("--headless", help="No page to watch and to fly from")] = False,
     seed: Annotated[int, typer.Option(min=0, metavar="N", help="Decides noise and wind")] = 0,
-    port: Annotated[int, typer.Option(min=0, max=65535, metavar="N", help="Of the page; 0 takes a free one")] = 0,
+    port: Annotated[
+        int | None,
+        typer.Option(
+            min=0, max=65535, metavar="N", help="Of the page; 0 takes a free one [8420, or the next free one]"
+        ),
+    ] = None,
     browser: Annotated[bool, typer.Option(help="Open the page in the browser")] = False,
 ) -> None:
     """Fly the paper's test flight on a simulated AR.Drone, record it, and make the paper's table and figures from it.
@@ -70,7 +75,7 @@ def paper(
     folder = _prepared(output)
     machine = Machine.here()
     flight = _Flight(console, minutes * 60.0, folder / RECORDING)
-    flight.fly(f"sim://?{urlencode({**VEHICLE, 'seed': seed})}", None if headless else port, browser)
+    flight.fly(f"sim://?{urlencode({**VEHICLE, 'seed': seed})}", not headless, port, browser)
     results = _evaluated(console, folder, machine, flight.load)
     console.print(f"report [bold]{folder / 'report.html'}[/], recording {RECORDING}, figures results.json")
     if results.tracking is None:
@@ -129,8 +134,8 @@ class _Flight:
     _on_stop: Callable[[], None] | None = None
     _printed_s: float = field(default_factory=time.monotonic)
 
-    def fly(self, uri: str, port: int | None, browser: bool) -> None:
-        """``port`` None: no page. Raises the errors of connecting, of recording and of take-off."""
+    def fly(self, uri: str, page_shown: bool, port: int | None, browser: bool) -> None:
+        """``port`` None: the default one of pages. Raises the errors of connecting, of recording and of take-off."""
         from skyloop.bench.paper.flight import DelayLog, PaperFlight
         from skyloop.client import connect
         from skyloop.cockpit.child import CockpitProcess
@@ -141,7 +146,7 @@ class _Flight:
             drone = stack.enter_context(connect(uri, name="paper"))
             stack.enter_context(interrupted_by_signals(self._stop))
             self.console.print(f"[bold]{uri}[/] is up as [bold]{drone.name}[/]")
-            page = None if port is None else stack.enter_context(CockpitProcess(drone.name, port))
+            page = stack.enter_context(CockpitProcess(drone.name, port)) if page_shown else None
             drone.next_frame(timeout_s=_FIRST_PICTURE_S)
             if page is not None:
                 show_page(page, self.console, browser)

@@ -159,4 +159,4 @@ class Teleop:
 def _page(drone: Drone) -> CockpitProcess:
     from skyloop.cockpit.child import CockpitProcess
 
-    return CockpitProcess(drone._core.reach)
+    return CockpitProcess(drone._core.reach, port=None)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from skyloop.child_process import on_parent_end
 from skyloop.client.connect import network_settings
+from skyloop.cockpit.addresses import DEFAULT_PORT
 from skyloop.cockpit.server import RECORDINGS, serve_cockpit
 from skyloop.errors import SkyloopError
 
@@ -27,7 +28,7 @@ def main(arguments: list[str] | None = None) -> int:
     """
     parser = argparse.ArgumentParser(prog="python -m skyloop.cockpit", description="A page to watch and fly drones.")
     parser.add_argument("names", metavar="name", nargs="*", help="of running proxies (default: all, as they come)")
-    parser.add_argument("--port", type=int, default=0, help="0 takes a free one (default)")
+    parser.add_argument("--port", type=int, help=f"0 takes a free one (default: {DEFAULT_PORT}, or the next free one)")
     parser.add_argument("--recordings", type=Path, default=RECORDINGS, help="folder for recordings")
     parser.add_argument("--parent-fd", type=int, help="end when this descriptor (the reading end of a pipe) ends")
     given = parser.parse_args(arguments)

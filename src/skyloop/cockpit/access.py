@@ -5,7 +5,8 @@ gate           lets in
 =============  ====================================================================================================
 ``OpenGate``   programs of this user (and of the superuser) on this machine, all in one role; loopback only
 ``TokenGate``  who once sent a token of the file of tokens, and has the cookie that was given for it, or sends the
-               token with each request (``Authorization: Bearer …``)
+               token with each request (``Authorization: Bearer …``), or who sent a code to pair with, which is
+               shown in the terminal and works once
 ``CertificateGate``  whose TLS certificate is signed by the given authority; its OU names the role, its CN the person
 =============  ====================================================================================================
 """
@@ -32,6 +33,7 @@ from skyloop.errors import FileFormatError, UsageError
 from skyloop.messages import Role
 
 SESSION_S: Final = 12 * 3600.0  #: how long a log-in lasts
+PAIRING_S: Final = 3600.0  #: how long a code to pair with works
 MAX_SESSIONS: Final = 1000
 SHORTEST_TOKEN: Final = 16  #: characters; a shorter one could be guessed
 MAX_TOKEN: Final = 256
@@ -159,15 +161,61 @@ class Token:
     secret: bytes
 
 
+class Pairing:
+    """Gives codes that let one browser in each, once and within :data:`PAIRING_S`. On the event loop.
+
+    Args:
+        role: Of who is let in.
+        clock: The monotonic clock [ns].
+    """
+
+    def __init__(self, role: Role, clock: Clock = monotonic_ns) -> None:
+        self.on_used: Callable[[str], None] = lambda _: None  #: called after a code was used, with who used it
+        self._role = role
+        self._clock = clock
+        self._code = ""
+        self._until_ns = 0
+
+    def code(self) -> str:
+        """Return a new code; those before it work no longer."""
+        self._code = secrets.token_urlsafe(24)
+        self._until_ns = self._clock() + nanoseconds(PAIRING_S)
+        return self._code
+
+    def person(self, code: str, address: str) -> Person | None:
+        """Return who sent a code, and use it up; None if it is not the one that works.
+
+        Args:
+            code: The code.
+            address: From where it came.
+        """
+        works = self._code != "" and self._clock() < self._until_ns
+        if not works or not hmac.compare_digest(self._code.encode(), code.encode()):
+            return None
+        self._code = ""
+        self.on_used(f"{address} as {self._role}")
+        return Person(self._role, "paired")
+
+
 class TokenGate:
     """Lets in by a token, sent once for a session's cookie or with each request. On the event loop."""
 
     takes_tokens = True
     hint = "log in with a token"
 
-    def __init__(self, tokens: Iterable[Token], cookie: str, clock: Clock = monotonic_ns) -> None:
-        """``cookie`` is the name of the cookie that browsers are given."""
+    def __init__(
+        self, tokens: Iterable[Token], cookie: str, clock: Clock = monotonic_ns, *, pairing: Pairing | None = None
+    ) -> None:
+        """Initialise without sessions.
+
+        Args:
+            tokens: Those that let in.
+            cookie: The name of the cookie that browsers are given.
+            clock: The monotonic clock [ns].
+            pairing: Gives codes that are taken once in place of a token.
+        """
         self.cookie = cookie
+        self.pairing = pairing
         self.wrong = WrongTokens(clock)
         self._tokens = tuple(tokens)
         self._clock = clock
@@ -196,6 +244,14 @@ class TokenGate:
         for one in self._tokens:
             if hmac.compare_digest(one.secret, given):
                 found = one.person
+        return found
+
+    def logged_in(self, token: str, scope: Scope) -> Person | None:
+        """Return who logs in with a token, or with a code to pair with, which is used up; None if it is neither."""
+        client = scope.get("client")
+        found = self.known(token)
+        if found is None and self.pairing is not None:
+            found = self.pairing.person(token, str(client[0]) if client else "somewhere")
         return found
 
     def begin(self, person: Person) -> str:

@@ -90,10 +90,15 @@ class Api:
         gate = self._gate
         if not isinstance(gate, TokenGate):
             raise BadRequest(404, "this cockpit asks for no token")
-        person = gate.known((await _body(request, _Login)).token)
+        person = gate.logged_in((await _body(request, _Login)).token, request.scope)
         if person is None:
             await gone_within(request.receive, gate.wrong_token_s(request.scope))
-            raise BadRequest(401, "this token is not known here")
+            raise BadRequest(
+                401,
+                "this token is not known here"
+                if gate.pairing is None
+                else "this code was used, or is too old: take the newest one",
+            )
         answer = _json({"role": person.role, "name": person.name})
         answer.set_cookie(
             gate.cookie,

@@ -24,18 +24,19 @@ class CockpitProcess:
     The child ends with :meth:`close`, and with this process, however that ends. Ctrl-C is for the parent.
     """
 
-    def __init__(self, name: str | None = None, port: int = 0, recordings: Path | None = None) -> None:
+    def __init__(self, name: str | None = None, port: int | None = 0, recordings: Path | None = None) -> None:
         """Start the child; returns at once, see :meth:`address`.
 
         Args:
             name: The proxy to show (default: all).
-            port: The port on loopback; 0 takes a free one.
+            port: The port on loopback; 0 takes a free one, None the default port or the next free one.
             recordings: The folder for recordings.
         """
         names = [] if name is None else [name]
-        folder = [] if recordings is None else ["--recordings", str(recordings)]
-        command = [sys.executable, "-m", "skyloop.cockpit", *names, *folder]
-        self._process = ChildProcess([*command, "--port", str(port), "--parent-fd", "0"])
+        options = [] if recordings is None else ["--recordings", str(recordings)]
+        options += [] if port is None else ["--port", str(port)]
+        command = [sys.executable, "-m", "skyloop.cockpit", *names, *options]
+        self._process = ChildProcess([*command, "--parent-fd", "0"])
         self.pid = self._process.pid  #: the child's process id
         self._address: str | None = None
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import errno
 import os
 import signal
 import socket
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from skyloop.clock import Clock, monotonic_ns
+from skyloop.cockpit.addresses import bind, host_names, reachable
 from skyloop.cockpit.admission import Admission, Connection
 from skyloop.cockpit.listening import Listener, ProtocolFactory, limit_messages, places_here
 from skyloop.errors import MissingExtraError, UnknownNameError, UsageError
@@ -44,7 +44,8 @@ class Access:
     ``client_ca``. ``token_file``: lines of ``ROLE TOKEN [NAME]``. ``tls_cert``, ``tls_key``: PEM files of the server's
     certificate and key, for TLS. ``client_ca``: PEM file of the authority that signed the certificates of those who
     may come in; their OU is the role. ``role``: of everybody, where neither tokens nor certificates decide it.
-    ``hostnames``: names by which browsers reach this machine, where they don't use its address.
+    ``hostnames``: names by which browsers reach this machine, where they don't use its address. ``pair``: lets in, as
+    ``role``, whoever opens the address in the QR code that is shown, which each time works once.
 
     Raises:
         UsageError: The options contradict one another.
@@ -57,6 +58,7 @@ class Access:
     client_ca: Path | None = None
     role: Role = Role.PILOT
     hostnames: tuple[str, ...] = ()
+    pair: bool = False
 
     def __post_init__(self) -> None:
         if (self.tls_cert is None) != (self.tls_key is None):
@@ -65,6 +67,8 @@ class Access:
             raise UsageError("certificates of clients need TLS: give --tls-cert and --tls-key too")
         if self.client_ca is not None and self.token_file is not None:
             raise UsageError("roles come from tokens or from certificates, not from both")
+        if self.client_ca is not None and self.pair:
+            raise UsageError("a browser is paired, or has a certificate, not both: leave out --pair or --client-ca")
 
     @property
     def scheme(self) -> str:
@@ -75,7 +79,7 @@ class Access:
 def serve_cockpit(
     names: Sequence[str] = (),
     *,
-    port: int = 0,
+    port: int | None = None,
     access: Access | None = None,
     recordings: Path = RECORDINGS,
     on_ready: Callable[[str], None] | None = None,
@@ -88,10 +92,12 @@ def serve_cockpit(
 
     Args:
         names: The drones to show; none: all that there are, as they come and go.
-        port: The TCP port; 0 takes a free one.
+        port: The TCP port; 0 takes a free one (default: :data:`skyloop.cockpit.addresses.DEFAULT_PORT`, or the next
+            free one).
         access: Who may come in, and from where; by default this user, on this machine, as a pilot.
         recordings: The folder for recordings, made when it is needed.
-        on_ready: Called once on this thread with the page's address (default: it is printed).
+        on_ready: Called once on this thread with the page's address (default: it is printed, and a QR code of it where
+            others reach it and standard output is a terminal).
         stop: Ends the server when it is set, from any thread.
         network: Shows drones that can be reached over it, too.
 
@@ -107,23 +113,27 @@ def serve_cockpit(
         import websockets  # noqa: F401
     except ImportError as error:
         raise MissingExtraError("the cockpit", "cockpit", cause=str(error)) from error
+    from skyloop.cockpit.access import TokenGate
+    from skyloop.cockpit.announcing import Announcer
     from skyloop.cockpit.security import bind_address
 
     access = access or Access()
     address, loopback = bind_address(access.host)
-    if not loopback and access.token_file is None and access.client_ca is None:
+    if not loopback and access.token_file is None and access.client_ca is None and not access.pair:
         raise UsageError(
-            f"{access.host} can be reached by others: give --token-file, or --tls-cert, --tls-key and --client-ca, so "
-            "that not everybody can watch and fly; or listen on loopback (127.0.0.1) and forward the port over SSH"
+            f"{access.host} can be reached by others: give --pair, --token-file, or --tls-cert, --tls-key and "
+            "--client-ca, so that not everybody can watch and fly; or listen on loopback (127.0.0.1) and forward the "
+            "port over SSH"
         )
     tls = None if access.tls_cert is None else _tls(access)
-    listening = _bind(address, port)
+    listening = bind(address, port)
     try:
         gate = _gate(access, listening.getsockname()[1])
         finder = _finder(names, network)
         try:
             _check_names(names, finder)
-            _serve(finder, names, access, gate, tls, recordings, listening, on_ready or _announce, stop)
+            announcer = Announcer(gate.pairing if isinstance(gate, TokenGate) else None, loopback)
+            _serve(finder, names, access, gate, tls, recordings, listening, on_ready or announcer, stop)
         finally:
             finder.close()
     finally:
@@ -147,13 +157,14 @@ def _check_names(names: Sequence[str], finder: Finder) -> None:
 
 
 def _gate(access: Access, port: int) -> Gate:
-    from skyloop.cockpit.access import CertificateGate, OpenGate, TokenGate, read_tokens
+    from skyloop.cockpit.access import CertificateGate, OpenGate, Pairing, TokenGate, read_tokens
 
     if access.client_ca is not None:
         return CertificateGate()
-    if access.token_file is not None:
+    if access.token_file is not None or access.pair:
+        tokens = [] if access.token_file is None else read_tokens(access.token_file)
         # Browsers don't distinguish cookies by port.
-        return TokenGate(read_tokens(access.token_file), f"skyloop-cockpit-{port}")
+        return TokenGate(tokens, f"skyloop-cockpit-{port}", pairing=Pairing(access.role) if access.pair else None)
     return OpenGate(access.role)
 
 
@@ -178,19 +189,6 @@ def _tls(access: Access) -> ssl.SSLContext:
     return context
 
 
-def _bind(address: str, port: int) -> socket.socket:
-    listening = socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET, socket.SOCK_STREAM)
-    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listening.bind((address, port))
-    except (OSError, OverflowError) as error:
-        listening.close()
-        taken = isinstance(error, OSError) and error.errno == errno.EADDRINUSE
-        hint = "is in use; port 0 takes a free one" if taken else f"can't be used: {error}"
-        raise UsageError(f"port {port} of {address} {hint}") from error
-    return listening
-
-
 def _serve(
     finder: Finder,
     names: Sequence[str],
@@ -208,12 +206,13 @@ def _serve(
     from skyloop.cockpit.security import bind_address, own_names
 
     address, port = listening.getsockname()[:2]
-    own_name = () if bind_address(address)[1] else (socket.gethostname(),)
+    own_name = () if bind_address(address)[1] else host_names()
     hosts = own_names(address, port, (*access.hostnames, *own_name), access.scheme)
     admission = Admission(places_here())
     app = create_app(Fleet(finder, kept=names), Recordings(recordings), hosts, gate, admission=admission)
     server = quiet_server(app)
-    page = f"{access.scheme}://{f'[{address}]' if ':' in address else address}:{port}/"
+    seen_at = reachable(address)[0]
+    page = f"{access.scheme}://{f'[{seen_at}]' if ':' in seen_at else seen_at}:{port}/"
     os.nice(NICENESS)
     listener = Listener(listening, admission, http_protocol(server, admission), tls)
     asyncio.run(_run(server, listener, lambda: on_ready(page), stop))
@@ -313,7 +312,3 @@ async def _run(
     await serving
     if not listening.cancelled():
         await listening  # what ended it
-
-
-def _announce(page: str) -> None:
-    print(f"cockpit: {page}", flush=True)

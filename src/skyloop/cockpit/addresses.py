@@ -1,0 +1,122 @@
+"""Where the page is: the port it takes, the addresses under which others reach it, and a QR code of one."""
+
+from __future__ import annotations
+
+import errno
+import ipaddress
+import socket
+import sys
+from contextlib import closing, suppress
+from pathlib import Path
+from typing import Final
+
+from skyloop.errors import UsageError
+
+DEFAULT_PORT: Final = 8420
+NEXT_PORTS: Final = 9  #: tried after it, if it is taken
+_TABLES: Final = (Path("/proc/net/tcp"), Path("/proc/net/tcp6"))
+_LISTENS: Final = "0A"  # the state of a listening socket in these tables
+_LOCAL, _STATE, _INODE = 1, 3, 9  # their columns
+_MDNS: Final = Path("/run/avahi-daemon/socket")
+_MAX_COMMAND: Final = 60
+
+
+def bind(address: str, port: int | None) -> socket.socket:
+    """Bind the socket that listens for pages.
+
+    Args:
+        address: The address.
+        port: The TCP port; 0: any free one; None: :data:`DEFAULT_PORT`, or the next free one, with a line on standard
+            error that says who has it.
+
+    Raises:
+        UsageError: The port is taken, or can't be used.
+    """
+    if port is not None:
+        return _bind(address, port)
+    for following in range(DEFAULT_PORT, DEFAULT_PORT + NEXT_PORTS + 1):
+        with suppress(UsageError):
+            listening = _bind(address, following)
+            if following != DEFAULT_PORT:
+                taken = f"port {DEFAULT_PORT} is in use{_by(DEFAULT_PORT)}"
+                print(f"cockpit: {taken}; the page is at port {following} (--port chooses one)", file=sys.stderr)
+            return listening
+    return _bind(address, 0)
+
+
+def _bind(address: str, port: int) -> socket.socket:
+    listening = socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET, socket.SOCK_STREAM)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listening.bind((address, port))
+        listening.listen(0)  # now, as two may bind one port where neither listens yet
+    except (OSError, OverflowError) as error:
+        listening.close()
+        taken = isinstance(error, OSError) and error.errno == errno.EADDRINUSE
+        hint = f"is in use{_by(port)}; port 0 takes a free one" if taken else f"can't be used: {error}"
+        raise UsageError(f"port {port} of {address} {hint}") from error
+    return listening
+
+
+def _by(port: int) -> str:
+    found = listener_of(port)
+    return f" by {found}" if found else ""
+
+
+def listener_of(port: int) -> str:
+    """Return which program of this user listens at a port: its process and command line; empty if it can't be found."""
+    inodes = set()
+    for table in _TABLES:
+        with suppress(OSError):
+            for line in table.read_text().splitlines()[1:]:
+                cells = line.split()
+                if cells[_STATE] == _LISTENS and int(cells[_LOCAL].rpartition(":")[2], 16) == port:
+                    inodes.add(f"socket:[{cells[_INODE]}]")
+    if not inodes:
+        return ""
+    for process in Path("/proc").iterdir():
+        if process.name.isdigit():
+            with suppress(OSError):  # another user's, or gone
+                if any(str(entry.readlink()) in inodes for entry in (process / "fd").iterdir()):
+                    command = (process / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace").strip()
+                    return f"process {process.name} ({command[:_MAX_COMMAND]})"
+    return ""
+
+
+def reachable(address: str) -> list[str]:
+    """Return the addresses under which others reach what listens at one; the first is the one to tell people.
+
+    Args:
+        address: An address of this machine, ``0.0.0.0`` or ``::``.
+    """
+    known = ipaddress.ip_address(address)
+    if not known.is_unspecified:
+        return [address]
+    families = [(socket.AF_INET, "192.0.2.1")]
+    if known.version == 6:
+        families.append((socket.AF_INET6, "2001:db8::1"))
+    found = []
+    for family, somewhere in families:
+        with suppress(OSError), closing(socket.socket(family, socket.SOCK_DGRAM)) as probe:
+            probe.connect((somewhere, 9))  # sends nothing: it only asks which of our addresses would be used
+            found.append(str(probe.getsockname()[0]))
+    return found or ["127.0.0.1" if known.version == 4 else "::1"]
+
+
+def host_names() -> tuple[str, ...]:
+    """Return the names of this machine: its own, and that of multicast DNS where a program answers for it."""
+    name = socket.gethostname()
+    return (name, f"{name.partition('.')[0]}.local") if _MDNS.exists() else (name,)
+
+
+def qr_code(text: str) -> str:
+    """Return a QR code for a terminal, in half blocks; empty if the library is not installed."""
+    try:
+        import segno
+    except ImportError:
+        return ""
+    from io import StringIO
+
+    drawn = StringIO()
+    segno.make(text, error="m").terminal(drawn, compact=True)
+    return drawn.getvalue()

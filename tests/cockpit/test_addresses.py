@@ -1,0 +1,127 @@
+"""The page's port, the addresses that others reach it by, and the code that lets a phone in once."""
+
+from __future__ import annotations
+
+import os
+import socket
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from skyloop.cockpit import addresses
+from skyloop.cockpit.access import PAIRING_S, Pairing, Token, TokenGate
+from skyloop.cockpit.addresses import bind, listener_of, qr_code, reachable
+from skyloop.cockpit.announcing import Announcer
+from skyloop.cockpit.security import own_names
+from skyloop.cockpit.server import Access
+from skyloop.errors import UsageError
+from skyloop.messages import Role
+from tests.cockpit.fake import ORIGIN, FakeDrone, cockpit, fake_fleet
+
+HERE = "127.0.0.1"
+
+
+@pytest.fixture
+def ports(monkeypatch: pytest.MonkeyPatch) -> tuple[int, int]:
+    """The default port and the next of this test: two free ones in a row."""
+    while True:
+        with ExitStack() as stack:
+            first = stack.enter_context(bind(HERE, 0)).getsockname()[1]
+            try:
+                stack.enter_context(bind(HERE, first + 1))
+            except UsageError:
+                continue
+        break
+    monkeypatch.setattr(addresses, "DEFAULT_PORT", first)
+    return first, first + 1
+
+
+def test_the_port_is_the_same_each_time(ports: tuple[int, int], capsys: pytest.CaptureFixture[str]) -> None:
+    for _ in range(2):
+        with bind(HERE, None) as listening:
+            assert listening.getsockname()[1] == ports[0]
+    assert capsys.readouterr().err == ""
+
+
+def test_where_it_is_taken_who_has_it_is_told(ports: tuple[int, int], capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.create_server((HERE, ports[0])), bind(HERE, None) as listening:
+        assert listening.getsockname()[1] == ports[1]
+    said = capsys.readouterr().err
+    assert f"port {ports[0]} is in use by process {os.getpid()} (" in said
+    assert f"at port {ports[1]}" in said
+
+
+def test_where_all_are_taken_any_free_one_does(ports: tuple[int, int], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(addresses, "NEXT_PORTS", 0)
+    with socket.create_server((HERE, ports[0])), bind(HERE, None) as listening:
+        assert listening.getsockname()[1] not in ports
+
+
+def test_nobody_listens_there() -> None:
+    with bind(HERE, 0) as listening:
+        port = listening.getsockname()[1]
+    assert listener_of(port) == ""
+
+
+def test_what_is_printed_is_an_address_that_is_answered() -> None:
+    assert reachable("192.0.2.7") == ["192.0.2.7"]
+    for everywhere in ("0.0.0.0", "::"):
+        names = own_names(everywhere, 8420, addresses.host_names())
+        for address in reachable(everywhere):
+            assert names.own(f"[{address}]:8420" if ":" in address else f"{address}:8420")
+        for name in addresses.host_names():
+            assert names.own(f"{name.lower()}:8420")
+        assert not names.own("elsewhere.local:8420")
+
+
+def test_a_code_works_once_and_not_for_ever() -> None:
+    now_ns = 0
+    used: list[str] = []
+    pairing = Pairing(Role.OBSERVER, lambda: now_ns)
+    pairing.on_used = used.append
+    assert pairing.person("", HERE) is None, "none was shown yet"
+    first, code = pairing.code(), pairing.code()
+    assert pairing.person(first, HERE) is None, "a newer one was shown"
+    assert pairing.person(code + "x", HERE) is None
+    person = pairing.person(code, HERE)
+    assert person is not None
+    assert (person.role, used) == (Role.OBSERVER, [f"{HERE} as observer"])
+    assert pairing.person(code, HERE) is None
+    late = pairing.code()
+    now_ns = round(PAIRING_S * 1e9)
+    assert pairing.person(late, HERE) is None
+
+
+def test_a_browser_is_paired(capsys: pytest.CaptureFixture[str]) -> None:
+    pairing = Pairing(Role.PILOT)
+    gate = TokenGate(list[Token](), "c", pairing=pairing)
+    with cockpit(fake_fleet({"alpha": FakeDrone()}), gate) as client:
+        Announcer(pairing, loopback=False)("http://127.0.0.1:8123/")
+        said = capsys.readouterr().out.splitlines()
+        assert said[0] == "cockpit: http://127.0.0.1:8123/"
+        code = said[1].rpartition("#pair=")[2]
+        assert client.get("/api/session").json()["role"] is None
+        answer = client.post("/api/login", json={"token": code}, headers=ORIGIN)
+        assert (answer.status_code, answer.json()["role"]) == (200, "pilot")
+        assert client.get("/api/session").json()["role"] == "pilot", "by its cookie"
+        said = capsys.readouterr().out.splitlines()
+        assert "as pilot" in said[0]
+        assert code not in said[1], "the next one is shown"
+        client.cookies.clear()
+        refused = client.post("/api/login", json={"token": code}, headers=ORIGIN)
+        assert (refused.status_code, "was used" in refused.json()["error"]) == (401, True)
+
+
+def test_pairing_and_certificates_exclude_each_other() -> None:
+    one = Path("one")
+    with pytest.raises(UsageError, match="--pair or --client-ca"):
+        Access(client_ca=one, tls_cert=one, tls_key=one, pair=True)
+
+
+def test_a_qr_code_in_half_blocks() -> None:
+    pytest.importorskip("segno")
+    drawn = qr_code("http://192.168.178.123:8420/#pair=0dXbq3T2mW0uJm3iT5nIYbWfZ0b0v8Kq")
+    lines = drawn.splitlines()
+    assert 15 < len(lines) < 24, "it fits a small terminal"
+    assert "▀" in drawn or "▄" in drawn
