@@ -7,7 +7,7 @@ ARGS   ?=
 LOCKED ?=
 PIP    := $(BIN)/python -m pip install --quiet --disable-pip-version-check $(if $(LOCKED),--constraint requirements-dev.lock)
 
-.PHONY: help demo test test-all explore check chaos docs fuzz format coverage page pictures lock clean
+.PHONY: help demo test test-all explore check chaos docs fuzz format coverage package page pictures lock clean
 help:
 	@echo "make demo [ARGS='--seconds 30 --headless']   a simulated drone that flies by its camera"
 	@echo "make test [ARGS='-k authority']              the tests of every day, 5 minutes; with ARGS, those that they select of all"
@@ -17,6 +17,7 @@ help:
 	@echo "make chaos [ARGS='--seconds 180']            drones flown while processes die, stall, starve and are flooded"
 	@echo "make fuzz [ARGS='--seconds 60 recording']    decoders, file readers and servers against hostile input"
 	@echo "make docs                                    the documentation as a site: build/site/index.html"
+	@echo "make package                                 wheel and source package, checked, and the demo flown from the wheel"
 	@echo "make page                                    the cockpit's page anew from its sources, where node and npm are"
 	@echo "make format | coverage | pictures | lock | clean"
 
@@ -69,6 +70,11 @@ coverage: $(VENV)/.installed-dev
 	$(BIN)/python -m pytest --numprocesses auto --cov --cov-report=term $(ARGS)
 	$(BIN)/coverage json --quiet -o .coverage.json
 	$(BIN)/python scripts/coverage_floor.py .coverage.json
+
+# Wheel and source package in dist/.
+package:
+	rm -rf dist
+	$(PYTHON) scripts/package_check.py --keep-in dist $(ARGS)
 
 # The newest versions that fit, for LOCKED=1; without the places they come from.
 lock: $(VENV)/.installed-dev

@@ -9,12 +9,10 @@ from __future__ import annotations
 import os
 import select
 import sys
-import termios
-import tty
 from types import TracebackType
 from typing import Any, Final, Literal, NamedTuple, Self
 
-from skyloop.errors import UsageError
+from skyloop.errors import UnsupportedError, UsageError
 
 HOLD_S: Final = 0.6  #: how long a press moves its stick
 TWICE_S: Final = 1.0  #: two presses of Esc within this cut the motors
@@ -121,9 +119,19 @@ class Keyboard:
 
     Raises:
         UsageError: Standard input is no terminal.
+        UnsupportedError: This platform's terminals give no single keys.
     """
 
     def __init__(self) -> None:
+        try:
+            import termios
+            import tty
+        except ImportError:
+            raise UnsupportedError(
+                f"flying by keys of the terminal needs Linux or macOS, and this is {sys.platform}; fly on the page: "
+                "skyloop cockpit"
+            ) from None
+        self._termios, self._tty = termios, tty
         if not sys.stdin.isatty():
             raise UsageError("standard input is no terminal: flying by keys needs one")
         self._fd = sys.stdin.fileno()
@@ -131,13 +139,13 @@ class Keyboard:
         self._rest = b""
 
     def __enter__(self) -> Self:
-        tty.setcbreak(self._fd)  # Ctrl-C still interrupts
+        self._tty.setcbreak(self._fd)  # Ctrl-C still interrupts
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        termios.tcsetattr(self._fd, termios.TCSADRAIN, self._before)
+        self._termios.tcsetattr(self._fd, self._termios.TCSADRAIN, self._before)
 
     def keys(self, within_s: float) -> list[str]:
         """Return the keys that were pressed, as soon as there are any.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import threading
 from collections.abc import Collection
 from pathlib import Path
@@ -61,6 +62,8 @@ class LocalFinder:
         """Do nothing: it holds nothing."""
 
     def __call__(self) -> list[Found]:
+        if sys.platform != "linux":  # no proxy can run there
+            return []
         from skyloop.transport.base import NAME
         from skyloop.transport.local import dial
         from skyloop.transport.local.directory import find_directory, is_live

@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import errno
 import logging
-import resource
 import socket
 import ssl
 from collections.abc import Callable
@@ -133,6 +132,10 @@ class Listener:
 
 def places_here() -> Places:
     """Return as many places as this process's limit of descriptors leaves room for."""
+    try:
+        import resource
+    except ImportError:  # Windows has no such limit
+        return Places()
     descriptors = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
     return Places() if descriptors == resource.RLIM_INFINITY else Places.within(descriptors)
 

@@ -7,6 +7,7 @@ import os
 import signal
 import socket
 import ssl
+import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -165,6 +166,11 @@ def _gate(access: Access, port: int) -> Gate:
         tokens = [] if access.token_file is None else read_tokens(access.token_file)
         # Browsers don't distinguish cookies by port.
         return TokenGate(tokens, f"skyloop-cockpit-{port}", pairing=Pairing(access.role) if access.pair else None)
+    if sys.platform != "linux":
+        raise UsageError(
+            f"on {sys.platform} the cockpit can't see whose program connects to it, so it asks for a token: give one "
+            "with --token-file FILE, lines of ROLE TOKEN [NAME]"
+        )
     return OpenGate(access.role)
 
 

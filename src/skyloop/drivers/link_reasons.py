@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import grp
 import os
 import socket
 import stat
@@ -78,7 +77,9 @@ def _permission(port: str, status: os.stat_result) -> str:
     if not status.st_mode & stat.S_IRGRP or not status.st_mode & stat.S_IWGRP or status.st_gid == 0:
         return f"add a udev rule that lets this user open {port}"
     try:
+        import grp
+
         group = grp.getgrgid(status.st_gid).gr_name
-    except KeyError:
+    except (KeyError, ImportError):  # Windows has no groups
         group = str(status.st_gid)
     return f"join the group {group}: sudo usermod -a -G {group} $USER, then log in again"

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import stat
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from skyloop.errors import UsageError
+from skyloop.errors import UnsupportedError, UsageError
 from skyloop.files import read_bytes
 
 MAX_BYTES: Final = 16 << 20  #: of a file; a roster of 10 000 identities takes 3 MB
@@ -94,7 +94,16 @@ def locked(directory: Path) -> Iterator[None]:
     """Lock a directory against other processes that change it, and wait until they have finished.
 
     The kernel releases the lock with the process.
+
+    Raises:
+        UnsupportedError: This platform has no such locks.
     """
+    try:
+        import fcntl
+    except ImportError:
+        raise UnsupportedError(
+            f"keys are made and revoked on Linux or macOS, and this is {sys.platform}; copy those that were issued here"
+        ) from None
     descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)

@@ -1,0 +1,82 @@
+"""Runs the `skyloop` command as if this were another platform: ``python -m tests.processes.other_platform win32 list``.
+
+What Skyloop imports from others is imported first, then ``sys.platform`` is changed and the parts of Python are
+withheld that the other platform lacks. It shows what Skyloop itself needs, and nothing of the others' libraries there.
+"""
+
+import asyncio
+import importlib
+import os
+import pkgutil
+import sys
+import sysconfig
+
+MISSING_MODULES = {
+    "darwin": (),
+    "win32": ("curses", "fcntl", "grp", "pty", "pwd", "resource", "termios", "tty"),
+}
+MISSING_NAMES = {
+    "darwin": ("memfd_create", "sched_getaffinity", "sched_setaffinity", "eventfd"),
+    "win32": (
+        "memfd_create",
+        "sched_getaffinity",
+        "sched_setaffinity",
+        "eventfd",
+        "getuid",
+        "geteuid",
+        "killpg",
+        "setsid",
+    ),
+}
+#: They look at the platform when they are imported.
+LIBRARIES = (
+    "numpy", "cv2", "zenoh", "msgspec", "platformdirs", "typer", "rich.console", "rich.live", "pydantic.fields",
+    "uvicorn.main", "starlette.applications", "websockets.asyncio.server", "cryptography", "urllib.request",
+    "webbrowser", "multiprocessing.connection", "concurrent.futures.process", "ctypes.util", "zoneinfo",
+)  # fmt: skip
+
+
+def pretend(platform: str) -> None:
+    """Make this process one of another platform, as far as Skyloop can see."""
+    sysconfig.get_config_vars()  # reads a file named after the platform, once
+    asyncio.new_event_loop().close()
+    for name in LIBRARIES:
+        try:
+            importlib.import_module(name)
+        except ImportError:  # of an extra that is not installed
+            continue
+    for name in MISSING_MODULES[platform]:
+        sys.modules[name] = None  # type: ignore[assignment]  # an import of it fails
+    for name in MISSING_NAMES[platform]:
+        if hasattr(os, name):
+            delattr(os, name)
+    sys.platform = platform
+
+
+def fly(name: str, place: str) -> None:
+    """Import all that the package offers, and fly a drone of the network."""
+    import skyloop
+
+    for offered in dir(skyloop):
+        getattr(skyloop, offered)
+    packages = ("client", "messages", "control", "vision", "recording", "cockpit", "keys", "aio", "drivers")
+    for package in packages:
+        module = importlib.import_module(f"skyloop.{package}")
+        for one in pkgutil.iter_modules(module.__path__):
+            if one.name != "__main__":
+                importlib.import_module(f"{module.__name__}.{one.name}")
+    with skyloop.connect(name, network=place) as drone:
+        drone.takeoff()
+        print("flew, and saw", drone.next_frame(timeout_s=20.0).shape, flush=True)
+        drone.land()
+
+
+if __name__ == "__main__":
+    pretend(sys.argv[1])
+    if sys.argv[2] == "fly":
+        fly(sys.argv[3], sys.argv[4])
+    else:
+        from skyloop.cli import main
+
+        sys.argv = ["skyloop", *sys.argv[2:]]
+        main()

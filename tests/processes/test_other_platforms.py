@@ -1,0 +1,53 @@
+"""What works where there is no local transport: programs and the page reach drones of the network (docs/platforms.md).
+
+As on Windows, which lacks more than macOS does; see :mod:`tests.processes.other_platform` for what that shows.
+"""
+
+from __future__ import annotations
+
+import json
+import urllib.request
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from skyloop.transport.fabric.config import free_port
+from tests.processes.conftest import Process
+
+pytest.importorskip("zenoh")
+pytestmark = pytest.mark.process
+
+LOCAL = "127.0.0.1"
+TOKEN = "a-token-of-this-test-alone-0123456789"
+
+
+def test_programs_and_the_page_reach_drones_of_the_network(start: Callable[..., Process], tmp_path: Path) -> None:
+    place = f"{LOCAL}:{free_port(LOCAL)}"
+    there = ("-m", "tests.processes.other_platform", "win32")
+    uri = "sim://?world=empty&cameras=front&speed=3"
+    network = ("--network", "--no-multicast", "--listen", place)
+    start("-m", "skyloop", "proxy", uri, "--name", "alpha", *network).until("ready")
+
+    flight = start(*there, "fly", "alpha", place)
+    flight.until("flew, and saw (240, 320, 3)", 60)
+    assert flight.wait() == 0
+
+    refused = start(*there, "cockpit", "--network", place)
+    refused.until("--token-file FILE", 60)
+    assert refused.wait() == 2, "who connects is not known there, so nobody is let in without a token"
+
+    tokens = tmp_path / "tokens"
+    tokens.write_text(f"observer {TOKEN} olga\n")
+    tokens.chmod(0o600)
+    page = start(*there, "cockpit", "--port", "0", "--token-file", str(tokens), "--network", place)
+    page.until("cockpit: http://127.0.0.1:", 60)
+    address = page.text.partition("cockpit: ")[2].split()[0]
+    body = json.dumps({"token": TOKEN}).encode()
+    headers = {"content-type": "application/json", "origin": address.rstrip("/")}
+    with urllib.request.urlopen(urllib.request.Request(f"{address}api/login", body, headers)) as answer:
+        assert json.load(answer)["role"] == "observer"
+
+    no_proxy = start(*there, "proxy", "sim://")
+    no_proxy.until("the local transport needs Linux", 60)
+    assert no_proxy.wait() == 1
