@@ -16,6 +16,8 @@ const INKS = ["well", "line", "muted", "text", "accent", "ok", "warn", "bad", "t
 
 export class MapView {
   readonly element: HTMLElement;
+  /** For buttons of tools, over the map. */
+  readonly corner = h("div", { class: "map-buttons left" });
   private readonly canvas = h("canvas", { class: "map", role: "application", tabindex: 0, "data-keys": [...MAP_KEYS].join(" "), "aria-label": "Map from above. Arrow keys move a cursor, Enter acts there, plus and minus zoom." });
   private readonly spoken = h("p", { class: "unseen", role: "status" });
   private readonly note = h("p", { class: "note" });
@@ -40,7 +42,7 @@ export class MapView {
   ) {
     const zoom = (sign: string, factor: number): HTMLElement => h("button", { type: "button", class: "small", "aria-label": factor > 1 ? "Zoom in" : "Zoom out", onclick: () => this.zoom(factor) }, sign);
     const buttons = h("div", { class: "map-buttons" }, zoom("+", ZOOM), zoom("−", 1 / ZOOM), this.follow);
-    this.element = h("div", { class: "filling mapping" }, h("div", { class: "map-box" }, this.canvas, buttons), ...below, this.note, this.spoken);
+    this.element = h("div", { class: "filling mapping" }, h("div", { class: "map-box" }, this.canvas, this.corner, buttons), ...below, this.note, this.spoken);
     // A press leaves the focus where it is: what has it may fly, and only who comes by Tab wants the map's own keys.
     this.canvas.addEventListener("mousedown", (event) => event.preventDefault());
     this.canvas.addEventListener("pointerdown", (event) => this.press(event));
@@ -116,7 +118,8 @@ export class MapView {
   private ease(scene: Scene, size: Size): void {
     if (!this.fitted && this.view) return;
     const bodies = [scene.own, scene.truth, ...scene.others, ...scene.targets].flatMap((body) => (body ? [body.position] : []));
-    const wanted = around([...bodies, ...scene.waypoints.map((one) => one.position), ...scene.trail.points.map((point) => point.place as Vector)], size);
+    const room = scene.world?.room ? [scene.world.room.low, scene.world.room.high] : [];
+    const wanted = around([...room, ...bodies, ...scene.waypoints.map((one) => one.position), ...scene.trail.points.map((point) => point.place as Vector)], size);
     if (!wanted) return;
     const { view } = this;
     const mix = (from: number, to: number): number => from + (to - from) * EASE;
@@ -205,6 +208,7 @@ export class MapView {
     const { width, height } = this.size;
     const [px, py] = toPixels(view, this.size, ...place);
     if (px < 0 || py < 0 || px > width || py > height) this.view = { ...view, east: place[0], north: place[1] };
+    this.used?.cursor?.(this.spot(this.view ?? view, ...toPixels(this.view ?? view, this.size, ...place)));
     setText(this.spoken, `${place[0].toFixed(2)} m east, ${place[1].toFixed(2)} m north`);
   }
 }

@@ -3,6 +3,7 @@
 import { figure } from "./format.js";
 import type { Ink, Project } from "./maptool.js";
 import { gridStep, type Size, toMetres, toPixels, type View } from "./view.js";
+import { drawBounds, drawView, drawWorld, home } from "./worldlayer.js";
 import type { Body, Scene } from "./world.js";
 
 export interface Chart {
@@ -16,6 +17,10 @@ export interface Chart {
 /** Everything of a scene. */
 export function drawScene(chart: Chart, scene: Scene): void {
   grid(chart);
+  if (scene.world) drawWorld(chart, scene.world);
+  if (scene.world) drawBounds(chart, scene.world.box, scene.world.zones);
+  if (scene.own) for (const camera of scene.world?.cameras ?? []) drawView(chart, scene.own, camera);
+  if (scene.start) home(chart, scene.start, "accent");
   for (const other of scene.others) if (other.trail) path(chart, other.trail.points.map((point) => point.place), other, "muted");
   const end = scene.own ?? scene.truth;
   path(chart, scene.trail.points.map((point) => point.place), end, scene.own ? "accent" : "ok");

@@ -32,6 +32,8 @@ export interface MapTool {
   lift(spot: Spot, click: boolean): void;
   /** A key, while the map has the focus; the cursor is at `spot`. True: it meant something, and the map ignores it. */
   key(event: KeyboardEvent, spot: Spot): boolean;
+  /** The cursor of the keyboard has moved. */
+  cursor?(spot: Spot): void;
   /** Another tool, or none, is used from now on. */
   dropped?(): void;
 }

@@ -16,8 +16,8 @@ import { History, Trail } from "./history.js";
 import type { Countdown } from "./hold.js";
 import { Instruments } from "./instruments.js";
 import type { Deed } from "./keys.js";
-import { MapView } from "./map.js";
-import type { Alarm, DroneRow, State, Sticks, Vehicle } from "./model.js";
+import { MapPanel } from "./mappanel.js";
+import type { Alarm, DroneRow, State, Sticks, Vector, Vehicle } from "./model.js";
 import { Parameters } from "./parameters.js";
 import { Pilot } from "./pilot.js";
 import { Plots } from "./plots.js";
@@ -27,8 +27,8 @@ import { LastingSocket } from "./socket.js";
 import { Strip } from "./strip.js";
 import { Thumbs } from "./thumbs.js";
 import { Stage } from "./video.js";
-import { WaypointTool } from "./waypoint.js";
 import { type Body, othersOf, type Scene } from "./world.js";
+import { Writes } from "./writes.js";
 
 export interface PaneHost {
   /** Of the last overview. */
@@ -53,6 +53,8 @@ export class Pane {
   readonly pilot: Pilot | null;
   private vehicle: Vehicle | null = null;
   private state: State | null = null;
+  /** Where it was when it was first seen in the air, in this flight. */
+  private start: Vector | null = null;
   private connected = false;
   private absent = "";
   private dirty = false;
@@ -82,8 +84,8 @@ export class Pane {
   private readonly instruments = new Instruments();
   private readonly strip: Strip;
   private readonly thumbs: Thumbs;
-  private readonly map: MapView;
-  private readonly waypoint: WaypointTool;
+  private readonly map: MapPanel;
+  private readonly writes: Writes;
   private readonly space = h("div", { class: "filling" });
   private readonly plots: Plots;
   private readonly events = new Events();
@@ -108,13 +110,13 @@ export class Pane {
       understood: () => this.pilot?.understood(),
     });
     this.thumbs = new Thumbs((sticks) => host.push(name, sticks));
-    this.waypoint = new WaypointTool({
+    this.writes = new Writes((parameter, value) => this.pilot?.write(parameter, value));
+    this.map = new MapPanel(name, {
+      scene: () => this.world(),
       own: () => this.state?.position ?? null,
-      speeds: () => null,
-      problem: () => "",
       goTo: (x, y, z) => this.pilot?.goTo(x, y, z),
+      write: (parameter, value) => this.writes.write(parameter, value),
     });
-    this.map = new MapView(() => this.world(), this.waypoint, this.waypoint.element);
     this.plots = new Plots(this.history, now_s);
     this.parameters = new Parameters(name, (parameter, value) => this.pilot?.write(parameter, value));
     this.decks = {
@@ -136,6 +138,7 @@ export class Pane {
     this.socket.close();
     this.stage.close();
     this.scene?.close();
+    this.map.close();
     this.element.remove();
   }
 
@@ -209,12 +212,12 @@ export class Pane {
     return {
       changed: () => this.update(),
       refused: (command, why) => {
-        if (command === "set" && [this.parameters, this.controls.parameters].some((list) => list.refused(why))) return;
+        if (command === "set" && [this.writes, this.parameters, this.controls.parameters].some((list) => list.refused(why))) return;
         if (command === "fly" && this.isOld) return; // the whole pane shows that
         this.notify(command ? `${words(command)}: ${why}` : why, "warn");
       },
       done: (command, name, value) => {
-        if (command === "set" && name !== undefined && value !== undefined) for (const list of [this.parameters, this.controls.parameters]) list.done(name, value);
+        if (command === "set" && name !== undefined && value !== undefined && !this.writes.done(name)) for (const list of [this.parameters, this.controls.parameters]) list.done(name, value);
         if (command === "stop") this.notify("emergency stop sent", "bad");
         if (command === "goto") this.notify("the waypoint is reached", "ok");
       },
@@ -235,7 +238,8 @@ export class Pane {
       this.stage.cameras(message.cameras);
       setHidden(this.endReplay, this.pilot === null || !message.uri.startsWith("replay:"));
       setAttribute(this.element, "data-recording", String(this.isRecording));
-      setHidden(this.waypoint.element, this.isRecording);
+      this.map.watchOnly(this.isRecording);
+      this.map.surroundings.reload();
     } else {
       this.state = message;
       this.absent = "";
@@ -245,6 +249,9 @@ export class Pane {
       const place = message.position ?? message.truth?.position;
       if (place) this.trail.add(now_s(), place);
       this.events.add(message.events);
+      if (message.events.some((event) => event.kind === "parameter_changed")) this.map.surroundings.reload();
+      if (!message.airborne) this.start = null;
+      else this.start ??= message.position;
     }
     this.dirty = true; // shown with the next tick
   }
@@ -295,9 +302,7 @@ export class Pane {
     const [mine, placed] = [(pilot?.mine ?? false) && !isOld && !recording, (live?.position ?? null) !== null];
     const inAir = live?.airborne ?? false;
     const nowhere = recording ? "A recording: nothing flies here." : isOld ? "What is shown is old." : !placed ? "It does not report its position: simulate it without position=none, or give it motion capture or GPS." : !mine ? "Take control to fly to a place." : "It must be in the air to fly to a place.";
-    const can = mine && placed && inAir;
-    this.waypoint.allow(can);
-    this.map.allow(can ? "" : nowhere);
+    this.map.allow(mine && placed && inAir ? "" : nowhere, mine ? "" : isOld ? "What is shown is old." : "Take control to change zones.");
     for (const list of [this.parameters, this.controls.parameters]) list.allow(mine, recording ? "As they were recorded." : "Take control to change them.");
     this.alarmBook.update(this.found(), performance.now());
     this.alarms.show();
@@ -346,6 +351,8 @@ export class Pane {
       targets: (state?.targets ?? []).map((target) => body(target.name, target.position, target.yaw)),
       waypoints: (state?.waypoints ?? []).map((one) => ({ position: one.position, own: one.app !== null })),
       trail: this.trail,
+      world: this.map.surroundings.world,
+      start: this.start,
     };
   }
 

@@ -26,12 +26,14 @@ export function leg(from: Vector, to: Vector, speeds: Speeds | null): Leg {
   return { distance_m: Math.hypot(along, up), time_s: speeds && Math.max(along / speeds.along, up / speeds.up) };
 }
 
+const AGAIN_MS = 1000;
+
 export interface WaypointHost {
   /** Where the drone is; null while that is not known. */
   own(): Vector | null;
   speeds(): Speeds | null;
   /** Why it may not fly to a place, in words; empty if it may. */
-  problem(from: Vector, to: Vector): string;
+  problem(place: Vector): Promise<string>;
   goTo(x: number, y: number, z: number): void;
 }
 
@@ -43,6 +45,9 @@ export class WaypointTool implements MapTool {
   private readonly clear = h("button", { type: "button", class: "small", "aria-label": "Forget the waypoint", hidden: true, onclick: () => this.choose(null) }, "×");
   private readonly preview = h("p", { class: "note preview", role: "status", hidden: true });
   private chosen: Vector | null = null;
+  private problem = "";
+  private asked_ms = 0;
+  private asked: Vector | null = null;
   private can = false;
 
   constructor(private readonly host: WaypointHost) {
@@ -60,7 +65,8 @@ export class WaypointTool implements MapTool {
     const { chosen } = this;
     if (!chosen) return;
     const own = this.host.own();
-    const tone = own && this.host.problem(own, chosen) ? "bad" : "accent";
+    if (performance.now() - this.asked_ms > AGAIN_MS) void this.ask(); // the drone moves, and zones are changed
+    const tone = this.problem ? "bad" : "accent";
     const [x, y] = project(chosen);
     if (own) {
       pen.beginPath();
@@ -105,6 +111,20 @@ export class WaypointTool implements MapTool {
   private choose(place: Vector | null): void {
     this.chosen = place;
     this.inputs.forEach((input, axis) => (input.value = place ? String(place[axis]) : ""));
+    void this.ask();
+  }
+
+  /** Ask whether it may fly there; until the answer nothing is known to speak against it, and the drone checks it too. */
+  private async ask(): Promise<void> {
+    const place = this.chosen;
+    this.asked_ms = performance.now();
+    if (this.asked?.join() !== place?.join()) this.problem = "";
+    this.asked = place;
+    this.show();
+    if (!place) return;
+    const problem = await this.host.problem(place);
+    if (this.asked !== place) return; // another one is chosen by now
+    this.problem = problem;
     this.show();
   }
 
@@ -113,14 +133,14 @@ export class WaypointTool implements MapTool {
     const own = this.host.own();
     const some = this.inputs.some((input) => input.value !== "");
     this.chosen = own && some ? (this.inputs.map((input, axis) => (input.value === "" ? round(own[axis] as number) : Number(input.value))) as Vector) : null;
-    this.show();
+    void this.ask();
   }
 
   private show(): void {
     const [own, place] = [this.host.own(), this.chosen];
     setHidden(this.preview, !place);
     setHidden(this.clear, !place);
-    const problem = own && place ? this.host.problem(own, place) : "";
+    const { problem } = this;
     setDisabled(this.go, !this.can || !place || !own || problem !== "");
     if (!own || !place) return;
     const { distance_m, time_s } = leg(own, place, this.host.speeds());

@@ -3,6 +3,7 @@
 import type { Trail } from "./history.js";
 import type { DroneRow, Vector } from "./model.js";
 import { isRecording } from "./safety.js";
+import type { World } from "./surroundings.js";
 
 export interface Body {
   name: string;
@@ -25,6 +26,10 @@ export interface Scene {
   targets: Body[];
   waypoints: { position: Vector; own: boolean }[];
   trail: Trail;
+  /** What stands there, where that is known. */
+  world?: World | null;
+  /** Where this flight began. */
+  start?: Vector | null;
 }
 
 /** What else flies, for the map of one of them: what was recorded is no part of what flies now, nor the other way round. */

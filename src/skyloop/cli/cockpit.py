@@ -51,6 +51,10 @@ def cockpit(
     recordings: Annotated[Path, typer.Option(metavar="FOLDER", help="Of recordings, made when needed")] = Path(
         "recordings"
     ),
+    world: Annotated[
+        str | None,
+        typer.Option(metavar="FILE", help="World file of the room, for the maps of drones that don't know theirs"),
+    ] = None,
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
@@ -63,5 +67,11 @@ def cockpit(
 
     access = Access(host, token_file, tls_cert, tls_key, client_ca, role, tuple(hostname or ()), pair)
     join_network(network, keys)
-    settings = network_settings()
-    serve_cockpit(drones(names, drone, needed=False), port=port, access=access, recordings=recordings, network=settings)
+    serve_cockpit(
+        drones(names, drone, needed=False),
+        port=port,
+        access=access,
+        recordings=recordings,
+        network=network_settings(),
+        world=world,
+    )

@@ -53,6 +53,9 @@ COMMANDS: Final = {
     ),
     "land": Entry(Task.FLY, "ending", "land", "Land a drone, or --all of them", "land alpha"),
     "stop": Entry(Task.FLY, "ending", "stop", "Emergency stop: cut a drone's motors, or --all", "stop alpha"),
+    "preflight": Entry(
+        Task.FLY, "preflight", "preflight", "What speaks against a flight, and what to do about it", "preflight alpha"
+    ),
     "list": Entry(Task.SEE, "listing", "list_proxies", "The running proxies and who flies", "list"),
     "watch": Entry(Task.SEE, "watch", "watch", "What a drone does, live in the terminal", "watch alpha"),
     "cockpit": Entry(

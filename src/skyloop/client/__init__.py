@@ -9,6 +9,7 @@ from skyloop.client.frame import Frame
 from skyloop.client.link_monitor import Thresholds
 from skyloop.client.logbook import Logbook
 from skyloop.client.parameters import Config
+from skyloop.client.preflight import Level, PreflightFinding
 from skyloop.client.results import Result
 from skyloop.client.statistics import ChannelStats, Distribution
 from skyloop.client.swarm import Swarm
@@ -27,9 +28,11 @@ __all__ = [
     "Distribution",
     "Drone",
     "Frame",
+    "Level",
     "LinkStatus",
     "Listener",
     "Logbook",
+    "PreflightFinding",
     "RedialPolicy",
     "Result",
     "Stats",

@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self, TypeVar, Unpack
 
@@ -27,8 +28,10 @@ from skyloop.client.commands import above_zero, checked, in_world_axes, number, 
 from skyloop.client.completion import is_there
 from skyloop.client.core import DOWN, UP, DroneCore, DroneOptions
 from skyloop.client.frame import Arrival, Frame
+from skyloop.client.inspection import inspect
 from skyloop.client.logbook import checked_time
 from skyloop.client.mailbox import Mailbox
+from skyloop.client.preflight import PreflightFinding
 from skyloop.client.results import (
     Result,
     ResultListener,
@@ -851,6 +854,24 @@ class Drone:
         return listener
 
     # The end ---------------------------------------------------------------------------------------------------
+
+    def preflight(self, *, video_s: float = 1.5, folder: str | Path | None = None) -> list[PreflightFinding]:
+        """Return the checklist before a flight: what is as it should be, what is not, why it matters, what to do.
+
+        Asks the proxy for its parameters and, of each camera, for a picture. Nothing is flown, and no authority is
+        needed.
+
+        Args:
+            video_s: How long to wait for pictures, in all [s]; 0: cameras are not checked.
+            folder: Where recordings are to go: whether there is room for them; None: not checked.
+
+        Raises:
+            ClosedError: If the drone is closed.
+            UsageError: If called from an inline callback.
+        """
+        self._core.check_open()
+        self._core.check_may_wait()
+        return inspect(self, self._state.newest, video_s, folder)
 
     def close(self) -> None:
         """Release the authority, then end the connection, all threads and a private proxy.

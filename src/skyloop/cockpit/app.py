@@ -41,7 +41,9 @@ from skyloop.cockpit.security import NOT_ALLOWED, Guard, Names, person_of
 from skyloop.cockpit.small_video import SmallVideoSender
 from skyloop.cockpit.station import Station
 from skyloop.cockpit.stream import UNKNOWN, BroadcastSender, PageCounts, TelemetrySender, VideoSender
+from skyloop.cockpit.world_api import WorldApi
 from skyloop.messages import Role
+from skyloop.messages.world import WorldGeometry
 
 STATIC = Path(__file__).with_name("static")
 _THREADS: Final = 32  # for what waits: proxies that answer late, recorders that end
@@ -148,6 +150,7 @@ def create_app(
     *,
     static: Path = STATIC,
     admission: Admission | None = None,
+    world: WorldGeometry | None = None,
 ) -> Starlette:
     """Make the cockpit's application.
 
@@ -158,6 +161,7 @@ def create_app(
         gate: Decides who is let in.
         static: The folder of the page.
         admission: Counts the connections.
+        world: What stands around drones that don't know it themselves.
     """
     cockpit = Cockpit(fleet, recordings, static)
     api = Api(fleet, gate, cockpit.counts, names.scheme, admission or Admission())
@@ -166,6 +170,7 @@ def create_app(
             Route("/", cockpit.page),
             *api.routes(),
             *RecordingsApi(fleet, recordings).routes(),
+            *WorldApi(fleet, recordings, world).routes(),
             WebSocketRoute("/ws/overview", cockpit.overview),
             WebSocketRoute("/ws/video", cockpit.small_video),
             WebSocketRoute("/ws/control", cockpit.all_drones),

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
     from skyloop.cockpit.access import Gate
     from skyloop.cockpit.discovery import Finder
+    from skyloop.messages.world import WorldGeometry
     from skyloop.transport.fabric import FabricSettings
 
 NICENESS = 10  #: of the serving thread and of those that it starts: programs that fly come first
@@ -86,6 +87,7 @@ def serve_cockpit(
     on_ready: Callable[[str], None] | None = None,
     stop: threading.Event | None = None,
     network: FabricSettings | None = None,
+    world: str | Path | None = None,
 ) -> None:
     """Serve the page until ``stop`` is set or a signal (Ctrl-C, SIGTERM) comes.
 
@@ -101,6 +103,7 @@ def serve_cockpit(
             others reach it and standard output is a terminal).
         stop: Ends the server when it is set, from any thread.
         network: Shows drones that can be reached over it, too.
+        world: File (or the name of a shipped one) of what stands around drones that don't know it themselves.
 
     Raises:
         UsageError: An address, port or file can't be used.
@@ -129,12 +132,13 @@ def serve_cockpit(
     tls = None if access.tls_cert is None else _tls(access)
     listening = bind(address, port)
     try:
+        given = None if world is None else _geometry(world)
         gate = _gate(access, listening.getsockname()[1])
         finder = _finder(names, network)
         try:
             _check_names(names, finder)
             announcer = Announcer(gate.pairing if isinstance(gate, TokenGate) else None, loopback)
-            _serve(finder, names, access, gate, tls, recordings, listening, on_ready or announcer, stop)
+            _serve(finder, names, access, gate, tls, recordings, listening, on_ready or announcer, stop, given)
         finally:
             finder.close()
     finally:
@@ -146,6 +150,13 @@ def _finder(names: Sequence[str], network: FabricSettings | None) -> Finder:
 
     near = LocalFinder(names)
     return near if network is None else NetworkFinder(near, network, frozenset(names))
+
+
+def _geometry(world: str | Path) -> WorldGeometry:
+    from skyloop.sim.geometry import geometry_of
+    from skyloop.sim.world_file import load_world
+
+    return geometry_of(load_world(world))
 
 
 def _check_names(names: Sequence[str], finder: Finder) -> None:
@@ -205,6 +216,7 @@ def _serve(
     listening: socket.socket,
     on_ready: Callable[[str], None],
     stop: threading.Event | None,
+    world: WorldGeometry | None,
 ) -> None:
     from skyloop.cockpit.app import create_app
     from skyloop.cockpit.fleet import Fleet
@@ -215,7 +227,7 @@ def _serve(
     own_name = () if bind_address(address)[1] else host_names()
     hosts = own_names(address, port, (*access.hostnames, *own_name), access.scheme)
     admission = Admission(places_here())
-    app = create_app(Fleet(finder, kept=names), Recordings(recordings), hosts, gate, admission=admission)
+    app = create_app(Fleet(finder, kept=names), Recordings(recordings), hosts, gate, admission=admission, world=world)
     server = quiet_server(app)
     seen_at = reachable(address)[0]
     page = f"{access.scheme}://{f'[{seen_at}]' if ':' in seen_at else seen_at}:{port}/"

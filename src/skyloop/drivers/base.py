@@ -33,6 +33,7 @@ from skyloop.messages import (
     Value,
     Vector,
 )
+from skyloop.messages.checkup import Diagnostic
 from skyloop.messages.pose import check_pose
 
 
@@ -153,23 +154,6 @@ class ExternalPose:
 
     def __post_init__(self) -> None:
         check_pose(self.position_m, self.quaternion, self.position_std_m, self.attitude_std_rad)
-
-
-@dataclass(frozen=True, slots=True)
-class Diagnostic:
-    """Something about a vehicle's settings that a person may want to know before flying.
-
-    Args:
-        what: What was examined.
-        good: Whether it is as it should be.
-        detail: What was found.
-        advice: What to do about it, empty if nothing.
-    """
-
-    what: str
-    good: bool
-    detail: str
-    advice: str = ""
 
 
 class Driver(ABC):
@@ -329,9 +313,10 @@ class Driver(ABC):
         raise UnsupportedError(f"{self.uri.scheme}:// takes no poses from outside")
 
     def checkup(self) -> list[Diagnostic]:
-        """Return which of the vehicle's settings need attention before flying, for ``skyloop doctor ADDRESS``.
+        """Return what about the vehicle and its settings needs attention before flying.
 
-        Called while the driver is open.
+        ``skyloop doctor ADDRESS`` and ``drone.preflight()`` show it. Called while the driver is open, from any thread;
+        returns at once.
         """
         return []
 

@@ -10,13 +10,14 @@ import math
 import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 
 from skyloop.clock import nanoseconds
-from skyloop.errors import ParameterError, UnknownNameError
+from skyloop.errors import DriverError, ParameterError, UnknownNameError
 from skyloop.messages import Parameter, ParameterPage, ParameterType, Refusal, Value
+from skyloop.messages.checkup import CHECKUP, encode_checkup
 from skyloop.messages.codec import MAX_BODY
 from skyloop.proxy.core.autopilot import AutopilotSettings
 from skyloop.proxy.core.failsafe import FailsafeSettings
@@ -28,8 +29,25 @@ MAX_TEXT: Final = 1024  #: characters of a text value
 MAX_PARAMETER: Final = 8192  #: bytes of one encoded parameter: a driver's larger one is left out
 PAGE_BYTES: Final = MAX_BODY - 256  #: of encoded parameters in one reply
 
+if TYPE_CHECKING:
+    from skyloop.drivers.base import Driver
+
 _KIND_NAMES: Final = {bool: "a bool", int: "an int", float: "a float", str: "a text", tuple: "a vector"}
 _encoded = msgspec.msgpack.Encoder().encode
+
+
+def described(driver: Driver) -> list[Parameter]:
+    """Return a driver's parameters, and what it finds about its vehicle as one more. Raises what the driver raises."""
+    parameters = list(driver.parameters())
+    try:
+        diagnostics = driver.checkup()
+    except DriverError:
+        return parameters  # not open
+    if not diagnostics:
+        return parameters
+    text = "what the driver finds before a flight, as JSON: skyloop preflight shows it"
+    value = encode_checkup(diagnostics)
+    return [*parameters, Parameter(CHECKUP, ParameterType.TEXT, value, read_only=True, description=text)]
 
 
 def _own(name: str, value: float, unit: str, minimum: float, maximum: float, description: str) -> Parameter:

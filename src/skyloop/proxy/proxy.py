@@ -57,7 +57,7 @@ from skyloop.proxy.events import Counters, EventPublisher
 from skyloop.proxy.executor import ActionExecutor
 from skyloop.proxy.flight_record import FlightRecord
 from skyloop.proxy.handler import CommandHandler
-from skyloop.proxy.parameters import Parameters
+from skyloop.proxy.parameters import Parameters, described
 from skyloop.proxy.publisher import VehiclePublisher, topic_problem
 from skyloop.proxy.relay import Relay
 from skyloop.proxy.requests import ParameterRequests, RequestDispatcher
@@ -131,7 +131,7 @@ class Proxy:
             clock=clock,
             shared=driver.shared,
         )
-        self.parameters = Parameters(driver.parameters, driver.set_parameter)
+        self.parameters = Parameters(lambda: described(driver), driver.set_parameter)
         self.workers = ProcessorWorkers(server_end, self.events, self._counters, self.publisher.cameras)
         self._relay = Relay(driver, server_end, self.publisher, self.events, self._counters)
         self._parameter_requests = ParameterRequests(

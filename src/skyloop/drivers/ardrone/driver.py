@@ -7,6 +7,7 @@ from typing import Final
 
 from skyloop.clock import monotonic_ns
 from skyloop.drivers.ardrone.configuration import own_ids
+from skyloop.drivers.ardrone.diagnostics import diagnose
 from skyloop.drivers.ardrone.link import ArdroneLink
 from skyloop.drivers.ardrone.options import options_of
 from skyloop.drivers.ardrone.parameters import Commands, Entry, active_camera, entries_of, taken, written
@@ -28,6 +29,7 @@ from skyloop.messages import (
     Severity,
     Value,
 )
+from skyloop.messages.checkup import Diagnostic
 
 ACTIONS: Final = frozenset({"idle", "takeoff", "hover", "land", "attitude", "emergency_stop", "reset_emergency"})
 
@@ -94,6 +96,15 @@ class ArdroneDriver(Driver):
         if self._link is None:
             raise DriverError(f"{self.uri} is not open")
         return self._link.command(action)
+
+    def checkup(self) -> list[Diagnostic]:
+        """Return what the drone's state and its configuration say about a flight."""
+        link = self._link
+        if link is None:
+            raise DriverError(f"{self.uri} is not open")
+        with link.lock:
+            state, values = link.session.state, dict(link.session.configurator.values)
+        return diagnose(state, values)
 
     # Parameters ------------------------------------------------------------------------------------------------
 

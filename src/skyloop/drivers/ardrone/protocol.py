@@ -152,6 +152,11 @@ class ArdroneSession(VehicleSession):
         """End the session: exchanges that are not done fail."""
         self.configurator.abandon("the driver was closed")
 
+    @property
+    def state(self) -> State | None:
+        """The newest bits of the drone's state; None before any came."""
+        return None if self._received_ns is None else self._state
+
     # From the sockets ------------------------------------------------------------------------------------------
 
     def on_navdata(self, datagram: bytes, now_ns: int) -> None:

@@ -11,9 +11,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Final, Protocol
 
-from skyloop.drivers.base import Diagnostic
 from skyloop.drivers.mavlink.microservices import VehicleCommand
 from skyloop.drivers.mavlink.telemetry import PREARM, SLOW_S, Telemetry, VehicleState
+from skyloop.messages.checkup import Diagnostic
 from skyloop.wire.mavlink.codec import dialect as m
 from skyloop.wire.mavlink.modes import COPTER_NUMBERS, PX4_NUMBERS, Autopilot, Landed, copter_mode, px4_mode
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from skyloop.clock import monotonic_ns
-from skyloop.drivers.base import Diagnostic, Driver, ExternalPose, Sink
+from skyloop.drivers.base import Driver, ExternalPose, Sink
 from skyloop.drivers.mavlink.link import MavlinkLink
 from skyloop.drivers.mavlink.microservices import pose_message
 from skyloop.drivers.mavlink.options import options_of
@@ -33,6 +33,7 @@ from skyloop.messages import (
     Severity,
     Value,
 )
+from skyloop.messages.checkup import Diagnostic
 from skyloop.wire.mavlink.parameter_values import is_integer
 
 ACTIONS: Final = frozenset(
@@ -121,10 +122,17 @@ class MavlinkDriver(Driver):
         with link.lock:
             session = link.session
             autopilot, values = session.autopilot, session.parameters.values
+            vehicle = session.vehicle_state(monotonic_ns())
         if autopilot is None or not values:
             return [Diagnostic("parameters", False, "the vehicle's parameters were not read, so nothing is known")]
         name = Diagnostic("autopilot", True, session.description)
-        return [name, *autopilot.safety_diagnostics(values, self.options.own_system)]
+        ready = None if vehicle is None else vehicle.ready
+        arming = Diagnostic("arming", ready is not False, _ARMING[ready], "" if ready else _PREARM, severe=True)
+        return [
+            name,
+            *([] if ready is None else [arming]),
+            *autopilot.safety_diagnostics(values, self.options.own_system),
+        ]
 
     def _opened(self) -> MavlinkLink:
         if self._link is None:
@@ -173,6 +181,14 @@ class MavlinkDriver(Driver):
         with link.lock:
             reported = dict(link.session.parameters.reported)
         return vehicle_parameters(reported)
+
+
+_ARMING: Final = {
+    True: "it reports that it can be armed",
+    False: "it can't be armed: it refuses to take off",
+    None: "",
+}
+_PREARM: Final = "its messages say why (events with prearm): wait for GPS or its estimate, calibrate, or unlock it"
 
 
 def _deliver(sink: Sink, pending: list[SinkCallback]) -> None:

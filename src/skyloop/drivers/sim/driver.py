@@ -127,10 +127,10 @@ class SimDriver(Driver):
     # Parameters ------------------------------------------------------------------------------------------------
 
     def parameters(self) -> list[Parameter]:
-        """Return limits, cameras, battery, wind, the radio link and the room, with their values in force."""
+        """Return limits, cameras, battery, wind, the radio link, the room and what stands in it."""
         world = self._known_world()
-        room = [] if world is None else [table.room(world.room)]
-        return [*table.describe(self._present(), self._standard()), *room]
+        surroundings = [] if world is None else [table.room(world.room), table.geometry(world)]
+        return [*table.describe(self._present(), self._standard()), *surroundings]
 
     def set_parameter(self, name: str, value: Value) -> Value:
         """Write a parameter. The wind is the whole world's.

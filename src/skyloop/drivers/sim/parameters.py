@@ -8,9 +8,11 @@ from typing import Any, Final
 
 from skyloop.errors import ParameterError, UnknownNameError
 from skyloop.messages import Parameter, ParameterType, Refusal, Value
+from skyloop.messages.world import WORLD, encode_world
 from skyloop.sim.camera import CameraModel
+from skyloop.sim.geometry import geometry_of
 from skyloop.sim.parameters import LIMIT_RANGES, Limits
-from skyloop.sim.world import Room, Wind
+from skyloop.sim.world import Room, Wind, World
 from skyloop.zones import ROOM, Box
 
 #: Parameter, field of :class:`Limits`, unit, description.
@@ -59,6 +61,12 @@ def room(room: Room) -> Parameter:
     walls = str(Box((-x / 2, -y / 2, 0.0), (x / 2, y / 2, z)))
     text = "walls of the simulated room, as a box"
     return Parameter(ROOM, ParameterType.TEXT, walls, "m", default=walls, read_only=True, description=text)
+
+
+def geometry(world: World) -> Parameter:
+    """Return the parameter that says what stands in the world, for maps."""
+    text = encode_world(geometry_of(world))
+    return Parameter(WORLD, ParameterType.TEXT, text, read_only=True, description="what stands in the world, as JSON")
 
 
 def with_value(state: ParameterValues, standard: ParameterValues, name: str, value: Value) -> ParameterValues:

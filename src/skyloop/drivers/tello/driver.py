@@ -16,6 +16,7 @@ from skyloop.drivers.uri import VehicleUri
 from skyloop.drivers.vehicle_session import SinkCallback
 from skyloop.errors import DriverError, ParameterError
 from skyloop.messages import AnyAction, Capabilities, Parameter, Refusal, Value
+from skyloop.messages.checkup import Diagnostic
 
 ACTIONS: Final = frozenset(
     {"idle", "takeoff", "hover", "land", "velocity", "attitude", "emergency_stop", "reset_emergency"}
@@ -81,6 +82,14 @@ class TelloDriver(Driver):
         if self._link is None:
             raise DriverError(f"{self.uri} is not open")
         return self._link.command(action)
+
+    def checkup(self) -> list[Diagnostic]:
+        """Return what the drone's newest state says about a flight."""
+        link = self._link
+        if link is None:
+            raise DriverError(f"{self.uri} is not open")
+        with link.lock:
+            return link.session.diagnose()
 
     # Parameters ------------------------------------------------------------------------------------------------
 

@@ -14,6 +14,7 @@ from skyloop.drivers.tello.telemetry import Health, feedback_of, native_of
 from skyloop.drivers.vehicle_session import LinkTimeouts, VehicleEvent, VehicleSession, message
 from skyloop.errors import DecodeError
 from skyloop.messages import AnyAction, LinkState, Severity, Value
+from skyloop.messages.checkup import Diagnostic
 from skyloop.wire.tello.commands import ENTER, Sdk, decoded, ports
 from skyloop.wire.tello.replies import Shape, answers, is_error, shape_of
 from skyloop.wire.tello.state import parse
@@ -254,6 +255,10 @@ class TelloSession(VehicleSession):
         native.update(self._telemetry())
         feedback = feedback_of(state, self.setpoints.flight_state(), now_ns, self.options.velocity_axes, native)
         self._pending.append(lambda sink: sink.feedback(feedback))
+
+    def diagnose(self) -> list[Diagnostic]:
+        """Return what the drone's newest state says about a flight."""
+        return self._health.diagnose()
 
     def on_reply(self, datagram: bytes, now_ns: int) -> None:
         """Handle a datagram of the port that commands are sent from, whatever it holds. Never raises."""

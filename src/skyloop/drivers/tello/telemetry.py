@@ -14,6 +14,7 @@ from skyloop.clock import nanoseconds
 from skyloop.drivers.tello.options import VelocityAxes
 from skyloop.drivers.vehicle_session import VehicleEvent, message
 from skyloop.messages import Feedback, FlightState, Severity, Value
+from skyloop.messages.checkup import Diagnostic
 from skyloop.messages.geometry import wrap_angle
 from skyloop.wire.tello.state import GROUND_CM, Pad, State, Vector
 
@@ -195,6 +196,7 @@ class Health:
 
     def __init__(self) -> None:
         self._hot = False
+        self._celsius: float | None = None
         self._pad = 0
         self._without = 0
 
@@ -202,10 +204,19 @@ class Health:
         """Return what changed since the last call."""
         return self._temperature(state.temperature_c) + self._mission_pad(state)
 
+    def diagnose(self) -> list[Diagnostic]:
+        """Return whether it is cool enough to fly; nothing while its temperature is not known."""
+        if self._celsius is None:
+            return []
+        if not self._hot:
+            return [Diagnostic("temperature", True, f"{self._celsius:g} °C")]
+        detail = f"{self._celsius:g} °C: it refuses its motors, or lands by itself, when it is hotter"
+        return [Diagnostic("temperature", False, detail, "let it cool with its fan free, or fly: moving air cools it")]
+
     def _temperature(self, range_c: tuple[float, float] | None) -> list[VehicleEvent]:
         if range_c is None:
             return []
-        highest = range_c[1]
+        highest = self._celsius = range_c[1]
         hot = highest >= (COOL_C if self._hot else HOT_C)
         if hot is self._hot:
             return []

@@ -1,0 +1,90 @@
+// The map of one drone with its tools: flying to a place, and the zones.
+
+import { h, setAttribute, setHidden } from "./dom.js";
+import { MapView } from "./map.js";
+import type { Vector } from "./model.js";
+import { Surroundings } from "./surroundings.js";
+import { WaypointTool } from "./waypoint.js";
+import type { Scene } from "./world.js";
+import { boundsOf } from "./zones.js";
+import { ZoneTool } from "./zonetool.js";
+
+export interface MapHost {
+  scene(): Scene;
+  /** Where the drone is; null while that is not known. */
+  own(): Vector | null;
+  goTo(x: number, y: number, z: number): void;
+  /** Write a parameter; returns why it was refused, or nothing. */
+  write(name: string, value: string | number): Promise<string>;
+}
+
+export class MapPanel {
+  readonly element: HTMLElement;
+  /** Other tools may be used on it: `map.use(tool)`. */
+  readonly map: MapView;
+  readonly surroundings: Surroundings;
+  private readonly waypoint: WaypointTool;
+  private readonly zones: ZoneTool;
+  private readonly edit = h("button", { type: "button", class: "small", "aria-pressed": "false", onclick: () => this.map.use(this.map.used === this.zones ? null : this.zones) }, "Zones");
+  private recording = false;
+  private why = { fly: "", write: "" };
+
+  constructor(drone: string, host: MapHost) {
+    this.surroundings = new Surroundings(drone, () => this.zones.update());
+    this.waypoint = new WaypointTool({
+      own: host.own,
+      speeds: () => {
+        const { speed = null, climb = null } = this.surroundings.world?.limits ?? {};
+        return speed && climb ? { along: speed, up: climb } : null;
+      },
+      problem: (place) => this.surroundings.problem(place),
+      goTo: host.goTo,
+    });
+    this.zones = new ZoneTool({
+      bounds: () => boundsOf(this.surroundings.world),
+      ceiling: () => this.surroundings.world?.limits.altitude ?? null,
+      write: host.write,
+      reload: () => this.surroundings.reload(0),
+    });
+    this.map = new MapView(host.scene, this.waypoint, this.waypoint.element, this.zones.element);
+    this.map.corner.append(this.edit);
+    this.element = this.map.element;
+    this.arrange();
+  }
+
+  /** Nothing flies: it is a recording. */
+  watchOnly(only: boolean): void {
+    this.recording = only;
+    if (only) this.map.use(null);
+  }
+
+  /** Why it can't be flown to a place now, and why no zone can be written; empty: it can. */
+  allow(fly: string, write: string): void {
+    this.why = { fly, write };
+    this.waypoint.allow(fly === "");
+    this.zones.allow(write === "");
+  }
+
+  draw(now_ms: number): void {
+    this.arrange();
+    this.map.draw(now_ms);
+  }
+
+  repaint(): void {
+    this.map.repaint();
+  }
+
+  close(): void {
+    this.surroundings.close();
+  }
+
+  /** The parts of the tool that is used. */
+  private arrange(): void {
+    const used = this.map.used;
+    setHidden(this.edit, this.recording);
+    setAttribute(this.edit, "aria-pressed", String(used === this.zones));
+    setHidden(this.zones.element, used !== this.zones);
+    setHidden(this.waypoint.element, used !== this.waypoint || this.recording);
+    this.map.allow(used === this.zones ? this.why.write : used === this.waypoint ? this.why.fly : "");
+  }
+}

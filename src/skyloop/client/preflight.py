@@ -1,0 +1,334 @@
+"""The checks before a flight: what is wrong, why it matters, and what to do. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Final
+
+from skyloop.client.telemetry import LinkStatus
+from skyloop.messages import Capabilities, Failsafe, Feedback, FlightState, LinkState, Value
+from skyloop.messages.checkup import CHECKUP, Diagnostic, decode_checkup
+
+STALE_S: Final = 1.0  #: feedback that is older is not now
+STALE_VIDEO_S: Final = 1.0
+CLOCK_S: Final = 0.05  #: ages of samples are known to this at least
+LEVEL_RAD: Final = 0.12  #: a vehicle that stands askew by more is not level
+FREE_BYTES: Final = 1_000_000_000  #: of a disk that a flight is recorded to
+FULL_BYTES: Final = 100_000_000
+FAR_M: Final = 10_000.0  #: a wall of the safety box that far away is none
+
+
+class Level(StrEnum):
+    """How serious a finding is."""
+
+    OK = "ok"
+    WARN = "warn"  #: it can fly; something that helps is missing
+    FAIL = "fail"  #: it would not fly, or not safely
+
+
+@dataclass(frozen=True, slots=True)
+class PreflightFinding:
+    """One line of the checklist.
+
+    Attributes:
+        check: What was checked: ``link``, ``battery``, ``position`` and so on.
+        level: How serious it is.
+        detail: What was found.
+        why: Why it matters; empty if all is well.
+        remedy: What to do about it; empty if nothing is needed.
+    """
+
+    check: str
+    level: Level
+    detail: str
+    why: str = ""
+    remedy: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class PreflightState:
+    """What is known of a vehicle before a flight.
+
+    Attributes:
+        link: Both hops.
+        capabilities: Of the vehicle.
+        feedback: The newest sample; None: none came.
+        feedback_age_s: Its age [s].
+        video_age_s: Age of each camera's newest picture [s]; None: none came in time.
+        parameters: Values by name; empty: they were not read.
+        clock_uncertainty_s: Of the ages of all samples [s].
+        app_id: This application's number in this run of the proxy.
+        free_bytes: Of the disk for recordings; None: not asked for.
+    """
+
+    link: LinkStatus
+    capabilities: Capabilities
+    feedback: Feedback | None = None
+    feedback_age_s: float | None = None
+    video_age_s: Mapping[str, float | None] = field(default_factory=dict)
+    parameters: Mapping[str, Value] = field(default_factory=dict)
+    clock_uncertainty_s: float = 0.0
+    app_id: int = 0
+    free_bytes: int | None = None
+
+
+def check_before_flight(state: PreflightState) -> list[PreflightFinding]:
+    """Return the checklist, in the order to be read; all lines, the good ones, too."""
+    return [
+        *_link(state),
+        *_flight_state(state),
+        *_battery(state),
+        *_position(state),
+        *_level(state),
+        *_bounds(state),
+        *_video(state),
+        *_control(state),
+        *_clock(state),
+        *_storage(state),
+        *_vehicle(state),
+    ]
+
+
+def _ok(check: str, detail: str) -> PreflightFinding:
+    return PreflightFinding(check, Level.OK, detail)
+
+
+def _link(state: PreflightState) -> Iterator[PreflightFinding]:
+    link = state.link
+    if link.application is not LinkState.UP:
+        bad = link.application is not LinkState.DEGRADED
+        yield PreflightFinding(
+            "link",
+            Level.FAIL if bad else Level.WARN,
+            f"the link to the proxy is {link.application}: {link.reason or 'no reason is known'}",
+            "commands may not arrive, and what is shown may be old",
+            "see that the proxy runs (skyloop list) and that its computer can be reached",
+        )
+        if bad:
+            return
+    if link.vehicle is LinkState.UP:
+        yield _ok("link", "the vehicle answers")
+        return
+    yield PreflightFinding(
+        "link",
+        Level.WARN if link.vehicle is LinkState.DEGRADED else Level.FAIL,
+        f"the link to the vehicle is {link.vehicle}: {link.reason or 'no reason is known'}",
+        "a vehicle that is not heard does not hear either",
+        link.remedy or "check its power, and the radio or Wi-Fi to it: skyloop doctor ADDRESS",
+    )
+
+
+def _flight_state(state: PreflightState) -> Iterator[PreflightFinding]:
+    feedback = state.feedback
+    if not state.capabilities.actions:
+        why = state.capabilities.why_not or "it takes no commands"
+        yield PreflightFinding("vehicle", Level.FAIL, f"nothing can be flown: {why}", "it can only be watched")
+    elif feedback is None:
+        yield PreflightFinding(
+            "vehicle", Level.FAIL, "it has not reported its state", "nothing is known of it", "wait for its first data"
+        )
+    elif feedback.state is FlightState.EMERGENCY:
+        yield PreflightFinding(
+            "vehicle",
+            Level.FAIL,
+            "its emergency stop is in force: the motors are off",
+            "it refuses to take off",
+            "find out why it stopped, stand clear, and reset it (drone.reset_emergency(), or Reset on the page)",
+        )
+    elif state.feedback_age_s is not None and state.feedback_age_s > STALE_S:
+        detail = f"its newest state is {state.feedback_age_s:.1f} s old"
+        yield PreflightFinding("vehicle", Level.FAIL, detail, "what is shown is not now", "check the link to it")
+    elif feedback.others:
+        yield PreflightFinding(
+            "vehicle",
+            Level.WARN,
+            f"another controller has it: {feedback.others}",
+            "the proxy leaves it alone until a pilot newly asks for hover, landing or take-off",
+            "agree with who flies it",
+        )
+    else:
+        yield _ok("vehicle", str(feedback.state).replace("_", " "))
+    if feedback is not None and feedback.failsafe is not Failsafe.NONE:
+        doing = f"the failsafe is in force: {feedback.failsafe}"
+        yield PreflightFinding("failsafe", Level.WARN, doing, "its pilot fell silent", "take control, and command it")
+
+
+def _battery(state: PreflightState) -> Iterator[PreflightFinding]:
+    charge = None if state.feedback is None else state.feedback.battery
+    land, warn = _number(state, "battery.land", 0.1), _number(state, "battery.warn", 0.2)
+    if charge is None:
+        yield PreflightFinding(
+            "battery", Level.WARN, "its charge is not reported", "it may come down by itself", "check it by hand"
+        )
+    elif charge < land:
+        yield PreflightFinding(
+            "battery",
+            Level.FAIL,
+            f"{charge:.0%} left, below {land:.0%} (battery.land)",
+            "it lands as soon as it flies, and takes no other command",
+            "charge or change it",
+        )
+    elif charge < warn:
+        yield PreflightFinding(
+            "battery", Level.WARN, f"{charge:.0%} left", "the flight will be short", "charge or change it"
+        )
+    else:
+        yield _ok("battery", f"{charge:.0%} left")
+
+
+def _position(state: PreflightState) -> Iterator[PreflightFinding]:
+    feedback = state.feedback
+    if feedback is None:
+        return
+    if feedback.position_m is None:
+        yield PreflightFinding(
+            "position",
+            Level.WARN,
+            "it does not report its position",
+            "waypoints, routes, the safety box and zones don't work; it can be flown by sticks and velocities",
+            "let it know its place: GPS, optical flow, or motion capture (drone.send_external_pose)",
+        )
+    else:
+        x, y, z = feedback.position_m
+        yield _ok("position", f"{x:.1f} m east, {y:.1f} m north, {z:.1f} m up")
+    if feedback.yaw_rad is None:
+        yield PreflightFinding(
+            "compass",
+            Level.WARN,
+            "it does not report its heading",
+            "it can't be flown to places, and cameras' views have no direction",
+            "calibrate its compass, or wait until its estimate has settled",
+        )
+    else:
+        yield _ok("compass", "its heading is known")
+
+
+def _level(state: PreflightState) -> Iterator[PreflightFinding]:
+    feedback = state.feedback
+    if feedback is None or feedback.state is not FlightState.LANDED:
+        return
+    if feedback.roll_rad is None or feedback.pitch_rad is None:
+        return
+    tilt = max(abs(feedback.roll_rad), abs(feedback.pitch_rad))
+    if tilt > LEVEL_RAD:
+        yield PreflightFinding(
+            "level",
+            Level.WARN,
+            f"it stands tilted by {tilt:.2f} rad, or takes a tilted attitude for level",
+            "it would drift off when it takes off",
+            "put it on level ground; if it stands level, calibrate it (AR.Drone: ardrone.flat_trim)",
+        )
+    else:
+        yield _ok("level", "it stands level")
+
+
+def _bounds(state: PreflightState) -> Iterator[PreflightFinding]:
+    if not state.parameters:
+        yield PreflightFinding(
+            "zones", Level.WARN, "its parameters could not be read", "its limits and failsafes are not known"
+        )
+        return
+    walls = [f"safety.box.{axis}_{end}" for axis in "xyz" for end in ("low", "high")]
+    count = sum(abs(_number(state, wall, FAR_M)) < FAR_M for wall in walls)
+    text = state.parameters.get("safety.zones", "")
+    zones = sum(bool(part.strip()) for part in text.split(";")) if isinstance(text, str) else 0
+    ceiling = state.parameters.get("limits.altitude")
+    high = f", at most {ceiling:g} m high" if isinstance(ceiling, int | float) else ""
+    if count or zones:
+        works = state.feedback is not None and state.feedback.position_m is not None
+        detail = f"{count} of 6 walls of the safety box, {zones} zone{'' if zones == 1 else 's'}{high}"
+        if works:
+            yield _ok("zones", detail)
+        else:
+            yield PreflightFinding(
+                "zones", Level.FAIL, detail, "without a position nothing keeps it inside", "let it know its place"
+            )
+        return
+    yield PreflightFinding(
+        "zones",
+        Level.WARN,
+        f"no safety box and no zones are set{high}",
+        "nothing stops it before walls and people",
+        "set them on the page's map (Zones), or skyloop param NAME safety.box.x_high 4",
+    )
+
+
+def _video(state: PreflightState) -> Iterator[PreflightFinding]:
+    for camera, age_s in state.video_age_s.items():
+        if age_s is None or age_s > STALE_VIDEO_S:
+            found = "no picture came" if age_s is None else f"the newest picture is {age_s:.1f} s old"
+            yield PreflightFinding(
+                f"video {camera}",
+                Level.WARN,
+                found,
+                "who flies by it would fly blind",
+                "check the camera, its link and its address; skyloop watch shows why",
+            )
+        else:
+            yield _ok(f"video {camera}", "pictures arrive")
+
+
+def _control(state: PreflightState) -> Iterator[PreflightFinding]:
+    feedback = state.feedback
+    if feedback is None or not feedback.lease:
+        yield _ok("control", "nobody has control: it is free")
+    elif feedback.owner_id == state.app_id:
+        yield _ok("control", "this application has control")
+    else:
+        yield PreflightFinding(
+            "control",
+            Level.WARN,
+            f"{feedback.owner} has control, with priority {feedback.owner_priority}",
+            "its commands count, yours are refused",
+            "ask for control, or agree with them",
+        )
+
+
+def _clock(state: PreflightState) -> Iterator[PreflightFinding]:
+    uncertainty_s = state.clock_uncertainty_s
+    if uncertainty_s > CLOCK_S:
+        yield PreflightFinding(
+            "clock",
+            Level.WARN,
+            f"ages are known to ±{uncertainty_s * 1000:.0f} ms only",
+            "commands may be refused as stale, and delays are wrong by as much",
+            "use a faster or less busy network",
+        )
+    else:
+        yield _ok("clock", f"ages are known to ±{uncertainty_s * 1000:.1f} ms")
+
+
+def _storage(state: PreflightState) -> Iterator[PreflightFinding]:
+    free = state.free_bytes
+    if free is None:
+        return
+    left = f"{free / 1e9:.1f} GB are free for recordings"
+    if free < FREE_BYTES:
+        level = Level.FAIL if free < FULL_BYTES else Level.WARN
+        yield PreflightFinding(
+            "storage", level, left, "a recording would end early", "delete old ones, or record elsewhere"
+        )
+    else:
+        yield _ok("storage", left)
+
+
+def _vehicle(state: PreflightState) -> Iterator[PreflightFinding]:
+    """What its driver finds."""
+    text = state.parameters.get(CHECKUP)
+    if not isinstance(text, str) or not text:
+        return
+    try:
+        diagnostics = decode_checkup(text)
+    except ValueError:
+        diagnostics = [Diagnostic("driver", False, "its check-up can't be read")]
+    for one in diagnostics:
+        level = Level.OK if one.good else Level.FAIL if one.severe else Level.WARN
+        detail, _, why = one.detail.partition(": ") if not one.good else (one.detail, "", "")
+        yield PreflightFinding(one.what, level, detail, why, one.advice)
+
+
+def _number(state: PreflightState, name: str, otherwise: float) -> float:
+    value = state.parameters.get(name)
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else otherwise

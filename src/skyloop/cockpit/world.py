@@ -1,0 +1,160 @@
+"""What maps show around a drone: what stands there, where it may fly, how fast, and where its cameras look."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from skyloop.cockpit.values import Json, number, vector
+from skyloop.errors import NoAnswerError, ParameterError
+from skyloop.messages import Position
+from skyloop.messages.world import WORLD, WorldGeometry, decode_world
+from skyloop.proxy.core.limits import Limits
+from skyloop.proxy.core.places import decide_place
+from skyloop.zones import FAR_M, Box, Space, Zone, space_of
+
+if TYPE_CHECKING:
+    from skyloop.client import Drone
+    from skyloop.messages import CameraInfo, Feedback, Value
+
+LIMITS: Final = ("speed", "climb", "altitude")
+
+
+def world_values(drone: Drone, given: WorldGeometry | None) -> Json:
+    """Return what maps show around a drone. Asks its proxy, and waits for the answers.
+
+    Args:
+        drone: The drone.
+        given: What stands there if the drone does not know.
+
+    Raises:
+        LinkError: The proxy does not answer.
+    """
+    read = _reader(drone)
+    known = _known(read(WORLD))
+    world = known or given
+    space = space_from(read)
+    return {
+        **geometry_values(world),
+        "source": "vehicle" if known else "file" if given else None,
+        "box": None if space.box is None else _box(space.box),
+        "zones": [_zone(zone) for zone in space.zones],
+        "limits": {name: _limit(read(f"limits.{name}")) for name in LIMITS},
+        "cameras": [view_values(camera) for camera in drone.capabilities.cameras],
+    }
+
+
+def way_values(drone: Drone, place: tuple[float, float, float]) -> Json:
+    """Return what speaks against flying straight to a place from where the drone is: the proxy's own decision.
+
+    Args:
+        drone: The drone.
+        place: World axes [m].
+
+    Raises:
+        LinkError: The proxy does not answer.
+    """
+    read = _reader(drone)
+
+    def limit(name: str) -> float:
+        value = _limit(read(f"limits.{name}"))
+        return math.inf if value is None else value
+
+    limits = Limits(limit("tilt"), limit("climb"), limit("yaw_rate"), limit("speed"), limit("altitude"))
+    decision = decide_place(Position(*place), limits, space_from(read), _newest(drone), drone.now_ns, new=True)
+    return {"problem": decision.why}
+
+
+def space_from(read: Callable[[str], Value | None]) -> Space:
+    """Return where parameters allow a vehicle to fly; those that it does not have limit nothing."""
+
+    def edge(name: str) -> float:
+        value = read(name)
+        return float(value) if isinstance(value, int | float) else FAR_M if name.endswith("high") else -FAR_M
+
+    def text(name: str) -> str:
+        value = read(name)
+        return value if isinstance(value, str) else ""
+
+    try:
+        return space_of(edge, text)
+    except ParameterError:
+        return Space()  # a driver with another notion of these names
+
+
+def geometry_values(world: WorldGeometry | None) -> Json:
+    """Return what stands in a world as JSON values; empty lists where nothing is known."""
+    if world is None:
+        return {"name": "", "room": None, "solids": [], "gates": [], "markers": [], "starts": [], "left_out": 0}
+    room = None
+    if world.low is not None and world.high is not None:
+        room = {"low": vector(world.low), "high": vector(world.high), "enclosed": world.enclosed}
+    return {
+        "name": world.name,
+        "room": room,
+        "solids": [_fields(one) for one in world.solids],
+        "gates": [_fields(one) for one in world.gates],
+        "markers": [_fields(one) for one in world.markers],
+        "starts": [_fields(one) for one in world.starts],
+        "left_out": world.left_out,
+    }
+
+
+def view_values(camera: CameraInfo) -> Json:
+    """Return where a camera looks: the rays through the corners of its pictures, in body axes; null if not known."""
+    lens, rotation = camera.intrinsics, camera.rotation
+    rays = None
+    if lens is not None and rotation is not None and lens.fx > 0 and lens.fy > 0:
+        to_body = np.reshape(np.asarray(rotation, dtype=np.float64), (3, 3))
+        corners = ((0, 0), (camera.width, 0), (camera.width, camera.height), (0, camera.height))
+        rays = []
+        for u, v in corners:
+            ray = to_body @ np.array([(u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy, 1.0])
+            rays.append([number(float(part)) for part in ray / np.linalg.norm(ray)])
+    return {"name": camera.name, "position": vector(camera.position_m), "rays": rays}
+
+
+def _newest(drone: Drone) -> Feedback | None:
+    try:
+        return drone.feedback()
+    except NoAnswerError:
+        return None
+
+
+def _reader(drone: Drone) -> Callable[[str], Value | None]:
+    """Return what reads a parameter's value; None where there is no such parameter."""
+    found = {parameter.name: parameter.value for parameter in drone.config.parameters()}
+    return found.get
+
+
+def _known(text: Value | None) -> WorldGeometry | None:
+    if not isinstance(text, str) or not text:
+        return None
+    try:
+        return decode_world(text)
+    except ValueError:
+        return None  # a driver with another notion of this name
+
+
+def _limit(value: Value | None) -> float | None:
+    return number(float(value)) if isinstance(value, int | float) and math.isfinite(value) else None
+
+
+def _box(box: Box) -> Json:
+    ends = zip(box.low, box.high, strict=True)
+    pairs = [(None if low <= -FAR_M else low, None if high >= FAR_M else high) for low, high in ends]
+    return {"low": [low for low, _ in pairs], "high": [high for _, high in pairs]}
+
+
+def _zone(zone: Zone) -> Json:
+    if isinstance(zone, Box):
+        return {"kind": "box", "low": vector(zone.low), "high": vector(zone.high)}
+    centre = [zone.x, zone.y]
+    return {"kind": "cylinder", "centre": centre, "radius": zone.radius, "low": zone.low, "high": zone.high}
+
+
+def _fields(thing: Any) -> Json:
+    return {name: getattr(thing, name) for name in thing.__struct_fields__}

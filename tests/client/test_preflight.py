@@ -1,0 +1,151 @@
+"""The checklist before a flight: each line that is not good says what, why and what to do."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import skyloop
+from skyloop.client import Level, LinkStatus, PreflightFinding
+from skyloop.client.preflight import PreflightState, check_before_flight
+from skyloop.drivers.ardrone.diagnostics import diagnose
+from skyloop.messages import CameraInfo, Capabilities, Failsafe, Feedback, FlightState, LinkState, Value
+from skyloop.messages.checkup import MAX_TEXT, Diagnostic, decode_checkup, encode_checkup
+from skyloop.wire.ardrone.navdata import State
+
+GOOD = Feedback(
+    captured_ns=1,
+    state=FlightState.LANDED,
+    battery=0.9,
+    roll_rad=0.0,
+    pitch_rad=0.01,
+    yaw_rad=0.0,
+    altitude_m=0.0,
+    position_m=(0.0, 0.0, 0.0),
+)
+PARAMETERS: dict[str, Value] = {
+    "battery.land": 0.1,
+    "battery.warn": 0.2,
+    "safety.box.x_high": 4.0,
+    "safety.zones": "cylinder 2 0 0.5 0 3",
+    "limits.altitude": 3.0,
+}
+READY = PreflightState(
+    link=LinkStatus(LinkState.UP, LinkState.UP),
+    capabilities=Capabilities(
+        "test", actions=frozenset({"takeoff", "land"}), cameras=(CameraInfo("front", 32, 24, 30.0),)
+    ),
+    feedback=GOOD,
+    feedback_age_s=0.02,
+    video_age_s={"front": 0.05},
+    parameters=PARAMETERS,
+    free_bytes=50_000_000_000,
+)
+
+
+def lines(state: PreflightState) -> dict[str, PreflightFinding]:
+    return {finding.check: finding for finding in check_before_flight(state)}
+
+
+def fed(**changes: Any) -> PreflightState:
+    import msgspec
+
+    return replace(READY, feedback=msgspec.structs.replace(GOOD, **changes))
+
+
+def with_parameters(**changes: Value) -> PreflightState:
+    return replace(READY, parameters={**PARAMETERS, **{name.replace("__", "."): v for name, v in changes.items()}})
+
+
+def test_a_vehicle_that_is_ready_has_good_lines_only() -> None:
+    found = lines(READY)
+    assert {finding.level for finding in found.values()} == {Level.OK}
+    assert list(found) == [
+        "link", "vehicle", "battery", "position", "compass", "level", "zones", "video front", "control", "clock",
+        "storage",
+    ]  # fmt: skip
+    assert "1 of 6 walls of the safety box, 1 zone, at most 3 m high" in found["zones"].detail
+
+
+@pytest.mark.parametrize(
+    ("state", "check", "level", "words"),
+    [
+        (replace(READY, link=LinkStatus(LinkState.LOST, LinkState.UP, "gone")), "link", Level.FAIL, "gone"),
+        (replace(READY, link=LinkStatus(LinkState.UP, LinkState.CONNECTING)), "link", Level.FAIL, "vehicle"),
+        (replace(READY, link=LinkStatus(LinkState.UP, LinkState.DEGRADED)), "link", Level.WARN, "degraded"),
+        (replace(READY, capabilities=Capabilities("video")), "vehicle", Level.FAIL, "takes no commands"),
+        (replace(READY, feedback=None), "vehicle", Level.FAIL, "not reported"),
+        (fed(state=FlightState.EMERGENCY), "vehicle", Level.FAIL, "emergency stop"),
+        (replace(READY, feedback_age_s=3.0), "vehicle", Level.FAIL, "3.0 s old"),
+        (fed(others="RTL"), "vehicle", Level.WARN, "another controller"),
+        (fed(failsafe=Failsafe.LAND), "failsafe", Level.WARN, "failsafe"),
+        (fed(battery=0.05), "battery", Level.FAIL, "5%"),
+        (fed(battery=0.15), "battery", Level.WARN, "15%"),
+        (fed(battery=None), "battery", Level.WARN, "not reported"),
+        (fed(position_m=None), "position", Level.WARN, "position"),
+        (fed(position_m=None), "zones", Level.FAIL, "walls"),
+        (fed(yaw_rad=None), "compass", Level.WARN, "heading"),
+        (fed(roll_rad=0.3), "level", Level.WARN, "tilted"),
+        (replace(READY, parameters={"limits.altitude": 3.0}), "zones", Level.WARN, "no safety box"),
+        (replace(READY, parameters={}), "zones", Level.WARN, "could not be read"),
+        (replace(READY, video_age_s={"front": None}), "video front", Level.WARN, "no picture"),
+        (replace(READY, video_age_s={"front": 4.0}), "video front", Level.WARN, "4.0 s old"),
+        (fed(owner="ann", owner_id=7, owner_priority=4, lease=3), "control", Level.WARN, "ann has control"),
+        (replace(READY, clock_uncertainty_s=0.2), "clock", Level.WARN, "200 ms"),
+        (replace(READY, free_bytes=500_000_000), "storage", Level.WARN, "0.5 GB"),
+        (replace(READY, free_bytes=1000), "storage", Level.FAIL, "0.0 GB"),
+        (with_parameters(vehicle__checkup="no list"), "driver", Level.WARN, "can't be read"),
+    ],
+)
+def test_what_is_not_good_says_why(state: PreflightState, check: str, level: Level, words: str) -> None:
+    finding = lines(state)[check]
+    assert (finding.level, words in finding.detail) == (level, True), finding
+    assert finding.why or finding.remedy or check == "driver"
+
+
+def test_what_the_driver_finds_is_part_of_it() -> None:
+    text = encode_checkup(
+        [
+            Diagnostic("autopilot", True, "ArduCopter 4.6"),
+            Diagnostic("loss of this computer", False, "FS_GCS_ENABLE is 0: it hovers until empty", "set it to 7"),
+            Diagnostic("arming", False, "it can't be armed: it refuses to take off", "wait for GPS", severe=True),
+        ]
+    )
+    found = lines(with_parameters(vehicle__checkup=text))
+    assert found["autopilot"].level is Level.OK
+    net = found["loss of this computer"]
+    assert (net.level, net.detail, net.why) == (Level.WARN, "FS_GCS_ENABLE is 0", "it hovers until empty")
+    assert found["arming"].level is Level.FAIL
+
+
+def test_a_check_up_that_is_too_long_keeps_what_is_wrong() -> None:
+    many = [Diagnostic(f"check {number}", number % 2 == 0, "x" * 200) for number in range(60)]
+    text = encode_checkup(many)
+    assert len(text) <= MAX_TEXT
+    assert [one.good for one in decode_checkup(text)].count(False) == 30
+
+
+def test_an_ardrone_says_what_keeps_it_down() -> None:
+    usual = {"control:altitude_max": "3000", "control:outdoor": "FALSE", "control:flight_without_shell": "FALSE"}
+    assert all(one.good for one in diagnose(State.FLYING, usual))
+    found = {one.what: one for one in diagnose(State.MOTORS_PROBLEM | State.MAGNETOMETER_UNCALIBRATED, {
+        **usual, "control:altitude_max": "100000", "control:outdoor": "TRUE"})}  # fmt: skip
+    assert found["motors"].severe
+    assert not found["compass"].severe
+    assert not found["ceiling"].good
+    assert not found["indoors"].good
+    assert not diagnose(None, {})[0].good
+
+
+def test_a_drone_checks_itself() -> None:
+    with skyloop.connect("sim://?world=empty&cameras=front&width=160", access="observe") as drone:
+        drone.next_feedback(10.0)
+        found = {finding.check: finding for finding in drone.preflight(video_s=10.0, folder=Path("recordings"))}
+        assert found["link"].level is Level.OK
+        assert found["video front"].level is Level.OK
+        assert found["zones"].level is Level.WARN
+        assert math.isfinite(len(found["storage"].detail))
