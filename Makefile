@@ -24,8 +24,10 @@ help:
 # One stamp for what the demo needs and one for what the tests need besides; both are made again when the project changes.
 $(VENV)/.installed: pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Skyloop needs Python 3.11 or newer, this is " + sys.version.split()[0])'
-	$(PYTHON) -m venv $(VENV)
-	$(PIP) --editable '.[sim,vision,cockpit]'
+	@echo "Installing Skyloop into $(VENV): a minute or two, once"
+	@(while sleep 2; do printf .; done) & trap "kill $$!" EXIT; $(PYTHON) -m venv $(VENV)
+	@echo
+	$(subst --quiet ,,$(PIP)) --editable '.[sim,vision,cockpit]'
 	@touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed requirements-dev.txt requirements-dev.lock

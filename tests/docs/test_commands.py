@@ -41,6 +41,9 @@ def test_the_pages_show_command_lines() -> None:
 
 @pytest.mark.parametrize("line", LINES)
 def test_a_command_line_is_accepted(line: str) -> None:
+    if words(line)[1].startswith("--"):
+        assert words(line)[1] in {word for param in GROUP.params for word in param.opts}
+        return
     parse(words(line)[1], words(line)[2:])
 
 

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from skyloop.cli.text import console, named
 from skyloop.errors import UsageError
 from skyloop.files import write as write_file
 
@@ -58,6 +59,7 @@ def bench(
         str | None, typer.Option(help="delays, loop: of the frames, such as 320x240,640x480 [default: 320x240]")
     ] = None,
     output: Output = None,
+    json: Annotated[bool, typer.Option("--json", help="For programs: the figures as one JSON object")] = False,
 ) -> None:
     """Measure delays on this machine, as medians and 99th percentiles, or how fast the simulator is.
 
@@ -77,7 +79,9 @@ def bench(
                 results, shown = _loop(wanted_s, wanted, progress)
             case What.SIM:
                 results, shown = _sim(wanted_s, progress)
-    finish(what.value, results, shown, output, _draw if what is What.DELAYS else None)
+    if json:
+        typer.echo(msgspec.json.encode(results).decode())
+    finish(what.value, results, [] if json else shown, output, _draw if what is What.DELAYS else None)
 
 
 def check_options(what: What, given: Mapping[str, object]) -> None:
@@ -153,13 +157,13 @@ def finish(
         MissingExtraError: matplotlib is not installed; the JSON is written all the same.
     """
     for table in shown:
-        Console().print(table)
+        console().print(table)
     if output is None:
         return
     file = output / f"{what}.json"
     write_file(file, msgspec.json.encode(results) + b"\n")
     for written in [file, *(draw(results, output) if draw else [])]:
-        typer.echo(f"wrote {written}")
+        typer.echo(f"wrote {written}", err=True)
 
 
 def _draw(results: Any, folder: Path) -> list[Path]:
@@ -216,7 +220,7 @@ def as_rich(found: Sequence[tables.Table], where: str) -> list[Table]:
     shown = []
     for one in found:
         if one.rows:
-            table = Table(*one.columns, title=one.title, caption=where, box=None)
+            table = Table(*map(named, one.columns), title=one.title, caption=where, box=None)
             for row in one.rows:
                 table.add_row(*row)
             shown.append(table)

@@ -9,7 +9,7 @@ from typing import Final
 
 import typer
 
-ANSWER_WITHIN_S: Final = 0.5
+ANSWER_WITHIN_S: Final = 2.0
 
 
 def drone_names(incomplete: str) -> list[str]:

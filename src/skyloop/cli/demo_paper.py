@@ -114,7 +114,7 @@ def _evaluated(console: Console, folder: Path, machine: Machine, load: float | N
 
 
 def _shown(found: tables.Table) -> Table:
-    table = Table(title=found.title, title_justify="left")
+    table = Table(title=found.title, title_justify="left", box=None)
     for number, column in enumerate(found.columns):
         table.add_column(column, justify="right" if number else "left")
     for row in found.rows:

@@ -124,7 +124,7 @@ class DemoReport:
 
     def table(self) -> Table:
         """Return the figures for the terminal."""
-        table = Table(title="The flight", title_justify="left", show_header=False)
+        table = Table(title="The flight", title_justify="left", show_header=False, box=None)
         seen = "never seen" if self.share_in_view is None else f"{self.share_in_view:.1%} of {self.frames} frames"
         rows = [
             ("marker in view since first seen", seen),

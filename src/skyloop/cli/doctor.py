@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Annotated, Final
 
+import msgspec
 import typer
 from rich.console import Console
 
@@ -22,11 +23,29 @@ IMPORT_BUDGET_S: Final = 0.3
 #: Each optional part: the extra's name, what it is for, and the modules that it needs.
 EXTRAS: Final = (
     ("sim", "simulator's cameras", ("cv2",)),
+    ("mujoco", "simulator with meshes and shadows", ("mujoco", "cv2")),
     ("vision", "markers and other vision", ("cv2", "PIL")),
     ("video", "recorded video, H.264", ("av",)),
     ("control", "poses and splines", ("scipy",)),
     ("mavlink", "ArduCopter and PX4", ("pymavlink", "serial")),
     ("cockpit", "page in the browser", ("starlette", "uvicorn", "websockets", "cv2")),
+    ("record", "recordings", ("mcap", "foxglove_schemas_protobuf", "google.protobuf", "cv2")),
+    ("parquet", "tables as Parquet", ("pyarrow",)),
+    ("network", "network and its keys", ("zenoh", "cryptography", "cv2")),
+    ("mocap", "motion capture", ("motioncapture", "scipy")),
+    ("gym", "reinforcement learning", ("gymnasium", "cv2")),
+    ("bench", "figures and diagrams", ("matplotlib",)),
+    ("ray", "processors on a Ray cluster", ("ray",)),
+)
+
+#: Ports that Skyloop listens at, or vehicles send to, and for what.
+PORTS: Final = (
+    ("UDP", 14550, "MAVLink ground stations"),
+    ("UDP", 14540, "PX4"),
+    ("UDP", 8890, "Tello's state"),
+    ("UDP", 11111, "Tello's video"),
+    ("UDP", 5554, "AR.Drone's navdata"),
+    ("TCP", 7447, "routers"),
 )
 
 
@@ -34,8 +53,9 @@ def doctor(
     address: Annotated[
         str, typer.Argument(metavar="[ADDRESS]", help="Of a vehicle to check instead; nothing is flown")
     ] = "",
+    json: Annotated[bool, typer.Option("--json", help="For programs: one JSON array")] = False,
 ) -> None:
-    """Check Python, the local transport, the optional parts, the drivers and the running proxies; or one vehicle.
+    """Check Python, the local transport, every optional part, cameras, ports, drivers and proxies; or one vehicle.
 
     Marks: ✓ works, – optional and not there, or a vehicle's safety net that is off, ✗ broken. The exit code is 1 if
     something is broken.
@@ -45,8 +65,11 @@ def doctor(
     console = Console(soft_wrap=True)
     findings = []
     for finding in examine_vehicle(address) if address else examine():
-        console.print(as_text(finding))
+        if not json:
+            console.print(as_text(finding))
         findings.append(finding)
+    if json:
+        typer.echo(msgspec.json.encode(findings).decode())
     if any(finding.health is Health.BAD for finding in findings):
         raise typer.Exit(1)
 
@@ -58,6 +81,9 @@ def examine() -> Iterator[Finding]:
         "local transport": _local_transport,
         "import skyloop": _import_time,
         "optional parts": _extras,
+        "cameras": _cameras,
+        "browser": _browser,
+        "ports": _ports,
         "drivers": _drivers,
         "proxies": _proxies,
     }
@@ -138,6 +164,51 @@ def _extras() -> Iterator[Finding]:
             yield Finding(what, Health.MISSING, f"{' and '.join(missing)} not installed", install)
         else:
             yield Finding(what, Health.GOOD, ", ".join(versions))
+
+
+def _cameras() -> Iterator[Finding]:
+    from skyloop.drivers.video.devices import cameras
+
+    found = cameras()
+    for camera in found:
+        health = Health.GOOD if camera.allowed else Health.MISSING
+        yield Finding("camera", health, str(camera))
+    if not found:
+        yield Finding("cameras", Health.MISSING, "none is connected", "for video:///dev/video0: connect a webcam")
+
+
+def _browser() -> Iterator[Finding]:
+    import webbrowser
+
+    try:
+        found = webbrowser.get()
+    except webbrowser.Error:
+        yield Finding(
+            "browser", Health.MISSING, "none is found here", "open the cockpit's address from another machine"
+        )
+    else:
+        yield Finding("browser", Health.GOOD, getattr(found, "name", type(found).__name__))
+
+
+def _ports() -> Iterator[Finding]:
+    taken = [f"{kind} {port} ({use})" for kind, port, use in PORTS if not _free(kind, port)]
+    if taken:
+        advice = "fine if a proxy of yours has them; else end the other program, such as a ground station"
+        yield Finding("ports", Health.MISSING, f"in use: {', '.join(taken)}", advice)
+    else:
+        yield Finding("ports", Health.GOOD, f"free: {', '.join(f'{kind} {port}' for kind, port, _ in PORTS)}")
+
+
+def _free(kind: str, port: int) -> bool:
+    """Whether a program could listen there."""
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM if kind == "TCP" else socket.SOCK_DGRAM) as probe:
+        if kind == "TCP":  # as servers do: a port that was just closed is free
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("", port))
+        except OSError:
+            return False
+    return True
 
 
 def _drivers() -> Iterator[Finding]:

@@ -13,6 +13,7 @@ import typer
 
 from skyloop.cli.completion import python_files
 from skyloop.cli.flight import Flight
+from skyloop.cli.flight_progress import FlightProgress
 from skyloop.cli.naming import DroneOption, KeysOption, NetworkOption, OptionalNameArgument, join_network, one_drone
 from skyloop.errors import UsageError
 
@@ -56,6 +57,8 @@ def fly(
     keys: KeysOption = None,
 ) -> None:
     """Take off, run a controller, land. Without NAME a simulated drone flies.
+
+    One line on standard error shows how it goes, in a pipe one every 5 seconds.
 
     Ctrl-C lands too, and so does an error in the controller without --reload.
     """
@@ -107,8 +110,9 @@ def _run(flight: Flight, drone: Drone, seconds: float | None, reloader: Reloader
             _print(f"taking off with {drone.name}")
             drone.takeoff()
         if reloader is None:
-            return flight.run(seconds)
-        with reloader:
+            with FlightProgress(drone):
+                return flight.run(seconds)
+        with reloader, FlightProgress(drone):
             return flight.run_reloading(seconds, reloader, lambda found: make(found, drone))
     except KeyboardInterrupt:
         _print("stopped by Ctrl-C")

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 from rich.console import Console
 
+from skyloop.cli.completion import recordings
 from skyloop.cli.text import console
 from skyloop.errors import FileFormatError, UsageError
 
@@ -21,7 +22,10 @@ if TYPE_CHECKING:
 
 log = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 
-File = Annotated[Path, typer.Argument(metavar="FILE", help="A recording: an MCAP file that Skyloop wrote")]
+File = Annotated[
+    Path,
+    typer.Argument(metavar="FILE", help="A recording: an MCAP file that Skyloop wrote", autocompletion=recordings),
+]
 DroneName = Annotated[str | None, typer.Option("--drone", metavar="NAME", help="Which one (default: the first)")]
 _EXAMPLE: Final = "Example: skyloop log "
 
@@ -159,14 +163,18 @@ def export(
     epilog=f"{_EXAMPLE}compare old.mcap new.mcap -o both.html",
 )
 def compare(
-    old: Annotated[Path, typer.Argument(metavar="OLD", help="A recording")],
-    new: Annotated[Path, typer.Argument(metavar="NEW", help="Another, such as one of a replay of the first")],
+    old: Annotated[Path, typer.Argument(metavar="OLD", help="A recording", autocompletion=recordings)],
+    new: Annotated[
+        Path,
+        typer.Argument(metavar="NEW", help="Another, such as one of a replay of the first", autocompletion=recordings),
+    ],
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="PAGE", help="Draw them: a .html page or a .png picture")
     ] = None,
     drone: DroneName = None,
     what: Annotated[Which, typer.Option(help="What applications asked for, or what was applied")] = Which.ASKED,
     part: Annotated[float, typer.Option(min=0.0, help="They part where set-points differ by more [SI unit]")] = 0.01,
+    json: Annotated[bool, typer.Option("--json", help="For programs: one JSON object")] = False,
 ) -> None:
     """How a changed controller's commands differ from the old one's: RMS of each set-point, and where they part."""
     from skyloop.cli import log_tables
@@ -176,7 +184,10 @@ def compare(
         raise UsageError(f"{output} can't be drawn: its name must end in .html or .png")
     older, newer = _open(old), _open(new)
     found = commands_of(older, newer, drone=drone, what=what.value, part=part)
-    console().print(log_tables.comparison(found, str(old), str(new)))
+    if json:
+        typer.echo(log_tables.comparison_json(found))
+    else:
+        console().print(log_tables.comparison(found, str(old), str(new)))
     if output is not None:
         from skyloop.recording.review.compare_page import write_comparison
 

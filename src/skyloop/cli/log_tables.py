@@ -11,6 +11,7 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
+from skyloop.cli.text import named
 from skyloop.clock import NS_PER_S
 from skyloop.logfile.listing import Described
 from skyloop.logfile.reader import Recording
@@ -106,11 +107,19 @@ def _losses(summary: Summary) -> Iterator[str]:
                 yield f"{drone}: {words} {what}"
 
 
+def comparison_json(found: Comparison) -> str:
+    """Return all that ``skyloop log compare --json`` prints."""
+    shown = {
+        name: getattr(found, name) for name in ("aligned", "seconds", "same_action", "fields", "part_at_s", "counts")
+    }
+    return msgspec.json.encode(shown).decode()
+
+
 def comparison(found: Comparison, old: str, new: str) -> Table:
     """Return the differences of two recordings."""
     parts = "they never part" if found.part_at_s is None else f"they part at {found.part_at_s:.2f} s"
     table = Table(
-        "set-point",
+        named("set-point"),
         "RMS",
         "largest",
         "at",

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Column
 
 _PIPE_COLUMNS: Final = 10_000
 
@@ -18,6 +19,13 @@ def columns(rows: Iterable[tuple[str, ...]]) -> list[str]:
     table = list(rows)
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in table]
+
+
+def named(title: str) -> Column:
+    """Return a column of a table whose words are never cut: in a narrow terminal they go on below."""
+    from rich.table import Column
+
+    return Column(title, overflow="fold")
 
 
 def console() -> Console:

@@ -17,6 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 from skyloop.cli.naming import DroneOption, KeysOption, NameArgument, NetworkOption, join_network, one_drone
+from skyloop.cli.text import named
 from skyloop.messages import Event, Failsafe, Feedback, Severity
 
 if TYPE_CHECKING:
@@ -152,7 +153,7 @@ def _state(drone: Drone) -> Table:
 
 def channels(drone: Drone) -> Table:
     """Return rates, delays and ages, a line for each channel."""
-    table = Table("channel", "rate", "delay median", "p99", "age", "lost", "dropped", box=None)
+    table = Table(named("channel"), "rate", "delay median", "p99", "age", "lost", "dropped", box=None)
     for name, channel in drone.stats.items():
         delay = channel.delay_s
         table.add_row(

@@ -12,6 +12,7 @@ from typing import Final
 from skyloop.drivers.base import reject_unknown_options
 from skyloop.drivers.intrinsics import INTRINSICS_OPTIONS, check_intrinsics
 from skyloop.drivers.uri import VehicleUri
+from skyloop.drivers.video.devices import cameras, described
 from skyloop.drivers.video.sources import DEFAULT_FPS, is_device
 from skyloop.errors import UsageError
 from skyloop.files import expand
@@ -44,9 +45,14 @@ def options_of(uri: VehicleUri) -> VideoOptions:
     """
     reject_unknown_options(uri, KNOWN)
     if not uri.place:
-        raise UsageError(f"{uri} names no file: it looks like video:///home/me/flight.mp4 or video:///dev/video0")
+        raise UsageError(
+            f"{uri} names no file and no camera: it looks like video:///home/me/flight.mp4 or video:///dev/video0; "
+            f"{described(cameras())}"
+        )
     path = expand(uri.place)
     live = is_device(path)
+    if live and not path.exists():
+        raise UsageError(f"{uri}: there is no {path}; {described(cameras())}")
     if not live and (given := _DEVICE_OPTIONS & uri.options.keys()):
         raise UsageError(f"{uri}: {', '.join(sorted(given))} can be asked of a device only, not of a file")
     camera = uri.options.get("camera", "front")
