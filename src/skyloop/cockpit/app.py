@@ -37,6 +37,8 @@ from skyloop.cockpit.fleet_control import FleetSession
 from skyloop.cockpit.page_files import PageFiles
 from skyloop.cockpit.recordings import Recordings
 from skyloop.cockpit.recordings_api import RecordingsApi
+from skyloop.cockpit.routes import RouteFiles
+from skyloop.cockpit.routes_api import RoutesApi
 from skyloop.cockpit.security import NOT_ALLOWED, Guard, Names, person_of
 from skyloop.cockpit.small_video import SmallVideoSender
 from skyloop.cockpit.station import Station
@@ -131,7 +133,7 @@ class Cockpit:
         if person is None or not person.may(Role.PILOT):
             await socket.close(NOT_ALLOWED, "this needs a pilot")
             return
-        await ControlSession(socket, station, person.name).run()
+        await ControlSession(socket, station, person.name, photos=self._recordings.folder / "photos").run()
 
     async def _accept(self, socket: WebSocket) -> Station | None:
         """Return the station of the drone that is asked for; None, and the socket is closed, if there is none."""
@@ -171,6 +173,7 @@ def create_app(
             *api.routes(),
             *RecordingsApi(fleet, recordings).routes(),
             *WorldApi(fleet, recordings, world).routes(),
+            *RoutesApi(fleet, RouteFiles(recordings.folder / "routes")).routes(),
             WebSocketRoute("/ws/overview", cockpit.overview),
             WebSocketRoute("/ws/video", cockpit.small_video),
             WebSocketRoute("/ws/control", cockpit.all_drones),

@@ -87,6 +87,28 @@ class GoTo(Command, frozen=True, tag="goto"):
     yaw: float | None = None
 
 
+class FlyRoute(Command, frozen=True, tag="route"):
+    """Fly along a route that was checked: ``id`` is of the check's answer."""
+
+    id: Annotated[str, msgspec.Meta(max_length=64)]
+
+
+class PauseRoute(Command, frozen=True, tag="route_pause"):
+    """Hover until the route is resumed."""
+
+
+class ResumeRoute(Command, frozen=True, tag="route_resume"):
+    """Fly on to the waypoint that comes next."""
+
+
+class SkipWaypoint(Command, frozen=True, tag="route_skip"):
+    """Leave the present waypoint out."""
+
+
+class StopRoute(Command, frozen=True, tag="route_stop"):
+    """Hover, and end the route."""
+
+
 class Write(Command, frozen=True, tag="set"):
     """Write a parameter."""
 
@@ -108,7 +130,25 @@ class StopAll(Command, frozen=True, tag="stop_all"):
     """Cut the motors of every drone; needs no authority."""
 
 
-AnyCommand = Take | Release | Answer | TakeOff | HoverHere | LandHere | Stop | Reset | Fly | GoTo | Write | Alive
+AnyCommand = (
+    Take
+    | Release
+    | Answer
+    | TakeOff
+    | HoverHere
+    | LandHere
+    | Stop
+    | Reset
+    | Fly
+    | GoTo
+    | Write
+    | Alive
+    | FlyRoute
+    | PauseRoute
+    | ResumeRoute
+    | SkipWaypoint
+    | StopRoute
+)
 
 AnyFleetCommand = LandAll | StopAll | Alive
 

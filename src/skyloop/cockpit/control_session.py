@@ -15,6 +15,7 @@ import asyncio
 import itertools
 from collections.abc import Callable, Coroutine
 from contextlib import suppress
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from starlette.websockets import WebSocket
@@ -28,12 +29,17 @@ from skyloop.cockpit.commands import (
     Answer,
     AnyCommand,
     Fly,
+    FlyRoute,
     GoTo,
     HoverHere,
     LandHere,
+    PauseRoute,
     Release,
     Reset,
+    ResumeRoute,
+    SkipWaypoint,
     Stop,
+    StopRoute,
     Take,
     TakeOff,
     Write,
@@ -42,8 +48,10 @@ from skyloop.cockpit.commands import (
     untimely,
 )
 from skyloop.cockpit.feeds import call_soon
+from skyloop.cockpit.route_session import RouteSession
 from skyloop.cockpit.stream import PageSocket
 from skyloop.cockpit.takeover import QueuePosition, TakeoverDialog
+from skyloop.control.route_flight import check_for
 from skyloop.control.waypoint import Waypoint, lacking, reached
 from skyloop.errors import AuthorityError, DecodeError, LinkError, RefusedError, SkyloopError
 from skyloop.messages import EventKind, FlightState, Land, LinkState, Position, Takeoff
@@ -71,7 +79,15 @@ Json = dict[str, Any]
 class ControlSession:
     """Serves one control socket of a page, from its opening to its end. On the event loop."""
 
-    def __init__(self, socket: WebSocket, station: Station, person: str = "", clock: Clock = monotonic_ns) -> None:
+    def __init__(
+        self,
+        socket: WebSocket,
+        station: Station,
+        person: str = "",
+        clock: Clock = monotonic_ns,
+        *,
+        photos: Path = Path("photos"),
+    ) -> None:
         """Prepare the session; :meth:`run` serves it.
 
         Args:
@@ -79,6 +95,7 @@ class ControlSession:
             station: The drone.
             person: The name of who flies, if it is known.
             clock: The monotonic clock [ns].
+            photos: Where photos of routes are saved, in a folder of the drone's name.
         """
         self._page = PageSocket(socket)
         self._send = self._page.send
@@ -90,6 +107,8 @@ class ControlSession:
         self._jobs: set[asyncio.Task[None]] = set()
         self._turn = asyncio.Lock()  # what waits for the proxy is done one after the other
         self._goto: asyncio.Task[None] | None = None
+        self._route: RouteSession | None = None
+        self._photos = photos / station.found.name
         self._steering = False  # by sticks: the newest set-point is a velocity of this page
         self._silence: asyncio.TimerHandle | None = None
         #: As the page was sent it last: state, holder, its priority, position in the queue, how control was lost.
@@ -114,6 +133,11 @@ class ControlSession:
             Stop: self._stop_motors,
             Fly: self._fly,
             GoTo: self._go_to,
+            FlyRoute: lambda command: self._run_in_turn(command, self._fly_route),
+            PauseRoute: lambda command: self._steer_route(command, RouteSession.pause),
+            ResumeRoute: lambda command: self._steer_route(command, RouteSession.resume),
+            SkipWaypoint: lambda command: self._steer_route(command, RouteSession.skip),
+            StopRoute: lambda command: self._steer_route(command, RouteSession.end),
             Write: lambda command: self._run_in_turn(command, self._write),
         }
 
@@ -216,6 +240,46 @@ class ControlSession:
         self._acknowledge(command)
         self._restart_silence_timer()
 
+    async def _fly_route(self, command: FlyRoute) -> None:
+        """Check a route again, as much may have changed, and fly it."""
+        route = self._station.routes.get(command.id)
+        self._held()
+        check = await asyncio.to_thread(check_for, self._station.drone, route, wait_s=0.0)
+        problem = next((one.reason for one in check.findings if one.severity == "error"), "")
+        if problem := problem or untimely(command, seconds(self._clock())):
+            raise RefusedError(f"the route can't be flown: {problem}")
+        pilot = self._held()
+        self._end_flight()
+        self._end_route()
+        self._route = RouteSession(route, pilot, self._station.drone, self._photos, self._send, self._aim)
+        self._route.begin()
+        self._acknowledge(command)
+        self._restart_silence_timer()
+
+    def _steer_route(self, command: AnyCommand, act: Callable[[RouteSession], None]) -> None:
+        self._held()
+        route = self._route
+        if route is None or route.law.over:
+            raise RefusedError("no route is flown from this page")
+        if isinstance(command, ResumeRoute):
+            self._end_flight()
+        act(route)
+        self._acknowledge(command)
+        self._restart_silence_timer()
+
+    def _aim(self, goal: Waypoint | None) -> None:
+        """Show where a route flies to."""
+        if goal is None:
+            self._station.goals.pop(self.app, None)
+        else:
+            self._station.goals[self.app] = goal
+
+    def _end_route(self) -> None:
+        """End the route for good, as its connection ends or another begins; the vehicle is commanded elsewhere."""
+        if self._route is not None:
+            self._route.end(hover=False)
+            self._route = None
+
     def _stop_motors(self, command: Stop) -> None:
         self._end_flight()
         self._start_job(self._cut_motors(command))
@@ -270,6 +334,7 @@ class ControlSession:
 
     async def _close_pilot(self) -> None:
         """Without the authority a page needs no connection of its own."""
+        self._end_route()
         pilot, self._pilot = self._pilot, None
         if pilot is not None:
             await self._station.close_pilot(pilot)
@@ -334,18 +399,25 @@ class ControlSession:
         if self._silence is not None:
             self._silence.cancel()
             self._silence = None
-        if self._steering or self._goto is not None:
+        if self._is_under_way:
             self._silence = asyncio.get_running_loop().call_later(SILENT_S, self._on_silence)
 
     def _on_silence(self) -> None:
         self._silence = None
-        if self._steering or self._goto is not None:
+        if self._is_under_way:
             self._hover()
             self._refuse(self._last_command, f"the page was silent for {SILENT_S:g} s: the vehicle hovers")
 
+    @property
+    def _is_under_way(self) -> bool:
+        """Whether this page has the vehicle under way: by sticks, to a waypoint or along a route."""
+        return self._steering or self._goto is not None or (self._route is not None and self._route.is_under_way)
+
     def _end_flight(self) -> None:
-        """End what the page flew before."""
+        """End what the page flew before; a route is paused, and may be resumed."""
         self._steering = False
+        if self._route is not None:
+            self._route.pause("something else was commanded, or the page was away", hover=False)
         self._awaited = None
         if self._goto is not None:
             self._goto.cancel()
@@ -354,7 +426,7 @@ class ControlSession:
 
     def _hover(self) -> None:
         """Hover if this page has the vehicle under way; a take-off or landing under way ends safely by itself."""
-        flies = self._steering or self._goto is not None
+        flies = self._is_under_way
         self._end_flight()
         pilot = self._pilot
         if pilot is not None and (flies or pilot.is_flying):
@@ -455,6 +527,11 @@ class ControlSession:
             return
         self._takeover.on_event(event, pilot)
         ours = event.kind is EventKind.COMMAND_REFUSED and event.app == self.app
+        if ours and self._route is not None and self._route.is_under_way:
+            if event.data.get("reason") not in OF_ONE_PACKET:
+                self._route.pause(event.text, hover=False)
+                self._hover_if_held(pilot)
+            return
         if not ours or self._refused_command == self._commands or event.data.get("reason") in OF_ONE_PACKET:
             return  # its repeats are refused too: nothing new
         self._refused_command = self._commands

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 from skyloop.clock import monotonic_ns, seconds
 from skyloop.cockpit.discovery import Found
 from skyloop.cockpit.feeds import CameraFeed, EventFeed, LogFeed, PeriodicBroadcast
+from skyloop.cockpit.routes import CheckedRoutes
 from skyloop.cockpit.small_feed import SmallFeed
 from skyloop.cockpit.telemetry import TelemetryView
 from skyloop.cockpit.thresholds import ThresholdReader
@@ -41,6 +42,7 @@ class Station:
         self.cameras: dict[str, CameraFeed] = {}
         self.small: dict[tuple[str, int], SmallFeed] = {}  #: by camera and width [pixels]
         self.goals: dict[str, Waypoint] = {}  #: where pages fly it to, by the name of the application that does
+        self.routes = CheckedRoutes()
         self.pilots: set[PilotConnection] = set()  #: pilots' connections of pages
         self.thresholds = ThresholdReader(drone)
         self.view = TelemetryView(self)

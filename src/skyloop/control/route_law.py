@@ -96,6 +96,11 @@ class RouteLaw:
         """Whether it commands the vehicle now."""
         return self.state in (RouteState.FLYING, RouteState.ACTING)
 
+    @property
+    def goal(self) -> Waypoint:
+        """Where it flies to, or is."""
+        return self._goals[self.index].goal
+
     # What somebody wants ----------------------------------------------------------------------------------------
 
     def start(self, feedback: Feedback) -> list[Effect]:

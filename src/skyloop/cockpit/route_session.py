@@ -1,0 +1,156 @@
+"""One page's flight along a route: the course is :class:`skyloop.control.route_law.RouteLaw`'s. On the event loop."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from skyloop.control.route_flight import save_photo
+from skyloop.control.route_law import Command, Effect, Progress, RouteLaw, TakePhoto
+from skyloop.errors import LinkError, RefusedError, SkyloopError
+from skyloop.messages import Hover, Land, Position
+
+if TYPE_CHECKING:
+    from skyloop.client import Drone
+    from skyloop.cockpit.pilot_connection import PilotConnection
+    from skyloop.control.route import Route
+    from skyloop.control.waypoint import Waypoint
+
+PERIOD_S: Final = 0.05  #: between two looks at the feedback
+OLD_S: Final = 1.0  #: feedback that is older pauses the route
+
+
+class RouteSession:
+    """A page's flight along a route.
+
+    Args:
+        route: Checked.
+        pilot: Holds the authority.
+        drone: Whose frames are saved.
+        folder: Where photos are saved.
+        send: Sends a message to the page.
+        aim: Called with where it flies to now; None for nowhere.
+    """
+
+    def __init__(
+        self,
+        route: Route,
+        pilot: PilotConnection,
+        drone: Drone,
+        folder: Path,
+        send: Callable[[dict[str, Any]], None],
+        aim: Callable[[Waypoint | None], None],
+    ) -> None:
+        self.law = RouteLaw(route)
+        self._pilot = pilot
+        self._drone = drone
+        self._folder = folder
+        self._send = send
+        self._aim = aim
+        self._action: Position | None = None
+        self._photos: set[asyncio.Task[None]] = set()
+        self._job: asyncio.Task[None] | None = None
+
+    @property
+    def is_under_way(self) -> bool:
+        """Whether it commands the vehicle now."""
+        return self.law.is_under_way
+
+    def begin(self) -> None:
+        """Fly to the first waypoint, and watch the flight on a task until :meth:`end`.
+
+        Raises:
+            SkyloopError: The drone is on the ground, its position is not known, or the command was not sent.
+        """
+        self._carry_out(self.law.start(self._pilot.feedback(max_age_s=OLD_S)))
+        self._job = asyncio.create_task(self._watch())
+
+    def pause(self, why: str = "", *, hover: bool = True) -> None:
+        """Pause; without ``hover`` because something else was commanded, or the control is gone."""
+        self._carry_out(self.law.pause(why), send=hover)
+
+    def resume(self) -> None:
+        """Fly on."""
+        self._ask(self.law.resume)
+
+    def skip(self) -> None:
+        """Leave the present waypoint out."""
+        self._ask(self.law.skip)
+
+    def end(self, *, hover: bool = True) -> None:
+        """End it for good; without ``hover`` because something else was commanded, or the control is gone."""
+        if self._job is not None:
+            self._job.cancel()
+        self._carry_out(self.law.stop(), send=hover)
+
+    def _ask(self, what: Callable[[], list[Effect]]) -> None:
+        try:
+            self._carry_out(what())
+        except SkyloopError as error:
+            self.pause(str(error), hover=False)
+            raise
+
+    async def _watch(self) -> None:
+        while not self.law.over:
+            await asyncio.sleep(PERIOD_S)
+            if self.is_under_way:
+                self._step()
+
+    def _step(self) -> None:
+        try:
+            if self._action is not None and self._pilot.has_ended(self._action):
+                raise RefusedError("it was ended on the way, by a failsafe or a lost link")
+            feedback = self._pilot.feedback(max_age_s=OLD_S)
+            self._carry_out(self.law.update(feedback, feedback.captured_ns))
+        except SkyloopError as error:
+            self.pause(str(error), hover=False)
+            with suppress(SkyloopError):  # somebody else has it, or the link is lost: then the proxy sees to it
+                self._pilot.hover()
+
+    def _carry_out(self, effects: list[Effect], *, send: bool = True) -> None:
+        for effect in effects:
+            if isinstance(effect, Command):
+                self._action = effect.action if isinstance(effect.action, Position) else None
+                if send:
+                    self._command(effect.action)
+            elif isinstance(effect, TakePhoto):
+                task = asyncio.create_task(self._photograph(effect))
+                self._photos.add(task)
+                task.add_done_callback(self._photos.discard)
+            else:
+                self._tell(effect)
+        if effects:
+            self._aim(self.law.goal if self.law.is_under_way else None)
+
+    def _command(self, action: Position | Hover | Land) -> None:
+        pilot = self._pilot
+        if pilot.command(action):
+            return
+        with suppress(SkyloopError):
+            pilot.idle()  # or it would be done after all when the link is back soon
+        raise LinkError(f"{action.name} was not sent: the link to the proxy is {pilot.link.application}")
+
+    def _tell(self, step: Progress) -> None:
+        law = self.law
+        self._send(
+            {
+                "type": "route",
+                "state": str(law.state),
+                "kind": step.kind,
+                "waypoint": step.waypoint,
+                "of": len(law.route.waypoints),
+                "text": step.text,
+                "problem": law.problem,
+            }
+        )
+
+    async def _photograph(self, wanted: TakePhoto) -> None:
+        try:
+            await asyncio.to_thread(save_photo, self._drone, self._folder, wanted)
+        except SkyloopError as error:
+            self.law.photo_done(str(error))
+        else:
+            self.law.photo_done()

@@ -1,0 +1,121 @@
+"""Routes of the page: files in one folder, and those that were checked and may be flown."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections import OrderedDict
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from skyloop.control.route import ENDING, Route, checked, load_route, save_route
+from skyloop.control.route_check import RouteCheck
+from skyloop.errors import RefusedError, SkyloopError, UnknownNameError, UsageError
+
+MOST_FILES: Final = 200
+MOST_CHECKED: Final = 16
+_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9 _.-]{0,47}")
+
+Json = dict[str, Any]
+
+
+class RouteFiles:
+    """The routes of one folder, ``NAME.route.json`` each. Its methods read and write files: call them on a thread.
+
+    Args:
+        folder: Made when it is needed.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def listing(self) -> Json:
+        """Return the routes as JSON values, by name; a file that is none has a problem."""
+        files = sorted(self.folder.glob(f"*{ENDING}"))[:MOST_FILES] if self.folder.is_dir() else []
+        return {"folder": str(self.folder), "routes": [self._entry(path) for path in files]}
+
+    def load(self, name: str) -> Route:
+        """Read a route.
+
+        Raises:
+            UnknownNameError: There is none of that name.
+            SkyloopError: It can't be read.
+        """
+        path = self._path(name)
+        if not path.is_file():
+            raise UnknownNameError("route", name, [one.name.removesuffix(ENDING) for one in self._files()])
+        return load_route(path)
+
+    def save(self, name: str, route: Route) -> None:
+        """Write a route; one that is there is replaced.
+
+        Raises:
+            UsageError: The name can't be one, or it can't be written.
+            RefusedError: There are :data:`MOST_FILES` already.
+        """
+        path = self._path(name)
+        if not path.exists() and len(self._files()) >= MOST_FILES:
+            raise RefusedError(f"{MOST_FILES} routes are kept in {self.folder}: delete one first")
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UsageError(f"{self.folder} can't be made: {error.strerror or error}") from None
+        save_route(msgspec.structs.replace(route, name=name), path)
+
+    def delete(self, name: str) -> None:
+        """Delete a route.
+
+        Raises:
+            UnknownNameError: There is none of that name.
+            UsageError: The name can't be one, or the file can't be deleted.
+        """
+        path = self._path(name)
+        try:
+            path.unlink()
+        except FileNotFoundError:
+            raise UnknownNameError("route", name, [one.name.removesuffix(ENDING) for one in self._files()]) from None
+        except OSError as error:
+            raise UsageError(f"{path} can't be deleted: {error.strerror or error}") from None
+
+    def _files(self) -> list[Path]:
+        return sorted(self.folder.glob(f"*{ENDING}")) if self.folder.is_dir() else []
+
+    def _path(self, name: str) -> Path:
+        if not _NAME.fullmatch(name):
+            raise UsageError(f"{name!r:.60} is no name of a route: up to 48 letters, digits, spaces and _ . -")
+        return self.folder / f"{name}{ENDING}"
+
+    def _entry(self, path: Path) -> Json:
+        name = path.name.removesuffix(ENDING)
+        try:
+            return {"name": name, "waypoints": len(load_route(path).waypoints), "problem": None}
+        except SkyloopError as error:
+            return {"name": name, "waypoints": None, "problem": str(error)}
+
+
+class CheckedRoutes:
+    """The routes of one drone that were checked last, by a number of their content: what is flown was checked."""
+
+    def __init__(self) -> None:
+        self._routes: OrderedDict[str, Route] = OrderedDict()
+
+    def add(self, route: Route, check: RouteCheck) -> Json:
+        """Keep a route, and return what was found as JSON values, with the ``id`` by which it is flown."""
+        number = hashlib.sha256(checked(route).to_json()).hexdigest()[:16]
+        self._routes[number] = route
+        self._routes.move_to_end(number)
+        while len(self._routes) > MOST_CHECKED:
+            self._routes.popitem(last=False)
+        return {"id": number, "ok": check.ok, **msgspec.to_builtins(check)}
+
+    def get(self, number: str) -> Route:
+        """Return a route.
+
+        Raises:
+            RefusedError: It was not checked, or too many others were since.
+        """
+        if number not in self._routes:
+            raise RefusedError("this route was not checked, or long ago: check it again")
+        return self._routes[number]
