@@ -20,6 +20,13 @@ export class History {
     this.written += 1;
   }
 
+  /** Forget everything but the names. */
+  clear(): void {
+    this.written = 0;
+    this.times.fill(Number.NaN);
+    for (const one of this.series.values()) one.fill(Number.NaN);
+  }
+
   /** Time and values since `from_s`, oldest first; null for what was not known. */
   since(from_s: number, names: readonly string[]): (number | null)[][] {
     const rows: (number | null)[][] = [[], ...names.map(() => [])];
@@ -65,5 +72,9 @@ export class Trail {
     const far = !last || Math.hypot(place[0] - last[0], place[1] - last[1], place[2] - last[2]) >= this.step_m;
     if (far) this.points.push({ at_s, place });
     while (this.points[0] && this.points[0].at_s < at_s - this.kept_s) this.points.shift();
+  }
+
+  clear(): void {
+    this.points = [];
   }
 }

@@ -6,6 +6,7 @@ import "./style/layout.css";
 import "./style/parts.css";
 import "./style/overview.css";
 import "./style/alarms.css";
+import "./style/replay.css";
 import { hashOf, namesOf, OVERVIEW } from "./address.js";
 import { AlarmBook } from "./alarms.js";
 import { AlarmSound } from "./alarmsound.js";

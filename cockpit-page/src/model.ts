@@ -211,12 +211,16 @@ export interface PastRecording {
   drones: string[];
   seconds: number | null;
   problem: string | null;
+  /** The beginning of what people wrote about it. */
+  note: string;
+  marks: number;
 }
 
 export interface Recordings {
   folder: string;
   running: RunningRecording[];
   past: PastRecording[];
+  trash: { count: number; bytes: number };
 }
 
 export type Shape =

@@ -12,15 +12,18 @@ import { Deck } from "./deck.js";
 import { h, setAttribute, setHidden, setText, setTone, type Tone } from "./dom.js";
 import { Events } from "./events.js";
 import { words } from "./format.js";
-import { History, Trail } from "./history.js";
+import { History, KEPT_S, Trail } from "./history.js";
 import type { Countdown } from "./hold.js";
 import { Instruments } from "./instruments.js";
+import { t } from "./language/index.js";
 import type { Deed } from "./keys.js";
 import { MapPanel } from "./mappanel.js";
 import type { Alarm, DroneRow, State, Sticks, Vector, Vehicle } from "./model.js";
 import { Parameters } from "./parameters.js";
 import { Pilot } from "./pilot.js";
 import { Plots } from "./plots.js";
+import { ReplayBar } from "./replaybar.js";
+import { before, type Playback, playbackOf, type Timeline } from "./replaytime.js";
 import { isRecording, type Target } from "./safety.js";
 import type { SceneView } from "./scene.js";
 import { LastingSocket } from "./socket.js";
@@ -92,6 +95,10 @@ export class Pane {
   private readonly channels = new Channels();
   private readonly parameters: Parameters;
   private readonly controls: CameraControls;
+  /** Of a replay: its bar, where it is, and the flight as far as the cockpit knows it. */
+  private bar: ReplayBar | null = null;
+  private playback: Playback | null = null;
+  private timeline: Timeline | null = null;
   private scene: SceneView | null = null;
   private readonly decks: Record<"space" | "plots" | "lists", Deck>;
   private noticed_ms = Number.NEGATIVE_INFINITY;
@@ -117,7 +124,7 @@ export class Pane {
       goTo: (x, y, z) => this.pilot?.goTo(x, y, z),
       write: (parameter, value) => this.writes.write(parameter, value),
     });
-    this.plots = new Plots(this.history, now_s);
+    this.plots = new Plots(this.history, () => this.moment_s);
     this.parameters = new Parameters(name, (parameter, value) => this.pilot?.write(parameter, value));
     this.decks = {
       space: new Deck("space", [{ name: "Map", element: this.map.element }, { name: "3-D", element: this.space, opened: () => void this.openSpace() }], "Map and space"),
@@ -185,6 +192,7 @@ export class Pane {
     if (this.dirty) this.update();
     this.strip.count(this.pilot);
     this.stage.update(now_ms);
+    this.bar?.update(this.playback, this.state?.links.vehicle === "closed", now_ms);
     if (this.decks.space.shown === "Map") this.map.draw(now_ms);
     else this.scene?.draw(now_ms);
     this.plots.draw(now_ms);
@@ -240,20 +248,57 @@ export class Pane {
       setAttribute(this.element, "data-recording", String(this.isRecording));
       this.map.watchOnly(this.isRecording);
       this.map.surroundings.reload();
+      if (message.uri.startsWith("replay:")) this.openBar();
     } else {
       this.state = message;
       this.absent = "";
       this.dated(message);
       this.alarmBook.update(this.found(), performance.now()); // also while nobody sees the page, and nothing is drawn
-      this.history.add(now_s(), message.values);
-      const place = message.position ?? message.truth?.position;
-      if (place) this.trail.add(now_s(), place);
+      this.remember(message);
       this.events.add(message.events);
       if (message.events.some((event) => event.kind === "parameter_changed")) this.map.surroundings.reload();
       if (!message.airborne) this.start = null;
       else this.start ??= message.position;
     }
     this.dirty = true; // shown with the next tick
+  }
+
+  /** The time axis of plots and trail: a replay's own, which stands still and jumps as it does. */
+  private get moment_s(): number {
+    return this.playback?.position_s ?? now_s();
+  }
+
+  private remember(state: State): void {
+    const before_it = this.playback;
+    this.playback = this.bar ? playbackOf(state.values) : null;
+    if (this.playback && this.playback.jumps !== before_it?.jumps) this.rebuild();
+    else if (this.playback && this.playback.position_s === before_it?.position_s) return;
+    this.history.add(this.moment_s, state.values);
+    const place = state.position ?? state.truth?.position;
+    if (place) this.trail.add(this.moment_s, place);
+  }
+
+  /** After a jump no line leads across: plots and trail show the flight before, as far as it is known. */
+  private rebuild(): void {
+    this.history.clear();
+    this.trail.clear();
+    if (this.timeline === null) return;
+    for (const { at_s, values, place } of before(this.timeline, this.moment_s, KEPT_S)) {
+      this.history.add(at_s, values);
+      if (place) this.trail.add(at_s, place);
+    }
+  }
+
+  private openBar(): void {
+    if (this.bar) return;
+    this.bar = new ReplayBar(this.name, this.pilot !== null, {
+      known: (timeline) => {
+        this.timeline = timeline;
+        if (this.playback) this.rebuild();
+      },
+      notify: (text) => this.notify(text, "warn"),
+    });
+    this.stage.append(this.bar.element);
   }
 
   /** When the state was true: it may have been long on its way, and old when it was sent. */
@@ -297,7 +342,7 @@ export class Pane {
     this.instruments.update(live, this.connected && !isOld, pilot?.round_trip_s ?? null);
     if (live) this.channels.update(live);
     if (this.connected && state && !live) this.instruments.lost(state);
-    this.stage.over(over);
+    this.stage.still(over ? t.replay.last : this.playback?.paused ? t.replay.paused : "");
     this.strip.update(vehicle, state, pilot, isOld, recording);
     const [mine, placed] = [(pilot?.mine ?? false) && !isOld && !recording, (live?.position ?? null) !== null];
     const inAir = live?.airborne ?? false;

@@ -1,12 +1,15 @@
-// Recordings: those that run, and those of the past.
+// Recordings: those that run, and those of the past, found and put in order.
 
 import { get, post, errorText } from "./api.js";
-import { h, setDisabled, setHidden, setText } from "./dom.js";
-import { bytes, clock, count } from "./format.js";
+import { h, memory, setDisabled, setHidden, setText } from "./dom.js";
+import { bytes, clock } from "./format.js";
+import { t } from "./language/index.js";
 import type { PastRecording, Recordings, RunningRecording } from "./model.js";
+import { RecordingRow } from "./recordingrow.js";
 
 const PERIOD_MS = 1000;
 const IDLE_PERIODS = 5; // while nothing is recorded it is asked less often
+const FEW = 3; // are seen at a glance
 
 /** Samples that a recording lacks: received and left out, or never received. */
 export function lacking(recording: Pick<RunningRecording, "dropped" | "missed">): number {
@@ -14,14 +17,35 @@ export function lacking(recording: Pick<RunningRecording, "dropped" | "missed">)
   return sums.reduce((sum, one) => sum + one, 0);
 }
 
+export type Order = "newest" | "name" | "longest" | "largest";
+const ORDERS: Readonly<Record<Order, (one: PastRecording, other: PastRecording) => number>> = {
+  newest: () => 0, // as they come
+  name: (one, other) => one.name.localeCompare(other.name, undefined, { numeric: true }),
+  longest: (one, other) => (other.seconds ?? 0) - (one.seconds ?? 0),
+  largest: (one, other) => other.size - one.size,
+};
+
+/** Those with every word in their name, drones or note, in an order. */
+export function chosen(past: readonly PastRecording[], words: string, order: Order): PastRecording[] {
+  const wanted = words.toLowerCase().split(/\s+/).filter(Boolean);
+  const text = (one: PastRecording): string => [one.name, ...one.drones, one.note].join(" ").toLowerCase();
+  return past.filter((one) => wanted.every((word) => text(one).includes(word))).sort(ORDERS[order]);
+}
+
 export class RecordingList {
   readonly element: HTMLElement;
-  private readonly start = h("button", { type: "button", class: "small record", onclick: () => void this.begin() }, h("i", { class: "record-dot" }), "Record");
-  private readonly running = h("ul", { class: "running", "aria-live": "polite", "aria-label": "Running recordings" });
-  private readonly past = h("ul", { class: "past", tabindex: 0, "aria-label": "Past recordings" });
-  private readonly none = h("p", { class: "empty" }, "None yet");
+  private readonly start = h("button", { type: "button", class: "small record", onclick: () => void this.begin() }, h("i", { class: "record-dot" }), t.recordings.record);
+  private readonly running = h("ul", { class: "running", "aria-live": "polite", "aria-label": t.recordings.running });
+  private readonly filter = h("input", { type: "search", placeholder: t.recordings.filterShort, "aria-label": t.recordings.filter, oninput: () => this.list() });
+  private readonly order = h("select", { "aria-label": t.recordings.order, onchange: () => this.reorder() });
+  private readonly finding = h("div", { class: "finding", hidden: true }, this.filter, this.order);
+  private readonly past = h("ul", { class: "past", tabindex: 0, "aria-label": t.recordings.past });
+  private readonly none = h("p", { class: "empty" }, t.recordings.none);
   private readonly note = h("p", { class: "note", role: "status" });
-  private known = "";
+  private readonly trash = h("div", { class: "rec-trash", hidden: true });
+  private readonly rows = new Map<string, RecordingRow>();
+  private known: readonly PastRecording[] = [];
+  private trashed = "";
   private round = 0;
   private some = false;
 
@@ -30,7 +54,10 @@ export class RecordingList {
     private readonly replayed: (name: string) => void,
     private readonly pilots: boolean,
   ) {
-    this.element = h("section", { class: "recordings", "aria-label": "Recordings" }, h("h2", {}, "Recordings", pilots ? this.start : null), this.note, this.running, this.past, this.none);
+    this.order.append(...Object.entries(t.recordings.orders).map(([value, label]) => h("option", { value }, label)));
+    this.order.value = memory.get("recordings-order") ?? "newest";
+    if (this.order.value === "") this.order.value = "newest";
+    this.element = h("section", { class: "recordings", "aria-label": t.recordings.title }, h("h2", {}, t.recordings.title, pilots ? this.start : null), this.note, this.running, this.finding, this.past, this.none, this.trash);
     void this.load();
     setInterval(() => this.tick(), PERIOD_MS);
   }
@@ -49,47 +76,84 @@ export class RecordingList {
     }
   }
 
-  private show({ running, past }: Recordings): void {
+  private show({ running, past, trash }: Recordings): void {
     this.some = running.length > 0;
     this.running.replaceChildren(...running.map((one) => this.runningRow(one)));
     setHidden(this.none, running.length + past.length > 0);
-    if (JSON.stringify(past) === this.known) return;
-    this.known = JSON.stringify(past);
-    this.past.replaceChildren(...past.map((one) => this.pastRow(one)));
+    setHidden(this.finding, past.length <= FEW);
+    this.showTrash(trash);
+    this.known = past;
+    this.list();
+  }
+
+  /** Elements stay where they are, unless others are to be shown: somebody may be typing in one. */
+  private list(): void {
+    const names = new Set(this.known.map((one) => one.name));
+    for (const name of [...this.rows.keys()]) if (!names.has(name)) this.rows.delete(name);
+    const few = this.known.length <= FEW;
+    const elements = chosen(this.known, few ? "" : this.filter.value, this.order.value as Order).map((one) => this.row(one).element);
+    const same = elements.length === this.past.children.length && elements.every((element, place) => this.past.children[place] === element);
+    if (!same) this.past.replaceChildren(...elements);
+    if (this.known.length) setText(this.none, t.recordings.noneSuch);
+    else setText(this.none, t.recordings.none);
+    setHidden(this.none, elements.length > 0 || this.some);
+  }
+
+  private reorder(): void {
+    memory.set("recordings-order", this.order.value);
+    this.list();
+  }
+
+  private row(one: PastRecording): RecordingRow {
+    const known = this.rows.get(one.name);
+    if (known) known.update(one);
+    const row = known ?? new RecordingRow(one, { pilots: this.pilots, act: (work) => this.act(work), replayed: this.replayed, thrown: (name) => this.offerUndo(name) });
+    this.rows.set(one.name, row);
+    return row;
   }
 
   private runningRow(one: RunningRecording): HTMLElement {
     const lost = lacking(one);
     const facts = `${clock(one.seconds)} · ${bytes(one.bytes)} · ${lost ? `${lost} dropped` : "none dropped"}`;
-    const stop = h("button", { type: "button", class: "small", "aria-label": `Stop recording ${one.drones.join(", ")}`, onclick: () => void this.act(() => post(`/api/recordings/${one.id}/stop`)) }, "Stop");
-    return h("li", {}, h("span", { class: "rec-name" }, h("i", { class: "record-dot live" }), h("b", {}, one.drones.join(", "))), this.pilots ? stop : null, h("span", { class: lost ? "facts bad" : "facts" }, one.reason ? `${one.state}: ${one.reason}` : facts));
+    const drones = one.drones.join(", ");
+    const mark = h("button", { type: "button", class: "small", "aria-label": t.recordings.markOf(drones), onclick: () => void this.act(() => post(`/api/recordings/${one.id}/mark`, { text: "" }), t.recordings.marked) }, t.recordings.mark);
+    const stop = h("button", { type: "button", class: "small", "aria-label": t.recordings.stopOf(drones), onclick: () => void this.act(() => post(`/api/recordings/${one.id}/stop`)) }, t.recordings.stop);
+    return h("li", {}, h("span", { class: "rec-name" }, h("i", { class: "record-dot live" }), h("b", {}, drones)), this.pilots ? mark : null, this.pilots ? stop : null, h("span", { class: lost ? "facts bad" : "facts" }, one.reason ? `${one.state}: ${one.reason}` : facts));
   }
 
-  private pastRow(one: PastRecording): HTMLElement {
-    const path = `/api/recordings/${encodeURIComponent(one.name)}`;
-    const at = one.started === null ? one.name : new Date(one.started * 1000).toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "short" });
-    const facts = `${one.drones.length > 2 ? count(one.drones.length, "drone") : one.drones.join(", ")} · ${clock(one.seconds)} · ${bytes(one.size)}`;
-    const report = h("a", { class: "button small", href: `${path}/report`, target: "_blank", rel: "noopener", "aria-label": `Report of ${one.name}` }, "Report");
-    const replay = h("button", { type: "button", class: "small", "aria-label": `Replay ${one.name}`, onclick: () => void this.act(() => this.replay(path)) }, "Replay");
-    return h("li", { title: one.name }, h("span", { class: "rec-name" }, at), h("span", { class: "facts" }, one.problem ? `${facts} · ${one.problem}` : facts), h("span", { class: "rec-acts" }, this.pilots ? replay : null, report));
+  private showTrash({ count, bytes: size }: Recordings["trash"]): void {
+    setHidden(this.trash, count === 0);
+    const text = t.recordings.trash(count, bytes(size));
+    if (text === this.trashed) return;
+    this.trashed = text;
+    const ask = h("button", { type: "button", class: "small", onclick: () => this.trash.replaceChildren(h("span", {}, text), keep, empty) }, t.recordings.empty);
+    const keep = h("button", { type: "button", class: "small", onclick: () => this.trash.replaceChildren(h("span", {}, text), ask) }, t.recordings.emptyNot);
+    const empty = h("button", { type: "button", class: "small danger", onclick: () => void this.act(() => post("/api/trash/empty")) }, t.recordings.emptyNow);
+    this.trash.replaceChildren(h("span", {}, text), ...(this.pilots ? [ask] : []));
+  }
+
+  private offerUndo(name: string): void {
+    const undo = h("button", { type: "button", class: "small", onclick: () => void this.act(() => post(`/api/trash/${encodeURIComponent(name)}/restore`)) }, t.recordings.undo);
+    this.note.replaceChildren(t.recordings.thrown(name), undo);
   }
 
   private async begin(): Promise<void> {
     await this.act(() => post("/api/recordings", { drones: this.drones() }));
   }
 
-  private async replay(path: string): Promise<void> {
-    this.replayed((await post<{ drone: string }>(`${path}/replay`)).drone);
-  }
-
-  private async act(work: () => Promise<unknown>): Promise<void> {
+  /** `done`: what to say afterwards. */
+  private async act(work: () => Promise<unknown>, done = ""): Promise<boolean> {
     setText(this.note, "…");
+    let error: unknown = null;
     try {
       await work();
-      setText(this.note, "");
-    } catch (error) {
-      setText(this.note, errorText(error));
+    } catch (caught) {
+      error = caught;
     }
+    // What the work itself has written stays.
+    if (error !== null) setText(this.note, errorText(error));
+    else if (this.note.textContent === "…") setText(this.note, done);
     await this.load();
+    return error === null;
   }
 }

@@ -23,8 +23,8 @@ interface Shown extends FrameHead {
 export class VideoView {
   readonly element: HTMLElement;
   overlay = true;
-  /** It was recorded, and the recording is over. */
-  over = false;
+  /** Why no new pictures come from what was recorded, which is no fault; empty while they do. */
+  still = "";
   readonly canvas: HTMLCanvasElement;
   private readonly tools: VideoTools;
   private readonly sheet = h("canvas", { class: "overlay", "aria-hidden": "true" });
@@ -68,11 +68,12 @@ export class VideoView {
     const age_s = this.age_s(now_ms);
     while (this.arrivals[0] !== undefined && this.arrivals[0] < now_ms - RATE_MS) this.arrivals.shift();
     if (age_s === null || this.shown === null) return;
-    const stale = age_s > STALE_S && !this.over;
-    setTone(this.ageChip, this.over ? "quiet" : stale ? "bad" : age_s > LATE_S ? "warn" : "ok");
-    setText(this.age, this.over ? "last picture" : stale ? `${duration(age_s)} old` : `${(age_s * 1000).toFixed(0)} ms`);
+    const stale = age_s > STALE_S && !this.still;
+    setTone(this.ageChip, this.still ? "quiet" : stale ? "bad" : age_s > LATE_S ? "warn" : "ok");
+    setText(this.age, this.still || (stale ? `${duration(age_s)} old` : `${(age_s * 1000).toFixed(0)} ms`));
     setAttribute(this.element, "data-age-ms", (age_s * 1000).toFixed(0));
     setAttribute(this.element, "data-seq", String(this.shown.seq));
+    setAttribute(this.element, "data-captured", this.shown.captured_ns);
     setAttribute(this.element, "data-stale", String(stale));
     setHidden(this.nothing, !stale);
     setText(this.nothing, "No new picture");
@@ -181,9 +182,14 @@ export class Stage {
     for (const view of this.views.values()) view.close();
   }
 
-  /** A recording is over, or goes on again: that there are no new pictures is no fault. */
-  over(over: boolean): void {
-    for (const view of this.views.values()) view.over = over;
+  /** Why no new pictures of a recording come; empty when they do: that is no fault. */
+  still(still: string): void {
+    for (const view of this.views.values()) view.still = still;
+  }
+
+  /** Below the pictures. */
+  append(element: HTMLElement): void {
+    this.element.append(element);
   }
 
   private choose(camera: Camera): void {

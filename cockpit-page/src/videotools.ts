@@ -25,7 +25,8 @@ export interface Pictures {
   readonly drone: string;
   readonly camera: { readonly name: string };
   readonly overlay: boolean;
-  readonly over: boolean;
+  /** Why no new pictures come from what was recorded; empty while they do. */
+  readonly still: string;
   age_s(now_ms: number): number | null;
   /** Draw what was published about the picture that is shown. */
   paint(pen: CanvasRenderingContext2D, box: HTMLCanvasElement, density: number): void;
@@ -202,7 +203,7 @@ export class VideoTools {
 
   /** Also while there is no new picture: what is old is marked. */
   private update(): void {
-    const old = (this.pictures.age_s(performance.now()) ?? 0) > STALE_S && !this.pictures.over;
+    const old = (this.pictures.age_s(performance.now()) ?? 0) > STALE_S && this.pictures.still === "";
     if (old) this.paint();
     if (this.clip === null) return;
     const seconds = (performance.now() - this.clip.since_ms) / 1000;
@@ -218,7 +219,7 @@ export class VideoTools {
     pen.drawImage(this.pictures.canvas, 0, 0, width, height);
     if (this.pictures.overlay) this.pictures.paint(pen, this.mix, 1);
     const age_s = this.pictures.age_s(performance.now()) ?? 0;
-    if (age_s <= STALE_S || this.pictures.over) return;
+    if (age_s <= STALE_S || this.pictures.still !== "") return;
     pen.fillStyle = "rgb(0 0 0 / 60%)";
     pen.fillRect(0, 0, width, height);
     pen.fillStyle = "#fff";

@@ -12,7 +12,7 @@ from starlette.routing import Route
 
 from skyloop.cockpit.answers import answer_json, answered, body_of, check_json, while_wanted
 from skyloop.cockpit.recording_files import Mark
-from skyloop.drivers.replay.playback import PAUSED, POSITION, SPEED
+from skyloop.cockpit.timeline import MARK
 from skyloop.errors import UnknownNameError, UsageError
 
 if TYPE_CHECKING:
@@ -25,6 +25,8 @@ _REPORT_POLICY: Final = (
     "sandbox allow-scripts; default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
     "img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
+#: Parameters of a replay, as ``docs/replay.md`` lists them. The driver itself is imported only where a replay runs.
+PAUSED, POSITION, SPEED = "replay.paused", "replay.position_s", "replay.speed"
 _MOST_CHARACTERS: Final = 16_384  #: of any text in a request; what it is for has its own limit, and says so
 _Text = Annotated[str, msgspec.Meta(max_length=_MOST_CHARACTERS)]
 
@@ -120,7 +122,7 @@ class RecordingsApi:
         drones = self._recordings.mark(request.path_params["number"], text)
         for name in drones:
             if name in self._fleet.stations:
-                self._fleet.stations[name].drone.log.text(text.strip(), name="mark")
+                self._fleet.stations[name].drone.log.text(text.strip() or MARK, name=MARK)
         return answer_json({"drones": drones})
 
     # Files -----------------------------------------------------------------------------------------------------

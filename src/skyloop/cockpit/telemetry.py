@@ -101,7 +101,9 @@ class TelemetryView:
         for feed in self._station.feeds:
             if (feed_s := feed.age_s) is not None:
                 ages[feed.camera] = min(feed_s, ages.get(feed.camera, feed_s))
-        return alarms(drone.link, feedback, age_s, ages, self._station.thresholds.newest())
+        found = alarms(drone.link, feedback, age_s, ages, self._station.thresholds.newest())
+        # The proxy of a recording has a failsafe too, and nothing that it could land.
+        return found if self._station.flies else [alarm for alarm in found if alarm.id != "failsafe"]
 
     def holder(self, feedback: Feedback | None) -> str | None:
         """Return who has the authority.

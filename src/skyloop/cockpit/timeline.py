@@ -11,7 +11,7 @@ import sys
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
@@ -21,9 +21,11 @@ from skyloop.cockpit.reports import NICENESS
 from skyloop.cockpit.values import flat_values, truth_values, vector
 from skyloop.errors import SkyloopError
 from skyloop.logfile.layout import Channel
-from skyloop.logfile.reader import Recording
 from skyloop.logfile.times import Course
 from skyloop.messages import Event, EventKind, Feedback, LogEntry, Severity
+
+if TYPE_CHECKING:
+    from skyloop.logfile.reader import Recording
 
 MARK: Final = "mark"  #: name of a logged text that is a mark
 MAX_EVENTS: Final = 300  #: the most severe ones
@@ -88,6 +90,8 @@ def main(arguments: Sequence[str]) -> int:
     """
     os.nice(NICENESS)
     on_parent_end(partial(os._exit, 1))
+    from skyloop.logfile.reader import Recording
+
     file, target, *drone = arguments
     try:
         recording = Recording.open(Path(file))
