@@ -1,8 +1,9 @@
-"""Photographs the cockpit: ``python scripts/cockpit_pictures.py``, or with ``one``, ``swarm`` or ``asked`` for a part.
+"""Photographs the cockpit: ``python scripts/cockpit_pictures.py``; ``one``, ``fleet``, ``swarm``, ``asked`` for a part.
 
 =======================================  ===========================================================================
 ``cockpit-one-dark.png``, ``…-light``    one simulated drone that follows a marker, with what its controller draws; once
                                          with the map and the events, once with the 3-D view and the parameters
+``cockpit-fleet-dark.png``, ``…-phone``  all drones: six in one world, four of them on rounds
 ``cockpit-swarm-dark.png``, ``…-light``  three in one world, each on a round of waypoints that its controller logs
 ``cockpit-phone-dark.png``, ``…-light``  the first one again, on a telephone
 ``cockpit-asked-dark.png``, ``…-phone``  a program asks for the drone that the page flies
@@ -55,7 +56,7 @@ Fly = Callable[[threading.Event], None]
 
 
 def main() -> None:
-    makers = {"one": one, "swarm": swarm, "asked": asked}
+    makers = {"one": one, "fleet": fleet, "swarm": swarm, "asked": asked}
     wanted = sys.argv[1:] or list(makers)
     for name in wanted:
         if name not in makers:
@@ -103,6 +104,20 @@ def swarm() -> None:
             page = open_page(chromium, f"{address}#{','.join(names)}", WALL, scheme)
             settle(page, names, 12.0)
             save(page, f"cockpit-swarm-{scheme}.png")
+
+
+def fleet() -> None:
+    """All drones at once, at a desk and on a telephone."""
+    names = [f"d{number}" for number in range(1, 7)]
+    command = ["sim", "--drones", str(len(names)), "--name", "d", "--seed", "1", "--option", "fps=10"]
+    with flight(command, [rounds(name, number) for number, name in enumerate(names[:4])]) as (chromium, address):
+        views: list[tuple[str, ViewportSize, Scheme]] = [("dark", DESK, "dark"), ("phone", PHONE, "light")]
+        for name, size, scheme in views:
+            page = open_page(chromium, f"{address}#/", size, scheme)
+            for drone in names[:4]:
+                page.locator(f'.tile[data-drone="{drone}"] .tile-state', has_text="flying").wait_for(timeout=90_000)
+            page.wait_for_timeout(12_000)
+            save(page, f"cockpit-fleet-{name}.png")
 
 
 def asked() -> None:
