@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import socket
+import stat
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from skyloop.cockpit.access import (
     SESSION_S,
     CertificateGate,
     OpenGate,
+    Pairing,
     Person,
     Token,
     TokenGate,
@@ -26,6 +28,7 @@ from skyloop.cockpit.access import (
     read_tokens,
     uid_in,
 )
+from skyloop.cockpit.sessions import SessionFile
 from skyloop.errors import FileFormatError, UsageError
 from skyloop.messages import Role
 
@@ -144,6 +147,37 @@ def test_a_session_can_be_ended_and_there_are_not_too_many() -> None:
         newest = gate.begin(ANN.person)
     assert gate.person(scope(cookie=f"c={second}")) is None, "the oldest made room"
     assert gate.person(scope(cookie=f"c={newest}")) == ANN.person
+
+
+def test_sessions_outlive_the_process_while_what_began_them_lets_in(tmp_path: Path) -> None:
+    def gate(*tokens: Token, boot: str = "one", pairing: Pairing | None = None) -> TokenGate:
+        return TokenGate(tokens, "c", pairing=pairing, kept=SessionFile(tmp_path / "sessions", boot))
+
+    first = gate(ANN, BOB, pairing=Pairing(Role.PILOT))
+    ann, bob = (first.begin(one.person, one.secret.decode()) for one in (ANN, BOB))
+    paired, ended = first.begin(Person(Role.PILOT, "paired"), "code"), first.begin(ANN.person, ANN.secret.decode())
+    first.end(scope(cookie=f"c={ended}"))
+    text = (tmp_path / "sessions").read_text()
+    assert not any(secret in text for secret in (ann, bob, paired, ANN.secret.decode()))
+    assert stat.S_IMODE((tmp_path / "sessions").stat().st_mode) == 0o600
+
+    def let_in(again: TokenGate) -> list[bool]:
+        return [again.person(scope(cookie=f"c={cookie}")) is not None for cookie in (ann, bob, paired, ended)]
+
+    assert let_in(gate(ANN, BOB, pairing=Pairing(Role.PILOT))) == [True, True, True, False]
+    assert let_in(gate(BOB)) == [False, True, False, False], "a token that was taken out of the file, and no pairing"
+    assert let_in(gate(ANN, pairing=Pairing(Role.OBSERVER))) == [True, False, False, False], "another role than it had"
+    assert let_in(gate(ANN, BOB, boot="two")) == [False] * 4, "times of before the machine was started"
+    (tmp_path / "sessions").chmod(0o644)
+    assert let_in(gate(ANN, BOB)) == [False] * 4, "others could have read it"
+    (tmp_path / "sessions").write_bytes(b"{}")
+    assert let_in(gate(ANN, BOB)) == [False] * 4
+
+
+def test_where_sessions_cannot_be_kept_they_last_as_long_as_the_process(tmp_path: Path) -> None:
+    gate = TokenGate([ANN], "c", kept=SessionFile(tmp_path / "gone" / "sessions"))
+    cookie = gate.begin(ANN.person, ANN.secret.decode())
+    assert gate.person(scope(cookie=f"c={cookie}")) == ANN.person
 
 
 # Certificates ------------------------------------------------------------------------------------------------------

@@ -28,6 +28,7 @@ from websockets.typing import Origin
 from skyloop.client import connect
 from skyloop.cockpit import Access, serve_cockpit
 from skyloop.cockpit.__main__ import main
+from skyloop.cockpit.addresses import bind
 from skyloop.cockpit.child import CockpitProcess
 from skyloop.cockpit.server import NICENESS
 from skyloop.cockpit.testing import HeadlessPage, Pages
@@ -175,6 +176,21 @@ def test_tokens_on_the_network(tokens: Path) -> None:
             asyncio.run(HeadlessPage(here, "alpha", token=OBSERVER).run())
         with pytest.raises(LinkError, match="did not open"), Pages(here, "alpha"):
             pass
+
+
+def test_a_session_is_valid_after_a_restart(tokens: Path) -> None:
+    with bind("127.0.0.1", 0) as free:
+        port = free.getsockname()[1]
+    access = Access(token_file=tokens)
+    with served(access=access, port=port) as address:
+        headers = {"content-type": "application/json", "origin": address}
+        login = urllib.request.Request(f"{address}/api/login", json.dumps({"token": PILOT}).encode(), headers)
+        with urllib.request.urlopen(login, timeout=5) as answer:
+            cookie = answer.headers["set-cookie"].partition(";")[0]
+    with served(access=access, port=port) as address:
+        again = urllib.request.Request(f"{address}/api/session", headers={"cookie": cookie})
+        with urllib.request.urlopen(again, timeout=5) as answer:
+            assert json.load(answer)["name"] == "ann"
 
 
 def test_programs_of_this_user_are_let_in_without_a_word() -> None:

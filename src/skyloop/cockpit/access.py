@@ -29,6 +29,7 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
+from skyloop.cockpit.sessions import Session, SessionFile
 from skyloop.errors import FileFormatError, UsageError
 from skyloop.messages import Role
 
@@ -171,7 +172,7 @@ class Pairing:
 
     def __init__(self, role: Role, clock: Clock = monotonic_ns) -> None:
         self.on_used: Callable[[str], None] = lambda _: None  #: called after a code was used, with who used it
-        self._role = role
+        self.role = role
         self._clock = clock
         self._code = ""
         self._until_ns = 0
@@ -193,8 +194,8 @@ class Pairing:
         if not works or not hmac.compare_digest(self._code.encode(), code.encode()):
             return None
         self._code = ""
-        self.on_used(f"{address} as {self._role}")
-        return Person(self._role, "paired")
+        self.on_used(f"{address} as {self.role}")
+        return Person(self.role, "paired")
 
 
 class TokenGate:
@@ -204,22 +205,31 @@ class TokenGate:
     hint = "log in with a token"
 
     def __init__(
-        self, tokens: Iterable[Token], cookie: str, clock: Clock = monotonic_ns, *, pairing: Pairing | None = None
+        self,
+        tokens: Iterable[Token],
+        cookie: str,
+        clock: Clock = monotonic_ns,
+        *,
+        pairing: Pairing | None = None,
+        kept: SessionFile | None = None,
     ) -> None:
-        """Initialise without sessions.
+        """Initialise with the sessions that were kept, as far as what began them still lets in.
 
         Args:
             tokens: Those that let in.
             cookie: The name of the cookie that browsers are given.
             clock: The monotonic clock [ns].
             pairing: Gives codes that are taken once in place of a token.
+            kept: Where sessions are kept for the next run of the cockpit.
         """
         self.cookie = cookie
         self.pairing = pairing
         self.wrong = WrongTokens(clock)
         self._tokens = tuple(tokens)
         self._clock = clock
-        self._sessions: dict[bytes, tuple[Person, int]] = {}  # by the hash of the cookie, until when [ns]
+        self._kept = kept
+        saved = [] if kept is None else kept.load()
+        self._sessions = {one.cookie: one for one in saved if self._still_lets_in(one)}  # by the hash of the cookie
 
     def person(self, scope: Scope) -> Person | None:
         header = _header(scope, b"authorization")
@@ -229,8 +239,8 @@ class TokenGate:
         given = _cookies(scope).get(self.cookie)
         if given is None:
             return None
-        person, until_ns = self._sessions.get(_hash(given), (None, 0))
-        return person if self._clock() < until_ns else None
+        session = self._sessions.get(_hash(given))
+        return Person(session.role, session.name) if session is not None and self._clock() < session.until_ns else None
 
     def wrong_token_s(self, scope: Scope) -> float:
         """Count a wrong token, and return for how long the answer to it is to wait [s]."""
@@ -254,19 +264,39 @@ class TokenGate:
             found = self.pairing.person(token, str(client[0]) if client else "somewhere")
         return found
 
-    def begin(self, person: Person) -> str:
-        """Begin a session, and return its cookie; the oldest sessions make room if there are too many."""
+    def begin(self, person: Person, token: str = "") -> str:
+        """Begin a session, and return its cookie; the oldest sessions make room if there are too many.
+
+        Args:
+            person: Whose it is.
+            token: What was given for it.
+        """
         now_ns = self._clock()
-        self._sessions = {key: value for key, value in self._sessions.items() if now_ns < value[1]}
+        self._sessions = {key: one for key, one in self._sessions.items() if now_ns < one.until_ns}
         while len(self._sessions) >= MAX_SESSIONS:
             del self._sessions[next(iter(self._sessions))]
         value = secrets.token_urlsafe(32)
-        self._sessions[_hash(value)] = person, now_ns + nanoseconds(SESSION_S)
+        origin = _hash(token) if self.known(token) is not None else b""
+        session = Session(_hash(value), origin, person.role, person.name, now_ns + nanoseconds(SESSION_S))
+        self._sessions[session.cookie] = session
+        self._keep()
         return value
 
     def end(self, scope: Scope) -> None:
         """End the session of this request's cookie."""
-        self._sessions.pop(_hash(_cookies(scope).get(self.cookie, "")), None)
+        if self._sessions.pop(_hash(_cookies(scope).get(self.cookie, "")), None) is not None:
+            self._keep()
+
+    def _keep(self) -> None:
+        if self._kept is not None:
+            self._kept.save(self._sessions.values())
+
+    def _still_lets_in(self, session: Session) -> bool:
+        """Return whether what began a session would do so now: its token is known, or pairing gives its role."""
+        if session.origin == b"":
+            return self.pairing is not None and self.pairing.role is session.role
+        person = Person(session.role, session.name)
+        return any(_hash(one.secret.decode()) == session.origin and one.person == person for one in self._tokens)
 
 
 class CertificateGate:

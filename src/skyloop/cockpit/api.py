@@ -90,7 +90,8 @@ class Api:
         gate = self._gate
         if not isinstance(gate, TokenGate):
             raise BadRequest(404, "this cockpit asks for no token")
-        person = gate.logged_in((await _body(request, _Login)).token, request.scope)
+        token = (await _body(request, _Login)).token
+        person = gate.logged_in(token, request.scope)
         if person is None:
             await gone_within(request.receive, gate.wrong_token_s(request.scope))
             raise BadRequest(
@@ -102,7 +103,7 @@ class Api:
         answer = _json({"role": person.role, "name": person.name})
         answer.set_cookie(
             gate.cookie,
-            gate.begin(person),
+            gate.begin(person, token),
             max_age=int(SESSION_S),
             httponly=True,
             samesite="strict",

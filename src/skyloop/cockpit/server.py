@@ -7,10 +7,9 @@ import os
 import signal
 import socket
 import ssl
-import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +18,7 @@ from skyloop.clock import Clock, monotonic_ns
 from skyloop.cockpit.addresses import bind, host_names, reachable
 from skyloop.cockpit.admission import Admission, Connection
 from skyloop.cockpit.listening import Listener, ProtocolFactory, limit_messages, places_here
-from skyloop.errors import MissingExtraError, UnknownNameError, UsageError
+from skyloop.errors import LinkError, MissingExtraError, UnknownNameError, UsageError
 from skyloop.messages import Role
 
 if TYPE_CHECKING:
@@ -170,18 +169,19 @@ def _check_names(names: Sequence[str], finder: Finder) -> None:
 
 def _gate(access: Access, port: int) -> Gate:
     from skyloop.cockpit.access import CertificateGate, OpenGate, Pairing, TokenGate, read_tokens
+    from skyloop.cockpit.sessions import SessionFile
+    from skyloop.transport.local.directory import find_directory
 
     if access.client_ca is not None:
         return CertificateGate()
     if access.token_file is not None or access.pair:
         tokens = [] if access.token_file is None else read_tokens(access.token_file)
-        # Browsers don't distinguish cookies by port.
-        return TokenGate(tokens, f"skyloop-cockpit-{port}", pairing=Pairing(access.role) if access.pair else None)
-    if sys.platform != "linux":
-        raise UsageError(
-            f"on {sys.platform} the cockpit can't see whose program connects to it, so it asks for a token: give one "
-            "with --token-file FILE, lines of ROLE TOKEN [NAME]"
-        )
+        cookie = f"skyloop-cockpit-{port}"  # browsers don't distinguish cookies by port
+        folder = find_directory()
+        with suppress(LinkError, OSError):  # then log-ins last as long as this process, which says so
+            folder.create()
+        kept = SessionFile(folder.path / f"{cookie}.sessions")
+        return TokenGate(tokens, cookie, pairing=Pairing(access.role) if access.pair else None, kept=kept)
     return OpenGate(access.role)
 
 
