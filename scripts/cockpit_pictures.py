@@ -1,4 +1,5 @@
-"""Photographs the cockpit: ``python scripts/cockpit_pictures.py``; ``one``, ``fleet``, ``swarm``, ``asked`` for a part.
+"""Photographs the cockpit: ``python scripts/cockpit_pictures.py``, or with ``one``, ``fleet``, ``swarm``,
+``asked`` or ``phone`` for a part.
 
 =======================================  ===========================================================================
 ``cockpit-one-dark.png``, ``…-light``    one simulated drone that follows a marker, with what its controller draws; once
@@ -6,6 +7,8 @@
 ``cockpit-fleet-dark.png``, ``…-phone``  all drones: six in one world, four of them on rounds
 ``cockpit-swarm-dark.png``, ``…-light``  three in one world, each on a round of waypoints that its controller logs
 ``cockpit-phone-dark.png``, ``…-light``  the first one again, on a telephone
+``cockpit-flight-portrait.png``,         the flight mode of a telephone, upright and on its side
+``cockpit-flight-landscape.png``
 ``cockpit-asked-dark.png``, ``…-phone``  a program asks for the drone that the page flies
 =======================================  ===========================================================================
 
@@ -41,6 +44,8 @@ MARKER_ID = 7
 DESK: ViewportSize = {"width": 1440, "height": 900}
 WALL: ViewportSize = {"width": 1680, "height": 1020}
 PHONE: ViewportSize = {"width": 390, "height": 844}
+PHONE_ON_ITS_SIDE: ViewportSize = {"width": 844, "height": 390}
+TOUCHED = (PHONE, PHONE_ON_ITS_SIDE)
 MOST_BYTES = 300_000
 ROUND_M = 1.1
 Scheme = Literal["dark", "light"]
@@ -56,7 +61,7 @@ Fly = Callable[[threading.Event], None]
 
 
 def main() -> None:
-    makers = {"one": one, "fleet": fleet, "swarm": swarm, "asked": asked}
+    makers = {"one": one, "fleet": fleet, "swarm": swarm, "asked": asked, "phone": phone}
     wanted = sys.argv[1:] or list(makers)
     for name in wanted:
         if name not in makers:
@@ -88,6 +93,7 @@ def one() -> None:
             save(page, f"cockpit-one-{scheme}.png")
         for scheme in SCHEMES:
             page = open_page(chromium, f"{address}#alpha", PHONE, scheme)
+            page.get_by_role("button", name="Leave flight mode").tap()
             settle(page, ["alpha"], 5.0)
             save(page, f"cockpit-phone-{scheme}.png")
 
@@ -139,6 +145,32 @@ def asked() -> None:
                 page.locator(".camera[data-seq]").first.wait_for()
                 page.wait_for_timeout(1500)
                 save(page, f"cockpit-asked-{name}.png")
+
+
+def phone() -> None:
+    """A person flies by touch."""
+    command = ["sim", "--name", "alpha", "--seed", "4"]
+    command += [word for option in ("width=640", "fps=15") for word in ("--option", option)]
+    with flight(command, []) as (chromium, address):
+        for name, size in (("portrait", PHONE), ("landscape", PHONE_ON_ITS_SIDE)):
+            page = open_page(chromium, f"{address}#alpha", size, "dark")
+            page.get_by_role("button", name="Take control").tap()
+            page.locator('.pane[data-mine="true"]').wait_for()
+            page.get_by_role("button", name="Take off").tap()
+            page.locator(".pill", has_text="hovering").wait_for()
+            page.locator(".camera[data-seq]").first.wait_for()
+            page.wait_for_timeout(9500)  # until the first alarms of a loaded machine are over
+            stick = page.locator(".thumb").nth(1).bounding_box()
+            assert stick is not None
+            x, y = stick["x"] + stick["width"] / 2, stick["y"] + stick["height"] / 2
+            session = page.context.new_cdp_session(page)
+            for kind, place in (("touchStart", (x, y)), ("touchMove", (x + 14, y - 26))):
+                point = {"x": place[0], "y": place[1]}
+                session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": [point]})
+            page.locator(".pill", has_text="flying").wait_for()
+            page.wait_for_timeout(700)
+            save(page, f"cockpit-flight-{name}.png")
+            session.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
 
 
 def rounds(name: str, number: int) -> Fly:
@@ -204,7 +236,9 @@ def flight(command: list[str], fliers: list[Fly]) -> Iterator[tuple[Browser, str
 def open_page(chromium: Browser, address: str, size: ViewportSize, scheme: Scheme) -> Page:
     for context in chromium.contexts:
         context.close()
-    context = chromium.new_context(viewport=size, color_scheme=scheme, has_touch=size is PHONE)
+    context = chromium.new_context(
+        viewport=size, color_scheme=scheme, has_touch=size in TOUCHED, is_mobile=size in TOUCHED
+    )
     page = context.new_page()
     page.goto(address)
     return page

@@ -7,6 +7,8 @@ import "./style/parts.css";
 import "./style/overview.css";
 import "./style/alarms.css";
 import "./style/replay.css";
+import "./style/touch.css";
+import "./style/flightmode.css";
 import { hashOf, namesOf, OVERVIEW } from "./address.js";
 import { AlarmBook } from "./alarms.js";
 import { AlarmSound } from "./alarmsound.js";
@@ -15,6 +17,7 @@ import { ServerClock } from "./clock.js";
 import { h, setAttribute, setHidden, setText } from "./dom.js";
 import { Flying, type InputView } from "./flying.js";
 import { FleetList } from "./fleet.js";
+import { FlightMode } from "./flightmode.js";
 import { Help } from "./help.js";
 import { Countdown } from "./hold.js";
 import type { Deed } from "./keys.js";
@@ -65,6 +68,7 @@ class Page {
   private readonly sight = new IntersectionObserver((entries) => this.look(entries), { threshold: [0, 0.05, 0.25, 0.5, 0.75, 1] });
   private readonly help: Help;
   private readonly flying: Flying;
+  private readonly flight = new FlightMode(() => this.flying.rest());
 
   constructor(
     root: HTMLElement,
@@ -222,6 +226,9 @@ class Page {
         close: (one) => this.close(one),
         push: (one, sticks) => this.push(one, sticks),
         help: () => this.help.open(),
+        fly: (one) => this.flight.toggle(one),
+        known: (one) => this.panes.size === 1 && this.flight.offer(one),
+        fillScreen: () => this.flight.fillScreen(),
         aimed: (one) => one === this.chosen && this.aim(),
         countdown: this.countdown,
       });
@@ -245,6 +252,7 @@ class Page {
   }
 
   private drop(name: string, pane: Pane): void {
+    this.flight.gone(pane);
     this.sight.unobserve(pane.element);
     this.seen.delete(name);
     pane.close();

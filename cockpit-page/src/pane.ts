@@ -11,6 +11,7 @@ import { STALE_MS } from "./commands.js";
 import { Deck } from "./deck.js";
 import { h, setAttribute, setHidden, setText, setTone, type Tone } from "./dom.js";
 import { Events } from "./events.js";
+import { corners, FlightHud } from "./flightmode.js";
 import { words } from "./format.js";
 import { History, KEPT_S, Trail } from "./history.js";
 import type { Countdown } from "./hold.js";
@@ -40,6 +41,11 @@ export interface PaneHost {
   close(name: string): void;
   push(name: string, sticks: Sticks): void;
   help(): void;
+  /** Into its flight mode, or out of it. */
+  fly(pane: Pane): void;
+  /** What it is has become known: it could be flown. */
+  known(pane: Pane): void;
+  fillScreen(): void;
   /** What its emergency stop is, or what became of it, may have changed. */
   aimed(name: string): void;
   readonly countdown: Countdown;
@@ -83,6 +89,9 @@ export class Pane {
   private readonly oldSeen = h("button", { type: "button", class: "small", "aria-label": "OK: acknowledge that it is old", onclick: () => this.alarmBook.acknowledge("old", performance.now()) && this.update() }, "OK");
   private readonly old = h("p", { class: "banner old", role: "alert", "data-tone": "warn", hidden: true }, h("span", {}, "Old"), this.oldAge, this.oldWhat, this.oldSeen);
   private readonly notice = h("p", { class: "banner notice", role: "alert", "data-tone": "warn" });
+  private readonly hud = new FlightHud();
+  private readonly fly = h("button", { type: "button", class: "small fly", "aria-pressed": "false", onclick: () => this.host.fly(this) }, "Flight mode");
+  private readonly full = h("button", { type: "button", class: "full", "aria-label": "Full screen", onclick: () => this.host.fillScreen() }, corners());
   private readonly stage: Stage;
   private readonly instruments = new Instruments();
   private readonly strip: Strip;
@@ -176,6 +185,15 @@ export class Pane {
     setAttribute(this.element, "data-selected", String(selected));
   }
 
+  /** For the flight mode, or as usual. */
+  arrange(flight: boolean): void {
+    setAttribute(this.element, "data-flight", String(flight));
+    setAttribute(this.fly, "aria-pressed", String(flight));
+    setAttribute(this.fly, "aria-label", flight ? "Leave flight mode" : "Flight mode");
+    setText(this.fly, flight ? "✕" : "Flight mode");
+    this.host.select(this.name);
+  }
+
   act(deed: Deed | "reset"): void {
     this.host.select(this.name);
     if (deed === "help") this.host.help();
@@ -208,7 +226,7 @@ export class Pane {
 
   private build(): HTMLElement {
     const close = h("button", { type: "button", class: "bare close", "aria-label": `Close ${this.name}`, onclick: () => this.host.close(this.name) }, "×");
-    const head = h("header", { class: "pane-head" }, h("h2", {}, this.name), this.kind, this.endReplay, this.alarms.chip, this.pill, this.battery.element, close);
+    const head = h("header", { class: "pane-head" }, h("h2", {}, this.name), this.kind, this.endReplay, this.alarms.chip, this.pill, this.battery.element, this.hud.element, this.full, this.fly, close);
     const body = h("div", { class: "pane-body" }, this.stage.element, this.decks.space.element, this.instruments.element, this.decks.plots.element, this.decks.lists.element, this.channels.element);
     const element = h("article", { class: "pane", "data-drone": this.name, "aria-label": `Drone ${this.name}`, tabindex: -1 }, head, h("div", { class: "over" }, h("div", { class: "stack" }, this.old, this.alarms.element, this.notice)), this.alarms.voice, body, this.thumbs.element, this.strip.element);
     element.addEventListener("pointerdown", () => this.host.select(this.name), { capture: true });
@@ -242,7 +260,9 @@ export class Pane {
 
   private onMessage(message: Vehicle | State): void {
     if (message.type === "vehicle") {
+      const first = this.vehicle === null;
       this.vehicle = message;
+      if (first && this.target) this.host.known(this);
       this.stage.cameras(message.cameras);
       setHidden(this.endReplay, this.pilot === null || !message.uri.startsWith("replay:"));
       setAttribute(this.element, "data-recording", String(this.isRecording));
@@ -339,6 +359,7 @@ export class Pane {
     setText(this.flight, over ? "recording over" : live && isOld ? `was ${flight}` : flight);
     setTone(this.pill, live && !isOld && !over ? (FLIGHT_TONES[live.flight] ?? "quiet") : "quiet");
     this.battery.show(live?.battery ?? null, live?.alarms ?? []);
+    this.hud.update(live, this.connected && !isOld, pilot?.round_trip_s ?? null);
     this.instruments.update(live, this.connected && !isOld, pilot?.round_trip_s ?? null);
     if (live) this.channels.update(live);
     if (this.connected && state && !live) this.instruments.lost(state);
@@ -370,7 +391,7 @@ export class Pane {
     return [...old, { id: "page_link", severity, text: `no data about ${this.name} from the cockpit: what is shown is old` }];
   }
 
-  private notify(text: string, tone: Tone): void {
+  notify(text: string, tone: Tone): void {
     setTone(this.notice, tone);
     setText(this.notice, text);
     this.noticed_ms = performance.now();

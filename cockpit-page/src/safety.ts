@@ -85,6 +85,7 @@ export class Safety {
   /** Of the last overview: those that fly. */
   know(rows: readonly DroneRow[]): void {
     this.flying = rows.filter((row) => row.can_fly && !isRecording(row)).length;
+    setAttribute(this.element, "data-flying", String(this.flying));
     this.show();
   }
 

@@ -11,7 +11,7 @@ function stick(label: string, push: Push): HTMLElement {
   const knob = h("i", { class: "knob" });
   const pad = h("div", { class: "thumb", role: "img", "aria-label": label }, knob, h("span", {}, label));
   const put = (x: number, y: number): void => {
-    knob.style.setProperty("translate", `${x * 36}px ${-y * 36}px`);
+    knob.style.setProperty("translate", `calc(${x} * var(--travel)) calc(${-y} * var(--travel))`);
     push(x, y);
   };
   const follow = (event: PointerEvent): void => {

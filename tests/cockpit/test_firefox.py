@@ -61,6 +61,33 @@ def test_a_person_logs_in_and_flies_by_keys(open_cockpit: tuple[Browser, str], d
     assert page.problems == []
 
 
+def test_two_thumbs_fly_in_the_flight_mode(deck: Deck) -> None:
+    deck.proxy("thumbs")
+    page = deck.page("thumbs", viewport={"width": 390, "height": 844}, has_touch=True)
+    page.pane.get_by_role("button", name="Flight mode").click()
+    with skyloop.connect("thumbs", access="observe", name="test") as drone:
+        page.take_off()
+        places = [page.pane.locator(".thumb").nth(place).bounding_box() for place in (0, 1)]
+        assert all(place is not None and place["y"] + place["height"] <= 844 for place in places), "on one screen"
+
+        def flies() -> bool:
+            forward, _, up = drone.feedback().velocity_m_s or (0.0, 0.0, 0.0)
+            return forward > 0.2 and up > 0.1
+
+        with fingers.on(page.page) as hand:
+            for number, place in enumerate(places):
+                assert place is not None
+                hand.put(str(number), place["x"] + place["width"] / 2, place["y"] + place["height"] / 2)
+                hand.put(str(number), place["x"] + place["width"] / 2, place["y"] + 6)
+            page.until(flies, "it flies forward and up")
+        page.until(lambda: drone.feedback().state is FlightState.HOVERING, "it hovers when they are lifted")
+        page.press("l")
+        page.wait_for_text(".pill", "landed")
+    page.press("Escape")
+    page.until(lambda: page.pane.get_attribute("data-flight") == "false", "Escape leaves it")
+    assert page.problems == []
+
+
 HEARD = """
 window.heard = [];
 for (const type of ["pointerdown", "pointermove", "pointerup"])
