@@ -7,6 +7,7 @@ import os
 import signal
 import socket
 import ssl
+import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
     from skyloop.cockpit.access import Gate
     from skyloop.cockpit.discovery import Finder
+    from skyloop.cockpit.sessions import SessionFile
     from skyloop.messages.world import WorldGeometry
     from skyloop.transport.fabric import FabricSettings
 
@@ -169,20 +171,33 @@ def _check_names(names: Sequence[str], finder: Finder) -> None:
 
 def _gate(access: Access, port: int) -> Gate:
     from skyloop.cockpit.access import CertificateGate, OpenGate, Pairing, TokenGate, read_tokens
-    from skyloop.cockpit.sessions import SessionFile
-    from skyloop.transport.local.directory import find_directory
 
     if access.client_ca is not None:
         return CertificateGate()
     if access.token_file is not None or access.pair:
         tokens = [] if access.token_file is None else read_tokens(access.token_file)
         cookie = f"skyloop-cockpit-{port}"  # browsers don't distinguish cookies by port
-        folder = find_directory()
-        with suppress(LinkError, OSError):  # then log-ins last as long as this process, which says so
-            folder.create()
-        kept = SessionFile(folder.path / f"{cookie}.sessions")
-        return TokenGate(tokens, cookie, pairing=Pairing(access.role) if access.pair else None, kept=kept)
+        pairing = Pairing(access.role) if access.pair else None
+        return TokenGate(tokens, cookie, pairing=pairing, kept=_session_file(cookie))
+    if sys.platform != "linux":
+        raise UsageError(
+            f"on {sys.platform} the cockpit can't see whose program connects to it, so it asks for a token: give one "
+            "with --token-file FILE, lines of ROLE TOKEN [NAME]"
+        )
     return OpenGate(access.role)
+
+
+def _session_file(cookie: str) -> SessionFile | None:
+    """Where log-ins outlive this process; None where no folder is this user's alone."""
+    if sys.platform != "linux":
+        return None
+    from skyloop.cockpit.sessions import SessionFile
+    from skyloop.transport.local.directory import find_directory
+
+    folder = find_directory()
+    with suppress(LinkError, OSError):  # then log-ins last as long as this process, which says so
+        folder.create()
+    return SessionFile(folder.path / f"{cookie}.sessions")
 
 
 def _tls(access: Access) -> ssl.SSLContext:
