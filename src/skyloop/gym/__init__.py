@@ -6,6 +6,7 @@
 
     skyloop.gym.register()
     env = gymnasium.make("skyloop/Reach-v0")
+    env = gymnasium.make("skyloop/Follow-v0", observe="pixels")
     envs = skyloop.gym.ReachVectorEnv(64)  # 64 drones in one simulation
 """
 
@@ -18,16 +19,37 @@ try:
 except ImportError:
     raise MissingExtraError("skyloop.gym", "gym") from None
 
-from skyloop.gym.reach import ReachEnv, ReachVectorEnv
+from skyloop.gym.envs import (
+    FollowEnv,
+    FollowVectorEnv,
+    GatesEnv,
+    GatesVectorEnv,
+    HoverEnv,
+    HoverVectorEnv,
+    ReachEnv,
+    ReachVectorEnv,
+)
 
-__all__ = ["ReachEnv", "ReachVectorEnv", "register"]
+__all__ = [
+    "FollowEnv",
+    "FollowVectorEnv",
+    "GatesEnv",
+    "GatesVectorEnv",
+    "HoverEnv",
+    "HoverVectorEnv",
+    "ReachEnv",
+    "ReachVectorEnv",
+    "register",
+]
+TASKS = ("Reach", "Hover", "Follow", "Gates")
 
 
 def register() -> None:
-    """Make ``skyloop/Reach-v0`` known to ``gymnasium.make`` and ``gymnasium.make_vec``. May be called twice."""
-    if "skyloop/Reach-v0" not in gymnasium.registry:
-        gymnasium.register(
-            "skyloop/Reach-v0",
-            entry_point="skyloop.gym:ReachEnv",
-            vector_entry_point="skyloop.gym:ReachVectorEnv",
-        )
+    """Make ``skyloop/Reach-v0`` and the other :data:`TASKS` known to ``gymnasium.make``. May be called twice."""
+    for task in TASKS:
+        if f"skyloop/{task}-v0" not in gymnasium.registry:
+            gymnasium.register(
+                f"skyloop/{task}-v0",
+                entry_point=f"skyloop.gym:{task}Env",
+                vector_entry_point=f"skyloop.gym:{task}VectorEnv",
+            )

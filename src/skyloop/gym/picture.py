@@ -1,8 +1,9 @@
-"""A drone and its goal, drawn for a person."""
+"""A drone and its goal, drawn for a person who looks on; and what the drone's own camera sees."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,43 +13,93 @@ from skyloop.errors import MissingExtraError
 if TYPE_CHECKING:
     from skyloop.gym.arena import Arena
 
-SIZE = (320, 240)
-_FOCAL_PX = 260.0
-_FROM = np.array([-5.5, -3.0, 3.2])  #: where the onlooker stands, from the middle of the first cell's floor [m]
-_AT = np.array([0.0, 0.0, 1.8])  #: and what it looks at
+Floats = NDArray[np.float64]
+#: Centre in the cell [m], normal (None: it faces the camera), radius [m].
+Rings = Iterable[tuple[Floats, Floats | None, float]]
+
+SIZE: Final = (320, 240)
+ONBOARD_PX: Final = 64
+_FOCAL_PX: Final = 260.0
+_ONBOARD_FOCAL_PX: Final = 40.0  # 77° across
+_FROM: Final = np.array([-5.5, -3.0, 3.2])  #: where the onlooker stands, from the middle of the first cell's floor [m]
+_AT: Final = np.array([0.0, 0.0, 1.8])  #: and what it looks at
+_AHEAD: Final = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # body from optical axes
+_RED: Final = (40, 40, 230)  # BGR
+_LATER: Final = (40, 160, 230)  # of what is to be reached after it
+_NEAREST_M: Final = 0.05
+_CORNERS: Final = np.linspace(0.0, 2.0 * np.pi, 25)
 
 
-class Picture:
-    """Draws the first drone of an arena. Raises :class:`MissingExtraError` without OpenCV."""
+class _View:
+    """Draws an arena and rings in it. Raises :class:`MissingExtraError` without OpenCV."""
 
-    def __init__(self, arena: Arena) -> None:
+    def __init__(self, arena: Arena, width: int, height: int, focal_px: float) -> None:
         try:
             from skyloop.sim.camera import CameraModel, CameraPose
             from skyloop.sim.render import PlanarRenderer, Scene, SceneState
         except ImportError:
             raise MissingExtraError("drawing the simulator's world", "sim") from None
-        width, height = SIZE
-        self._arena = arena
-        self._model = CameraModel("onlooker", width, height, 25.0, _FOCAL_PX, _FOCAL_PX, width / 2, height / 2)
-        middle = np.array([*arena.centres[0], 0.0])
-        self._pose: Any = CameraPose(middle + _FROM, look_at(_FROM, _AT))
-        self._middle = middle
+        self.arena = arena  #: another one of as many drones may take its place: the world is the same
+        self._model = CameraModel("view", width, height, 25.0, focal_px, focal_px, width / 2, height / 2)
+        self._pose: Any = CameraPose
         self._state = SceneState
         self._renderer = PlanarRenderer(Scene(arena.world, arena.count))
 
-    def draw(self, goal: NDArray[np.float64]) -> NDArray[np.uint8]:
-        """RGB, shape (240, 320, 3), uint8; the goal, relative to the cell, is a red ring."""
+    def render(self, drone: int, eye: Floats, rotation: Floats, rings: Rings) -> NDArray[np.uint8]:
+        """RGB of shape (height, width, 3), uint8, from a point in world axes."""
         import cv2
 
-        positions, rotations = self._arena.simulation.poses()
-        image = self._renderer.render(self._state(positions, rotations), self._pose, self._model)
-        x, y, depth = self._pose.rotation.T @ (goal + self._middle - self._pose.position_m)
-        at = (round(self._model.cx + _FOCAL_PX * x / depth), round(self._model.cy + _FOCAL_PX * y / depth))
-        cv2.circle(image, at, max(3, round(_FOCAL_PX * 0.2 / depth)), (40, 40, 230), 2, cv2.LINE_AA)
+        positions, rotations = self.arena.simulation.poses()
+        image = self._renderer.render(self._state(positions, rotations), self._pose(eye, rotation), self._model)
+        middle = np.array([*self.arena.centres[drone], 0.0])
+        for number, (centre, normal, radius) in reversed(list(enumerate(rings))):
+            points = _circle(centre + middle, rotation[:, 2] if normal is None else normal, radius)
+            seen = (points - eye) @ rotation
+            if (seen[:, 2] < _NEAREST_M).any():
+                continue
+            pixels = self._model.fx * seen[:, :2] / seen[:, 2:] + [self._model.cx, self._model.cy]
+            corners = np.round(np.clip(pixels, -4096, 4096)).astype(np.int32)
+            cv2.polylines(image, [corners], True, _LATER if number else _RED, 2, cv2.LINE_AA)
         return np.ascontiguousarray(image[:, :, ::-1])
 
 
-def look_at(eye: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
+class Picture(_View):
+    """Draws the first drone of an arena for a person."""
+
+    def __init__(self, arena: Arena) -> None:
+        super().__init__(arena, *SIZE, _FOCAL_PX)
+
+    def draw(self, rings: Rings) -> NDArray[np.uint8]:
+        """RGB, shape (240, 320, 3), uint8; what to reach next is a red ring."""
+        middle = np.array([*self.arena.centres[0], 0.0])
+        return self.render(0, middle + _FROM, look_at(_FROM, _AT), rings)
+
+
+class OnBoard(_View):
+    """What the cameras of an arena's drones see ahead."""
+
+    def __init__(self, arena: Arena) -> None:
+        super().__init__(arena, ONBOARD_PX, ONBOARD_PX, _ONBOARD_FOCAL_PX)
+
+    def draw(self, drone: int, rings: Rings) -> NDArray[np.uint8]:
+        """RGB, shape (64, 64, 3), uint8; what to reach next is a red ring."""
+        positions, rotations = self.arena.simulation.poses()
+        rotation = np.asarray(rotations[drone])
+        eye = np.asarray(positions[drone]) + rotation @ np.array([0.12, 0.0, 0.0])  # in front of its own body
+        return self.render(drone, eye, rotation @ _AHEAD, rings)
+
+
+def _circle(centre: Floats, normal: Floats, radius: float) -> Floats:
+    """Points of a circle round a normal, shape (25, 3)."""
+    aside = np.cross(normal, [0.0, 0.0, 1.0] if abs(normal[2]) < 0.9 else [1.0, 0.0, 0.0])
+    aside /= np.linalg.norm(aside)
+    points: Floats = centre + radius * (
+        np.cos(_CORNERS)[:, None] * aside + np.sin(_CORNERS)[:, None] * np.cross(normal, aside)
+    )
+    return points
+
+
+def look_at(eye: Floats, target: Floats) -> Floats:
     """World from optical axes (x right, y down, z forward) of a camera that looks from one point at another."""
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, [0.0, 0.0, 1.0])

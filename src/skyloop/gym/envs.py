@@ -1,0 +1,226 @@
+"""The tasks as Gymnasium environments: one drone, or many in one simulation; by numbers, by picture, or both."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Final, Literal, get_args
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+
+from skyloop.errors import UsageError
+from skyloop.gym.picture import ONBOARD_PX, OnBoard, Picture
+from skyloop.gym.tasks import (
+    ACTIONS,
+    MOTION,
+    MOTIONS,
+    OBSERVATIONS,
+    PERIOD_S,
+    Following,
+    Hovering,
+    Infos,
+    Observation,
+    Racing,
+    Reaching,
+)
+
+Observe = Literal["state", "pixels", "both"]
+#: What an observation is: numbers, a picture, or a dict of picture and motion.
+Seen = Observation | NDArray[np.uint8] | dict[str, NDArray[Any]]
+
+PIXELS: Final = spaces.Box(0, 255, (ONBOARD_PX, ONBOARD_PX, 3), np.uint8)
+SPACES: Final[dict[str, spaces.Space[Any]]] = {
+    "state": OBSERVATIONS,
+    "pixels": PIXELS,
+    "both": spaces.Dict({"pixels": PIXELS, "motion": MOTIONS}),
+}
+
+
+class _Observer:
+    """Makes the observations of all drones of a task in the form that is asked for."""
+
+    def __init__(self, task: Reaching, form: Observe) -> None:
+        if form not in get_args(Observe):
+            raise UsageError(f"observe is {form!r} and must be one of {', '.join(get_args(Observe))}")
+        self._task = task
+        self._form = form
+        self._camera: OnBoard | None = None
+
+    def renew(self) -> None:
+        """Look at the world that has begun; what draws it is made once, as that takes long."""
+        if self._camera is not None:
+            self._camera.arena = self._task.arena
+
+    def all(self) -> Any:
+        """Return the observations of all drones, with a leading axis."""
+        state = self._task.observe()
+        if self._form == "state":
+            return state
+        if self._camera is None:
+            self._camera = OnBoard(self._task.arena)
+        pixels = np.stack([self._camera.draw(drone, self._task.rings(drone)) for drone in range(self._task.drones)])
+        return pixels if self._form == "pixels" else {"pixels": pixels, "motion": state[:, MOTION]}
+
+    def first(self) -> Seen:
+        """Return the observation of the first drone."""
+        found = self.all()
+        return {name: rows[0] for name, rows in found.items()} if isinstance(found, dict) else found[0]
+
+
+class TaskEnv(gymnasium.Env[Seen, NDArray[np.float32]]):
+    """One drone and one task; subclasses name the task.
+
+    Action, shape (4,), float32, from -1 to 1: velocity ahead, left, up in shares of 1 m/s, turning counter-clockwise in
+    shares of 1.5 rad/s, for 40 ms. Observation with ``observe="state"``, shape (10,), float32: where the goal is,
+    ahead, left, up [m]; velocity as the drone believes [m/s]; roll (right side down), pitch (nose down) [rad]; sine and
+    cosine of the turn to the wanted heading. With ``"pixels"``: what its camera ahead sees, RGB, shape (64, 64, 3),
+    uint8, the goal as a red ring. With ``"both"``: a dict of ``pixels`` and ``motion``, which is velocity, roll and
+    pitch. ``info`` has ``is_success`` and ``distance_m``, of reset too. Leaving the cell of 7 m costs 5 and ends the
+    episode. ``render_mode="rgb_array"``: a picture of the drone and its goal.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / PERIOD_S)}  # noqa: RUF012
+    task: ClassVar[type[Reaching]]
+    action_space = ACTIONS
+
+    def __init__(
+        self,
+        *,
+        seconds: float = 8.0,
+        gusts_m_s: float = 0.3,
+        observe: Observe = "state",
+        render_mode: str | None = None,
+    ) -> None:
+        if render_mode not in (None, "rgb_array"):
+            raise UsageError(f'render_mode is {render_mode!r} and must be "rgb_array" or None')
+        self.render_mode = render_mode
+        self._task = self.task(1, seconds, gusts_m_s)
+        self._observer = _Observer(self._task, observe)
+        self.observation_space = SPACES[observe]
+        self._picture: Picture | None = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Seen, dict[str, Any]]:
+        super().reset(seed=seed, options=options)
+        if seed is not None or not self._task.begun:
+            self._task.begin(int(self.np_random.integers(2**31)))
+            self._observer.renew()
+        self._task.restart(np.array([True]), self.np_random)
+        return self._observer.first(), _one(self._task.infos())
+
+    def step(self, action: NDArray[np.float32]) -> tuple[Seen, float, bool, bool, dict[str, Any]]:
+        rewards, ended, over, infos = self._task.step(np.asarray(action, dtype=float).reshape(1, 4))
+        truncated = bool(over[0] and not ended[0])
+        return self._observer.first(), float(rewards[0]), bool(ended[0]), truncated, _one(infos)
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """RGB, shape (240, 320, 3), uint8, or None without a render mode."""
+        if self.render_mode is None:
+            return None
+        arena = self._task.arena
+        if self._picture is None:
+            self._picture = Picture(arena)
+        self._picture.arena = arena
+        return self._picture.draw(self._task.rings(0))
+
+
+class TaskVectorEnv(VectorEnv[Any, NDArray[np.float32], NDArray[Any]]):
+    """Many drones in one simulation, which is many times faster than as many simulations.
+
+    As :class:`TaskEnv`, with a leading axis; an episode that ended starts over with the step after
+    (``AutoresetMode.NEXT_STEP``).
+    """
+
+    metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
+    task: ClassVar[type[Reaching]]
+
+    def __init__(
+        self, num_envs: int = 16, *, seconds: float = 8.0, gusts_m_s: float = 0.3, observe: Observe = "state"
+    ) -> None:
+        if isinstance(num_envs, bool) or not isinstance(num_envs, int) or not 1 <= num_envs <= 1000:
+            raise UsageError(f"num_envs is {num_envs!r} and must be a whole number from 1 to 1000")
+        self.num_envs = num_envs
+        self._task = self.task(num_envs, seconds, gusts_m_s)
+        self._observer = _Observer(self._task, observe)
+        self.single_action_space, self.single_observation_space = ACTIONS, SPACES[observe]
+        self.action_space = batch_space(ACTIONS, num_envs)
+        self.observation_space = batch_space(SPACES[observe], num_envs)
+        self._ended = np.zeros(num_envs, dtype=np.bool_)
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed[0] if isinstance(seed, list) else seed, options=options)
+        if seed is not None or not self._task.begun:
+            self._task.begin(int(self.np_random.integers(2**31)))
+            self._observer.renew()
+        self._task.restart(np.ones(self.num_envs, dtype=np.bool_), self.np_random)
+        self._ended[:] = False
+        return self._observer.all(), dict(self._task.infos())
+
+    def step(
+        self, actions: NDArray[np.float32]
+    ) -> tuple[Any, NDArray[Any], NDArray[Any], NDArray[Any], dict[str, Any]]:
+        again = self._ended.copy()
+        if again.any():
+            self._task.restart(again, self.np_random)
+        rewards, ended, over, infos = self._task.step(np.asarray(actions, dtype=float))
+        # The first step of a new episode is its reset: it has no reward and can't end it.
+        rewards[again], ended[again], over[again] = 0.0, False, False
+        over &= ~ended
+        self._ended = ended | over
+        return self._observer.all(), rewards, ended, over, dict(infos)
+
+
+def _one(infos: Infos) -> dict[str, Any]:
+    return {name: values[0].item() for name, values in infos.items()}
+
+
+class ReachEnv(TaskEnv):
+    """Fly to a place and stay there: up to 0.1 a step at the goal, less with distance and jerky actions."""
+
+    task = Reaching
+
+
+class HoverEnv(TaskEnv):
+    """Stay at a place in gusts; rewarded as :class:`ReachEnv`."""
+
+    task = Hovering
+
+
+class FollowEnv(TaskEnv):
+    """Follow a target that walks about, from 1.5 m, with the target in the middle of the picture."""
+
+    task = Following
+
+
+class GatesEnv(TaskEnv):
+    """Fly through four gates in order: 1 for each, and what it came nearer to the next one in m; ends at the last."""
+
+    task = Racing
+
+
+class ReachVectorEnv(TaskVectorEnv):
+    """:class:`ReachEnv` for many drones."""
+
+    task = Reaching
+
+
+class HoverVectorEnv(TaskVectorEnv):
+    """:class:`HoverEnv` for many drones."""
+
+    task = Hovering
+
+
+class FollowVectorEnv(TaskVectorEnv):
+    """:class:`FollowEnv` for many drones."""
+
+    task = Following
+
+
+class GatesVectorEnv(TaskVectorEnv):
+    """:class:`GatesEnv` for many drones."""
+
+    task = Racing

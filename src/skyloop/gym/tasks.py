@@ -1,0 +1,259 @@
+"""What the environments ask for, each for all drones of an arena at once: reach a place, hover, follow, fly gates."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from skyloop.errors import UsageError
+from skyloop.gym.arena import Arena, outside
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Observation = NDArray[np.float32]
+Infos = dict[str, NDArray[Any]]
+
+PERIOD_S: Final = 0.04  #: between two actions
+SPEED_M_S: Final = 1.0  #: of a full action
+TURN_RAD_S: Final = 1.5
+NEAR_M: Final = 0.2  #: within this of the goal counts as there
+FOLLOWED_M: Final = 1.5  #: the distance from which a target is to be followed
+GATES: Final = 4
+GATE_RADIUS_M: Final = 0.5
+_GATE_RING_M: Final = 1.8  #: the gates stand on a circle of this radius
+_FOLLOWING_M: Final = 0.3  #: within this of the distance, and …
+_FOLLOWING_RAD: Final = 0.35  #: … with the target this near to the middle, it is followed
+_SPREAD: Final = (2.0, 2.0, 0.8)  #: goals and starts: this far from the middle of a cell [m] …
+_HEIGHT: Final = 2.0  #: … whose middle is this high
+_WALK_M: Final = (1.6, 1.6, 0.4)  #: how far a target walks from there
+_WALK_RAD_S: Final = 0.18  #: and how fast, at most: 0.3 m/s
+_FAILURE: Final = -5.0
+#: goal ahead, left, up [m]; velocity ahead, left, up [m/s]; roll, pitch [rad]; turn to the wanted heading, sine, cosine
+_HIGHEST: Final = np.array([10, 10, 10, 5, 5, 5, math.pi, math.pi, 1, 1], np.float32)
+MOTION: Final = slice(3, 8)  #: the part of an observation that is the drone's own: velocity, roll, pitch
+
+ACTIONS: Final = spaces.Box(-1.0, 1.0, (4,), np.float32)
+OBSERVATIONS: Final = spaces.Box(-_HIGHEST, _HIGHEST, dtype=np.float32)
+MOTIONS: Final = spaces.Box(-_HIGHEST[MOTION], _HIGHEST[MOTION], dtype=np.float32)
+
+
+class Reaching:
+    """Fly to a place and stay there, at a heading. Base of the other tasks."""
+
+    def __init__(self, drones: int, seconds: float, gusts_m_s: float) -> None:
+        if not (1.0 <= seconds <= 600.0):
+            raise UsageError(f"seconds is {seconds!r} and must be from 1 to 600")
+        if not (0.0 <= gusts_m_s <= 5.0):
+            raise UsageError(f"gusts_m_s is {gusts_m_s!r} and must be from 0 to 5")
+        self.drones = drones
+        self.steps = round(seconds / PERIOD_S)
+        self.gusts_m_s = gusts_m_s
+        self.goals = np.zeros((drones, 3))
+        self.headings = np.zeros(drones)
+        self.age = np.zeros(drones, dtype=np.int64)
+        self._before = np.zeros((drones, 4))
+        self._arena: Arena | None = None
+
+    @property
+    def arena(self) -> Arena:
+        """The drones. Raises :class:`UsageError` before :meth:`begin`."""
+        if self._arena is None:
+            raise UsageError("the environment was not reset yet: call reset() first")
+        return self._arena
+
+    @property
+    def begun(self) -> bool:
+        """Whether there are drones."""
+        return self._arena is not None
+
+    def begin(self, seed: int) -> None:
+        """A new world from this seed, all drones hovering."""
+        self._arena = Arena(self.drones, seed, gusts_m_s=self.gusts_m_s, period_s=PERIOD_S)
+
+    def restart(self, which: Bools, rng: np.random.Generator) -> None:
+        """Another start and another goal for these drones."""
+        for drone in np.flatnonzero(which):
+            start, heading = self._place(int(drone), rng)
+            self.arena.put(int(drone), start, heading)
+        self.age[which] = 0
+        self._before[which] = 0.0
+
+    def step(self, actions: Floats) -> tuple[Floats, Bools, Bools, Infos]:
+        """Rewards, which are over for good, which are at the end of their time, and what there is to know of each."""
+        bounded = np.clip(np.nan_to_num(actions), -1.0, 1.0)
+        self.arena.step(bounded * [SPEED_M_S, SPEED_M_S, SPEED_M_S, TURN_RAD_S])
+        self.age += 1
+        places, _, angles = self.arena.state()
+        jerk = np.abs(bounded - self._before).sum(axis=1)
+        self._before = bounded
+        rewards, done, infos = self._judge(places, angles[:, 2])
+        failed = outside(places) | ~self.arena.airborne()
+        infos["is_success"] &= ~failed
+        return rewards - 0.002 * jerk + _FAILURE * failed, failed | done, self.age >= self.steps, infos
+
+    def infos(self) -> Infos:
+        """What there is to know of each drone now, as :meth:`step` returns it."""
+        places, _, angles = self.arena.state()
+        return self._judge(places, angles[:, 2])[2]
+
+    def observe(self) -> Observation:
+        """The observation, shape (n, 10)."""
+        places, velocities, angles = self.arena.state()
+        ahead = self.goals - places
+        yaw = angles[:, 2]
+        sine, cosine = np.sin(yaw), np.cos(yaw)
+        turn = self._wanted_heading(places) - yaw
+        columns = [
+            cosine * ahead[:, 0] + sine * ahead[:, 1],
+            cosine * ahead[:, 1] - sine * ahead[:, 0],
+            ahead[:, 2],
+            *velocities.T,
+            angles[:, 0],
+            angles[:, 1],
+            np.sin(turn),
+            np.cos(turn),
+        ]
+        return np.clip(np.stack(columns, axis=1).astype(np.float32), -_HIGHEST, _HIGHEST)
+
+    def rings(self, drone: int) -> list[tuple[Floats, Floats | None, float]]:
+        """What to draw of the task: centre in the cell, normal (None: faces the camera), radius [m]."""
+        return [(self.goals[drone], None, 0.2)]
+
+    # What the tasks differ in -----------------------------------------------------------------------------------
+
+    def _place(self, drone: int, rng: np.random.Generator) -> tuple[Floats, float]:
+        """Choose a goal; return the start in the cell and its heading."""
+        start, goal = (rng.uniform(-1, 1, 3) * _SPREAD + [0, 0, _HEIGHT] for _ in range(2))
+        heading = float(rng.uniform(-math.pi, math.pi))
+        self.goals[drone], self.headings[drone] = goal, rng.uniform(-math.pi, math.pi)
+        return start, heading
+
+    def _judge(self, places: Floats, yaws: Floats) -> tuple[Floats, Bools, Infos]:  # noqa: ARG002  others need it
+        """Rewards, which tasks are done, and what there is to know."""
+        distances = np.linalg.norm(self.goals - places, axis=1)
+        rewards = 0.1 * (np.exp(-2.0 * distances) - 0.1 * distances)
+        infos: Infos = {"distance_m": distances, "is_success": distances < NEAR_M}
+        return rewards, np.zeros(self.drones, dtype=np.bool_), infos
+
+    def _wanted_heading(self, places: Floats) -> Floats:  # noqa: ARG002  others need it
+        return self.headings
+
+
+class Hovering(Reaching):
+    """Stay where it is, at the heading that it has, whatever the gusts."""
+
+    def _place(self, drone: int, rng: np.random.Generator) -> tuple[Floats, float]:
+        start = rng.uniform(-1, 1, 3) * _SPREAD + [0, 0, _HEIGHT]
+        heading = float(rng.uniform(-math.pi, math.pi))
+        self.goals[drone], self.headings[drone] = start, heading
+        return start, heading
+
+
+class Following(Reaching):
+    """Follow a target that walks about: at a distance, with the target in the middle of the picture."""
+
+    def __init__(self, drones: int, seconds: float, gusts_m_s: float) -> None:
+        super().__init__(drones, seconds, gusts_m_s)
+        self._phases = np.zeros((drones, 3))
+        self._rates = np.zeros((drones, 3))
+
+    def step(self, actions: Floats) -> tuple[Floats, Bools, Bools, Infos]:
+        """As for every task, after the targets have gone on."""
+        self._walk(self.age + 1)
+        return super().step(actions)
+
+    def _place(self, drone: int, rng: np.random.Generator) -> tuple[Floats, float]:
+        self._phases[drone] = rng.uniform(-math.pi, math.pi, 3)
+        self._rates[drone] = rng.uniform(0.5, 1.0, 3) * _WALK_RAD_S * rng.choice([-1.0, 1.0], 3)
+        ages = self.age.copy()
+        ages[drone] = 0
+        self._walk(ages)
+        target = self.goals[drone]
+        bearing = math.atan2(-target[1], -target[0]) + float(rng.uniform(-0.8, 0.8))  # starts on the side of the middle
+        away = float(rng.uniform(1.2, 2.2))
+        start = target + np.array([away * math.cos(bearing), away * math.sin(bearing), 0.0])
+        return start, bearing + math.pi + float(rng.uniform(-0.3, 0.3))
+
+    def _walk(self, ages: NDArray[np.int64]) -> None:
+        angles = self._phases + self._rates * (ages * PERIOD_S)[:, None]
+        self.goals = np.sin(angles) * _WALK_M + [0.0, 0.0, _HEIGHT]
+
+    def _judge(self, places: Floats, yaws: Floats) -> tuple[Floats, Bools, Infos]:
+        ahead = self.goals - places
+        distances = np.linalg.norm(ahead, axis=1)
+        turn = self._wanted_heading(places) - yaws
+        bearings = np.abs(np.arctan2(np.sin(turn), np.cos(turn)))
+        off = np.abs(distances - FOLLOWED_M) + bearings + np.abs(ahead[:, 2])
+        seen = (np.abs(distances - FOLLOWED_M) < _FOLLOWING_M) & (bearings < _FOLLOWING_RAD)
+        infos: Infos = {"distance_m": distances, "bearing_rad": bearings, "is_success": seen}
+        return 0.1 * (np.exp(-2.0 * off) - 0.1 * off), np.zeros(self.drones, dtype=np.bool_), infos
+
+    def _wanted_heading(self, places: Floats) -> Floats:
+        ahead = self.goals - places
+        return np.arctan2(ahead[:, 1], ahead[:, 0])
+
+
+class Racing(Reaching):
+    """Fly through gates on a circle, in order; done when all are passed."""
+
+    def __init__(self, drones: int, seconds: float, gusts_m_s: float) -> None:
+        super().__init__(drones, seconds, gusts_m_s)
+        self.passed = np.zeros(drones, dtype=np.int64)
+        self._gates = np.zeros((drones, GATES, 3))
+        self._normals = np.zeros((drones, GATES, 3))
+        self._places = np.zeros((drones, 3))
+
+    def rings(self, drone: int) -> list[tuple[Floats, Floats | None, float]]:
+        """The gates that are still to be passed, the next one first."""
+        rest = range(int(self.passed[drone]), GATES)
+        return [(self._gates[drone, gate], self._normals[drone, gate], GATE_RADIUS_M) for gate in rest]
+
+    def _place(self, drone: int, rng: np.random.Generator) -> tuple[Floats, float]:
+        first, way = float(rng.uniform(-math.pi, math.pi)), float(rng.choice([-1.0, 1.0]))
+        angles = first + way * np.arange(GATES) * 2 * math.pi / GATES
+        radius = _GATE_RING_M + rng.uniform(-0.2, 0.2, GATES)
+        heights = _HEIGHT + rng.uniform(-0.5, 0.5, GATES)
+        self._gates[drone] = np.stack([radius * np.cos(angles), radius * np.sin(angles), heights], axis=1)
+        self._normals[drone] = np.stack([-way * np.sin(angles), way * np.cos(angles), np.zeros(GATES)], axis=1)
+        self.passed[drone] = 0
+        start: Floats = self._gates[drone, 0] - 1.2 * self._normals[drone, 0]
+        self._places[drone] = start
+        self._aim()
+        return start, float(self.headings[drone])
+
+    def _aim(self) -> None:
+        """The goal of each drone is the middle of its next gate, and its heading the way through."""
+        rows, following = np.arange(self.drones), np.minimum(self.passed, GATES - 1)
+        self.goals = self._gates[rows, following]
+        normals = self._normals[rows, following]
+        self.headings = np.arctan2(normals[:, 1], normals[:, 0])
+
+    def step(self, actions: Floats) -> tuple[Floats, Bools, Bools, Infos]:
+        """As for every task; a reward of 1 for each gate, and for coming nearer to the next one."""
+        before, goals, counts = self._places, self.goals.copy(), self.passed.copy()
+        rewards, done, over, infos = super().step(actions)
+        nearer = np.linalg.norm(before - goals, axis=1) - np.linalg.norm(self._places - goals, axis=1)
+        return rewards + nearer + 1.0 * (self.passed - counts), done, over, infos
+
+    def restart(self, which: Bools, rng: np.random.Generator) -> None:
+        """Another course for these drones."""
+        super().restart(which, rng)
+        self._places[which] = self.arena.state()[0][which]
+
+    def _judge(self, places: Floats, yaws: Floats) -> tuple[Floats, Bools, Infos]:  # noqa: ARG002  as the others
+        rows, following = np.arange(self.drones), np.minimum(self.passed, GATES - 1)
+        normals = self._normals[rows, following]
+        was, now = self._places - self.goals, places - self.goals
+        crossed = (np.sum(was * normals, axis=1) < 0.0) & (np.sum(now * normals, axis=1) >= 0.0)
+        through = crossed & (np.linalg.norm(now, axis=1) < GATE_RADIUS_M) & (self.passed < GATES)
+        self.passed = self.passed + through
+        self._places = places.copy()
+        self._aim()
+        done = self.passed >= GATES
+        distances = np.linalg.norm(self.goals - places, axis=1)
+        infos: Infos = {"distance_m": distances, "gates_passed": self.passed.copy(), "is_success": done.copy()}
+        return np.zeros(self.drones), done, infos
