@@ -23,6 +23,7 @@ import type { Alarm, DroneRow, State, Sticks, Vector, Vehicle } from "./model.js
 import { Parameters } from "./parameters.js";
 import { Pilot } from "./pilot.js";
 import { Plots } from "./plots.js";
+import { Preflight } from "./preflight.js";
 import { ReplayBar } from "./replaybar.js";
 import { before, type Playback, playbackOf, type Timeline } from "./replaytime.js";
 import { isRecording, type Target } from "./safety.js";
@@ -103,6 +104,7 @@ export class Pane {
   private readonly events = new Events();
   private readonly channels = new Channels();
   private readonly parameters: Parameters;
+  private readonly preflight: Preflight;
   private readonly controls: CameraControls;
   /** Of a replay: its bar, where it is, and the flight as far as the cockpit knows it. */
   private bar: ReplayBar | null = null;
@@ -135,10 +137,11 @@ export class Pane {
     });
     this.plots = new Plots(this.history, () => this.moment_s);
     this.parameters = new Parameters(name, (parameter, value) => this.pilot?.write(parameter, value));
+    this.preflight = new Preflight(name);
     this.decks = {
       space: new Deck("space", [{ name: "Map", element: this.map.element }, { name: "3-D", element: this.space, opened: () => void this.openSpace() }], "Map and space"),
       plots: new Deck("plots", [{ name: "Plots", element: this.plots.element }], "Plots"),
-      lists: new Deck("lists", [{ name: "Events", element: this.events.element }, { name: "Parameters", element: this.parameters.element, opened: () => void this.parameters.load() }], "Events and parameters"),
+      lists: new Deck("lists", [{ name: "Events", element: this.events.element }, { name: "Parameters", element: this.parameters.element, opened: () => void this.parameters.load() }, { name: "Pre-flight", element: this.preflight.element, opened: () => void this.preflight.load() }], "Events, parameters and pre-flight checks"),
     };
     this.element = this.build();
     this.socket = new LastingSocket(`${base}/telemetry`, {
@@ -202,7 +205,14 @@ export class Pane {
     else if (deed === "question") this.strip.question.focus();
     else if (deed === "take") this.pilot.take(this.strip.wanted, this.strip.asks);
     else if (deed === "release") this.pilot.release();
-    else this.pilot.act(deed);
+    else if (deed !== "takeoff" || this.mayTakeOff()) this.pilot.act(deed);
+  }
+
+  /** False: the pilot is asked once more, as something speaks against it. */
+  private mayTakeOff(): boolean {
+    const question = this.state?.flight === "landed" ? this.preflight.ask(performance.now()) : "";
+    if (question) this.notify(question, "bad");
+    return question === "";
   }
 
   tick(now_ms: number): void {
@@ -211,6 +221,7 @@ export class Pane {
     this.strip.count(this.pilot);
     this.stage.update(now_ms);
     this.bar?.update(this.playback, this.state?.links.vehicle === "closed", now_ms);
+    this.preflight.watch((this.pilot?.mine ?? false) && this.state?.flight === "landed" && !this.isOld, now_ms);
     if (this.decks.space.shown === "Map") this.map.draw(now_ms);
     else this.scene?.draw(now_ms);
     this.plots.draw(now_ms);

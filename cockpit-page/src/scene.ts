@@ -27,13 +27,19 @@ import {
 } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import { colour, h } from "./dom.js";
+import { discard, frustum, scenery } from "./scenery.js";
+import type { World } from "./surroundings.js";
 import type { Body, Scene } from "./world.js";
 
 const PERIOD_MS = 50;
 const POINTS = 4096; // of the path, at most
 
+const TURNS: ReadonlySet<string> = new Set(["ArrowUp", "ArrowDown", "ArrowLeft", "ArrowRight"]);
+const NEARER: Readonly<Record<string, number>> = { Equal: 0.85, NumpadAdd: 0.85, Minus: 1.18, NumpadSubtract: 1.18 };
+const TURN_RAD = 0.1;
+
 export class SceneView {
-  readonly element = h("div", { class: "scene", role: "img", "aria-label": "The flight in three dimensions" });
+  readonly element = h("div", { class: "scene", role: "application", tabindex: 0, "data-keys": [...TURNS, ...Object.keys(NEARER)].join(" "), "aria-label": "The flight in three dimensions. Arrow keys turn it, plus and minus zoom." });
   private readonly renderer = new WebGLRenderer({ antialias: true, alpha: true, powerPreference: "low-power" });
   private readonly scene = new ThreeScene();
   private readonly camera = new PerspectiveCamera(50, 1, 0.05, 200);
@@ -43,6 +49,8 @@ export class SceneView {
   private readonly drop = new Line(new BufferGeometry(), new LineDashedMaterial({ dashSize: 0.08, gapSize: 0.06 }));
   private grid = new GridHelper();
   private drawn_ms = 0;
+  private world: World | null = null;
+  private around: Group | null = null;
 
   /** Throws where there is no WebGL. */
   constructor(private readonly current: () => Scene) {
@@ -58,6 +66,7 @@ export class SceneView {
     sun.position.set(-3, -2, 8);
     this.scene.add(sun, new AmbientLight(0xffffff, 1.3), this.path, this.drop, new AxesHelper(0.6));
     this.element.append(this.renderer.domElement);
+    this.element.addEventListener("keydown", (event) => this.key(event));
     this.repaint();
   }
 
@@ -71,6 +80,7 @@ export class SceneView {
     this.drop.material.color = new Color(colour("muted"));
     for (const body of this.bodies.values()) this.scene.remove(body);
     this.bodies.clear();
+    this.surround(null);
   }
 
   draw(now_ms: number): void {
@@ -98,6 +108,7 @@ export class SceneView {
   }
 
   private arrange(scene: Scene): void {
+    if ((scene.world ?? null) !== this.world) this.surround(scene.world ?? null);
     const shown = new Set<string>();
     const place = (key: string, body: Body, make: () => Group): void => {
       shown.add(key);
@@ -111,7 +122,7 @@ export class SceneView {
       // Rz(yaw) Ry(pitch) Rx(roll): REP 103's signs are those of right-handed turns about these axes.
       group.rotation.set(body.roll, body.pitch, body.yaw ?? 0, "ZYX");
     };
-    if (scene.own) place("own", scene.own, () => quadrotor(colour("accent"), 1));
+    if (scene.own) place("own", scene.own, () => this.equipped(quadrotor(colour("accent"), 1)));
     if (scene.truth) place(scene.own ? "ghost" : "truth", scene.truth, () => quadrotor(colour("ok"), scene.own ? 0.35 : 1));
     for (const other of scene.others) place(`other ${other.name}`, other, () => quadrotor(colour("muted"), 1));
     for (const target of scene.targets) place(`target ${target.name}`, target, () => solid(new OctahedronGeometry(0.14), colour("target")));
@@ -127,6 +138,46 @@ export class SceneView {
     this.trace(scene);
     const own = scene.own ?? scene.truth;
     if (own) this.follow(new Vector3(...own.position));
+  }
+
+  private surround(world: World | null): void {
+    this.world = world;
+    if (this.around) {
+      this.scene.remove(this.around);
+      discard(this.around);
+    }
+    this.around = world && scenery(world);
+    if (this.around) this.scene.add(this.around);
+    const own = this.bodies.get("own"); // its cameras may be others
+    if (own) this.scene.remove(own);
+    this.bodies.delete("own");
+    this.grid.visible = !world?.room;
+  }
+
+  /** With what its cameras see. */
+  private equipped(body: Group): Group {
+    for (const camera of this.world?.cameras ?? []) {
+      const view = frustum(camera);
+      if (view) body.add(view);
+    }
+    return body;
+  }
+
+  private key(event: KeyboardEvent): void {
+    if (event.ctrlKey || event.altKey || event.metaKey) return;
+    const nearer = NEARER[event.code];
+    if (nearer === undefined && !TURNS.has(event.code)) return;
+    event.preventDefault();
+    const arm = this.camera.position.clone().sub(this.controls.target);
+    if (nearer !== undefined) arm.multiplyScalar(nearer);
+    else if (event.code === "ArrowLeft" || event.code === "ArrowRight") arm.applyAxisAngle(this.camera.up, event.code === "ArrowLeft" ? -TURN_RAD : TURN_RAD);
+    else {
+      const level = new Vector3().crossVectors(this.camera.up, arm).normalize();
+      const turned = arm.clone().applyAxisAngle(level, event.code === "ArrowUp" ? -TURN_RAD : TURN_RAD);
+      const steep = turned.angleTo(this.camera.up);
+      if (steep > 0.05 && steep < Math.PI / 2 - 0.02) arm.copy(turned);
+    }
+    this.camera.position.copy(this.controls.target).add(arm);
   }
 
   private trace(scene: Scene): void {

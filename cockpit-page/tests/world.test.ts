@@ -4,6 +4,7 @@ import assert from "node:assert/strict";
 import { test } from "node:test";
 import { corners, hull, rayEnd, turned } from "../src/geometry.js";
 import type { Zone } from "../src/surroundings.js";
+import { type Finding, TakeOffQuestion } from "../src/preflight.js";
 import { Writes } from "../src/writes.js";
 import { type Bounds, fields, handles, rectangle, round, writes, zoneAt, zonesText } from "../src/zones.js";
 
@@ -83,4 +84,17 @@ test("parameters are written one after the other, and a refusal is of the one un
   assert.ok(queue.refused("too far"));
   assert.equal(await second, "too far");
   assert.ok(!queue.refused("of something else"));
+});
+
+test("a take-off that something speaks against is asked about once, and the pilot decides", () => {
+  const finding = (level: Finding["level"]): Finding => ({ check: "battery", level, detail: "5% left", why: "it lands at once", remedy: "charge it" });
+  const question = new TakeOffQuestion();
+  assert.equal(question.ask([finding("ok"), finding("warn")], 0, 0), "", "a warning forbids nothing");
+  assert.match(question.ask([finding("fail")], 0, 1000), /battery: 5% left – it lands at once/);
+  assert.notEqual(question.ask([finding("fail")], 0, 1200), "", "too soon: nobody has read it");
+  assert.equal(question.ask([finding("fail")], 0, 3000), "", "the second press is the answer");
+  assert.notEqual(question.ask([finding("fail")], 0, 3500), "", "the next take-off is asked about again");
+  assert.notEqual(question.ask([finding("fail")], 0, 20_000), "", "the answer came too late: asked again");
+  assert.notEqual(question.ask([{ ...finding("fail"), check: "link" }], 0, 21_000), "", "it is another question");
+  assert.equal(new TakeOffQuestion().ask([finding("fail")], 60_000, 0), "", "what is old says nothing");
 });

@@ -12,6 +12,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.routing import Route
 
+from skyloop.client import Level, PreflightFinding
 from skyloop.cockpit.answers import BadRequest, answer_json, answered
 from skyloop.cockpit.world import way_values, world_values
 from skyloop.errors import UnknownNameError
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from skyloop.cockpit.recordings import Recordings
     from skyloop.messages.world import WorldGeometry
 
+_OURS: Final = PreflightFinding("control", Level.OK, "a page of this cockpit has control")
 MAX_ASKING: Final = 4  #: drones that are asked at one time; each may take its thread for seconds
 
 
@@ -63,7 +65,14 @@ class WorldApi:
     async def preflight(self, request: Request) -> Response:
         """Answer with the checklist before a flight."""
         folder = self._recordings.folder
-        return await self._ask(request, lambda drone: [asdict(one) for one in drone.preflight(folder=folder)])
+        station = self._fleet.stations.get(request.path_params["name"])
+        ours = station is not None and bool(station.view.overview()["me"])
+
+        def check(drone: Drone) -> list[Any]:
+            findings = drone.preflight(folder=folder)
+            return [asdict(_OURS if ours and one.check == "control" else one) for one in findings]
+
+        return await self._ask(request, check)
 
     async def _ask(self, request: Request, question: Callable[[Drone], Any]) -> Response:
         """Ask a drone on a thread, as its answer may take a while."""
