@@ -13,13 +13,14 @@ class Card {
   private readonly owner = h("span", { class: "card-owner" });
   private readonly hops = [h("i", { class: "dot" }), h("i", { class: "dot" })];
   private readonly linked = h("span", { class: "card-links" }, ...this.hops);
+  private readonly linkText = h("span", { class: "unseen" });
   private readonly recording = h("span", { class: "rec", title: "being recorded" }, "REC");
   private readonly alarms = h("p", { class: "card-alarm" });
   private readonly beside: HTMLButtonElement;
   private readonly main: HTMLButtonElement;
 
   constructor(name: string, open: (name: string, alone: boolean) => void) {
-    this.main = h("button", { type: "button", class: "card-main", onclick: () => open(name, true) }, h("span", { class: "card-top" }, h("b", {}, name), this.recording, this.linked), h("span", { class: "card-bottom" }, this.state, this.battery.element), this.owner);
+    this.main = h("button", { type: "button", class: "card-main", onclick: () => open(name, true) }, h("span", { class: "unseen" }, "Open"), h("span", { class: "card-top" }, h("b", {}, name), this.recording, this.linked), h("span", { class: "card-bottom" }, this.state, this.battery.element), this.owner, this.linkText);
     this.beside = h("button", { type: "button", class: "card-beside", title: "Show beside the others", onclick: () => open(name, false) }, "+");
     this.element = h("li", { class: "card", "data-drone": name }, this.main, this.beside, this.alarms);
   }
@@ -35,7 +36,7 @@ class Card {
     setHidden(this.recording, !row.recording);
     setText(this.alarms, alarm);
     setHidden(this.alarms, alarm === "");
-    setAttribute(this.main, "aria-label", `Open ${row.name}: ${state}, ${holder}, ${links}`);
+    setText(this.linkText, links);
     setAttribute(this.element, "data-open", String(open));
     setAttribute(this.beside, "aria-pressed", String(open));
     setAttribute(this.beside, "aria-label", open ? `Close ${row.name}` : `Show ${row.name} beside the others`);

@@ -62,7 +62,7 @@ export class Safety {
     this.own = holdButton(countdown, () => this.one(), { class: "stop own", "aria-keyshortcuts": "Control+Enter", title: "Press and hold" }, h("span", {}, "Motors off"), this.name, h("kbd", { "aria-hidden": "true" }, "hold"), this.fate);
     const button = (deed: Deed, kind: string, keys: string): { button: HTMLButtonElement; fate: HTMLElement } => {
       const fate = h("span", { class: "fate" });
-      return { button: holdButton(countdown, () => this.every(deed), { class: kind, "aria-keyshortcuts": keys, title: "Press and hold" }, h("span", {}, WORDS[deed]), h("kbd", { "aria-hidden": "true" }, "hold"), fate), fate };
+      return { button: holdButton(countdown, () => this.every(deed), { class: kind, ...(keys ? { "aria-keyshortcuts": keys } : {}), title: "Press and hold: of all drones" }, h("span", {}, WORDS[deed]), h("kbd", { "aria-hidden": "true" }, "hold"), fate), fate };
     };
     this.all = { land_all: button("land_all", "land-all", ""), stop_all: button("stop_all", "stop", "Control+Shift+Enter") };
     this.element = h("div", { class: "safety", role: "group", "aria-label": "Emergency: press and hold" }, this.own, this.all.land_all.button, this.all.stop_all.button);
@@ -145,12 +145,10 @@ export class Safety {
     const { target } = this;
     setHidden(this.own, target === null);
     setText(this.name, target?.name ?? "");
-    setAttribute(this.own, "aria-label", `Motors off, ${target?.name ?? ""}: press and hold`);
     showFate(this.own, this.fate, target?.result ?? null);
     for (const deed of Object.keys(this.all) as Deed[]) {
       const { button, fate } = this.all[deed];
       setDisabled(button, this.flying === 0);
-      setAttribute(button, "aria-label", `${deed === "land_all" ? "Land all drones" : "Stop all: motors of all drones off"}, press and hold`);
       showFate(button, fate, this.commands.result(deed));
     }
   }

@@ -67,7 +67,7 @@ export class Strip {
     this.hover = keyed("Hover", "H", "", () => act("hover"));
     this.land = keyed("Land", "L", "", () => act("land"));
     this.reset = keyed("Reset emergency", "", "", () => act("reset"));
-    this.stop = holdButton(stop.countdown, stop.deadly, { class: "stop", "aria-label": `Motors off, ${drone}: press and hold`, title: "Press and hold" }, h("span", {}, "Motors off"), h("span", { class: "stop-name" }, drone), h("span", { class: "fate" }));
+    this.stop = holdButton(stop.countdown, stop.deadly, { class: "stop", title: "Press and hold" }, h("span", {}, "Motors off"), h("span", { class: "stop-name" }, drone), h("span", { class: "fate" }));
     this.ended = h("p", { class: "ended", role: "alert", "data-tone": "bad", hidden: true }, this.endedText, h("button", { type: "button", class: "small", onclick: stop.understood }, "Understood"));
     this.buttons = [["take", this.take], ["release", this.release], ["takeoff", this.takeOff], ["hover", this.hover], ["land", this.land], ["reset", this.reset], ["stop", this.stop]];
     this.element = h("div", { class: "strip", role: "group", "aria-label": "Flying" }, this.question.voice, this.question.element, this.ended, this.waiting, this.holder, h("span", { class: "taking" }, this.priority, this.ask, this.take, this.release), h("span", { class: "deeds" }, this.takeOff, this.hover, this.land, this.reset), this.why, this.stop);

@@ -25,6 +25,7 @@ export class Tile implements Sink {
   private readonly battery = new Battery();
   private readonly hops = [h("i", { class: "dot" }), h("i", { class: "dot" })];
   private readonly links = h("span", { class: "card-links" }, ...this.hops);
+  private readonly linkText = h("span", { class: "unseen" });
   private readonly recording = h("span", { class: "rec", title: "being recorded" }, "REC");
   private readonly state = h("span", { class: "tile-state" });
   private readonly holder = h("span", { class: "tile-holder" });
@@ -45,7 +46,7 @@ export class Tile implements Sink {
     const top = h("span", { class: "tile-top" }, h("b", {}, name), this.recording, this.links);
     const picture = h("span", { class: "tile-picture" }, this.canvas, this.nothing, top, this.alarm);
     const text = h("span", { class: "tile-text" }, h("span", { class: "tile-line" }, this.state, this.battery.element), this.holder);
-    this.main = h("button", { type: "button", class: "tile-main", onclick: open }, picture, text);
+    this.main = h("button", { type: "button", class: "tile-main", onclick: open }, h("span", { class: "unseen" }, "Open"), picture, text, this.linkText);
     this.element = h("li", { class: "tile", "data-drone": name }, this.main);
   }
 
@@ -64,7 +65,7 @@ export class Tile implements Sink {
     setTone(this.alarm, alarmTone);
     setHidden(this.alarm, alarm === "");
     setAttribute(this.element, "data-lost", String(lost && !over));
-    setAttribute(this.main, "aria-label", `Open ${row.name}: ${[state, this.holder.textContent, links, alarm].filter(Boolean).join(", ")}`);
+    setText(this.linkText, links);
     const camera = row.cameras[0]?.name ?? "";
     if (camera !== this.camera) {
       this.rest();

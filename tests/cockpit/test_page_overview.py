@@ -99,7 +99,7 @@ def test_no_key_flies_what_is_not_seen_and_all_land(deck: Deck) -> None:
         assert before is not None
         assert after is not None
         assert math.dist(before[:2], after[:2]) < 0.1
-        button = page.page.get_by_role("button", name="Land all drones")
+        button = page.page.get_by_role("button", name="Land all")
         button.hover()
         page.page.mouse.down()
         page.page.locator(".safety-message").wait_for()

@@ -1,0 +1,140 @@
+"""The page for everybody: axe-core finds no fault in it, and keys reach all that a mouse does."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import pytest
+
+from tests.cockpit.browser import CHROMIUM, Deck, browser_and_cockpit
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
+
+RULES: dict[Literal["dark", "light"], str] = {"dark": "{}", "light": "{runOnly: ['color-contrast']}"}
+AXE = Path(__file__).parents[2] / "cockpit-page/node_modules/axe-core/axe.min.js"
+
+pytest.importorskip("playwright.sync_api", reason="the tests of the page need: pip install playwright")
+pytestmark = [
+    pytest.mark.process,
+    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here (Debian: apt install chromium)"),
+]
+
+
+@pytest.fixture(scope="module")
+def open_cockpit() -> Iterator[tuple[Browser, str]]:
+    with browser_and_cockpit() as opened:
+        yield opened
+
+
+@pytest.fixture
+def deck(open_cockpit: tuple[Browser, str]) -> Iterator[Deck]:
+    deck = Deck(*open_cockpit)
+    yield deck
+    deck.end()
+
+
+def faults(page: Page) -> list[str]:
+    """What axe-core finds, each in a line: theme, rule, element, what is wrong."""
+    if not page.evaluate("'axe' in window"):
+        page.evaluate(AXE.read_text())
+    lines: list[str] = []
+    for scheme, rules in RULES.items():
+        page.emulate_media(color_scheme=scheme)
+        found: list[dict[str, Any]] = page.evaluate(f"axe.run({rules}).then((all) => all.violations)")
+        for rule in found:
+            for node in rule["nodes"]:
+                wrong = node["failureSummary"].splitlines()[1].strip()
+                lines.append(f"{scheme}: {rule['id']}: {node['html'][:160]}: {wrong}")
+    return lines
+
+
+@pytest.mark.timeout(240)  # a busy machine takes seconds for each look
+@pytest.mark.skipif(not AXE.exists(), reason="no axe-core here (npm ci in cockpit-page)")
+def test_axe_finds_no_fault(deck: Deck, open_cockpit: tuple[Browser, str], tmp_path: Path) -> None:
+    deck.proxy("alpha")
+    deck.proxy("beta")
+    page = deck.page("alpha", reduced_motion="reduce")
+    found: dict[str, list[str]] = {}
+    page.wait_for_new_picture()
+    page.take_off()
+    found["one drone"] = faults(page.page)
+    for name in ("Controls", "Parameters"):
+        page.pane.get_by_role("button", name=name).dispatch_event("click")  # whatever banner lies over it
+    page.pane.locator('.deck [data-parameter="limits.speed"]').wait_for()
+    found["parameters"] = faults(page.page)
+    page.press("?")
+    found["keys"] = faults(page.page)
+    page.page.get_by_role("button", name="Map the gamepad").click()
+    found["gamepad"] = faults(page.page)
+    page.press("Escape")
+    page.page.get_by_role("button", name="Settings").click()
+    found["settings"] = faults(page.page)
+    page.press("Escape")
+    page.page.set_viewport_size({"width": 390, "height": 844})
+    found["phone"] = faults(page.page)
+    page.page.set_viewport_size({"width": 1280, "height": 860})
+    page.page.get_by_role("button", name="All drones", exact=True).click()
+    page.page.locator(".tile").nth(1).wait_for()
+    found["all drones"] = faults(page.page)
+    tokens = tmp_path / "tokens"
+    tokens.write_text("pilot 0123456789abcdefP ann\n")
+    tokens.chmod(0o600)
+    browser, _ = open_cockpit
+    with browser.new_context() as context:
+        login = context.new_page()
+        login.goto(deck.cockpit("--token-file", str(tokens), "--recordings", str(tmp_path)))
+        login.get_by_label("Token").wait_for()
+        found["login"] = faults(login)
+    assert {where: what for where, what in found.items() if what} == {}
+    assert page.problems == []
+
+
+INTERACTIVE = "a[href], button, input, select, textarea, summary, [tabindex='0']"
+AROUND = """() => {
+  const element = document.activeElement;
+  if (element === document.body) return false; // on the way around, or what had the focus was disabled
+  if ("reached" in element.dataset) return true;
+  const outlined = ({ outlineStyle, outlineWidth }) => outlineStyle !== "none" && parseFloat(outlineWidth) >= 1;
+  // Some show it by their frame.
+  element.dataset.reached = String([element, element.parentElement].map((one) => getComputedStyle(one)).some(outlined));
+  return false;
+}"""
+MISSED = f"""() => [...document.querySelectorAll("body *")].filter((element) => {{
+  if (!element.checkVisibility() || element.disabled) return false;
+  if (element.matches("{INTERACTIVE}")) return element.dataset.reached !== "true";
+  // What looks as if it could be pressed lies in something that can be focused.
+  return getComputedStyle(element).cursor === "pointer" && !element.closest("label, {INTERACTIVE}");
+}}).map((element) => `${{element.dataset.reached ?? "not reached"}}: ${{element.outerHTML.slice(0, 120)}}`)"""
+
+
+def missed(page: Page) -> list[str]:
+    """What the tabulator key does not reach, or without showing it."""
+    page.evaluate("document.activeElement.blur()")
+    page.evaluate("for (const one of document.querySelectorAll('[data-reached]')) delete one.dataset.reached")
+    for _ in range(300):
+        page.keyboard.press("Tab")
+        if page.evaluate(AROUND):
+            break
+    found: list[str] = page.evaluate(MISSED)
+    return found
+
+
+def test_keys_reach_everything_and_show_where_they_are(deck: Deck) -> None:
+    deck.proxy("tabs")
+    deck.proxy("others")
+    page = deck.page("tabs")
+    page.take_control()
+    page.pane.get_by_role("button", name="Parameters").dispatch_event("click")
+    page.pane.locator('.deck [data-parameter="limits.speed"]').wait_for()
+    assert missed(page.page) == []
+    page.page.get_by_role("button", name="All drones", exact=True).click()
+    page.page.locator(".tile").nth(1).wait_for()
+    assert missed(page.page) == []
+    page.press("?")
+    page.page.get_by_role("button", name="Map the gamepad").wait_for()
+    page.press("Tab")
+    assert page.page.evaluate("document.activeElement.closest('dialog') !== null")
+    assert page.problems == []
