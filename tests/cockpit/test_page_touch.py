@@ -96,7 +96,7 @@ def check_arrangement(page: DronePage, size: tuple[int, int]) -> None:
         assert within(stick, video)
         assert stick["right"] - stick["left"] >= 2 * FINGER_PX
         assert apart(stick, stop)
-        for button in page.pane.locator(".strip button:visible, .pane-head button:visible").all():
+        for button in page.pane.locator("button:visible").all():
             found = button.bounding_box()
             assert found is not None
             edges = {"left": found["x"], "top": found["y"]}
