@@ -51,4 +51,7 @@ def main(name: str, seconds: float = 20.0) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    try:
+        main(sys.argv[1] if sys.argv[1:] else "alpha")
+    except skyloop.UnknownNameError:
+        sys.exit("start the drone and the detector first, as the first lines of this file say: skyloop proxy sim:// …")

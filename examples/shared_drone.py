@@ -22,8 +22,7 @@ def pilot(name: str, seconds: float = 60.0) -> None:
 
         drone.on_takeover(may_have_it)
         drone.takeoff()
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
+        for _ in range(round(seconds * 10)):
             if drone.authority.state == "held":
                 drone.velocity(yaw_rate=0.5)  # rad/s, counter-clockwise
             else:
@@ -38,11 +37,9 @@ def look(name: str, seconds: float = 60.0) -> None:
     with skyloop.connect(name, access="observe") as drone:
         owner, end = "", time.monotonic() + seconds
         while time.monotonic() < end:
-            feedback = drone.next_feedback(timeout_s=5.0)
-            if (feedback.owner or "nobody") != owner:
-                owner = feedback.owner or "nobody"
-                battery = "unknown" if feedback.battery is None else f"{feedback.battery:.0%}"
-                print(owner, "flies, battery", battery, flush=True)
+            now = drone.next_feedback(timeout_s=5.0)
+            if (now.owner or "nobody") != owner:
+                print(owner := now.owner or "nobody", "flies, battery", now.battery, flush=True)  # 0 to 1, or None
 
 
 def turn(name: str, seconds: float = 5.0) -> None:
@@ -55,4 +52,8 @@ def turn(name: str, seconds: float = 5.0) -> None:
 
 
 if __name__ == "__main__":
-    {"pilot": pilot, "look": look, "turn": turn}[sys.argv[2]](sys.argv[1], *map(float, sys.argv[3:4]))
+    name, role, *seconds = sys.argv[1:] if sys.argv[2:] else ("alpha", "look")
+    try:
+        {"pilot": pilot, "look": look, "turn": turn}[role](name, *map(float, seconds))
+    except skyloop.UnknownNameError:
+        sys.exit("start the drone first: skyloop sim --name alpha")

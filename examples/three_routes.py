@@ -41,4 +41,7 @@ def main(*targets: str) -> None:
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:] or ("drone*",))
+    try:
+        main(*sys.argv[1:] or ("drone*",))
+    except skyloop.UnknownNameError:
+        sys.exit("start three drones first: skyloop sim --drones 3 --name drone --option cameras=none")
