@@ -118,7 +118,7 @@ export class AlarmSound {
     setTone(this.button, !muted && blocked ? "warn" : "quiet");
     this.wave.setAttribute("visibility", muted || blocked ? "hidden" : "visible");
     setAttribute(this.button, "aria-pressed", String(!muted));
-    setAttribute(this.button, "aria-label", muted ? "Alarms' sound: muted" : blocked ? "Alarms' sound: the browser blocks it until the page is touched" : "Alarms' sound: on");
+    setAttribute(this.button, "aria-label", `Alarms' sound: ${state || "on"}`); // with what is read on it, for who speaks to the page
     setAttribute(this.button, "title", muted ? "Alarms are muted" : blocked ? "The browser blocks sound until you touch the page" : "Alarms are heard: press to mute them");
   }
 }

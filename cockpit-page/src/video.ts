@@ -43,7 +43,7 @@ export class VideoView {
     readonly drone: string,
     readonly camera: Camera,
   ) {
-    this.canvas = h("canvas", { class: "video", role: "img", width: camera.width, height: camera.height });
+    this.canvas = h("canvas", { class: "video", role: "img", "aria-label": `Camera ${camera.name}: no picture yet`, width: camera.width, height: camera.height });
     this.element = h("figure", { class: "camera", "data-camera": camera.name }, this.canvas, this.sheet, this.ageChip, this.rate, this.nothing);
     this.tools = new VideoTools(this);
     // A page that nobody sees asks for no pictures.
