@@ -4,6 +4,7 @@ import "uplot/dist/uPlot.min.css";
 import "./style/base.css";
 import "./style/layout.css";
 import "./style/parts.css";
+import "./style/route.css";
 import "./style/overview.css";
 import "./style/alarms.css";
 import "./style/replay.css";

@@ -3,6 +3,7 @@
 import { h, setAttribute, setHidden } from "./dom.js";
 import { MapView } from "./map.js";
 import type { Vector } from "./model.js";
+import { type RouteDeed, RoutePanel } from "./routepanel.js";
 import { Surroundings } from "./surroundings.js";
 import { WaypointTool } from "./waypoint.js";
 import type { Scene } from "./world.js";
@@ -14,6 +15,9 @@ export interface MapHost {
   /** Where the drone is; null while that is not known. */
   own(): Vector | null;
   goTo(x: number, y: number, z: number): void;
+  /** Along a route that was checked, and what is done with it on the way. */
+  flyRoute(id: string): void;
+  steerRoute(deed: RouteDeed): void;
   /** Write a parameter; returns why it was refused, or nothing. */
   write(name: string, value: string | number): Promise<string>;
 }
@@ -23,13 +27,19 @@ export class MapPanel {
   /** Other tools may be used on it: `map.use(tool)`. */
   readonly map: MapView;
   readonly surroundings: Surroundings;
+  readonly route: RoutePanel;
   private readonly waypoint: WaypointTool;
   private readonly zones: ZoneTool;
   private readonly edit = h("button", { type: "button", class: "small", "aria-pressed": "false", onclick: () => this.map.use(this.map.used === this.zones ? null : this.zones) }, "Zones");
+  private readonly plan = h("button", { type: "button", class: "small", "aria-pressed": "false", onclick: () => this.map.use(this.map.used === this.route ? null : this.route) }, "Route");
   private recording = false;
   private why = { fly: "", write: "" };
 
-  constructor(drone: string, host: MapHost) {
+  constructor(
+    drone: string,
+    host: MapHost,
+    private readonly pilots: boolean,
+  ) {
     this.surroundings = new Surroundings(drone, () => this.zones.update());
     this.waypoint = new WaypointTool({
       own: host.own,
@@ -46,8 +56,9 @@ export class MapPanel {
       write: host.write,
       reload: () => this.surroundings.reload(0),
     });
-    this.map = new MapView(host.scene, this.waypoint, this.waypoint.element, this.zones.element);
-    this.map.corner.append(this.edit);
+    this.route = new RoutePanel(drone, { own: host.own, fly: host.flyRoute, act: host.steerRoute });
+    this.map = new MapView(host.scene, this.waypoint, this.waypoint.element, this.zones.element, this.route.element);
+    this.map.corner.append(this.plan, this.edit);
     this.element = this.map.element;
     this.arrange();
   }
@@ -63,6 +74,7 @@ export class MapPanel {
     this.why = { fly, write };
     this.waypoint.allow(fly === "");
     this.zones.allow(write === "");
+    this.route.allow(fly);
   }
 
   draw(now_ms: number): void {
@@ -83,6 +95,9 @@ export class MapPanel {
     const used = this.map.used;
     setHidden(this.edit, this.recording);
     setAttribute(this.edit, "aria-pressed", String(used === this.zones));
+    setHidden(this.plan, this.recording || !this.pilots);
+    setAttribute(this.plan, "aria-pressed", String(used === this.route));
+    this.route.shown(used === this.route);
     setHidden(this.zones.element, used !== this.zones);
     setHidden(this.waypoint.element, used !== this.waypoint || this.recording);
     this.map.allow(used === this.zones ? this.why.write : used === this.waypoint ? this.why.fly : "");

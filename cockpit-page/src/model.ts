@@ -1,5 +1,7 @@
 // What the cockpit's server sends and receives: docs/cockpit.md. SI units and radians; what is not known is null.
 
+import type { RouteProgress } from "./route.js";
+
 export type Vector = [number, number, number];
 
 export interface Camera {
@@ -165,6 +167,7 @@ export type PilotMessage =
   | Authority
   | { type: "asked"; questions: Question[] }
   | { type: "done"; do: string; name?: string; value?: Value }
+  | RouteProgress
   | { type: "sent"; do: string; n: number }
   | { type: "refused"; do: string; n: number; why: string }
   | { type: "pong"; n: number; now_s: number };
@@ -182,6 +185,8 @@ export type Command =
   | { do: "release" | "takeoff" | "hover" | "land" | "stop" | "reset" }
   | ({ do: "fly" } & Sticks)
   | { do: "goto"; x: number; y: number; z: number; yaw?: number }
+  | { do: "route"; id: string }
+  | { do: "route_pause" | "route_resume" | "route_skip" | "route_stop" }
   | { do: "set"; name: string; value: Value };
 
 export interface Session {

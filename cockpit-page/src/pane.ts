@@ -133,8 +133,10 @@ export class Pane {
       scene: () => this.world(),
       own: () => this.state?.position ?? null,
       goTo: (x, y, z) => this.pilot?.goTo(x, y, z),
+      flyRoute: (id) => this.pilot?.flyRoute(id),
+      steerRoute: (deed) => this.pilot?.steerRoute(deed),
       write: (parameter, value) => this.writes.write(parameter, value),
-    });
+    }, pilots);
     this.plots = new Plots(this.history, () => this.moment_s);
     this.parameters = new Parameters(name, (parameter, value) => this.pilot?.write(parameter, value));
     this.preflight = new Preflight(name);
@@ -253,6 +255,7 @@ export class Pane {
         if (command === "fly" && this.isOld) return; // the whole pane shows that
         this.notify(command ? `${words(command)}: ${why}` : why, "warn");
       },
+      route: (progress) => this.map.route.update(progress),
       done: (command, name, value) => {
         if (command === "set" && name !== undefined && value !== undefined && !this.writes.done(name)) for (const list of [this.parameters, this.controls.parameters]) list.done(name, value);
         if (command === "stop") this.notify("emergency stop sent", "bad");

@@ -7,6 +7,7 @@
 import type { ServerClock } from "./clock.js";
 import { CommandSender, type CommandSocket, type Result } from "./commands.js";
 import type { Authority, Command, PilotMessage, Question, Sticks, Value } from "./model.js";
+import type { RouteProgress } from "./route.js";
 import type { Handlers } from "./socket.js";
 import { isCentred } from "./sticks.js";
 
@@ -19,6 +20,8 @@ export interface PilotListener {
   changed(): void;
   refused(command: string, why: string): void;
   done(command: string, name?: string, value?: Value): void;
+  /** A flight along a route goes on. */
+  route?(progress: RouteProgress): void;
 }
 
 const NOBODY: Authority = { type: "authority", state: "none", holder: null, priority: null, mine: false, why: null, line: null };
@@ -123,6 +126,16 @@ export class Pilot {
     this.going = this.send({ do: "goto", x, y, z });
   }
 
+  /** Along a route that was checked. */
+  flyRoute(id: string): void {
+    this.end();
+    this.going = this.send({ do: "route", id });
+  }
+
+  steerRoute(deed: "route_pause" | "route_resume" | "route_skip" | "route_stop"): void {
+    this.send({ do: deed });
+  }
+
   write(name: string, value: Value): void {
     this.send({ do: "set", name, value });
   }
@@ -173,7 +186,7 @@ export class Pilot {
   }
 
   private refused(command: string, why: string): void {
-    if (command === "goto" || command === "fly") this.end();
+    if (command === "goto" || command === "fly" || command === "route") this.end();
     this.listener.refused(command, why);
   }
 
@@ -190,6 +203,9 @@ export class Pilot {
       this.questions = message.questions;
       this.questioned_ms = this.now_ms();
       this.listener.changed();
+    } else if (message.type === "route") {
+      this.going = message.state === "flying" || message.state === "acting";
+      this.listener.route?.(message);
     } else if (message.type === "done") {
       if (message.do === "goto") this.going = false;
       this.listener.done(message.do, message.name, message.value);

@@ -1,0 +1,89 @@
+// A route as it is in its file, and what is edited of it. Pure.
+
+export interface RouteAction {
+  do: "look" | "wait" | "photo";
+  yaw?: number;
+  at?: [number, number];
+  seconds?: number;
+  camera?: string;
+}
+
+export interface RouteWaypoint {
+  x: number;
+  y: number;
+  z: number;
+  speed?: number;
+  yaw?: number;
+  look_at?: [number, number];
+  actions?: RouteAction[];
+}
+
+export type RouteEnd = "hover" | "land" | "return";
+
+export interface Route {
+  version: 1;
+  name: string;
+  speed: number;
+  end: RouteEnd;
+  waypoints: RouteWaypoint[];
+}
+
+export interface Finding {
+  /** From 1 on; null: of the whole route. */
+  waypoint: number | null;
+  severity: "error" | "warning";
+  reason: string;
+}
+
+export interface RouteCheck {
+  /** By which it is flown. */
+  id: string;
+  ok: boolean;
+  findings: Finding[];
+  length_m: number;
+  seconds: number;
+  battery_left: number | null;
+}
+
+/** Where a flight along a route is. */
+export interface RouteProgress {
+  type: "route";
+  state: "ready" | "flying" | "acting" | "paused" | "done" | "stopped";
+  kind: string;
+  waypoint: number;
+  of: number;
+  text: string;
+  problem: string;
+}
+
+export const emptyRoute = (): Route => ({ version: 1, name: "", speed: 0.5, end: "hover", waypoints: [] });
+
+/** With everything that a file may leave out. */
+export const whole = (route: Partial<Route>): Route => ({ ...emptyRoute(), ...route });
+
+export const waitOf = (one: RouteWaypoint): number => (one.actions ?? []).reduce((sum, action) => sum + (action.do === "wait" ? (action.seconds ?? 0) : 0), 0);
+
+export const hasPhoto = (one: RouteWaypoint): boolean => (one.actions ?? []).some((action) => action.do === "photo");
+
+/** With this wait and with or without a photo; turns to look somewhere stay, and come first. */
+export function withActions(one: RouteWaypoint, wait_s: number, photo: boolean): RouteWaypoint {
+  const photos = (one.actions ?? []).filter((action) => action.do === "photo");
+  const looks = (one.actions ?? []).filter((action) => action.do === "look");
+  const waits: RouteAction[] = wait_s > 0 ? [{ do: "wait", seconds: wait_s }] : [];
+  const actions = [...looks, ...waits, ...(photo ? (photos.length > 0 ? photos : [{ do: "photo" } as const]) : [])];
+  const { actions: _, ...rest } = one;
+  return actions.length > 0 ? { ...rest, actions } : rest;
+}
+
+/** With a waypoint moved to another place of the order. */
+export function moved<T>(all: readonly T[], from: number, to: number): T[] {
+  if (to < 0 || to >= all.length) return [...all];
+  const rest = all.filter((_, number) => number !== from);
+  return [...rest.slice(0, to), all[from] as T, ...rest.slice(to)];
+}
+
+/** What speaks against a waypoint, or against the leg to it; the worst first. */
+export function toneOf(check: RouteCheck | null, number: number): "accent" | "warn" | "bad" {
+  const own = (check?.findings ?? []).filter((one) => one.waypoint === number);
+  return own.some((one) => one.severity === "error") ? "bad" : own.length > 0 ? "warn" : "accent";
+}

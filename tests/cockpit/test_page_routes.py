@@ -1,0 +1,124 @@
+"""Routes on the page, in Chromium and Firefox: planned on the map and by keys, checked, kept, and flown."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, cast
+
+import pytest
+
+import skyloop
+from tests.cockpit.browser import CHROMIUM, Deck, DronePage, browser_and_cockpit
+from tests.cockpit.firefox import FIREFOX
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
+pytest.importorskip("playwright.sync_api", reason="the tests of the page need: pip install playwright")
+pytestmark = pytest.mark.process
+
+SIM = "sim://?world=empty&cameras=front&width=64&fps=10&wind=0"
+MISSING = {"chromium": CHROMIUM is None, "firefox": FIREFOX is None}
+
+
+@pytest.fixture(scope="module", params=["chromium", "firefox"])
+def open_cockpit(request: pytest.FixtureRequest) -> Iterator[tuple[Browser, str]]:
+    if MISSING[request.param]:
+        pytest.skip(f"no {request.param} here")
+    with browser_and_cockpit(cast(Literal["chromium", "firefox"], request.param)) as opened:
+        yield opened
+
+
+@pytest.fixture
+def deck(open_cockpit: tuple[Browser, str]) -> Iterator[Deck]:
+    deck = Deck(*open_cockpit)
+    yield deck
+    deck.end()
+
+
+def write(page: DronePage, label: str, text: str) -> None:
+    """Into a field of numbers, by keys: Firefox does not clear one before it is filled."""
+    page.pane.get_by_label(label, exact=True).focus()
+    page.press("Control+A", *text)
+
+
+def field(page: DronePage, name: str, number: int) -> str:
+    return page.pane.locator(f".route-table tbody tr:nth-child({number}) [data-field={name}]").input_value()
+
+
+def test_a_route_of_three_waypoints_is_planned_and_flown(deck: Deck, tmp_path: Path) -> None:
+    deck.proxy("planner", SIM)
+    page = deck.page("planner")
+    pane = page.pane
+    pane.get_by_role("button", name="Route", exact=True).click()
+    rows = pane.locator(".route-table tbody tr")
+    canvas = pane.locator(".map")
+    box = canvas.bounding_box()
+    assert box is not None
+    canvas.click(position={"x": box["width"] / 2 + 60, "y": box["height"] / 2})
+    page.until(lambda: rows.count() == 1, "a press adds a waypoint")
+    canvas.focus()
+    page.press("ArrowUp", "ArrowUp", "Enter")
+    page.until(lambda: rows.count() == 2, "so does Enter at the cursor")
+    page.press("ArrowLeft", "ArrowLeft", "Enter")
+    page.until(lambda: rows.count() == 3, "and again")
+    places = ((0.8, 0.0, 1.0), (0.8, 0.8, 1.4), (0.0, 0.8, 1.0))
+    for number, place in enumerate(places, 1):
+        for name, value in zip("xyz", place, strict=True):
+            write(page, f"{name} in metres of waypoint {number}", str(value))
+    pane.get_by_label("Photo at waypoint 2").check()
+    write(page, "wait in seconds of waypoint 1", "0.5")
+    page.wait_for_text(".route-body .note[role=status]", "about")
+
+    write(page, "z in metres of waypoint 3", "40")
+    page.wait_for_text(".route-findings", "Waypoint 3: ")
+    assert pane.get_by_role("button", name="Fly the route").is_disabled(), "what can't be flown is not flown"
+    write(page, "z in metres of waypoint 3", "1")
+    page.until(lambda: page.says(".route-findings") == "", "it is checked again")
+    assert pane.get_by_role("button", name="Fly the route").is_disabled(), "nobody has control"
+
+    pane.get_by_label("Name of the route").fill("square")
+    pane.get_by_role("button", name="Save", exact=True).click()
+    page.wait_for_text(".route", "saved as square")
+    pane.get_by_role("button", name="New", exact=True).click()
+    page.until(lambda: rows.count() == 0, "it is empty")
+    pane.get_by_label("Saved routes").select_option("square")
+    page.until(lambda: rows.count() == 3, "it is loaded")
+    assert [float(field(page, axis, 2)) for axis in "xyz"] == [0.8, 0.8, 1.4]
+    uploaded = tmp_path / "bad.route.json"
+    uploaded.write_text(json.dumps({"waypoints": [{"x": 1}]}))
+    pane.locator(".route input[type=file]").set_input_files(uploaded)
+    page.wait_for_text(".route", "missing required field")
+    assert rows.count() == 3, "what is no route takes nothing's place"
+    if folder := os.environ.get("SKYLOOP_PICTURES"):
+        page.page.screenshot(path=f"{folder}/route-plan.png")
+
+    with skyloop.connect("planner", access="observe", name="test") as drone:
+        canvas.evaluate("map => map.blur()")
+        page.take_off()
+        fly = pane.get_by_role("button", name="Fly the route")
+        page.until(lambda: not fly.is_disabled(), "it can be flown")
+        page.problems.clear()  # the refused upload is one
+        fly.click()
+        page.wait_for_text(".route-progress", "waypoint 1 of 3")
+        pane.get_by_role("button", name="Pause the route").click()
+        page.wait_for_text(".route-progress", "paused")
+        resume = pane.get_by_role("button", name="Resume the route")
+
+        def arrived() -> bool:
+            """It pauses by itself where a busy machine lets the page be silent for half a second."""
+            if resume.is_visible():
+                resume.click(timeout=1000)
+            return "done" in page.says(".route-progress")
+
+        page.until(arrived, "it arrives", 60.0)
+        position = drone.feedback().position_m
+        assert position is not None
+        assert math.dist(position, places[2]) < 0.4
+        if folder:
+            page.page.screenshot(path=f"{folder}/route-done.png")
+    assert page.problems == []
