@@ -14,6 +14,7 @@ export interface MapHost {
   scene(): Scene;
   /** Where the drone is; null while that is not known. */
   own(): Vector | null;
+  stands(): boolean;
   goTo(x: number, y: number, z: number): void;
   /** Along a route that was checked, and what is done with it on the way. */
   flyRoute(id: string): void;
@@ -43,6 +44,7 @@ export class MapPanel {
     this.surroundings = new Surroundings(drone, () => this.zones.update());
     this.waypoint = new WaypointTool({
       own: host.own,
+      stands: host.stands,
       speeds: () => {
         const { speed = null, climb = null } = this.surroundings.world?.limits ?? {};
         return speed && climb ? { along: speed, up: climb } : null;

@@ -132,6 +132,7 @@ export class Pane {
     this.map = new MapPanel(name, {
       scene: () => this.world(),
       own: () => this.state?.position ?? null,
+      stands: () => this.state?.flight === "landed",
       goTo: (x, y, z) => this.pilot?.goTo(x, y, z),
       flyRoute: (id) => this.pilot?.flyRoute(id),
       steerRoute: (deed) => this.pilot?.steerRoute(deed),

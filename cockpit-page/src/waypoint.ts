@@ -27,10 +27,13 @@ export function leg(from: Vector, to: Vector, speeds: Speeds | null): Leg {
 }
 
 const AGAIN_MS = 1000;
+const ABOVE_GROUND_M = 1; // height of a place that is chosen before the take-off
 
 export interface WaypointHost {
   /** Where the drone is; null while that is not known. */
   own(): Vector | null;
+  /** It stands on the ground: a place at its height can't be flown to. */
+  stands(): boolean;
   speeds(): Speeds | null;
   /** Why it may not fly to a place, in words; empty if it may. */
   problem(place: Vector): Promise<string>;
@@ -92,7 +95,7 @@ export class WaypointTool implements MapTool {
   lift(spot: Spot, click: boolean): void {
     const own = this.host.own();
     if (!click || !own) return;
-    const height = this.chosen?.[2] ?? own[2];
+    const height = this.chosen?.[2] ?? own[2] + (this.host.stands() ? ABOVE_GROUND_M : 0);
     this.choose([round(spot.place[0]), round(spot.place[1]), round(height)]);
     if (this.can) this.go.focus({ preventScroll: true }); // Enter flies there now; the keys that fly still do
   }

@@ -421,7 +421,9 @@ def test_a_zone_is_drawn_refused_and_seen_by_another_page(deck: Deck) -> None:
         page.until(lambda: bottom.input_value() == "0", "the field shows what is in force")
         # A place in it is refused before anything flies; then by keys alone: the cursor, and Del.
         page.pane.get_by_role("button", name="Zones").click()
-        canvas.click(position={"x": box["width"] * 0.8, "y": box["height"] * 0.5})
+        west, south, _, east, north, _ = map(float, drawn.split()[1:])
+        for axis, value in (("x", (west + east) / 2), ("y", (south + north) / 2), ("z", 1.0)):
+            page.pane.get_by_label(f"Waypoint {axis} in metres").fill(f"{value:.2f}")
         page.wait_for_text(".preview", "in a no-fly zone")
         page.pane.get_by_role("button", name="Zones").click()
         canvas.focus()
