@@ -80,10 +80,10 @@ def test_a_flight_is_recorded_kept_in_order_and_replayed(deck: Deck, tmp_path: P
 
     page = replay(deck, "First flight.mcap")
     page.until(lambda: position(page) > 0.2, "it plays", LONG_S)
-    page.pane.locator(".replay-ticks i[data-kind='mark']").wait_for(state="attached", timeout=LONG_S * 1000)
     page.pane.locator(".replay-slider").focus()
     page.press("Space")
     page.until(lambda: page.attribute(".replay", "data-paused") == "true", "it is paused")
+    page.pane.locator(".replay-ticks i[data-kind='mark']").wait_for(state="attached", timeout=LONG_S * 1000)
     name = page.pane.get_attribute("data-drone") or ""
     with skyloop.connect(name, access="observe", name="test") as drone:
         seen: dict[str, Feedback] = {}
