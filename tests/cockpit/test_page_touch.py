@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
@@ -84,6 +86,20 @@ def take_control(page: DronePage) -> None:
     page.until(lambda: page.pane.get_attribute("data-mine") == "true", "this page has control")
 
 
+def tap_until(page: DronePage, name: str, state: str) -> None:
+    """Tap again if it came too late to count, as on a busy machine."""
+    tapped_s = -math.inf
+
+    def reached() -> bool:
+        nonlocal tapped_s
+        if time.monotonic() - tapped_s > 4.0 and "ing" not in page.says(".pill").replace("hovering", ""):
+            tapped_s = time.monotonic()
+            page.pane.get_by_role("button", name=name).tap()
+        return state in page.says(".pill")
+
+    page.until(reached, f"it is {state} after {name}", timeout_s=30.0)
+
+
 def check_arrangement(page: DronePage, size: tuple[int, int]) -> None:
     """Both sticks on the picture, all on one screen, and nothing of it under something else."""
     screen = {"left": 0.0, "top": 0.0, "right": float(size[0]), "bottom": float(size[1])}
@@ -119,8 +135,7 @@ def test_a_flight_on_a_telephone(deck: Deck) -> None:
         still = page.page.evaluate(STILL)
         take_control(page)
         check_arrangement(page, PORTRAIT)
-        page.pane.get_by_role("button", name="Take off").tap()
-        page.until(lambda: drone.feedback().state is FlightState.HOVERING, "it hovers", timeout_s=20.0)
+        tap_until(page, "Take off", "hovering")
         left, right = (page.pane.locator(".thumb").nth(place).bounding_box() for place in (0, 1))
         assert left is not None
         assert right is not None
@@ -142,8 +157,7 @@ def test_a_flight_on_a_telephone(deck: Deck) -> None:
             for y in (200, 300, 420, 560):
                 hand.put("swipe", 195, y)
         assert page.page.evaluate(STILL) == still
-        page.pane.get_by_role("button", name="Land").tap()
-        page.wait_for_text(".pill", "landed")
+        tap_until(page, "Land", "landed")
     page.page.go_back()
     page.until(lambda: not in_flight_mode(page), "Back leaves it")
     assert page.pane.get_attribute("data-mine") == "true", "and nothing else"
