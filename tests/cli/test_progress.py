@@ -104,11 +104,10 @@ def test_cameras_are_listed_by_name_and_node(tmp_path: Path) -> None:
     assert "this user may not open it: sudo usermod -aG video $USER" in described([closed])
 
 
-@pytest.mark.parametrize("address", ["video://", "video:///dev/video97"])
-def test_video_without_a_camera_says_which_there_are(run: Run, address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_video_without_a_camera_says_which_there_are(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     webcam = CameraDevice(Path("/dev/video4"), "HD Webcam", allowed=True)
     monkeypatch.setattr("skyloop.drivers.video.options.cameras", lambda: [webcam])
-    ended = run("proxy", address)
+    ended = run("proxy", "video://")
     assert ended.code == 2
     assert ended.err.endswith("cameras of this machine: video:///dev/video4 (HD Webcam)\n")
 

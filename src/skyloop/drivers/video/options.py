@@ -51,8 +51,6 @@ def options_of(uri: VehicleUri) -> VideoOptions:
         )
     path = expand(uri.place)
     live = is_device(path)
-    if live and not path.exists():
-        raise UsageError(f"{uri}: there is no {path}; {described(cameras())}")
     if not live and (given := _DEVICE_OPTIONS & uri.options.keys()):
         raise UsageError(f"{uri}: {', '.join(sorted(given))} can be asked of a device only, not of a file")
     camera = uri.options.get("camera", "front")
