@@ -96,13 +96,13 @@ export class RecordingRow {
   }
 
   private noting(): HTMLElement {
-    const area = h("textarea", { maxlength: TEXT, rows: 3, placeholder: t.recordings.note, "aria-label": t.recordings.note });
+    const area = h("textarea", { disabled: true, maxlength: TEXT, rows: 3, placeholder: t.recordings.note, "aria-label": t.recordings.note });
     const save = h("button", { type: "submit", class: "small", disabled: true }, t.recordings.save);
     // The list has only its beginning.
     get<{ text: string }>(`${this.path}/notes`).then(
       ({ text }) => {
         area.value = text;
-        save.disabled = false;
+        area.disabled = save.disabled = false; // not before: it would replace what somebody types
       },
       (error: unknown) => setText(this.note, errorText(error)),
     );
