@@ -22,11 +22,11 @@ export async function session(place: HTMLElement): Promise<Session> {
       const found = await get<Session>("/api/session");
       if (found.role !== null) return found;
       if (!found.login) {
-        place.replaceChildren(h("main", { class: "gate" }, h("h1", {}, "Skyloop cockpit"), h("p", {}, found.hint)));
+        place.replaceChildren(h("main", { id: "panes", class: "gate" }, h("h1", {}, "Skyloop cockpit"), h("p", {}, found.hint)));
         await new Promise((later) => setTimeout(later, 3000));
       } else await ask(place);
     } catch (error) {
-      place.replaceChildren(h("main", { class: "gate" }, h("h1", {}, "Skyloop cockpit"), h("p", { role: "alert" }, errorText(error))));
+      place.replaceChildren(h("main", { id: "panes", class: "gate" }, h("h1", {}, "Skyloop cockpit"), h("p", { role: "alert" }, errorText(error))));
       await new Promise((later) => setTimeout(later, 1000));
     }
   }
@@ -36,7 +36,7 @@ async function ask(place: HTMLElement): Promise<void> {
   const token = h("input", { type: "password", id: "token", autocomplete: "current-password", required: true, maxlength: 256 });
   const problem = h("p", { class: "answer", role: "alert", "data-tone": "bad" });
   const form = h("form", { class: "gate" }, h("h1", {}, "Skyloop cockpit"), h("label", { for: "token" }, "Token"), token, h("button", { type: "submit", class: "primary" }, "Enter"), problem);
-  place.replaceChildren(h("main", {}, form));
+  place.replaceChildren(h("main", { id: "panes" }, form));
   token.focus();
   await new Promise<void>((done) => {
     form.addEventListener("submit", async (event) => {
