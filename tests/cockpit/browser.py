@@ -52,7 +52,7 @@ class Deck:
 
     def own_cockpit(self, *options: str) -> Process:
         """Another cockpit whose pages are opened from now on, and which can be stopped."""
-        process = Process("-m", "skyloop", "cockpit", *options)
+        process = Process("-m", "skyloop", "cockpit", "--port", "0", *options)
         self._processes.append(process)
         process.until("/\n")
         self.address = process.text.split("cockpit: ")[1].strip()

@@ -225,8 +225,7 @@ def test_the_emergency_stop_is_held_shown_as_it_counts_and_names_the_drone(deck:
             assert "Motors of left off" in counting.inner_text()
         page.until(lambda: "released too early" in counting.inner_text(), "it says that nothing was done")
         assert {left.feedback().state, right.feedback().state} == {FlightState.HOVERING}
-        # While somebody writes, and with the list of keys over it.
-        page.press("?")
+        # While somebody writes; test_page_dialogs.py has it with a dialog over it.
         field = page.page.locator('.pane[data-drone="left"] input[aria-label="Filter events by words"]')
         field.fill("wind")
         with page.holding("Control", "Enter"):
@@ -258,7 +257,7 @@ def test_land_all_and_stop_all_are_there_with_nothing_opened(deck: Deck) -> None
     page = deck.page("one", "two")
     for name in ("one", "two"):
         page.page.get_by_role("button", name=f"Close {name}", exact=True).last.click()
-    page.page.locator(".nobody").wait_for()
+    page.page.locator(".overview .tile").first.wait_for()
     assert not page.page.locator(".safety .own").is_visible(), "nothing is seen that it could name"
     with (
         skyloop.connect("one", name="a", on_exit="hover") as one,
