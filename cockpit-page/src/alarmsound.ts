@@ -56,7 +56,8 @@ export class AlarmSound {
     const picture = svg("svg", { viewBox: "0 0 16 16", width: 16, height: 16, "aria-hidden": "true" }, svg("path", { d: "M2 6v4h2.6L9 13.4V2.6L4.6 6z", fill: "currentColor" }), this.wave);
     this.button = h("button", { type: "button", class: "small sound", onclick: () => this.mute(!this.isMuted) }, picture, this.text);
     // Browsers allow sound only after the first touch of the page.
-    for (const touch of ["pointerdown", "keydown"]) window.addEventListener(touch, () => this.wake(), { capture: true });
+    // At the end of a press: what the button says changes its width, and nothing may move under the finger that is down.
+    for (const touch of ["pointerup", "keydown"]) window.addEventListener(touch, () => this.wake(), { capture: true });
     setInterval(() => this.look(), LOOK_MS);
     this.show();
   }
