@@ -165,8 +165,7 @@ def test_pre_emption_by_priority_and_the_return(node: Node, drone: Drone) -> Non
             drone.velocity(forward=0.5)
         drone.wait("hovering", WAIT_S)
         boss.velocity(left=0.3)
-        boss.wait("flying", WAIT_S)
-        assert boss.feedback().owner == "boss"
+        boss.wait(lambda state: state.state is FlightState.FLYING and state.owner == "boss", WAIT_S)
     drone.wait(lambda _: drone.authority.state == "held", WAIT_S)
     node.vehicle.applied.clear()
     seq = drone.feedback().seq

@@ -140,7 +140,7 @@ def test_recordings_and_replays_are_few(tmp_path: Path, monkeypatch: pytest.Monk
     class Replay:
         numbers = iter(range(100))
 
-        def __init__(self, _: Path) -> None:
+        def __init__(self, _: Path, drone: str | None) -> None:
             self.name = f"replay {next(self.numbers)}"
 
         def close(self) -> None: ...

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import inspect
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Unpack
 
@@ -172,6 +173,12 @@ class Drone:
         return self.sync.recent_events()
 
     # Commands --------------------------------------------------------------------------------------------------
+
+    async def preflight(
+        self, *, video_s: float = 1.5, folder: str | Path | None = None
+    ) -> list[client.PreflightFinding]:
+        """Return the checklist before a flight; see :meth:`skyloop.Drone.preflight`."""
+        return await in_thread(lambda: self.sync.preflight(video_s=video_s, folder=folder))
 
     async def takeoff(self, *, wait: bool = True, timeout_s: float = 15.0) -> None:
         """Take off, then hover; see :meth:`skyloop.Drone.takeoff`."""

@@ -139,6 +139,8 @@ class Playback:
         """Return what is wanted now; a position is given once."""
         with self._lock:
             wanted, self._wanted = self._wanted, Wanted(self._wanted.paused, self._wanted.speed)
+            if wanted.position_s is not None:  # who wrote it reads it, also before its moment is shown
+                self.position_s = wanted.position_s
             if not self.stopped:
                 self._changed.clear()
         return wanted
