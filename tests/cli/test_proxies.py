@@ -274,4 +274,6 @@ def test_the_cockpit_says_what_is_wrong(run: Run, alpha: Process) -> None:
         other.listen()
         port = other.getsockname()[1]
         ended = run("cockpit", "alpha", "--port", str(port))
-    assert ended == (2, "", f"skyloop: port {port} of 127.0.0.1 is in use; port 0 takes a free one\n")
+    assert (ended.code, ended.out) == (2, "")
+    assert ended.err.startswith(f"skyloop: port {port} of 127.0.0.1 is in use by process {os.getpid()} (")
+    assert ended.err.endswith("); port 0 takes a free one\n")

@@ -87,6 +87,9 @@ def test_observers_that_stop_reading_delay_no_command_and_no_emergency_stop(
         # On a busy machine Zenoh gives their links up first, and they are gone by that.
         eventually(lambda: len(let_go()) == STALLED, "all that stopped reading were let go, and it was told", 30.0)
         stalled = sum("it took nothing" in text for text in let_go())
-        counted = eye._proxy_statistics()
-        assert counted is not None
-        assert counted.counters.get("network.dropped", 0) == stalled
+
+        def counted() -> bool:
+            statistics = eye._proxy_statistics()
+            return statistics is not None and statistics.counters.get("network.dropped", 0) == stalled
+
+        eventually(counted, "and counted")

@@ -17,6 +17,7 @@ ADVICE: Final = "write when they have landed, or take over with a higher --prior
 TRUTH: Final = {
     word: truth for truth, words in ((True, "true yes on 1"), (False, "false no off 0")) for word in words.split()
 }
+LONGEST_VALUE: Final = 30  #: of a value in a table; the world of a simulator is a thousand characters
 KINDS: Final = {
     ParameterType.BOOL: "true or false",
     ParameterType.INT: "a whole number",
@@ -104,9 +105,14 @@ def parse_value(parameter: Parameter, text: str) -> Value:
 
 
 def table(parameters: list[Parameter]) -> list[str]:
-    """Return a line for each parameter: name, value with unit, what is allowed."""
-    rows = [(p.name, f"{show(p.value)} {p.unit}".rstrip(), allowed(p)) for p in parameters]
+    """Return a line for each parameter: name, value with unit, what is allowed; long values are cut."""
+    rows = [(p.name, shorten(f"{show(p.value)} {p.unit}".rstrip()), allowed(p)) for p in parameters]
     return columns([("PARAMETER", "VALUE", "ALLOWED"), *rows])
+
+
+def shorten(value: str) -> str:
+    """Return a value as it fits into a table."""
+    return value if len(value) <= LONGEST_VALUE else f"{value[: LONGEST_VALUE - 1]}…"
 
 
 def details(parameter: Parameter) -> list[str]:
