@@ -384,7 +384,7 @@ def test_a_waypoint_is_previewed_and_flown_to(deck: Deck) -> None:
         page.wait_for_text(".preview", "m straight")
         assert drone.feedback().state is FlightState.HOVERING, "choosing moves nothing"
         page.press("Enter")
-        page.wait_for_text(".notice", "waypoint is reached")
+        page.until(lambda: "waypoint is reached" in page.says(".notice"), "it flies there, some metres", 40.0)
         there = drone.feedback().position_m
         assert start is not None
         assert there is not None
