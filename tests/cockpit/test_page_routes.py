@@ -47,7 +47,7 @@ def write(page: DronePage, label: str, text: str) -> None:
 
 
 def field(page: DronePage, name: str, number: int) -> str:
-    return page.pane.locator(f".route-table tbody tr:nth-child({number}) [data-field={name}]").input_value()
+    return str(page.pane.locator(f".route-table tbody tr:nth-child({number}) [data-field={name}]").input_value())
 
 
 def test_a_route_of_three_waypoints_is_planned_and_flown(deck: Deck, tmp_path: Path) -> None:

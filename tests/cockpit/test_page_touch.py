@@ -55,7 +55,7 @@ def touched(deck: Deck, drone: str, size: tuple[int, int]) -> DronePage:
 
 
 def in_flight_mode(page: DronePage) -> bool:
-    return page.pane.get_attribute("data-flight") == "true"
+    return bool(page.pane.get_attribute("data-flight") == "true")
 
 
 def box(page: DronePage, selector: str, place: int = 0) -> dict[str, float]:
