@@ -24,6 +24,8 @@ CHROMIUM = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
 )
 PATIENCE_S = 10.0
+IN_FIREFOX = pytest.mark.parametrize("open_cockpit", ["firefox"], indirect=True, scope="module")
+IN_BOTH = pytest.mark.parametrize("open_cockpit", ["chromium", "firefox"], indirect=True, scope="module")
 WATCHED = "sim://?world=empty&cameras=front&width=320&fps=15"
 
 
@@ -188,14 +190,15 @@ def _chromium(playwright: Playwright) -> Iterator[Browser]:
 
 @contextmanager
 def browser_and_cockpit(name: Literal["chromium", "firefox"] = "chromium") -> Iterator[tuple[Browser, str]]:
-    """A browser, and the address of a cockpit that shows every proxy as it comes."""
-    from playwright.sync_api import sync_playwright
-
+    """A browser, and the address of a cockpit that shows every proxy as it comes. Skips where there is none."""
+    sync_api = pytest.importorskip("playwright.sync_api", reason="the tests of the page need: pip install playwright")
+    if {"chromium": CHROMIUM, "firefox": firefox.FIREFOX}[name] is None:
+        pytest.skip(f"no {name} here (Debian: apt install chromium firefox-esr)")
     with (
         runtime(),
         tempfile.TemporaryDirectory(prefix="skyloop-recordings-") as folder,
         CockpitProcess(recordings=Path(folder)) as cockpit,
-        sync_playwright() as playwright,
+        sync_api.sync_playwright() as playwright,
         _chromium(playwright) if name == "chromium" else firefox.launch(playwright) as browser,
     ):
         yield browser, cockpit.address()

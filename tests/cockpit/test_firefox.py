@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,30 +10,12 @@ import pytest
 import skyloop
 from skyloop.messages import FlightState
 from tests.cockpit import fingers
-from tests.cockpit.browser import Deck, DronePage, browser_and_cockpit
-from tests.cockpit.firefox import FIREFOX
+from tests.cockpit.browser import IN_FIREFOX, Deck, DronePage
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
-pytest.importorskip("playwright.sync_api", reason="the tests of the page need: pip install playwright")
-pytestmark = [
-    pytest.mark.process,
-    pytest.mark.skipif(FIREFOX is None, reason="no Firefox here (Debian: apt install firefox-esr)"),
-]
-
-
-@pytest.fixture(scope="module")
-def open_cockpit() -> Iterator[tuple[Browser, str]]:
-    with browser_and_cockpit("firefox") as opened:
-        yield opened
-
-
-@pytest.fixture
-def deck(open_cockpit: tuple[Browser, str]) -> Iterator[Deck]:
-    deck = Deck(*open_cockpit)
-    yield deck
-    deck.end()
+pytestmark = [pytest.mark.process, IN_FIREFOX]
 
 
 def test_a_person_logs_in_and_flies_by_keys(open_cockpit: tuple[Browser, str], deck: Deck, tmp_path: Path) -> None:

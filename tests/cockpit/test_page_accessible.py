@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import pytest
 
-from tests.cockpit.browser import CHROMIUM, Deck, browser_and_cockpit
+from tests.cockpit.browser import Deck
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -16,24 +15,7 @@ if TYPE_CHECKING:
 RULES: dict[Literal["dark", "light"], str] = {"dark": "{}", "light": "{runOnly: ['color-contrast']}"}
 AXE = Path(__file__).parents[2] / "cockpit-page/node_modules/axe-core/axe.min.js"
 
-pytest.importorskip("playwright.sync_api", reason="the tests of the page need: pip install playwright")
-pytestmark = [
-    pytest.mark.process,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here (Debian: apt install chromium)"),
-]
-
-
-@pytest.fixture(scope="module")
-def open_cockpit() -> Iterator[tuple[Browser, str]]:
-    with browser_and_cockpit() as opened:
-        yield opened
-
-
-@pytest.fixture
-def deck(open_cockpit: tuple[Browser, str]) -> Iterator[Deck]:
-    deck = Deck(*open_cockpit)
-    yield deck
-    deck.end()
+pytestmark = pytest.mark.process
 
 
 def faults(page: Page) -> list[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,29 +11,12 @@ import pytest
 
 import skyloop
 from skyloop.messages import FlightState
-from tests.cockpit.browser import CHROMIUM, Deck, browser_and_cockpit
+from tests.cockpit.browser import Deck
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser
+    pass
 
-pytest.importorskip("playwright.sync_api", reason="the tests of the page need: pip install playwright")
-pytestmark = [
-    pytest.mark.process,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here (Debian: apt install chromium)"),
-]
-
-
-@pytest.fixture(scope="module")
-def open_cockpit() -> Iterator[tuple[Browser, str]]:
-    with browser_and_cockpit() as opened:
-        yield opened
-
-
-@pytest.fixture
-def deck(open_cockpit: tuple[Browser, str]) -> Iterator[Deck]:
-    deck = Deck(*open_cockpit)
-    yield deck
-    deck.end()
+pytestmark = pytest.mark.process
 
 
 def test_nothing_flies_while_a_dialog_is_open_but_the_emergency_stop_works(deck: Deck) -> None:

@@ -17,31 +17,14 @@ import pytest
 
 import skyloop
 from skyloop.messages import FlightState
-from tests.cockpit.browser import CHROMIUM, Deck, DronePage, browser_and_cockpit
+from tests.cockpit.browser import Deck, DronePage
 from tests.processes.conftest import Process
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
-sync_api = pytest.importorskip("playwright.sync_api", reason="the tests of the page need: pip install playwright")
-pytestmark = [
-    pytest.mark.process,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here (Debian: apt install chromium)"),
-]
+pytestmark = pytest.mark.process
 SMALL = "sim://?world=empty&cameras="
-
-
-@pytest.fixture(scope="module")
-def open_cockpit() -> Iterator[tuple[Browser, str]]:
-    with browser_and_cockpit() as opened:
-        yield opened
-
-
-@pytest.fixture
-def deck(open_cockpit: tuple[Browser, str]) -> Iterator[Deck]:
-    deck = Deck(*open_cockpit)
-    yield deck
-    deck.end()
 
 
 @contextmanager

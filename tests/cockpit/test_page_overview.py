@@ -13,17 +13,13 @@ import pytest
 import skyloop
 from skyloop.cockpit.addresses import bind
 from skyloop.messages import FlightState
-from tests.cockpit.browser import CHROMIUM, PATIENCE_S, Deck, DronePage, browser_and_cockpit
+from tests.cockpit.browser import PATIENCE_S, Deck, DronePage
 from tests.processes.conftest import Process
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
-sync_api = pytest.importorskip("playwright.sync_api", reason="the tests of the page need: pip install playwright")
-pytestmark = [
-    pytest.mark.process,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here (Debian: apt install chromium)"),
-]
+pytestmark = pytest.mark.process
 
 NAMES = ["d1", "d2", "d3"]
 BACK_S = 3.0
@@ -31,22 +27,15 @@ SMALL = ("cameras=front", "width=160", "height=120", "fps=10", "position=1")
 
 
 @pytest.fixture(scope="module")
-def opened() -> Iterator[tuple[Browser, str]]:
-    with browser_and_cockpit() as opened:
-        options = [word for option in SMALL for word in ("--option", option)]
-        world = Process("-m", "skyloop", "sim", "--drones", "3", "--name", "d", "--world", "empty", *options)
-        try:
-            world.until("ready d3")
-            yield opened
-        finally:
-            world.end()
-
-
-@pytest.fixture
-def deck(opened: tuple[Browser, str]) -> Iterator[Deck]:
-    deck = Deck(*opened)
-    yield deck
-    deck.end()
+def open_cockpit(open_cockpit: tuple[Browser, str]) -> Iterator[tuple[Browser, str]]:
+    """The cockpit, with three drones that fly in one world."""
+    options = [word for option in SMALL for word in ("--option", option)]
+    world = Process("-m", "skyloop", "sim", "--drones", "3", "--name", "d", "--world", "empty", *options)
+    try:
+        world.until("ready d3")
+        yield open_cockpit
+    finally:
+        world.end()
 
 
 def frames(page: DronePage, name: str) -> int:

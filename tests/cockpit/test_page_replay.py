@@ -9,13 +9,9 @@ import pytest
 
 import skyloop
 from skyloop.messages import Feedback
-from tests.cockpit.browser import CHROMIUM, Deck, DronePage, browser_and_cockpit
+from tests.cockpit.browser import Deck, DronePage, browser_and_cockpit
 
-pytest.importorskip("playwright.sync_api", reason="the tests of the page need: pip install playwright")
-pytestmark = [
-    pytest.mark.process,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here (Debian: apt install chromium)"),
-]
+pytestmark = pytest.mark.process
 
 LONG_S = 30.0
 

@@ -5,39 +5,16 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, cast
 
 import pytest
 
 import skyloop
-from tests.cockpit.browser import CHROMIUM, Deck, DronePage, browser_and_cockpit
-from tests.cockpit.firefox import FIREFOX
+from tests.cockpit.browser import IN_BOTH, Deck, DronePage
 
-if TYPE_CHECKING:
-    from playwright.sync_api import Browser
-
-pytest.importorskip("playwright.sync_api", reason="the tests of the page need: pip install playwright")
-pytestmark = pytest.mark.process
+pytestmark = [pytest.mark.process, IN_BOTH]
 
 SIM = "sim://?world=empty&cameras=front&width=64&fps=10&wind=0"
-MISSING = {"chromium": CHROMIUM is None, "firefox": FIREFOX is None}
-
-
-@pytest.fixture(scope="module", params=["chromium", "firefox"])
-def open_cockpit(request: pytest.FixtureRequest) -> Iterator[tuple[Browser, str]]:
-    if MISSING[request.param]:
-        pytest.skip(f"no {request.param} here")
-    with browser_and_cockpit(cast(Literal["chromium", "firefox"], request.param)) as opened:
-        yield opened
-
-
-@pytest.fixture
-def deck(open_cockpit: tuple[Browser, str]) -> Iterator[Deck]:
-    deck = Deck(*open_cockpit)
-    yield deck
-    deck.end()
 
 
 def write(page: DronePage, label: str, text: str) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -12,16 +11,12 @@ import pytest
 import skyloop
 from skyloop.messages import FlightState
 from tests.cockpit import fingers
-from tests.cockpit.browser import CHROMIUM, Deck, DronePage, browser_and_cockpit
+from tests.cockpit.browser import Deck, DronePage
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser
+    pass
 
-pytest.importorskip("playwright.sync_api", reason="the tests of the page need: pip install playwright")
-pytestmark = [
-    pytest.mark.process,
-    pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here (Debian: apt install chromium)"),
-]
+pytestmark = pytest.mark.process
 
 PORTRAIT, LANDSCAPE, TABLET = (390, 844), (844, 390), (1024, 768)
 FINGER_PX = 44.0
@@ -33,19 +28,6 @@ SMALL = """(least) => [...document.querySelectorAll("button, .button, select, in
   .map(([name, box]) => [name, box.width, box.height])
   .filter(([, width, height]) => width > 0 && (width < least - 0.5 || height < least - 0.5))"""
 STILL = "[scrollX, scrollY, document.scrollingElement.scrollTop, visualViewport.scale, visualViewport.pageTop].join()"
-
-
-@pytest.fixture(scope="module")
-def open_cockpit() -> Iterator[tuple[Browser, str]]:
-    with browser_and_cockpit() as opened:
-        yield opened
-
-
-@pytest.fixture
-def deck(open_cockpit: tuple[Browser, str]) -> Iterator[Deck]:
-    deck = Deck(*open_cockpit)
-    yield deck
-    deck.end()
 
 
 def touched(deck: Deck, drone: str, size: tuple[int, int]) -> DronePage:
