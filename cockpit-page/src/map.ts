@@ -4,15 +4,21 @@ import { colour, fit, h, setText } from "./dom.js";
 import { caption, crosshair, drawScene } from "./maplayers.js";
 import { arrow, type Ink, MAP_KEYS, type MapTool, nearest, type Project, type Spot } from "./maptool.js";
 import type { Vector } from "./model.js";
-import { around, gridStep, type Size, toMetres, toPixels, type View, zoomed } from "./view.js";
+import { apart, around, gridStep, type Size, toMetres, toPixels, type View, zoomed } from "./view.js";
 import type { Scene } from "./world.js";
 
 const PERIOD_MS = 80;
 const CLICK_PX = 5;
 const REACH_PX = 12;
 const EASE = 0.15; // of the way to the wanted view, each time that it is drawn
+const STILL = 0.01; // of the view's extent: less than this to the wanted view is no movement
 const ZOOM = 1.4;
 const INKS = ["well", "line", "muted", "text", "accent", "ok", "warn", "bad", "target"];
+
+interface Shown {
+  view: View;
+  size: Size;
+}
 
 export class MapView {
   readonly element: HTMLElement;
@@ -24,8 +30,11 @@ export class MapView {
   private readonly follow = h("button", { type: "button", class: "small", "aria-pressed": "true", onclick: () => this.refit() }, "Fit");
   private tool: MapTool | null = null;
   private view: View | null = null;
+  /** What is on the screen: what a press means is what is seen, though the page may have been laid out anew since. */
+  private drawn: Shown | null = null;
+  private room = "";
   private fitted = true;
-  private drag: { x: number; y: number; view: View; moved: boolean; taken: boolean } | null = null;
+  private drag: { x: number; y: number; shown: Shown; moved: boolean; taken: boolean } | null = null;
   /** Of the keyboard, while the map has the focus; east and north [m]. */
   private cursor: [number, number] | null = null;
   private ink: Ink = {};
@@ -95,6 +104,7 @@ export class MapView {
     pen.fillStyle = ink["well"] ?? "";
     pen.fillRect(0, 0, size.width, size.height);
     const view = this.view;
+    this.drawn = view && { view, size };
     if (!view) {
       caption({ pen, ink, size }, "Nothing here has a known position");
       return;
@@ -122,8 +132,12 @@ export class MapView {
     const wanted = around([...room, ...bodies, ...scene.waypoints.map((one) => one.position), ...scene.trail.points.map((point) => point.place as Vector)], size);
     if (!wanted) return;
     const { view } = this;
+    const known = room.flat().join();
+    const jumps = !view || known !== this.room; // a room that has become known is not approached, it is shown
+    this.room = known;
     const mix = (from: number, to: number): number => from + (to - from) * EASE;
-    this.view = view ? { east: mix(view.east, wanted.east), north: mix(view.north, wanted.north), scale: mix(view.scale, wanted.scale) } : wanted;
+    this.view = jumps ? wanted : { east: mix(view.east, wanted.east), north: mix(view.north, wanted.north), scale: mix(view.scale, wanted.scale) };
+    this.canvas.dataset["still"] = String(room.length > 0 && (jumps || apart(this.view, wanted, size) < STILL));
   }
 
   // Moving about
@@ -151,49 +165,61 @@ export class MapView {
 
   // Pointers and keys, for the tool
 
-  private spot(view: View, x: number, y: number): Spot {
-    const place = toMetres(view, this.size, x, y);
+  /** A pixel of the canvas as it is now, as one of the picture on it: it is stretched until it is drawn anew. */
+  private pixel(event: PointerEvent): [number, number] {
+    const { size, drawn } = this;
+    return drawn ? [(event.offsetX * drawn.size.width) / size.width, (event.offsetY * drawn.size.height) / size.height] : [event.offsetX, event.offsetY];
+  }
+
+  private spot({ view, size }: Shown, x: number, y: number): Spot {
+    const place = toMetres(view, size, x, y);
     const { own, others, targets } = this.scene();
     const reach_m = REACH_PX / view.scale;
     return { place, pixel: [x, y], reach_m, under: nearest(place, reach_m, [...(own ? [own] : []), ...others, ...targets]) };
   }
 
   private press(event: PointerEvent): void {
-    if (!this.view || event.button !== 0) return;
+    const shown = this.drawn;
+    if (!shown || event.button !== 0) return;
     this.canvas.setPointerCapture(event.pointerId);
-    const taken = this.used?.press(this.spot(this.view, event.offsetX, event.offsetY)) ?? false;
+    const [x, y] = this.pixel(event);
+    const taken = this.used?.press(this.spot(shown, x, y)) ?? false;
     if (taken) this.free(); // the view stays while something is dragged
-    this.drag = { x: event.offsetX, y: event.offsetY, view: this.view, moved: false, taken };
+    this.drag = { x, y, shown, moved: false, taken };
   }
 
   private move(event: PointerEvent): void {
-    const { drag, view } = this;
-    if (!drag || !view) return;
-    const [dx, dy] = [event.offsetX - drag.x, event.offsetY - drag.y];
+    const { drag } = this;
+    if (!drag) return;
+    const [x, y] = this.pixel(event);
+    const [dx, dy] = [x - drag.x, y - drag.y];
     if (!drag.moved && Math.hypot(dx, dy) < CLICK_PX) return;
     drag.moved = true;
+    const { view } = drag.shown;
     if (drag.taken) {
-      this.used?.move(this.spot(view, event.offsetX, event.offsetY));
+      this.used?.move(this.spot(this.drawn ?? drag.shown, x, y));
       return;
     }
     this.free();
-    this.view = { ...drag.view, east: drag.view.east - dx / drag.view.scale, north: drag.view.north + dy / drag.view.scale };
+    this.view = { ...view, east: view.east - dx / view.scale, north: view.north + dy / view.scale };
   }
 
   private lift(event: PointerEvent): void {
-    const { drag, view } = this;
+    const { drag } = this;
     this.drag = null;
-    if (!drag || !view || (drag.moved && !drag.taken)) return;
-    this.used?.lift(this.spot(view, event.offsetX, event.offsetY), !drag.moved);
+    if (!drag || (drag.moved && !drag.taken)) return;
+    // A click means what was seen when it was pressed, though the view may have eased on since.
+    const shown = drag.moved ? (this.drawn ?? drag.shown) : drag.shown;
+    this.used?.lift(this.spot(shown, ...this.pixel(event)), !drag.moved);
   }
 
   private key(event: KeyboardEvent): void {
-    const { view } = this;
+    const { view, size } = this;
     if (!view || event.ctrlKey || event.altKey || event.metaKey || !MAP_KEYS.has(event.code)) return;
     event.preventDefault();
     const step = arrow(event.code);
     const from = (this.cursor ??= [view.east, view.north]);
-    if (this.used?.key(event, this.spot(view, ...toPixels(view, this.size, ...from)))) return;
+    if (this.used?.key(event, this.spot({ view, size }, ...toPixels(view, size, ...from)))) return;
     if (step) this.moveCursor(view, step, gridStep(view.scale) / (event.shiftKey ? 50 : 5));
     else if (event.code === "Equal" || event.code === "NumpadAdd") this.zoom(ZOOM);
     else if (event.code === "Minus" || event.code === "NumpadSubtract") this.zoom(1 / ZOOM);
@@ -205,10 +231,11 @@ export class MapView {
     const [x, y] = this.cursor ?? [view.east, view.north];
     const place: [number, number] = [snapped(x + east * step_m, step_m), snapped(y + north * step_m, step_m)];
     this.cursor = place;
-    const { width, height } = this.size;
-    const [px, py] = toPixels(view, this.size, ...place);
-    if (px < 0 || py < 0 || px > width || py > height) this.view = { ...view, east: place[0], north: place[1] };
-    this.used?.cursor?.(this.spot(this.view ?? view, ...toPixels(this.view ?? view, this.size, ...place)));
+    const { size } = this;
+    const [px, py] = toPixels(view, size, ...place);
+    if (px < 0 || py < 0 || px > size.width || py > size.height) this.view = { ...view, east: place[0], north: place[1] };
+    const now = { view: this.view ?? view, size };
+    this.used?.cursor?.(this.spot(now, ...toPixels(now.view, size, ...place)));
     setText(this.spoken, `${place[0].toFixed(2)} m east, ${place[1].toFixed(2)} m north`);
   }
 }

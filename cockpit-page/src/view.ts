@@ -35,6 +35,13 @@ export function around(places: readonly (readonly [number, number, ...number[]])
   return { east: (west + east) / 2, north: (south + north) / 2, scale: Math.min(size.width / wide, size.height / high) };
 }
 
+/** How far apart two views are, as a share of the smaller one's extent. */
+export function apart(one: View, other: View, size: Size): number {
+  const way_m = Math.hypot(one.east - other.east, one.north - other.north);
+  const scale = Math.max(one.scale, other.scale);
+  return Math.max((way_m * scale) / Math.min(size.width, size.height), Math.abs(Math.log(one.scale / other.scale)));
+}
+
 /** The distance between the lines of a grid: 1, 2 or 5 times a power of ten, at least `pixels` apart [m]. */
 export function gridStep(scale: number, pixels = 45): number {
   const least = pixels / scale;

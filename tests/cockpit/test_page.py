@@ -358,11 +358,12 @@ def test_a_waypoint_is_previewed_and_flown_to(deck: Deck) -> None:
         page.take_off()
         canvas = page.pane.locator(".map.clickable")
         canvas.wait_for()
+        page.until(lambda: canvas.get_attribute("data-still") == "true", "it shows the room")
         box = canvas.bounding_box()
         assert box is not None
         start = drone.feedback().position_m
-        # The map shows the whole room, 30 m wide.
-        place = {"x": box["width"] * 0.56, "y": box["height"] / 2}
+        # The room, 30 m wide, has 10/13 of the map's height: some 2 m to the right.
+        place = {"x": box["width"] / 2 + box["height"] * 0.05, "y": box["height"] / 2}
         canvas.click(position=place)
         page.wait_for_text(".preview", "m straight")
         assert drone.feedback().state is FlightState.HOVERING, "choosing moves nothing"
@@ -377,7 +378,8 @@ def test_a_waypoint_is_previewed_and_flown_to(deck: Deck) -> None:
                 return True
             if drone.feedback().state is FlightState.HOVERING and time.monotonic() - pressed_s > 3.0:
                 pressed_s = time.monotonic()
-                page.pane.get_by_role("button", name="Fly there").click()
+                canvas.click(position=place)
+                page.press("Enter")
             return False
 
         page.until(arrived, "it flies there, some metres", 40.0)
@@ -396,12 +398,15 @@ def test_a_zone_is_drawn_refused_and_seen_by_another_page(deck: Deck) -> None:
         for one in (page, other):
             one.pane.get_by_role("button", name="Zones").click()
         canvas = page.pane.locator(".map")
+        page.until(lambda: canvas.get_attribute("data-still") == "true", "it shows the room")
         box = canvas.bounding_box()
         assert box is not None
         page.pane.get_by_role("button", name="Add box").click()
-        canvas.hover(position={"x": box["width"] * 0.7, "y": box["height"] * 0.3})
+        # The room, 30 m wide, has 10/13 of the map's height.
+        middle = box["width"] / 2
+        canvas.hover(position={"x": middle + box["height"] * 0.1, "y": box["height"] * 0.4})
         page.page.mouse.down()
-        page.page.mouse.move(box["x"] + box["width"] * 0.9, box["y"] + box["height"] * 0.7, steps=3)
+        page.page.mouse.move(box["x"] + middle + box["height"] * 0.3, box["y"] + box["height"] * 0.6, steps=3)
         page.page.mouse.up()
         page.wait_for_text(".zones .answer", "written")
         drawn = str(drone.config["safety.zones"])
