@@ -21,7 +21,7 @@ from skyloop.cli.findings import Health
 from skyloop.cli.text import named
 from skyloop.drivers.video.devices import CameraDevice, cameras, described
 from tests.cli.conftest import FAST_SIM, Run
-from tests.processes.conftest import Process
+from tests.processes.conftest import Process, in_terminal
 
 ROOT = Path(__file__).parents[2]
 HOVER = """
@@ -54,25 +54,9 @@ def test_a_flight_shows_its_progress_line_by_line_in_a_pipe(
 @pytest.mark.daily
 def test_a_flight_keeps_one_line_up_to_date_in_a_terminal(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(HOVER)
-    leader, follower = os.openpty()
-    words = ("fly", str(tmp_path / "mine.py"), "--drone", FAST_SIM, "--seconds", "1")
-    with subprocess.Popen(
-        [sys.executable, "-m", "skyloop", *words],
-        stdout=follower,
-        stderr=follower,
-        env={**os.environ, "TERM": "xterm", "COLUMNS": "40"},
-    ) as process:
-        os.close(follower)
-        text = b""
-        try:
-            while said := os.read(leader, 4096):
-                text += said
-        except OSError:  # how a terminal ends whose other end is closed
-            pass
-        assert process.wait(20) == 0
-    os.close(leader)
-    assert re.search(rb"hovering  \d s  altitude ", text)
-    assert text.count(b"\x1b[2K") >= 3, "the line is written anew"
+    text = in_terminal("fly", str(tmp_path / "mine.py"), "--drone", FAST_SIM, "--seconds", "1", columns=40)
+    assert re.search(r"hovering  \d s  altitude ", text)
+    assert text.count("\x1b[2K") >= 3, "the line is written anew"
 
 
 # video:// --------------------------------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from skyloop.cli.sim import address
 from skyloop.cli.text import columns
 from skyloop.errors import UsageError
 from tests.cli.conftest import FAST_SIM, Run
-from tests.processes.conftest import Process, eventually
+from tests.processes.conftest import Process, eventually, in_terminal
 
 pytestmark = pytest.mark.process
 
@@ -123,23 +123,9 @@ def test_watching_shows_events_as_they_come(start: Callable[..., Process], alpha
 
 
 def test_watching_in_a_terminal_is_a_picture(alpha: Process) -> None:
-    leader, follower = os.openpty()
-    with subprocess.Popen(
-        [sys.executable, "-m", "skyloop", "watch", "alpha", "--seconds", "0.5"],
-        stdout=follower,
-        env={**os.environ, "TERM": "xterm", "COLUMNS": "80"},
-    ) as process:
-        os.close(follower)
-        text = b""
-        try:
-            while said := os.read(leader, 4096):
-                text += said
-        except OSError:  # how a terminal ends whose other end is closed
-            pass
-        assert process.wait(10) == 0
-    os.close(leader)
+    text = in_terminal("watch", "alpha", "--seconds", "0.5", columns=80)
     for words in ("alpha", "roll, pitch, yaw", "link to vehicle", "delay median", "feedback"):
-        assert words in text.decode()
+        assert words in text
 
 
 def test_a_watched_reader_that_goes_away_is_no_error(alpha: Process) -> None:

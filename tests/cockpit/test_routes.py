@@ -36,13 +36,6 @@ def route(*places: tuple[float, float, float]) -> Route:
 
 
 @pytest.fixture
-def node() -> Iterator[Node]:
-    node = Node()
-    yield node
-    node.stop()
-
-
-@pytest.fixture
 def client(node: Node, tmp_path: Path) -> Iterator[TestClient]:
     with cockpit(Fleet(Nodes(node)), recordings=Recordings(tmp_path)) as client:
         client.headers.update(ORIGIN)

@@ -170,13 +170,6 @@ def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def node() -> Iterator[Node]:
-    node = Node()
-    yield node
-    node.stop()
-
-
-@pytest.fixture
 def guarded(node: Node, tmp_path: Path) -> Iterator[TestClient]:
     """A cockpit that asks for tokens, with a drone that can fly."""
     tokens = [Token(Person(Role.PILOT, "ann"), PILOT.encode()), Token(Person(Role.OBSERVER), OBSERVER.encode())]

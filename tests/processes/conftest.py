@@ -70,6 +70,27 @@ class Process:
             self._popen.stdout.close()
 
 
+def in_terminal(*words: str, columns: int) -> str:
+    """Run a command of ``skyloop`` in a terminal this wide, to its good end; what the terminal showed."""
+    leader, follower = os.openpty()
+    with subprocess.Popen(
+        [sys.executable, "-m", "skyloop", *words],
+        stdout=follower,
+        stderr=follower,
+        env={**os.environ, "TERM": "xterm", "COLUMNS": str(columns)},
+    ) as process:
+        os.close(follower)
+        text = b""
+        try:
+            while said := os.read(leader, 4096):
+                text += said
+        except OSError:  # how a terminal ends whose other end is closed
+            pass
+        assert process.wait(20) == 0, text.decode()
+    os.close(leader)
+    return text.decode()
+
+
 @pytest.fixture
 def start() -> Iterator[Callable[..., Process]]:
     """Starts Python processes that end with the test."""

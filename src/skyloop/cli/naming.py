@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 import typer
 
@@ -19,32 +19,15 @@ MULTICAST: Final = "multicast"
 NETWORK_VARIABLE: Final = "SKYLOOP_NETWORK"
 KEYS_VARIABLE: Final = "SKYLOOP_KEYS"
 
-NameArgument = Annotated[
-    str | None,
-    typer.Argument(
-        metavar="NAME",
-        help="A running proxy's, as skyloop list shows them",
-        autocompletion=drone_names,
-        show_default=False,
-    ),
-]
-AnyNameArgument = Annotated[
-    str | None,
-    typer.Argument(
-        metavar="NAME",
-        help="A running proxy's, or a vehicle's address such as sim://",
-        autocompletion=drone_names,
-        show_default=False,
-    ),
-]
+
+def _name(metavar: str, what: str) -> Any:
+    return typer.Argument(metavar=metavar, help=what, autocompletion=drone_names, show_default=False)
+
+
+NameArgument = Annotated[str | None, _name("NAME", "A running proxy's, as skyloop list shows them")]
+AnyNameArgument = Annotated[str | None, _name("NAME", "A running proxy's, or a vehicle's address such as sim://")]
 OptionalNameArgument = Annotated[
-    str | None,
-    typer.Argument(
-        metavar="[NAME]",
-        help="A running proxy's, or a vehicle's address; without: sim://",
-        autocompletion=drone_names,
-        show_default=False,
-    ),
+    str | None, _name("[NAME]", "A running proxy's, or a vehicle's address; without: sim://")
 ]
 NamesArgument = Annotated[
     list[str] | None,

@@ -9,6 +9,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from skyloop.client.completion import OF_ONE_PACKET
 from skyloop.clock import nanoseconds
 from skyloop.control.controller import Controller, RunSummary
 from skyloop.control.route import Route
@@ -16,7 +17,7 @@ from skyloop.control.route_check import RouteCheck, check_route, conditions_of
 from skyloop.control.route_law import PHOTO_S, Command, Effect, Progress, RouteLaw, RouteState, TakePhoto
 from skyloop.errors import LinkError, NoAnswerError, SkyloopError, UsageError
 from skyloop.files import write
-from skyloop.messages import AnyAction, Event, EventKind, Feedback, Land, Position, Refusal, Severity
+from skyloop.messages import AnyAction, Event, EventKind, Feedback, Land, Position, Severity
 from skyloop.vision.opencv import opencv
 
 if TYPE_CHECKING:
@@ -27,7 +28,6 @@ LOG: Final = "route"  #: under this name the progress is logged on the drone
 WAYPOINTS: Final = "waypoints"  #: and under this one the places that are left, for maps
 _QUALITY: Final = 92
 _LOG_S: Final = 4.0  #: maps forget places that were logged longer than 10 s ago
-_OF_ONE_PACKET: Final = (Refusal.STALE, Refusal.OUT_OF_SEQUENCE)
 
 
 class FlyRoute(Controller):
@@ -154,7 +154,7 @@ class FlyRoute(Controller):
 
     def _on_event(self, event: Event) -> None:
         own = event.kind is EventKind.COMMAND_REFUSED and event.app == self.drone._core.app
-        if own and self._action is not None and event.data.get("reason") not in _OF_ONE_PACKET:
+        if own and self._action is not None and event.data.get("reason") not in OF_ONE_PACKET:
             self._refused = event.text
 
 
