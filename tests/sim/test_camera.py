@@ -12,7 +12,15 @@ from numpy.typing import NDArray
 
 from skyloop.errors import UsageError
 from skyloop.messages.geometry import rotation_from_euler
-from skyloop.sim.camera import BOTTOM_CAMERA, FRONT_CAMERA, LOOKING_DOWN, LOOKING_FORWARD, CameraModel
+from skyloop.sim.camera import (
+    BOTTOM_CAMERA,
+    FRONT_CAMERA,
+    LOOKING_DOWN,
+    LOOKING_FORWARD,
+    CameraModel,
+    distort,
+    undistort,
+)
 
 PLAIN = replace(FRONT_CAMERA, distortion=(0.0,) * 5)
 
@@ -111,3 +119,13 @@ def test_impossible_values_are_refused_by_name(change: dict[str, Any], word: str
         replace(FRONT_CAMERA, **change)
     with pytest.raises(UsageError, match="scaled"):
         FRONT_CAMERA.scaled(0.0)
+
+
+def test_a_large_picture_is_undistorted_in_parts_as_it_is_at_once() -> None:
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (40_000, 2))
+    bent = (-0.05, 0.1, 0.001, -0.006, 0.0)
+    straight = undistort(points, bent)
+    assert straight is not None
+    np.testing.assert_allclose(distort(straight, bent), points, atol=1e-9)
+    folded = np.vstack([points, [(9.0, 9.0)]])
+    assert undistort(folded, (-0.3, 0.0, 0.0, 0.0, 0.0)) is None

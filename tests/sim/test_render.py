@@ -15,6 +15,7 @@ from skyloop.errors import UnknownNameError, UsageError
 from skyloop.messages.geometry import rotation_from_euler
 from skyloop.sim.camera import BOTTOM_CAMERA, FRONT_CAMERA, CameraModel, CameraPose
 from skyloop.sim.render import PlanarRenderer, Quality, Scene, SceneState
+from skyloop.sim.render.planar import prepare
 from skyloop.sim.world import (
     BoardTarget,
     Box,
@@ -281,3 +282,14 @@ def test_without_opencv_the_error_says_what_to_install() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
     assert "skyloop[sim]" in done.stdout
+
+
+@pytest.mark.parametrize("quality", list(Quality))
+def test_a_prepared_lens_is_computed_once_for_all_renderers(
+    scene: Scene, quality: Quality, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = replace(FRONT_CAMERA, width=40, height=30, fx=26.0 + list(Quality).index(quality))
+    prepare(model, quality)
+    monkeypatch.setattr("skyloop.sim.render.planar._rays", lambda *_: pytest.fail("computed again"))
+    for _ in range(2):
+        view_from(scene, state_at([(0.0, 0.0, 1.0), (2.0, 0.0, 1.0)]), (-1.0, 0.0, 1.0), model=model, quality=quality)

@@ -115,9 +115,13 @@ def _autopilots(options: SimOptions, drones: int, firmware: Firmware, serving: S
 
 def _tellos(options: SimOptions, drones: int, serving: Serving) -> list[TelloFirmware]:
     from skyloop.emulators.tello import TelloFirmware, with_tellos
+    from skyloop.emulators.tello.settings import FRONT
     from skyloop.sim.host import SimHost
+    from skyloop.sim.render.planar import Quality, prepare
     from skyloop.wire.tello.commands import PORT
 
+    if options.renderer == "planar":
+        prepare(FRONT, Quality(options.quality))  # so that its first picture comes at once when it is asked for
     host = SimHost(with_tellos(options), drones)
     return [
         TelloFirmware(

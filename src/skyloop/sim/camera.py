@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,8 @@ from skyloop.messages.frame import CameraInfo, Intrinsics
 Vec3 = tuple[float, float, float]
 Rotation9 = tuple[float, float, float, float, float, float, float, float, float]
 Distortion = tuple[float, float, float, float, float]
+
+_BLOCK: Final = 16384  #: points that are undistorted at a time
 
 #: Body from optical of a camera that looks forward, level, with the image's top up.
 LOOKING_FORWARD: Rotation9 = (0.0, 0.0, 1.0, -1.0, 0.0, 0.0, 0.0, -1.0, 0.0)
@@ -186,6 +189,16 @@ def distort(points: NDArray[np.float64], distortion: Distortion) -> NDArray[np.f
 
 def undistort(points: NDArray[np.float64], distortion: Distortion) -> NDArray[np.float64] | None:
     """The inverse of :func:`distort` by Newton's method; None where there is no inverse near the optical axis."""
+    straight = np.empty_like(points)
+    for first in range(0, len(points), _BLOCK):  # each block's intermediate values stay in the processor's cache
+        part = slice(first, first + _BLOCK)
+        if (block := _undistort(points[part], distortion)) is None:
+            return None
+        straight[part] = block
+    return straight
+
+
+def _undistort(points: NDArray[np.float64], distortion: Distortion) -> NDArray[np.float64] | None:
     k1, k2, p1, p2, k3 = distortion
     guess = points.copy()
     for _ in range(25):

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.errors import UsageError
-from skyloop.sim.camera import CameraModel, CameraPose
+from skyloop.sim.camera import CameraModel, CameraPose, Distortion
 from skyloop.sim.render.base import Image, SceneState
 from skyloop.sim.render.opencv import cv2
 from skyloop.sim.render.scene import Posed, Scene
@@ -73,41 +73,42 @@ class PlanarRenderer:
             small = cv2.resize(large, (model.width, model.height), interpolation=cv2.INTER_AREA)
             cv2.cvtColor(small, cv2.COLOR_BGRA2BGR, dst=out)
         else:
-            picture = self._draw(state, pose, model, samples=4 if self.quality is Quality.SMOOTH else 1)
+            picture = self._draw(state, pose, model, samples=_samples(self.quality))
             cv2.cvtColor(picture, cv2.COLOR_BGRA2BGR, dst=out)
         return out
 
     def _draw(self, state: SceneState, pose: CameraPose, model: CameraModel, samples: int) -> NDArray[np.uint8]:
         raster = self._raster(model, samples)
+        lens = raster.lens
         posed = self._pose(state)
         quads = posed.quads
         shown = np.ones(len(quads), np.bool_) if pose.drone is None else posed.drone != pose.drone
-        view = visible_quads(quads, shown, pose, raster.grid)
+        view = visible_quads(quads, shown, pose, lens.grid)
         raster.buffer.draw(view, quads.priority[view.index])
         table = sampling_table(quads, view, pose, self.scene.atlas, 1.0 / (model.fx * model.fy))
         seen = raster.buffer.seen.reshape(-1)
-        np.take(seen, raster.lookup[0], out=raster.seen[0], mode="clip")
+        np.take(seen, lens.lookup[0], out=raster.seen[0], mode="clip")
         np.copyto(raster.column, raster.seen[0])
-        self._shader.shade(table, raster.column, raster.ray_x, raster.ray_y, raster.colours, raster.inverse_depth)
+        self._shader.shade(table, raster.column, lens.ray_x, lens.ray_y, raster.colours, raster.inverse_depth)
         if samples > 1:
             self._smooth_edges(raster, table)
         picture = raster.colours.reshape(model.height, model.width, 4)
         for shadow in posed.shadows:
-            darken(picture, shadow, pose, raster.ray_x, raster.ray_y, raster.inverse_depth)
+            darken(picture, shadow, pose, lens.ray_x, lens.ray_y, raster.inverse_depth)
         return picture
 
     def _smooth_edges(self, raster: _Raster, table: NDArray[np.float32]) -> None:
         """Colours all samples of the pixels whose samples see different quads, and averages them."""
-        seen = raster.seen
+        seen, lens = raster.seen, raster.lens
         for k in range(1, len(seen)):
-            np.take(raster.buffer.seen.reshape(-1), raster.lookup[k], out=seen[k], mode="clip")
+            np.take(raster.buffer.seen.reshape(-1), lens.lookup[k], out=seen[k], mode="clip")
         mixed = (seen[1:] != seen[0]).any(axis=0)
         pixels = np.flatnonzero(mixed)
-        places = raster.lookup[:, pixels]
+        places = lens.lookup[:, pixels]
         columns = seen[:, pixels].astype(np.intp).reshape(-1)
         colours = np.empty((columns.size, 4), np.uint8)
-        ray_x = raster.sample_x[places % raster.grid.width].reshape(-1)
-        ray_y = raster.sample_y[places // raster.grid.width].reshape(-1)
+        ray_x = lens.sample_x[places % lens.grid.width].reshape(-1)
+        ray_y = lens.sample_y[places // lens.grid.width].reshape(-1)
         self._shader.shade(table, columns, ray_x, ray_y, colours, np.empty(columns.size, np.float32))
         total = colours.reshape(len(seen), -1, 4).sum(axis=0, dtype=np.uint16)
         raster.colours[pixels] = (total + len(seen) // 2) // len(seen)
@@ -118,54 +119,87 @@ class PlanarRenderer:
         return self._posed[1]
 
     def _raster(self, model: CameraModel, samples: int) -> _Raster:
-        key = (model.width, model.height, model.fx, model.fy, model.cx, model.cy, model.distortion, samples)
+        key = _lens_key(model, samples)
         if key not in self._rasters:
-            self._rasters[key] = _Raster.of(model, samples)
+            self._rasters[key] = _Raster.of(_Lens.of(*key))
         return self._rasters[key]
 
 
-@dataclass(slots=True)
-class _Raster:
-    """What is computed once for a lens: where its samples lie on a distortion-free grid; and buffers of its size."""
+def prepare(model: CameraModel, quality: Quality = Quality.SMOOTH) -> None:
+    """Compute what the first picture through a lens would wait for: a second for 960×720 pixels with distortion.
+
+    It is kept for all renderers of the process.
+    """
+    _Lens.of(*_lens_key(_doubled(model) if quality is Quality.BEST else model, _samples(quality)))
+
+
+def _samples(quality: Quality) -> int:
+    return 4 if quality is Quality.SMOOTH else 1
+
+
+_LensKey = tuple[int, int, float, float, float, float, Distortion, int]
+
+
+def _lens_key(model: CameraModel, samples: int) -> _LensKey:
+    return (model.width, model.height, model.fx, model.fy, model.cx, model.cy, model.distortion, samples)
+
+
+@dataclass(frozen=True, slots=True)
+class _Lens:
+    """What is computed once for a lens, and only read: where its samples lie on a distortion-free grid."""
 
     grid: Grid
-    buffer: DepthBuffer
     lookup: NDArray[np.intp]  # flat places on the grid of each pixel's samples, (samples, pixels)
     sample_x: NDArray[np.float32]  # x/z of each column of the grid
     sample_y: NDArray[np.float32]  # y/z of each row of the grid
     ray_x: NDArray[np.float32]  # x/z of each pixel
     ray_y: NDArray[np.float32]
+
+    @staticmethod
+    @lru_cache(maxsize=8)  # 30 MB for one of 960×720 pixels
+    def of(
+        width: int, height: int, fx: float, fy: float, cx: float, cy: float, distortion: Distortion, samples: int
+    ) -> _Lens:
+        model = CameraModel("lens", width, height, 1.0, fx, fy, cx, cy, distortion)
+        fine = 2 if samples > 1 else 1
+        offsets = [(0.0, 0.0)] if samples == 1 else [(x, y) for y in (-0.25, 0.25) for x in (-0.25, 0.25)]
+        rays = [_rays(model, dx, dy) for dx, dy in offsets]
+        scale = (fine * fx, fine * fy)
+        low = np.min([r.min(axis=0) for r in rays], axis=0) * scale
+        high = np.max([r.max(axis=0) for r in rays], axis=0) * scale
+        # Without distortion the grid's samples are exactly the pixels' own.
+        middle = -low if not model.distorted else np.ceil(-low)
+        columns, rows = (int(n) for n in np.rint(high + middle) + 1)
+        places = [np.rint(r * scale + middle).astype(np.intp) for r in rays]
+        middle_x, middle_y = (float(n) for n in middle)
+        ray_x, ray_y = _rays(model, 0.0, 0.0).T.astype(np.float32)
+        return _Lens(
+            Grid(columns, rows, *scale, middle_x, middle_y),
+            np.array([p[:, 1] * columns + p[:, 0] for p in places]),
+            ((np.arange(columns) - middle_x) / scale[0]).astype(np.float32),
+            ((np.arange(rows) - middle_y) / scale[1]).astype(np.float32),
+            np.ascontiguousarray(ray_x),
+            np.ascontiguousarray(ray_y),
+        )
+
+
+@dataclass(slots=True)
+class _Raster:
+    """A lens, and a renderer's buffers of its size."""
+
+    lens: _Lens
+    buffer: DepthBuffer
     seen: NDArray[np.int32]  # (samples, pixels)
     column: NDArray[np.intp]
     colours: NDArray[np.uint8]  # (pixels, 4)
     inverse_depth: NDArray[np.float32]
 
     @staticmethod
-    def of(model: CameraModel, samples: int) -> _Raster:
-        fine = 2 if samples > 1 else 1
-        offsets = [(0.0, 0.0)] if samples == 1 else [(x, y) for y in (-0.25, 0.25) for x in (-0.25, 0.25)]
-        rays = [_rays(model, dx, dy) for dx, dy in offsets]
-        fx, fy = fine * model.fx, fine * model.fy
-        low = np.min([r.min(axis=0) for r in rays], axis=0) * (fx, fy)
-        high = np.max([r.max(axis=0) for r in rays], axis=0) * (fx, fy)
-        # Without distortion the grid's samples are exactly the pixels' own.
-        cx, cy = -low if not model.distorted else np.ceil(-low)
-        width, height = (int(n) for n in np.rint(high + np.array([cx, cy])) + 1)
-        grid = Grid(width, height, fx, fy, float(cx), float(cy))
-        places = [np.rint(r * (fx, fy) + (cx, cy)).astype(np.intp) for r in rays]
-        lookup = np.array([p[:, 1] * width + p[:, 0] for p in places])
-        sample_x = ((np.arange(width) - cx) / fx).astype(np.float32)
-        sample_y = ((np.arange(height) - cy) / fy).astype(np.float32)
-        ray_x, ray_y = _rays(model, 0.0, 0.0).T.astype(np.float32)
-        pixels = model.width * model.height
+    def of(lens: _Lens) -> _Raster:
+        samples, pixels = lens.lookup.shape
         return _Raster(
-            grid,
-            DepthBuffer(grid),
-            lookup,
-            sample_x,
-            sample_y,
-            np.ascontiguousarray(ray_x),
-            np.ascontiguousarray(ray_y),
+            lens,
+            DepthBuffer(lens.grid),
             np.empty((samples, pixels), np.int32),
             np.empty(pixels, np.intp),
             np.empty((pixels, 4), np.uint8),
