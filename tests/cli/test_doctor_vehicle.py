@@ -13,7 +13,7 @@ from tests.cli.conftest import Run
 
 @pytest.mark.parametrize(
     ("kind", "name", "advice"),
-    [(Kind.ARDUCOPTER, "ArduCopter 4.7.0", "fs_gcs_enable=7"), (Kind.PX4, "PX4 1.17.0", "com_obl_rc_act=5")],
+    [(Kind.ARDUCOPTER, "ArduCopter 4.7.0", "fs_gcs_enable 7"), (Kind.PX4, "PX4 1.17.0", "com_obl_rc_act 5")],
 )
 def test_safety_nets_that_are_off_are_reported(run: Run, kind: Kind, name: str, advice: str) -> None:
     host = SimHost(with_multirotors(SimOptions(world="empty", speed=3.0)))
@@ -22,7 +22,7 @@ def test_safety_nets_that_are_off_are_reported(run: Run, kind: Kind, name: str, 
     assert ended.code == 0, ended.out
     assert f"✓ autopilot: {name}, system 1" in ended.out
     assert "– loss of this computer:" in ended.out
-    assert f"→ set the parameter mavlink.{advice}" in ended.out
+    assert f"→ skyloop param NAME mavlink.{advice}" in ended.out
 
 
 def test_a_vehicle_that_is_not_there(run: Run) -> None:

@@ -7,15 +7,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 import skyloop
 from skyloop.client import Level, LinkStatus, PreflightFinding
 from skyloop.client.preflight import PreflightState, check_before_flight
 from skyloop.drivers.ardrone.diagnostics import diagnose
+from skyloop.drivers.mavlink.autopilots import ArduCopterProfile, AutopilotProfile, Px4Profile
+from skyloop.drivers.tello.telemetry import Health
 from skyloop.messages import CameraInfo, Capabilities, Failsafe, Feedback, FlightState, LinkState, Value
 from skyloop.messages.checkup import MAX_TEXT, Diagnostic, decode_checkup, encode_checkup
 from skyloop.wire.ardrone.navdata import State
+from skyloop.wire.tello.state import parse
 
 GOOD = Feedback(
     captured_ns=1,
@@ -52,8 +56,6 @@ def lines(state: PreflightState) -> dict[str, PreflightFinding]:
 
 
 def fed(**changes: Any) -> PreflightState:
-    import msgspec
-
     return replace(READY, feedback=msgspec.structs.replace(GOOD, **changes))
 
 
@@ -92,7 +94,12 @@ def test_a_vehicle_that_is_ready_has_good_lines_only() -> None:
         (fed(roll_rad=0.3), "level", Level.WARN, "tilted"),
         (replace(READY, parameters={"limits.altitude": 3.0}), "zones", Level.WARN, "no safety box"),
         (replace(READY, parameters={}), "zones", Level.WARN, "could not be read"),
-        (replace(READY, video_age_s={"front": None}), "video front", Level.WARN, "no picture"),
+        (
+            replace(READY, video_age_s={"front": None}, video_waited_s=1.5),
+            "video front",
+            Level.WARN,
+            "no picture yet, in 1.5 s",
+        ),
         (replace(READY, video_age_s={"front": 4.0}), "video front", Level.WARN, "4.0 s old"),
         (fed(owner="ann", owner_id=7, owner_priority=4, lease=3), "control", Level.WARN, "ann has control"),
         (replace(READY, clock_uncertainty_s=0.2), "clock", Level.WARN, "200 ms"),
@@ -104,7 +111,8 @@ def test_a_vehicle_that_is_ready_has_good_lines_only() -> None:
 def test_what_is_not_good_says_why(state: PreflightState, check: str, level: Level, words: str) -> None:
     finding = lines(state)[check]
     assert (finding.level, words in finding.detail) == (level, True), finding
-    assert finding.why or finding.remedy or check == "driver"
+    assert finding.why
+    assert finding.remedy
 
 
 def test_what_the_driver_finds_is_part_of_it() -> None:
@@ -120,6 +128,63 @@ def test_what_the_driver_finds_is_part_of_it() -> None:
     net = found["loss of this computer"]
     assert (net.level, net.detail, net.why) == (Level.WARN, "FS_GCS_ENABLE is 0", "it hovers until empty")
     assert found["arming"].level is Level.FAIL
+
+
+def test_a_remedy_is_a_command_for_this_drone() -> None:
+    advice = Diagnostic("fence", False, "FENCE_ENABLE is 0: none", "skyloop param NAME mavlink.fence_enable 1; a NAME")
+    found = lines(replace(with_parameters(vehicle__checkup=encode_checkup([advice])), name="alpha"))
+    assert found["fence"].remedy == "skyloop param alpha mavlink.fence_enable 1; a NAME"
+
+
+@pytest.mark.parametrize(("chosen", "shown"), [("front", True), ("bottom", False), ("both_in_one", True)])
+def test_a_camera_that_is_not_chosen_is_not_missed(chosen: str, shown: bool) -> None:
+    both = (CameraInfo("front", 32, 24, 30.0), CameraInfo("bottom", 32, 24, 30.0))
+    state = with_parameters(camera__active=chosen)
+    state = replace(state, capabilities=replace_cameras(state.capabilities, both), video_age_s={"front": None})
+    found = lines(state)["video front"]
+    assert found.level is (Level.WARN if shown else Level.OK)
+    assert ("one camera at a time, now bottom" in found.detail) is not shown
+
+
+def replace_cameras(capabilities: Capabilities, cameras: tuple[CameraInfo, ...]) -> Capabilities:
+    return msgspec.structs.replace(capabilities, cameras=cameras)
+
+
+@pytest.mark.parametrize("profile", [ArduCopterProfile(), Px4Profile()], ids=["arducopter", "px4"])
+def test_each_safety_net_of_an_autopilot_that_is_off_is_explained(profile: AutopilotProfile) -> None:
+    off = {net.name: next(bad for bad in (0.0, 99.0) if not net.good(bad)) for net in profile.SAFETY_NETS}
+    diagnostics = profile.safety_diagnostics(off, own_system=255)
+    state = replace(with_parameters(vehicle__checkup=encode_checkup(diagnostics)), name="alpha")
+    found = [line for line in check_before_flight(state) if line.level is not Level.OK]
+    assert [line.detail.split()[0] for line in found] == [net.name for net in profile.SAFETY_NETS]
+    assert len({line.check for line in found}) == len(found)
+    for line, net in zip(found, profile.SAFETY_NETS, strict=True):
+        assert line.level is Level.WARN
+        assert line.why
+        key, value = line.remedy.removeprefix("skyloop param alpha mavlink.").split()
+        assert key.upper() == net.name
+        assert net.good(float(value)), "what is advised is good"
+
+
+def test_an_autopilot_that_watches_another_computer_says_so() -> None:
+    found = {one.what: one for one in ArduCopterProfile().safety_diagnostics({"MAV_GCS_SYSID": 42.0}, own_system=255)}
+    net = lines(with_parameters(vehicle__checkup=encode_checkup([found["ground station"]])))["ground station"]
+    assert (net.level, net.why, net.remedy) == (
+        Level.WARN, "it won't detect our loss", "give the address ?own_sysid=42"
+    )  # fmt: skip
+    assert "ground station" not in {
+        one.what for one in ArduCopterProfile().safety_diagnostics({"MAV_GCS_SYSID": 255.0}, own_system=255)
+    }
+
+
+def test_a_hot_tello_says_why_it_may_come_down() -> None:
+    watch = Health()
+    assert watch.diagnose() == []
+    for celsius, level in ((60, Level.OK), (95, Level.WARN), (88, Level.WARN), (70, Level.OK)):
+        watch.changes(parse(f"templ:{celsius - 2};temph:{celsius};bat:50;".encode()))
+        found = lines(with_parameters(vehicle__checkup=encode_checkup(watch.diagnose())))["temperature"]
+        assert (found.level, f"{celsius} °C" in found.detail) == (level, True)
+        assert bool(found.why and found.remedy) is (level is Level.WARN)
 
 
 def test_a_check_up_that_is_too_long_keeps_what_is_wrong() -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from skyloop.cockpit.alarms import USUAL, Thresholds, alarms
+from skyloop.cockpit.alarms import USUAL, DegradedTimes, Thresholds, alarms
 from skyloop.cockpit.telemetry import encode_json
 from skyloop.cockpit.thresholds import PARAMETERS, thresholds_of
 from skyloop.errors import UnknownNameError
@@ -82,19 +82,35 @@ GONE = ("vehicle_link", "critical", "link to the vehicle lost: radio")
     ],
 )
 def test_alarms(given: tuple[Any, Any, Any, Any], told: list[tuple[str, str, str]]) -> None:
-    assert [(alarm.id, alarm.severity, alarm.text) for alarm in alarms(*given)] == told
+    long = DegradedTimes().update(given[0], 0)
+    found = alarms(*given, degraded_s=dict.fromkeys(long, USUAL.link_degraded_s))
+    assert [(alarm.id, alarm.severity, alarm.text) for alarm in found] == told
+
+
+def test_a_link_is_an_alarm_once_it_has_been_degraded_for_a_while() -> None:
+    times, bad = DegradedTimes(), link(vehicle="degraded", reason="slow")
+
+    def told(status: Any, at_s: float, thresholds: Thresholds = USUAL) -> list[str]:
+        degraded_s = times.update(status, round(at_s * 1e9))
+        return [alarm.id for alarm in alarms(status, flying(), 0.1, {}, degraded_s, thresholds)]
+
+    assert told(bad, 1.0) == told(bad, 1.4) == []
+    assert told(bad, 1.5) == ["vehicle_link"]
+    assert told(bad, 1.5, Thresholds(link_degraded_s=2.0)) == told(bad, 99.0, Thresholds(link_degraded_s=0.0)) == []
+    assert told(link(), 100.0) == []
+    assert told(bad, 100.1) == [], "it was up in between"
 
 
 def test_thresholds_are_the_drones_and_zero_is_never() -> None:
     late = (link(), flying(battery=0.3), 1.5, {"front": 2.5})
-    told = alarms(*late, Thresholds(battery_low=0.5, battery_critical=0.35, feedback_age_s=2.0, video_age_s=2.0))
+    told = alarms(*late, {}, Thresholds(battery_low=0.5, battery_critical=0.35, feedback_age_s=2.0, video_age_s=2.0))
     assert [(alarm.id, alarm.severity) for alarm in told] == [("battery", "critical"), ("video_age.front", "warning")]
     never = Thresholds(battery_low=0.0, battery_critical=0.0, feedback_age_s=0.0, video_age_s=0.0)
-    assert alarms(link(), flying(battery=0.0), 1e6, {"front": 1e6}, never) == []
+    assert alarms(link(), flying(battery=0.0), 1e6, {"front": 1e6}, {}, never) == []
 
 
 def test_an_alarm_is_an_object_for_pages() -> None:
-    told = encode_json(alarms(link("degraded"), None, None, {}))
+    told = encode_json(alarms(link("degraded"), None, None, {}, {"application_link": 9.0}))
     assert told == b'[{"id":"application_link","severity":"warning","text":"link to the proxy degraded"}]'
 
 

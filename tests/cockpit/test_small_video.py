@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Iterator
 from contextlib import ExitStack
 from typing import Any
@@ -11,6 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from skyloop.cockpit.feeds import CameraFeed
 from skyloop.cockpit.small_feed import FPS, WIDTHS, SmallFeed, rounded_width
 from skyloop.cockpit.small_video import MAX_SHOWN
 from skyloop.messages import CameraInfo
@@ -163,3 +165,29 @@ def test_a_small_camera_is_not_made_larger() -> None:
     assert drone.requests[0][1]["scale"] == 1.0
     feed.unsubscribe()
     assert drone.processors["front"] == []
+
+
+def test_video_has_an_age_from_its_first_picture_on() -> None:
+    async def watch() -> None:
+        drone, now_ns = FakeDrone(), 0
+        small = SmallFeed(drone, CameraInfo("front", 64, 48, 15.0), WIDTHS[0], lambda: now_ns)  # type: ignore[arg-type]
+        large = CameraFeed(drone, "front", lambda: now_ns)  # type: ignore[arg-type]
+
+        def woken() -> None: ...
+
+        small.subscribe()
+        large.subscribe(woken)
+        now_ns = 20_000_000_000
+        assert (small.age_s, large.age_s) == (None, None), "the vehicle is starting"
+        drone.show()
+        await asyncio.sleep(0)  # the frame is handed over on the loop
+        assert small.age_s is not None
+        assert large.age_s is not None
+        small.unsubscribe()
+        large.unsubscribe(woken)
+        small.subscribe()
+        large.subscribe(woken)
+        now_ns = 23_000_000_000
+        assert (small.age_s, large.age_s) == (3.0, 3.0), "it sent pictures before"
+
+    asyncio.run(watch())

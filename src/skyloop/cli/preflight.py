@@ -17,6 +17,7 @@ from skyloop.errors import NoAnswerError
 
 _MARKS = {Level.OK: ("✓", "green"), Level.WARN: ("!", "yellow"), Level.FAIL: ("✗", "red")}
 FEEDBACK_S = 2.0
+VIDEO_S = 5.0  #: a vehicle that was just started, such as a Tello, sends its first picture after some seconds
 
 
 def preflight(
@@ -41,7 +42,7 @@ def preflight(
     with connect(one_drone(name, drone), access="observe", name="skyloop preflight") as checked:
         with suppress(NoAnswerError):
             checked.next_feedback(FEEDBACK_S)
-        findings = checked.preflight(folder=folder)
+        findings = checked.preflight(video_s=VIDEO_S, folder=folder)
     if json:
         typer.echo(msgspec.json.encode([asdict(finding) for finding in findings]).decode())
     else:

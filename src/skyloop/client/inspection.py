@@ -5,13 +5,13 @@ from __future__ import annotations
 import shutil
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any, Protocol
 
 from skyloop.client.frame import Frame
 from skyloop.client.parameters import Config
-from skyloop.client.preflight import PreflightFinding, PreflightState, check_before_flight
+from skyloop.client.preflight import PreflightFinding, PreflightState, check_before_flight, shown_cameras
 from skyloop.client.telemetry import LinkStatus
 from skyloop.errors import ClosedError, SkyloopError
 from skyloop.messages import Capabilities, Feedback, Value
@@ -22,6 +22,8 @@ class Inspected(Protocol):
 
     config: Config
 
+    @property
+    def name(self) -> str: ...
     @property
     def link(self) -> LinkStatus: ...
     @property
@@ -38,14 +40,18 @@ def inspect(
     drone: Inspected, feedback: Feedback | None, video_s: float, folder: str | Path | None
 ) -> list[PreflightFinding]:
     """Return the checklist of a drone; see :meth:`skyloop.client.Drone.preflight`."""
+    parameters = _parameters(drone)
+    shown = shown_cameras(drone.capabilities, parameters)
     return check_before_flight(
         PreflightState(
+            name=drone.name,
             link=drone.link,
             capabilities=drone.capabilities,
             feedback=feedback,
             feedback_age_s=None if feedback is None else drone.age_s(feedback),
-            video_age_s=_video(drone, video_s) if video_s > 0 else {},
-            parameters=_parameters(drone),
+            video_age_s=_video(drone, shown, video_s) if video_s > 0 else {},
+            video_waited_s=video_s,
+            parameters=parameters,
             clock_uncertainty_s=drone.clock_uncertainty_ns / 1e9,
             app_id=drone.app_id,
             free_bytes=None if folder is None else _free(Path(folder)),
@@ -53,8 +59,8 @@ def inspect(
     )
 
 
-def _video(drone: Inspected, timeout_s: float) -> dict[str, float | None]:
-    """Return the age of a picture of each camera; None where none came in time."""
+def _video(drone: Inspected, shown: Collection[str], timeout_s: float) -> dict[str, float | None]:
+    """Return the age of a picture of each camera; None where none came in time. Waits for those that are shown."""
     deadline = time.monotonic() + timeout_s
     ages: dict[str, float | None] = {}
     listeners, events = [], []
@@ -62,7 +68,8 @@ def _video(drone: Inspected, timeout_s: float) -> dict[str, float | None]:
         for camera in drone.capabilities.cameras:
             ages[camera.name] = None
             came = threading.Event()
-            events.append(came)
+            if camera.name in shown:
+                events.append(came)
 
             def note(frame: Frame, name: str = camera.name, came: threading.Event = came) -> None:
                 ages[name] = drone.age_s(frame)

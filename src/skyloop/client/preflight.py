@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Final
 
@@ -15,6 +16,8 @@ STALE_S: Final = 1.0  #: feedback that is older is not now
 STALE_VIDEO_S: Final = 1.0
 CLOCK_S: Final = 0.05  #: ages of samples are known to this at least
 LEVEL_RAD: Final = 0.12  #: a vehicle that stands askew by more is not level
+ACTIVE: Final = "camera.active"  #: the parameter of a vehicle that sends one camera at a time
+_COMMAND: Final = re.compile(r"(skyloop \w+) NAME\b")
 FREE_BYTES: Final = 1_000_000_000  #: of a disk that a flight is recorded to
 FULL_BYTES: Final = 100_000_000
 FAR_M: Final = 10_000.0  #: a wall of the safety box that far away is none
@@ -52,6 +55,7 @@ class PreflightState:
     """What is known of a vehicle before a flight.
 
     Attributes:
+        name: The drone's, for commands that a remedy names.
         link: Both hops.
         capabilities: Of the vehicle.
         feedback: The newest sample; None: none came.
@@ -59,6 +63,7 @@ class PreflightState:
         video_age_s: Age of each camera's newest picture [s]; None: none came in time.
         parameters: Values by name; empty: they were not read.
         clock_uncertainty_s: Of the ages of all samples [s].
+        video_waited_s: How long pictures were waited for [s].
         app_id: This application's number in this run of the proxy.
         free_bytes: Of the disk for recordings; None: not asked for.
     """
@@ -72,11 +77,13 @@ class PreflightState:
     clock_uncertainty_s: float = 0.0
     app_id: int = 0
     free_bytes: int | None = None
+    video_waited_s: float = 0.0
+    name: str = "NAME"
 
 
 def check_before_flight(state: PreflightState) -> list[PreflightFinding]:
     """Return the checklist, in the order to be read; all lines, the good ones, too."""
-    return [
+    found = [
         *_link(state),
         *_flight_state(state),
         *_battery(state),
@@ -89,10 +96,17 @@ def check_before_flight(state: PreflightState) -> list[PreflightFinding]:
         *_storage(state),
         *_vehicle(state),
     ]
+    # What drivers and the checks above advise is for any drone; a person wants a command to copy.
+    return [replace(one, remedy=_COMMAND.sub(rf"\1 {state.name}", one.remedy)) for one in found]
 
 
 def _ok(check: str, detail: str) -> PreflightFinding:
     return PreflightFinding(check, Level.OK, detail)
+
+
+def _judged(level: Level, check: str, detail: str, why: str, remedy: str) -> PreflightFinding:
+    """Return a line of that level; a good one needs neither a reason nor a remedy."""
+    return _ok(check, detail) if level is Level.OK else PreflightFinding(check, level, detail, why, remedy)
 
 
 def _link(state: PreflightState) -> Iterator[PreflightFinding]:
@@ -124,7 +138,9 @@ def _flight_state(state: PreflightState) -> Iterator[PreflightFinding]:
     feedback = state.feedback
     if not state.capabilities.actions:
         why = state.capabilities.why_not or "it takes no commands"
-        yield PreflightFinding("vehicle", Level.FAIL, f"nothing can be flown: {why}", "it can only be watched")
+        yield PreflightFinding(
+            "vehicle", Level.FAIL, f"nothing can be flown: {why}", "it can only be watched", "connect to one that flies"
+        )
     elif feedback is None:
         yield PreflightFinding(
             "vehicle", Level.FAIL, "it has not reported its state", "nothing is known of it", "wait for its first data"
@@ -162,20 +178,15 @@ def _battery(state: PreflightState) -> Iterator[PreflightFinding]:
         yield PreflightFinding(
             "battery", Level.WARN, "its charge is not reported", "it may come down by itself", "check it by hand"
         )
-    elif charge < land:
-        yield PreflightFinding(
-            "battery",
-            Level.FAIL,
-            f"{charge:.0%} left, below {land:.0%} (battery.land)",
-            "it lands as soon as it flies, and takes no other command",
-            "charge or change it",
-        )
-    elif charge < warn:
-        yield PreflightFinding(
-            "battery", Level.WARN, f"{charge:.0%} left", "the flight will be short", "charge or change it"
-        )
-    else:
-        yield _ok("battery", f"{charge:.0%} left")
+        return
+    empty = charge < land
+    yield _judged(
+        Level.FAIL if empty else Level.WARN if charge < warn else Level.OK,
+        "battery",
+        f"{charge:.0%} left" + (f", below {land:.0%} (battery.land)" if empty else ""),
+        "it lands as soon as it flies, and takes no other command" if empty else "the flight will be short",
+        "charge or change it",
+    )
 
 
 def _position(state: PreflightState) -> Iterator[PreflightFinding]:
@@ -193,16 +204,14 @@ def _position(state: PreflightState) -> Iterator[PreflightFinding]:
     else:
         x, y, z = feedback.position_m
         yield _ok("position", f"{x:.1f} m east, {y:.1f} m north, {z:.1f} m up")
-    if feedback.yaw_rad is None:
-        yield PreflightFinding(
-            "compass",
-            Level.WARN,
-            "it does not report its heading",
-            "it can't be flown to places, and cameras' views have no direction",
-            "calibrate its compass, or wait until its estimate has settled",
-        )
-    else:
-        yield _ok("compass", "its heading is known")
+    known = feedback.yaw_rad is not None
+    yield _judged(
+        Level.OK if known else Level.WARN,
+        "compass",
+        "its heading is known" if known else "it does not report its heading",
+        "it can't be flown to places, and cameras' views have no direction",
+        "calibrate its compass, or wait until its estimate has settled",
+    )
 
 
 def _level(state: PreflightState) -> Iterator[PreflightFinding]:
@@ -212,22 +221,24 @@ def _level(state: PreflightState) -> Iterator[PreflightFinding]:
     if feedback.roll_rad is None or feedback.pitch_rad is None:
         return
     tilt = max(abs(feedback.roll_rad), abs(feedback.pitch_rad))
-    if tilt > LEVEL_RAD:
-        yield PreflightFinding(
-            "level",
-            Level.WARN,
-            f"it stands tilted by {tilt:.2f} rad, or takes a tilted attitude for level",
-            "it would drift off when it takes off",
-            "put it on level ground; if it stands level, calibrate it (AR.Drone: ardrone.flat_trim)",
-        )
-    else:
-        yield _ok("level", "it stands level")
+    level = tilt <= LEVEL_RAD
+    yield _judged(
+        Level.OK if level else Level.WARN,
+        "level",
+        "it stands level" if level else f"it stands tilted by {tilt:.2f} rad, or takes a tilted attitude for level",
+        "it would drift off when it takes off",
+        "put it on level ground; if it stands level, calibrate it (AR.Drone: ardrone.flat_trim)",
+    )
 
 
 def _bounds(state: PreflightState) -> Iterator[PreflightFinding]:
     if not state.parameters:
         yield PreflightFinding(
-            "zones", Level.WARN, "its parameters could not be read", "its limits and failsafes are not known"
+            "zones",
+            Level.WARN,
+            "its parameters could not be read",
+            "its limits and failsafes are not known",
+            "check again when its link is up",
         )
         return
     walls = [f"safety.box.{axis}_{end}" for axis in "xyz" for end in ("low", "high")]
@@ -238,13 +249,13 @@ def _bounds(state: PreflightState) -> Iterator[PreflightFinding]:
     high = f", at most {ceiling:g} m high" if isinstance(ceiling, int | float) else ""
     if count or zones:
         works = state.feedback is not None and state.feedback.position_m is not None
-        detail = f"{count} of 6 walls of the safety box, {zones} zone{'' if zones == 1 else 's'}{high}"
-        if works:
-            yield _ok("zones", detail)
-        else:
-            yield PreflightFinding(
-                "zones", Level.FAIL, detail, "without a position nothing keeps it inside", "let it know its place"
-            )
+        yield _judged(
+            Level.OK if works else Level.FAIL,
+            "zones",
+            f"{count} of 6 walls of the safety box, {zones} zone{'' if zones == 1 else 's'}{high}",
+            "without a position nothing keeps it inside",
+            "let it know its place",
+        )
         return
     yield PreflightFinding(
         "zones",
@@ -256,18 +267,36 @@ def _bounds(state: PreflightState) -> Iterator[PreflightFinding]:
 
 
 def _video(state: PreflightState) -> Iterator[PreflightFinding]:
+    shown = shown_cameras(state.capabilities, state.parameters)
     for camera, age_s in state.video_age_s.items():
-        if age_s is None or age_s > STALE_VIDEO_S:
-            found = "no picture came" if age_s is None else f"the newest picture is {age_s:.1f} s old"
+        check = f"video {camera}"
+        if age_s is None and camera not in shown:
+            yield _ok(check, f"not shown: it sends one camera at a time, now {', '.join(shown)} ({ACTIVE})")
+        elif age_s is None:
             yield PreflightFinding(
-                f"video {camera}",
+                check,
                 Level.WARN,
-                found,
+                f"no picture yet, in {state.video_waited_s:g} s",
                 "who flies by it would fly blind",
-                "check the camera, its link and its address; skyloop watch shows why",
+                "a vehicle that was just started may need some seconds more: check again; else check the camera, its "
+                "link and its address (skyloop watch NAME)",
             )
         else:
-            yield _ok(f"video {camera}", "pictures arrive")
+            old = age_s > STALE_VIDEO_S
+            yield _judged(
+                Level.WARN if old else Level.OK,
+                check,
+                f"the newest picture is {age_s:.1f} s old" if old else "pictures arrive",
+                "who flies by it would fly blind",
+                "check the camera, its link and its address; skyloop watch NAME shows why",
+            )
+
+
+def shown_cameras(capabilities: Capabilities, parameters: Mapping[str, Value]) -> tuple[str, ...]:
+    """Return the cameras whose pictures a vehicle sends now: all, or the one that it is set to."""
+    names = tuple(camera.name for camera in capabilities.cameras)
+    chosen = parameters.get(ACTIVE)
+    return (chosen,) if isinstance(chosen, str) and chosen in names else names
 
 
 def _control(state: PreflightState) -> Iterator[PreflightFinding]:
@@ -287,31 +316,28 @@ def _control(state: PreflightState) -> Iterator[PreflightFinding]:
 
 
 def _clock(state: PreflightState) -> Iterator[PreflightFinding]:
-    uncertainty_s = state.clock_uncertainty_s
-    if uncertainty_s > CLOCK_S:
-        yield PreflightFinding(
-            "clock",
-            Level.WARN,
-            f"ages are known to ±{uncertainty_s * 1000:.0f} ms only",
-            "commands may be refused as stale, and delays are wrong by as much",
-            "use a faster or less busy network",
-        )
-    else:
-        yield _ok("clock", f"ages are known to ±{uncertainty_s * 1000:.1f} ms")
+    vague = state.clock_uncertainty_s > CLOCK_S
+    milliseconds = state.clock_uncertainty_s * 1000
+    yield _judged(
+        Level.WARN if vague else Level.OK,
+        "clock",
+        f"ages are known to ±{milliseconds:.0f} ms only" if vague else f"ages are known to ±{milliseconds:.1f} ms",
+        "commands may be refused as stale, and delays are wrong by as much",
+        "use a faster or less busy network",
+    )
 
 
 def _storage(state: PreflightState) -> Iterator[PreflightFinding]:
     free = state.free_bytes
     if free is None:
         return
-    left = f"{free / 1e9:.1f} GB are free for recordings"
-    if free < FREE_BYTES:
-        level = Level.FAIL if free < FULL_BYTES else Level.WARN
-        yield PreflightFinding(
-            "storage", level, left, "a recording would end early", "delete old ones, or record elsewhere"
-        )
-    else:
-        yield _ok("storage", left)
+    yield _judged(
+        Level.FAIL if free < FULL_BYTES else Level.WARN if free < FREE_BYTES else Level.OK,
+        "storage",
+        f"{free / 1e9:.1f} GB are free for recordings",
+        "a recording would end early",
+        "delete old ones, or record elsewhere",
+    )
 
 
 def _vehicle(state: PreflightState) -> Iterator[PreflightFinding]:
@@ -322,11 +348,12 @@ def _vehicle(state: PreflightState) -> Iterator[PreflightFinding]:
     try:
         diagnostics = decode_checkup(text)
     except ValueError:
-        diagnostics = [Diagnostic("driver", False, "its check-up can't be read")]
+        unread = "its check-up can't be read: nothing is known of its own safety nets"
+        diagnostics = [Diagnostic("driver", False, unread, "start its proxy with the same version of Skyloop as this")]
     for one in diagnostics:
         level = Level.OK if one.good else Level.FAIL if one.severe else Level.WARN
-        detail, _, why = one.detail.partition(": ") if not one.good else (one.detail, "", "")
-        yield PreflightFinding(one.what, level, detail, why, one.advice)
+        detail, _, why = (one.detail, "", "") if one.good else one.detail.partition(": ")
+        yield _judged(level, one.what, detail, why, one.advice)
 
 
 def _number(state: PreflightState, name: str, otherwise: float) -> float:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 
+from skyloop.clock import seconds
 from skyloop.messages import Failsafe, Feedback, FlightState, LinkState
 
 if TYPE_CHECKING:
@@ -45,9 +46,23 @@ class Thresholds(msgspec.Struct, frozen=True):
     battery_critical: float = 0.15
     feedback_age_s: float = 1.0
     video_age_s: float = 1.0
+    link_degraded_s: float = 0.5
 
 
 USUAL: Final = Thresholds()
+
+
+class DegradedTimes:
+    """How long the hops have been degraded without a break."""
+
+    def __init__(self) -> None:
+        self._since_ns: dict[str, int] = {}
+
+    def update(self, link: LinkStatus, now_ns: int) -> dict[str, float]:
+        """Take the state of now, and return the time of each hop that is degraded [s], by the ``id`` of its alarm."""
+        degraded = [hop for hop, _, state in _hops(link) if state is LinkState.DEGRADED]
+        self._since_ns = {hop: self._since_ns.get(hop, now_ns) for hop in degraded}
+        return {hop: seconds(now_ns - since_ns) for hop, since_ns in self._since_ns.items()}
 
 
 def alarms(
@@ -55,6 +70,7 @@ def alarms(
     feedback: Feedback | None,
     feedback_age_s: float | None,
     video_age_s: Mapping[str, float],
+    degraded_s: Mapping[str, float],
     thresholds: Thresholds = USUAL,
 ) -> list[Alarm]:
     """Return what a person must know at once, the most severe first.
@@ -64,7 +80,8 @@ def alarms(
         feedback: The newest, None for none.
         feedback_age_s: Its age [s].
         video_age_s: Age of what is shown [s], by camera that somebody watches.
-        thresholds: From where on a charge or an age is an alarm.
+        degraded_s: How long the links that are degraded have been so [s], from :class:`DegradedTimes`.
+        thresholds: From where on a charge, an age or a degraded link is an alarm.
     """
     # On the ground there is time: only what is, or was when last heard of, in the air is urgent.
     urgent = _critical if feedback is not None and feedback.state.airborne else _warning
@@ -73,7 +90,7 @@ def alarms(
         return [urgent("application_link", _because("link to the proxy lost", link.reason))]
     if link.vehicle is LinkState.CLOSED:
         return []  # a recording that is over, as every recording is some time: nothing is wrong
-    found = [*_of_flight(feedback, thresholds, urgent), *_of_links(link, urgent)]
+    found = [*_of_flight(feedback, thresholds, urgent), *_of_links(link, degraded_s, thresholds, urgent)]
     if feedback_age_s is not None and 0 < thresholds.feedback_age_s < feedback_age_s:
         found.append(urgent("feedback_age", f"feedback is {feedback_age_s:.1f} s old"))
     for camera, age_s in video_age_s.items():
@@ -98,17 +115,20 @@ def _of_flight(feedback: Feedback | None, thresholds: Thresholds, urgent: _Make)
         yield _warning("battery", f"battery low: {charge:.0%}")
 
 
-def _of_links(link: LinkStatus, urgent: _Make) -> Iterator[Alarm]:
+def _of_links(
+    link: LinkStatus, degraded_s: Mapping[str, float], thresholds: Thresholds, urgent: _Make
+) -> Iterator[Alarm]:
     if link.vehicle is LinkState.LOST:
         yield urgent("vehicle_link", _because("link to the vehicle lost", link.reason, link.remedy))
     elif link.vehicle is LinkState.CONNECTING:
         yield _warning("vehicle_link", _because("no vehicle yet", link.reason, link.remedy))
-    for hop, name, state in (
-        ("application_link", "proxy", link.application),
-        ("vehicle_link", "vehicle", link.vehicle),
-    ):
-        if state is LinkState.DEGRADED:
+    for hop, name, _ in _hops(link):
+        if 0 < thresholds.link_degraded_s <= degraded_s.get(hop, 0.0):
             yield _warning(hop, _because(f"link to the {name} degraded", link.reason))
+
+
+def _hops(link: LinkStatus) -> tuple[tuple[str, str, LinkState], ...]:
+    return ("application_link", "proxy", link.application), ("vehicle_link", "vehicle", link.vehicle)
 
 
 def _critical(what: str, text: str) -> Alarm:

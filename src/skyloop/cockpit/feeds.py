@@ -138,8 +138,11 @@ class CameraFeed:
 
     @property
     def age_s(self) -> float | None:
-        """Age of the newest frame [s], or how long one was waited for in vain; None while no page wants any."""
-        if self._listener is None:
+        """Age of the newest frame [s], or how long one was waited for in vain.
+
+        None while no page wants any, and before the first that ever came: a vehicle may take seconds to send it.
+        """
+        if self._listener is None or not self._serial:
             return None
         return seconds(self._clock() - self._since_ns) if self.newest is None else self.newest.frame.age_s
 

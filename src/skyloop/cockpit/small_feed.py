@@ -62,8 +62,11 @@ class SmallFeed:
 
     @property
     def age_s(self) -> float | None:
-        """Age of the newest frame [s], or how long one was waited for in vain; None while no page shows it."""
-        if not self.wanted:
+        """Age of the newest frame [s], or how long one was waited for in vain.
+
+        None while no page shows it, and before the first that ever came: a vehicle may take seconds to send it.
+        """
+        if not self.wanted or not self.encoded:
             return None
         newest, now_ns = self.newest, self._clock()
         if newest is None:

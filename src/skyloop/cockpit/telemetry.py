@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from skyloop.clock import Clock, monotonic_ns, seconds
-from skyloop.cockpit.alarms import Alarm, alarms
+from skyloop.cockpit.alarms import Alarm, DegradedTimes, alarms
 from skyloop.cockpit.values import (
     Json,
     channel_values,
@@ -47,6 +47,7 @@ class TelemetryView:
     def __init__(self, station: Station, clock: Clock = monotonic_ns) -> None:
         self._station = station
         self._clock = clock
+        self._degraded = DegradedTimes()
         self._channels: dict[str, Json] = {}
         self._channels_ns: int | None = None
         self._channels_task: asyncio.Task[None] | None = None
@@ -101,7 +102,9 @@ class TelemetryView:
         for feed in self._station.feeds:
             if (feed_s := feed.age_s) is not None:
                 ages[feed.camera] = min(feed_s, ages.get(feed.camera, feed_s))
-        found = alarms(drone.link, feedback, age_s, ages, self._station.thresholds.newest())
+        link = drone.link
+        degraded_s = self._degraded.update(link, self._clock())
+        found = alarms(link, feedback, age_s, ages, degraded_s, self._station.thresholds.newest())
         # The proxy of a recording has a failsafe too, and nothing that it could land.
         return found if self._station.flies else [alarm for alarm in found if alarm.id != "failsafe"]
 

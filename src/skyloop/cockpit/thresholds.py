@@ -24,6 +24,7 @@ PARAMETERS: Final = {
     "battery_critical": "alarms.battery_critical",
     "feedback_age_s": "alarms.feedback_age_s",
     "video_age_s": "alarms.video_age_s",
+    "link_degraded_s": "alarms.link_degraded_s",
 }
 
 

@@ -58,6 +58,9 @@ def _own(name: str, value: float, unit: str, minimum: float, maximum: float, des
 OWN: Final[tuple[Parameter, ...]] = (
     _own("alarms.battery_critical", 0.15, "", 0.0, 1.0, "Charge below which the cockpit's alarm is critical; 0: never"),
     _own("alarms.feedback_age_s", 1.0, "s", 0.0, 60.0, "Age of feedback above which there is an alarm; 0: never"),
+    _own(
+        "alarms.link_degraded_s", 0.5, "s", 0.0, 60.0, "Time that a link is degraded until there is an alarm; 0: never"
+    ),
     _own("alarms.video_age_s", 1.0, "s", 0.0, 60.0, "Age of shown video above which there is an alarm; 0: never"),
     _own(
         "authority.ask_s", 10.0, "s", 0.0, 600.0, "A higher priority that asks takes over after this time at the latest"

@@ -124,7 +124,8 @@ class MavlinkDriver(Driver):
             autopilot, values = session.autopilot, session.parameters.values
             vehicle = session.vehicle_state(monotonic_ns())
         if autopilot is None or not values:
-            return [Diagnostic("parameters", False, "the vehicle's parameters were not read, so nothing is known")]
+            unread = "the vehicle's parameters were not read: its own safety nets are not known"
+            return [Diagnostic("parameters", False, unread, "wait until its link is up, then check again")]
         name = Diagnostic("autopilot", True, session.description)
         ready = None if vehicle is None else vehicle.ready
         arming = Diagnostic("arming", ready is not False, _ARMING[ready], "" if ready else _PREARM, severe=True)
