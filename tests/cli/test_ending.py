@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 
 import pytest
@@ -34,6 +35,12 @@ def test_a_drone_on_the_ground_has_landed_already(run: Run) -> None:
     ended = run("land", "--drone", "nobody")
     assert ended.code == 1
     assert ended.err.startswith("nobody: NOT landed: no proxy named 'nobody'")
+    ended = run("land", "alpha", "nobody", "--json")
+    assert (ended.code, ended.err) == (1, "")
+    first, second = json.loads(ended.out)
+    assert first == {"name": "alpha", "ok": True, "outcome": "landed already"}
+    assert (second["name"], second["ok"]) == ("nobody", False)
+    assert second["outcome"].startswith("NOT landed: no proxy named 'nobody'")
 
 
 @pytest.mark.usefixtures("alpha")
@@ -64,9 +71,9 @@ def test_all_land_and_all_stop(run: Run, swarm: Process, alpha: Process) -> None
             "skyloop: an emergency stop asks before: give --yes where nobody can answer\n",
         )
         assert one.feedback().state.airborne
-        ended = run("stop", "--all", "--yes")
+        ended = run("stop", "--all", "--yes", "--json")
         assert ended.code == 0
-        assert "b1: motors off\n" in ended.out
+        assert {"name": "b1", "ok": True, "outcome": "motors off"} in json.loads(ended.out)
         eventually(lambda: state("b1") == "emergency", "its motors are off")
     assert run("land", "--all", "b1").err == "skyloop: --all is every drone: give it alone, or names\n"
 
@@ -85,5 +92,7 @@ def test_a_stop_is_asked_for(run: Run, alpha: Process, monkeypatch: pytest.Monke
     monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
     monkeypatch.setattr("typer.confirm", lambda text, **_: asked.append(text))
     asked: list[str] = []
-    assert run("stop", "alpha").code == 0
+    ended = run("stop", "alpha")
+    assert ended.code == 0
+    assert ended.out.startswith("alpha: motors off")
     assert asked == ["Cut the motors of alpha? What flies FALLS."]

@@ -129,6 +129,13 @@ def test_an_iterator_that_gets_nothing_says_so(drone: Drone) -> None:
         next(iter(drone.frames(timeout_s=0.02)))
 
 
+def test_where_no_frame_comes_because_of_the_vehicle_the_reason_is_told(proxy: ScriptedProxy, drone: Drone) -> None:
+    proxy.more = {"vehicle_link": "lost", "link_reason": "no camera there", "link_remedy": "plug it in"}
+    drone.wait(lambda _: drone.link.vehicle is LinkState.LOST, WAIT_S)
+    with pytest.raises(NoAnswerError, match=r"0\.02 s: the vehicle's link is lost: no camera there: plug it in$"):
+        drone.next_frame(timeout_s=0.02)
+
+
 def test_closing_ends_iterators_and_waits(proxy: ScriptedProxy, drone: Drone) -> None:
     ends: list[object] = []
 

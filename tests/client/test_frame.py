@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import sys
+import traceback
 from typing import Any
 
 import numpy as np
@@ -86,6 +87,9 @@ def test_what_is_derived_is_plain() -> None:
             _ = derived.feedback
     with pytest.raises(AttributeError, match="no attribute 'colour'"):
         _ = frame.colour
+    with pytest.raises(AttributeError, match="no image: it is the image itself, a NumPy array") as raised:
+        _ = frame.image
+    assert "imag'" not in "".join(traceback.format_exception(raised.value))
 
 
 def test_consumers_share_one_frame() -> None:

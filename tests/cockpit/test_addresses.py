@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 from contextlib import ExitStack
@@ -11,7 +12,7 @@ import pytest
 
 from skyloop.cockpit import addresses
 from skyloop.cockpit.access import PAIRING_S, Pairing, Token, TokenGate
-from skyloop.cockpit.addresses import bind, listener_of, qr_code, reachable
+from skyloop.cockpit.addresses import bind, listener_of, own_addresses, qr_code, reachable
 from skyloop.cockpit.announcing import Announcer
 from skyloop.cockpit.security import own_names
 from skyloop.cockpit.server import Access
@@ -73,6 +74,32 @@ def test_what_is_printed_is_an_address_that_is_answered() -> None:
         for name in addresses.host_names():
             assert names.own(f"{name.lower()}:8420")
         assert not names.own("elsewhere.local:8420")
+
+
+def test_where_no_route_leads_further_the_addresses_of_the_interfaces_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(socket.socket, "connect", no_route)
+    monkeypatch.setattr(addresses, "own_addresses", lambda: ["192.0.2.9", "198.51.100.9"])
+    assert reachable("0.0.0.0") == ["192.0.2.9", "198.51.100.9"]
+    monkeypatch.setattr(addresses, "own_addresses", list)
+    assert reachable("0.0.0.0") == [HERE]
+
+
+def no_route(*_: object) -> None:
+    raise OSError(errno.ENETUNREACH, "Network is unreachable")
+
+
+def test_the_addresses_of_the_interfaces_can_be_bound() -> None:
+    for address in own_addresses():
+        with bind(address, 0) as listening:
+            assert listening.getsockname()[0] == address != HERE
+
+
+def test_where_there_is_no_network_it_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    Announcer(None, loopback=False)("http://127.0.0.1:8123/")
+    assert "this machine is in no network" in capsys.readouterr().err
+    Announcer(None, loopback=True)("http://127.0.0.1:8123/")
+    Announcer(None, loopback=False)("http://[2001:db8::1]:8123/")
+    assert capsys.readouterr().err == ""
 
 
 def test_a_code_works_once_and_not_for_ever() -> None:

@@ -78,8 +78,10 @@ def test_what_does_not_go_together_is_told(tmp_path: Path) -> None:
 def test_files_that_can_not_be_used_are_told(tmp_path: Path, tokens: Path) -> None:
     with pytest.raises(UsageError, match="can't be read"):
         serve_cockpit(access=Access(token_file=tmp_path / "gone"))
-    with pytest.raises(UsageError, match="can't be used for TLS"):
+    with pytest.raises(UsageError, match=r"there is no .*gone: make certificate and key"):
         serve_cockpit(access=Access(token_file=tokens, tls_cert=tmp_path / "gone", tls_key=tokens))
+    with pytest.raises(UsageError, match="can't be used for TLS"):
+        serve_cockpit(access=Access(token_file=tokens, tls_cert=tokens, tls_key=tokens))
 
 
 def test_port_in_use() -> None:

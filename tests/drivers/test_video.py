@@ -18,6 +18,7 @@ from skyloop.clock import monotonic_ns
 from skyloop.drivers.base import Driver
 from skyloop.drivers.recording_sink import RecordingSink
 from skyloop.drivers.registry import make_driver
+from skyloop.drivers.video.devices import cameras, described
 from skyloop.drivers.video.player import CameraPublisher, LivePlayer
 from skyloop.drivers.video.sources import ContainerSource, DecodedImage, Source
 from skyloop.errors import DriverError, FileFormatError, MissingExtraError, UnknownNameError, UsageError
@@ -345,7 +346,8 @@ def test_a_device_that_is_not_there_is_no_error() -> None:
         camera = driver.capabilities().cameras[0]
         assert (camera.width, camera.height, camera.fps) == (320, 240, 15)
         assert sink.wait(lambda: sink.link_state is LinkState.LOST, 5.0)
-    assert sink.links == [(LinkState.LOST, "there is no device /dev/skyloop-no-such-camera")]
+    assert [state for state, _ in sink.links] == [LinkState.LOST]
+    assert sink.links[0][1] == f"there is no /dev/skyloop-no-such-camera; {described(cameras())}"
 
 
 def test_a_file_that_is_no_camera_is_told() -> None:

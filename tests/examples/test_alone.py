@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
+import runpy
 import sys
 from pathlib import Path
+from typing import Any, NoReturn
 
 import pytest
 
-FOLDER = Path(__file__).parents[2] / "examples"
+import skyloop
+
+EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.py"))
 #: Those that join drones which others share, and what they say to start.
 JOINING = {
     "shared_drone": "start the drone first: skyloop sim --name alpha",
@@ -20,23 +22,30 @@ JOINING = {
 }
 
 
-@pytest.mark.parametrize("name", JOINING)
-def test_one_that_joins_drones_says_in_one_line_what_to_start(name: str, tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, str(FOLDER / f"{name}.py")],
-        env={**os.environ, "SKYLOOP_RUNTIME_DIR": str(tmp_path / "none"), "PYTHONIOENCODING": "utf-8"},
-        capture_output=True,
-        text=True,
-        encoding="utf-8",
-        timeout=60,
-        check=False,
-    )
-    assert (done.returncode, done.stdout, done.stderr) == (1, "", f"{JOINING[name]}\n")
+class Starts(Exception):  # noqa: N818  it is how a test ends, and no error
+    """The example starts a simulation of its own; the other tests of this folder, and of ``tests/gym``, fly it."""
 
 
-def test_every_other_one_flies_a_drone_of_its_own() -> None:
-    """They are flown without arguments by the other tests of this folder; that of learning by ``tests/gym``."""
-    for path in FOLDER.glob("*.py"):
-        text = path.read_text()
-        if path.stem not in JOINING:
-            assert 'target: str = "sim://' in text or "sim://?" in text or "VectorEnv" in text, path.name
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_alone_it_starts_what_it_needs_or_says_what_to_start(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    join = skyloop.connect
+
+    def connect(target: str, **options: Any) -> skyloop.Drone:
+        return starts() if target.startswith("sim://") else join(target, **options)
+
+    def starts(*_: object, **__: object) -> NoReturn:
+        raise Starts
+
+    monkeypatch.setattr("skyloop.connect", connect)
+    monkeypatch.setattr("skyloop.control.rehearsal.rehearse", starts)
+    monkeypatch.setattr("skyloop.gym.ReachVectorEnv", starts)
+    monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", str(tmp_path / "nothing runs"))
+    monkeypatch.delenv("SKYLOOP_NETWORK", raising=False)
+    monkeypatch.setattr(sys, "argv", [str(path)])
+    with pytest.raises((Starts, SystemExit)) as ended:
+        runpy.run_path(str(path), run_name="__main__")
+    said = str(ended.value)  # an exit with words prints them alone, on standard error, with exit code 1
+    assert said == JOINING.get(path.stem, "")
+    assert "\n" not in said

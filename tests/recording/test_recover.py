@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -73,6 +74,19 @@ def test_a_whole_file_needs_nothing(log: Log, flight: Path) -> None:
     ended = log("recover", flight)
     assert (ended.code, ended.err) == (0, f"{flight} is whole: there is nothing to repair\n")
     assert not flight.with_name("flight-recovered.mcap").exists()
+
+
+def test_programs_get_it_as_json(log: Log, cut: Path, flight: Path) -> None:
+    ended = log("recover", cut, "--json")
+    assert (ended.code, ended.err) == (0, "")
+    told = json.loads(ended.out)
+    saved = told["saved"]
+    mended = cut.with_name("flight-recovered.mcap")
+    assert (told["file"], saved["path"]) == (str(cut), str(mended))
+    assert sum(saved["messages"].values()) == len(samples(mended))
+    assert saved["size"] == mended.stat().st_size
+    assert "it ends within a record" in saved["why"][0]
+    assert json.loads(log("recover", flight, "--json").out) == {"file": str(flight), "saved": None}
 
 
 def test_nothing_is_overwritten(log: Log, cut: Path, tmp_path: Path) -> None:

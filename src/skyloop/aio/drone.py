@@ -359,7 +359,7 @@ class Drone:
                 try:
                     await asyncio.wait_for(came.wait(), timeout_s)
                 except TimeoutError:
-                    raise NoAnswerError(f"no frame of {channel.camera.name} came within {timeout_s:g} s") from None
+                    raise self.sync._core.no_frame(channel.camera.name, timeout_s) from None
                 came.clear()
                 arrival = mailbox.take()
                 if arrival is None:

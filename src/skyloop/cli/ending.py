@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
+import msgspec
 import typer
 
 from skyloop.cli import wording
@@ -26,6 +27,15 @@ _MOST_AT_ONCE: Final = 64
 LEAVE: Final = "take over with --priority 0, or ask them"
 
 AllOption = Annotated[bool, typer.Option("--all", help="Every drone that runs here, or on the --network")]
+JsonOption = Annotated[bool, typer.Option("--json", help="For programs: one JSON array, once all have ended")]
+
+
+class Ending(msgspec.Struct, frozen=True):
+    """What became of the flight of one drone."""
+
+    name: str
+    ok: bool
+    outcome: str  #: in words: how it ended, or why it did not
 
 
 def land(
@@ -36,6 +46,7 @@ def land(
         int | None,
         typer.Option(metavar="P", min=0, max=31, help="0, the highest, takes over [default: 16; with --all: 0]"),
     ] = None,
+    json: JsonOption = False,
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
@@ -48,7 +59,7 @@ def land(
 
     chosen = _chosen(names, drone, every, network, keys)
     wanted = (HIGHEST_PRIORITY if every else DEFAULT_PRIORITY) if priority is None else priority
-    _each(chosen, lambda name: _land(name, wanted), "NOT landed")
+    _each(chosen, lambda name: _land(name, wanted), "NOT landed", json)
 
 
 def stop(
@@ -56,6 +67,7 @@ def stop(
     drone: DronesOption = None,
     every: AllOption = False,
     yes: Annotated[bool, typer.Option("--yes", "-y", help="Do not ask: the motors are cut at once")] = False,
+    json: JsonOption = False,
     network: NetworkOption = None,
     keys: KeysOption = None,
 ) -> None:
@@ -68,7 +80,7 @@ def stop(
         if not sys.stdin.isatty():
             raise UsageError("an emergency stop asks before: give --yes where nobody can answer")
         typer.confirm(f"Cut the motors of {', '.join(chosen)}? What flies FALLS.", abort=True, err=True)
-    _each(chosen, _stop, "NOT stopped")
+    _each(chosen, _stop, "NOT stopped", json)
 
 
 def _chosen(
@@ -87,21 +99,24 @@ def _chosen(
     return found
 
 
-def _each(names: Sequence[str], end: Callable[[str], str], failed: str) -> None:
-    """End all flights at the same time, and print a line for each as soon as it has ended."""
+def _each(names: Sequence[str], end: Callable[[str], str], failed: str, json: bool) -> None:
+    """End all flights at the same time, and print a line for each as soon as it has ended, or all as JSON."""
 
-    def attempt(name: str) -> tuple[str, bool]:
+    def attempt(name: str) -> Ending:
         try:
-            return f"{name}: {end(name)}", True
+            return Ending(name, True, end(name))
         except SkyloopError as error:
-            return f"{name}: {failed}: {wording.of(error)}", False
+            return Ending(name, False, f"{failed}: {wording.of(error)}")
 
-    worked = True
+    ended = []
     with ThreadPoolExecutor(max_workers=min(_MOST_AT_ONCE, len(names))) as pool:
-        for line, good in pool.map(attempt, names):
-            typer.echo(line, err=not good)
-            worked &= good
-    if not worked:
+        for one in pool.map(attempt, names):
+            ended.append(one)
+            if not json:
+                typer.echo(f"{one.name}: {one.outcome}", err=not one.ok)
+    if json:
+        typer.echo(msgspec.json.encode(ended).decode())
+    if not all(one.ok for one in ended):
         raise typer.Exit(1)
 
 

@@ -201,8 +201,10 @@ def recover(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", metavar="NEW", help="Default: FILE-recovered.mcap beside it")
     ] = None,
+    json: Annotated[bool, typer.Option("--json", help="For programs: one JSON object")] = False,
 ) -> None:
     """Write what can be read of a cut or damaged recording to a new file, with its index; the old one is left alone."""
+    from skyloop.cli import log_tables
     from skyloop.recording.review import recover as mending
 
     recording = _open(file)
@@ -210,10 +212,15 @@ def recover(
         wrong = mending.problems(recording, progress)
     if not wrong and output is None:
         _print(f"{file} is whole: there is nothing to repair")
+        if json:
+            typer.echo(log_tables.recovered_json(file, None))
         return
     target = output or file.with_name(f"{file.stem}-recovered.mcap")
     with _progress("mending") as progress:
         saved = mending.recover(recording, target, progress)
+    if json:
+        typer.echo(log_tables.recovered_json(file, saved))
+        return
     for problem in saved.why:
         _print(f"{file}: {problem}")
     for topic, count in sorted(saved.messages.items()):

@@ -16,6 +16,7 @@ from skyloop.clock import NS_PER_S
 from skyloop.logfile.listing import Described
 from skyloop.logfile.reader import Recording
 from skyloop.recording.review.compare import Comparison
+from skyloop.recording.review.recover import Recovered
 from skyloop.recording.review.summary import Delay, Row, Summary
 
 
@@ -105,6 +106,11 @@ def _losses(summary: Summary) -> Iterator[str]:
             words = ", ".join(f"{count} of {channel}" for channel, count in channels.items() if count)
             if words:
                 yield f"{drone}: {words} {what}"
+
+
+def recovered_json(file: Path, saved: Recovered | None) -> str:
+    """Return all that ``skyloop log recover --json`` prints: ``saved`` is null for a recording that is whole."""
+    return msgspec.json.encode({"file": str(file), "saved": saved}, enc_hook=str).decode()
 
 
 def comparison_json(found: Comparison) -> str:

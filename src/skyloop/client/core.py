@@ -259,6 +259,14 @@ class DroneCore:
         if self.connection.receiving:
             raise UsageError("an inline listener can't wait for what it would itself have to receive")
 
+    def no_frame(self, camera: str, timeout_s: float) -> NoAnswerError:
+        """Return the error for a frame that did not come, with what is known of the reason."""
+        link = self.state.status
+        words = [f"no frame of {camera} came within {timeout_s:g} s"]
+        if link.vehicle is not LinkState.UP:
+            words += [f"the vehicle's link is {link.vehicle.value}", link.reason, link.remedy]
+        return NoAnswerError(": ".join(filter(None, words)))
+
     def _known(self) -> bool:
         """Whether feedback has come and the link's state was judged."""
         return self.state.newest is not None and self.state.status.application is not LinkState.CONNECTING

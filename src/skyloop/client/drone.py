@@ -552,7 +552,7 @@ class Drone:
             frame = channel.read()
             if frame is not None:
                 return frame
-        raise NoAnswerError(f"no frame of {channel.camera.name} came within {timeout_s:g} s")
+        raise self._core.no_frame(channel.camera.name, timeout_s)
 
     def frames(
         self,
@@ -591,7 +591,7 @@ class Drone:
                     if frame is not None:
                         yield frame
                 elif not mailbox.closed:
-                    raise NoAnswerError(f"no frame of {channel.camera.name} came within {timeout_s:g} s")
+                    raise self._core.no_frame(channel.camera.name, timeout_s)
 
     def wait(self, state: Wanted, timeout_s: float = 10.0) -> Feedback:
         """Wait until the newest feedback is as wanted.

@@ -34,6 +34,7 @@ _ATTRIBUTES: Final = frozenset(
     {"camera", "seq", "captured_ns", "published_ns", "received_ns", "intrinsics", "header", "age_s"}
     | {"feedback", "feedback_reach_s"}
 )
+_THE_IMAGE: Final = frozenset({"image", "img", "pixels", "array"})  #: as other libraries call it
 
 
 class Frame(_Base):
@@ -123,6 +124,8 @@ class Frame(_Base):
             raise AttributeError(
                 f"this array was derived from a frame and has no {name}: only the frame as it was delivered knows it"
             )
+        if name in _THE_IMAGE:  # with a name but no object Python adds no guess of its own ("imag")
+            raise AttributeError(f"a frame has no {name}: it is the image itself, a NumPy array", name=name)
         raise AttributeError(f"a frame has no attribute {name!r}")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import ipaddress
 import socket
+import struct
 import sys
 from contextlib import closing, suppress
 from pathlib import Path
@@ -17,6 +18,7 @@ NEXT_PORTS: Final = 9  #: tried after it, if it is taken
 _TABLES: Final = (Path("/proc/net/tcp"), Path("/proc/net/tcp6"))
 _LISTENS: Final = "0A"  # the state of a listening socket in these tables
 _LOCAL, _STATE, _INODE = 1, 3, 9  # their columns
+_SIOCGIFADDR: Final = 0x8915  # Linux: the IPv4 address of an interface
 _MDNS: Final = Path("/run/avahi-daemon/socket")
 _MAX_COMMAND: Final = 60
 
@@ -86,6 +88,8 @@ def listener_of(port: int) -> str:
 def reachable(address: str) -> list[str]:
     """Return the addresses under which others reach what listens at one; the first is the one to tell people.
 
+    Where this machine is in no network, that is its loopback address.
+
     Args:
         address: An address of this machine, ``0.0.0.0`` or ``::``.
     """
@@ -100,7 +104,25 @@ def reachable(address: str) -> list[str]:
         with suppress(OSError), closing(socket.socket(family, socket.SOCK_DGRAM)) as probe:
             probe.connect((somewhere, 9))  # sends nothing: it only asks which of our addresses would be used
             found.append(str(probe.getsockname()[0]))
-    return found or ["127.0.0.1" if known.version == 4 else "::1"]
+    return found or own_addresses() or ["127.0.0.1" if known.version == 4 else "::1"]
+
+
+def own_addresses() -> list[str]:
+    """Return the IPv4 addresses of this machine's networks, in the order of its interfaces; none but on Linux.
+
+    They matter where no route leads further: a drone's own Wi-Fi, or a hall's that has no internet.
+    """
+    if sys.platform != "linux":
+        return []
+    from fcntl import ioctl
+
+    found = []
+    with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as any_socket:
+        for _, name in socket.if_nameindex():
+            with suppress(OSError):  # it has no address
+                answer = ioctl(any_socket, _SIOCGIFADDR, struct.pack("256s", name.encode()))
+                found.append(socket.inet_ntoa(answer[20:24]))
+    return [address for address in found if not ipaddress.ip_address(address).is_loopback]
 
 
 def host_names() -> tuple[str, ...]:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ipaddress
 import sys
+from urllib.parse import urlsplit
 
 from skyloop.cockpit.access import PAIRING_S, Pairing
 from skyloop.cockpit.addresses import qr_code
@@ -28,6 +30,8 @@ class Announcer:
         print(f"cockpit: {page}", flush=True)
         if self._pairing is not None:
             self._pairing.on_used = lambda who: self._show(page, who)
+        if not self._loopback and ipaddress.ip_address(urlsplit(page).hostname or "").is_loopback:
+            print("cockpit: this machine is in no network: nobody else reaches the page", file=sys.stderr)
         self._show(page, "")
 
     def _show(self, page: str, paired: str) -> None:

@@ -207,6 +207,9 @@ def _tls(access: Access) -> ssl.SSLContext:
         UsageError: A file can't be used.
     """
     assert access.tls_cert is not None
+    for file in filter(None, (access.tls_cert, access.tls_key)):
+        if not file.exists():
+            raise UsageError(f"there is no {file}: make certificate and key with openssl, as docs/cockpit.md shows")
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
         context.load_cert_chain(access.tls_cert, access.tls_key)

@@ -41,7 +41,7 @@ class RunSummary:
         return (
             f"{self.seconds:.1f} s until {self.reason}: {self.frames} frames ({self.frames_dropped} dropped), "
             f"{self.feedback} feedback samples ({self.feedback_dropped} dropped), "
-            f"{self._results()}{self.overruns} overruns"
+            f"{self._results()}{self.overruns} overrun{'' if self.overruns == 1 else 's'}"
         )
 
     def _results(self) -> str:

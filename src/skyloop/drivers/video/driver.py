@@ -8,6 +8,7 @@ from functools import partial
 from skyloop.drivers.base import Driver, Sink
 from skyloop.drivers.intrinsics import intrinsics_of
 from skyloop.drivers.uri import VehicleUri
+from skyloop.drivers.video.devices import cameras, described
 from skyloop.drivers.video.options import options_of
 from skyloop.drivers.video.player import CameraPublisher, FilePlayer, LivePlayer
 from skyloop.drivers.video.sources import Source, open_device, open_file
@@ -72,7 +73,7 @@ class VideoDriver(Driver):
 
     def _open_device(self) -> Source:
         if not self.options.path.exists():
-            raise DriverError(f"there is no device {self.options.path}")
+            raise DriverError(f"there is no {self.options.path}; {described(cameras())}")
         size = f"{self.options.width}x{self.options.height}"
         return open_device(self.options.path, {"video_size": size, "framerate": f"{self.options.fps:g}"})
 
