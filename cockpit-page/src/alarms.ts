@@ -1,7 +1,7 @@
 // What is wrong with a drone, over its pane and not in its flow: nothing moves under the finger. Each alarm can be acknowledged.
 
 import { h, setAttribute, setHidden, setText, setTone } from "./dom.js";
-import { count } from "./format.js";
+import { t } from "./language/index.js";
 import type { Alarm } from "./model.js";
 
 /** An alarm that was away for so long is a new one when it comes back [ms]. */
@@ -77,14 +77,14 @@ class Row {
   private readonly ok: HTMLButtonElement;
 
   constructor(acknowledge: () => void) {
-    this.ok = h("button", { type: "button", class: "small", onclick: acknowledge }, "OK");
+    this.ok = h("button", { type: "button", class: "small", onclick: acknowledge }, t.alarms.ok);
     this.element = h("p", { class: "banner alarm" }, this.text, this.ok);
   }
 
   show(alarm: Alarm, open: boolean): void {
     setTone(this.element, !open ? "quiet" : alarm.severity === "critical" ? "bad" : "warn");
     setText(this.text, alarm.text);
-    setAttribute(this.ok, "aria-label", `OK: acknowledge ${alarm.text}`);
+    setAttribute(this.ok, "aria-label", t.alarms.acknowledge(alarm.text));
     setHidden(this.ok, !open);
   }
 }
@@ -126,7 +126,7 @@ export class AlarmBanner {
     setHidden(this.chip, acknowledged.length === 0);
     if (acknowledged.length === 0) setAttribute(this.chip, "aria-expanded", "false");
     setTone(this.chip, acknowledged.some((alarm) => alarm.severity === "critical") ? "bad" : "warn");
-    setText(this.chip, count(acknowledged.length, "alarm"));
+    setText(this.chip, t.alarms.count(acknowledged.length));
     setAttribute(this.chip, "title", acknowledged.map((alarm) => alarm.text).join(" · "));
     if (this.book.raised === this.raised) return;
     this.raised = this.book.raised;

@@ -1,7 +1,9 @@
 // Alarms that are heard and felt: a tone where the browser allows it, and a vibration where there is a motor for it.
 
-import { h, memory, setAttribute, setText, setTone, svg } from "./dom.js";
+import { h, setAttribute, setText, setTone, svg } from "./dom.js";
+import { t } from "./language/index.js";
 import type { Alarm } from "./model.js";
+import { settings } from "./settings.js";
 
 type Severity = Alarm["severity"];
 
@@ -58,12 +60,13 @@ export class AlarmSound {
     // Browsers allow sound only after the first touch of the page.
     // At the end of a press: what the button says changes its width, and nothing may move under the finger that is down.
     for (const touch of ["pointerup", "keydown"]) window.addEventListener(touch, () => this.wake(), { capture: true });
+    settings.on("sound", () => this.show());
     setInterval(() => this.look(), LOOK_MS);
     this.show();
   }
 
   private get isMuted(): boolean {
-    return memory.get("alarms-muted") === "true";
+    return settings.get("sound") === "off";
   }
 
   private get isBlocked(): boolean {
@@ -71,8 +74,7 @@ export class AlarmSound {
   }
 
   private mute(muted: boolean): void {
-    memory.set("alarms-muted", String(muted));
-    this.show();
+    settings.set("sound", muted ? "off" : "on");
     if (!muted) this.play("warning"); // so that one knows what it is like
   }
 
@@ -114,12 +116,12 @@ export class AlarmSound {
 
   private show(): void {
     const [muted, blocked] = [this.isMuted, this.isBlocked];
-    const state = muted ? "Muted" : blocked ? "Touch for sound" : "";
+    const state = muted ? t.alarms.muted : blocked ? t.alarms.touch : "";
     setText(this.text, state);
     setTone(this.button, !muted && blocked ? "warn" : "quiet");
     this.wave.setAttribute("visibility", muted || blocked ? "hidden" : "visible");
     setAttribute(this.button, "aria-pressed", String(!muted));
-    setAttribute(this.button, "aria-label", `Alarms' sound: ${state || "on"}`); // with what is read on it, for who speaks to the page
-    setAttribute(this.button, "title", muted ? "Alarms are muted" : blocked ? "The browser blocks sound until you touch the page" : "Alarms are heard: press to mute them");
+    setAttribute(this.button, "aria-label", t.alarms.sound(state || t.alarms.on)); // with what is read on it, for who speaks to the page
+    setAttribute(this.button, "title", muted ? t.alarms.isMuted : blocked ? t.alarms.isBlocked : t.alarms.isHeard);
   }
 }

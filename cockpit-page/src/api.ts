@@ -1,12 +1,14 @@
 // Requests over HTTP.
 
+import { t } from "./language/index.js";
+
 export class Refused extends Error {}
 
 async function answered(response: Response): Promise<unknown> {
   const text = (await response.text()) || "{}";
   const isJson = response.headers.get("content-type")?.startsWith("application/json") ?? false;
   const values = isJson ? (JSON.parse(text) as { error?: string }) : { error: text };
-  if (!response.ok) throw new Refused(values.error ?? `refused (${response.status})`);
+  if (!response.ok) throw new Refused(values.error ?? t.api.refused(response.status));
   return values;
 }
 
@@ -15,7 +17,7 @@ async function ask(path: string, options: RequestInit): Promise<unknown> {
     return await answered(await fetch(path, options));
   } catch (error) {
     if (error instanceof Refused) throw error;
-    throw new Refused("the cockpit does not answer");
+    throw new Refused(t.api.silent);
   }
 }
 

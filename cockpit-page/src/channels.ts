@@ -2,15 +2,16 @@
 
 import { h, setText } from "./dom.js";
 import { figure, type Known } from "./format.js";
+import { t } from "./language/index.js";
 import type { Channel, State } from "./model.js";
 
 const COLUMNS: readonly (readonly [string, string])[] = [
-  ["/s", "samples a second over the last two seconds"],
-  ["delay", "from sending to receiving, median, in milliseconds"],
-  ["p99", "99 of 100 samples took less, in milliseconds"],
-  ["age", "since the newest sample was captured, in milliseconds; s: seconds"],
-  ["lost", "missing by the gaps in the numbers"],
-  ["drop", "received and not used, as newer ones were there"],
+  ["/s", t.channels.rate],
+  [t.channels.delayHead, t.channels.delay],
+  ["p99", t.channels.p99],
+  [t.channels.ageHead, t.channels.age],
+  [t.channels.lostHead, t.channels.lost],
+  [t.channels.dropHead, t.channels.dropped],
 ];
 
 export class Channels {
@@ -19,8 +20,8 @@ export class Channels {
 
   constructor() {
     const columns = COLUMNS.map(([name, title]) => h("th", { scope: "col" }, h("abbr", { title }, name)));
-    const head = h("tr", {}, h("th", { scope: "col" }, "Channel"), ...columns);
-    const label = "Channels: rates, delays in milliseconds, ages and drops";
+    const head = h("tr", {}, h("th", { scope: "col" }, t.channels.channel), ...columns);
+    const label = t.channels.label;
     this.element = h("section", { class: "channels scroll", tabindex: 0, "aria-label": label }, h("table", {}, h("thead", {}, head), this.body));
   }
 

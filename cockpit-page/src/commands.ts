@@ -4,6 +4,7 @@
 // emergency stop: that one is tried for two seconds, while the page shows it as pending.
 
 import type { ServerClock } from "./clock.js";
+import { t } from "./language/index.js";
 import type { Handlers } from "./socket.js";
 
 /** A command that is older is not executed [ms]. */
@@ -25,9 +26,9 @@ export interface CommandSocket {
   close(): void;
 }
 
-/** `sent`: the cockpit passed it on. `refused`: by the cockpit or the drone, with a reason. `not sent`: it never left, or
- *  came too late to count. `no answer`: it left in time, and nothing came back. */
-export type Fate = "pending" | "sent" | "refused" | "not sent" | "no answer";
+/** `sent`: the cockpit passed it on. `refused`: by the cockpit or the drone, with a reason. `not_sent`: it never left, or
+ *  came too late to count. `no_answer`: it left in time, and nothing came back. */
+export type Fate = "pending" | "sent" | "refused" | "not_sent" | "no_answer";
 
 /** The outcome of the newest command of its kind. */
 export interface Result {
@@ -109,7 +110,7 @@ export class CommandSender {
     const pending: Pending = { command, n: this.number, pressed_ms: now_ms, on_its_way: false, went: false };
     const stop = STOPS.has(command.do);
     if (!stop && !this.isLive) {
-      this.end(command.do, "not sent", this.silence(now_ms));
+      this.end(command.do, "not_sent", this.silence(now_ms));
       return false;
     }
     this.pending.set(command.do, pending);
@@ -131,8 +132,8 @@ export class CommandSender {
       const late_ms = this.late_ms(pending);
       const age_ms = now_ms - pending.pressed_ms;
       if (!pending.on_its_way && age_ms < late_ms) this.transmit(pending);
-      if (age_ms >= late_ms && !pending.went) this.end(pending.command.do, "not sent", this.silence(now_ms));
-      else if (age_ms >= late_ms + (STOPS.has(pending.command.do) ? 0 : ANSWER_MS)) this.end(pending.command.do, "no answer", `${this.silence(now_ms)}; it won't be executed if it has not been by now`);
+      if (age_ms >= late_ms && !pending.went) this.end(pending.command.do, "not_sent", this.silence(now_ms));
+      else if (age_ms >= late_ms + (STOPS.has(pending.command.do) ? 0 : ANSWER_MS)) this.end(pending.command.do, "no_answer", t.commands.late(this.silence(now_ms)));
     }
     for (const [what, { fate, since_ms }] of [...this.results]) {
       const shown_ms = fate === "sent" ? SENT_SHOWN_MS : FAILED_SHOWN_MS;
@@ -151,8 +152,8 @@ export class CommandSender {
 
   private silence(now_ms: number): string {
     const age_ms = this.age_ms(now_ms);
-    if (!this.socket.isOpen || age_ms === null) return "this page has no connection to the cockpit";
-    return `no answer from the cockpit for ${(age_ms / 1000).toFixed(1)} s`;
+    if (!this.socket.isOpen || age_ms === null) return t.commands.noConnection;
+    return t.commands.silent((age_ms / 1000).toFixed(1));
   }
 
   private transmit(pending: Pending): boolean {
@@ -223,7 +224,7 @@ export class CommandSender {
     this.pending.delete(what);
     if (pending) this.settled.set(what, pending.n);
     this.show(what, fate, why);
-    this.listener.refused(what, `${fate}: ${why}`);
+    this.listener.refused(what, `${t.commands.fates[fate]}: ${why}`);
   }
 
   private show(what: string, fate: Fate, why: string): void {

@@ -2,6 +2,7 @@
 
 import { h, type Tone } from "./dom.js";
 import { words } from "./format.js";
+import { t } from "./language/index.js";
 import type { DroneEvent } from "./model.js";
 
 const MOST_EVENTS = 300;
@@ -10,10 +11,10 @@ const TONES: Readonly<Record<string, Tone>> = { info: "quiet", warning: "warn", 
 /** The newest first; words and severity choose what is shown. */
 export class Events {
   readonly element: HTMLElement;
-  private readonly list = h("ol", { class: "events", tabindex: 0, "aria-label": "Events, newest first" });
-  private readonly words = h("input", { type: "search", placeholder: "Filter", "aria-label": "Filter events by words", oninput: () => this.filter() });
-  private readonly severity = h("select", { "aria-label": "Severity", onchange: () => this.filter() }, h("option", { value: "" }, "All"), h("option", { value: "warning" }, "Warnings"), h("option", { value: "error" }, "Errors"));
-  private readonly none = h("p", { class: "empty" }, "No events");
+  private readonly list = h("ol", { class: "events", tabindex: 0, "aria-label": t.events.label });
+  private readonly words = h("input", { type: "search", placeholder: t.events.filter, "aria-label": t.events.filterLong, oninput: () => this.filter() });
+  private readonly severity = h("select", { "aria-label": t.events.severity, onchange: () => this.filter() }, h("option", { value: "" }, t.events.all), h("option", { value: "warning" }, t.events.warnings), h("option", { value: "error" }, t.events.errors));
+  private readonly none = h("p", { class: "empty" }, t.events.none);
   private readonly shown: { event: DroneEvent; row: HTMLElement }[] = [];
   private newest = 0;
 

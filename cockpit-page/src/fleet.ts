@@ -1,8 +1,8 @@
 // All drones that were found, each in a card: a click opens one alone, its second button opens it beside the others.
 
 import { Battery } from "./battery.js";
-import { count } from "./format.js";
 import { h, setAttribute, setHidden, setText, setTone } from "./dom.js";
+import { t } from "./language/index.js";
 import type { DroneRow } from "./model.js";
 import { byName, describe } from "./row.js";
 
@@ -14,14 +14,14 @@ class Card {
   private readonly hops = [h("i", { class: "dot" }), h("i", { class: "dot" })];
   private readonly linked = h("span", { class: "card-links" }, ...this.hops);
   private readonly linkText = h("span", { class: "unseen" });
-  private readonly recording = h("span", { class: "rec", title: "being recorded" }, "REC");
+  private readonly recording = h("span", { class: "rec", title: t.overview.recorded }, t.overview.recordedShort);
   private readonly alarms = h("p", { class: "card-alarm" });
   private readonly beside: HTMLButtonElement;
   private readonly main: HTMLButtonElement;
 
   constructor(name: string, open: (name: string, alone: boolean) => void) {
-    this.main = h("button", { type: "button", class: "card-main", onclick: () => open(name, true) }, h("span", { class: "unseen" }, "Open"), h("span", { class: "card-top" }, h("b", {}, name), this.recording, this.linked), h("span", { class: "card-bottom" }, this.state, this.battery.element), this.owner, this.linkText);
-    this.beside = h("button", { type: "button", class: "card-beside", title: "Show beside the others", onclick: () => open(name, false) }, "+");
+    this.main = h("button", { type: "button", class: "card-main", onclick: () => open(name, true) }, h("span", { class: "unseen" }, t.overview.open), h("span", { class: "card-top" }, h("b", {}, name), this.recording, this.linked), h("span", { class: "card-bottom" }, this.state, this.battery.element), this.owner, this.linkText);
+    this.beside = h("button", { type: "button", class: "card-beside", title: t.overview.beside, onclick: () => open(name, false) }, "+");
     this.element = h("li", { class: "card", "data-drone": name }, this.main, this.beside, this.alarms);
   }
 
@@ -39,7 +39,7 @@ class Card {
     setText(this.linkText, links);
     setAttribute(this.element, "data-open", String(open));
     setAttribute(this.beside, "aria-pressed", String(open));
-    setAttribute(this.beside, "aria-label", open ? `Close ${row.name}` : `Show ${row.name} beside the others`);
+    setAttribute(this.beside, "aria-label", open ? t.overview.close(row.name) : t.overview.openBeside(row.name));
     setText(this.beside, open ? "−" : "+");
   }
 }
@@ -47,12 +47,12 @@ class Card {
 export class FleetList {
   readonly element: HTMLElement;
   private readonly list = h("ul", { class: "cards" });
-  private readonly none = h("p", { class: "empty" }, "No drone found yet. ", h("span", {}, "Start one: "), h("code", {}, "skyloop sim"));
+  private readonly none = h("p", { class: "empty" }, t.overview.none, h("span", {}, t.overview.start), h("code", {}, "skyloop sim"));
   private readonly counted = h("span", { class: "count" });
   private readonly cards = new Map<string, Card>();
 
   constructor(private readonly open: (name: string, alone: boolean) => void) {
-    this.element = h("nav", { class: "fleet", "aria-label": "Drones" }, h("h2", {}, "Drones", this.counted), this.list, this.none);
+    this.element = h("nav", { class: "fleet", "aria-label": t.overview.drones }, h("h2", {}, t.overview.drones, this.counted), this.list, this.none);
   }
 
   update(rows: readonly DroneRow[], opened: ReadonlySet<string>): void {
@@ -72,7 +72,7 @@ export class FleetList {
       card.update(row, opened.has(row.name));
     });
     setText(this.counted, rows.length ? String(rows.length) : "");
-    setAttribute(this.counted, "aria-label", count(rows.length, "drone"));
+    setAttribute(this.counted, "aria-label", t.overview.count(rows.length));
     setHidden(this.none, rows.length > 0);
   }
 }

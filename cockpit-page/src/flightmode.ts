@@ -2,9 +2,10 @@
 // arranged otherwise (style/flightmode.css): the rules for flying are the same, as nothing of it is made twice.
 
 import { h, setAttribute, setText, setTone, svg, type Tone } from "./dom.js";
-import { figure } from "./format.js";
+import { named, t } from "./language/index.js";
 import { isModalOpen } from "./modal.js";
 import type { State } from "./model.js";
+import { lengthText, speedText } from "./units.js";
 
 /** A touch screen of a telephone's size: there the flight mode begins by itself. */
 const TELEPHONE = "(pointer: coarse) and (max-width: 600px), (pointer: coarse) and (max-height: 500px)";
@@ -110,7 +111,7 @@ export class FlightMode {
       else this.lock = lock;
     } catch {
       // Browsers have it only on this machine itself or over https, and not with a low battery.
-      pane?.notify("This browser may turn the screen off (it keeps it on over https only): the drone then hovers", "quiet");
+      pane?.notify(t.flight.mayTurnOff, "quiet");
     }
   }
 }
@@ -129,16 +130,16 @@ export class FlightHud {
   private readonly links = h("span", { class: "hud-links", role: "img" }, ...this.hops, this.trip);
 
   constructor() {
-    this.element = h("p", { class: "hud" }, h("span", {}, this.altitude, " m"), h("span", {}, this.speed, " m/s"), this.links);
+    this.element = h("p", { class: "hud" }, h("span", {}, this.altitude), h("span", {}, this.speed), this.links);
   }
 
   update(state: State | null, connected: boolean, round_trip_s: number | null): void {
-    setText(this.altitude, figure(state?.altitude, 1));
-    setText(this.speed, figure(state?.speed, 1));
-    const links = [connected ? "up" : "lost", state?.links.application ?? "lost", state?.links.vehicle ?? "lost"];
+    setText(this.altitude, lengthText(state?.altitude, 1));
+    setText(this.speed, speedText(state?.speed, 1));
+    const links: [string, string, string] = [connected ? "up" : "lost", state?.links.application ?? "lost", state?.links.vehicle ?? "lost"];
     this.hops.forEach((hop, place) => setTone(hop, LINKS[links[place] as string] ?? "quiet"));
     const worst = links.find((link) => link !== "up");
-    setText(this.trip, worst ?? (round_trip_s === null ? "links up" : `${Math.max(1, Math.round(round_trip_s * 1000))} ms`));
-    setAttribute(this.links, "aria-label", `Links: to the cockpit ${links[0]}, to the proxy ${links[1]}, to the vehicle ${links[2]}`);
+    setText(this.trip, worst ? named(t.linkStates, worst) : (round_trip_s === null ? t.flight.up : t.flight.milliseconds(Math.max(1, Math.round(round_trip_s * 1000)))));
+    setAttribute(this.links, "aria-label", t.flight.links(...(links.map((link) => named(t.linkStates, link)) as typeof links)));
   }
 }

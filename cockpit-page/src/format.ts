@@ -70,6 +70,3 @@ export function short(value: Known): string {
 export const plain = (value: number): string => String(Number(value.toPrecision(5))).replace("-", "−");
 
 export const words = (name: string): string => name.replaceAll("_", " ");
-
-/** "1 drone", "2 drones". */
-export const count = (number: number, noun: string): string => `${number} ${noun}${number === 1 ? "" : "s"}`;

@@ -8,6 +8,7 @@ import { t } from "./language/index.js";
 import { Modal } from "./modal.js";
 import { PadDialog, padRows } from "./paddialog.js";
 import { isCentred, PACES } from "./sticks.js";
+import { speedText } from "./units.js";
 
 type Row = { keys: string[]; does: string };
 
@@ -16,14 +17,14 @@ export class Help {
   readonly chip = h("button", { type: "button", class: "small inputs", "data-tone": "quiet", onclick: () => this.open() });
   readonly mapping: PadDialog;
   private readonly gamepad = h("div", {});
-  private readonly keys = h("span", {}, "Keys");
+  private readonly keys = h("span", {}, t.help.keys);
   private readonly dot = h("i", { class: "dot" });
   private readonly pad = h("p", { class: "note", role: "status" });
 
   constructor(flying: () => Flying) {
-    const paces = h("div", { class: "choices", role: "group", "aria-label": "How fast keys and sticks fly" });
+    const paces = h("div", { class: "choices", role: "group", "aria-label": t.help.paces });
     PACES.forEach((pace, place) => {
-      const button = h("button", { type: "button", class: "small", "aria-pressed": String(place === 1), title: `${pace.speed} m/s, up and down ${pace.climb} m/s, turning ${pace.turn} rad/s` }, pace.name);
+      const button = h("button", { type: "button", class: "small", "aria-pressed": String(place === 1), title: t.help.paceIs(speedText(pace.speed, 1), speedText(pace.climb, 1), pace.turn) }, pace.name);
       button.addEventListener("click", () => {
         flying().pace = pace;
         for (const one of paces.children) setAttribute(one, "aria-pressed", String(one === button));
@@ -32,26 +33,26 @@ export class Help {
     });
     this.chip.append(this.dot, this.keys);
     this.mapping = new PadDialog((silent) => (flying().padSilent = silent));
-    this.modal = new Modal("Keys and gamepad", "help", [
-      h("div", { class: "help-columns" }, table("Keyboard", KEY_MAP), this.gamepad),
+    this.modal = new Modal(t.help.title, "help", [
+      h("div", { class: "help-columns" }, table(t.help.keyboard, KEY_MAP), this.gamepad),
       h("div", { class: "pad-line" }, this.pad, h("button", { type: "button", class: "small", onclick: () => this.mapping.open() }, t.pad.open)),
-      h("p", { class: "note" }, "They fly the drone that is marked, while you have control of it. It hovers when keys and sticks are released, when this page loses the focus or its connection, when the gamepad goes away, and while a dialog as this one is open. The emergency stop needs no control: it is held for 0.8 s, and works while you type and in dialogs, too."),
-      h("div", { class: "pace" }, h("span", {}, "Pace"), paces),
+      h("p", { class: "note" }, t.help.note),
+      h("div", { class: "pace" }, h("span", {}, t.help.pace), paces),
     ]);
   }
 
   open(): void {
-    this.gamepad.replaceChildren(table("Gamepad", padRows(plugged()[0] ?? null)));
+    this.gamepad.replaceChildren(table(t.help.gamepad, padRows(plugged()[0] ?? null)));
     this.modal.open();
   }
 
   update(view: InputView, mine: boolean): void {
     const moving = !isCentred(view.sticks);
-    const text = !view.focused ? "Keys: no focus" : view.typing ? "Keys: typing" : mine ? (moving ? "Flying" : "Keys fly") : "Keys";
-    setText(this.keys, view.gamepad ? `${text} · pad` : text);
+    const text = !view.focused ? t.help.noFocus : view.typing ? t.help.typing : mine ? (moving ? t.help.flying : t.help.fly) : t.help.keys;
+    setText(this.keys, view.gamepad ? t.help.pad(text) : text);
     setTone(this.dot, !mine ? "quiet" : view.focused && !view.typing ? (moving ? "busy" : "ok") : "warn");
-    setAttribute(this.chip, "aria-label", `Keys and gamepad: ${text}. Show the list.`);
-    setText(this.pad, view.gamepad ? `Gamepad: ${view.gamepad}` : "No gamepad: connect one and press a button.");
+    setAttribute(this.chip, "aria-label", t.help.chip(text));
+    setText(this.pad, view.gamepad ? t.help.connected(view.gamepad) : t.pad.none);
   }
 }
 

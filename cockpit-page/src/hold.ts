@@ -1,6 +1,7 @@
 // The emergency stop's gesture: press and hold. It is hardly done by accident, and the countdown shows.
 
 import { h, setAttribute, setText } from "./dom.js";
+import { t } from "./language/index.js";
 
 /** So long it is held [ms]. */
 export const HOLD_MS = 800;
@@ -77,7 +78,7 @@ export class Countdown {
     if (!this.hold.isHeld) return;
     this.end();
     this.element.hidden = false;
-    setText(this.how, `Not done: released too early. Press and hold for ${HOLD_MS / 1000} s`);
+    setText(this.how, t.hold.tooEarly(HOLD_MS / 1000));
     setText(this.left, "");
     this.bar.style.setProperty("width", "0");
     this.hint = setTimeout(() => (this.element.hidden = true), HINT_MS);
@@ -102,7 +103,7 @@ export class Countdown {
     const share = this.hold.share(now_ms) ?? 0;
     this.element.hidden = false;
     setText(this.what, held.what);
-    setText(this.how, "Keep holding, release to cancel");
+    setText(this.how, t.hold.keep);
     setText(this.left, `${(((1 - share) * HOLD_MS) / 1000).toFixed(1)} s`);
     this.bar.style.setProperty("width", `${share * 100}%`);
     if (!this.hold.isDone(now_ms)) return;

@@ -3,6 +3,7 @@
 
 import { setAttribute, setText, svg, unique } from "./dom.js";
 import { degrees, figure, type Known, heading, headingText, plain } from "./format.js";
+import { t } from "./language/index.js";
 import type { State } from "./model.js";
 import { unit } from "./units.js";
 
@@ -105,7 +106,7 @@ export class Horizon {
     this.heading = new Tape(false, { x: LEFT, y: BOTTOM + 6, width: RIGHT - LEFT, height: 24 }, 15, 2.4, compassName);
     this.element = svg(
       "svg",
-      { class: "horizon", viewBox: "0 0 320 218", role: "img", "aria-label": "Artificial horizon: attitude not known" },
+      { class: "horizon", viewBox: "0 0 320 218", role: "img", "aria-label": t.instruments.horizonUnknown },
       svg("defs", {}, svg("clipPath", { id: glass }, svg("rect", box))),
       svg("g", { "clip-path": `url(#${glass})` }, middle, ...rollScale(), this.pointer),
       svg("path", { class: "own", d: `M${MID_X - 58} ${MID_Y} h34 l7 9 M${MID_X + 58} ${MID_Y} h-34 l-7 9` }),
@@ -138,10 +139,9 @@ export class Horizon {
     this.described_ms = now;
     const tilt =
       roll === null || pitch === null
-        ? "attitude not known"
-        : `${roll >= 0 ? "right" : "left"} side down ${figure(Math.abs(degrees(roll)), 0)} degrees, ` +
-          `nose ${pitch > 0 ? "down" : "up"} ${figure(Math.abs(degrees(pitch)), 0)} degrees`;
-    setAttribute(this.element, "aria-label", `Artificial horizon: ${tilt}, heading ${yaw === null ? "not known" : headingText(yaw)}`);
+        ? t.instruments.attitudeUnknown
+        : t.instruments.tilted(roll >= 0, figure(Math.abs(degrees(roll)), 0), pitch > 0, figure(Math.abs(degrees(pitch)), 0));
+    setAttribute(this.element, "aria-label", t.instruments.horizon(tilt, yaw === null ? t.instruments.notKnown : headingText(yaw)));
   }
 }
 

@@ -3,11 +3,12 @@
 import { h, setHidden, setText, setTone, type Tone } from "./dom.js";
 import { degrees, duration, figure, headingText, words } from "./format.js";
 import { Horizon } from "./horizon.js";
+import { named, t } from "./language/index.js";
 import type { Authority, State } from "./model.js";
 import { inUnit, unit } from "./units.js";
 
 const LINK_TONES: Readonly<Record<string, Tone>> = { up: "ok", degraded: "warn", connecting: "busy", lost: "bad", closed: "bad" };
-const FIGURES = ["Altitude", "Climb", "Speed", "Heading", "Roll", "Nose up"] as const;
+const FIGURES = ["altitude", "climb", "speed", "heading", "roll", "pitch"] as const;
 const SLOW_S = 0.25;
 
 class Hop {
@@ -39,11 +40,11 @@ export class Instruments {
     const node = (name: string): HTMLElement => h("li", { class: "node" }, name);
     this.element = h(
       "section",
-      { class: "side", "aria-label": "Instruments" },
+      { class: "side", "aria-label": t.instruments.label },
       this.horizon.element,
-      h("dl", { class: "figures" }, ...FIGURES.map((name, place) => h("div", {}, h("dt", {}, name), h("dd", {}, this.outputs[place] as Node, this.units[place] as Node)))),
+      h("dl", { class: "figures" }, ...FIGURES.map((name, place) => h("div", {}, h("dt", {}, t.instruments.figures[name]), h("dd", {}, this.outputs[place] as Node, this.units[place] as Node)))),
       this.command,
-      h("ol", { class: "hops", "aria-label": "Links, from this page to the vehicle" }, node("Page"), this.page.element, node("Cockpit"), this.application.element, node("Proxy"), this.vehicle.element, node("Vehicle")),
+      h("ol", { class: "hops", "aria-label": t.instruments.links }, node(t.instruments.page), this.page.element, node(t.instruments.cockpit), this.application.element, node(t.instruments.proxy), this.vehicle.element, node(t.instruments.vehicle)),
       this.reason,
     );
   }
@@ -73,11 +74,11 @@ export class Instruments {
 
   private links(state: State | null, connected: boolean, round_trip_s: number | null): void {
     const slow = round_trip_s !== null && round_trip_s > SLOW_S;
-    this.page.show(connected ? (round_trip_s === null ? "up" : `${Math.max(1, Math.round(round_trip_s * 1000))} ms`) : "lost", connected ? (slow ? "warn" : "ok") : "bad");
-    const hop = (name: string | undefined): [string, Tone] => (connected && name ? [name, LINK_TONES[name] ?? "quiet"] : ["–", "quiet"]);
+    this.page.show(connected ? (round_trip_s === null ? named(t.linkStates, "up") : t.flight.milliseconds(Math.max(1, Math.round(round_trip_s * 1000)))) : named(t.linkStates, "lost"), connected ? (slow ? "warn" : "ok") : "bad");
+    const hop = (name: string | undefined): [string, Tone] => (connected && name ? [named(t.linkStates, name), LINK_TONES[name] ?? "quiet"] : ["–", "quiet"]);
     const over = state?.links.vehicle === "closed"; // a recording, which ends some time
     this.application.show(...hop(state?.links.application));
-    this.vehicle.show(...(over && connected ? (["over", "quiet"] as [string, Tone]) : hop(state?.links.vehicle)));
+    this.vehicle.show(...(over && connected ? ([t.linkStates["over"], "quiet"] as [string, Tone]) : hop(state?.links.vehicle)));
     setText(this.reason, connected ? (state?.links.reason ?? "") : "");
     setHidden(this.reason, !this.reason.textContent);
   }
@@ -86,24 +87,24 @@ export class Instruments {
 /** The command that was applied last, in words. */
 export function commandText(state: State | null): string {
   const applied = state?.set_points;
-  if (!applied) return "No command yet";
+  if (!applied) return t.instruments.noCommand;
   const values = Object.entries(applied.values).filter(([, value]) => value !== null && value !== 0);
   const shown = values.map(([name, value]) => `${words(name)} ${figure(value, 2)}`).join(", ");
   const age_s = applied.age_s ?? 0;
-  return `Applied: ${words(applied.action)}${shown ? ` · ${shown}` : ""}${age_s > 1 ? ` · ${duration(age_s)} ago` : ""}`;
+  return t.instruments.applied(`${words(applied.action)}${shown ? ` · ${shown}` : ""}`, age_s > 1 ? duration(age_s) : "");
 }
 
 /** Who has control, in words, when the newest state is too old to be sure. */
 export function oldHolderText(mine: boolean): { who: string; more: string; tone: Tone } {
-  return { who: "Not known", more: mine ? "you had control" : "who has control", tone: "quiet" };
+  return { who: t.instruments.unknownHolder, more: mine ? t.instruments.youHad : t.instruments.whoHas, tone: "quiet" };
 }
 
 /** Who has control, in words; `authority` is the state of this page's own connection, where there is one. */
 export function holderText(state: State | null, authority: Authority | null): { who: string; more: string; tone: Tone } {
-  if (authority?.mine) return { who: "You", more: `have control, priority ${authority.priority ?? "–"}`, tone: "busy" };
+  if (authority?.mine) return { who: t.instruments.you, more: t.instruments.youHave(String(authority.priority ?? "–")), tone: "busy" };
   const { holder = null, priority = null } = authority?.holder ? authority : (state?.authority ?? {});
   const down = state?.links.application === "lost";
-  if (!holder) return { who: "Nobody", more: down ? "has control: the link is down" : "has control", tone: "quiet" };
-  const waits = authority?.state === "queued" || authority?.state === "preempted" ? ", you are in line" : "";
-  return { who: holder, more: `has control, priority ${priority ?? "–"}${waits}`, tone: "ok" };
+  if (!holder) return { who: t.instruments.nobody, more: down ? t.instruments.nobodyDown : t.instruments.nobodyHas, tone: "quiet" };
+  const waits = authority?.state === "queued" || authority?.state === "preempted" ? t.instruments.inLine : "";
+  return { who: holder, more: t.instruments.has(String(priority ?? "–"), waits), tone: "ok" };
 }

@@ -1,5 +1,6 @@
 // The map of keys. By place on the keyboard, not by letter: the same on every layout.
 
+import { t } from "./language/index.js";
 import type { Sticks } from "./model.js";
 import { type Axis, CENTRED } from "./sticks.js";
 
@@ -27,20 +28,20 @@ const DEEDS: Readonly<Record<string, Deed>> = {
 };
 
 export const KEY_MAP: readonly { keys: string[]; does: string }[] = [
-  { keys: ["Ctrl", "Enter"], does: "Hold: motors off, of the drone that is named above" },
-  { keys: ["Ctrl", "Shift", "Enter"], does: "Hold: motors off, of all drones" },
-  { keys: ["C"], does: "Take control" },
-  { keys: ["R"], does: "Release, or stop waiting for control" },
-  { keys: ["Q"], does: "To the question of who asks for control" },
-  { keys: ["T"], does: "Take off" },
-  { keys: ["H"], does: "Hover" },
-  { keys: ["L"], does: "Land" },
-  { keys: ["W", "S"], does: "Forward, back" },
-  { keys: ["A", "D"], does: "Left, right" },
-  { keys: ["↑", "↓"], does: "Up, down" },
-  { keys: ["←", "→"], does: "Turn left, right" },
-  { keys: ["Tab"], does: "To the map: there arrows move a cursor, Enter acts at it, + and − zoom, 0 shows all, Del removes" },
-  { keys: ["?"], does: "This list; Esc closes it" },
+  { keys: [t.keys.ctrl, t.keys.enter], does: t.keys.stop },
+  { keys: [t.keys.ctrl, t.keys.shift, t.keys.enter], does: t.keys.stopAll },
+  { keys: ["C"], does: t.keys.take },
+  { keys: ["R"], does: t.keys.release },
+  { keys: ["Q"], does: t.keys.question },
+  { keys: ["T"], does: t.keys.takeOff },
+  { keys: ["H"], does: t.keys.hover },
+  { keys: ["L"], does: t.keys.land },
+  { keys: ["W", "S"], does: t.keys.along },
+  { keys: ["A", "D"], does: t.keys.across },
+  { keys: ["↑", "↓"], does: t.keys.vertical },
+  { keys: ["←", "→"], does: t.keys.turn },
+  { keys: [t.keys.tab], does: t.keys.map },
+  { keys: ["?"], does: t.keys.list },
 ];
 
 export interface Press {

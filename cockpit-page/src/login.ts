@@ -2,6 +2,7 @@
 
 import { get, post, errorText } from "./api.js";
 import { h, setText } from "./dom.js";
+import { t } from "./language/index.js";
 import type { Session } from "./model.js";
 
 /** The code to pair with that an address has after its `#`; null for any other address. Pure. */
@@ -22,11 +23,11 @@ export async function session(place: HTMLElement): Promise<Session> {
       const found = await get<Session>("/api/session");
       if (found.role !== null) return found;
       if (!found.login) {
-        place.replaceChildren(h("main", { id: "panes", class: "gate" }, h("h1", {}, "Skyloop cockpit"), h("p", {}, found.hint)));
+        place.replaceChildren(h("main", { id: "panes", class: "gate" }, h("h1", {}, t.login.title), h("p", {}, found.hint)));
         await new Promise((later) => setTimeout(later, 3000));
       } else await ask(place);
     } catch (error) {
-      place.replaceChildren(h("main", { id: "panes", class: "gate" }, h("h1", {}, "Skyloop cockpit"), h("p", { role: "alert" }, errorText(error))));
+      place.replaceChildren(h("main", { id: "panes", class: "gate" }, h("h1", {}, t.login.title), h("p", { role: "alert" }, errorText(error))));
       await new Promise((later) => setTimeout(later, 1000));
     }
   }
@@ -35,7 +36,7 @@ export async function session(place: HTMLElement): Promise<Session> {
 async function ask(place: HTMLElement): Promise<void> {
   const token = h("input", { type: "password", id: "token", autocomplete: "current-password", required: true, maxlength: 256 });
   const problem = h("p", { class: "answer", role: "alert", "data-tone": "bad" });
-  const form = h("form", { class: "gate" }, h("h1", {}, "Skyloop cockpit"), h("label", { for: "token" }, "Token"), token, h("button", { type: "submit", class: "primary" }, "Enter"), problem);
+  const form = h("form", { class: "gate" }, h("h1", {}, t.login.title), h("label", { for: "token" }, t.login.token), token, h("button", { type: "submit", class: "primary" }, t.login.enter), problem);
   place.replaceChildren(h("main", { id: "panes" }, form));
   token.focus();
   await new Promise<void>((done) => {

@@ -22,6 +22,7 @@ import { FlightMode } from "./flightmode.js";
 import { Help } from "./help.js";
 import { Countdown } from "./hold.js";
 import type { Deed } from "./keys.js";
+import { named, t } from "./language/index.js";
 import { session } from "./login.js";
 import type { DroneRow, Session, Sticks } from "./model.js";
 import { OverviewView } from "./overview.js";
@@ -43,17 +44,17 @@ class Page {
   private readonly panes = new Map<string, Pane>();
   private chosen: string | null = null;
   private readonly fleet = new FleetList((name, alone) => this.open(name, alone));
-  private readonly main = h("main", { id: "panes", tabindex: -1, "aria-label": "Opened drones" });
+  private readonly main = h("main", { id: "panes", tabindex: -1, "aria-label": t.page.opened });
   private readonly overview = new OverviewView((name) => this.enter(name), (name) => this.own(name));
   /** Back to the overview. */
-  private readonly all = h("button", { type: "button", class: "small all-drones", onclick: () => this.leave() }, "All drones");
+  private readonly all = h("button", { type: "button", class: "small all-drones", onclick: () => this.leave() }, t.overview.all);
   private readonly deckhouse: HTMLElement;
   /** Nobody has chosen yet what to see: the only drone is opened by itself. */
   private undecided = namesOf(location.hash).length === 0 && location.hash !== OVERVIEW;
   /** Overviews in a row with one and the same only drone. */
   private lonely = 0;
   private readonly lostAge = h("span", { "aria-hidden": "true" });
-  private readonly lost = h("div", { class: "banner lost", role: "alert", "data-tone": "bad", hidden: true }, "No answer from the cockpit: what is shown is old. Reconnecting…", this.lostAge);
+  private readonly lost = h("div", { class: "banner lost", role: "alert", "data-tone": "bad", hidden: true }, t.page.lost, this.lostAge);
   private readonly countdown = new Countdown();
   private readonly safety: Safety | null;
   private readonly clock = new ServerClock();
@@ -80,8 +81,9 @@ class Page {
     const settings = new SettingsDialog();
     followTheme(() => this.repaint());
     for (const element of [this.safety?.element, this.safety?.message, this.countdown.element]) keepInReach(element ?? null);
-    const person = h("span", { class: "person", title: who.name || who.role || "" }, who.name ? `${who.name} · ${who.role}` : (who.role ?? ""));
-    const leave = who.login ? h("button", { type: "button", class: "small", onclick: () => void post("/api/logout").finally(() => location.reload()) }, "Log out") : null;
+    const role = named(t.roles, who.role ?? "");
+    const person = h("span", { class: "person", title: who.name || role }, who.name ? `${who.name} · ${role}` : role);
+    const leave = who.login ? h("button", { type: "button", class: "small", onclick: () => void post("/api/logout").finally(() => location.reload()) }, t.page.logOut) : null;
     const brand = h("h1", { class: "brand" }, h("img", { src: "/static/icon.svg", alt: "", width: 24, height: 24 }), "Skyloop");
     const bar = h("header", { class: "bar" }, brand, this.all, h("span", { class: "spring" }), person, leave, this.sound.button, this.help.chip, settings.button, this.safety?.element ?? null);
     const recordings = new RecordingList(() => this.recorded, (name) => this.enter(name), who.role === "pilot");

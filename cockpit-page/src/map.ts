@@ -1,9 +1,11 @@
 // The map from above: north is up. It shows a scene, and what is done on it is its tool's affair.
 
 import { colour, fit, h, setText } from "./dom.js";
+import { t } from "./language/index.js";
 import { caption, crosshair, drawScene } from "./maplayers.js";
 import { arrow, type Ink, MAP_KEYS, type MapTool, nearest, type Project, type Spot } from "./maptool.js";
 import type { Vector } from "./model.js";
+import { lengthText } from "./units.js";
 import { apart, around, gridStep, type Size, toMetres, toPixels, type View, zoomed } from "./view.js";
 import type { Scene } from "./world.js";
 
@@ -24,10 +26,10 @@ export class MapView {
   readonly element: HTMLElement;
   /** For buttons of tools, over the map. */
   readonly corner = h("div", { class: "map-buttons left" });
-  private readonly canvas = h("canvas", { class: "map", role: "application", tabindex: 0, "data-keys": [...MAP_KEYS].join(" "), "aria-label": "Map from above. Arrow keys move a cursor, Enter acts there, plus and minus zoom." });
+  private readonly canvas = h("canvas", { class: "map", role: "application", tabindex: 0, "data-keys": [...MAP_KEYS].join(" "), "aria-label": t.map.label });
   private readonly spoken = h("p", { class: "unseen", role: "status" });
   private readonly note = h("p", { class: "note" });
-  private readonly follow = h("button", { type: "button", class: "small", "aria-pressed": "true", onclick: () => this.refit() }, "Fit");
+  private readonly follow = h("button", { type: "button", class: "small", "aria-pressed": "true", onclick: () => this.refit() }, t.map.fit);
   private tool: MapTool | null = null;
   private view: View | null = null;
   /** What is on the screen: what a press means is what is seen, though the page may have been laid out anew since. */
@@ -49,7 +51,7 @@ export class MapView {
     private readonly standard: MapTool | null = null,
     ...below: HTMLElement[]
   ) {
-    const zoom = (sign: string, factor: number): HTMLElement => h("button", { type: "button", class: "small", "aria-label": factor > 1 ? "Zoom in" : "Zoom out", onclick: () => this.zoom(factor) }, sign);
+    const zoom = (sign: string, factor: number): HTMLElement => h("button", { type: "button", class: "small", "aria-label": factor > 1 ? t.map.zoomIn : t.map.zoomOut, onclick: () => this.zoom(factor) }, sign);
     const buttons = h("div", { class: "map-buttons" }, zoom("+", ZOOM), zoom("−", 1 / ZOOM), this.follow);
     this.element = h("div", { class: "filling mapping" }, h("div", { class: "map-box" }, this.canvas, this.corner, buttons), ...below, this.note, this.spoken);
     // A press leaves the focus where it is: what has it may fly, and only who comes by Tab wants the map's own keys.
@@ -106,7 +108,7 @@ export class MapView {
     const view = this.view;
     this.drawn = view && { view, size };
     if (!view) {
-      caption({ pen, ink, size }, "Nothing here has a known position");
+      caption({ pen, ink, size }, t.map.nowhere);
       return;
     }
     const at: Project = (place) => toPixels(view, size, place[0] as number, place[1] as number);
@@ -236,7 +238,7 @@ export class MapView {
     if (px < 0 || py < 0 || px > size.width || py > size.height) this.view = { ...view, east: place[0], north: place[1] };
     const now = { view: this.view ?? view, size };
     this.used?.cursor?.(this.spot(now, ...toPixels(now.view, size, ...place)));
-    setText(this.spoken, `${place[0].toFixed(2)} m east, ${place[1].toFixed(2)} m north`);
+    setText(this.spoken, t.map.cursor(lengthText(place[0], 2), lengthText(place[1], 2)));
   }
 }
 

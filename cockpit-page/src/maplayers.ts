@@ -1,7 +1,9 @@
 // What the map shows, from below to above: grid, paths, waypoints, drones, names.
 
 import { figure } from "./format.js";
+import { t } from "./language/index.js";
 import type { Ink, Project } from "./maptool.js";
+import { unit } from "./units.js";
 import { gridStep, type Size, toMetres, toPixels, type View } from "./view.js";
 import { drawBounds, drawView, drawWorld, home } from "./worldlayer.js";
 import type { Body, Scene } from "./world.js";
@@ -28,7 +30,7 @@ export function drawScene(chart: Chart, scene: Scene): void {
   for (const other of scene.others) body(chart, other, other.ink ?? "muted", other.name);
   for (const target of scene.targets) diamond(chart, target);
   scene.waypoints.forEach((waypoint, number) => flag(chart, waypoint.position, String(number + 1), waypoint.own ? "accent" : "warn"));
-  if (scene.truth && !scene.own) body(chart, scene.truth, "ok", "truth");
+  if (scene.truth && !scene.own) body(chart, scene.truth, "ok", t.map.truth);
   else if (scene.truth) ghost(chart, scene.truth);
   if (scene.own) body(chart, scene.own, "accent", "");
 }
@@ -71,7 +73,8 @@ export function flag({ pen, ink, at }: Pick<Chart, "pen" | "ink" | "at">, place:
 }
 
 function grid({ pen, view, size, ink }: Chart): void {
-  const step = gridStep(view.scale);
+  const { factor, name } = unit("length");
+  const step = gridStep(view.scale / factor); // in the unit that people read
   const [west, north] = toMetres(view, size, 0, 0);
   const [east, south] = toMetres(view, size, size.width, size.height);
   pen.lineWidth = 1;
@@ -81,15 +84,15 @@ function grid({ pen, view, size, ink }: Chart): void {
   pen.textBaseline = "alphabetic";
   pen.beginPath();
   const decimals = step < 1 ? 1 : 0;
-  for (let x = Math.ceil(west / step) * step; x <= east; x += step) {
-    const px = Math.round(toPixels(view, size, x, 0)[0]) + 0.5;
+  for (let x = Math.ceil((west * factor) / step) * step; x <= east * factor; x += step) {
+    const px = Math.round(toPixels(view, size, x / factor, 0)[0]) + 0.5;
     pen.moveTo(px, 0);
     pen.lineTo(px, size.height);
     pen.textAlign = "center";
     if (px > 30 && px < size.width - 60) pen.fillText(figure(x, decimals), px, size.height - 5);
   }
-  for (let y = Math.ceil(south / step) * step; y <= north; y += step) {
-    const py = Math.round(toPixels(view, size, 0, y)[1]) + 0.5;
+  for (let y = Math.ceil((south * factor) / step) * step; y <= north * factor; y += step) {
+    const py = Math.round(toPixels(view, size, 0, y / factor)[1]) + 0.5;
     pen.moveTo(0, py);
     pen.lineTo(size.width, py);
     pen.textAlign = "left";
@@ -97,7 +100,7 @@ function grid({ pen, view, size, ink }: Chart): void {
   }
   pen.stroke();
   pen.textAlign = "right";
-  pen.fillText(`N ↑  grid ${step < 1 ? figure(step, 1) : step} m`, size.width - 8, size.height - 5);
+  pen.fillText(t.map.grid(`${figure(step, decimals)} ${name}`), size.width - 8, size.height - 5);
 }
 
 function path({ pen, ink, at }: Chart, places: readonly (readonly number[])[], end: Body | null, tone: string): void {

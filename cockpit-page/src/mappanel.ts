@@ -1,6 +1,7 @@
 // The map of one drone with its tools: flying to a place, and the zones.
 
 import { h, setAttribute, setHidden } from "./dom.js";
+import { t } from "./language/index.js";
 import { MapView } from "./map.js";
 import type { Vector } from "./model.js";
 import { type RouteDeed, RoutePanel } from "./routepanel.js";
@@ -31,8 +32,8 @@ export class MapPanel {
   readonly route: RoutePanel;
   private readonly waypoint: WaypointTool;
   private readonly zones: ZoneTool;
-  private readonly edit = h("button", { type: "button", class: "small", "aria-pressed": "false", onclick: () => this.map.use(this.map.used === this.zones ? null : this.zones) }, "Zones");
-  private readonly plan = h("button", { type: "button", class: "small", "aria-pressed": "false", onclick: () => this.map.use(this.map.used === this.route ? null : this.route) }, "Route");
+  private readonly edit = h("button", { type: "button", class: "small", "aria-pressed": "false", onclick: () => this.map.use(this.map.used === this.zones ? null : this.zones) }, t.map.zones);
+  private readonly plan = h("button", { type: "button", class: "small", "aria-pressed": "false", onclick: () => this.map.use(this.map.used === this.route ? null : this.route) }, t.map.route);
   private recording = false;
   private why = { fly: "", write: "" };
 

@@ -1,8 +1,8 @@
 // All drones: a tile for each, or a line in a table when they are many, and one map of them all.
 
 import { h, memory, setAttribute, setHidden, setText } from "./dom.js";
-import { count } from "./format.js";
 import { Trail } from "./history.js";
+import { t } from "./language/index.js";
 import { MapView } from "./map.js";
 import type { DroneRow } from "./model.js";
 import { byName, found } from "./row.js";
@@ -32,10 +32,10 @@ export class OverviewView {
   private readonly table: DroneTable;
   private readonly map = new MapView(() => this.scene());
   private readonly trails = new Map<string, Trail>();
-  private readonly none = h("p", { class: "empty nobody" }, "No drone found yet. ", h("span", {}, "Start one: "), h("code", {}, "skyloop sim"));
-  private readonly unfound = h("p", { class: "empty" }, "No drone fits these words.");
+  private readonly none = h("p", { class: "empty nobody" }, t.overview.none, h("span", {}, t.overview.start), h("code", {}, "skyloop sim"));
+  private readonly unfound = h("p", { class: "empty" }, t.overview.unfound);
   private readonly counted = h("span", { class: "count" });
-  private readonly search = h("input", { type: "search", placeholder: "Search", "aria-label": "Search drones by name, state, control or alarm", oninput: () => this.show() });
+  private readonly search = h("input", { type: "search", placeholder: t.overview.search, "aria-label": t.overview.searchLong, oninput: () => this.show() });
   private readonly kinds: Readonly<Record<Kind, HTMLButtonElement>>;
   private readonly sight = new IntersectionObserver((entries) => this.look(entries), { rootMargin: MARGIN });
   private rows: readonly DroneRow[] = [];
@@ -49,10 +49,10 @@ export class OverviewView {
   ) {
     this.table = new DroneTable(open, () => this.show());
     const choice = (kind: Kind, title: string): HTMLButtonElement => h("button", { type: "button", class: "tab", onclick: () => this.choose(kind) }, title);
-    this.kinds = { tiles: choice("tiles", "Tiles"), table: choice("table", "Table") };
-    const kinds = h("span", { class: "tabs", role: "group", "aria-label": "Shown as" }, ...Object.values(this.kinds));
-    this.element = h("main", { class: "overview", id: "overview", tabindex: -1, "aria-label": "All drones" }, h("header", { class: "overview-head" }, h("h2", {}, "Drones", this.counted), this.search, kinds), this.list, this.table.element, this.none, this.unfound);
-    this.side = h("section", { class: "overview-map", "aria-label": "Map of all drones" }, this.map.element);
+    this.kinds = { tiles: choice("tiles", t.overview.tiles), table: choice("table", t.overview.table) };
+    const kinds = h("span", { class: "tabs", role: "group", "aria-label": t.overview.shownAs }, ...Object.values(this.kinds));
+    this.element = h("main", { class: "overview", id: "overview", tabindex: -1, "aria-label": t.overview.all }, h("header", { class: "overview-head" }, h("h2", {}, t.overview.drones, this.counted), this.search, kinds), this.list, this.table.element, this.none, this.unfound);
+    this.side = h("section", { class: "overview-map", "aria-label": t.overview.map }, this.map.element);
     this.map.allow("");
     window.addEventListener("resize", () => this.visible && this.tiles.forEach((tile) => tile.look()));
   }
@@ -106,7 +106,7 @@ export class OverviewView {
     const { kind, rows } = this;
     const wanted = rows.length >= SEARCH_FROM && this.search.value ? rows.filter((row) => found(row, this.search.value)) : rows;
     setText(this.counted, rows.length ? String(rows.length) : "");
-    setAttribute(this.counted, "aria-label", count(rows.length, "drone"));
+    setAttribute(this.counted, "aria-label", t.overview.count(rows.length));
     setHidden(this.search, rows.length < SEARCH_FROM);
     setHidden(this.none, rows.length > 0);
     setHidden(this.unfound, rows.length === 0 || wanted.length > 0);

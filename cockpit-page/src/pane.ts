@@ -16,7 +16,7 @@ import { words } from "./format.js";
 import { History, KEPT_S, Trail } from "./history.js";
 import type { Countdown } from "./hold.js";
 import { Instruments } from "./instruments.js";
-import { t } from "./language/index.js";
+import { named, t } from "./language/index.js";
 import type { Deed } from "./keys.js";
 import { MapPanel } from "./mappanel.js";
 import type { Alarm, DroneRow, State, Sticks, Vector, Vehicle } from "./model.js";
@@ -78,21 +78,21 @@ export class Pane {
   private readonly trail = new Trail();
   private readonly battery = new Battery();
   private readonly kind = h("span", { class: "kind" });
-  private readonly endReplay = h("button", { type: "button", class: "small", hidden: true, onclick: () => void this.stopReplay() }, "End replay");
-  private readonly flight = h("span", {}, "no feedback yet");
-  private readonly pill = h("p", { class: "pill", role: "status", "aria-label": "Flight state", "data-tone": "quiet" }, h("i", { class: "dot" }), this.flight);
+  private readonly endReplay = h("button", { type: "button", class: "small", hidden: true, onclick: () => void this.stopReplay() }, t.pane.endReplay);
+  private readonly flight = h("span", {}, t.pane.noFeedback);
+  private readonly pill = h("p", { class: "pill", role: "status", "aria-label": t.pane.flightState, "data-tone": "quiet" }, h("i", { class: "dot" }), this.flight);
   private readonly alarmBook = new AlarmBook();
   private readonly alarms = new AlarmBanner(this.alarmBook);
   private readonly opened_ms = performance.now();
   private wasConnected = false;
   private readonly oldAge = h("b", { "aria-hidden": "true" });
   private readonly oldWhat = h("span", {});
-  private readonly oldSeen = h("button", { type: "button", class: "small", "aria-label": "OK: acknowledge that it is old", onclick: () => this.alarmBook.acknowledge("old", performance.now()) && this.update() }, "OK");
-  private readonly old = h("p", { class: "banner old", role: "alert", "data-tone": "warn", hidden: true }, h("span", {}, "Old"), this.oldAge, this.oldWhat, this.oldSeen);
+  private readonly oldSeen = h("button", { type: "button", class: "small", "aria-label": t.pane.acknowledgeOld, onclick: () => this.alarmBook.acknowledge("old", performance.now()) && this.update() }, t.alarms.ok);
+  private readonly old = h("p", { class: "banner old", role: "alert", "data-tone": "warn", hidden: true }, h("span", {}, t.pane.old), this.oldAge, this.oldWhat, this.oldSeen);
   private readonly notice = h("p", { class: "banner notice", role: "alert", "data-tone": "warn" });
   private readonly hud = new FlightHud();
-  private readonly fly = h("button", { type: "button", class: "small fly", "aria-pressed": "false", onclick: () => this.host.fly(this) }, "Flight mode");
-  private readonly full = h("button", { type: "button", class: "full", "aria-label": "Full screen", onclick: () => this.host.fillScreen() }, corners());
+  private readonly fly = h("button", { type: "button", class: "small fly", "aria-pressed": "false", onclick: () => this.host.fly(this) }, t.pane.flightMode);
+  private readonly full = h("button", { type: "button", class: "full", "aria-label": t.pane.fullScreen, onclick: () => this.host.fillScreen() }, corners());
   private readonly stage: Stage;
   private readonly instruments = new Instruments();
   private readonly strip: Strip;
@@ -124,7 +124,7 @@ export class Pane {
     this.stage = new Stage(name, this.controls);
     this.strip = new Strip(name, (deed) => this.act(deed), (id, grant, reason) => this.pilot?.answer(id, grant, reason), {
       countdown: host.countdown,
-      deadly: () => (this.target === null ? null : { what: `Motors of ${name} off`, act: () => this.target?.stop() }),
+      deadly: () => (this.target === null ? null : { what: t.safety.motorsOff(name), act: () => this.target?.stop() }),
       understood: () => this.pilot?.understood(),
     });
     this.thumbs = new Thumbs((sticks) => host.push(name, sticks));
@@ -142,9 +142,9 @@ export class Pane {
     this.parameters = new Parameters(name, (parameter, value) => this.pilot?.write(parameter, value));
     this.preflight = new Preflight(name);
     this.decks = {
-      space: new Deck("space", [{ name: "Map", element: this.map.element }, { name: "3-D", element: this.space, opened: () => void this.openSpace() }], "Map and space"),
-      plots: new Deck("plots", [{ name: "Plots", element: this.plots.element }], "Plots"),
-      lists: new Deck("lists", [{ name: "Events", element: this.events.element }, { name: "Parameters", element: this.parameters.element, opened: () => void this.parameters.load() }, { name: "Pre-flight", element: this.preflight.element, opened: () => void this.preflight.load() }], "Events, parameters and pre-flight checks"),
+      space: new Deck("space", [{ name: t.pane.map, element: this.map.element }, { name: "3-D", element: this.space, opened: () => void this.openSpace() }], t.pane.mapAndSpace),
+      plots: new Deck("plots", [{ name: t.pane.plots, element: this.plots.element }], t.pane.plots),
+      lists: new Deck("lists", [{ name: t.pane.events, element: this.events.element }, { name: t.pane.parameters, element: this.parameters.element, opened: () => void this.parameters.load() }, { name: t.pane.preflight, element: this.preflight.element, opened: () => void this.preflight.load() }], t.pane.lists),
     };
     this.element = this.build();
     this.socket = new LastingSocket(`${base}/telemetry`, {
@@ -159,6 +159,7 @@ export class Pane {
     this.pilot?.close();
     this.socket.close();
     this.stage.close();
+    this.thumbs.forget();
     this.scene?.close();
     this.map.close();
     this.element.remove();
@@ -195,16 +196,16 @@ export class Pane {
   arrange(flight: boolean): void {
     setAttribute(this.element, "data-flight", String(flight));
     setAttribute(this.fly, "aria-pressed", String(flight));
-    setAttribute(this.fly, "aria-label", flight ? "Leave flight mode" : "Flight mode");
-    setText(this.fly, flight ? "✕" : "Flight mode");
+    setAttribute(this.fly, "aria-label", flight ? t.pane.leaveFlightMode : t.pane.flightMode);
+    setText(this.fly, flight ? "✕" : t.pane.flightMode);
     this.host.select(this.name);
   }
 
   act(deed: Deed | "reset"): void {
     this.host.select(this.name);
     if (deed === "help") this.host.help();
-    else if (this.isRecording) this.notify("a recording: nothing flies here", "quiet");
-    else if (this.pilot === null) this.notify("you may watch, not fly", "warn");
+    else if (this.isRecording) this.notify(t.pane.recording, "quiet");
+    else if (this.pilot === null) this.notify(t.pane.watch, "warn");
     else if (deed === "question") this.strip.question.focus();
     else if (deed === "take") this.pilot.take(this.strip.wanted, this.strip.asks);
     else if (deed === "release") this.pilot.release();
@@ -239,10 +240,10 @@ export class Pane {
   }
 
   private build(): HTMLElement {
-    const close = h("button", { type: "button", class: "bare close", "aria-label": `Close ${this.name}`, onclick: () => this.host.close(this.name) }, "×");
+    const close = h("button", { type: "button", class: "bare close", "aria-label": t.pane.close(this.name), onclick: () => this.host.close(this.name) }, "×");
     const head = h("header", { class: "pane-head" }, h("h2", {}, this.name), this.kind, this.endReplay, this.alarms.chip, this.pill, this.battery.element, this.hud.element, this.full, this.fly, close);
     const body = h("div", { class: "pane-body" }, this.stage.element, this.decks.space.element, this.instruments.element, this.decks.plots.element, this.decks.lists.element, this.channels.element);
-    const element = h("article", { class: "pane", "data-drone": this.name, "aria-label": `Drone ${this.name}`, tabindex: -1 }, head, h("div", { class: "over" }, h("div", { class: "stack" }, this.old, this.alarms.element, this.notice)), this.alarms.voice, body, this.thumbs.element, this.strip.element);
+    const element = h("article", { class: "pane", "data-drone": this.name, "aria-label": t.pane.drone(this.name), tabindex: -1 }, head, h("div", { class: "over" }, h("div", { class: "stack" }, this.old, this.alarms.element, this.notice)), this.alarms.voice, body, this.thumbs.element, this.strip.element);
     element.addEventListener("pointerdown", () => this.host.select(this.name), { capture: true });
     element.addEventListener("focusin", () => this.host.select(this.name));
     return element;
@@ -259,8 +260,8 @@ export class Pane {
       route: (progress) => this.map.route.update(progress),
       done: (command, name, value) => {
         if (command === "set" && name !== undefined && value !== undefined && !this.writes.done(name)) for (const list of [this.parameters, this.controls.parameters]) list.done(name, value);
-        if (command === "stop") this.notify("emergency stop sent", "bad");
-        if (command === "goto") this.notify("the waypoint is reached", "ok");
+        if (command === "stop") this.notify(t.pane.stopSent, "bad");
+        if (command === "goto") this.notify(t.pane.reached, "ok");
       },
     };
   }
@@ -269,7 +270,7 @@ export class Pane {
     this.connected = open;
     this.wasConnected ||= open;
     if (open) this.events.restart();
-    this.absent = code === 4404 ? `${this.name} is not there; it is shown when it comes back` : "";
+    this.absent = code === 4404 ? t.pane.gone(this.name) : "";
     this.update();
   }
 
@@ -355,7 +356,7 @@ export class Pane {
     const isOld = age_ms > STALE_MS;
     if (isOld) {
       setText(this.oldAge, `${(age_ms / 1000).toFixed(1)} s`);
-      setText(this.oldWhat, old_ms >= silent_ms ? `nothing new is known of ${this.name}: what is shown is not now` : "the cockpit does not answer: nothing that you press is sent");
+      setText(this.oldWhat, old_ms >= silent_ms ? t.pane.nothingNew(this.name) : t.pane.cockpitSilent);
     }
     if (isOld === this.isOld) return;
     this.isOld = isOld;
@@ -370,8 +371,8 @@ export class Pane {
     const live = this.connected && state?.links.application !== "lost" ? state : null;
     const over = recording && (live === null || live.links.vehicle === "closed");
     setText(this.kind, vehicle ? vehicle.description || vehicle.vehicle : "");
-    const flight = live ? words(live.flight) : "not known";
-    setText(this.flight, over ? "recording over" : live && isOld ? `was ${flight}` : flight);
+    const flight = live ? named(t.states, live.flight) : t.pane.unknown;
+    setText(this.flight, over ? t.pane.over : live && isOld ? t.pane.was(flight) : flight);
     setTone(this.pill, live && !isOld && !over ? (FLIGHT_TONES[live.flight] ?? "quiet") : "quiet");
     this.battery.show(live?.battery ?? null, live?.alarms ?? []);
     this.hud.update(live, this.connected && !isOld, pilot?.round_trip_s ?? null);
@@ -382,9 +383,9 @@ export class Pane {
     this.strip.update(vehicle, state, pilot, isOld, recording);
     const [mine, placed] = [(pilot?.mine ?? false) && !isOld && !recording, (live?.position ?? null) !== null];
     const inAir = live?.airborne ?? false;
-    const nowhere = recording ? "A recording: nothing flies here." : isOld ? "What is shown is old." : !placed ? "It does not report its position: simulate it without position=none, or give it motion capture or GPS." : !mine ? "Take control to fly to a place." : "It must be in the air to fly to a place.";
-    this.map.allow(mine && placed && inAir ? "" : nowhere, mine ? "" : isOld ? "What is shown is old." : "Take control to change zones.");
-    for (const list of [this.parameters, this.controls.parameters]) list.allow(mine, recording ? "As they were recorded." : "Take control to change them.");
+    const nowhere = recording ? t.pane.recordingFlies : isOld ? t.pane.isOld : !placed ? t.pane.noPosition : !mine ? t.pane.takeToFly : t.pane.notInAir;
+    this.map.allow(mine && placed && inAir ? "" : nowhere, mine ? "" : isOld ? t.pane.isOld : t.pane.takeForZones);
+    for (const list of [this.parameters, this.controls.parameters]) list.allow(mine, recording ? t.pane.asRecorded : t.pane.takeToChange);
     this.alarmBook.update(this.found(), performance.now());
     this.alarms.show();
     setHidden(this.oldSeen, !this.alarmBook.open.some((alarm) => alarm.id === "old"));
@@ -399,11 +400,11 @@ export class Pane {
     const { state } = this;
     if (this.isRecording && (!this.connected || state?.links.application === "lost" || state?.links.vehicle === "closed")) return []; // it is over
     const severity = state?.airborne || this.pilot?.mine ? "critical" : "warning";
-    const old: Alarm[] = this.isOld ? [{ id: "old", severity, text: "what is shown is old" }] : [];
+    const old: Alarm[] = this.isOld ? [{ id: "old", severity, text: t.pane.shownIsOld }] : [];
     if (this.connected) return [...old, ...(state?.alarms ?? [])];
     if (this.absent) return [{ id: "absent", severity, text: this.absent }];
     if (!this.wasConnected && performance.now() - this.opened_ms < CONNECT_MS) return [];
-    return [...old, { id: "page_link", severity, text: `no data about ${this.name} from the cockpit: what is shown is old` }];
+    return [...old, { id: "page_link", severity, text: t.pane.noData(this.name) }];
   }
 
   notify(text: string, tone: Tone): void {
@@ -444,7 +445,7 @@ export class Pane {
       this.scene = new SceneView(() => this.world());
       this.space.append(this.scene.element);
     } catch (error) {
-      this.space.replaceChildren(h("p", { class: "empty" }, `No 3-D view here: ${errorText(error)}`));
+      this.space.replaceChildren(h("p", { class: "empty" }, t.pane.noSpace(errorText(error))));
     }
   }
 }

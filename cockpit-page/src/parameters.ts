@@ -2,6 +2,7 @@
 
 import { get, errorText } from "./api.js";
 import { h, setAttribute, setDisabled, setHidden, setText, setTone } from "./dom.js";
+import { t } from "./language/index.js";
 import type { Parameter, Value } from "./model.js";
 import { parse, rangeText, valueText } from "./values.js";
 
@@ -24,10 +25,10 @@ interface Row {
 
 export class Parameters {
   readonly element: HTMLElement;
-  private readonly words = h("input", { type: "search", placeholder: "Filter", "aria-label": "Filter parameters by words", oninput: () => this.filter() });
-  private readonly list = h("div", { class: "parameters", tabindex: 0, role: "region", "aria-label": "Parameters" });
+  private readonly words = h("input", { type: "search", placeholder: t.parameters.filter, "aria-label": t.parameters.filterLong, oninput: () => this.filter() });
+  private readonly list = h("div", { class: "parameters", tabindex: 0, role: "region", "aria-label": t.parameters.label });
   private readonly note = h("p", { class: "note" }, "");
-  private readonly empty = h("p", { class: "empty" }, "No parameters");
+  private readonly empty = h("p", { class: "empty" }, t.parameters.none);
   private rows = new Map<string, Row>();
   private writing: string | null = null;
   private can = false;
@@ -37,7 +38,7 @@ export class Parameters {
     private readonly write: (name: string, value: Value) => void,
     private readonly choice: Choice | null = null,
   ) {
-    const again = h("button", { type: "button", class: "small", onclick: () => void this.load() }, "Read again");
+    const again = h("button", { type: "button", class: "small", onclick: () => void this.load() }, t.parameters.again);
     if (choice) setAttribute(this.list, "aria-label", choice.title);
     this.element = h("div", { class: "filling" }, choice ? null : h("div", { class: "filters" }, this.words, again), this.note, this.list);
   }
@@ -58,7 +59,7 @@ export class Parameters {
       this.list.append(this.empty);
       this.filter();
     } catch (error) {
-      this.list.replaceChildren(h("p", { class: "empty" }, `Not read: ${errorText(error)}`));
+      this.list.replaceChildren(h("p", { class: "empty" }, t.parameters.notRead(errorText(error))));
     }
   }
 
@@ -69,7 +70,7 @@ export class Parameters {
     if (!row) return;
     row.parameter.value = value;
     row.editor.value = valueText(value);
-    this.answer(row, "ok", "written");
+    this.answer(row, "ok", t.parameters.written);
     this.enable(row);
   }
 
@@ -85,10 +86,10 @@ export class Parameters {
 
   private row(parameter: Parameter): Row {
     const editor = editorOf(parameter);
-    const button = h("button", { type: "submit", class: "small" }, "Set");
+    const button = h("button", { type: "submit", class: "small" }, t.parameters.set);
     const answer = h("p", { class: "answer", role: "status" });
-    const standard = parameter.default === null ? "" : `default ${valueText(parameter.default)}`;
-    const facts = [parameter.type, rangeText(parameter), standard, parameter.read_only ? "read only" : ""].filter(Boolean).join(" · ");
+    const standard = parameter.default === null ? "" : t.parameters.standard(valueText(parameter.default));
+    const facts = [parameter.type, rangeText(parameter), standard, parameter.read_only ? t.parameters.readOnly : ""].filter(Boolean).join(" · ");
     const element = h(
       "form",
       { class: "parameter", "data-parameter": parameter.name, novalidate: true },
@@ -140,13 +141,13 @@ export class Parameters {
       element.hidden = !fits;
       some ||= fits;
     }
-    setText(this.empty, this.choice?.none ?? "No parameters");
+    setText(this.empty, this.choice?.none ?? t.parameters.none);
     setHidden(this.empty, some);
   }
 }
 
 function editorOf(parameter: Parameter): Editor {
-  const label = { "aria-label": parameter.unit ? `${parameter.name} in ${parameter.unit}` : parameter.name };
+  const label = { "aria-label": parameter.unit ? t.parameters.inUnit(parameter.name, parameter.unit) : parameter.name };
   const choices = parameter.type === "bool" ? [true, false] : parameter.choices;
   if (choices.length) {
     const editor = h("select", label, ...choices.map((choice) => h("option", {}, valueText(choice))));

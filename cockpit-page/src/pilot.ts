@@ -6,6 +6,7 @@
 
 import type { ServerClock } from "./clock.js";
 import { CommandSender, type CommandSocket, type Result } from "./commands.js";
+import { t } from "./language/index.js";
 import type { Authority, Command, PilotMessage, Question, Sticks, Value } from "./model.js";
 import type { RouteProgress } from "./route.js";
 import type { Handlers } from "./socket.js";
@@ -177,7 +178,7 @@ export class Pilot {
   }
 
   private linked(open: boolean): void {
-    if (!open && this.mine) this.ended = "the connection to the cockpit broke while you had control: it hovers, and nobody has control";
+    if (!open && this.mine) this.ended = t.pilot.broke;
     this.connected = open;
     this.end();
     this.authority = NOBODY;

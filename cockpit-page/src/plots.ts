@@ -4,6 +4,7 @@ import uPlot from "uplot";
 import { colour, h, memory, setText } from "./dom.js";
 import { figure, plain, short } from "./format.js";
 import type { History } from "./history.js";
+import { t } from "./language/index.js";
 
 const COLOURS = 8;
 const FIRST = ["altitude", "velocity.forward", "velocity.left"];
@@ -26,11 +27,11 @@ export class Plots {
   private chosen: string[];
   private span_s = 30;
   private paused = false;
-  private readonly picker = h("select", { "aria-label": "Add a number to the plot", onchange: () => this.pick() });
-  private readonly spans = h("select", { "aria-label": "Time shown", onchange: () => this.resize() });
-  private readonly pause = h("button", { type: "button", class: "small", "aria-pressed": "false", onclick: () => this.hold() }, "Pause");
+  private readonly picker = h("select", { "aria-label": t.plots.add, onchange: () => this.pick() });
+  private readonly spans = h("select", { "aria-label": t.plots.span, onchange: () => this.resize() });
+  private readonly pause = h("button", { type: "button", class: "small", "aria-pressed": "false", onclick: () => this.hold() }, t.plots.pause);
   private readonly legend = h("div", { class: "legend" });
-  private readonly box = h("div", { class: "plot", role: "img", "aria-label": "Plot of the chosen numbers" });
+  private readonly box = h("div", { class: "plot", role: "img", "aria-label": t.plots.label });
   private plot: uPlot | null = null;
   private drawn_ms = 0;
   private offered = 0;
@@ -77,7 +78,7 @@ export class Plots {
       options.append(...names.map((name) => h("option", { value: name }, name)));
       return options;
     });
-    this.picker.replaceChildren(h("option", { value: "" }, "Add a number…"), ...groups);
+    this.picker.replaceChildren(h("option", { value: "" }, t.plots.addShort), ...groups);
   }
 
   private pick(): void {
@@ -103,7 +104,7 @@ export class Plots {
           h("i", { class: "swatch" }),
           h("span", { class: "series-name" }, name),
           h("output", {}, "–"),
-          h("button", { type: "button", class: "bare", "aria-label": `Remove ${name}`, onclick: () => this.choose(this.chosen.filter((one) => one !== name)) }, "×"),
+          h("button", { type: "button", class: "bare", "aria-label": t.plots.remove(name), onclick: () => this.choose(this.chosen.filter((one) => one !== name)) }, "×"),
         ),
       ),
     );

@@ -2,6 +2,7 @@
 
 import { errorText, get } from "./api.js";
 import { h, setText, setTone } from "./dom.js";
+import { t } from "./language/index.js";
 
 export interface Finding {
   check: string;
@@ -20,7 +21,6 @@ const ANSWER_MS = 8000;
 const READ_MS = 600;
 const MARKS = { ok: "✓", warn: "!", fail: "✗" } as const;
 const TONES = { ok: "ok", warn: "warn", fail: "bad" } as const;
-const WORDS = { ok: "fine", warn: "attention", fail: "not ready" } as const;
 
 /** Asks once more before a take-off that something speaks against. The pilot decides. Pure. */
 export class TakeOffQuestion {
@@ -39,7 +39,7 @@ export class TakeOffQuestion {
     }
     if (!answered) this.asked_ms = now_ms;
     this.asked = words;
-    return `Not ready. ${words}. Take off once more within ${ANSWER_MS / 1000} s to fly all the same.`;
+    return t.preflight.notReadyAsk(words, ANSWER_MS / 1000);
   }
 }
 
@@ -50,11 +50,11 @@ export class Preflight {
   private tried_ms = Number.NEGATIVE_INFINITY;
   private reading = false;
   private readonly question = new TakeOffQuestion();
-  private readonly list = h("ul", { class: "preflight", tabindex: 0, "aria-label": "Pre-flight checks" });
-  private readonly sum = h("p", { class: "note preflight-sum", role: "status" }, "Not checked yet.");
+  private readonly list = h("ul", { class: "preflight", tabindex: 0, "aria-label": t.preflight.label });
+  private readonly sum = h("p", { class: "note preflight-sum", role: "status" }, t.preflight.unchecked);
 
   constructor(private readonly drone: string) {
-    const again = h("button", { type: "button", class: "small", onclick: () => void this.load() }, "Check again");
+    const again = h("button", { type: "button", class: "small", onclick: () => void this.load() }, t.preflight.again);
     this.element = h("div", { class: "filling" }, h("div", { class: "filters" }, this.sum, again), this.list);
   }
 
@@ -80,7 +80,7 @@ export class Preflight {
       this.findings = [];
       this.list.replaceChildren();
       setTone(this.sum, "warn");
-      setText(this.sum, `Not checked: ${errorText(error)}`);
+      setText(this.sum, t.preflight.notChecked(errorText(error)));
     } finally {
       this.reading = false;
     }
@@ -90,7 +90,7 @@ export class Preflight {
     const count = (level: Finding["level"]): number => this.findings.filter((one) => one.level === level).length;
     const [bad, warn] = [count("fail"), count("warn")];
     setTone(this.sum, bad ? "bad" : warn ? "warn" : "ok");
-    setText(this.sum, bad ? `Not ready: ${bad} of ${this.findings.length}${warn ? `, and ${warn} to look at` : ""}` : warn ? `Ready; ${warn} to look at` : "Ready to fly");
+    setText(this.sum, bad ? t.preflight.notReady(bad, this.findings.length, warn) : warn ? t.preflight.readyBut(warn) : t.preflight.ready);
     const rank = { fail: 0, warn: 1, ok: 2 } as const;
     const sorted = [...this.findings].sort((a, b) => rank[a.level] - rank[b.level]);
     this.list.replaceChildren(...sorted.map(row));
@@ -101,7 +101,7 @@ function row({ check, level, detail, why, remedy }: Finding): HTMLElement {
   return h(
     "li",
     { "data-tone": TONES[level] },
-    h("span", { class: "mark", role: "img", "aria-label": WORDS[level] }, MARKS[level]),
+    h("span", { class: "mark", role: "img", "aria-label": t.preflight.levels[level] }, MARKS[level]),
     h("div", {}, h("b", {}, check), ` ${detail}`, why ? h("p", {}, why) : null, remedy ? h("p", { class: "remedy" }, `→ ${remedy}`) : null),
   );
 }

@@ -5,6 +5,7 @@
 
 import { h, setAttribute, setDisabled, setHidden, setText, unique } from "./dom.js";
 import { lasting } from "./format.js";
+import { t } from "./language/index.js";
 import type { Question } from "./model.js";
 import type { Pilot } from "./pilot.js";
 
@@ -20,11 +21,11 @@ export const pending = (questions: readonly Question[], own: number | null): Que
 
 /** What it means, in sentences. `own`: the priority that this page has control with; `more`: how many others ask. */
 export function explained(question: Question, own: number | null, more: number): string {
-  const others = more > 0 ? [`${more} more ${more === 1 ? "asks" : "ask"} for it.`] : [];
-  if (question.declined) return ["You keep it for now; the higher priority has it when the time is over.", ...others].join(" ");
-  const length = question.for_s === null ? "Wanted for an unspecified time." : `Wanted for ${lasting(question.for_s)}.`;
-  const end = wins(question, own) ? "That is higher than yours: it has control when the time is over." : "That is no higher than yours: you keep control unless you hand it over.";
-  return [`Priority ${question.priority}, yours ${own ?? "–"}. ${end}`, length, ...others].join(" ");
+  const others = more > 0 ? [t.question.more(more)] : [];
+  if (question.declined) return [t.question.keepForNow, ...others].join(" ");
+  const length = question.for_s === null ? t.question.unspecified : t.question.wantedFor(lasting(question.for_s));
+  const end = wins(question, own) ? t.question.higher : t.question.notHigher;
+  return [t.question.priority(question.priority, String(own ?? "–"), end), length, ...others].join(" ");
 }
 
 export class QuestionPanel {
@@ -34,14 +35,14 @@ export class QuestionPanel {
   private readonly title = h("h3", { id: unique("asks") });
   private readonly text = h("p", { id: unique("asks-text"), class: "asks-text" });
   private readonly left = h("b", {});
-  private readonly reason = h("input", { type: "text", maxlength: MOST_REASON, placeholder: "Reason, if you like", "aria-label": "Reason to keep it, if you like", autocomplete: "off", enterkeyhint: "send" });
-  private readonly keep = h("button", { type: "submit" }, "Keep it");
-  private readonly handOver = h("button", { type: "button", class: "primary", onclick: () => this.reply(true) }, "Hand over");
+  private readonly reason = h("input", { type: "text", maxlength: MOST_REASON, placeholder: t.question.reasonShort, "aria-label": t.question.reason, autocomplete: "off", enterkeyhint: "send" });
+  private readonly keep = h("button", { type: "submit" }, t.question.keep);
+  private readonly handOver = h("button", { type: "button", class: "primary", onclick: () => this.reply(true) }, t.question.handOver);
   private shown: Question | null = null;
   private since_ms = 0;
 
   constructor(private readonly answer: (id: number, grant: boolean, reason: string) => void) {
-    const time = h("p", { class: "asks-left", role: "timer", "aria-live": "off" }, this.left, " left");
+    const time = h("p", { class: "asks-left", role: "timer", "aria-live": "off" }, this.left, t.question.left);
     const form = h("form", { class: "asks-form", onsubmit: (event: Event) => this.submit(event) }, this.reason, this.keep, this.handOver);
     const marks = { role: "alertdialog", "aria-modal": "false", "aria-labelledby": this.title.id, "aria-describedby": this.text.id, "aria-keyshortcuts": "Q" };
     this.element = h("section", { class: "asks", tabindex: -1, hidden: true, "data-tone": "warn", ...marks }, this.title, time, this.text, form);
@@ -71,9 +72,9 @@ export class QuestionPanel {
       return;
     }
     const text = explained(question, own, asked.length - 1);
-    setText(this.title, question.declined ? `${question.by} still asks for control` : `${question.by} asks for control`);
+    setText(this.title, question.declined ? t.question.stillAsks(question.by) : t.question.asks(question.by));
     setText(this.text, text);
-    setText(this.voice, `${this.title.textContent}. ${text} Press Q to answer.`);
+    setText(this.voice, t.question.voice(this.title.textContent, text));
     setHidden(this.reason, question.declined);
     setHidden(this.keep, question.declined);
     setHidden(this.element, false);

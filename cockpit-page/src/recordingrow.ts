@@ -3,7 +3,7 @@
 
 import { errorText, get, post } from "./api.js";
 import { h, setAttribute, setHidden, setText } from "./dom.js";
-import { bytes, clock, count } from "./format.js";
+import { bytes, clock } from "./format.js";
 import { t } from "./language/index.js";
 import type { PastRecording } from "./model.js";
 
@@ -43,8 +43,8 @@ export class RecordingRow {
     this.one = one;
     const started = one.started === null ? "" : new Date(one.started * 1000).toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "short" });
     setText(this.title, one.name.replace(/\.mcap$/, ""));
-    const drones = one.drones.length > 2 ? count(one.drones.length, "drone") : one.drones.join(", ");
-    const marks = one.marks ? count(one.marks, "mark") : "";
+    const drones = one.drones.length > 2 ? t.overview.count(one.drones.length) : one.drones.join(", ");
+    const marks = one.marks ? t.recordings.marks(one.marks) : "";
     setText(this.facts, [started, drones, clock(one.seconds), bytes(one.size), marks, one.problem].filter(Boolean).join(" · "));
     setText(this.note, one.note);
   }

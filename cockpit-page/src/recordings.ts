@@ -114,7 +114,7 @@ export class RecordingList {
 
   private runningRow(one: RunningRecording): HTMLElement {
     const lost = lacking(one);
-    const facts = `${clock(one.seconds)} · ${bytes(one.bytes)} · ${lost ? `${lost} dropped` : "none dropped"}`;
+    const facts = `${clock(one.seconds)} · ${bytes(one.bytes)} · ${lost ? `${lost} dropped` : t.recordings.noneDropped}`;
     const drones = one.drones.join(", ");
     const mark = h("button", { type: "button", class: "small", "aria-label": t.recordings.markOf(drones), onclick: () => void this.act(() => post(`/api/recordings/${one.id}/mark`, { text: "" }), t.recordings.marked) }, t.recordings.mark);
     const stop = h("button", { type: "button", class: "small", "aria-label": t.recordings.stopOf(drones), onclick: () => void this.act(() => post(`/api/recordings/${one.id}/stop`)) }, t.recordings.stop);

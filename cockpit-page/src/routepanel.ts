@@ -2,11 +2,13 @@
 
 import { errorText, get, post } from "./api.js";
 import { h, setDisabled, setHidden, setText, setTone } from "./dom.js";
-import { figure, lasting } from "./format.js";
+import { lasting } from "./format.js";
+import { t } from "./language/index.js";
 import { flag } from "./maplayers.js";
 import { type Ink, type MapTool, nearest, type Project, type Spot } from "./maptool.js";
 import type { Vector } from "./model.js";
 import { emptyRoute, hasPhoto, moved, type Route, type RouteCheck, type RouteEnd, type RouteProgress, type RouteWaypoint, toneOf, waitOf, whole, withActions } from "./route.js";
+import { lengthText } from "./units.js";
 
 export type RouteDeed = "route_pause" | "route_resume" | "route_skip" | "route_stop";
 
@@ -19,24 +21,23 @@ export interface RouteHost {
 
 const CHECK_MS = 400;
 const HEIGHT_M = 1;
-const ENDS: Readonly<Record<RouteEnd, string>> = { hover: "hover", land: "land", return: "fly back and land" };
 
 export class RoutePanel implements MapTool {
   readonly element: HTMLElement;
-  readonly hint = "Press the map to add a waypoint; drag one to move it. Enter adds at the cursor, Delete removes.";
-  private readonly files = h("select", { class: "small", "aria-label": "Saved routes", onchange: () => void this.load() });
-  private readonly title = h("input", { type: "text", maxlength: 48, placeholder: "name", "aria-label": "Name of the route", oninput: () => (this.route.name = this.title.value.trim()) });
-  private readonly speed = h("input", { type: "number", min: 0.05, max: 30, step: 0.1, "aria-label": "Speed of the route in metres per second", oninput: () => this.typed() });
-  private readonly end = h("select", { class: "small", "aria-label": "At the end of the route", onchange: () => this.typed() }, ...Object.entries(ENDS).map(([value, text]) => h("option", { value }, text)));
+  readonly hint = t.route.hint;
+  private readonly files = h("select", { class: "small", "aria-label": t.route.saved, onchange: () => void this.load() });
+  private readonly title = h("input", { type: "text", maxlength: 48, placeholder: t.route.nameShort, "aria-label": t.route.name, oninput: () => (this.route.name = this.title.value.trim()) });
+  private readonly speed = h("input", { type: "number", min: 0.05, max: 30, step: 0.1, "aria-label": t.route.speed, oninput: () => this.typed() });
+  private readonly end = h("select", { class: "small", "aria-label": t.route.end, onchange: () => this.typed() }, ...Object.entries(t.route.ends).map(([value, text]) => h("option", { value }, text)));
   private readonly upload = h("input", { type: "file", accept: ".json", hidden: true, onchange: () => void this.read() });
   private readonly rows = h("tbody");
-  private readonly table = h("table", { class: "route-table" }, h("thead", {}, h("tr", {}, ...["", "x", "y", "z", "m/s", "yaw °", "wait s", "photo", ""].map((text) => h("th", { scope: "col" }, text)))), this.rows);
+  private readonly table = h("table", { class: "route-table" }, h("thead", {}, h("tr", {}, ...["", "x m", "y m", "z m", "m/s", "yaw °", t.route.wait, t.route.photo, ""].map((text) => h("th", { scope: "col" }, text)))), this.rows);
   private readonly summary = h("p", { class: "note", role: "status" });
   private readonly said = h("p", { class: "note", role: "alert", "data-tone": "warn" });
-  private readonly found = h("ul", { class: "route-findings", "aria-label": "What speaks against the route" });
+  private readonly found = h("ul", { class: "route-findings", "aria-label": t.route.against });
   private readonly progress = h("p", { class: "note route-progress", role: "status" });
-  private readonly go = h("button", { type: "button", class: "small primary", onclick: () => this.fly() }, "Fly the route");
-  private readonly deeds = { route_pause: this.deed("route_pause", "Pause"), route_resume: this.deed("route_resume", "Resume"), route_skip: this.deed("route_skip", "Skip"), route_stop: this.deed("route_stop", "Stop") };
+  private readonly go = h("button", { type: "button", class: "small primary", onclick: () => this.fly() }, t.route.fly);
+  private readonly deeds = { route_pause: this.deed("route_pause", t.route.pause), route_resume: this.deed("route_resume", t.route.resume), route_skip: this.deed("route_skip", t.route.skip), route_stop: this.deed("route_stop", t.route.stop) };
   private readonly body: HTMLElement;
   private route: Route = emptyRoute();
   private check: RouteCheck | null = null;
@@ -52,11 +53,11 @@ export class RoutePanel implements MapTool {
     private readonly host: RouteHost,
   ) {
     const button = (text: string, act: () => void): HTMLElement => h("button", { type: "button", class: "small", onclick: act }, text);
-    const kept = h("div", { class: "route-line" }, this.files, this.title, button("Save", () => void this.save()), button("New", () => this.edit(emptyRoute())), button("Delete", () => void this.remove()), button("Download", () => this.download()), button("Upload", () => this.upload.click()), this.upload);
-    const wishes = h("div", { class: "route-line" }, h("label", {}, "m/s ", this.speed), h("label", {}, "at the end ", this.end));
+    const kept = h("div", { class: "route-line" }, this.files, this.title, button(t.route.save, () => void this.save()), button(t.route.new, () => this.edit(emptyRoute())), button(t.route.delete, () => void this.remove()), button(t.route.download, () => this.download()), button(t.route.upload, () => this.upload.click()), this.upload);
+    const wishes = h("div", { class: "route-line" }, h("label", {}, "m/s ", this.speed), h("label", {}, t.route.endShort, this.end));
     const flight = h("div", { class: "route-line" }, this.go, ...Object.values(this.deeds));
     this.body = h("div", { class: "route-body", hidden: true }, kept, this.said, wishes, this.table, this.summary, this.found, flight);
-    this.element = h("section", { class: "route", "aria-label": "Route" }, this.progress, this.body);
+    this.element = h("section", { class: "route", "aria-label": t.route.label }, this.progress, this.body);
     this.edit(emptyRoute());
   }
 
@@ -72,7 +73,7 @@ export class RoutePanel implements MapTool {
     this.flying = progress;
     const words = progress.kind.replace("route.", "").replaceAll("_", " ");
     setTone(this.progress, progress.problem ? "warn" : progress.state === "done" ? "ok" : "busy");
-    setText(this.progress, `Route: waypoint ${progress.waypoint} of ${progress.of}, ${progress.state} · ${words}: ${progress.text}`);
+    setText(this.progress, t.route.progress(progress.waypoint, progress.of, progress.state, words, progress.text));
     this.show();
   }
 
@@ -195,18 +196,18 @@ export class RoutePanel implements MapTool {
     const number = index + 1;
     const latest = (): RouteWaypoint => this.route.waypoints[index] as RouteWaypoint;
     const field = (name: string, value: number | string, label: string, step: number, set: (value: number | null) => RouteWaypoint | null): HTMLElement => {
-      const input = h("input", { type: "number", step, value, "data-field": name, "aria-label": `${label} of waypoint ${number}`, onfocus: () => this.mark((this.chosen = index)) });
+      const input = h("input", { type: "number", step, value, "data-field": name, "aria-label": t.route.ofWaypoint(label, number), onfocus: () => this.mark((this.chosen = index)) });
       input.addEventListener("input", () => {
         const next = set(input.value === "" || !Number.isFinite(input.valueAsNumber) ? null : input.valueAsNumber);
         if (next) this.put(index, next);
       });
       return h("td", {}, input);
     };
-    const axis = (name: "x" | "y" | "z"): HTMLElement => field(name, one[name], `${name} in metres`, 0.1, (value) => (value === null ? null : { ...latest(), [name]: value }));
-    const photo = h("input", { type: "checkbox", "aria-label": `Photo at waypoint ${number}` });
+    const axis = (name: "x" | "y" | "z"): HTMLElement => field(name, one[name], t.route.inMetres(name), 0.1, (value) => (value === null ? null : { ...latest(), [name]: value }));
+    const photo = h("input", { type: "checkbox", "aria-label": t.route.photoAt(number) });
     photo.checked = hasPhoto(one);
     photo.addEventListener("change", () => this.put(index, withActions(latest(), waitOf(latest()), photo.checked)));
-    const act = (text: string, label: string, run: () => void, off = false): HTMLElement => h("button", { type: "button", class: "small bare", "aria-label": `${label} waypoint ${number}`, disabled: off, onclick: run }, text);
+    const act = (text: string, label: string, run: () => void, off = false): HTMLElement => h("button", { type: "button", class: "small bare", "aria-label": t.route.actOn(label, number), disabled: off, onclick: run }, text);
     const shift = (to: number): void => this.edit({ ...this.route, waypoints: moved(this.route.waypoints, index, to) });
     return h(
       "tr",
@@ -215,11 +216,11 @@ export class RoutePanel implements MapTool {
       axis("x"),
       axis("y"),
       axis("z"),
-      field("speed", one.speed ?? "", "speed in metres per second", 0.1, (value) => without(latest(), "speed", value)),
-      field("yaw", one.yaw === undefined ? "" : Math.round((one.yaw * 180) / Math.PI), "yaw in degrees", 5, (value) => without(value === null ? latest() : without(latest(), "look_at", null), "yaw", value === null ? null : (value * Math.PI) / 180)),
-      field("wait", waitOf(one) || "", "wait in seconds", 1, (value) => withActions(latest(), value ?? 0, hasPhoto(latest()))),
+      field("speed", one.speed ?? "", t.route.speedIn, 0.1, (value) => without(latest(), "speed", value)),
+      field("yaw", one.yaw === undefined ? "" : Math.round((one.yaw * 180) / Math.PI), t.route.yawIn, 5, (value) => without(value === null ? latest() : without(latest(), "look_at", null), "yaw", value === null ? null : (value * Math.PI) / 180)),
+      field("wait", waitOf(one) || "", t.route.waitIn, 1, (value) => withActions(latest(), value ?? 0, hasPhoto(latest()))),
       h("td", {}, photo),
-      h("td", { class: "route-acts" }, act("↑", "Move up", () => shift(index - 1), index === 0), act("↓", "Move down", () => shift(index + 1), index === this.route.waypoints.length - 1), act("×", "Delete", () => this.drop(index))),
+      h("td", { class: "route-acts" }, act("↑", t.route.up, () => shift(index - 1), index === 0), act("↓", t.route.down, () => shift(index + 1), index === this.route.waypoints.length - 1), act("×", t.route.delete, () => this.drop(index))),
     );
   }
 
@@ -264,10 +265,10 @@ export class RoutePanel implements MapTool {
     for (const [deed, button] of Object.entries(this.deeds)) {
       setHidden(button, !active || (deed === "route_pause" && flying.state === "paused") || (deed === "route_resume" && flying.state !== "paused"));
     }
-    this.found.replaceChildren(...(check?.findings ?? []).map((one) => h("li", { class: one.severity === "error" ? "bad" : "warn" }, `${one.waypoint === null ? "" : `Waypoint ${one.waypoint}: `}${one.reason}`)));
-    if (this.route.waypoints.length === 0) this.say("No waypoint yet: press the map.");
-    else if (!check) this.say("Checking…");
-    else this.say(`${figure(check.length_m, 1)} m, about ${lasting(Math.max(1, check.seconds))}${check.battery_left === null ? "" : `, battery ${Math.round(check.battery_left * 100)} % at the end`}${check.ok ? "" : ": it can't be flown like this"}`, !check.ok);
+    this.found.replaceChildren(...(check?.findings ?? []).map((one) => h("li", { class: one.severity === "error" ? "bad" : "warn" }, `${one.waypoint === null ? "" : t.route.waypointFound(one.waypoint)}${one.reason}`)));
+    if (this.route.waypoints.length === 0) this.say(t.route.none);
+    else if (!check) this.say(t.route.checking);
+    else this.say(t.route.summary(lengthText(check.length_m, 1), lasting(Math.max(1, check.seconds)), check.battery_left === null ? null : Math.round(check.battery_left * 100), check.ok), !check.ok);
   }
 
   private say(text: string, bad = false): void {
@@ -280,7 +281,7 @@ export class RoutePanel implements MapTool {
   private async list(): Promise<void> {
     try {
       const { routes } = await get<{ routes: { name: string; problem: string | null }[] }>("/api/routes");
-      this.files.replaceChildren(h("option", { value: "" }, routes.length > 0 ? "Load…" : "None saved"), ...routes.map((one) => h("option", { value: one.name, disabled: one.problem !== null }, one.name)));
+      this.files.replaceChildren(h("option", { value: "" }, routes.length > 0 ? t.route.load : t.route.noneSaved), ...routes.map((one) => h("option", { value: one.name, disabled: one.problem !== null }, one.name)));
     } catch (error) {
       setText(this.said, errorText(error));
     }
@@ -293,13 +294,13 @@ export class RoutePanel implements MapTool {
   }
 
   private async save(): Promise<void> {
-    await this.doing(() => post(`/api/routes/${encodeURIComponent(this.route.name || "route")}`, this.route), `saved as ${this.route.name || "route"}`);
+    await this.doing(() => post(`/api/routes/${encodeURIComponent(this.route.name || "route")}`, this.route), t.route.savedAs(this.route.name || "route"));
     await this.list();
   }
 
   private async remove(): Promise<void> {
-    if (!this.route.name) return setText(this.said, "Name the saved route to delete, or load it.");
-    await this.doing(() => post(`/api/routes/${encodeURIComponent(this.route.name)}/delete`), `${this.route.name} was deleted; it stays here until another is loaded`);
+    if (!this.route.name) return setText(this.said, t.route.nameToDelete);
+    await this.doing(() => post(`/api/routes/${encodeURIComponent(this.route.name)}/delete`), t.route.deleted(this.route.name));
     await this.list();
   }
 
@@ -314,7 +315,7 @@ export class RoutePanel implements MapTool {
     this.upload.value = "";
     if (!file) return;
     await this.doing(async () => {
-      if (file.size > 65536) throw new Error(`${file.name} is no route: it is larger than 64 kB`);
+      if (file.size > 65536) throw new Error(t.route.tooLarge(file.name));
       const read: unknown = JSON.parse(await file.text());
       const checked = await post<RouteCheck>(`/api/drones/${encodeURIComponent(this.drone)}/route/check`, read as object); // says what is wrong with it
       this.edit(whole(read as Partial<Route>));
@@ -339,7 +340,7 @@ export class RoutePanel implements MapTool {
   }
 
   private deed(deed: RouteDeed, text: string): HTMLButtonElement {
-    return h("button", { type: "button", class: "small", "aria-label": `${text} the route`, hidden: true, onclick: () => this.host.act(deed) }, text);
+    return h("button", { type: "button", class: "small", "aria-label": t.route.actOnRoute(text), hidden: true, onclick: () => this.host.act(deed) }, text);
   }
 }
 

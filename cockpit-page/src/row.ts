@@ -1,10 +1,10 @@
 // A drone of the overview in words, for tiles, table and list alike. Pure.
 
 import type { Tone } from "./dom.js";
-import { figure, words } from "./format.js";
+import { named, t } from "./language/index.js";
 import type { DroneRow } from "./model.js";
 import { isRecording } from "./safety.js";
-import { inUnit, unit } from "./units.js";
+import { lengthText } from "./units.js";
 
 export interface Described {
   tone: Tone;
@@ -27,7 +27,7 @@ export interface Described {
 const LINKS: Readonly<Record<string, Tone>> = { up: "ok", degraded: "warn", connecting: "busy", lost: "bad", closed: "bad" };
 
 /** In the unit that the person chose. */
-export const height = (altitude_m: number | null): string => (altitude_m === null ? "–" : `${figure(inUnit("length", altitude_m), 1)} ${unit("length").name}`);
+export const height = (altitude_m: number | null): string => lengthText(altitude_m, 1);
 
 export function describe(row: DroneRow): Described {
   const recorded = isRecording(row);
@@ -35,16 +35,16 @@ export function describe(row: DroneRow): Described {
   const lost = application === "lost";
   const over = recorded && (lost || vehicle === "closed"); // as every recording is some time
   const critical = row.alarms.some((alarm) => alarm.severity === "critical");
-  const flight = row.airborne && row.altitude !== null ? `${words(row.state)} · ${height(row.altitude)}` : words(row.state);
+  const flight = row.airborne && row.altitude !== null ? `${named(t.states, row.state)} · ${height(row.altitude)}` : named(t.states, row.state);
   return {
     tone: over ? "quiet" : lost || critical ? "bad" : row.alarms.length ? "warn" : row.airborne ? "ok" : "quiet",
-    state: over ? "recording over" : lost ? "lost" : flight,
-    holder: recorded ? "recording, nothing flies" : row.owner === null ? "nobody has control" : `${row.owner} has control`,
+    state: over ? t.overview.over : lost ? t.overview.lost : flight,
+    holder: recorded ? t.overview.recordedRow : row.owner === null ? t.overview.nobody : t.overview.holder(row.owner),
     alarm: over ? "" : row.alarms.map((alarm) => alarm.text).join(" · "),
     alarmTone: critical || lost ? "bad" : "warn",
     battery: lost ? null : row.battery,
     hops: over ? ["quiet", "quiet"] : [LINKS[application] ?? "quiet", LINKS[vehicle] ?? "quiet"],
-    links: `link to the proxy ${application}, to the vehicle ${vehicle}`,
+    links: t.overview.links(named(t.linkStates, application), named(t.linkStates, vehicle)),
     over,
     lost,
   };

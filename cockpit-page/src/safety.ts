@@ -4,6 +4,7 @@ import type { ServerClock } from "./clock.js";
 import { type Answer, CommandSender, type CommandSocket, type Result } from "./commands.js";
 import { h, setAttribute, setDisabled, setHidden, setText, setTone } from "./dom.js";
 import { type Countdown, type Deadly, holdButton } from "./hold.js";
+import { t } from "./language/index.js";
 import type { DroneRow } from "./model.js";
 import { STEER_MS } from "./pilot.js";
 import type { Handlers } from "./socket.js";
@@ -25,20 +26,19 @@ interface Each extends Answer {
   state: "sent" | "done" | "refused";
 }
 
-export const WORDS: Readonly<Record<Deed, string>> = { land_all: "Land all", stop_all: "Stop all" };
+export const WORDS: Readonly<Record<Deed, string>> = { land_all: t.safety.landAll, stop_all: t.safety.stopAll };
 
 /** The outcome of a command to all drones, in words, the worst first. Pure. */
 export function outcome(deed: Deed, drones: readonly string[], each: ReadonlyMap<string, { state: string; why: string }>): { text: string; bad: boolean } {
   const of = (state: string): string[] => drones.filter((name) => (each.get(name)?.state ?? "pending") === state);
   const failed = of("refused").map((name) => `${name}: ${each.get(name)?.why}`);
-  const done = deed === "land_all" ? "landed" : "done";
-  const parts = [
-    failed.length ? `NOT ${deed === "land_all" ? "landed" : "stopped"}: ${failed.join("; ")}` : "",
-    of("pending").length ? `pending: ${of("pending").join(", ")}` : "",
-    of("sent").length ? `sent: ${of("sent").join(", ")}` : "",
-    of("done").length ? `${done}: ${of("done").join(", ")}` : "",
+    const parts = [
+    failed.length ? t.safety.failed[deed](failed.join("; ")) : "",
+    of("pending").length ? t.safety.pending(of("pending").join(", ")) : "",
+    of("sent").length ? t.safety.sent(of("sent").join(", ")) : "",
+    of("done").length ? t.safety.done[deed](of("done").join(", ")) : "",
   ].filter(Boolean);
-  return { text: drones.length ? `${WORDS[deed]} · ${parts.join(" · ")}` : `${WORDS[deed]} · there is no drone that flies`, bad: failed.length > 0 };
+  return { text: drones.length ? `${WORDS[deed]} · ${parts.join(" · ")}` : t.safety.none(WORDS[deed]), bad: failed.length > 0 };
 }
 
 export class Safety {
@@ -59,13 +59,13 @@ export class Safety {
     clock: ServerClock,
     private readonly countdown: Countdown,
   ) {
-    this.own = holdButton(countdown, () => this.one(), { class: "stop own", "aria-keyshortcuts": "Control+Enter", title: "Press and hold" }, h("span", {}, "Motors off"), this.name, h("kbd", { "aria-hidden": "true" }, "hold"), this.fate);
+    this.own = holdButton(countdown, () => this.one(), { class: "stop own", "aria-keyshortcuts": "Control+Enter", title: t.safety.hold }, h("span", {}, t.safety.off), this.name, h("kbd", { "aria-hidden": "true" }, t.safety.holdShort), this.fate);
     const button = (deed: Deed, kind: string, keys: string): { button: HTMLButtonElement; fate: HTMLElement } => {
       const fate = h("span", { class: "fate" });
-      return { button: holdButton(countdown, () => this.every(deed), { class: kind, ...(keys ? { "aria-keyshortcuts": keys } : {}), title: "Press and hold: of all drones" }, h("span", {}, WORDS[deed]), h("kbd", { "aria-hidden": "true" }, "hold"), fate), fate };
+      return { button: holdButton(countdown, () => this.every(deed), { class: kind, ...(keys ? { "aria-keyshortcuts": keys } : {}), title: t.safety.holdAll }, h("span", {}, WORDS[deed]), h("kbd", { "aria-hidden": "true" }, t.safety.holdShort), fate), fate };
     };
     this.all = { land_all: button("land_all", "land-all", ""), stop_all: button("stop_all", "stop", "Control+Shift+Enter") };
-    this.element = h("div", { class: "safety", role: "group", "aria-label": "Emergency: press and hold" }, this.own, this.all.land_all.button, this.all.stop_all.button);
+    this.element = h("div", { class: "safety", role: "group", "aria-label": t.safety.emergency }, this.own, this.all.land_all.button, this.all.stop_all.button);
     this.commands = new CommandSender(
       connect,
       clock,
@@ -95,25 +95,25 @@ export class Safety {
     else {
       const meant = which === "one" ? this.one() : this.every("stop_all");
       if (meant) this.countdown.press(meant);
-      else this.notify("No drone that flies is opened and seen here: hold Stop all, or open one", true);
+      else this.notify(t.safety.aimless, true);
     }
   }
 
   private one(): Deadly | null {
     const { target } = this;
-    return target && { what: `Motors of ${target.name} off`, act: () => target.stop() };
+    return target && { what: t.safety.motorsOff(target.name), act: () => target.stop() };
   }
 
   private every(deed: Deed): Deadly {
     const count = this.flying;
-    const which = count === 1 ? "the only drone" : `all ${count} drones`;
-    return { what: deed === "land_all" ? `Land ${which}` : `Motors of ${which} off`, act: () => this.send(deed) };
+    const which = count === 1 ? t.safety.theOnly : t.safety.allOf(count);
+    return { what: deed === "land_all" ? t.safety.landThese(which) : t.safety.motorsOff(which), act: () => this.send(deed) };
   }
 
   private send(deed: Deed): void {
     this.asked = { deed, drones: [], each: new Map(), since_ms: performance.now() };
     this.commands.send({ do: deed });
-    if (this.commands.result(deed)?.fate === "pending") this.notify(`${WORDS[deed]} · pending`, false);
+    if (this.commands.result(deed)?.fate === "pending") this.notify(`${WORDS[deed]} · ${t.commands.fates.pending}`, false);
   }
 
   private onMessage(message: Answer): void {
@@ -157,7 +157,7 @@ export class Safety {
 /** On the control itself: pending, sent, refused, not sent. */
 export function showFate(button: HTMLElement, place: HTMLElement, result: Result | null): void {
   setAttribute(button, "data-fate", result?.fate ?? "");
-  setText(place, result?.fate ?? "");
+  setText(place, result ? t.commands.fates[result.fate] : "");
   setAttribute(place, "title", result?.why ?? "");
 }
 

@@ -27,6 +27,7 @@ import {
 } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import { colour, h } from "./dom.js";
+import { t } from "./language/index.js";
 import { discard, frustum, scenery } from "./scenery.js";
 import type { World } from "./surroundings.js";
 import type { Body, Scene } from "./world.js";
@@ -39,7 +40,7 @@ const NEARER: Readonly<Record<string, number>> = { Equal: 0.85, NumpadAdd: 0.85,
 const TURN_RAD = 0.1;
 
 export class SceneView {
-  readonly element = h("div", { class: "scene", role: "application", tabindex: 0, "data-keys": [...TURNS, ...Object.keys(NEARER)].join(" "), "aria-label": "The flight in three dimensions. Arrow keys turn it, plus and minus zoom." });
+  readonly element = h("div", { class: "scene", role: "application", tabindex: 0, "data-keys": [...TURNS, ...Object.keys(NEARER)].join(" "), "aria-label": t.map.space });
   private readonly renderer = new WebGLRenderer({ antialias: true, alpha: true, powerPreference: "low-power" });
   private readonly scene = new ThreeScene();
   private readonly camera = new PerspectiveCamera(50, 1, 0.05, 200);

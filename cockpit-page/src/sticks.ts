@@ -2,6 +2,7 @@
 //
 // Body axes as in Skyloop: forward, left, up, counter-clockwise; each from −1 to 1 until it is scaled.
 
+import { t } from "./language/index.js";
 import type { Sticks } from "./model.js";
 
 export const CENTRED: Readonly<Sticks> = { forward: 0, left: 0, up: 0, yaw_rate: 0 };
@@ -58,9 +59,9 @@ export interface Pace {
 }
 
 export const PACES: readonly Pace[] = [
-  { name: "Gentle", speed: 0.4, climb: 0.3, turn: 0.6 },
-  { name: "Normal", speed: 0.8, climb: 0.5, turn: 1.0 },
-  { name: "Brisk", speed: 1.6, climb: 0.8, turn: 1.6 },
+  { name: t.help.gentle, speed: 0.4, climb: 0.3, turn: 0.6 },
+  { name: t.help.normal, speed: 0.8, climb: 0.5, turn: 1.0 },
+  { name: t.help.brisk, speed: 1.6, climb: 0.8, turn: 1.6 },
 ];
 
 /** Sticks as a velocity: [m/s] and [rad/s]. */

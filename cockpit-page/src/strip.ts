@@ -5,6 +5,7 @@ import { lasting } from "./format.js";
 import { type Countdown, type Deadly, holdButton } from "./hold.js";
 import { holderText, oldHolderText } from "./instruments.js";
 import type { Deed } from "./keys.js";
+import { t } from "./language/index.js";
 import type { Authority, State, Vehicle } from "./model.js";
 import type { Pilot } from "./pilot.js";
 import { QuestionPanel } from "./question.js";
@@ -21,10 +22,10 @@ function keyed(name: string, key: string, kind: string, act: () => void): HTMLBu
 /** Where this page waits, in words; empty while it does not. */
 export function lineText({ state, holder, line }: Authority): string {
   if (state === "none" || state === "held" || line === null) return "";
-  const who = holder ?? "the one in control";
-  const answer = line.declined !== null ? `${who} keeps it for now${line.declined && `: “${line.declined}”`}` : line.asked ? `${who} was asked` : "";
-  const place = line.position === null ? "wait in line" : `are number ${line.position} in line`;
-  return answer ? `${answer} · you ${place}` : `You ${place}`;
+  const who = holder ?? t.strip.theHolder;
+  const answer = line.declined !== null ? t.strip.keeps(who, line.declined) : line.asked ? t.strip.asked(who) : "";
+  const place = line.position === null ? t.strip.inLine : t.strip.number(line.position);
+  return answer ? t.strip.answered(answer, place) : t.strip.you(place);
 }
 
 export class Strip {
@@ -33,9 +34,9 @@ export class Strip {
   private readonly who = h("b", { class: "who" });
   private readonly more = h("span", { class: "more" });
   private readonly holder: HTMLElement;
-  private readonly priority = h("input", { type: "number", class: "priority", min: 0, max: 31, step: 1, title: "Priority: 0 is the highest, 31 the lowest", "aria-label": "Priority to take control with: 0 is the highest, 31 the lowest" });
-  private readonly ask = h("button", { type: "button", class: "small", title: "Who has control is asked first, and may say no; a higher priority has it after a time all the same", onclick: () => this.choose(!this.asks) }, "Ask first");
-  private readonly line = h("span", { role: "status", "aria-label": "Your place in the line" });
+  private readonly priority = h("input", { type: "number", class: "priority", min: 0, max: 31, step: 1, title: t.strip.priorityShort, "aria-label": t.strip.priority });
+  private readonly ask = h("button", { type: "button", class: "small", title: t.strip.askLong, onclick: () => this.choose(!this.asks) }, t.strip.ask);
+  private readonly line = h("span", { role: "status", "aria-label": t.strip.line });
   private readonly wait = h("span", { class: "wait", role: "timer", "aria-live": "off" });
   private readonly waiting = h("p", { class: "waiting" }, this.line, this.wait);
   private readonly take: HTMLButtonElement;
@@ -57,20 +58,20 @@ export class Strip {
     stop: { countdown: Countdown; deadly: () => Deadly | null; understood: () => void },
   ) {
     this.question = new QuestionPanel(answer);
-    this.holder = h("div", { class: "holder", role: "status", "aria-live": "polite", "aria-label": "Who has control" }, this.who, this.more);
+    this.holder = h("div", { class: "holder", role: "status", "aria-live": "polite", "aria-label": t.strip.control }, this.who, this.more);
     this.priority.value = memory.get("priority") ?? String(USUAL_PRIORITY);
     this.priority.addEventListener("change", () => memory.set("priority", this.priority.value));
-    this.take = keyed("Take control", "C", "primary", () => act("take"));
+    this.take = keyed(t.strip.take, "C", "primary", () => act("take"));
     this.choose(memory.get("ask-first") === "true");
-    this.release = keyed("Release", "R", "", () => act("release"));
-    this.takeOff = keyed("Take off", "T", "", () => act("takeoff"));
-    this.hover = keyed("Hover", "H", "", () => act("hover"));
-    this.land = keyed("Land", "L", "", () => act("land"));
-    this.reset = keyed("Reset emergency", "", "", () => act("reset"));
-    this.stop = holdButton(stop.countdown, stop.deadly, { class: "stop", title: "Press and hold" }, h("span", {}, "Motors off"), h("span", { class: "stop-name" }, drone), h("span", { class: "fate" }));
-    this.ended = h("p", { class: "ended", role: "alert", "data-tone": "bad", hidden: true }, this.endedText, h("button", { type: "button", class: "small", onclick: stop.understood }, "Understood"));
+    this.release = keyed(t.strip.release, "R", "", () => act("release"));
+    this.takeOff = keyed(t.strip.takeOff, "T", "", () => act("takeoff"));
+    this.hover = keyed(t.strip.hover, "H", "", () => act("hover"));
+    this.land = keyed(t.strip.land, "L", "", () => act("land"));
+    this.reset = keyed(t.strip.reset, "", "", () => act("reset"));
+    this.stop = holdButton(stop.countdown, stop.deadly, { class: "stop", title: t.safety.hold }, h("span", {}, t.safety.off), h("span", { class: "stop-name" }, drone), h("span", { class: "fate" }));
+    this.ended = h("p", { class: "ended", role: "alert", "data-tone": "bad", hidden: true }, this.endedText, h("button", { type: "button", class: "small", onclick: stop.understood }, t.strip.understood));
     this.buttons = [["take", this.take], ["release", this.release], ["takeoff", this.takeOff], ["hover", this.hover], ["land", this.land], ["reset", this.reset], ["stop", this.stop]];
-    this.element = h("div", { class: "strip", role: "group", "aria-label": "Flying" }, this.question.voice, this.question.element, this.ended, this.waiting, this.holder, h("span", { class: "taking" }, this.priority, this.ask, this.take, this.release), h("span", { class: "deeds" }, this.takeOff, this.hover, this.land, this.reset), this.why, this.stop);
+    this.element = h("div", { class: "strip", role: "group", "aria-label": t.strip.label }, this.question.voice, this.question.element, this.ended, this.waiting, this.holder, h("span", { class: "taking" }, this.priority, this.ask, this.take, this.release), h("span", { class: "deeds" }, this.takeOff, this.hover, this.land, this.reset), this.why, this.stop);
   }
 
   /** What was chosen, within its range. */
@@ -97,7 +98,7 @@ export class Strip {
     setHidden(this.take, mine || pilot === null || !flies);
     for (const choice of [this.priority, this.ask]) setHidden(choice, mine || pilot === null || !flies);
     setHidden(this.release, !mine && !(pilot?.waits ?? false));
-    setText(this.release.firstElementChild as Element, pilot?.waits ? "Stop waiting" : "Release");
+    setText(this.release.firstElementChild as Element, pilot?.waits ? t.strip.stopWaiting : t.strip.release);
     setText(this.line, pilot?.waits ? lineText(pilot.authority) : "");
     setHidden(this.waiting, !this.line.textContent);
     this.question.update(pilot, performance.now());
@@ -110,10 +111,10 @@ export class Strip {
     setHidden(this.reset, !emergency || pilot === null);
     setDisabled(this.reset, !mine);
     setHidden(this.stop, pilot === null || !flies);
-    setText(this.why, vehicle && !flies ? `It can't fly: ${vehicle.why_not}` : pilot === null ? "You may watch, not fly." : "");
+    setText(this.why, vehicle && !flies ? t.strip.cantFly(vehicle.why_not) : pilot === null ? t.strip.watch : "");
     setHidden(this.why, !this.why.textContent);
     setAttribute(this.element, "data-mine", String(mine && !old));
-    setText(this.endedText, pilot?.ended ? `You lost control. ${pilot.ended[0]?.toUpperCase()}${pilot.ended.slice(1)}.` : "");
+    setText(this.endedText, pilot?.ended ? t.strip.lost(`${pilot.ended[0]?.toUpperCase()}${pilot.ended.slice(1)}`) : "");
     setHidden(this.ended, !this.endedText.textContent);
     for (const [what, button] of this.buttons) showFate(button, button.lastElementChild as HTMLElement, pilot?.result(what) ?? null);
   }
@@ -123,12 +124,12 @@ export class Strip {
     this.question.count(pilot, performance.now());
     if (this.waiting.hidden || pilot === null) return;
     const wait_s = pilot.wait_s;
-    setText(this.wait, wait_s === null ? "nobody knows for how long" : `about ${lasting(wait_s)} to wait`);
+    setText(this.wait, wait_s === null ? t.strip.unknownWait : t.strip.wait(lasting(wait_s)));
   }
 
   private choose(asks: boolean): void {
     memory.set("ask-first", String(asks));
     setAttribute(this.ask, "aria-pressed", String(asks));
-    setText(this.take.firstElementChild as Element, asks ? "Ask for control" : "Take control");
+    setText(this.take.firstElementChild as Element, asks ? t.strip.askForControl : t.strip.take);
   }
 }

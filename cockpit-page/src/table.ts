@@ -2,17 +2,18 @@
 
 import { Battery } from "./battery.js";
 import { h, setAttribute, setText, setTone } from "./dom.js";
+import { t } from "./language/index.js";
 import type { DroneRow } from "./model.js";
 import { type Column, describe, height, sorted } from "./row.js";
 import { OWN_WORDS, type Own } from "./tile.js";
 
 const COLUMNS: readonly { key: Column; title: string }[] = [
-  { key: "name", title: "Drone" },
-  { key: "state", title: "State" },
-  { key: "altitude", title: "Height" },
-  { key: "battery", title: "Battery" },
-  { key: "holder", title: "Control" },
-  { key: "alarm", title: "Alarms" },
+  { key: "name", title: t.overview.drone },
+  { key: "state", title: t.overview.state },
+  { key: "altitude", title: t.overview.height },
+  { key: "battery", title: t.overview.battery },
+  { key: "holder", title: t.overview.control },
+  { key: "alarm", title: t.overview.alarms },
 ];
 
 class Line {
@@ -24,7 +25,7 @@ class Line {
 
   constructor(name: string, open: () => void) {
     const { state, altitude, holder, alarm } = this.cells;
-    const button = h("button", { type: "button", class: "line-name", "aria-label": `Open ${name}` }, name);
+    const button = h("button", { type: "button", class: "line-name", "aria-label": t.overview.openDrone(name) }, name);
     this.element = h("tr", { "data-drone": name, onclick: open }, h("th", { scope: "row" }, button, this.links), state, altitude, h("td", {}, this.battery.element), holder, alarm);
   }
 
@@ -54,7 +55,7 @@ export class DroneTable {
     private readonly changed: () => void,
   ) {
     this.heads = COLUMNS.map(({ key, title }) => h("th", { scope: "col", "data-column": key }, h("button", { type: "button", class: "bare", onclick: () => this.sort(key) }, title)));
-    this.element = h("div", { class: "lines", tabindex: 0, role: "region", "aria-label": "Drones, one in each line" }, h("table", {}, h("thead", {}, h("tr", {}, ...this.heads)), this.body));
+    this.element = h("div", { class: "lines", tabindex: 0, role: "region", "aria-label": t.overview.lines }, h("table", {}, h("thead", {}, h("tr", {}, ...this.heads)), this.body));
     this.mark();
   }
 

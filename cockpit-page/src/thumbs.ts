@@ -1,15 +1,18 @@
 // Two sticks on the screen, for thumbs and mice.
 
-import { h } from "./dom.js";
+import { h, setAttribute, setText } from "./dom.js";
+import { t } from "./language/index.js";
 import type { Sticks } from "./model.js";
-import { CENTRED, deadBand } from "./sticks.js";
+import { settings } from "./settings.js";
+import { CENTRED, deadBand, STICK_MODES } from "./sticks.js";
 
 type Push = (x: number, y: number) => void;
 
 /** One stick: pushes from −1 to 1, right and up positive; back to the centre when it is released. */
-function stick(label: string, push: Push): HTMLElement {
+function stick(push: Push): { pad: HTMLElement; call: (label: string) => void } {
   const knob = h("i", { class: "knob" });
-  const pad = h("div", { class: "thumb", role: "img", "aria-label": label }, knob, h("span", {}, label));
+  const name = h("span", {});
+  const pad = h("div", { class: "thumb", role: "img" }, knob, name);
   const put = (x: number, y: number): void => {
     knob.style.setProperty("translate", `calc(${x} * var(--travel)) calc(${-y} * var(--travel))`);
     push(x, y);
@@ -27,7 +30,17 @@ function stick(label: string, push: Push): HTMLElement {
   });
   pad.addEventListener("pointermove", follow);
   for (const end of ["pointerup", "pointercancel", "lostpointercapture"] as const) pad.addEventListener(end, () => put(0, 0));
-  return pad;
+  const call = (label: string): void => {
+    setText(name, label);
+    setAttribute(pad, "aria-label", label);
+  };
+  return { pad, call };
+}
+
+/** What both sticks do now, by the mode that the person chose. Pure. */
+export function thumbed(mode: keyof typeof STICK_MODES, place: "left" | "right", x: number, y: number): Partial<Sticks> {
+  const axes = STICK_MODES[mode][place];
+  return { [axes.x]: deadBand(-x) + 0, [axes.y]: deadBand(y) }; // to the left is positive
 }
 
 export class Thumbs {
@@ -35,15 +48,26 @@ export class Thumbs {
   private sticks: Sticks = { ...CENTRED };
 
   constructor(push: (sticks: Sticks) => void) {
-    const update = (change: Partial<Sticks>): void => {
-      this.sticks = { ...this.sticks, ...change };
+    const sides = (["left", "right"] as const).map((place) => ({
+      place,
+      ...stick((x, y) => {
+        this.sticks = { ...this.sticks, ...thumbed(settings.get("mode"), place, x, y) };
+        push(this.sticks);
+      }),
+    }));
+    const label = (): void => {
+      this.sticks = { ...CENTRED }; // what a thumb held has another meaning now
       push(this.sticks);
+      for (const { place, call } of sides) {
+        const { x, y } = STICK_MODES[settings.get("mode")][place];
+        call(t.thumbs.label(t.thumbs.axes[y], t.thumbs.axes[x]));
+      }
     };
-    this.element = h(
-      "div",
-      { class: "thumbs" },
-      stick("up · turn", (x, y) => update({ up: deadBand(y), yaw_rate: deadBand(-x) + 0 })),
-      stick("forward · side", (x, y) => update({ forward: deadBand(y), left: deadBand(-x) + 0 })),
-    );
+    this.element = h("div", { class: "thumbs" }, ...sides.map(({ pad }) => pad));
+    label();
+    this.forget = settings.on("mode", label);
   }
+
+  /** To be called when it is not shown any more. */
+  readonly forget: () => void;
 }

@@ -3,6 +3,7 @@
 import { Battery } from "./battery.js";
 import { h, setAttribute, setHidden, setText, setTone } from "./dom.js";
 import { duration } from "./format.js";
+import { t } from "./language/index.js";
 import type { DroneRow } from "./model.js";
 import { describe } from "./row.js";
 import type { Sink, SmallHead, SmallVideo } from "./smallvideo.js";
@@ -15,7 +16,7 @@ const OTHER = 0.15;
 
 /** What this page itself has to do with a drone that is not opened. */
 export type Own = "" | "held" | "asked";
-export const OWN_WORDS: Readonly<Record<Own, string>> = { "": "", held: "This page has control", asked: "Asked for control: open it to answer" };
+export const OWN_WORDS: Readonly<Record<Own, string>> = { "": "", held: t.overview.held, asked: t.overview.asked };
 
 export class Tile implements Sink {
   readonly element: HTMLElement;
@@ -26,7 +27,7 @@ export class Tile implements Sink {
   private readonly hops = [h("i", { class: "dot" }), h("i", { class: "dot" })];
   private readonly links = h("span", { class: "card-links" }, ...this.hops);
   private readonly linkText = h("span", { class: "unseen" });
-  private readonly recording = h("span", { class: "rec", title: "being recorded" }, "REC");
+  private readonly recording = h("span", { class: "rec", title: t.overview.recorded }, t.overview.recordedShort);
   private readonly state = h("span", { class: "tile-state" });
   private readonly holder = h("span", { class: "tile-holder" });
   private readonly alarm = h("span", { class: "tile-alarm" });
@@ -46,7 +47,7 @@ export class Tile implements Sink {
     const top = h("span", { class: "tile-top" }, h("b", {}, name), this.recording, this.links);
     const picture = h("span", { class: "tile-picture" }, this.canvas, this.nothing, top, this.alarm);
     const text = h("span", { class: "tile-text" }, h("span", { class: "tile-line" }, this.state, this.battery.element), this.holder);
-    this.main = h("button", { type: "button", class: "tile-main", onclick: open }, h("span", { class: "unseen" }, "Open"), picture, text, this.linkText);
+    this.main = h("button", { type: "button", class: "tile-main", onclick: open }, h("span", { class: "unseen" }, t.overview.open), picture, text, this.linkText);
     this.element = h("li", { class: "tile", "data-drone": name }, this.main);
   }
 
@@ -104,7 +105,7 @@ export class Tile implements Sink {
     const age_s = this.shown && this.shown.age_s + (now_ms - this.shown.received_ms) / 1000;
     const stale = age_s !== null && age_s > STALE_S && !this.over;
     setAttribute(this.element, "data-stale", String(stale));
-    setText(this.nothing, this.camera === "" ? "No camera" : age_s === null ? "No picture yet" : stale ? `Picture ${duration(age_s)} old` : "");
+    setText(this.nothing, this.camera === "" ? t.overview.noCamera : age_s === null ? t.overview.noPicture : stale ? t.overview.oldPicture(duration(age_s)) : "");
   }
 
   close(): void {

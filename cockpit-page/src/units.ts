@@ -1,6 +1,6 @@
 // Lengths and speeds as the person wants to read them. Everything else of the page is in SI units.
 
-import { type Known } from "./format.js";
+import { figure, type Known } from "./format.js";
 import { settings, type Values } from "./settings.js";
 
 const FEET = 1 / 0.3048;
@@ -20,3 +20,11 @@ export const unit = (of: "length" | "speed"): Unit => UNITS[settings.get("units"
 
 /** A length [m] or speed [m/s] in the person's unit; what is not known stays so. */
 export const inUnit = (of: "length" | "speed", value: Known): Known => (value === null || value === undefined ? value : value * unit(of).factor);
+
+const textOf = (of: "length" | "speed", value: Known, decimals: number): string => (value === null || value === undefined ? "–" : `${figure(inUnit(of, value), decimals)} ${unit(of).name}`);
+
+/** A length [m] with the person's unit; a dash for what is not known. */
+export const lengthText = (metres: Known, decimals: number): string => textOf("length", metres, decimals);
+
+/** A speed [m/s], as above. */
+export const speedText = (speed_m_s: Known, decimals: number): string => textOf("speed", speed_m_s, decimals);

@@ -1,6 +1,7 @@
 // Parameters' values as people write and read them. Pure.
 
 import { plain } from "./format.js";
+import { t } from "./language/index.js";
 import type { Parameter, Value } from "./model.js";
 
 export function valueText(value: Value | null): string {
@@ -14,14 +15,14 @@ export function parse(parameter: Pick<Parameter, "type">, text: string): { value
   const written = text.trim();
   if (parameter.type === "text") return { value: text };
   if (parameter.type === "bool") {
-    return written === "true" || written === "false" ? { value: written === "true" } : { problem: "true or false is needed" };
+    return written === "true" || written === "false" ? { value: written === "true" } : { problem: t.parameters.boolNeeded };
   }
   const parts = parameter.type === "vector" ? written.split(/\s*,\s*|\s+/) : [written];
   const numbers = parts.map((one) => (one === "" ? Number.NaN : Number(one)));
-  if (!numbers.every(Number.isFinite)) return { problem: parameter.type === "vector" ? "numbers with commas between are needed" : "a number is needed" };
+  if (!numbers.every(Number.isFinite)) return { problem: parameter.type === "vector" ? t.parameters.numbersNeeded : t.parameters.numberNeeded };
   if (parameter.type === "vector") return { value: numbers };
   const value = numbers[0] as number;
-  if (parameter.type === "int" && !Number.isInteger(value)) return { problem: "a whole number is needed" };
+  if (parameter.type === "int" && !Number.isInteger(value)) return { problem: t.parameters.wholeNeeded };
   return { value };
 }
 

@@ -4,6 +4,7 @@ import type { CameraControls } from "./cameracontrols.js";
 import { fit, h, setAttribute, setHidden, setText, setTone } from "./dom.js";
 import { contain, draw } from "./drawing.js";
 import { duration } from "./format.js";
+import { t } from "./language/index.js";
 import type { Camera, Drawing, FrameHead } from "./model.js";
 import { NewestFrame, type Received, unpack } from "./newest.js";
 import { LastingSocket } from "./socket.js";
@@ -31,7 +32,7 @@ export class VideoView {
   private readonly age = h("span");
   private readonly ageChip = h("p", { class: "chip age", "data-tone": "quiet" }, h("i", { class: "dot" }), this.age);
   private readonly rate = h("p", { class: "chip rate" });
-  private readonly nothing = h("p", { class: "nothing" }, "Waiting for the first picture…");
+  private readonly nothing = h("p", { class: "nothing" }, t.video.waiting);
   private readonly drawings = new Map<string, Drawing>();
   private socket: LastingSocket | null = null;
   private frames: NewestFrame<ImageBitmap> | null = null;
@@ -43,7 +44,7 @@ export class VideoView {
     readonly drone: string,
     readonly camera: Camera,
   ) {
-    this.canvas = h("canvas", { class: "video", role: "img", "aria-label": `Camera ${camera.name}: no picture yet`, width: camera.width, height: camera.height });
+    this.canvas = h("canvas", { class: "video", role: "img", "aria-label": t.video.none(camera.name), width: camera.width, height: camera.height });
     this.element = h("figure", { class: "camera", "data-camera": camera.name }, this.canvas, this.sheet, this.ageChip, this.rate, this.nothing);
     this.tools = new VideoTools(this);
     // A page that nobody sees asks for no pictures.
@@ -70,16 +71,16 @@ export class VideoView {
     if (age_s === null || this.shown === null) return;
     const stale = age_s > STALE_S && !this.still;
     setTone(this.ageChip, this.still ? "quiet" : stale ? "bad" : age_s > LATE_S ? "warn" : "ok");
-    setText(this.age, this.still || (stale ? `${duration(age_s)} old` : `${(age_s * 1000).toFixed(0)} ms`));
+    setText(this.age, this.still || (stale ? t.video.age(duration(age_s)) : t.video.milliseconds((age_s * 1000).toFixed(0))));
     setAttribute(this.element, "data-age-ms", (age_s * 1000).toFixed(0));
     setAttribute(this.element, "data-seq", String(this.shown.seq));
     setAttribute(this.element, "data-captured", this.shown.captured_ns);
     setAttribute(this.element, "data-stale", String(stale));
     setHidden(this.nothing, !stale);
-    setText(this.nothing, "No new picture");
+    setText(this.nothing, t.video.noNew);
     const { width, height } = this.shown;
-    setText(this.rate, `${this.camera.name} · ${width} × ${height} · ${((this.arrivals.length * 1000) / RATE_MS).toFixed(0)} fps`);
-    setAttribute(this.canvas, "aria-label", `Camera ${this.camera.name}: ${stale ? "no new picture" : "live picture"}`);
+    setText(this.rate, t.video.rate(this.camera.name, width, height, ((this.arrivals.length * 1000) / RATE_MS).toFixed(0)));
+    setAttribute(this.canvas, "aria-label", t.video.showing(this.camera.name, stale));
   }
 
   redraw(): void {
@@ -144,10 +145,10 @@ export class VideoView {
 /** The cameras of a drone: each can be shown and hidden, the first one is. */
 export class Stage {
   readonly element: HTMLElement;
-  private readonly choices = h("div", { class: "choices", role: "group", "aria-label": "Cameras" });
+  private readonly choices = h("div", { class: "choices", role: "group", "aria-label": t.video.cameras });
   private readonly pictures = h("div", { class: "pictures" });
-  private readonly overlay = h("button", { type: "button", class: "small", "aria-pressed": "true", onclick: () => this.toggle() }, "Overlay");
-  private readonly nothing = h("p", { class: "empty" }, "No camera");
+  private readonly overlay = h("button", { type: "button", class: "small", "aria-pressed": "true", onclick: () => this.toggle() }, t.video.overlay);
+  private readonly nothing = h("p", { class: "empty" }, t.video.noCamera);
   private readonly views = new Map<string, VideoView>();
   private known = "";
   private told_ms = 0;
@@ -157,7 +158,7 @@ export class Stage {
     private readonly controls: CameraControls,
   ) {
     const head = h("header", { class: "deck-head" }, this.choices, h("div", { class: "choices" }, this.overlay, controls.button));
-    this.element = h("section", { class: "stage", "aria-label": "Cameras" }, head, this.pictures, controls.element);
+    this.element = h("section", { class: "stage", "aria-label": t.video.cameras }, head, this.pictures, controls.element);
     this.pictures.append(this.nothing);
   }
 

@@ -3,10 +3,12 @@
 // Choosing moves nothing: where it is, how far and how long is shown first, and what speaks against it.
 
 import { h, setDisabled, setHidden, setText, setTone } from "./dom.js";
-import { figure, lasting } from "./format.js";
+import { lasting } from "./format.js";
+import { t } from "./language/index.js";
 import { flag, label } from "./maplayers.js";
 import type { Ink, MapTool, Project, Spot } from "./maptool.js";
 import type { Vector } from "./model.js";
+import { lengthText } from "./units.js";
 
 /** Greatest speeds of the drone [m/s]. */
 export interface Speeds {
@@ -42,10 +44,10 @@ export interface WaypointHost {
 
 export class WaypointTool implements MapTool {
   readonly element: HTMLElement;
-  readonly hint = "Press a place on the map to choose it. Nothing flies before “Fly there”.";
-  private readonly inputs = ["x", "y", "z"].map((name) => h("input", { type: "number", step: "0.1", "aria-label": `Waypoint ${name} in metres`, placeholder: name, oninput: () => this.typed() }));
-  private readonly go = h("button", { type: "submit", class: "small primary" }, "Fly there");
-  private readonly clear = h("button", { type: "button", class: "small", "aria-label": "Forget the waypoint", hidden: true, onclick: () => this.choose(null) }, "×");
+  readonly hint = t.waypoint.hint;
+  private readonly inputs = ["x", "y", "z"].map((name) => h("input", { type: "number", step: "0.1", "aria-label": t.waypoint.inMetres(name), placeholder: `${name} m`, oninput: () => this.typed() }));
+  private readonly go = h("button", { type: "submit", class: "small primary" }, t.waypoint.fly);
+  private readonly clear = h("button", { type: "button", class: "small", "aria-label": t.waypoint.forget, hidden: true, onclick: () => this.choose(null) }, "×");
   private readonly preview = h("p", { class: "note preview", role: "status", hidden: true });
   private chosen: Vector | null = null;
   private problem = "";
@@ -54,7 +56,7 @@ export class WaypointTool implements MapTool {
   private can = false;
 
   constructor(private readonly host: WaypointHost) {
-    const form = h("form", { class: "waypoint", "aria-label": "Waypoint", novalidate: true, onsubmit: (event: Event) => this.submit(event) }, ...this.inputs, this.go, this.clear);
+    const form = h("form", { class: "waypoint", "aria-label": t.waypoint.label, novalidate: true, onsubmit: (event: Event) => this.submit(event) }, ...this.inputs, this.go, this.clear);
     this.element = h("div", {}, form, this.preview);
   }
 
@@ -82,7 +84,7 @@ export class WaypointTool implements MapTool {
       pen.setLineDash([]);
     }
     flag({ pen, ink, at: project }, chosen, tone === "bad" ? "×" : "?", tone);
-    label({ pen, ink }, x + 13, y, `${figure(chosen[2], 1)} m high`);
+    label({ pen, ink }, x + 13, y, t.waypoint.high(lengthText(chosen[2], 1)));
     this.show();
   }
 
@@ -148,10 +150,10 @@ export class WaypointTool implements MapTool {
     if (!own || !place) return;
     const { distance_m, time_s } = leg(own, place, this.host.speeds());
     const climb = place[2] - own[2];
-    const height = Math.abs(climb) < 0.1 ? "at this height" : `${figure(Math.abs(climb), 1)} m ${climb > 0 ? "up" : "down"}`;
-    const time = time_s === null ? "" : ` · about ${lasting(Math.max(1, time_s))}`;
+    const height = Math.abs(climb) < 0.1 ? t.waypoint.same : t.waypoint.climb(lengthText(Math.abs(climb), 1), climb > 0);
+    const time = time_s === null ? "" : t.waypoint.time(lasting(Math.max(1, time_s)));
     setTone(this.preview, problem ? "bad" : "quiet");
-    setText(this.preview, problem ? `Not there: ${problem}` : `${figure(distance_m, 1)} m straight, ${height}${time}`);
+    setText(this.preview, problem ? t.waypoint.not(problem) : t.waypoint.way(lengthText(distance_m, 1), height, time));
   }
 
   private submit(event: Event): void {

@@ -1,9 +1,12 @@
 // The map's lowest layers: the room and what stands in it, the safety box, no-fly zones, and what the cameras see.
 
+import { short } from "./format.js";
 import { corners, hull, type Point, rayEnd, turned } from "./geometry.js";
+import { t } from "./language/index.js";
 import { type Chart, label } from "./maplayers.js";
 import type { Vector } from "./model.js";
 import type { CameraView, SafetyBox, World, Zone } from "./surroundings.js";
+import { inUnit, unit } from "./units.js";
 import type { Body } from "./world.js";
 
 const SEEN_M = 3; // how far a camera's field of view is drawn
@@ -117,9 +120,9 @@ function drawBox(chart: Chart, box: SafetyBox): void {
   pen.lineWidth = 2;
   pen.stroke();
   pen.setLineDash([]);
-  const heights = [box.low[2], box.high[2]].map((value) => (value === null ? "…" : String(value))).join(" to ");
+  const heights = [box.low[2], box.high[2]].map((value) => (value === null ? "…" : short(inUnit("length", value))));
   const [x, y] = at([west, north]);
-  if (box.low[0] !== null && box.high[1] !== null) label(chart, x + 4, y - 8, `safety box, ${heights} m`, "ok");
+  if (box.low[0] !== null && box.high[1] !== null) label(chart, x + 4, y - 8, t.map.box(heights[0] as string, heights[1] as string, unit("length").name), "ok");
 }
 
 function outline({ pen, at }: Pick<Chart, "pen" | "at">, points: readonly Point[]): void {

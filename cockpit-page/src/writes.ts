@@ -1,5 +1,7 @@
 // Parameters that are written one after the other: each waits for the drone's answer to the one before.
 
+import { t } from "./language/index.js";
+
 const ANSWER_MS = 4000;
 
 export class Writes {
@@ -32,7 +34,7 @@ export class Writes {
 
   private one(name: string, value: string | number): Promise<string> {
     return new Promise((resolve) => {
-      const late = setTimeout(() => this.under?.done("no answer from the drone"), ANSWER_MS);
+      const late = setTimeout(() => this.under?.done(t.parameters.noAnswer), ANSWER_MS);
       const done = (why: string): void => {
         clearTimeout(late);
         this.under = null;

@@ -1,5 +1,6 @@
 // Safety box and no-fly zones as they are edited: their text, their fields, their corners. Pure.
 
+import { t } from "./language/index.js";
 import type { Vector } from "./model.js";
 import type { SafetyBox, World, Zone } from "./surroundings.js";
 
@@ -108,12 +109,14 @@ export function zoneAt(zones: readonly Zone[], [x, y]: readonly [number, number]
   return Number.isFinite(least) ? sizes.indexOf(least) : null;
 }
 
+/** What the ends of each axis are called: x east, y north, z up. */
+const WALLS = [[t.zones.west, t.zones.east], [t.zones.south, t.zones.north], [t.zones.bottom, t.zones.top]] as const;
+
 /** Every number of it. */
 export function fields(bounds: Bounds, edited: Edited): Field[] {
   if (edited === "box") {
     const box = bounds.box ?? { low: [null, null, null], high: [null, null, null] };
-    const names = [["west", "east"], ["south", "north"], ["bottom", "top"]] as const;
-    return names.flatMap(([low, high], axis) => [
+    return WALLS.flatMap(([low, high], axis) => [
       { label: low, value: box.low[axis] ?? null, with: (value: number | null) => ({ ...bounds, box: closed(walled(box, "low", axis, value)) }) },
       { label: high, value: box.high[axis] ?? null, with: (value: number | null) => ({ ...bounds, box: closed(walled(box, "high", axis, value)) }) },
     ]);
@@ -124,16 +127,15 @@ export function fields(bounds: Bounds, edited: Edited): Field[] {
   if (zone.kind === "cylinder") {
     const { centre, radius, low, high } = zone;
     return [
-      { label: "centre east", value: centre[0], with: (value) => put({ ...zone, centre: [value ?? centre[0], centre[1]] }) },
-      { label: "centre north", value: centre[1], with: (value) => put({ ...zone, centre: [centre[0], value ?? centre[1]] }) },
-      { label: "radius", value: radius, with: (value) => put({ ...zone, radius: value ?? radius }) },
-      { label: "bottom", value: low, with: (value) => put({ ...zone, low: value ?? low }) },
-      { label: "top", value: high, with: (value) => put({ ...zone, high: value ?? high }) },
+      { label: t.zones.centreEast, value: centre[0], with: (value) => put({ ...zone, centre: [value ?? centre[0], centre[1]] }) },
+      { label: t.zones.centreNorth, value: centre[1], with: (value) => put({ ...zone, centre: [centre[0], value ?? centre[1]] }) },
+      { label: t.zones.radius, value: radius, with: (value) => put({ ...zone, radius: value ?? radius }) },
+      { label: t.zones.bottom, value: low, with: (value) => put({ ...zone, low: value ?? low }) },
+      { label: t.zones.top, value: high, with: (value) => put({ ...zone, high: value ?? high }) },
     ];
   }
-  const names = [["west", "east"], ["south", "north"], ["bottom", "top"]] as const;
   const set = (end: "low" | "high", axis: number, value: number | null): Bounds => put({ ...zone, [end]: zone[end].map((one, place) => (place === axis ? (value ?? one) : one)) as Vector });
-  return names.flatMap(([low, high], axis) => [
+  return WALLS.flatMap(([low, high], axis) => [
     { label: low, value: zone.low[axis] ?? null, with: (value: number | null) => set("low", axis, value) },
     { label: high, value: zone.high[axis] ?? null, with: (value: number | null) => set("high", axis, value) },
   ]);

@@ -3,6 +3,7 @@
 // Each change is written to the drone at once, as parameters; one that is refused leaves what was, and shows why.
 
 import { h, setDisabled, setText, setTone } from "./dom.js";
+import { t } from "./language/index.js";
 import type { Ink, MapTool, Project, Spot } from "./maptool.js";
 import type { Zone } from "./surroundings.js";
 import { zoneOutline } from "./worldlayer.js";
@@ -22,8 +23,8 @@ export interface ZoneHost {
 
 export class ZoneTool implements MapTool {
   readonly element: HTMLElement;
-  private readonly list = h("select", { "aria-label": "Zone", onchange: () => this.edit(this.list.value === "box" ? "box" : Number(this.list.value)) });
-  private readonly numbers = h("div", { class: "zone-fields", role: "group", "aria-label": "Edges in metres" });
+  private readonly list = h("select", { "aria-label": t.zones.zone, onchange: () => this.edit(this.list.value === "box" ? "box" : Number(this.list.value)) });
+  private readonly numbers = h("div", { class: "zone-fields", role: "group", "aria-label": t.zones.edges });
   private readonly answer = h("p", { class: "answer", role: "status" });
   private readonly buttons: HTMLButtonElement[];
   private edited: Edited = "box";
@@ -37,15 +38,15 @@ export class ZoneTool implements MapTool {
 
   constructor(private readonly host: ZoneHost) {
     const button = (text: string, act: () => void): HTMLButtonElement => h("button", { type: "button", class: "small", onclick: act }, text);
-    this.buttons = [button("Add box", () => this.add("box")), button("Add cylinder", () => this.add("cylinder")), button("Delete", () => this.remove())];
+    this.buttons = [button(t.zones.addBox, () => this.add("box")), button(t.zones.addCylinder, () => this.add("cylinder")), button(t.zones.delete, () => this.remove())];
     this.element = h("div", { class: "zones" }, h("div", { class: "zone-row" }, this.list, ...this.buttons), this.numbers, this.answer);
     this.show();
   }
 
   get hint(): string {
-    if (!this.adding) return "Drag a corner or the centre; press a zone to choose it.";
-    if (this.adding.kind === "cylinder") return this.adding.from ? "Now a place on its edge." : "Press its centre and drag to its edge.";
-    return this.adding.from ? "Now the opposite corner." : "Press one corner and drag to the opposite one.";
+    if (!this.adding) return t.zones.hint;
+    if (this.adding.kind === "cylinder") return this.adding.from ? t.zones.nowEdge : t.zones.pressCentre;
+    return this.adding.from ? t.zones.nowCorner : t.zones.pressCorner;
   }
 
   /** Whether zones can be written now. */
@@ -153,7 +154,7 @@ export class ZoneTool implements MapTool {
 
   private add(kind: Zone["kind"]): void {
     if (this.host.bounds().zones.length >= MAX_ZONES) {
-      this.say(`at most ${MAX_ZONES} zones are possible`, "bad");
+      this.say(t.zones.tooMany(MAX_ZONES), "bad");
       return;
     }
     this.edit(this.edited);
@@ -198,7 +199,7 @@ export class ZoneTool implements MapTool {
       this.draft = null; // what is in force is shown again, also in the field that was written
       this.shown = "";
     }
-    this.say(why ? `Refused: ${why}` : "written", why ? "bad" : "ok");
+    this.say(why ? t.zones.refused(why) : t.parameters.written, why ? "bad" : "ok");
     this.host.reload();
     this.show();
   }
@@ -216,16 +217,16 @@ export class ZoneTool implements MapTool {
     if (state === this.shown) return;
     this.shown = state;
     const option = (value: string, text: string): HTMLElement => h("option", { value }, text);
-    this.list.replaceChildren(option("box", bounds.box ? "Safety box" : "Safety box: none"), ...bounds.zones.map((zone, number) => option(String(number), `Z${number + 1}, ${zone.kind}`)));
+    this.list.replaceChildren(option("box", bounds.box ? t.zones.box : t.zones.noBox), ...bounds.zones.map((zone, number) => option(String(number), t.zones.named(number + 1, t.zones.kinds[zone.kind]))));
     this.list.value = String(this.edited);
     for (const button of this.buttons) setDisabled(button, !this.can);
     const has = this.edited === "box" ? bounds.box !== null : bounds.zones[this.edited] !== undefined;
     setDisabled(this.buttons[2] as HTMLButtonElement, !this.can || !has);
     this.numbers.replaceChildren(
       ...fields(bounds, this.edited).map(({ label, value, with: changed }) => {
-        const input = h("input", { type: "number", step: "0.1", value: value ?? "", placeholder: "none", "aria-label": `${label} in metres`, disabled: !this.can });
+        const input = h("input", { type: "number", step: "0.1", value: value ?? "", placeholder: t.zones.none, "aria-label": t.zones.inMetres(label), disabled: !this.can });
         input.addEventListener("change", () => void this.commit(changed(input.value === "" ? null : Number(input.value))));
-        return h("label", {}, h("span", {}, label), input);
+        return h("label", {}, h("span", {}, `${label} m`), input);
       }),
     );
   }

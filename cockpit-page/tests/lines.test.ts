@@ -264,7 +264,7 @@ test("a page that has no answer for a second sends nothing, and says so on the c
   pilot.act("takeoff");
   pilot.steer(FORWARD);
   assert.deepEqual(doings(sent.slice(before)), []);
-  assert.equal(pilot.result("takeoff")?.fate, "not sent");
+  assert.equal(pilot.result("takeoff")?.fate, "not_sent");
   assert.match(reported.at(-1) ?? "", /no answer from the cockpit for 1\.5 s/);
 });
 
@@ -277,7 +277,7 @@ test("what left and was never answered is shown as that, not as sent", () => {
     at(ms);
     pilot.steer(CENTRED);
   }
-  assert.equal(pilot.result("land")?.fate, "no answer");
+  assert.equal(pilot.result("land")?.fate, "no_answer");
 });
 
 test("an emergency stop needs no control, stays pending for two seconds, and goes when the link is back by then", () => {
@@ -298,7 +298,7 @@ test("an emergency stop that did not go within two seconds never goes, and is sh
   pilot.act("stop");
   at(2100);
   pilot.steer(CENTRED);
-  assert.equal(pilot.result("stop")?.fate, "not sent");
+  assert.equal(pilot.result("stop")?.fate, "not_sent");
   assert.match(reported.at(-1) ?? "", /stop: not sent/);
   live();
   pilot.steer(CENTRED);

@@ -92,7 +92,7 @@ def test_keyboard_flight(deck: Deck) -> None:
         page.page.keyboard.down("w")
         page.until(lambda: (drone.feedback().velocity_m_s or (0,))[0] > 0.4, "it flies forward")
         page.until(
-            lambda: float(page.says('[data-figure="Speed"]').replace("−", "-")) > 0.4, "the page shows its speed"
+            lambda: float(page.says('[data-figure="speed"]').replace("−", "-")) > 0.4, "the page shows its speed"
         )
         page.wait_for_text(".command", "forward 0.80")
         page.page.keyboard.up("w")

@@ -61,12 +61,12 @@ def test_a_take_off_pressed_in_a_stall_does_not_happen_when_the_link_returns(dec
         with stopped(cockpit.pid):
             page.press("t")
             page.until(lambda: fate(page, "Take off") == "pending", "it is shown as pending")
-            page.until(lambda: fate(page, "Take off") == "no answer", "and then as not answered")
+            page.until(lambda: fate(page, "Take off") == "no_answer", "and then as not answered")
             page.press("t")
-            page.until(lambda: fate(page, "Take off") == "not sent", "it is not even sent any more")
+            page.until(lambda: fate(page, "Take off") == "not_sent", "it is not even sent any more")
             page.wait_for_text(".notice", "no answer from the cockpit for")
         page.until(lambda: page.pane.get_attribute("data-old") == "false", "the cockpit is heard again")
-        page.until(lambda: fate(page, "Take off") in ("refused", "not sent"), "what came late was refused")
+        page.until(lambda: fate(page, "Take off") in ("refused", "not_sent"), "what came late was refused")
         for _ in range(20):
             assert drone.next_feedback().state is FlightState.LANDED
 
@@ -85,7 +85,7 @@ def test_an_emergency_stop_held_in_a_stall_is_pending_for_two_seconds_and_never_
             with page.holding("Control", "Enter"):
                 page.until(lambda: stop.get_attribute("data-fate") == "pending", "it is shown as pending")
             pressed_s = time.monotonic()
-            page.until(lambda: stop.get_attribute("data-fate") in ("no answer", "not sent"), "it is given up")
+            page.until(lambda: stop.get_attribute("data-fate") in ("no_answer", "not_sent"), "it is given up")
             assert 1.0 < time.monotonic() - pressed_s < 8.0
         page.until(lambda: page.pane.get_attribute("data-old") == "false", "the cockpit is heard again")
         page.until(lambda: stop.get_attribute("data-fate") == "refused", "it was refused")

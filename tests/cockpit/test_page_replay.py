@@ -97,7 +97,7 @@ def test_a_flight_is_recorded_kept_in_order_and_replayed(deck: Deck, tmp_path: P
                 return isinstance(at_s, float) and abs(at_s - position(page)) < 0.001
 
             page.until(one_instant, "picture and state are of one instant")
-            heights.append(page.says('[data-figure="Altitude"]'))
+            heights.append(page.says('[data-figure="altitude"]'))
         assert heights[0] != heights[1]
         assert page.says(".chip.age") == "paused"
     before = position(page)

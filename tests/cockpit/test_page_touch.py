@@ -189,5 +189,5 @@ def test_an_alarm_moves_nothing_is_felt_and_acknowledged(deck: Deck) -> None:
         page.until(lambda: page.page.evaluate("felt.length") >= 3, "felt again and again")
         drone.land()
     page.page.get_by_role("button", name="Alarms' sound").tap()
-    assert page.page.evaluate("localStorage.getItem('skyloop-alarms-muted')") == "true"
+    assert page.page.evaluate("localStorage.getItem('skyloop-sound')") == "off"
     assert page.problems == []

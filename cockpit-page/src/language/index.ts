@@ -15,4 +15,7 @@ const LANGUAGES: Readonly<Record<string, () => Language>> = { en: () => en, pseu
 /** What people can choose, each by its own name. */
 export const LANGUAGE_NAMES: Readonly<Record<string, string>> = { en: "English" };
 
+/** A name that the cockpit sends, in words: as it is where the language has none for it. */
+export const named = (names: Readonly<Record<string, string>>, name: string): string => names[name] ?? name.replaceAll("_", " ");
+
 export const t: Language = (LANGUAGES[settings.get("language")] ?? (() => en))();
