@@ -1,8 +1,9 @@
-"""``skyloop land`` and ``skyloop stop``, with real proxies: of a drone of one's own, of others, and of all."""
+"""``skyloop land``, ``return`` and ``stop``, with real proxies: of a drone of one's own, of others, and of all."""
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 
 import pytest
@@ -53,6 +54,35 @@ def test_a_drone_of_another_is_left_to_it_unless_the_priority_is_higher(run: Run
         assert drone.feedback().state.airborne
         assert run("land", "alpha", "--priority", "0") == (0, "alpha: landed\n", "")
         assert not drone.feedback().state.airborne
+
+
+@pytest.mark.usefixtures("alpha")
+def test_a_drone_returns_to_its_start(run: Run) -> None:
+    assert run("return", "alpha") == (0, "alpha: landed already\n", "")
+    with skyloop.connect("alpha", name="the pilot", on_exit="hover") as drone:
+        drone.takeoff()
+        drone.go_to(x=1.5, y=0.0, z=1.0)
+        ended = run("return", "alpha")
+        assert (ended.code, "NOT returned: the pilot holds the authority over alpha" in ended.err) == (1, True)
+        start, there = drone.start_position, drone.feedback().position_m
+        assert start is not None
+        assert there is not None
+        assert math.dist(start[:2], there[:2]) > 1.0
+        assert run("return", "alpha", "--height", "1.5", "--priority", "0") == (0, "alpha: landed at its start\n", "")
+        there = drone.feedback().position_m
+        assert there is not None
+        assert math.dist(start[:2], there[:2]) < 0.6
+        eventually(lambda: drone.authority.state == "held", "the authority comes back")
+        drone.takeoff()
+        drone.go_to(x=1.5, y=0.0, z=1.0)
+        drone.config["safety.zones"] = "cylinder 0.8 0 0.2 0 3"
+        drone.release_authority()
+        ended = run("return", "alpha")
+        assert ended.code == 1
+        assert "alpha: NOT returned: skyloop return: return_to_start refused: a no-fly zone is in" in ended.err
+        drone.request_authority(wait_s=10.0)
+        drone.config["safety.zones"] = ""
+        drone.land()
 
 
 def test_all_land_and_all_stop(run: Run, swarm: Process, alpha: Process) -> None:

@@ -51,6 +51,8 @@ from skyloop.messages import (
     Request,
     RequestAuthority,
     ResetEmergency,
+    ReturnPhase,
+    ReturnToStart,
     Role,
     Sample,
     SetParameter,
@@ -95,6 +97,8 @@ SAMPLES: dict[str, Sample] = {
     "applied": Applied(
         8, 7, 2, 1_000_000_008, 1_000_090_008, Velocity(9.0, 0.0, 0.0, 0.0), Velocity(1.0, 0.0, 0.0, 0.0)
     ),
+    "command-return": Command(11, 7, 11, 1_000_000_011, ReturnToStart(2.5, False)),
+    "command-return-minimal": Command(12, 7, 12, 1_000_000_012, ReturnToStart()),
     "feedback": Feedback(
         captured_ns=2_000_000_000,
         state=FlightState.FLYING,
@@ -120,6 +124,8 @@ SAMPLES: dict[str, Sample] = {
         link_reason="no heartbeat",
         link_remedy="plug the vehicle in",
         others="the vehicle is in RTL, which was not chosen here",
+        start_position_m=(0.5, -0.5, 0.125),
+        return_phase=ReturnPhase.FLYING,
     ),
     "feedback-minimal": Feedback(captured_ns=1),
     "frame": FrameHeader("front", 12, 3_000_000_000, 3_000_500_000, 320, 240, Encoding.BGR8, 230_400, INTRINSICS),

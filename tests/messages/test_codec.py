@@ -29,6 +29,8 @@ from skyloop.messages import (
     Reply,
     Request,
     RequestAuthority,
+    ReturnPhase,
+    ReturnToStart,
     Sample,
     Velocity,
     Welcome,
@@ -66,7 +68,9 @@ def test_a_camera_told_by_an_older_proxy_has_no_stream() -> None:
 @pytest.mark.parametrize("name", ["feedback", "feedback-minimal"])
 def test_feedback_of_an_older_proxy_has_no_reason_of_its_link_and_nobody_else_who_flies(name: str) -> None:
     older = decode((PACKETS / "older" / f"{name}.bin").read_bytes())
-    assert older == msgspec.structs.replace(SAMPLES[name], link_reason="", link_remedy="", others=None)
+    before = {"link_reason": "", "link_remedy": "", "others": None}
+    before |= {"start_position_m": None, "return_phase": ReturnPhase.NONE}
+    assert older == msgspec.structs.replace(SAMPLES[name], **before)
 
 
 def test_an_older_proxy_does_not_tell_its_clock() -> None:
@@ -98,6 +102,7 @@ def without_software(welcome: AnyReply) -> Reply:
         (Position(0.0, 0.0, 1e6), "z is 1e"),
         (Position(0.0, 0.0, 1.0, yaw=1e4), "yaw is 10000 rad and must be from -1000 to 1000"),
         (Position(0.0, 0.0, 1.0, speed=0.0), "speed is 0 m/s and must be more than 0"),
+        (ReturnToStart(-0.5), "height is -0.5 m above the start and must be from 0 to 100000 m"),
         (Position(0.0, 0.0, 1.0, turn_rate=-1.0), "turn_rate is -1 rad/s and must be more than 0"),
     ],
 )

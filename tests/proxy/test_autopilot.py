@@ -78,10 +78,10 @@ def taken_off(mass: PointMass) -> Autopilot:
 @pytest.mark.parametrize(
     ("native", "added"),
     [
-        ({"attitude"}, {"takeoff", "hover", "land", "velocity", "position"}),
-        ({"velocity"}, {"takeoff", "hover", "land", "position"}),
-        ({"takeoff", "land", "hover", "attitude"}, {"velocity", "position"}),
-        ({"takeoff", "land", "hover", "velocity", "position"}, set()),
+        ({"attitude"}, {"takeoff", "hover", "land", "velocity", "position", "return_to_start"}),
+        ({"velocity"}, {"takeoff", "hover", "land", "position", "return_to_start"}),
+        ({"takeoff", "land", "hover", "attitude"}, {"velocity", "position", "return_to_start"}),
+        ({"takeoff", "land", "hover", "velocity", "position"}, {"return_to_start"}),
         ({"takeoff", "land"}, set()),
         (set(), set()),
     ],

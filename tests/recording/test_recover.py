@@ -20,10 +20,11 @@ Log = Callable[..., Ended]
 
 @pytest.fixture
 def cut(tmp_path: Path) -> Path:
-    """Two thirds of a recording."""
+    """Two thirds of a recording, up to the middle of a chunk."""
     path = write_flight(tmp_path / "flight.mcap", Plan(chunk_size=4096))
-    last = Recording.open(path).found.pieces[-1]
-    path.write_bytes(path.read_bytes()[: (last.offset + last.size) * 2 // 3])
+    pieces = Recording.open(path).found.pieces
+    last = pieces[len(pieces) * 2 // 3]
+    path.write_bytes(path.read_bytes()[: last.offset + last.size // 2])
     return path
 
 

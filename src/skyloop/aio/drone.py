@@ -160,6 +160,11 @@ class Drone:
         """Largest error of ``clock_offset_ns`` [ns]; see :attr:`skyloop.Drone.clock_uncertainty_ns`."""
         return self.sync.clock_uncertainty_ns
 
+    @property
+    def start_position(self) -> Vector | None:
+        """Where the vehicle took off last, in world axes [m]; see :attr:`skyloop.Drone.start_position`."""
+        return self.sync.start_position
+
     def age_s(self, sample: Feedback | client.Frame) -> float:
         """Return the time since the sample's capture [s], within ``clock_uncertainty_ns``."""
         return self.sync.age_s(sample)
@@ -240,6 +245,17 @@ class Drone:
                 tolerance_rad=tolerance_rad,
             )
         )
+
+    async def return_to_start(
+        self,
+        height_m: float | None = None,
+        *,
+        land: bool | None = None,
+        wait: bool = True,
+        timeout_s: float = 180.0,
+    ) -> None:
+        """Fly back to where it took off, and land there or hover; see :meth:`skyloop.Drone.return_to_start`."""
+        await in_thread(lambda: self.sync.return_to_start(height_m, land=land, wait=wait, timeout_s=timeout_s))
 
     def attitude(self, *, roll: float = 0.0, pitch: float = 0.0, climb: float = 0.0, yaw_rate: float = 0.0) -> bool:
         """Hold an attitude with a climb rate.

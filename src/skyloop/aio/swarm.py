@@ -147,6 +147,17 @@ class Swarm:
             lambda: self.sync.go_to(places, speed=speed, wait=wait, timeout_s=timeout_s, tolerance_m=tolerance_m)
         )
 
+    async def return_to_start(
+        self,
+        height_m: float | None = None,
+        *,
+        land: bool | None = None,
+        wait: bool = True,
+        timeout_s: float = 180.0,
+    ) -> None:
+        """Fly all active drones back to where each took off; see :meth:`skyloop.Swarm.return_to_start`."""
+        await in_thread(lambda: self.sync.return_to_start(height_m, land=land, wait=wait, timeout_s=timeout_s))
+
     async def hover(self) -> dict[str, bool]:
         """Stop and hold the position, with all active drones."""
         return await in_thread(self.sync.hover)

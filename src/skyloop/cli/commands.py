@@ -52,6 +52,9 @@ COMMANDS: Final = {
         Task.FLY, "teleop", "teleop", "Fly a drone by the keys of the terminal", "teleop alpha --speed 0.5"
     ),
     "land": Entry(Task.FLY, "ending", "land", "Land a drone, or --all of them", "land alpha"),
+    "return": Entry(
+        Task.FLY, "ending", "return_to_start", "Fly a drone, or --all, back to its start and land", "return alpha"
+    ),
     "stop": Entry(Task.FLY, "ending", "stop", "Emergency stop: cut a drone's motors, or --all", "stop alpha"),
     "preflight": Entry(
         Task.FLY, "preflight", "preflight", "What speaks against a flight, and what to do about it", "preflight alpha"

@@ -1,4 +1,4 @@
-"""``skyloop land`` and ``skyloop stop``: the end of a flight from any terminal, of one drone or of all."""
+"""``skyloop land``, ``return`` and ``stop``: the end of a flight from any terminal, of one drone or of all."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -21,11 +22,16 @@ if TYPE_CHECKING:
 
 FRESH_S: Final = 1.0  #: as old as a state may be that is believed
 LANDING_S: Final = 60.0  #: as long as a landing is waited for
+RETURN_S: Final = 600.0  #: as long as a return is waited for
 STOPPING_S: Final = 3.0  #: as long as a stop is repeated until the vehicle reports it
 _REPEAT_S: Final = 0.1
 _MOST_AT_ONCE: Final = 64
 LEAVE: Final = "take over with --priority 0, or ask them"
 
+PriorityOption = Annotated[
+    int | None,
+    typer.Option(metavar="P", min=0, max=31, help="0, the highest, takes over [default: 16; with --all: 0]"),
+]
 AllOption = Annotated[bool, typer.Option("--all", help="Every drone that runs here, or on the --network")]
 JsonOption = Annotated[bool, typer.Option("--json", help="For programs: one JSON array, once all have ended")]
 
@@ -42,10 +48,7 @@ def land(
     names: NamesArgument = None,
     drone: DronesOption = None,
     every: AllOption = False,
-    priority: Annotated[
-        int | None,
-        typer.Option(metavar="P", min=0, max=31, help="0, the highest, takes over [default: 16; with --all: 0]"),
-    ] = None,
+    priority: PriorityOption = None,
     json: JsonOption = False,
     network: NetworkOption = None,
     keys: KeysOption = None,
@@ -55,11 +58,43 @@ def land(
     A drone that another application flies is left to it, and named, unless --priority is higher (a lower number). With
     --all everything lands that does not fly with the highest priority itself. Exit code 1 if one has not landed.
     """
-    from skyloop.messages import DEFAULT_PRIORITY, HIGHEST_PRIORITY
-
     chosen = _chosen(names, drone, every, network, keys)
-    wanted = (HIGHEST_PRIORITY if every else DEFAULT_PRIORITY) if priority is None else priority
+    wanted = _priority(priority, every)
     _each(chosen, lambda name: _land(name, wanted), "NOT landed", json)
+
+
+def return_to_start(
+    names: NamesArgument = None,
+    drone: DronesOption = None,
+    every: AllOption = False,
+    height: Annotated[
+        float | None,
+        typer.Option(
+            metavar="M", min=0.0, help="Metres above the start, at least, on the way [default: return.height]"
+        ),
+    ] = None,
+    priority: PriorityOption = None,
+    json: JsonOption = False,
+    network: NetworkOption = None,
+    keys: KeysOption = None,
+) -> None:
+    """Fly drones back to where they took off, land there, and wait until they have landed.
+
+    Each climbs first, flies straight over its start and lands; with several, nothing keeps them apart on the way. A
+    drone that another application flies is left to it, and named, unless --priority is higher (a lower number). Exit
+    code 1 if one has not landed at its start: like all of them after Ctrl-C it hovers, and lands 5 s later if nobody
+    flies it.
+    """
+    chosen = _chosen(names, drone, every, network, keys)
+    wanted = _priority(priority, every)
+    flown: list[Drone] = []
+
+    def stay() -> None:
+        for one in flown:
+            with suppress(SkyloopError):
+                one.hover()
+
+    _each(chosen, lambda name: _return(name, wanted, height, flown), "NOT returned", json, stay)
 
 
 def stop(
@@ -83,6 +118,12 @@ def stop(
     _each(chosen, _stop, "NOT stopped", json)
 
 
+def _priority(priority: int | None, every: bool) -> int:
+    from skyloop.messages import DEFAULT_PRIORITY, HIGHEST_PRIORITY
+
+    return (HIGHEST_PRIORITY if every else DEFAULT_PRIORITY) if priority is None else priority
+
+
 def _chosen(
     names: list[str] | None, others: list[str] | None, every: bool, network: str | None, keys: Path | None
 ) -> list[str]:
@@ -99,8 +140,17 @@ def _chosen(
     return found
 
 
-def _each(names: Sequence[str], end: Callable[[str], str], failed: str, json: bool) -> None:
-    """End all flights at the same time, and print a line for each as soon as it has ended, or all as JSON."""
+def _each(
+    names: Sequence[str],
+    end: Callable[[str], str],
+    failed: str,
+    json: bool,
+    interrupted: Callable[[], None] = lambda: None,
+) -> None:
+    """End all flights at the same time, and print a line for each as soon as it has ended, or all as JSON.
+
+    ``interrupted`` is called on Ctrl-C, and has to bring about that each ``end`` returns or raises.
+    """
 
     def attempt(name: str) -> Ending:
         try:
@@ -110,10 +160,14 @@ def _each(names: Sequence[str], end: Callable[[str], str], failed: str, json: bo
 
     ended = []
     with ThreadPoolExecutor(max_workers=min(_MOST_AT_ONCE, len(names))) as pool:
-        for one in pool.map(attempt, names):
-            ended.append(one)
-            if not json:
-                typer.echo(f"{one.name}: {one.outcome}", err=not one.ok)
+        try:
+            for one in pool.map(attempt, names):
+                ended.append(one)
+                if not json:
+                    typer.echo(f"{one.name}: {one.outcome}", err=not one.ok)
+        except KeyboardInterrupt:
+            interrupted()
+            raise
     if json:
         typer.echo(msgspec.json.encode(ended).decode())
     if not all(one.ok for one in ended):
@@ -122,17 +176,39 @@ def _each(names: Sequence[str], end: Callable[[str], str], failed: str, json: bo
 
 def _land(name: str, priority: int) -> str:
     from skyloop.cli.piloting import connect_pilot
-    from skyloop.client import Authority, connect
+    from skyloop.client import Authority
 
-    with connect(name, access="observe", name="skyloop land") as seen:
-        if not seen.capabilities.actions:
-            return "takes no commands: it shows a recording or a camera"
-        if _on_the_ground(seen):
-            return "landed already"
+    over = _over_already(name, "skyloop land")
+    if over:
+        return over
     authority = Authority(priority=priority)
     with connect_pilot(name, LEAVE, name="skyloop land", authority=authority) as flown:
         flown.land(timeout_s=LANDING_S)
     return "landed"
+
+
+def _return(name: str, priority: int, height_m: float | None, flown: list[Drone]) -> str:
+    from skyloop.cli.piloting import connect_pilot
+    from skyloop.client import Authority
+
+    over = _over_already(name, "skyloop return")
+    if over:
+        return over
+    authority = Authority(priority=priority)
+    with connect_pilot(name, LEAVE, name="skyloop return", authority=authority, on_exit="hover") as back:
+        flown.append(back)
+        back.return_to_start(height_m, land=True, timeout_s=RETURN_S)
+    return "landed at its start"
+
+
+def _over_already(name: str, program: str) -> str:
+    """Return why there is no flight to end, for a person; empty if there is one."""
+    from skyloop.client import connect
+
+    with connect(name, access="observe", name=program) as seen:
+        if not seen.capabilities.actions:
+            return "takes no commands: it shows a recording or a camera"
+        return "landed already" if _on_the_ground(seen) else ""
 
 
 def _stop(name: str) -> str:

@@ -23,6 +23,7 @@ from skyloop.messages import (
     Land,
     Position,
     ResetEmergency,
+    ReturnToStart,
     Takeoff,
     Velocity,
 )
@@ -34,12 +35,14 @@ _DONE_IN: Final[dict[type[AnyAction], frozenset[FlightState]]] = {
     Takeoff: frozenset({FlightState.HOVERING, FlightState.FLYING}),
     Land: frozenset({FlightState.LANDED}),
     EmergencyStop: frozenset({FlightState.EMERGENCY}),
+    ReturnToStart: frozenset({FlightState.LANDED}),
     ResetEmergency: frozenset(FlightState) - {FlightState.EMERGENCY},
 }
 #: How long such an action is repeated at least, as the known state may be from before it was commanded.
 _AT_LEAST_NS: Final[dict[type[AnyAction], int]] = {
     Takeoff: nanoseconds(0.3),
     Land: nanoseconds(0.3),
+    ReturnToStart: nanoseconds(0.3),
     EmergencyStop: nanoseconds(0.1),
     ResetEmergency: nanoseconds(0.1),
 }
@@ -62,7 +65,7 @@ class CommandSchedule:
         Args:
             rate_hz: Rate of repeats, 1 to 200 Hz.
             stall_s: Time without a call after which a velocity or attitude decays to hover [s]; ``math.inf``: never. A
-                place to fly to does not decay: the vehicle stops there.
+                place to fly to and a return do not decay: the vehicle stops there.
             min_interval_s: Least time between two set-points of the application [s]; repeats in between do not count.
             keep_s: A set-point given while the link was down is sent when it is back, if it is not older than this [s].
 
@@ -163,7 +166,7 @@ class CommandSchedule:
     @property
     def wants_flight(self) -> bool:
         """Whether the newest set-point keeps, or brings, the vehicle in the air."""
-        return isinstance(self.action, Takeoff | Hover | Velocity | Attitude | Position)
+        return isinstance(self.action, Takeoff | Hover | Velocity | Attitude | Position | ReturnToStart)
 
     def _decays(self, now_ns: int) -> bool:
         if self._stall_ns is None or not isinstance(self.action, Velocity | Attitude):

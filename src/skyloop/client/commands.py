@@ -32,6 +32,7 @@ from skyloop.messages import (
     Refused,
     ReleaseAuthority,
     RequestAuthority,
+    ReturnToStart,
     Role,
     encode,
 )
@@ -474,6 +475,23 @@ def position_action(x: object, y: object, z: object, yaw: object = None, speed: 
     )
     checked(place)
     return place
+
+
+def return_action(height_m: object, land: object) -> ReturnToStart:
+    """Return the action that flies back to the start.
+
+    Args:
+        height_m: Above the start, at least, on the way [m]; None: the proxy's parameter.
+        land: Whether to land there; None: the proxy's parameter.
+
+    Raises:
+        UsageError: If something is no number or no bool, or makes no sense.
+    """
+    if not (land is None or isinstance(land, bool)):
+        raise UsageError(f"land is {land!r:.60} and must be True, False or None (as return.land says)")
+    back = ReturnToStart(None if height_m is None else number("height_m", height_m), land)
+    checked(back)
+    return back
 
 
 def in_world_axes(

@@ -11,11 +11,22 @@ from skyloop.client.commands import CommandSender
 from skyloop.client.connection import ProxyConnection
 from skyloop.client.telemetry import ClientState
 from skyloop.errors import AuthorityError, ClosedError, NoAnswerError, RefusedError, UnsupportedError
-from skyloop.messages import AnyAction, Event, Feedback, FlightState, Land, Position, Refusal
+from skyloop.messages import (
+    AnyAction,
+    Event,
+    Feedback,
+    FlightState,
+    Land,
+    Position,
+    Refusal,
+    ReturnPhase,
+    ReturnToStart,
+)
 from skyloop.messages.geometry import wrap_angle
 
 AT_REST_M_S: Final = 0.3  #: a vehicle that is slower than this at its place has arrived
 _STALE_NS: Final = 100_000_000  #: feedback received sooner after a command may be older than it
+_TO_PLACES: Final = (Position, ReturnToStart)
 #: Refusals of one packet, not of what was asked for: the next repeat is younger, and newer.
 OF_ONE_PACKET: Final = (Refusal.STALE, Refusal.OUT_OF_SEQUENCE)
 
@@ -36,6 +47,20 @@ def is_there(target: Position, feedback: Feedback, tolerance_m: float, tolerance
         return False
     flies = feedback.state.airborne or feedback.state is FlightState.UNKNOWN
     return flies and (feedback.velocity_m_s is None or math.hypot(*feedback.velocity_m_s) <= AT_REST_M_S)
+
+
+class ReturnWatch:
+    """Whether a return is over; called with each newest feedback."""
+
+    def __init__(self) -> None:
+        """Begin before it is commanded."""
+        self._began = False
+
+    def __call__(self, feedback: Feedback) -> bool:
+        """Return whether the vehicle was on its way back, and has landed since or stays above its start."""
+        phase = feedback.return_phase
+        self._began |= phase is not ReturnPhase.NONE
+        return self._began and (phase is ReturnPhase.ARRIVED or feedback.state is FlightState.LANDED)
 
 
 class ActionWait:
@@ -124,17 +149,17 @@ class ActionWait:
         status = self._commands.status
         if status.state in ("queued", "preempted"):
             return AuthorityError(f"{name}: {status.holder or 'another application'} took over the authority")
-        if type(self._action) is Position and self._commands.lapsed(self._action):
+        if type(self._action) in _TO_PLACES and self._commands.lapsed(self._action):
             return RefusedError(
                 f"{name} was ended on the way, by a failsafe or a lost link: send the command again", code="not_fresh"
             )
-        if type(self._action) is Position and status.state == "held" and not self._commands.is_newest(self._action):
+        if type(self._action) in _TO_PLACES and status.state == "held" and not self._commands.is_newest(self._action):
             return RefusedError(f"{name} was ended on the way: another command took its place", code="replaced")
         refusal = self._state.refusal
         if refusal is None or not self._concerns(refusal):
             return None
         reason = refusal.data.get("reason")
-        if type(self._action) is Position and reason not in OF_ONE_PACKET:
+        if type(self._action) in _TO_PLACES and reason not in OF_ONE_PACKET:
             unsupported = reason == Refusal.UNSUPPORTED
             return UnsupportedError(refusal.text) if unsupported else RefusedError(refusal.text, code=str(reason))
         if reason == Refusal.UNSUPPORTED:

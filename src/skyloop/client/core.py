@@ -38,6 +38,7 @@ from skyloop.messages import (
     Land,
     LinkState,
     Position,
+    ReturnToStart,
     Role,
     Severity,
 )
@@ -47,6 +48,7 @@ from skyloop.transport.base import EVENTS, FEEDBACK, Dialer
 
 Access = Literal["pilot", "observe"]
 OnExit = Literal["land", "hover"]
+LATER_ACTIONS: Final = (Position, ReturnToStart)  #: that not every proxy knows
 UP: Final = frozenset({FlightState.HOVERING, FlightState.FLYING})
 DOWN: Final = frozenset({FlightState.LANDED})
 LANDING_S: Final = 20.0  #: how long a landing is waited for
@@ -296,8 +298,8 @@ class DroneCore:
         if welcome is not None and not welcome.capabilities.actions:
             why_not = welcome.capabilities.why_not or "the vehicle takes no commands"
             raise UnsupportedError(f"{action.name} is not possible: {why_not}")
-        if welcome is not None and type(action) is Position:
-            _check_knows_places(welcome.capabilities)
+        if welcome is not None and type(action) in LATER_ACTIONS:
+            _check_knows(welcome.capabilities, action)
         return self.commands.command(action, now=now)
 
     def complete(self, action: AnyAction, is_done: Callable[[Feedback], bool], wait: bool, timeout_s: float) -> None:
@@ -449,10 +451,10 @@ class DroneCore:
         self.state.emit(EventKind.CALLBACK_ERROR, text, Severity.ERROR, where=where)
 
 
-def _check_knows_places(capabilities: Capabilities) -> None:
+def _check_knows(capabilities: Capabilities, action: AnyAction) -> None:
     """Raise if the proxy does not know the action, which proxies of earlier versions would not even decode."""
-    if "position" not in capabilities.actions | capabilities.software:
+    if action.name not in capabilities.actions | capabilities.software:
         raise UnsupportedError(
-            f"position is not possible: neither the vehicle ({capabilities.vehicle}) nor its proxy can fly to a "
+            f"{action.name} is not possible: neither the vehicle ({capabilities.vehicle}) nor its proxy can fly to a "
             "place; a proxy of an earlier version must be updated"
         )

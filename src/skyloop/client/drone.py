@@ -24,8 +24,8 @@ from skyloop.client.authority import (
     authority_request,
 )
 from skyloop.client.channels import Channel, Listener, VideoOptions
-from skyloop.client.commands import above_zero, checked, in_world_axes, number, position_action
-from skyloop.client.completion import is_there
+from skyloop.client.commands import above_zero, checked, in_world_axes, number, position_action, return_action
+from skyloop.client.completion import ReturnWatch, is_there
 from skyloop.client.core import DOWN, UP, DroneCore, DroneOptions
 from skyloop.client.frame import Arrival, Frame
 from skyloop.client.inspection import inspect
@@ -160,6 +160,12 @@ class Drone:
         """
         status = self._state.status
         return replace(status, reason=self._core.connection.reason) if status.application is LinkState.LOST else status
+
+    @property
+    def start_position(self) -> Vector | None:
+        """Where the vehicle took off last, east, north, up in world axes [m]; None where that is not known."""
+        newest = self._state.newest
+        return None if newest is None else newest.start_position_m
 
     @property
     def closed(self) -> bool:
@@ -403,6 +409,40 @@ class Drone:
         place = position_action(*local, yaw, speed)
         near_m, near_rad = above_zero("tolerance_m", tolerance_m), above_zero("tolerance_rad", tolerance_rad)
         self._core.complete(place, lambda feedback: is_there(place, feedback, near_m, near_rad), wait, timeout_s)
+
+    def return_to_start(
+        self,
+        height_m: float | None = None,
+        *,
+        land: bool | None = None,
+        wait: bool = True,
+        timeout_s: float = 180.0,
+    ) -> None:
+        """Fly back to where the vehicle took off, and land there or hover.
+
+        It climbs straight up to a safe height if it is lower, kept below ``limits.altitude``, the ceiling of the room
+        and the upper wall of the safety box, flies straight over its start (:attr:`start_position`) as :meth:`go_to`
+        does, and lands. Any other command ends it, as do another pilot and a failsafe. Nothing keeps it away from
+        obstacles.
+
+        Args:
+            height_m: Above the start, at least, on the way [m]; None: as the parameter ``return.height`` says.
+            land: Land there, else hover above it; None: as the parameter ``return.land`` says.
+            wait: Wait until it has landed, or hovers above its start; else only send the command.
+            timeout_s: How long to wait [s].
+
+        Raises:
+            NoAnswerError: If it is not over in time; names the vehicle's state and, if known, the reason.
+            RefusedError: If the proxy refuses it, as where position or start are not known, the vehicle does not fly,
+                or a no-fly zone is in the way; or if a failsafe or another command ends it.
+            UnsupportedError: If neither the vehicle nor its proxy can fly to a place.
+            LinkError: Without ``wait``, if the link is down; the vehicle does not return later either.
+            AuthorityError: If the authority is not held, or another application takes it over meanwhile.
+            ClosedError: If the drone is closed.
+            UsageError: If an argument makes no sense, or if called with ``wait`` from an inline callback; nothing is
+                sent.
+        """
+        self._core.complete(return_action(height_m, land), ReturnWatch(), wait, timeout_s)
 
     def emergency_stop(self) -> bool:
         """Cut the motors at once: the vehicle falls.

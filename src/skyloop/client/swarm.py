@@ -15,7 +15,7 @@ from typing import Final, Literal, Self, TypeVar, get_args
 import numpy as np
 
 from skyloop.client.authority import AuthorityStatus, TakeoverWay
-from skyloop.client.commands import above_zero, checked, number, position_action
+from skyloop.client.commands import above_zero, checked, number, position_action, return_action
 from skyloop.client.drone import Drone
 from skyloop.client.statistics import DEPTH, Distribution, distribution
 from skyloop.client.telemetry import Wanted, as_predicate
@@ -274,6 +274,34 @@ class Swarm:
         jobs = {name: job(drone, wanted[name]) for name, drone in self.active.items() if name in wanted}
         _, errors = in_parallel(jobs)
         self.fail("go_to", errors)
+
+    def return_to_start(
+        self,
+        height_m: float | None = None,
+        *,
+        land: bool | None = None,
+        wait: bool = True,
+        timeout_s: float = 180.0,
+    ) -> None:
+        """Fly all active drones back to where each took off, all at the same time; see :meth:`Drone.return_to_start`.
+
+        Nothing keeps the drones apart on the way.
+
+        Args:
+            height_m: Above the start, at least, on the way [m]; None: as each drone's ``return.height`` says.
+            land: Land there, else hover above it; None: as each drone's ``return.land`` says.
+            wait: Wait until each has landed, or hovers above its start; else only send the commands.
+            timeout_s: How long to wait [s].
+
+        Raises:
+            UsageError: If an argument makes no sense; nothing is sent then.
+            SwarmError: As set by ``on_error``.
+            ClosedError: If the swarm was closed.
+        """
+        return_action(height_m, land)
+        self.each(
+            lambda drone: drone.return_to_start(height_m, land=land, wait=wait, timeout_s=timeout_s), "return_to_start"
+        )
 
     def reset_emergency(self) -> dict[str, bool]:
         """Leave the emergency state, on the ground, with all active drones."""

@@ -134,7 +134,32 @@ class Position(Action, frozen=True, array_like=True, tag=8):
         return self.x, self.y, self.z
 
 
-AnyAction = Idle | Takeoff | Hover | Land | EmergencyStop | ResetEmergency | Attitude | Velocity | Position
+class ReturnToStart(Action, frozen=True, array_like=True, tag=9):
+    """Climb, fly to where the vehicle took off (``Feedback.start_position_m``), and land or stay there.
+
+    ``height`` [m] above the start, at least, on the way; ``land`` at the end, or hover. None: as the proxy's parameters
+    ``return.height`` and ``return.land`` say.
+    """
+
+    height: float | None = None
+    land: bool | None = None
+
+    @property
+    def finite(self) -> bool:
+        """Whether all numbers of the action are finite."""
+        return math.isfinite(self.height or 0.0)
+
+    @property
+    def problem(self) -> str:
+        """What makes no sense about its numbers, in words for a person; empty if they can be flown."""
+        if self.height is not None and not 0.0 <= self.height <= FARTHEST_M:
+            return f"height is {self.height:g} m above the start and must be from 0 to {FARTHEST_M:g} m"
+        return ""
+
+
+AnyAction = (
+    Idle | Takeoff | Hover | Land | EmergencyStop | ResetEmergency | Attitude | Velocity | Position | ReturnToStart
+)
 
 ACTION_NAMES: dict[type[Action], str] = {
     Idle: "idle",
@@ -146,6 +171,7 @@ ACTION_NAMES: dict[type[Action], str] = {
     Attitude: "attitude",
     Velocity: "velocity",
     Position: "position",
+    ReturnToStart: "return_to_start",
 }
 
 

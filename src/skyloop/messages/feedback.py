@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import msgspec
 
 from skyloop.messages.earth import EarthOrigin
-from skyloop.messages.kinds import Failsafe, FlightState, LinkState
+from skyloop.messages.kinds import Failsafe, FlightState, LinkState, ReturnPhase
 from skyloop.messages.numbers import Count, Finite, TimeNs
 
 if TYPE_CHECKING:
@@ -64,6 +64,8 @@ class Feedback(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
     link_reason: LinkText = ""  #: why the hop proxy–vehicle is as it is; empty while it is up
     link_remedy: LinkText = ""  #: what a person can do about it
     others: LinkText | None = None  #: why the proxy leaves the vehicle alone: another controller flies it
+    start_position_m: Vector | None = None  #: where it took off last, in world axes [m]; None: that is not known
+    return_phase: ReturnPhase = ReturnPhase.NONE  #: how far it is on its way back there
 
     @property
     def origin(self) -> EarthOrigin | None:

@@ -43,6 +43,16 @@ class Failsafe(StrEnum):
     LAND = "land"  #: still no pilot, or the battery is low: landing
 
 
+class ReturnPhase(StrEnum):
+    """How far a vehicle is on its way back to where it took off."""
+
+    NONE = "none"  #: it is not on its way back
+    CLIMBING = "climbing"  #: to the height that it flies back at
+    FLYING = "flying"  #: towards the start
+    ARRIVED = "arrived"  #: stays above the start
+    LANDING = "landing"  #: lands there
+
+
 class Encoding(StrEnum):
     """How the bytes of a frame are to be read."""
 

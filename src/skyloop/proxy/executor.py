@@ -88,6 +88,15 @@ class ActionExecutor:
         self._in_force = applied
         return applied
 
+    def fly_to(self, place: Position, now_ns: int) -> bool:
+        """Fly to a place with nobody in command; returns whether it was taken. A failure is published, not raised."""
+        try:
+            self.execute(place, now_ns, new=False)
+        except Exception as error:  # noqa: BLE001  it is reported, and the next step tries again
+            self._vehicle.driver_failed("failsafe", error)
+            return False
+        return True
+
     def failsafe(self, action: Hover | Land, now_ns: int) -> bool:
         """Hover or land with nobody in command; returns whether it was taken. A failure is published, not raised."""
         if type(action) in self.native:

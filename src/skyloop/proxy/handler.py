@@ -33,6 +33,7 @@ from skyloop.messages import (
     Refused,
     ReleaseAuthority,
     RequestAuthority,
+    ReturnToStart,
     Role,
     Takeoff,
     Takeover,
@@ -43,7 +44,7 @@ from skyloop.proxy.core.authority import Authority, Granted, Lost, Preempted
 from skyloop.proxy.core.authority import Effect as AuthorityEffect
 from skyloop.proxy.core.authority_events import EventContext, authority_event
 from skyloop.proxy.core.command_checks import CommandChecks, Decision
-from skyloop.proxy.core.failsafe import BatteryLow, FailsafeAction, FailsafeInputs, FailsafeLadder
+from skyloop.proxy.core.failsafe import BatteryLow, FailsafeAction, FailsafeInputs, FailsafeLadder, StepChange
 from skyloop.proxy.core.failsafe import Effect as FailsafeEffect
 from skyloop.proxy.core.flight_events import (
     battery_event,
@@ -60,6 +61,7 @@ from skyloop.proxy.events import Counters, EventPublisher
 from skyloop.proxy.executor import ActionExecutor
 from skyloop.proxy.parameters import FlightSettings
 from skyloop.proxy.publisher import VehiclePublisher
+from skyloop.proxy.returning import ReturnSupervisor
 from skyloop.proxy.sessions import Session
 from skyloop.transport.base import COMMANDS, TransportServer
 
@@ -99,6 +101,7 @@ class CommandHandler:
         self.checks = CommandChecks(
             self.authority, self.ladder, self.ownership, supported=executor.supported, why_not=executor.why_not
         )
+        self._back = ReturnSupervisor(self.checks, self.ladder, executor, publisher)
         self.on_ownership: Callable[[bool], None] = lambda _: None  #: called with whether the flight is ours, locked
         if executor.autopilot is not None:
             executor.autopilot.guard = self.checks.guard
@@ -129,6 +132,7 @@ class CommandHandler:
             self.checks.limits = settings.limits
             self.checks.safety = settings.safety
             self.checks.space = settings.space
+            self.checks.returns = settings.returns
             self.checks.max_age_ns = settings.max_age_ns
             self.authority.timeout_ns = settings.authority_timeout_ns
             self.authority.ask_ns = settings.authority_ask_ns
@@ -209,6 +213,8 @@ class CommandHandler:
             if effects:
                 self._apply_authority(effects, now_ns)
             self._update_failsafe(now_ns)
+            if self._back.update(now_ns, ours=self.ownership.ours):
+                self._stamp()
             steered = self._executor.step(now_ns)
             if steered is not None:
                 self._echo_own(steered, now_ns)
@@ -277,6 +283,8 @@ class CommandHandler:
                 ownership.claim(now_ns)
             if not ownership.ours or kind is Takeoff:
                 self._take_vehicle(session, applied, decision.new)
+        if kind is not ReturnToStart and decision.action is not None:
+            checks.back = None
         applied_ns = self._count_applied(command)
         if not self.ladder.idle:
             self._apply_failsafe(self.ladder.fresh_command(), now_ns)
@@ -303,6 +311,7 @@ class CommandHandler:
             why = self._vehicle.driver_refused("emergency_stop", error)
             return self._refuse(session, command, Refusal.DRIVER_FAILED, why), now_ns
         self._end_intents()
+        self.checks.back = None
         self._events.publish_repeated((session.app_id, "emergency"), lambda: emergency_event(session.name))
         return applied, self._count_applied(command)
 
@@ -394,6 +403,8 @@ class CommandHandler:
                 "lease": self.authority.lease,
                 "failsafe": self.ladder.step,
                 "others": self.ownership.others or None,
+                "start_position_m": self._back.start,
+                "return_phase": self._back.phase,
             }
         )
 
@@ -451,6 +462,7 @@ class CommandHandler:
             link_up=self._vehicle.link_up,
             battery=feedback.battery if feedback is not None else None,
             ours=self.ownership.ours,
+            return_problem=self._back.why_not(now_ns),
         )
         effects = self.ladder.update(now_ns, inputs)
         if effects:
@@ -458,15 +470,23 @@ class CommandHandler:
 
     def _apply_failsafe(self, effects: list[FailsafeEffect], now_ns: int) -> None:
         for effect in effects:
-            if isinstance(effect, FailsafeAction):
+            if not isinstance(effect, FailsafeAction):
+                self._publish_failsafe(effect)
+            elif isinstance(effect.action, ReturnToStart):
+                self._back.begin(effect.action, now_ns)
+                self.ladder.attempted(True)
+            else:
+                self.checks.back = None
                 taken = self._executor.failsafe(effect.action, now_ns)
                 self.ladder.attempted(taken)
                 if taken:
                     self._echo_own(effect.action, now_ns)
-            elif isinstance(effect, BatteryLow):
-                self._events.publish_draft(battery_event(effect))
-            else:
-                self._stamp()
-                if effect.step is not Failsafe.NONE:
-                    self._end_intents()
-                self._events.publish_draft(failsafe_event(effect))
+
+    def _publish_failsafe(self, effect: StepChange | BatteryLow) -> None:
+        if isinstance(effect, BatteryLow):
+            self._events.publish_draft(battery_event(effect))
+            return
+        self._stamp()
+        if effect.step is not Failsafe.NONE:
+            self._end_intents()
+        self._events.publish_draft(failsafe_event(effect))

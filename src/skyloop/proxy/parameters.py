@@ -22,6 +22,7 @@ from skyloop.messages.codec import MAX_BODY
 from skyloop.proxy.core.autopilot import AutopilotSettings
 from skyloop.proxy.core.failsafe import FailsafeSettings
 from skyloop.proxy.core.limits import Limits
+from skyloop.proxy.core.returning import ReturnSettings
 from skyloop.proxy.core.safety import Safety, check_written, safety_of
 from skyloop.zones import BOX, FAR_M, ROOM, ZONES, Space, space_of
 
@@ -75,6 +76,9 @@ OWN: Final[tuple[Parameter, ...]] = (
     _own("autopilot.velocity_p", 0.15, "rad s/m", 0.0, 1.0, "Proportional gain of the software velocity loop"),
     _own("battery.flight_time", 600.0, "s", 10.0, 36000.0, "Flight time of a full battery, for the check of routes"),
     _own("battery.land", 0.1, "", 0.0, 1.0, "Charge below which the vehicle lands and accepts no set-points; 0: never"),
+    _own(
+        "battery.return", 0.0, "", 0.0, 1.0, "Charge below which the vehicle returns to its start and lands; 0: never"
+    ),
     _own("battery.warn", 0.2, "", 0.0, 1.0, "Charge below which a low battery is reported; 0: never"),
     _own("command.max_age_s", 0.25, "s", 0.01, 10.0, "Older commands are refused as stale"),
     _own("failsafe.hover_after_s", 0.5, "s", 0.05, 3600.0, "A flying vehicle hovers after this time without a command"),
@@ -87,11 +91,23 @@ OWN: Final[tuple[Parameter, ...]] = (
         10.0,
         "Interval at which a failsafe step is retried until the vehicle executes it",
     ),
+    Parameter(
+        "failsafe.return",
+        ParameterType.BOOL,
+        False,
+        default=False,
+        description="A vehicle without a pilot returns to its start and lands there, instead of where it is",
+    ),
     _own("limits.altitude", 5.0, "m", 0.3, 500.0, "Maximum height above ground: climbing ends there"),
     _own("limits.climb", 1.0, "m/s", 0.05, 10.0, "Maximum vertical speed"),
     _own("limits.speed", 2.0, "m/s", 0.05, 30.0, "Maximum horizontal speed of a velocity set-point"),
     _own("limits.tilt", 0.35, "rad", 0.02, 1.0, "Maximum tilt of an attitude set-point, roll and pitch together"),
     _own("limits.yaw_rate", 1.75, "rad/s", 0.05, 10.0, "Maximum yaw rate"),
+    _own("return.height", 2.0, "m", 0.0, 500.0, "Height above the start, at least, on the way back there"),
+    Parameter(
+        "return.land", ParameterType.BOOL, True, default=True, description="Land at the end of a return, or hover there"
+    ),
+    _own("return.speed", 1.0, "m/s", 0.1, 30.0, "Maximum speed of a return, within the limits"),
     *(
         _own(f"{BOX}.{axis}_{end}", value, "m", -FAR_M, FAR_M, f"{side} wall of the safety box; {value:g}: none")
         for axis, sides in (("x", ("West", "East")), ("y", ("South", "North")), ("z", ("Lower", "Upper")))
@@ -183,6 +199,7 @@ class FlightSettings:
     space: Space  #: where it may fly
     failsafe: FailsafeSettings
     autopilot: AutopilotSettings
+    returns: ReturnSettings
     max_age_ns: int  #: of a command
     authority_timeout_ns: int
     authority_ask_ns: int
@@ -228,6 +245,11 @@ class Parameters:
         assert isinstance(own, float)
         return own
 
+    def flag(self, name: str) -> bool:
+        """The value in force of one of the proxy's own parameters that is a bool, the driver's where it has it too."""
+        value = self.get(name).value
+        return value if isinstance(value, bool) else bool(self._own[name].value)
+
     def text(self, name: str) -> str:
         """The value in force of one of the proxy's own parameters that is a text, the driver's where it has it too."""
         value = self.get(name).value
@@ -249,6 +271,8 @@ class Parameters:
             retry_s=number("failsafe.retry_s"),
             battery_warn=number("battery.warn"),
             battery_land=number("battery.land"),
+            battery_return=number("battery.return"),
+            returns=self.flag("failsafe.return"),
         )
         autopilot = AutopilotSettings(
             takeoff_altitude=min(number("autopilot.takeoff_altitude"), limits.altitude),
@@ -265,6 +289,7 @@ class Parameters:
             space,
             failsafe,
             autopilot,
+            ReturnSettings(number("return.height"), number("return.speed"), self.flag("return.land")),
             max_age_ns=nanoseconds(number("command.max_age_s")),
             authority_timeout_ns=nanoseconds(number("authority.timeout_s")),
             authority_ask_ns=nanoseconds(number("authority.ask_s")),

@@ -11,8 +11,8 @@ from skyloop.sim.parameters import VehicleParameters
 from skyloop.sim.world import Wind, World
 from skyloop.sim.world_file import load_world
 
-#: What simulated vehicles do by themselves; to places the proxy flies them.
-EVERY_ACTION: Final = frozenset(ACTION_NAMES.values()) - {"position"}
+#: What simulated vehicles do by themselves; to places, and back to their start, the proxy flies them.
+EVERY_ACTION: Final = frozenset(ACTION_NAMES.values()) - {"position", "return_to_start"}
 STANDARD_VEHICLE: Final = VehicleParameters()
 
 

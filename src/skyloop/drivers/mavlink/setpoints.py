@@ -39,6 +39,7 @@ from skyloop.messages import (
     Land,
     Position,
     ResetEmergency,
+    ReturnToStart,
     Severity,
     Takeoff,
     Velocity,
@@ -142,6 +143,7 @@ class SetpointController:
         elif isinstance(action, Hover):
             self._hover(vehicle, now_ns, alone=alone)
         else:
+            assert not isinstance(action, ReturnToStart)  # the proxy makes places of it
             action = self._steer(action, vehicle, now_ns)
         if self.goal is not Goal.NOTHING and not isinstance(action, Idle):
             self.ownership.take(action, vehicle, alone=alone, new=new)

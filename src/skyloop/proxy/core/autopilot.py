@@ -39,7 +39,7 @@ STALL_NS: Final = NS_PER_S
 STALL_HEADWAY: Final = 0.02  #: [m]
 BLIND_LANDING_NS: Final = 15 * NS_PER_S  #: how long a landing takes where the altitude is not known
 
-SOFTWARE: Final = frozenset({"takeoff", "hover", "land", "velocity", "position"})
+SOFTWARE: Final = frozenset({"takeoff", "hover", "land", "velocity", "position", "return_to_start"})
 
 
 def software_actions(native: frozenset[str]) -> frozenset[str]:

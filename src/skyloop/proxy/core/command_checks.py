@@ -26,6 +26,8 @@ from skyloop.messages import (
     Position,
     Refusal,
     ResetEmergency,
+    ReturnPhase,
+    ReturnToStart,
     Takeoff,
     Velocity,
 )
@@ -34,13 +36,15 @@ from skyloop.proxy.core.failsafe import REASONS, FailsafeLadder
 from skyloop.proxy.core.limits import Ceiling, Clamp, Limits
 from skyloop.proxy.core.ownership import Ownership, Whose
 from skyloop.proxy.core.places import decide_place
+from skyloop.proxy.core.returning import ReturnDecision, ReturnFlight, ReturnSettings, StartPoint
 from skyloop.proxy.core.safety import Safety
 from skyloop.zones import Space
 
 MAX_AHEAD_S: Final = 0.05  #: how far in the future a command's time may lie: the error of the clocks' offset
 _MAX_AHEAD_NS: Final = nanoseconds(MAX_AHEAD_S)
 _HOVER_ACTION: Final = Hover()
-_SET_POINTS: Final = (Velocity, Attitude, Position)
+_SET_POINTS: Final = (Velocity, Attitude, Position, ReturnToStart)
+_ON_THE_GROUND: Final = (FlightState.LANDED, FlightState.UNKNOWN)
 _TAKING: Final = (Takeoff, Hover, Land)  #: newly asked for, they take a vehicle that others fly
 
 
@@ -114,6 +118,7 @@ STATE_POLICIES: Final[dict[type[Action], dict[FlightState, StatePolicy]]] = {
     Attitude: _SET_POINT,
     Velocity: _SET_POINT,
     Position: _SET_POINT,
+    ReturnToStart: _SET_POINT,
 }
 
 
@@ -152,6 +157,9 @@ class CommandChecks:
         self.limits = Limits()
         self.safety: Safety | None = None  #: the safety box and zones; None: there are none
         self.space = Space()  #: the same and the room, for what is flown by position
+        self.returns = ReturnSettings()
+        self.start = StartPoint()
+        self.back: ReturnFlight | None = None  #: the flight back to the start; None: it was not asked for
         self.max_age_ns = 0
         self._authority = authority
         self._ladder = ladder
@@ -197,13 +205,17 @@ class CommandChecks:
         action = command.action
         kind = type(action)
         policy = STATE_POLICIES[kind][state]
+        if kind is ReturnToStart and state is FlightState.LANDED and self._has_returned(command, sequence):
+            policy = StatePolicy.HOLD
         new = command.intent > sequence.acted
         if new:
             sequence.acted = command.intent
+            if kind is ReturnToStart:
+                self.back = None
         problem = self._problem(command, sequence, state, link, new)
         if problem is not None:
             return Decision(None, *problem, new)
-        is_set_point = kind is Velocity or kind is Attitude or kind is Position
+        is_set_point = kind in _SET_POINTS
         if policy is StatePolicy.HOLD and is_set_point and self._ladder.step is Failsafe.LAND:
             policy = StatePolicy.HOVER  # the ladder's landing, not a pilot's: a pilot who is back breaks it off
         if policy is StatePolicy.REFUSE:
@@ -221,6 +233,14 @@ class CommandChecks:
                 return Decision(instead, place.refusal, place.why, new)  # without a refusal: until it is known again
             action, clamps = place.action, place.clamps
             enforced = None if self.safety is None else True
+        elif type(action) is ReturnToStart:
+            if self.back is None:
+                self.begin_return(action)
+            back = self.step_return(feedback, now_ns)
+            if back.action is None:
+                return Decision(_HOVER_ACTION, back.refusal, back.why, new)
+            action, clamps = back.action, back.clamps
+            enforced = None if self.safety is None else True
         elif is_set_point:
             action, clamps = self.limits.clamp(action, feedback.altitude_m if feedback else None)  # type: ignore[arg-type]
             if self.safety is not None:
@@ -228,6 +248,25 @@ class CommandChecks:
                 clamps += walls
         takes_off = kind is Takeoff and policy is StatePolicy.APPLY
         return Decision(action, None, "", new, takes_off, clamps, enforced)
+
+    def begin_return(self, action: ReturnToStart) -> None:
+        """Begin a flight back to the start, in place of another one."""
+        self.back = ReturnFlight(action, self.start.position, self.returns)
+
+    def step_return(self, feedback: Feedback | None, now_ns: int) -> ReturnDecision:
+        """Decide what the vehicle does now on its flight back to the start."""
+        assert self.back is not None
+        return self.back.step(self.limits, self.space, feedback, now_ns)
+
+    def why_no_return(self, feedback: Feedback | None, now_ns: int) -> str:
+        """Return why the vehicle could not begin to return to its start now and land there; empty if it could."""
+        flight = ReturnFlight(ReturnToStart(land=True), self.start.position, self.returns)
+        decision = flight.step(self.limits, self.space, feedback, now_ns)
+        return decision.why if decision.action is None and decision.refusal is not None else ""
+
+    def _has_returned(self, command: Command, sequence: CommandSequence) -> bool:
+        """Whether it landed at the end of the return that this command repeats."""
+        return self.back is not None and self.back.phase is ReturnPhase.LANDING and command.intent <= sequence.acted
 
     def guard(self, wanted: Velocity, feedback: Feedback, now_ns: int) -> Velocity:
         """Return the nearest velocity that limits, safety box and zones allow, on the way to a place."""
@@ -257,6 +296,12 @@ class CommandChecks:
                 return Refusal.WRONG_STATE, f"{others}, and a repeated command does not take it back: send a new one"
         if self._ladder.barred and kind is not Land:
             return Refusal.WRONG_STATE, f"only landing is possible: {REASONS[self._ladder.barred]}"
+        if self._ladder.lands_for_battery and kind in _SET_POINTS:
+            what = "returns to its start" if self._ladder.returning else "lands"
+            return Refusal.WRONG_STATE, f"it {what}, because the battery is low: hover or land first to take it over"
+        if self._ladder.battery_low and kind is Takeoff and state in _ON_THE_GROUND:
+            why = "the battery is low, and it would return at once (battery.return): charge it"
+            return Refusal.WRONG_STATE, f"{command.action.name} is not possible: {why}"
         if STATE_POLICIES[kind][state] is StatePolicy.HOVER and Hover not in self._supported:
             return Refusal.UNSUPPORTED, f"{command.action.name} is not possible while {state.value}"
         return None

@@ -1,7 +1,8 @@
 """The failsafe ladder: when a flying vehicle that nobody commands hovers, and when it lands. Pure: time is an argument.
 
-Steps go up by themselves (none, hover, land) and are left only by a fresh command or on the ground. The rules in
-words are in ``docs/proxy.md``.
+Steps go up by themselves (none, hover, land) and are left only by a fresh command or on the ground. The landing may be
+one at the start, after a flight back there, where parameters ask for it and nothing is against it. The rules in words
+are in ``docs/proxy.md``.
 """
 
 from __future__ import annotations
@@ -10,9 +11,9 @@ from dataclasses import dataclass
 from typing import Final
 
 from skyloop.clock import nanoseconds
-from skyloop.messages import Failsafe, FlightState, Hover, Land
+from skyloop.messages import Failsafe, FlightState, Hover, Land, ReturnToStart
 
-#: A battery must rise so far above the warning level before it can warn again.
+#: A battery must rise so far above a level before falling below it counts again.
 BATTERY_REARM: Final = 0.05
 
 #: Why a step was taken, in words for people.
@@ -24,17 +25,23 @@ REASONS: Final = {
     "none": "nobody is in command",
     "vehicle_link": "the link to the vehicle is lost",
     "battery": "the battery is nearly empty",
+    "battery_return": "the battery is low",
     "closing": "the proxy is closing",
     "others": "others fly the vehicle",
 }
 
 _RANK: Final = {Failsafe.NONE: 0, Failsafe.HOVER: 1, Failsafe.LAND: 2}
 _MANOEUVRES: Final = (FlightState.TAKING_OFF, FlightState.LANDING)
+_LAND_AT_START: Final = ReturnToStart(land=True)
 #: States that show that an action which the driver took did not reach the vehicle.
 _CONTRADICTIONS: Final = {
     Hover: frozenset({FlightState.FLYING}),
     Land: frozenset({FlightState.TAKING_OFF, FlightState.HOVERING, FlightState.FLYING}),
+    ReturnToStart: frozenset(),  # it is steered all the way
 }
+
+
+FailsafeTask = Hover | Land | ReturnToStart
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +53,8 @@ class FailsafeSettings:
     retry_s: float = 0.25
     battery_warn: float = 0.2
     battery_land: float = 0.1  #: 0: never
+    battery_return: float = 0.0  #: 0: never
+    returns: bool = False  #: where nobody is in command, it lands at the start
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +68,7 @@ class FailsafeInputs:
     link_up: bool  #: hop proxy–vehicle
     battery: float | None
     ours: bool = True  #: the flight was begun, or taken, by an application of this proxy
+    return_problem: str = ""  #: why it can't return to its start, for a person; empty if it can, or need not
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +77,8 @@ class StepChange:
 
     step: Failsafe
     reason: str
+    returns: bool = False  #: it lands at its start, after a flight back there
+    why: str = ""  #: it does not return although it should, for a person
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +92,7 @@ class BatteryLow:
 class FailsafeAction:
     """The vehicle must do this now; report whether it did with :meth:`FailsafeLadder.attempted`."""
 
-    action: Hover | Land
+    action: FailsafeTask
 
 
 Effect = StepChange | BatteryLow | FailsafeAction
@@ -96,7 +108,9 @@ class FailsafeLadder:
         self.barred = ""  #: why set-points are refused now: ``battery``, ``closing``, or empty
         self._closing = False
         self._warned = False
-        self._wanted: Hover | Land | None = None
+        self.battery_low = False  #: it is below the charge to return at, and was not charged since
+        self._overruled = False  # the pilot has taken over a return for that, and flies on
+        self._wanted: FailsafeTask | None = None
         self._taken = False
         self._next_try_ns = 0
 
@@ -111,14 +125,20 @@ class FailsafeLadder:
             return effects + self._move(Failsafe.NONE, "others")
         step, reason = self._due(now_ns, inputs)
         if _RANK[step] > _RANK[self.step]:
-            effects += self._move(step, reason)
-            self._want(Land() if step is Failsafe.LAND else Hover(), now_ns)
+            returns = step is Failsafe.LAND and self._should_return(reason) and inputs.state is not FlightState.LANDING
+            why = inputs.return_problem if returns else ""
+            effects += self._begin(StepChange(step, reason, returns and not why, why), now_ns)
+        elif self.returning and self.barred:
+            effects += self._begin(StepChange(Failsafe.LAND, self.barred), now_ns)
+        elif self.returning and inputs.return_problem:
+            effects += self._begin(StepChange(Failsafe.LAND, self.reason, why=inputs.return_problem), now_ns)
         return effects + self._try(now_ns, inputs.state)
 
     def fresh_command(self) -> list[Effect]:
         """The pilot sent a fresh command: end the step, unless the vehicle lands for a reason that stays."""
         if self.barred:
             return []
+        self._overruled |= self.lands_for_battery
         self._wanted = None
         return self._move(Failsafe.NONE, "fresh command")
 
@@ -127,9 +147,19 @@ class FailsafeLadder:
         """Whether no step is in force and nothing is to be done."""
         return self._wanted is None and self.step is Failsafe.NONE
 
+    @property
+    def returning(self) -> bool:
+        """Whether the vehicle is to fly back to its start and land there."""
+        return type(self._wanted) is ReturnToStart
+
+    @property
+    def lands_for_battery(self) -> bool:
+        """Whether it returns, or lands, because the battery is low: a decision of the pilot ends it, no set-point."""
+        return self.step is Failsafe.LAND and self.reason == "battery_return"
+
     def hand_over(self, now_ns: int) -> None:
         """The authority changes hands: hover in between, unless the vehicle is landing for a reason."""
-        if not isinstance(self._wanted, Land):
+        if not isinstance(self._wanted, Land | ReturnToStart):
             self._want(Hover(), now_ns)
 
     def order_landing(self) -> None:
@@ -148,6 +178,12 @@ class FailsafeLadder:
             self.barred = "closing" if self._closing else "battery" if critical else ""
         if level is None:
             return []
+        if level < settings.battery_return:
+            self.battery_low = True
+        elif not inputs.airborne or level >= settings.battery_return + BATTERY_REARM:
+            self.battery_low = False
+        if not (self.battery_low and inputs.airborne):
+            self._overruled = False
         if level >= settings.battery_warn + BATTERY_REARM:
             self._warned = False
         if level < settings.battery_warn and not self._warned:
@@ -158,6 +194,8 @@ class FailsafeLadder:
     def _due(self, now_ns: int, inputs: FailsafeInputs) -> tuple[Failsafe, str]:
         if self.barred:
             return Failsafe.LAND, self.barred
+        if self.battery_low and not self._overruled and inputs.state is not FlightState.LANDING:
+            return Failsafe.LAND, "battery_return"
         silent_ns = now_ns - inputs.last_command_ns
         silence = "silent" if inputs.pilot == "held" else inputs.pilot
         if silent_ns >= nanoseconds(self.settings.land_after_s):
@@ -170,13 +208,24 @@ class FailsafeLadder:
             return Failsafe.HOVER, "vehicle_link"
         return Failsafe.NONE, ""
 
+    def _should_return(self, reason: str) -> bool:
+        """Whether a landing for this reason is to be one at the start."""
+        return not self.barred and (reason == "battery_return" or self.settings.returns)
+
+    def _begin(self, change: StepChange, now_ns: int) -> list[Effect]:
+        """Take a step, or another way to end it."""
+        self.step, self.reason = change.step, change.reason
+        landing = _LAND_AT_START if change.returns else Land()
+        self._want(landing if change.step is Failsafe.LAND else Hover(), now_ns)
+        return [change]
+
     def _move(self, step: Failsafe, reason: str) -> list[Effect]:
         if step is self.step:
             return []
         self.step, self.reason = step, reason
         return [StepChange(step, reason)]
 
-    def _want(self, action: Hover | Land, now_ns: int) -> None:
+    def _want(self, action: FailsafeTask, now_ns: int) -> None:
         self._wanted, self._taken, self._next_try_ns = action, False, now_ns
 
     def _try(self, now_ns: int, state: FlightState) -> list[Effect]:
@@ -186,6 +235,8 @@ class FailsafeLadder:
         if self._taken and state not in _CONTRADICTIONS[type(wanted)]:
             return []
         if isinstance(wanted, Hover) and state in _MANOEUVRES:  # each ends safely by itself
+            return []
+        if isinstance(wanted, ReturnToStart) and state is FlightState.TAKING_OFF:
             return []
         self._next_try_ns = now_ns + nanoseconds(self.settings.retry_s)
         return [FailsafeAction(wanted)]

@@ -46,8 +46,11 @@ def failsafe_event(change: StepChange) -> EventDraft:
     if change.step is Failsafe.NONE:
         text, severity = f"failsafe ended: {why}", Severity.INFO
     else:
-        text, severity = f"failsafe: {change.step.value}, because {why}", Severity.WARNING
-    data: dict[str, Value] = {"step": change.step.value, "reason": change.reason}
+        what = "return to the start and land there" if change.returns else change.step.value
+        text, severity = f"failsafe: {what}, because {why}", Severity.WARNING
+        if change.why:
+            text += f"; it can't return to its start: {change.why}"
+    data: dict[str, Value] = {"step": change.step.value, "reason": change.reason, "returns": change.returns}
     return EventDraft(EventKind.FAILSAFE, text, severity, data=data)
 
 
