@@ -8,12 +8,14 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
+from docutils import nodes
 from sphinx.application import Sphinx
 from sphinx.errors import ExtensionError
 from sphinx.ext.napoleon import GoogleDocstring
+from sphinx.util.docutils import SphinxDirective
 
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "src"))
+sys.path[:0] = [str(ROOT / "src"), str(ROOT / "scripts")]
 _PROJECT: dict[str, Any] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 project = "Skyloop"
@@ -86,6 +88,19 @@ def _loads_nothing(app: Sphinx, exception: Exception | None) -> None:
             raise ExtensionError(f"{page} loads something from another host: {found[0]}")
 
 
+class Commands(SphinxDirective):
+    """``.. commands::``: the reference of the command line, made from the commands themselves."""
+
+    def run(self) -> list[nodes.Node]:
+        """Return the sections."""
+        from command_reference import reference
+
+        for source in (ROOT / "scripts" / "command_reference.py", *(ROOT / "src/skyloop/cli").glob("*.py")):
+            self.env.note_dependency(source)
+        return self.parse_text_to_nodes(reference(), allow_section_headings=True)
+
+
 def setup(app: Sphinx) -> None:
     """Called by Sphinx."""
+    app.add_directive("commands", Commands)
     app.connect("build-finished", _loads_nothing)

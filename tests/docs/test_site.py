@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import re
+import runpy
+from pathlib import Path
 
 import pytest
 
 import skyloop
+from skyloop.cli.commands import COMMANDS
 from tests.docs.pages import ROOT
 
 DOCS = ROOT / "docs"
@@ -35,3 +38,16 @@ def test_what_other_packages_leave_out_is_shown_with_skyloop() -> None:
     left_out = ",".join(re.findall(r":exclude-members: (.+)", "\n".join(REFERENCE.values())))
     for name in filter(None, (name.strip() for name in left_out.split(","))):
         assert re.search(rf"^\.\. auto(class|function):: {name}$", REFERENCE["skyloop"], re.MULTILINE), name
+
+
+def test_the_reference_has_each_command_with_its_options() -> None:
+    """What becomes of it in the site is checked by ``make docs``."""
+    text = runpy.run_path(str(ROOT / "scripts" / "command_reference.py"))["reference"]()
+    sections = dict(re.findall(r"^\.\. program:: skyloop (.+)\n((?:(?!\.\. program::).*\n)*)", text, re.MULTILINE))
+    assert set(COMMANDS) <= set(sections)
+    assert ".. option:: --seconds N" in sections["demo"]
+    assert ".. option:: --json" in sections["log recover"]
+    assert "asks before, except with ``--yes``" in sections["stop"]
+    assert "   skyloop land [OPTIONS] NAME..." in sections["land"]
+    assert "Show this message" not in text
+    assert str(Path.home()) not in text, "it is the same on each machine"

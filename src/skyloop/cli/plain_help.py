@@ -85,8 +85,8 @@ def argument_words(command: Any, ctx: Any) -> list[str]:
     return words
 
 
-def write_options(command: Any, ctx: Any, formatter: Any) -> None:
-    """Write arguments by their words alone, and options with what they take."""
+def described(command: Any, ctx: Any) -> dict[str, list[tuple[str, str]]]:
+    """Return the words that a command takes, and what each means, as ``Arguments`` and ``Options`` if there are any."""
     arguments, options = [], []
     for param in command.get_params(ctx):
         if param.param_type_name == "argument":
@@ -94,10 +94,14 @@ def write_options(command: Any, ctx: Any, formatter: Any) -> None:
                 arguments.append((_word(param).strip("[]"), param.help or ""))
         elif (record := param.get_help_record(ctx)) is not None:
             options.append((_replaced(record[0], _KINDS), _replaced(record[1], _RANGES)))
-    for title, rows in (("Arguments", arguments), ("Options", options)):
-        if rows:
-            with formatter.section(title):
-                formatter.write_dl(rows, col_max=_COLUMN if width() >= 2 * _COLUMN else _NARROW_COLUMN)
+    return {title: rows for title, rows in (("Arguments", arguments), ("Options", options)) if rows}
+
+
+def write_options(command: Any, ctx: Any, formatter: Any) -> None:
+    """Write arguments by their words alone, and options with what they take."""
+    for title, rows in described(command, ctx).items():
+        with formatter.section(title):
+            formatter.write_dl(rows, col_max=_COLUMN if width() >= 2 * _COLUMN else _NARROW_COLUMN)
 
 
 def _word(param: Any) -> str:

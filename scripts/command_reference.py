@@ -1,0 +1,70 @@
+"""The reference of the command line, made from the commands themselves: the site's page of it, in reStructuredText.
+
+python scripts/command_reference.py    # prints it; `make docs` puts it into the site
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Any, Final
+
+from typer.main import get_command
+
+from skyloop.cli.app import build
+from skyloop.cli.commands import COMMANDS, Task
+from skyloop.cli.plain_help import described
+
+_HELP: Final = ("--help", "-h, --help")  # every command has it
+_OPTION: Final = re.compile(r"(?<![\w-])(--?[a-zA-Z][\w-]*)")
+_MARKUP: Final = re.compile(r"([\\*`|_<>])")
+
+
+def reference() -> str:
+    """Return the sections of all commands, by what one wants to do."""
+    group = get_command(build())
+    root = _context(group, "skyloop", None)
+    lines: list[str] = []
+    for task in Task:
+        lines += _title(task.value, "-")
+        for name, entry in COMMANDS.items():
+            if entry.task is task:
+                lines += _command(group.commands[name], name, root, "~")  # type: ignore[attr-defined]
+    return "\n".join(lines)
+
+
+def _command(command: Any, name: str, parent: Any, underline: str) -> Iterator[str]:
+    context = _context(command, name, parent)
+    yield from _title(context.command_path, underline)
+    yield from (f".. program:: {context.command_path}", "")
+    usage = " ".join(filter(None, command.collect_usage_pieces(context)))
+    yield from (".. code-block:: text", "", f"   {context.command_path} {usage}", "")
+    for paragraph in (command.help or "").split("\n\n"):
+        if " COMMAND --help shows more" not in paragraph:
+            yield from (_prose(paragraph), "")
+    if command.epilog:
+        yield from ("Example:", "", ".. code-block:: text", "", f"   {command.epilog.removeprefix('Example: ')}", "")
+    for rows in described(command, context).values():
+        for words, meaning in rows:
+            if words not in _HELP:
+                yield from (f".. option:: {words}", "", f"   {_prose(meaning)}", "")
+    for sub, inner in getattr(command, "commands", {}).items():
+        yield from _command(inner, sub, context, "^")
+
+
+def _context(command: Any, name: str, parent: Any) -> Any:
+    return command.context_class(command, info_name=name, parent=parent)
+
+
+def _title(words: str, underline: str) -> tuple[str, ...]:
+    return (words, underline * len(words), "")
+
+
+def _prose(text: str) -> str:
+    """Help as reStructuredText: options as code, and nothing else that could be markup."""
+    parts = _OPTION.split(" ".join(text.split()))
+    return "".join(f"``{part}``" if number % 2 else _MARKUP.sub(r"\\\1", part) for number, part in enumerate(parts))
+
+
+if __name__ == "__main__":
+    print(reference())
