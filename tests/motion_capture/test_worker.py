@@ -5,13 +5,14 @@ from __future__ import annotations
 import io
 import sys
 import types
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
 import pytest
 
 from skyloop.errors import LinkError, MissingExtraError
-from skyloop.motion_capture import parse_system, worker
+from skyloop.motion_capture import MotionCapture, parse_system, worker
 from skyloop.motion_capture.source import ChildSource
 from skyloop.motion_capture.worker import RawFrame, read
 from skyloop.transport.testing import wait_until
@@ -105,6 +106,31 @@ def test_what_a_child_complains_of_is_told() -> None:
         failing.start(1.0)
     assert failing.pid is not None
     assert any("no such host" in text for text in told)
+
+
+def test_the_child_itself_says_why_it_ends_and_nothing_else() -> None:
+    told: list[str] = []
+    with pytest.raises((LinkError, MissingExtraError)):
+        ChildSource(parse_system("qualisys://127.0.0.1"), lambda _: None, told.append).start(5.0)
+    assert not any("Warning" in text for text in told)
+
+
+def test_the_same_trouble_is_told_once() -> None:
+    told: list[str] = []
+    makers: list[tuple[Callable[[RawFrame], None], Callable[[str], None]]] = []
+
+    def make(_system: Any, _names: Any, take: Any, trouble: Any) -> Any:
+        makers.append((take, trouble))
+        return types.SimpleNamespace(close=lambda: None)
+
+    capture = MotionCapture(SYSTEM, {"alpha": "alpha_body"}, make)
+    capture.on_event(lambda event: told.append(event.text), inline=True)
+    take, trouble = makers[0]
+    for text in ("refused", "refused", "no route", "refused"):
+        trouble(text)
+    take(RawFrame(1, {}))
+    trouble("refused")
+    assert told == ["refused", "no route", "refused", "refused"]
 
 
 def test_a_child_that_sends_nonsense_is_replaced() -> None:

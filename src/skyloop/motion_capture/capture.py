@@ -93,6 +93,7 @@ class MotionCapture:
         self._names = {theirs: ours for ours, theirs in bodies.items()}
         self._tracks = {name: Track(name, may_freeze=system.kind == "sim") for name in bodies}
         self._reported = dict.fromkeys(bodies, TrackState.WAITING)
+        self._troubled = ""  # the trouble that was told last, until a frame comes
         self._calibrations: dict[str, Calibration] = {}
         self._poses: Channel[BodyPose] = Channel()
         self._events: Channel[TrackEvent] = Channel()
@@ -307,6 +308,7 @@ class MotionCapture:
 
     def _take(self, frame: RawFrame) -> None:
         """Handle a frame of the system."""
+        self._troubled = ""
         captured_ns = frame.received_ns - self.latency_ns
         for theirs, (position, quaternion) in frame.bodies.items():
             name = self._names.get(theirs)
@@ -329,7 +331,9 @@ class MotionCapture:
             self._poses.publish(pose)
 
     def _trouble(self, text: str) -> None:
-        self._publish_event("", TrackState.LOST, text)
+        if text != self._troubled:  # a source tries again all the time, and fails for the same reason
+            self._troubled = text
+            self._publish_event("", TrackState.LOST, text)
 
     def _look_on(self) -> None:
         while not self._ended.wait(LOOK_S):

@@ -15,6 +15,12 @@ from skyloop.errors import LinkError, MissingExtraError
 from skyloop.motion_capture.address import System
 from skyloop.motion_capture.worker import MISSING, RawFrame, read
 
+#: Not ``-m``: the package imports the worker's module, of which Python would warn in each child.
+WORKER: Final = (
+    sys.executable,
+    "-c",
+    "import sys; from skyloop.motion_capture.worker import main; sys.exit(main(*sys.argv[1:]))",
+)
 AGAIN_S: Final = 0.5  #: pause before a child that ended is restarted
 SILENT_S: Final = 3.0  #: a child that sends nothing for so long is killed: its system may have been restarted
 FIRST_S: Final = 10.0  #: the same before its first frame
@@ -32,7 +38,7 @@ class ChildSource:
         take: Callable[[RawFrame], None],
         trouble: Callable[[str], None],
         *,
-        command: tuple[str, ...] = (sys.executable, "-m", "skyloop.motion_capture.worker"),
+        command: tuple[str, ...] = WORKER,
     ) -> None:
         """Initialise without starting the child.
 

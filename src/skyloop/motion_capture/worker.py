@@ -1,4 +1,4 @@
-"""The process that receives from a motion capture system: ``python -m skyloop.motion_capture.worker KIND SETTINGS``.
+"""The process that receives from a motion capture system: :func:`main` with its kind and settings.
 
 The ``motioncapture`` package waits in native code, without a timeout and partly with the interpreter locked. In its own
 process it can block nobody, and can be killed whatever it waits for. Each frame is written to standard output as a
@@ -98,7 +98,3 @@ def main(kind: str, settings: str) -> int:
     except Exception as error:  # noqa: BLE001  whatever the native code throws
         print(error, file=sys.stderr)
         return 1
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1], sys.argv[2]))
