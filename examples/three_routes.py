@@ -18,26 +18,34 @@ def tour(height: float, x: float, y: float) -> Route:
     return Route(waypoints=tuple(places), name=f"square at {height:g} m", speed=0.6, end="return")
 
 
+def fly(flight: FlyRoute) -> None:
+    """To the end of the route, or until it pauses because something is wrong."""
+    flight.run(seconds=120.0, until=lambda: bool(flight.law.problem))
+
+
 def main(*targets: str) -> None:
     with skyloop.swarm(*targets) as drones:
         drones.wait_all(lambda feedback: feedback.position_m is not None, timeout_s=10)
         flights = []
         for number, drone in enumerate(drones):
             x, y, _ = drone.feedback().position_m or (0.0, 0.0, 0.0)
-            flights.append(FlyRoute(drone, tour(0.8 + 0.5 * number, x, y)))
+            told = lambda step, name=drone.name: print(f"{name}: {step.text}", flush=True)  # noqa: E731
+            flights.append(FlyRoute(drone, tour(0.8 + 0.5 * number, x, y), on_progress=told))
         for flight in flights:
             for finding in (found := flight.check()).findings:
                 print(flight.drone.name, finding.severity, finding.waypoint, finding.reason)
             if not found.ok:
                 sys.exit("a route can't be flown: see above")
         drones.takeoff()
-        running = [threading.Thread(target=flight.run, args=(120.0,)) for flight in flights]
+        running = [threading.Thread(target=fly, args=(flight,)) for flight in flights]
         for thread in running:
             thread.start()
         for thread in running:
             thread.join()
         for flight in flights:
             print(f"{flight.drone.name}: {flight.law.route.name} {flight.law.state} {flight.law.problem}")
+        if any(flight.law.state != "done" for flight in flights):
+            sys.exit("not all routes were flown to their end: see above")
 
 
 if __name__ == "__main__":

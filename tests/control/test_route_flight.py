@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import msgspec
 import pytest
 
 import skyloop
 from skyloop.control import FlyRoute, Photo, Route, RouteWaypoint, Wait
-from skyloop.control.route_flight import check_for, save_photo
+from skyloop.control.route_flight import ENDED, check_for, save_photo
 from skyloop.control.route_law import Progress, TakePhoto
 from skyloop.errors import UnknownNameError, UsageError
-from skyloop.messages import Event, EventKind
+from skyloop.messages import Event, EventKind, Position, Refusal
 from skyloop.stepping.rehearsal import rehearse
 
 CALM = "sim://?world=empty&cameras=none&wind=0"
@@ -78,6 +79,18 @@ def test_a_refused_leg_pauses_with_the_reason_and_can_be_skipped() -> None:
     paused = [step for step in told if step.kind == "route.paused"]
     assert [step.waypoint for step in paused] == [2]
     assert "a no-fly zone is in the straight way there" in paused[0].text
+
+
+def test_a_stall_of_this_program_is_told_as_what_it_was() -> None:
+    with rehearse(CALM) as drone:
+        flight = FlyRoute(drone, TRIANGLE)
+        flight._action = Position(0.5, 0.0, 1.0)
+        text = "position refused: it repeats a command from before a failsafe or a new lease: send a new one"
+        event = Event(EventKind.COMMAND_REFUSED, text, 1, app=drone._core.app, data={"reason": Refusal.NOT_FRESH})
+        flight._on_event(event)
+        assert flight._refused == ENDED
+        flight._on_event(msgspec.structs.replace(event, data={"reason": Refusal.OUT_OF_RANGE}))
+        assert flight._refused == text
 
 
 def test_it_is_paused_and_ended_from_another_place() -> None:

@@ -17,12 +17,13 @@ from skyloop.control.route_check import RouteCheck, check_route, conditions_of
 from skyloop.control.route_law import PHOTO_S, Command, Effect, Progress, RouteLaw, RouteState, TakePhoto
 from skyloop.errors import LinkError, NoAnswerError, SkyloopError, UsageError
 from skyloop.files import write
-from skyloop.messages import AnyAction, Event, EventKind, Feedback, Land, Position, Severity
+from skyloop.messages import AnyAction, Event, EventKind, Feedback, Land, Position, Refusal, Severity
 from skyloop.vision.opencv import opencv
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
 
+ENDED: Final = "a failsafe took over on the way: this program sent nothing for a while, or a link was lost"
 PHOTOS: Final = "photos"  #: the folder that photos are saved to where none is named
 LOG: Final = "route"  #: under this name the progress is logged on the drone
 WAYPOINTS: Final = "waypoints"  #: and under this one the places that are left, for maps
@@ -111,7 +112,7 @@ class FlyRoute(Controller):
             self._carry_out(self._asked.pop(0)())
         refused, self._refused = self._refused, None
         if refused is None and self._action is not None and self.drone._core.commands.lapsed(self._action):
-            refused = "it was ended on the way, by a failsafe or a lost link"
+            refused = ENDED
         if refused is not None:
             self._carry_out(law.pause(refused))
         self._carry_out(law.update(feedback, feedback.captured_ns))
@@ -155,7 +156,8 @@ class FlyRoute(Controller):
     def _on_event(self, event: Event) -> None:
         own = event.kind is EventKind.COMMAND_REFUSED and event.app == self.drone._core.app
         if own and self._action is not None and event.data.get("reason") not in OF_ONE_PACKET:
-            self._refused = event.text
+            # That a repeat came too late says nothing to a person; what did it, does.
+            self._refused = ENDED if event.data.get("reason") == Refusal.NOT_FRESH else event.text
 
 
 def check_for(drone: Drone, route: Route, *, wait_s: float = 2.0) -> RouteCheck:
