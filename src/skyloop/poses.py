@@ -102,7 +102,7 @@ def _scipy() -> Any:
     try:
         from scipy.spatial import transform as transforms
     except ImportError as error:
-        raise MissingExtraError("poses", "control", cause=str(error)) from error
+        raise MissingExtraError("a pose", "control", cause=str(error)) from error
     if not hasattr(transforms, "RigidTransform"):
-        raise MissingExtraError("poses", "control", cause="SciPy is older than 1.16")
+        raise MissingExtraError("a pose", "control", cause="SciPy is older than 1.16")
     return transforms

@@ -253,6 +253,6 @@ def solver() -> Callable[[NDArray[np.float64]], tuple[NDArray[np.intp], NDArray[
     try:
         from scipy.optimize import linear_sum_assignment
     except ImportError as error:
-        raise MissingExtraError("formations", "control", cause=str(error)) from error
+        raise MissingExtraError("a formation", "control", cause=str(error)) from error
     found: Callable[[NDArray[np.float64]], tuple[NDArray[np.intp], NDArray[np.intp]]] = linear_sum_assignment
     return found

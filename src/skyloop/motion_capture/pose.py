@@ -115,5 +115,5 @@ def scipy_types() -> Any:
 
         transform.RigidTransform  # noqa: B018  SciPy 1.16 and newer
     except (ImportError, AttributeError):
-        raise MissingExtraError("poses as SciPy's Rotation and RigidTransform", "control") from None
+        raise MissingExtraError("a pose as SciPy's Rotation and RigidTransform", "control") from None
     return transform
