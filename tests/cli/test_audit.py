@@ -36,6 +36,7 @@ def test_nobody_has_flown_yet(run: Run) -> None:
     ended = run("audit", "alpha")
     assert ended.code == 2
     assert "no named proxy of this user has run yet" in ended.err
+    assert "skyloop audit --file ./mine.jsonl" in run("audit", "./mine.jsonl").err
 
 
 @pytest.mark.process

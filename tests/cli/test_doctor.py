@@ -11,6 +11,7 @@ import pytest
 
 from skyloop.cli import doctor
 from skyloop.cli.findings import Finding, Health, as_text
+from skyloop.errors import MissingExtraError
 from tests.cli.conftest import Run
 
 
@@ -51,6 +52,17 @@ def test_a_part_that_is_not_installed_is_no_fault_and_is_told_with_what_installs
     ended = run("doctor")
     assert ended.code == 0
     assert "– page in the browser [cockpit]: uvicorn not installed\n  → pip install 'skyloop[cockpit]'" in ended.out
+
+
+def test_a_check_that_needs_a_part_that_is_not_installed_is_no_fault(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def cameras() -> Iterator[Finding]:
+        raise MissingExtraError("video://", "video", cause="No module named 'av'")
+        yield
+
+    monkeypatch.setattr(doctor, "_cameras", cameras)
+    ended = run("doctor")
+    assert ended.code == 0, ended.out
+    assert "– cameras: video:// needs an optional part" in ended.out
 
 
 def test_a_part_that_is_broken_is_a_fault(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:

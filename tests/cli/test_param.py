@@ -114,6 +114,8 @@ def test_all_some_and_one_are_shown(run: Run, alpha: Process) -> None:
 @pytest.mark.process
 def test_values_are_written(run: Run, alpha: Process) -> None:
     assert "0.3 rad" in run("param", "alpha", "limits.tilt", "0.3").out
+    assert "0.25 rad" in run("param", "alpha", "limits.tilt=0.25").out
+    assert "0.3 rad" in run("param", "alpha", "limits.tilt", "0.3").out
     assert "-1,0.5,0 m/s" in run("param", "alpha", "sim.wind", "-1,0.5,0").out
     with skyloop.connect("alpha", access="observe") as drone:
         assert drone.config["limits.tilt"] == 0.3

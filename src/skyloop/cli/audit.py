@@ -86,6 +86,8 @@ def _files(name: str | None, file: Path | None) -> list[Path]:
 
     if file is not None:
         return [file]
+    if name is not None and ("/" in name or name.endswith(SUFFIX)):
+        raise UsageError(f"{name} is a file, not the name of a proxy: skyloop audit --file {name}")
     folder = audit_folder()
     known = sorted(path.name.removesuffix(SUFFIX) for path in folder.glob("*" + SUFFIX)) if folder.is_dir() else []
     if name is None:

@@ -76,6 +76,8 @@ def doctor(
 
 def examine() -> Iterator[Finding]:
     """All findings, in the order to be read. A check that breaks is a finding too."""
+    from skyloop.errors import MissingExtraError
+
     checks: dict[str, Callable[[], Iterator[Finding]]] = {
         "Python": _python,
         "local transport": _local_transport,
@@ -90,6 +92,8 @@ def examine() -> Iterator[Finding]:
     for what, check in checks.items():
         try:
             yield from check()
+        except MissingExtraError as error:
+            yield Finding(what, Health.MISSING, str(error))
         except Exception as error:  # noqa: BLE001  a doctor reports what is broken, also in the checks
             yield Finding(what, Health.BAD, f"{type(error).__name__}: {error}")
 

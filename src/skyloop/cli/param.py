@@ -54,6 +54,8 @@ def param(
             name, key, value = drone, name, key
     join_network(network, keys)
     name = one_drone(name, drone)
+    if key is not None and value is None and "=" in key:
+        key, value = key.split("=", 1)
     found = _write(name, key, value, priority) if key is not None and value is not None else _read(name, key)
     if json:
         typer.echo(msgspec.json.encode([msgspec.structs.asdict(each) for each in found]).decode())
