@@ -18,6 +18,7 @@ from skyloop.messages import Takeoff, Velocity
 from skyloop.sim import STEP_S, Simulation, load_world
 from skyloop.sim.camera import BOTTOM_CAMERA, FRONT_CAMERA, CameraModel
 from skyloop.sim.render import PlanarRenderer, Scene, SceneState, SensorEffects, use_one_core
+from skyloop.sim.render.compiled import COMPILER
 from skyloop.sim.render.opencv import cv2
 
 DRAWING_WORLD = "room"  #: furnished, with markers and a moving board
@@ -78,6 +79,8 @@ class SimResults(msgspec.Struct, frozen=True):
 def measure(seconds: float, progress: Progress = lambda _: None) -> SimResults:
     """Measure physics and drawing in the calling thread, to which OpenCV is kept meanwhile.
 
+    Where Numba is installed, pictures are drawn by compiled code from the first on.
+
     Args:
         seconds: About how long, beside the time for making the scenes [s].
         progress: Called with the share that is done, 0 to 1.
@@ -90,6 +93,7 @@ def measure(seconds: float, progress: Progress = lambda _: None) -> SimResults:
     def part(number: int) -> Progress:
         return lambda share: progress((number + share) / parts)
 
+    COMPILER.start().join()
     with _one_core():
         for number, (world, drones) in enumerate(FLEETS):
             physics.append(measure_physics(world, drones, share_s, part(number)))

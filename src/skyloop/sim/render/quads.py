@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from skyloop.sim.render.atlas import Texture
 
 Floats = NDArray[np.float64]
+CHANGING = ("corners", "normals", "u_slope", "v_slope", "u_start", "v_start")  #: when quads are moved
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +31,7 @@ class Quads:
     two_sided: NDArray[np.bool_]  #: (n,) seen from behind as well
     priority: NDArray[np.intp]  #: (n,) of things in one plane the highest is seen
     lit: NDArray[np.bool_]  #: (n,) brighter where it faces the light; the sky is not
+    density: Floats  #: (n,) [texel/m²]
 
     def __len__(self) -> int:
         return len(self.corners)
@@ -40,17 +42,28 @@ class Quads:
 
     def moved(self, position_m: Floats, rotation: Floats) -> Quads:
         """The same quads after a rotation (3, 3) and a shift (3,)."""
-        u_slope = self.u_slope @ rotation.T
-        v_slope = self.v_slope @ rotation.T
-        return replace(
-            self,
-            corners=self.corners @ rotation.T + position_m,
-            normals=self.normals @ rotation.T,
-            u_slope=u_slope,
-            v_slope=v_slope,
-            u_start=self.u_start - u_slope @ position_m,
-            v_start=self.v_start - v_slope @ position_m,
-        )
+        return moved_each(self, position_m[None], rotation[None])
+
+
+def moved_each(many: Quads, positions_m: Floats, rotations: Floats) -> Quads:
+    """Quads of ``n`` equal bodies, one body after the other, each after a rotation (n, 3, 3) and a shift (n, 3)."""
+    bodies = len(positions_m)
+    across = rotations.transpose(0, 2, 1)
+
+    def turned(vectors: Floats) -> Floats:
+        return np.asarray(np.matmul(vectors.reshape(bodies, -1, 3), across))
+
+    corners = turned(many.corners) + positions_m[:, None]
+    u_slope, v_slope = turned(many.u_slope), turned(many.v_slope)
+    return replace(
+        many,
+        corners=corners.reshape(-1, 4, 3),
+        normals=turned(many.normals).reshape(-1, 3),
+        u_slope=u_slope.reshape(-1, 3),
+        v_slope=v_slope.reshape(-1, 3),
+        u_start=many.u_start - np.matmul(u_slope, positions_m[:, :, None]).reshape(-1),
+        v_start=many.v_start - np.matmul(v_slope, positions_m[:, :, None]).reshape(-1),
+    )
 
 
 def concatenate(parts: list[Quads]) -> Quads:
@@ -177,4 +190,5 @@ class QuadBuilder:
             np.array(two_sided, dtype=np.bool_),
             np.array(priority, dtype=np.intp),
             np.array(lit, dtype=np.bool_),
+            np.linalg.norm(np.cross(u_slope, v_slope), axis=1),
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from skyloop.errors import UsageError
 from skyloop.sim.render import models
 from skyloop.sim.render.atlas import AtlasBuilder
 from skyloop.sim.render.base import SceneState
-from skyloop.sim.render.quads import Quads, concatenate
+from skyloop.sim.render.quads import CHANGING, Quads, concatenate, moved_each
 from skyloop.sim.render.room import static_quads
 from skyloop.sim.render.shadows import Shadow
 from skyloop.sim.world import BoardTarget, PlatformTarget, World
@@ -48,9 +48,29 @@ class Scene:
         self._stand = models.stand(atlas)
         hulls = [models.drone(atlas, hull) for hull in models.HULLS[: max(1, drones)]]
         self._hulls = [hulls[k % len(hulls)] for k in range(drones)]
+        standing = [
+            part
+            for target, template in zip(world.targets, self._targets, strict=True)
+            for part in ([template, self._stand] if isinstance(target, BoardTarget) else [template])
+        ]
+        # Everything in the order of ``posed``, for what doesn't change when it moves.
+        self._everything = concatenate([self._static, *standing, *self._hulls])
+        owners = [np.full(len(self._static) + sum(map(len, standing)), -1, np.intp)]
+        owners += [np.full(len(hull), k, np.intp) for k, hull in enumerate(self._hulls)]
+        self._owner = np.concatenate(owners)
+        self._swarm = concatenate(self._hulls) if self._hulls else None
         self.atlas = atlas.pack()
-        # Where shadows can fall: upright solids, as yaw, centre and half size.
-        self._tops = [(box.yaw_rad, np.array(box.position_m), np.array(box.size_m) / 2) for box in world.solids()]
+        # Where shadows can fall: upright solids, as cosine and sine of the yaw, centre, half width and depth, and top.
+        self._tops = [
+            (
+                math.cos(box.yaw_rad),
+                math.sin(box.yaw_rad),
+                *map(float, box.position_m[:2]),
+                *(side / 2 for side in map(float, box.size_m[:2])),
+                float(box.position_m[2] + box.size_m[2] / 2),
+            )
+            for box in world.solids()
+        ]
 
     def posed(self, state: SceneState) -> Posed:
         """Place everything that moves as a state says.
@@ -77,32 +97,25 @@ class Scene:
                 shadows.append(Shadow(on_floor, 0.32, 0.45))
             else:
                 shadows.append(Shadow(on_floor, 0.75 * math.hypot(*target.size_m[:2]), 0.45))
-        still = sum(len(part) for part in parts)
-        owner = [np.full(still, -1, np.intp)]
-        for k, hull in enumerate(self._hulls):
-            parts.append(hull.moved(state.drone_positions_m[k], state.drone_rotations[k]))
-            owner.append(np.full(len(hull), k, np.intp))
-            shadow = self._drone_shadow(state.drone_positions_m[k])
-            if shadow is not None:
-                shadows.append(shadow)
-        return Posed(concatenate(parts), np.concatenate(owner), tuple(shadows))
+        if self._swarm is not None:
+            parts.append(moved_each(self._swarm, state.drone_positions_m, state.drone_rotations))
+            shadows += filter(None, map(self._drone_shadow, state.drone_positions_m.tolist()))
+        changing = {name: np.concatenate([getattr(part, name) for part in parts]) for name in CHANGING}
+        return Posed(replace(self._everything, **changing), self._owner, tuple(shadows))
 
-    def _drone_shadow(self, position_m: NDArray[np.float64]) -> Shadow | None:
+    def _drone_shadow(self, position_m: list[float]) -> Shadow | None:
         """The soft spot on whatever surface is below a drone; None if it is too high above it."""
+        x, y, z = position_m
         surface = 0.0
-        for yaw, centre, half in self._tops:
-            c, s = math.cos(yaw), math.sin(yaw)
-            dx, dy = position_m[0] - centre[0], position_m[1] - centre[1]
-            top = float(centre[2] + half[2])
-            over = abs(c * dx + s * dy) < half[0] and abs(c * dy - s * dx) < half[1]
-            if over and surface < top <= position_m[2]:
+        for c, s, at_x, at_y, half_x, half_y, top in self._tops:
+            dx, dy = x - at_x, y - at_y
+            if surface < top <= z and abs(c * dx + s * dy) < half_x and abs(c * dy - s * dx) < half_y:
                 surface = top
-        above = float(position_m[2]) - surface
+        above = z - surface
         fade = 1.0 - above / _FADES_AT_M
         if fade <= 0.0:
             return None
-        centre_m = np.array([position_m[0], position_m[1], surface])
-        return Shadow(centre_m, models.DRONE_RADIUS_M * (1.1 + 0.35 * above), 0.6 * fade**1.5)
+        return Shadow(np.array([x, y, surface]), models.DRONE_RADIUS_M * (1.1 + 0.35 * above), 0.6 * fade**1.5)
 
 
 def _yaw(angle: float) -> NDArray[np.float64]:

@@ -12,8 +12,8 @@ from skyloop.sim.render.opencv import cv2
 
 # How far, as a share of the distance, a pixel may lie off the shadow's plane and still be darkened by it.
 _THICKNESS = 4e-3
+_MORE_M = 4e-3
 _NEAR_M = 0.01
-_SQUARE = np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,73 +31,97 @@ class Shadow:
     strength: float
 
 
-def darken(
-    picture: NDArray[np.uint8],
-    shadow: Shadow,
-    pose: CameraPose,
-    ray_x: NDArray[np.float32],
-    ray_y: NDArray[np.float32],
-    inverse_depth: NDArray[np.float32],
-) -> None:
+@dataclass(frozen=True, slots=True)
+class Rays:
+    """x/z and y/z of each pixel of a lens, (height, width), and their extremes in each column and row."""
+
+    x: NDArray[np.float32]
+    y: NDArray[np.float32]
+    columns: tuple[NDArray[np.float32], NDArray[np.float32]]  #: least and most x, (width,)
+    rows: tuple[NDArray[np.float32], NDArray[np.float32]]  #: least and most y, (height,)
+
+    @staticmethod
+    def of(x: NDArray[np.float32], y: NDArray[np.float32]) -> Rays:
+        """Find the extremes."""
+        return Rays(x, y, (x.min(axis=0), x.max(axis=0)), (y.min(axis=1), y.max(axis=1)))
+
+
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """A shadow as a camera sees it.
+
+    Attributes:
+        box: First row that may show it, row after the last, first column, column after the last.
+        axes: World from optical.
+        numbers: Its plane above the camera [m]; the camera from its centre, east and north [m]; square of its radius
+            [m²]; strength of 255; how far a pixel may lie off the plane: share of the distance, and more [m].
+    """
+
+    box: tuple[int, int, int, int]
+    axes: NDArray[np.float32]
+    numbers: NDArray[np.float32]
+
+
+def placed(shadow: Shadow, pose: CameraPose, rays: Rays) -> Placed | None:
+    """Return where a shadow may be seen; None if nowhere."""
+    away = pose.position_m - shadow.centre_m
+    at = _seen_at((-away @ pose.rotation).tolist(), (shadow.radius_m * pose.rotation[:2]).tolist())
+    if not at:
+        return None
+    columns = _span(rays.columns, min(x for x, _ in at), max(x for x, _ in at))
+    rows = _span(rays.rows, min(y for _, y in at), max(y for _, y in at))
+    if columns is None or rows is None:
+        return None
+    numbers = (-away[2], away[0], away[1], shadow.radius_m**2, 255.0 * shadow.strength, _THICKNESS, _MORE_M)
+    return Placed((*rows, *columns), pose.rotation.astype(np.float32), np.array(numbers, np.float32))
+
+
+def darken(picture: NDArray[np.uint8], shadow: Placed, rays: Rays, inverse_depth: NDArray[np.float32]) -> None:
     """Darken the pixels of an image that show the shadow's place.
 
     Args:
-        picture: Shape (h, w, 4), changed in place.
+        picture: BGR, (height, width, 3), changed in place.
         shadow: The shadow.
-        pose: Of the camera.
-        ray_x: Of each pixel, flat.
-        ray_y: Of each pixel, flat.
-        inverse_depth: Of each pixel [1/m], flat.
+        rays: Of the lens.
+        inverse_depth: Of each pixel [1/m], (height, width).
     """
-    height, width = picture.shape[:2]
-    box = _rows_and_columns(shadow, pose, ray_x.reshape(height, width), ray_y.reshape(height, width))
-    if box is None:
-        return
-    rows, columns = box
-    x = ray_x.reshape(height, width)[rows, columns]
-    y = ray_y.reshape(height, width)[rows, columns]
-    w = inverse_depth.reshape(height, width)[rows, columns]
-    east, north, up = pose.rotation.astype(np.float32)
-    below = np.float32(shadow.centre_m[2] - pose.position_m[2])
-    away_x = np.float32(pose.position_m[0] - shadow.centre_m[0])
-    away_y = np.float32(pose.position_m[1] - shadow.centre_m[1])
-    depth = 1.0 / w
+    top, bottom, left, right = shadow.box
+    part = slice(top, bottom), slice(left, right)
+    x, y, depth = rays.x[part], rays.y[part], 1.0 / inverse_depth[part]
+    east, north, up = shadow.axes
+    below, away_x, away_y, square, strength, thickness, more = shadow.numbers
     off_plane = np.abs((up[0] * x + up[1] * y + up[2]) * depth - below)
     at_x = (east[0] * x + east[1] * y + east[2]) * depth + away_x
     at_y = (north[0] * x + north[1] * y + north[2]) * depth + away_y
-    rim = np.clip(1.0 - (at_x * at_x + at_y * at_y) / np.float32(shadow.radius_m**2), 0.0, 1.0)
-    rim *= off_plane < _THICKNESS * depth + np.float32(0.004)
-    light = (255.0 - 255.0 * shadow.strength * rim * rim * (3.0 - 2.0 * rim)).astype(np.uint8)
-    part = picture[rows, columns]
-    part[...] = cv2.multiply(np.ascontiguousarray(part), cv2.cvtColor(light, cv2.COLOR_GRAY2BGRA), scale=1.0 / 255.0)
+    rim = np.clip(1.0 - (at_x * at_x + at_y * at_y) / square, 0.0, 1.0)
+    rim *= off_plane < thickness * depth + more
+    light = (255.0 - strength * rim * rim * (3.0 - 2.0 * rim)).astype(np.uint8)
+    target = picture[part]
+    target[...] = cv2.multiply(np.ascontiguousarray(target), cv2.cvtColor(light, cv2.COLOR_GRAY2BGR), scale=1.0 / 255.0)
 
 
-def _rows_and_columns(
-    shadow: Shadow, pose: CameraPose, ray_x: NDArray[np.float32], ray_y: NDArray[np.float32]
-) -> tuple[slice, slice] | None:
-    """The part of the picture that may show the shadow; None if no part does."""
-    corners = shadow.centre_m + shadow.radius_m * _SQUARE
-    optical = _in_front((corners - pose.position_m) @ pose.rotation)
-    if not len(optical):
+def _seen_at(centre: list[float], sides: list[list[float]]) -> list[tuple[float, float]]:
+    """x/z and y/z of the corners of the part of a square that lies farther ahead than a centimetre, optical axes.
+
+    Args:
+        centre: Of the square [m].
+        sides: From there to the middles of two sides [m].
+    """
+    (ax, ay, az), (bx, by, bz) = sides
+    signs = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))
+    x, y, z = centre
+    corners = [(x + p * ax + q * bx, y + p * ay + q * by, z + p * az + q * bz) for p, q in signs]
+    found = [(x / z, y / z) for x, y, z in corners if z > _NEAR_M]
+    for (x, y, z), (x2, y2, z2) in zip(corners, corners[1:] + corners[:1], strict=True):
+        if (z > _NEAR_M) != (z2 > _NEAR_M):
+            share = (_NEAR_M - z) / (z2 - z)
+            found.append(((x + share * (x2 - x)) / _NEAR_M, (y + share * (y2 - y)) / _NEAR_M))
+    return found
+
+
+def _span(extremes: tuple[NDArray[np.float32], NDArray[np.float32]], low: float, high: float) -> tuple[int, int] | None:
+    """The first row or column that may see something between two bounds, and the one after the last; None if none."""
+    if not (low <= extremes[1].max() and high >= extremes[0].min()):
         return None
-    at = optical[:, :2] / optical[:, 2:]
-    columns = (ray_x.max(axis=0) >= at[:, 0].min()) & (ray_x.min(axis=0) <= at[:, 0].max())
-    rows = (ray_y.max(axis=1) >= at[:, 1].min()) & (ray_y.min(axis=1) <= at[:, 1].max())
-    if not (columns.any() and rows.any()):
-        return None
-    return _span(rows), _span(columns)
-
-
-def _in_front(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The corners of the part of a polygon, (n, 3) optical, that lies farther ahead than a centimetre."""
-    ahead = corners[:, 2] > _NEAR_M
-    after = np.roll(corners, -1, axis=0)
-    crossing = ahead != np.roll(ahead, -1)
-    share = (_NEAR_M - corners[crossing, 2]) / (after[crossing, 2] - corners[crossing, 2])
-    cuts = corners[crossing] + share[:, None] * (after[crossing] - corners[crossing])
-    return np.vstack([corners[ahead], cuts])
-
-
-def _span(flags: NDArray[np.bool_]) -> slice:
-    where = np.flatnonzero(flags)
-    return slice(int(where[0]), int(where[-1]) + 1)
+    where = np.flatnonzero((extremes[1] >= low) & (extremes[0] <= high))
+    return (int(where[0]), int(where[-1]) + 1) if len(where) else None

@@ -21,7 +21,7 @@ from skyloop.sim.render.quads import Floats, Quads
 # How much nearer a picture on a wall counts than the wall behind it, per step of priority, as a share of the distance.
 PRIORITY_SHARE = 1e-3
 # A quad this nearly edge-on [m from its plane to the eye] covers nothing that could be seen.
-_EDGE_ON_M = 1e-5
+EDGE_ON_M = 1e-5
 _BAND = 32768  # samples of a quad drawn at a time: few enough for the working arrays to stay in the cache
 
 
@@ -54,15 +54,25 @@ class View:
     box: NDArray[np.intp]
 
 
+def dot(a: Floats, b: Floats) -> Floats:
+    """Return a · b along the last axis of three, summed from the first on: no library's order, so the same bits."""
+    return np.asarray(a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2])
+
+
+def turned(vectors: Floats, rotation: Floats) -> Floats:
+    """Return vectors, shape (…, 3), times a rotation from the right, with the sums of :func:`dot`."""
+    return np.stack([dot(vectors, rotation[:, axis]) for axis in range(3)], axis=-1)
+
+
 def visible_quads(quads: Quads, shown: NDArray[np.bool_], pose: CameraPose, grid: Grid) -> View:
     """Return the ``shown`` quads, (n,), that a pose can see through a grid, each on its own.
 
     Occlusion is left to :class:`DepthBuffer`.
     """
-    height_m = np.einsum("ij,ij->i", quads.normals, pose.position_m - quads.corners[:, 0])
-    facing = (height_m > _EDGE_ON_M) | (quads.two_sided & (height_m < -_EDGE_ON_M))
+    height_m = dot(quads.normals, pose.position_m - quads.corners[:, 0])
+    facing = (height_m > EDGE_ON_M) | (quads.two_sided & (height_m < -EDGE_ON_M))
     index = np.flatnonzero(facing & shown)
-    corners = (quads.corners[index] - pose.position_m) @ pose.rotation
+    corners = turned(quads.corners[index] - pose.position_m, pose.rotation)
     inside = _touches_view(corners, grid)
     index, corners = index[inside], corners[inside]
     height_m = height_m[index]
@@ -77,7 +87,7 @@ def visible_quads(quads: Quads, shown: NDArray[np.bool_], pose: CameraPose, grid
         box[:, 1] = covered.argmax(axis=1)
         box[:, 2] = np.where(covered, end, 0).max(axis=1)
         box[:, 3] = grid.height - covered[:, ::-1].argmax(axis=1)
-    inverse_depth = (quads.normals[index] @ pose.rotation) / -height_m[:, None]
+    inverse_depth = turned(quads.normals[index], pose.rotation) / -height_m[:, None]
     return View(index, inverse_depth, height_m, first, end, box)
 
 

@@ -1,0 +1,129 @@
+"""The compiled way of drawing against the plain one, and what happens where nothing can be compiled."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from skyloop.messages.geometry import rotation_from_euler
+from skyloop.sim.camera import BOTTOM_CAMERA, FRONT_CAMERA, CameraModel, CameraPose
+from skyloop.sim.render import PlanarRenderer, Quality, Scene, SceneState, planar
+from skyloop.sim.render.compiled import Compiler, Kernels, load_kernels
+from tests.sim.test_render import WORLD, state_at
+
+STRONG = replace(FRONT_CAMERA, name="strong", distortion=(-0.3, 0.1, 0.01, -0.01, 0.0))
+
+
+def ready(functions: Kernels) -> Compiler:
+    """A compiler that is done."""
+    compiler = Compiler(lambda: functions)
+    compiler.start().join()
+    return compiler
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return Scene(WORLD, drones=3)
+
+
+@pytest.fixture(autouse=True)
+def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(planar, "WORTH_COMPILING", 0)
+
+
+def random_view(rng: np.random.Generator, model: CameraModel) -> tuple[SceneState, CameraPose]:
+    """Drones low over the floor, over one another and in front of the camera, which looks anywhere."""
+    size = np.array(WORLD.room.size_m)
+    places = rng.uniform(-0.45, 0.45, (3, 3)) * size + (0.0, 0.0, size[2] / 2)
+    places[1, 2] = rng.uniform(0.05, 0.3)
+    places[2] = places[0] + rng.uniform(-0.6, 0.6, 3)
+    turns = np.array([rotation_from_euler(*rng.uniform((-0.4, -0.4, -3.1), (0.4, 0.4, 3.1))) for _ in range(3)])
+    state = replace(state_at([(0.0, 0.0, 1.0)] * 3), drone_positions_m=places, drone_rotations=turns)
+    return state, model.pose(places[0], turns[0], 0)
+
+
+def assert_the_same(
+    scene: Scene, functions: Kernels, model: CameraModel, quality: Quality, views: int, seed: int
+) -> None:
+    plain, compiled = (PlanarRenderer(scene, quality, compiler=way) for way in (None, ready(functions)))
+    rng = np.random.default_rng(seed)
+    for number in range(views):
+        state, pose = random_view(rng, model)
+        expected = plain.render(state, pose, model)
+        assert np.array_equal(compiled.render(state, pose, model), expected), f"view {number}"
+        assert expected.std() > 1.0
+
+
+@pytest.mark.parametrize("quality", list(Quality))
+@pytest.mark.parametrize("model", [FRONT_CAMERA, BOTTOM_CAMERA, STRONG], ids=lambda model: model.name)
+def test_compiled_pictures_are_the_plain_ones_bit_by_bit(scene: Scene, model: CameraModel, quality: Quality) -> None:
+    pytest.importorskip("numba")
+    assert_the_same(scene, load_kernels(), model.scaled(0.5), quality, views=12, seed=1)
+
+
+@pytest.mark.parametrize("model", [FRONT_CAMERA, BOTTOM_CAMERA], ids=lambda model: model.name)
+def test_the_kernels_draw_the_same_where_nothing_compiles_them(scene: Scene, model: CameraModel) -> None:
+    with np.errstate(over="ignore"):
+        assert_the_same(scene, Kernels(), model.scaled(0.08), Quality.SMOOTH, views=2, seed=2)
+
+
+def test_a_picture_within_a_larger_one_is_drawn_too(scene: Scene) -> None:
+    state, pose = random_view(np.random.default_rng(3), FRONT_CAMERA)
+    renderer = PlanarRenderer(scene, compiler=None)
+    twice = np.zeros((240, 640, 3), np.uint8)
+    renderer.render(state, pose, FRONT_CAMERA, twice[:, 320:])
+    assert np.array_equal(twice[:, 320:], renderer.render(state, pose, FRONT_CAMERA))
+    assert not twice[:, :320].any()
+
+
+def test_it_draws_the_plain_way_until_the_kernels_are_compiled(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(planar, "WORTH_COMPILING", 2)
+    loads: list[int] = []
+
+    def load() -> Kernels:
+        loads.append(1)
+        return Kernels()
+
+    compiler = Compiler(load)
+    model = BOTTOM_CAMERA.scaled(0.05)
+    renderer = PlanarRenderer(scene, compiler=compiler)
+    state, pose = random_view(np.random.default_rng(4), model)
+    first = renderer.render(state, pose, model)
+    renderer.render(state, pose, model)
+    assert not loads, "too few pictures to compile for"
+    renderer.render(state, pose, model)
+    compiler.start().join()
+    assert np.array_equal(renderer.render(state, pose, model), first)
+    assert loads == [1]
+    assert compiler.problem == ""
+
+
+@pytest.mark.parametrize(
+    ("error", "problem", "told"),
+    [
+        (ImportError("No module named 'numba'"), "Numba is not there: No module named 'numba'", 0),
+        (RuntimeError("cannot cache function\nmore"), "Numba can't compile here: cannot cache function", 1),
+        (ValueError(), "Numba can't compile here: ValueError()", 1),
+    ],
+)
+def test_where_nothing_can_be_compiled_it_says_so_once_and_draws_the_plain_way(
+    scene: Scene, caplog: pytest.LogCaptureFixture, error: Exception, problem: str, told: int
+) -> None:
+    def load() -> Kernels:
+        raise error
+
+    compiler = Compiler(load)
+    renderer = PlanarRenderer(scene, compiler=compiler)
+    model = BOTTOM_CAMERA.scaled(0.1)
+    state, pose = random_view(np.random.default_rng(5), model)
+    with caplog.at_level(logging.WARNING):
+        pictures = []
+        for _ in range(3):
+            pictures.append(renderer.render(state, pose, model))
+            compiler.start().join()
+    assert compiler.problem == problem
+    assert len([record for record in caplog.records if problem in record.getMessage()]) == told
+    assert all(np.array_equal(picture, pictures[0]) for picture in pictures)
