@@ -97,6 +97,8 @@ export interface State {
   velocity: Vector | null;
   speed: number | null;
   position: Vector | null;
+  /** Where it took off. */
+  start: Vector | null;
   battery: number | null;
   flight: string;
   airborne: boolean;
@@ -182,7 +184,7 @@ export interface Sticks {
 export type Command =
   | { do: "take"; priority: number; ask: boolean }
   | { do: "answer"; id: number; grant: boolean; reason: string }
-  | { do: "release" | "takeoff" | "hover" | "land" | "stop" | "reset" }
+  | { do: "release" | "takeoff" | "hover" | "land" | "return" | "stop" | "reset" }
   | ({ do: "fly" } & Sticks)
   | { do: "goto"; x: number; y: number; z: number; yaw?: number }
   | { do: "route"; id: string }

@@ -19,7 +19,7 @@ import { Instruments } from "./instruments.js";
 import { named, t } from "./language/index.js";
 import type { Deed } from "./keys.js";
 import { MapPanel } from "./mappanel.js";
-import type { Alarm, DroneRow, State, Sticks, Vector, Vehicle } from "./model.js";
+import type { Alarm, DroneRow, State, Sticks, Vehicle } from "./model.js";
 import { Parameters } from "./parameters.js";
 import { Pilot } from "./pilot.js";
 import { Plots } from "./plots.js";
@@ -64,7 +64,6 @@ export class Pane {
   private vehicle: Vehicle | null = null;
   private state: State | null = null;
   /** Where it was when it was first seen in the air, in this flight. */
-  private start: Vector | null = null;
   private connected = false;
   private absent = "";
   private dirty = false;
@@ -293,8 +292,6 @@ export class Pane {
       this.remember(message);
       this.events.add(message.events);
       if (message.events.some((event) => event.kind === "parameter_changed")) this.map.surroundings.reload();
-      if (!message.airborne) this.start = null;
-      else this.start ??= message.position;
     }
     this.dirty = true; // shown with the next tick
   }
@@ -434,7 +431,7 @@ export class Pane {
       waypoints: (state?.waypoints ?? []).map((one) => ({ position: one.position, own: one.app !== null })),
       trail: this.trail,
       world: this.map.surroundings.world,
-      start: this.start,
+      start: state?.start ?? null,
     };
   }
 

@@ -116,10 +116,11 @@ export class Pilot {
     this.send({ do: "release" });
   }
 
-  /** Take-off, landing, hover, emergency stop and its end. */
-  act(deed: "takeoff" | "hover" | "land" | "stop" | "reset"): void {
+  /** Take-off, landing, hover, the way back, emergency stop and its end. */
+  act(deed: "takeoff" | "hover" | "land" | "return" | "stop" | "reset"): void {
     this.end();
-    this.send({ do: deed });
+    const sent = this.send({ do: deed });
+    this.going = sent && deed === "return";
   }
 
   goTo(x: number, y: number, z: number): void {
@@ -187,7 +188,7 @@ export class Pilot {
   }
 
   private refused(command: string, why: string): void {
-    if (command === "goto" || command === "fly" || command === "route") this.end();
+    if (command === "goto" || command === "fly" || command === "route" || command === "return") this.end();
     this.listener.refused(command, why);
   }
 
@@ -208,7 +209,7 @@ export class Pilot {
       this.going = message.state === "flying" || message.state === "acting";
       this.listener.route?.(message);
     } else if (message.type === "done") {
-      if (message.do === "goto") this.going = false;
+      if (message.do === "goto" || message.do === "return") this.going = false;
       this.listener.done(message.do, message.name, message.value);
     }
   }

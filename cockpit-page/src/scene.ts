@@ -28,7 +28,7 @@ import {
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import { colour, h } from "./dom.js";
 import { t } from "./language/index.js";
-import { discard, frustum, scenery } from "./scenery.js";
+import { discard, frustum, ring, scenery } from "./scenery.js";
 import type { World } from "./surroundings.js";
 import type { Body, Scene } from "./world.js";
 
@@ -131,6 +131,7 @@ export class SceneView {
       const body = { name: "", position, roll: 0, pitch: 0, yaw: null };
       place(`waypoint ${number} ${own}`, body, () => solid(new SphereGeometry(0.09, 16, 12), colour(own ? "accent" : "warn")));
     });
+    if (scene.start) place("start", { name: "", position: scene.start, roll: 0, pitch: 0, yaw: null }, () => new Group().add(ring([0, 0, 0], "accent")));
     for (const [key, group] of this.bodies) {
       if (shown.has(key)) continue;
       this.scene.remove(group);

@@ -38,7 +38,7 @@ export function scenery(world: World): Group {
     card.rotation.set(0, -elevation, yaw, "ZYX");
     group.add(card);
   }
-  for (const { position } of world.starts) group.add(ring(position));
+  for (const { position } of world.starts) group.add(ring(position, "muted"));
   for (const zone of world.zones) {
     if (zone.kind === "box") group.add(...between(zone.low, zone.high, "bad"));
     else {
@@ -138,8 +138,9 @@ function frame({ position, size, yaw, frame: bar }: World["gates"][number]): Gro
   return group;
 }
 
-function ring([x, y, z]: Vector): Mesh {
-  const mesh = new Mesh(new RingGeometry(0.2, 0.25, 40), new MeshBasicMaterial({ color: new Color(colour("muted")), side: DoubleSide }));
+/** Where a drone begins, on the ground. */
+export function ring([x, y, z]: Vector, ink: string): Mesh {
+  const mesh = new Mesh(new RingGeometry(0.2, 0.25, 40), new MeshBasicMaterial({ color: new Color(colour(ink)), side: DoubleSide }));
   mesh.position.set(x, y, z + 0.005);
   return mesh;
 }

@@ -44,6 +44,7 @@ export class Strip {
   private readonly takeOff: HTMLButtonElement;
   private readonly hover: HTMLButtonElement;
   private readonly land: HTMLButtonElement;
+  private readonly back: HTMLButtonElement;
   private readonly reset: HTMLButtonElement;
   private readonly stop: HTMLButtonElement;
   private readonly why = h("p", { class: "note" });
@@ -67,11 +68,12 @@ export class Strip {
     this.takeOff = keyed(t.strip.takeOff, "T", "", () => act("takeoff"));
     this.hover = keyed(t.strip.hover, "H", "", () => act("hover"));
     this.land = keyed(t.strip.land, "L", "", () => act("land"));
+    this.back = keyed(t.strip.back, "B", "", () => act("return"));
     this.reset = keyed(t.strip.reset, "", "", () => act("reset"));
     this.stop = holdButton(stop.countdown, stop.deadly, { class: "stop", title: t.safety.hold }, h("span", {}, t.safety.off), h("span", { class: "stop-name" }, drone), h("span", { class: "fate" }));
     this.ended = h("p", { class: "ended", role: "alert", "data-tone": "bad", hidden: true }, this.endedText, h("button", { type: "button", class: "small", onclick: stop.understood }, t.strip.understood));
-    this.buttons = [["take", this.take], ["release", this.release], ["takeoff", this.takeOff], ["hover", this.hover], ["land", this.land], ["reset", this.reset], ["stop", this.stop]];
-    this.element = h("div", { class: "strip", role: "group", "aria-label": t.strip.label }, this.question.voice, this.question.element, this.ended, this.waiting, this.holder, h("span", { class: "taking" }, this.priority, this.ask, this.take, this.release), h("span", { class: "deeds" }, this.takeOff, this.hover, this.land, this.reset), this.why, this.stop);
+    this.buttons = [["take", this.take], ["release", this.release], ["takeoff", this.takeOff], ["hover", this.hover], ["land", this.land], ["return", this.back], ["reset", this.reset], ["stop", this.stop]];
+    this.element = h("div", { class: "strip", role: "group", "aria-label": t.strip.label }, this.question.voice, this.question.element, this.ended, this.waiting, this.holder, h("span", { class: "taking" }, this.priority, this.ask, this.take, this.release), h("span", { class: "deeds" }, this.takeOff, this.hover, this.land, this.back, this.reset), this.why, this.stop);
   }
 
   /** What was chosen, within its range. */
@@ -104,7 +106,7 @@ export class Strip {
     this.question.update(pilot, performance.now());
     this.count(pilot);
     setDisabled(this.take, !can);
-    for (const button of [this.takeOff, this.hover, this.land]) {
+    for (const button of [this.takeOff, this.hover, this.land, this.back]) {
       setHidden(button, pilot === null || !flies || emergency);
       setDisabled(button, !mine);
     }

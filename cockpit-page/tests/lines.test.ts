@@ -255,6 +255,23 @@ test("each command carries the time of its press, on the cockpit's clock, and is
   assert.deepEqual(pilot.result("takeoff"), { ...pilot.result("takeoff"), fate: "refused", why: "battery low" });
 });
 
+test("the way back to the start is flown from the page, which makes it hover when it loses the focus", () => {
+  const { pilot, sent, receive, live } = flown();
+  live();
+  receive(held(true));
+  pilot.act("return");
+  assert.equal(sent.at(-1)?.["do"], "return");
+  assert.ok(pilot.going);
+  pilot.rest();
+  assert.equal(sent.at(-1)?.["do"], "hover");
+  pilot.act("return");
+  receive({ type: "done", do: "return" });
+  assert.ok(!pilot.going, "it lands by itself from there on");
+  pilot.act("return");
+  receive({ type: "refused", do: "return", n: 0, why: "a no-fly zone is in the straight way there" });
+  assert.ok(!pilot.going);
+});
+
 test("a page that has no answer for a second sends nothing, and says so on the control", () => {
   const { pilot, sent, reported, receive, live, at } = flown();
   live();

@@ -71,6 +71,7 @@ test("keys: sticks by place, deeds once, nothing while somebody types", () => {
   keys.clear();
   assert.ok(isCentred(keys.sticks()));
   assert.equal(keys.down(press("KeyT")), "takeoff");
+  assert.equal(keys.down(press("KeyB")), "return");
   assert.equal(keys.down(press("KeyT", { repeat: true })), null);
   assert.equal(keys.down(press("KeyT", { typing: true })), null);
   assert.equal(keys.down(press("KeyR", { modified: true })), null, "Ctrl+R is the browser's");

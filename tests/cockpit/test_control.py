@@ -274,6 +274,31 @@ def test_flying_to_a_place(client: TestClient, node: Node) -> None:
         until(lambda: node.flyer.state is FlightState.HOVERING)
 
 
+def test_returning_to_the_start(client: TestClient, node: Node) -> None:
+    with page(client) as pilot:
+        pilot.take().say("return")
+        assert "take off first" in pilot.wait("refused", do="return")["why"]
+        pilot.say("set", name="return.height", value=0.0)
+        pilot.wait("done", do="set")
+        pilot.take_off()
+        pilot.say("goto", x=1.2, y=0.3, z=0.5)
+        with pilot.staying():
+            pilot.wait("done", do="goto")
+        pilot.say("return")
+        assert "silent" in pilot.wait("refused", do="return")["why"]
+        until(lambda: node.flyer.state is FlightState.HOVERING)
+        with open_socket(client, "drones/alpha/telemetry") as telemetry:
+            pilot.say("return")
+            state: dict[str, Any] = {}
+            while [goal["position"] for goal in state.get("waypoints", [])] != [[0.0, 0.0, 0.0]]:
+                state = telemetry.receive_json()
+            assert state["start"] == [0.0, 0.0, 0.0]
+        with pilot.staying():
+            pilot.wait("done", do="return")
+        until(lambda: node.flyer.state is FlightState.LANDED)
+        assert math.dist(node.flyer.place[:2], (0.0, 0.0)) < 0.4
+
+
 def test_a_page_that_falls_silent_on_the_way_stops_there(client: TestClient, node: Node) -> None:
     with page(client) as pilot:
         pilot.take().take_off()

@@ -139,7 +139,11 @@ def test_a_flight_on_a_telephone(deck: Deck) -> None:
             for y in (200, 300, 420, 560):
                 hand.put("swipe", 195, y)
         assert page.page.evaluate(STILL) == still
-        tap_until(page, "Land", "landed")
+        tap_until(page, "Return", "landed")
+        start, there = drone.start_position, drone.feedback().position_m
+        assert start is not None
+        assert there is not None
+        assert math.dist(start[:2], there[:2]) < 0.6
     page.page.go_back()
     page.until(lambda: not in_flight_mode(page), "Back leaves it")
     assert page.pane.get_attribute("data-mine") == "true", "and nothing else"

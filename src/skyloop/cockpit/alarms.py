@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import msgspec
 
 from skyloop.clock import seconds
-from skyloop.messages import Failsafe, Feedback, FlightState, LinkState
+from skyloop.messages import Failsafe, Feedback, FlightState, LinkState, ReturnPhase
 
 if TYPE_CHECKING:
     from skyloop.client import LinkStatus
@@ -105,7 +105,8 @@ def _of_flight(feedback: Feedback | None, thresholds: Thresholds, urgent: _Make)
     if feedback.state is FlightState.EMERGENCY:
         yield _critical("emergency", "emergency: the motors are off")
     if feedback.failsafe is Failsafe.LAND:
-        yield _critical("failsafe", "failsafe: landing by itself")
+        returns = feedback.return_phase in (ReturnPhase.CLIMBING, ReturnPhase.FLYING)
+        yield _critical("failsafe", f"failsafe: {'returning to its start' if returns else 'landing'} by itself")
     elif feedback.failsafe is not Failsafe.NONE:
         yield _warning("failsafe", "failsafe: hovering by itself")
     charge = feedback.battery

@@ -87,6 +87,10 @@ class GoTo(Command, frozen=True, tag="goto"):
     yaw: float | None = None
 
 
+class FlyBack(Command, frozen=True, tag="return"):
+    """Fly back to where it took off, and land or hover there, as its parameters say."""
+
+
 class FlyRoute(Command, frozen=True, tag="route"):
     """Fly along a route that was checked: ``id`` is of the check's answer."""
 
@@ -141,6 +145,7 @@ AnyCommand = (
     | Reset
     | Fly
     | GoTo
+    | FlyBack
     | Write
     | Alive
     | FlyRoute

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Final
 from starlette.websockets import WebSocket
 
 from skyloop.client.commands import position_action
-from skyloop.client.completion import OF_ONE_PACKET
+from skyloop.client.completion import OF_ONE_PACKET, ReturnWatch
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
 from skyloop.cockpit.commands import (
     SETTLED_NS,
@@ -29,6 +29,7 @@ from skyloop.cockpit.commands import (
     Answer,
     AnyCommand,
     Fly,
+    FlyBack,
     FlyRoute,
     GoTo,
     HoverHere,
@@ -54,7 +55,17 @@ from skyloop.cockpit.takeover import QueuePosition, TakeoverDialog
 from skyloop.control.route_flight import check_for
 from skyloop.control.waypoint import Waypoint, lacking, reached
 from skyloop.errors import AuthorityError, DecodeError, LinkError, RefusedError, SkyloopError
-from skyloop.messages import EventKind, FlightState, Land, LinkState, Position, Takeoff
+from skyloop.messages import (
+    EventKind,
+    Feedback,
+    FlightState,
+    Land,
+    LinkState,
+    Position,
+    ReturnPhase,
+    ReturnToStart,
+    Takeoff,
+)
 
 if TYPE_CHECKING:
     from skyloop.cockpit.pilot_connection import PilotConnection
@@ -133,6 +144,7 @@ class ControlSession:
             Stop: self._stop_motors,
             Fly: self._fly,
             GoTo: self._go_to,
+            FlyBack: self._return,
             FlyRoute: lambda command: self._run_in_turn(command, self._fly_route),
             PauseRoute: lambda command: self._steer_route(command, RouteSession.pause),
             ResumeRoute: lambda command: self._steer_route(command, RouteSession.resume),
@@ -227,16 +239,37 @@ class ControlSession:
 
     def _go_to(self, command: GoTo) -> None:
         pilot = self._held()
-        problem = lacking(pilot.feedback())
-        if problem:
-            raise RefusedError(f"it can't be flown to a place: {problem}")
-        if not pilot.feedback().state.airborne:
-            raise RefusedError("it can't be flown to a place: it is not in the air, take off first")
+        _fit_for_places(pilot, "it can't be flown to a place")
         goal = Waypoint(command.x, command.y, command.z, command.yaw)
         place = position_action(goal.x, goal.y, goal.z, goal.yaw, GOTO_M_S)
-        self._send_now(pilot, lambda pilot: pilot.command(place), command)
+        self._set_out(command, pilot, place, goal, lambda feedback: reached(goal, feedback))
+
+    def _return(self, command: FlyBack) -> None:
+        pilot = self._held()
+        start = _fit_for_places(pilot, "it can't return to its start").start_position_m
+        if start is None:
+            raise RefusedError("it can't return to its start: where it took off is not known")
+        over = ReturnWatch()
+        self._set_out(
+            command,
+            pilot,
+            ReturnToStart(),
+            Waypoint(*start),
+            lambda feedback: over(feedback) or feedback.return_phase is ReturnPhase.LANDING,
+        )
+
+    def _set_out(
+        self,
+        command: AnyCommand,
+        pilot: PilotConnection,
+        action: Position | ReturnToStart,
+        goal: Waypoint,
+        is_over: Callable[[Feedback], bool],
+    ) -> None:
+        """Send a flight to a place, show its goal, and watch it until it is over."""
+        self._send_now(pilot, lambda pilot: pilot.command(action), command)
         self._station.goals[self.app] = goal
-        self._goto = self._start_job(self._follow(pilot, place, goal))
+        self._goto = self._start_job(self._follow(command.do, pilot, action, is_over))
         self._acknowledge(command)
         self._restart_silence_timer()
 
@@ -351,17 +384,26 @@ class ControlSession:
         value = await asyncio.to_thread(write)
         self._send({"type": "done", "do": command.do, "name": command.name, "value": value})
 
-    async def _follow(self, pilot: PilotConnection, place: Position, goal: Waypoint) -> None:
+    async def _follow(
+        self,
+        do: str,
+        pilot: PilotConnection,
+        action: Position | ReturnToStart,
+        is_over: Callable[[Feedback], bool],
+    ) -> None:
         """Watch the way to a place. Ends there, with the first thing that goes wrong, and with the next command."""
         try:
-            while not reached(goal, pilot.feedback(max_age_s=1.0)):
-                if pilot.has_ended(place):
+            while not is_over(pilot.feedback(max_age_s=1.0)):
+                if pilot.has_ended(action):
                     raise RefusedError("it was ended on the way, by a failsafe or a lost link")
                 await asyncio.sleep(GOTO_PERIOD_S)
-            pilot.hover()
-            self._send({"type": "done", "do": "goto"})
+            if pilot.feedback().return_phase is ReturnPhase.LANDING:  # which ends by itself from here on
+                pilot.command(Land())
+            elif pilot.feedback().state in _UP:
+                pilot.hover()
+            self._send({"type": "done", "do": do})
         except SkyloopError as error:
-            self._refuse("goto", str(error))
+            self._refuse(do, str(error))
             self._hover_if_held(pilot)
         finally:
             if self._goto is asyncio.current_task():
@@ -577,6 +619,17 @@ class ControlSession:
                 await work(command)
         except SkyloopError as error:
             self._refuse_command(command, str(error))
+
+
+def _fit_for_places(pilot: PilotConnection, what: str) -> Feedback:
+    """Return the newest feedback of a vehicle that can be flown to places now; :class:`RefusedError` if it can't."""
+    feedback = pilot.feedback()
+    problem = lacking(feedback)
+    if problem:
+        raise RefusedError(f"{what}: {problem}")
+    if not feedback.state.airborne:
+        raise RefusedError(f"{what}: it is not in the air, take off first")
+    return feedback
 
 
 def _end_of_control(pilot: PilotConnection) -> str:

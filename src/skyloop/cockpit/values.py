@@ -57,6 +57,7 @@ def feedback_values(feedback: Feedback, now_ns: int) -> Json:
         "velocity": vector(feedback.velocity_m_s),
         "position": vector(feedback.position_m),
         "failsafe": str(feedback.failsafe),
+        "return_phase": str(feedback.return_phase),
         "owner": feedback.owner,
         "owner_priority": feedback.owner_priority,
         "lease": feedback.lease,
@@ -70,7 +71,7 @@ def _scalars(feedback: Feedback) -> dict[str, float | None]:
 def motion_values(feedback: Feedback | None) -> Json:
     """Return what instruments show, each value known by itself."""
     if feedback is None:
-        names = ("attitude", "angular_velocity", "altitude", "velocity", "speed", "position", "battery")
+        names = ("attitude", "angular_velocity", "altitude", "velocity", "speed", "position", "start", "battery")
         return {**dict.fromkeys(names), "flight": "unknown", "airborne": False}
     velocity = feedback.velocity_m_s
     return {
@@ -80,6 +81,7 @@ def motion_values(feedback: Feedback | None) -> Json:
         "velocity": vector(velocity),
         "speed": None if velocity is None else number(math.hypot(*velocity)),
         "position": vector(feedback.position_m),
+        "start": vector(feedback.start_position_m),
         "battery": number(feedback.battery),
         "flight": str(feedback.state),
         "airborne": feedback.state.airborne,

@@ -45,6 +45,7 @@ class StartPoint:
         self.position: Vec3 | None = None  #: [m]; None: not known
         self._state = FlightState.UNKNOWN
         self._standing_ns: int | None = None  # since when it stands; None: it does not
+        self._flew = False  # it was seen in the air
         self._open = False  # it is just taking off, and its position is still awaited
 
     def observe(self, state: FlightState, feedback: Feedback | None, now_ns: int) -> None:
@@ -58,7 +59,9 @@ class StartPoint:
             return
         taking_off = state is FlightState.TAKING_OFF
         since_ns, self._standing_ns = self._standing_ns, None
-        if since_ns is not None and (now_ns - since_ns >= STANDING_NS or (taking_off and before in _GROUNDED)):
+        flew, self._flew = self._flew, True
+        stood = since_ns is not None and (now_ns - since_ns >= STANDING_NS or not flew)
+        if stood or (taking_off and before in _GROUNDED):
             self.position, self._open = None, True
             self._note(feedback, now_ns, 0.0)
         elif self._open and taking_off:
