@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import re
 import select
@@ -122,15 +123,14 @@ def run(*options: str) -> subprocess.CompletedProcess[str]:
 @pytest.mark.daily
 @pytest.mark.process
 def test_headless_flight_is_good() -> None:
-    done = run("--headless", "--seconds", "2.5", "--seed", "7")
+    done = run("--headless", "--seconds", "2.5", "--seed", "7", "--json")
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "watch it at" not in done.stdout
-    share = re.search(r"in view since first seen\D+([\d.]+)%", done.stdout)
-    assert share is not None, done.stdout
-    assert float(share[1]) >= 90
-    first = re.search(r"first frame after\D+([\d.]+) s", done.stdout)
-    assert first is not None
-    assert float(first[1]) < 30.0
+    assert "looking for marker 7" in done.stderr
+    assert "watch it at" not in done.stderr
+    figures = json.loads(done.stdout)
+    assert figures["share_in_view"] >= 0.9
+    assert figures["first_picture_s"] < 30.0
+    assert figures["channels"]["command"]["count"] > 0
 
 
 @pytest.mark.process

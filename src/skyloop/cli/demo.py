@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any
 from urllib.parse import urlencode
 
+import msgspec
 import typer
 from rich.console import Console
 from rich.live import Live
@@ -49,6 +50,9 @@ def follow(
     ] = None,
     browser: Annotated[bool, typer.Option(help="Open the page in the browser")] = False,
     name: Annotated[str, typer.Option(help="Who flies, for those who watch")] = "demo",
+    json: Annotated[
+        bool, typer.Option("--json", help="For programs: the figures as one JSON object; the rest on standard error")
+    ] = False,
 ) -> None:
     """Take off in a simulated room, find the marker, follow it at 1.5 m by the camera. Ctrl-C lands.
 
@@ -60,9 +64,12 @@ def follow(
             if source is not None and source.name == "COMMANDLINE":
                 raise UsageError(f"--{given} stands before {context.invoked_subcommand}: give its options after it")
         return
-    console = Console(highlight=False)
+    console = Console(highlight=False, stderr=json)
     report = _Demo(console, name, seconds).fly(_address(world, seed), not headless, port, browser)
-    console.print(report.table())
+    if json:
+        typer.echo(msgspec.json.encode(report).decode())
+    else:
+        console.print(report.table())
     if headless and not report.good(ENOUGH_IN_VIEW):
         console.print(f"[bold red]{report.verdict(ENOUGH_IN_VIEW)}[/]")
         raise typer.Exit(1)
