@@ -89,7 +89,7 @@ function grid({ pen, view, size, ink }: Chart): void {
     pen.moveTo(px, 0);
     pen.lineTo(px, size.height);
     pen.textAlign = "center";
-    if (px > 30 && px < size.width - 60) pen.fillText(figure(x, decimals), px, size.height - 5);
+    if (px > 30 && px < size.width - 90) pen.fillText(figure(x, decimals), px, size.height - 5);
   }
   for (let y = Math.ceil((south * factor) / step) * step; y <= north * factor; y += step) {
     const py = Math.round(toPixels(view, size, 0, y / factor)[1]) + 0.5;

@@ -88,6 +88,8 @@ export class Pane {
   private readonly oldWhat = h("span", {});
   private readonly oldSeen = h("button", { type: "button", class: "small", "aria-label": t.pane.acknowledgeOld, onclick: () => this.alarmBook.acknowledge("old", performance.now()) && this.update() }, t.alarms.ok);
   private readonly old = h("p", { class: "banner old", role: "alert", "data-tone": "warn", hidden: true }, h("span", {}, t.pane.old), this.oldAge, this.oldWhat, this.oldSeen);
+  /** Nothing is replayed any more: what is seen is the last of it. */
+  private readonly ended = h("p", { class: "banner ended-replay", role: "status", "data-tone": "quiet", hidden: true }, h("span", {}, t.pane.replayEnded), h("button", { type: "button", class: "small", onclick: () => this.host.close(this.name) }, t.modal.close));
   private readonly notice = h("p", { class: "banner notice", role: "alert", "data-tone": "warn" });
   private readonly hud = new FlightHud();
   private readonly fly = h("button", { type: "button", class: "small fly", "aria-pressed": "false", onclick: () => this.host.fly(this) }, t.pane.flightMode);
@@ -242,7 +244,7 @@ export class Pane {
     const close = h("button", { type: "button", class: "bare close", "aria-label": t.pane.close(this.name), onclick: () => this.host.close(this.name) }, "×");
     const head = h("header", { class: "pane-head" }, h("h2", {}, this.name), this.kind, this.endReplay, this.alarms.chip, this.pill, this.battery.element, this.hud.element, this.full, this.fly, close);
     const body = h("div", { class: "pane-body" }, this.stage.element, this.decks.space.element, this.instruments.element, this.decks.plots.element, this.decks.lists.element, this.channels.element);
-    const element = h("article", { class: "pane", "data-drone": this.name, "aria-label": t.pane.drone(this.name), tabindex: -1 }, head, h("div", { class: "over" }, h("div", { class: "stack" }, this.old, this.alarms.element, this.notice)), this.alarms.voice, body, this.thumbs.element, this.strip.element);
+    const element = h("article", { class: "pane", "data-drone": this.name, "aria-label": t.pane.drone(this.name), tabindex: -1 }, head, h("div", { class: "over" }, h("div", { class: "stack" }, this.old, this.ended, this.alarms.element, this.notice)), this.alarms.voice, body, this.thumbs.element, this.strip.element);
     element.addEventListener("pointerdown", () => this.host.select(this.name), { capture: true });
     element.addEventListener("focusin", () => this.host.select(this.name));
     return element;
@@ -269,7 +271,9 @@ export class Pane {
     this.connected = open;
     this.wasConnected ||= open;
     if (open) this.events.restart();
-    this.absent = code === 4404 ? t.pane.gone(this.name) : "";
+    this.absent = code === 4404 ? (this.isRecording ? t.pane.replayEnded : t.pane.gone(this.name)) : "";
+    this.bar?.end(this.absent !== "");
+    setHidden(this.ended, !this.isRecording || this.absent === "");
     this.update();
   }
 
@@ -415,6 +419,7 @@ export class Pane {
       await post(`/api/replays/${encodeURIComponent(this.name)}/stop`);
       this.host.close(this.name);
     } catch (error) {
+      if (this.absent) return this.host.close(this.name); // somebody else has ended it
       this.notify(errorText(error), "warn");
     }
   }
@@ -431,6 +436,7 @@ export class Pane {
       waypoints: (state?.waypoints ?? []).map((one) => ({ position: one.position, own: one.app !== null })),
       trail: this.trail,
       world: this.map.surroundings.world,
+      route: this.map.route.places,
       start: state?.start ?? null,
     };
   }

@@ -37,6 +37,7 @@ export class ReplayBar {
   private ticks: Tick[] = [];
   private asked: { position_s: number; until_ms: number } | null = null;
   private dragging = false;
+  private gone = false;
   private wanted: object | null = null; // to be sent after what is on its way
   private sending = false;
   private notes_ms = 0;
@@ -217,7 +218,14 @@ export class ReplayBar {
   }
 
   /** One request at a time; of those meanwhile, what was wanted last. */
+  /** The replay is gone: nothing can be moved any more, or it is back. */
+  end(gone: boolean): void {
+    this.gone = gone;
+    this.element.inert = gone;
+  }
+
   private send(wanted: object): void {
+    if (this.gone) return;
     this.wanted = { ...this.wanted, ...wanted };
     if (!this.sending) void this.transmit();
   }

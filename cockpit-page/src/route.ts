@@ -75,6 +75,47 @@ export function withActions(one: RouteWaypoint, wait_s: number, photo: boolean):
   return actions.length > 0 ? { ...rest, actions } : rest;
 }
 
+/** Where it looks: a heading [rad], or a point (x, y) [m]. */
+export interface Direction {
+  yaw?: number;
+  at?: [number, number];
+}
+
+const DEGREES = 180 / Math.PI;
+
+/** A direction as it is typed: degrees, or a point as "x, y"; empty for none. */
+export function directionText({ yaw, at }: Direction): string {
+  return at ? at.join(", ") : yaw === undefined ? "" : String(Math.round(yaw * DEGREES));
+}
+
+/** What was typed; null if it can't be understood. */
+export function parseDirection(text: string): Direction | null {
+  const numbers = text.trim().split(/\s*[,;]\s*|\s+/).filter(Boolean).map(Number);
+  if (numbers.length > 2 || !numbers.every(Number.isFinite)) return null;
+  const [first, second] = numbers;
+  if (first === undefined) return {};
+  return second === undefined ? { yaw: first / DEGREES } : { at: [first, second] };
+}
+
+/** The heading that it arrives with. */
+export const headingOf = ({ yaw, look_at }: RouteWaypoint): Direction => ({ ...(yaw === undefined ? {} : { yaw }), ...(look_at ? { at: look_at } : {}) });
+
+export function withHeading(one: RouteWaypoint, { yaw, at }: Direction): RouteWaypoint {
+  const { yaw: _, look_at: __, ...rest } = one;
+  return { ...rest, ...(at ? { look_at: at } : yaw === undefined ? {} : { yaw }) };
+}
+
+/** Where it turns when it is there: its first action of that kind; others stay. */
+export const turnOf = (one: RouteWaypoint): Direction => (one.actions ?? []).find((action) => action.do === "look") ?? {};
+
+export function withTurn(one: RouteWaypoint, { yaw, at }: Direction): RouteWaypoint {
+  const old = (one.actions ?? []).find((action) => action.do === "look");
+  const rest = (one.actions ?? []).filter((action) => action !== old);
+  const turn: RouteAction[] = at ? [{ do: "look", at }] : yaw === undefined ? [] : [{ do: "look", yaw }];
+  const { actions: _, ...place } = one;
+  return turn.length + rest.length ? { ...place, actions: [...turn, ...rest] } : place;
+}
+
 /** With a waypoint moved to another place of the order. */
 export function moved<T>(all: readonly T[], from: number, to: number): T[] {
   if (to < 0 || to >= all.length) return [...all];

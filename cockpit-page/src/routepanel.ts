@@ -1,13 +1,13 @@
 // Routes on the map: planned by presses and in a table, checked by the cockpit, flown with pause, skip and resume.
 
 import { errorText, get, post } from "./api.js";
-import { h, setDisabled, setHidden, setText, setTone } from "./dom.js";
+import { h, setAttribute, setDisabled, setHidden, setText, setTone } from "./dom.js";
 import { lasting } from "./format.js";
 import { t } from "./language/index.js";
 import { flag } from "./maplayers.js";
 import { type Ink, type MapTool, nearest, type Project, type Spot } from "./maptool.js";
 import type { Vector } from "./model.js";
-import { emptyRoute, hasPhoto, moved, type Route, type RouteCheck, type RouteEnd, type RouteProgress, type RouteWaypoint, toneOf, waitOf, whole, withActions } from "./route.js";
+import { type Direction, directionText, emptyRoute, hasPhoto, headingOf, moved, parseDirection, type Route, type RouteCheck, type RouteEnd, type RouteProgress, type RouteWaypoint, toneOf, turnOf, waitOf, whole, withActions, withHeading, withTurn } from "./route.js";
 import { lengthText } from "./units.js";
 
 export type RouteDeed = "route_pause" | "route_resume" | "route_skip" | "route_stop";
@@ -31,7 +31,7 @@ export class RoutePanel implements MapTool {
   private readonly end = h("select", { class: "small", "aria-label": t.route.end, onchange: () => this.typed() }, ...Object.entries(t.route.ends).map(([value, text]) => h("option", { value }, text)));
   private readonly upload = h("input", { type: "file", accept: ".json", hidden: true, onchange: () => void this.read() });
   private readonly rows = h("tbody");
-  private readonly table = h("table", { class: "route-table" }, h("thead", {}, h("tr", {}, ...["", "x m", "y m", "z m", "m/s", "yaw °", t.route.wait, t.route.photo, ""].map((text) => h("th", { scope: "col" }, text)))), this.rows);
+  private readonly table = h("table", { class: "route-table" }, h("thead", {}, h("tr", {}, ...["", "x m", "y m", "z m", "m/s", t.route.yawHead, t.route.turnHead, t.route.wait, t.route.photo, ""].map((text) => (text ? h("th", { scope: "col" }, text) : h("td"))))), this.rows);
   private readonly summary = h("p", { class: "note", role: "status" });
   private readonly said = h("p", { class: "note", role: "alert", "data-tone": "warn" });
   private readonly found = h("ul", { class: "route-findings", "aria-label": t.route.against });
@@ -83,6 +83,11 @@ export class RoutePanel implements MapTool {
     this.flying = null;
     setText(this.progress, "");
     this.show();
+  }
+
+  /** Where it leads, for other views; empty unless it is flown or edited. */
+  get places(): Vector[] {
+    return this.body.hidden && this.flying === null ? [] : this.route.waypoints.map(({ x, y, z }) => [x, y, z]);
   }
 
   /** It is the map's tool now, or not. */
@@ -203,6 +208,15 @@ export class RoutePanel implements MapTool {
       });
       return h("td", {}, input);
     };
+    const direction = (name: string, value: Direction, label: string, set: (to: Direction) => RouteWaypoint): HTMLElement => {
+      const input = h("input", { type: "text", value: directionText(value), "data-field": name, "aria-label": t.route.ofWaypoint(label, number), title: t.route.direction, autocomplete: "off", onfocus: () => this.mark((this.chosen = index)) });
+      input.addEventListener("input", () => {
+        const to = parseDirection(input.value);
+        setAttribute(input, "aria-invalid", String(to === null));
+        if (to) this.put(index, set(to));
+      });
+      return h("td", {}, input);
+    };
     const axis = (name: "x" | "y" | "z"): HTMLElement => field(name, one[name], t.route.inMetres(name), 0.1, (value) => (value === null ? null : { ...latest(), [name]: value }));
     const photo = h("input", { type: "checkbox", "aria-label": t.route.photoAt(number) });
     photo.checked = hasPhoto(one);
@@ -217,7 +231,8 @@ export class RoutePanel implements MapTool {
       axis("y"),
       axis("z"),
       field("speed", one.speed ?? "", t.route.speedIn, 0.1, (value) => without(latest(), "speed", value)),
-      field("yaw", one.yaw === undefined ? "" : Math.round((one.yaw * 180) / Math.PI), t.route.yawIn, 5, (value) => without(value === null ? latest() : without(latest(), "look_at", null), "yaw", value === null ? null : (value * Math.PI) / 180)),
+      direction("yaw", headingOf(one), t.route.yawIn, (to) => withHeading(latest(), to)),
+      direction("turn", turnOf(one), t.route.turnIn, (to) => withTurn(latest(), to)),
       field("wait", waitOf(one) || "", t.route.waitIn, 1, (value) => withActions(latest(), value ?? 0, hasPhoto(latest()))),
       h("td", {}, photo),
       h("td", { class: "route-acts" }, act("↑", t.route.up, () => shift(index - 1), index === 0), act("↓", t.route.down, () => shift(index + 1), index === this.route.waypoints.length - 1), act("×", t.route.delete, () => this.drop(index))),
@@ -346,7 +361,7 @@ export class RoutePanel implements MapTool {
 
 const round = (metres: number): number => Math.round(metres * 100) / 100;
 
-function without(one: RouteWaypoint, key: "speed" | "yaw" | "look_at", value: number | null): RouteWaypoint {
+function without(one: RouteWaypoint, key: "speed", value: number | null): RouteWaypoint {
   const { [key]: _, ...rest } = one;
   return value === null ? (rest as RouteWaypoint) : ({ ...rest, [key]: value } as RouteWaypoint);
 }

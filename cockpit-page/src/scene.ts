@@ -29,6 +29,7 @@ import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import { colour, h } from "./dom.js";
 import { t } from "./language/index.js";
 import { discard, frustum, ring, scenery } from "./scenery.js";
+import type { Vector } from "./model.js";
 import type { World } from "./surroundings.js";
 import type { Body, Scene } from "./world.js";
 
@@ -48,6 +49,8 @@ export class SceneView {
   private readonly bodies = new Map<string, Group>();
   private readonly path = new Line(new BufferGeometry(), new LineBasicMaterial());
   private readonly drop = new Line(new BufferGeometry(), new LineDashedMaterial({ dashSize: 0.08, gapSize: 0.06 }));
+  private readonly legs = new Line(new BufferGeometry(), new LineBasicMaterial());
+  private laid = "";
   private grid = new GridHelper();
   private drawn_ms = 0;
   private world: World | null = null;
@@ -62,10 +65,10 @@ export class SceneView {
     this.controls.target.set(0, 0, 1);
     this.path.geometry.setAttribute("position", new Float32BufferAttribute(POINTS * 3, 3));
     this.drop.geometry.setAttribute("position", new Float32BufferAttribute(6, 3));
-    this.path.frustumCulled = this.drop.frustumCulled = false;
+    this.path.frustumCulled = this.drop.frustumCulled = this.legs.frustumCulled = false;
     const sun = new DirectionalLight(0xffffff, 2.2);
     sun.position.set(-3, -2, 8);
-    this.scene.add(sun, new AmbientLight(0xffffff, 1.3), this.path, this.drop, new AxesHelper(0.6));
+    this.scene.add(sun, new AmbientLight(0xffffff, 1.3), this.path, this.drop, this.legs, new AxesHelper(0.6));
     this.element.append(this.renderer.domElement);
     this.element.addEventListener("keydown", (event) => this.key(event));
     this.repaint();
@@ -78,6 +81,7 @@ export class SceneView {
     this.grid.rotateX(Math.PI / 2);
     this.scene.add(this.grid);
     this.path.material.color = new Color(colour("accent"));
+    this.legs.material.color = new Color(colour("warn"));
     this.drop.material.color = new Color(colour("muted"));
     for (const body of this.bodies.values()) this.scene.remove(body);
     this.bodies.clear();
@@ -132,14 +136,26 @@ export class SceneView {
       place(`waypoint ${number} ${own}`, body, () => solid(new SphereGeometry(0.09, 16, 12), colour(own ? "accent" : "warn")));
     });
     if (scene.start) place("start", { name: "", position: scene.start, roll: 0, pitch: 0, yaw: null }, () => new Group().add(ring([0, 0, 0], "accent")));
+    (scene.route ?? []).forEach((position, number) => place(`route ${number}`, { name: "", position, roll: 0, pitch: 0, yaw: null }, () => solid(new SphereGeometry(0.07, 16, 12), colour("warn"))));
     for (const [key, group] of this.bodies) {
       if (shown.has(key)) continue;
       this.scene.remove(group);
       this.bodies.delete(key);
     }
+    this.lay(scene.route ?? []);
     this.trace(scene);
     const own = scene.own ?? scene.truth;
     if (own) this.follow(new Vector3(...own.position));
+  }
+
+  /** The legs of a route. */
+  private lay(places: readonly Vector[]): void {
+    this.legs.visible = places.length > 1;
+    const key = places.join(";");
+    if (key === this.laid) return;
+    this.laid = key;
+    this.legs.geometry.dispose();
+    this.legs.geometry = new BufferGeometry().setFromPoints(places.map((place) => new Vector3(...place)));
   }
 
   private surround(world: World | null): void {

@@ -9,10 +9,12 @@ const CHOICES = {
   sound: ["on", "off"],
   /** What the two sticks of a gamepad and on a touch screen do: see `STICK_MODES`. */
   mode: ["1", "2", "3", "4"],
+  /** What a photo shows: what the page shows, or the camera's picture alone. */
+  photo: ["shown", "plain"],
   language: ["en", "pseudo"],
 } as const;
 
-const STANDARD: Values = { theme: "system", units: "metric", sound: "on", mode: "2", language: "en" };
+const STANDARD: Values = { theme: "system", units: "metric", sound: "on", mode: "2", photo: "shown", language: "en" };
 
 export type Name = keyof typeof CHOICES;
 export type Values = { -readonly [Key in Name]: (typeof CHOICES)[Key][number] };

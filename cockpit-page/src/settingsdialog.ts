@@ -18,6 +18,7 @@ export class SettingsDialog {
       choice("units", t.settings.units, t.settings.unit, h("p", { class: "note" }, t.settings.unitsNote)),
       choice("sound", t.settings.sound, t.settings.sounds),
       choice("mode", t.settings.mode, t.settings.modes, mode),
+      choice("photo", t.settings.photo, t.settings.photos),
       languages.length > 1 ? choice("language", t.settings.language, LANGUAGE_NAMES, h("p", { class: "note" }, t.settings.languageNote)) : "",
       h("p", { class: "note" }, t.settings.note),
     ]);

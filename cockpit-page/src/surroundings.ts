@@ -9,7 +9,7 @@ export interface Thing {
   yaw: number;
 }
 
-export type Zone = { kind: "box"; low: Vector; high: Vector } | { kind: "cylinder"; centre: [number, number]; radius: number; low: number; high: number };
+export type Zone = { name?: string } & ({ kind: "box"; low: Vector; high: Vector } | { kind: "cylinder"; centre: [number, number]; radius: number; low: number; high: number });
 
 type Ends = [number | null, number | null, number | null];
 

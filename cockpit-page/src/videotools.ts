@@ -4,6 +4,7 @@ import { h, setAttribute, setHidden, setText, svg } from "./dom.js";
 import { clock, duration } from "./format.js";
 import { t } from "./language/index.js";
 import { lend, takeBack } from "./reach.js";
+import { settings } from "./settings.js";
 
 /** A clip is kept in the browser's memory until it is saved: it ends by itself [s]. */
 const LONGEST_S = 300;
@@ -110,7 +111,7 @@ export class VideoTools {
     const sheet = h("canvas", { width: canvas.width, height: canvas.height });
     const pen = sheet.getContext("2d") as CanvasRenderingContext2D;
     pen.drawImage(canvas, 0, 0);
-    if (overlay) this.pictures.paint(pen, sheet, 1);
+    if (overlay && settings.get("photo") === "shown") this.pictures.paint(pen, sheet, 1);
     const blob = await new Promise<Blob | null>((done) => sheet.toBlob(done, "image/png"));
     if (blob === null) return this.say(t.video.failed);
     const name = `${fileName(drone, camera.name, captured)}.png`;

@@ -28,6 +28,8 @@ export interface Scene {
   trail: Trail;
   /** What stands there, where that is known. */
   world?: World | null;
+  /** The route that is planned or flown. */
+  route?: readonly Vector[];
   /** Where this flight began. */
   start?: Vector | null;
 }

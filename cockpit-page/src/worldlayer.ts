@@ -8,6 +8,7 @@ import type { Vector } from "./model.js";
 import type { CameraView, SafetyBox, World, Zone } from "./surroundings.js";
 import { inUnit, unit } from "./units.js";
 import type { Body } from "./world.js";
+import { zoneName } from "./zones.js";
 
 const SEEN_M = 3; // how far a camera's field of view is drawn
 
@@ -45,7 +46,7 @@ export function drawBounds(chart: Chart, box: SafetyBox | null, zones: readonly 
     pen.lineWidth = 1.5;
     pen.stroke();
     const [x, y] = chart.at(zoneCentre(zone));
-    label(chart, x - 8, y, `Z${number + 1}`, "bad");
+    label(chart, x - 8, y, zoneName(zone, number), "bad");
   });
   if (box) drawBox(chart, box);
 }

@@ -31,8 +31,11 @@ const cm = (value: number): number => Math.round(value * 100) / 100;
 
 export function zoneText(zone: Zone): string {
   const numbers = zone.kind === "box" ? [...zone.low, ...zone.high] : [...zone.centre, zone.radius, zone.low, zone.high];
-  return `${zone.kind} ${numbers.map(cm).join(" ")}`;
+  return `${zone.name ? `${zone.name}: ` : ""}${zone.kind} ${numbers.map(cm).join(" ")}`;
 }
+
+/** What a zone is called: by its name, or by its number in the list, from 0 on. */
+export const zoneName = (zone: Zone, number: number): string => zone.name || `Z${number + 1}`;
 
 export const zonesText = (zones: readonly Zone[]): string => zones.map(zoneText).join("; ");
 
@@ -76,7 +79,7 @@ export function handles(bounds: Bounds, edited: Edited): { place: [number, numbe
   const { low, high } = zone;
   const corner = (x: number, y: number) => ({
     place: [x, y] as [number, number],
-    drag: ([east, north]: readonly [number, number]) => put(rectangle([x === low[0] ? high[0] : low[0], y === low[1] ? high[1] : low[1]], [east, north], low[2], high[2])),
+    drag: ([east, north]: readonly [number, number]) => put(same(zone, rectangle([x === low[0] ? high[0] : low[0], y === low[1] ? high[1] : low[1]], [east, north], low[2], high[2]))),
   });
   const [cx, cy] = [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2];
   const moved = ([east, north]: readonly [number, number]): Bounds => {
@@ -85,6 +88,8 @@ export function handles(bounds: Bounds, edited: Edited): { place: [number, numbe
   };
   return [corner(low[0], low[1]), corner(high[0], low[1]), corner(high[0], high[1]), corner(low[0], high[1]), { place: [cx, cy], drag: moved }];
 }
+
+const same = (before: Zone, after: Zone): Zone => (before.name ? { ...after, name: before.name } : after);
 
 /** An upright box over the rectangle between two corners; never thinner than a few centimetres. */
 export function rectangle(one: readonly [number, number], other: readonly [number, number], low: number, high: number): Zone {

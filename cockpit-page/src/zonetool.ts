@@ -7,7 +7,7 @@ import { t } from "./language/index.js";
 import type { Ink, MapTool, Project, Spot } from "./maptool.js";
 import type { Zone } from "./surroundings.js";
 import { zoneOutline } from "./worldlayer.js";
-import { type Bounds, type Edited, fields, handles, MAX_ZONES, rectangle, round, writes, zoneAt } from "./zones.js";
+import { type Bounds, type Edited, fields, handles, MAX_ZONES, rectangle, round, writes, zoneAt, zoneName } from "./zones.js";
 
 const DEFAULT_TOP_M = 3;
 
@@ -204,6 +204,16 @@ export class ZoneTool implements MapTool {
     this.show();
   }
 
+  /** The field for the name of a zone. */
+  private naming(bounds: Bounds): HTMLElement[] {
+    const { edited } = this;
+    const zone = edited === "box" ? undefined : bounds.zones[edited];
+    if (!zone) return [];
+    const input = h("input", { type: "text", maxlength: 24, value: zone.name ?? "", placeholder: t.zones.none, "aria-label": t.zones.nameLong, disabled: !this.can });
+    input.addEventListener("change", () => void this.commit({ ...bounds, zones: bounds.zones.map((one) => (one === zone ? { ...one, name: input.value.trim() } : one)) }));
+    return [h("label", {}, h("span", {}, t.zones.name), input)];
+  }
+
   private say(text: string, tone: "ok" | "bad" | "busy"): void {
     setTone(this.answer, tone);
     setText(this.answer, text);
@@ -217,12 +227,13 @@ export class ZoneTool implements MapTool {
     if (state === this.shown) return;
     this.shown = state;
     const option = (value: string, text: string): HTMLElement => h("option", { value }, text);
-    this.list.replaceChildren(option("box", bounds.box ? t.zones.box : t.zones.noBox), ...bounds.zones.map((zone, number) => option(String(number), t.zones.named(number + 1, t.zones.kinds[zone.kind]))));
+    this.list.replaceChildren(option("box", bounds.box ? t.zones.box : t.zones.noBox), ...bounds.zones.map((zone, number) => option(String(number), t.zones.named(zoneName(zone, number), t.zones.kinds[zone.kind]))));
     this.list.value = String(this.edited);
     for (const button of this.buttons) setDisabled(button, !this.can);
     const has = this.edited === "box" ? bounds.box !== null : bounds.zones[this.edited] !== undefined;
     setDisabled(this.buttons[2] as HTMLButtonElement, !this.can || !has);
     this.numbers.replaceChildren(
+      ...this.naming(bounds),
       ...fields(bounds, this.edited).map(({ label, value, with: changed }) => {
         const input = h("input", { type: "number", step: "0.1", value: value ?? "", placeholder: t.zones.none, "aria-label": t.zones.inMetres(label), disabled: !this.can });
         input.addEventListener("change", () => void this.commit(changed(input.value === "" ? null : Number(input.value))));

@@ -2,7 +2,7 @@
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
-import { emptyRoute, hasPhoto, moved, type RouteCheck, toneOf, waitOf, whole, withActions } from "../src/route.js";
+import { directionText, emptyRoute, hasPhoto, headingOf, moved, parseDirection, type RouteCheck, toneOf, turnOf, waitOf, whole, withActions, withHeading, withTurn } from "../src/route.js";
 
 const PLACE = { x: 1, y: 2, z: 1 };
 
@@ -31,4 +31,26 @@ test("a leg has the colour of the worst that was found", () => {
 
 test("what a file leaves out is filled in", () => {
   assert.deepEqual(whole({ waypoints: [PLACE] }), { ...emptyRoute(), waypoints: [PLACE] });
+});
+
+test("a direction is degrees or a point", () => {
+  assert.deepEqual(parseDirection(" 180 "), { yaw: Math.PI });
+  assert.deepEqual(parseDirection("1.5, -2"), { at: [1.5, -2] });
+  assert.deepEqual(parseDirection(""), {});
+  assert.equal(parseDirection("north"), null);
+  assert.equal(parseDirection("1, 2, 3"), null);
+  assert.equal(directionText({ yaw: Math.PI / 2 }), "90");
+  assert.equal(directionText({ at: [1.5, -2] }), "1.5, -2");
+  assert.equal(directionText({}), "");
+});
+
+test("a waypoint has one heading, and its first turn is edited", () => {
+  const looking = withHeading({ ...PLACE, yaw: 1 }, { at: [0, 0] });
+  assert.deepEqual(looking, { ...PLACE, look_at: [0, 0] });
+  assert.deepEqual(headingOf(looking), { at: [0, 0] });
+  assert.deepEqual(withHeading(looking, {}), PLACE);
+  const turning = withTurn({ ...PLACE, actions: [{ do: "wait", seconds: 1 }] }, { yaw: 1 });
+  assert.deepEqual(turning.actions, [{ do: "look", yaw: 1 }, { do: "wait", seconds: 1 }]);
+  assert.deepEqual(turnOf(turning), { do: "look", yaw: 1 });
+  assert.deepEqual(withTurn(withTurn(PLACE, { at: [1, 1] }), {}), PLACE);
 });

@@ -28,6 +28,7 @@ test("a camera's view ends at the floor, and has a convex outline", () => {
 
 test("zones as the drone reads them", () => {
   assert.equal(zonesText([box, pillar]), "box 0 0 0 2 1 3; cylinder 1 0.5 0.2 0 3");
+  assert.equal(zonesText([{ ...pillar, name: "tree" }]), "tree: cylinder 1 0.5 0.2 0 3");
   assert.equal(zonesText([]), "");
   assert.deepEqual(rectangle([2, 1], [0, 3], 0, 1), { kind: "box", low: [0, 1, 0], high: [2, 3, 1] });
   const thin = rectangle([1, 1], [1, 1], 0, 1);

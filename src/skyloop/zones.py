@@ -20,7 +20,9 @@ BOX: Final = "safety.box"  #: the parameters of the box begin so
 ZONES: Final = "safety.zones"
 ROOM: Final = "safety.room"
 
+MAX_NAME: Final = 24  #: letters of a zone's name
 _SHAPES: Final = {"box": 6, "cylinder": 5}
+_NAME: Final = re.compile(rf"[^:;,\x00-\x1f\x7f]{{1,{MAX_NAME}}}")
 
 Vec3 = tuple[float, float, float]
 
@@ -39,6 +41,7 @@ class Box:
 
     low: Vec3
     high: Vec3
+    name: str = ""  #: of a zone
 
     def walls_inside(self, place: Vec3) -> Iterator[Wall]:
         """Those of a box that is to be kept in."""
@@ -72,7 +75,7 @@ class Box:
         return first <= last
 
     def __str__(self) -> str:
-        return f"box {_numbers(*self.low, *self.high)}"
+        return f"{_prefix(self.name)}box {_numbers(*self.low, *self.high)}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +87,7 @@ class Cylinder:
     radius: float
     low: float
     high: float
+    name: str = ""
 
     def wall_outside(self, place: Vec3) -> Wall:
         """The one of a cylinder that is to be kept out of."""
@@ -116,7 +120,7 @@ class Cylinder:
         return math.hypot(x + share * across, y + share * along) <= self.radius
 
     def __str__(self) -> str:
-        return f"cylinder {_numbers(self.x, self.y, self.radius, self.low, self.high)}"
+        return f"{_prefix(self.name)}cylinder {_numbers(self.x, self.y, self.radius, self.low, self.high)}"
 
 
 Zone = Box | Cylinder
@@ -186,7 +190,8 @@ def parse_zones(text: str) -> tuple[Zone, ...]:
     """Read zones as they are written, with semicolons between them.
 
     Args:
-        text: ``box x y z x y z`` (two corners) or ``cylinder x y radius z_low z_high``, world axes [m].
+        text: ``box x y z x y z`` (two corners) or ``cylinder x y radius z_low z_high``, world axes [m]; a name and a
+            colon may stand before each: ``tree: cylinder 1 2 0.5 0 3``.
 
     Raises:
         ParameterError: it can't be read, or there are too many.
@@ -198,7 +203,11 @@ def parse_zones(text: str) -> tuple[Zone, ...]:
 
 
 def _parse_zone(text: str) -> Zone:
-    shape, *words = re.split(r"[\s,]+", text.strip())
+    before, colon, after = text.partition(":")
+    name = " ".join(before.split()) if colon else ""
+    if colon and not _NAME.fullmatch(name):
+        raise _wrong(f"a name has 1 to {MAX_NAME} letters and no comma, colon or semicolon, not {name!r:.40}")
+    shape, *words = re.split(r"[\s,]+", (after if colon else text).strip())
     if shape not in _SHAPES:
         raise _wrong(f"a zone is a box or a cylinder, not {shape!r:.40}")
     try:
@@ -212,15 +221,19 @@ def _parse_zone(text: str) -> Zone:
         low, high = [min(pair) for pair in pairs], [max(pair) for pair in pairs]
         if any(a == b for a, b in pairs):
             raise _wrong(f"a box must have an extent along each axis: {text.strip()!r:.60}")
-        return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]))
+        return Box((low[0], low[1], low[2]), (high[0], high[1], high[2]), name)
     x, y, radius, bottom, top = numbers
     if radius <= 0.0 or bottom >= top:
         raise _wrong(f"a cylinder has a radius above 0 and its low end below its high one: {text.strip()!r:.60}")
-    return Cylinder(x, y, radius, bottom, top)
+    return Cylinder(x, y, radius, bottom, top, name)
+
+
+def _prefix(name: str) -> str:
+    return f"{name}: " if name else ""
 
 
 def _wrong(why: str) -> ParameterError:
-    form = "box x y z x y z; cylinder x y radius z_low z_high"
+    form = "box x y z x y z; tree: cylinder x y radius z_low z_high"
     return ParameterError(f"{ZONES}: {why}; it looks like {form!r} [m]", code=Refusal.OUT_OF_RANGE)
 
 

@@ -156,6 +156,8 @@ def test_an_obedient_vehicle_never_leaves_the_box_nor_enters_the_zone(
 
 def test_safety_as_they_are_written() -> None:
     assert parse_zones("") == parse_zones(" ; ") == ()
+    assert parse_zones(" the  old tree :cylinder 1 2 0.5 0 3") == (Cylinder(1.0, 2.0, 0.5, 0.0, 3.0, "the old tree"),)
+    assert str(parse_zones("table: box 3 3 2 1 1 0")[0]) == "table: box 1 1 0 3 3 2"
     assert parse_zones("cylinder 1 2 0.5 0 3; box 3,3,2 1 1 0") == (
         Cylinder(1.0, 2.0, 0.5, 0.0, 3.0),
         Box((1.0, 1.0, 0.0), (3.0, 3.0, 2.0)),
@@ -173,6 +175,9 @@ def test_safety_as_they_are_written() -> None:
         ("cylinder 0 0 0 0 1", "radius"),
         ("cylinder 0 0 1 2 1", "low end"),
         ("cylinder 0 0 1 0 1;" * 33, "at most 32"),
+        ("a, b: box 1 2 3 4 5 6", "no comma"),
+        (f"{'a' * 25}: box 1 2 3 4 5 6", "1 to 24 letters"),
+        ("tree: bush: box 1 2 3 4 5 6", "a box or a cylinder"),
     ],
 )
 def test_safety_that_make_no_sense(text: str, why: str) -> None:

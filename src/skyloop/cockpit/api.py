@@ -12,9 +12,7 @@ from starlette.responses import Response
 from starlette.routing import Route
 
 from skyloop.cockpit.access import SESSION_S, Gate, TokenGate
-from skyloop.cockpit.answers import BadRequest, answered
-from skyloop.cockpit.answers import answer_json as _json
-from skyloop.cockpit.answers import body_of as _body
+from skyloop.cockpit.answers import BadRequest, answer_json, answered, body_of
 from skyloop.cockpit.security import gone_within, person_of
 from skyloop.cockpit.values import number
 from skyloop.errors import UnknownNameError
@@ -75,7 +73,7 @@ class Api:
     async def session(self, request: Request) -> Response:
         """Answer with the role of who asks; null for nobody known, with what to do about it."""
         person = person_of(request.scope)
-        return _json(
+        return answer_json(
             {
                 "role": None if person is None else person.role,
                 "name": "" if person is None else person.name,
@@ -90,7 +88,7 @@ class Api:
         gate = self._gate
         if not isinstance(gate, TokenGate):
             raise BadRequest(404, "this cockpit asks for no token")
-        token = (await _body(request, _Login)).token
+        token = (await body_of(request, _Login)).token
         person = gate.logged_in(token, request.scope)
         if person is None:
             await gone_within(request.receive, gate.wrong_token_s(request.scope))
@@ -100,7 +98,7 @@ class Api:
                 if gate.pairing is None
                 else "this code was used, or is too old: take the newest one",
             )
-        answer = _json({"role": person.role, "name": person.name})
+        answer = answer_json({"role": person.role, "name": person.name})
         answer.set_cookie(
             gate.cookie,
             gate.begin(person, token),
@@ -114,7 +112,7 @@ class Api:
     @answered
     async def logout(self, request: Request) -> Response:
         """End the session of the request's cookie."""
-        answer = _json({"role": None})
+        answer = answer_json({"role": None})
         if isinstance(self._gate, TokenGate):
             self._gate.end(request.scope)
             answer.delete_cookie(self._gate.cookie, httponly=True, samesite="strict")
@@ -124,7 +122,7 @@ class Api:
 
     async def drones(self, _: Request) -> Response:
         """Answer with the drones that are connected."""
-        return _json(
+        return answer_json(
             [
                 {"name": name, "uri": one.drone.uri, "cameras": [c.name for c in one.drone.capabilities.cameras]}
                 for name, one in self._fleet.stations.items()
@@ -137,7 +135,7 @@ class Api:
         station = self._station(request.path_params["name"])
         async with self._asking:
             found = await asyncio.to_thread(station.drone.config.parameters)
-        return _json([parameter_values(parameter) for parameter in found])
+        return answer_json([parameter_values(parameter) for parameter in found])
 
     async def statistics(self, _: Request) -> Response:
         """Answer with what pages were sent.
@@ -146,7 +144,7 @@ class Api:
         """
         counts = self._counts
         feeds = [feed for station in self._fleet.stations.values() for feed in station.feeds]
-        return _json(
+        return answer_json(
             {
                 "pages": counts.pages,
                 "frames_sent": counts.frames_sent,

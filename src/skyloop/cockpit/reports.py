@@ -15,11 +15,14 @@ import tempfile
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from skyloop.child_process import on_parent_end
 from skyloop.errors import LinkError, RefusedError, SkyloopError, UsageError
 from skyloop.messages import Refusal
+
+if TYPE_CHECKING:
+    from skyloop.logfile.reader import Recording
 
 REPORT_S: Final = 120.0  #: for one report, before the next one has its turn
 MAX_WAITING: Final = 4  #: who comes later would wait for minutes
@@ -104,8 +107,12 @@ class Reports:
             return await asyncio.to_thread(target.read_text, encoding="utf-8")
 
 
-def main(arguments: Sequence[str]) -> int:
-    """Make one report, unless standard input ends before: then who wanted it is gone.
+def run_child(arguments: Sequence[str], make: Callable[[Recording, str, Path], None]) -> int:
+    """Make a file of a recording, unless standard input ends before: then who wanted it is gone.
+
+    Args:
+        arguments: FILE TARGET [DRONE], of the command line.
+        make: Makes the target of the recording and the drone's name in it.
 
     Returns:
         The exit code: 0, or 2 with a line of explanation.
@@ -113,17 +120,22 @@ def main(arguments: Sequence[str]) -> int:
     os.nice(NICENESS)
     on_parent_end(partial(os._exit, 1))
     from skyloop.logfile.reader import Recording
-    from skyloop.recording.review.report import write_report
 
     file, target, *drone = arguments
     try:
         recording = Recording.open(Path(file))
-        write_report(recording, recording.drone(drone[0] if drone else None).name, Path(target), pictures=8)
+        make(recording, recording.drone(drone[0] if drone else None).name, Path(target))
     except SkyloopError as error:
         print(error, file=sys.stderr)
         return 2
     return 0
 
 
+def _report(recording: Recording, drone: str, target: Path) -> None:
+    from skyloop.recording.review.report import write_report
+
+    write_report(recording, drone, target, pictures=8)
+
+
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(run_child(sys.argv[1:], _report))

@@ -6,20 +6,16 @@ Making it reads the whole file: a child process does it, as for :mod:`skyloop.co
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from skyloop.child_process import on_parent_end
 from skyloop.clock import seconds
-from skyloop.cockpit.reports import NICENESS
+from skyloop.cockpit.reports import run_child
 from skyloop.cockpit.values import flat_values, truth_values, vector
-from skyloop.errors import SkyloopError
 from skyloop.logfile.layout import Channel
 from skyloop.logfile.times import Course
 from skyloop.messages import Event, EventKind, Feedback, LogEntry, Severity
@@ -82,26 +78,9 @@ def timeline(recording: Recording, drone: str) -> dict[str, Any]:
     return {"events": shown, "marks": marks[:MAX_MARKS], "times": times, "track": track, "values": values}
 
 
-def main(arguments: Sequence[str]) -> int:
-    """Make one timeline, unless standard input ends before: then who wanted it is gone.
-
-    Returns:
-        The exit code: 0, or 2 with a line of explanation.
-    """
-    os.nice(NICENESS)
-    on_parent_end(partial(os._exit, 1))
-    from skyloop.logfile.reader import Recording
-
-    file, target, *drone = arguments
-    try:
-        recording = Recording.open(Path(file))
-        found = timeline(recording, recording.drone(drone[0] if drone else None).name)
-        Path(target).write_bytes(msgspec.json.encode(found))
-    except SkyloopError as error:
-        print(error, file=sys.stderr)
-        return 2
-    return 0
+def _write(recording: Recording, drone: str, target: Path) -> None:
+    target.write_bytes(msgspec.json.encode(timeline(recording, drone)))
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(run_child(sys.argv[1:], _write))

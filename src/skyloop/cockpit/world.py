@@ -150,10 +150,11 @@ def _box(box: Box) -> Json:
 
 
 def _zone(zone: Zone) -> Json:
+    name = {"name": zone.name} if zone.name else {}
     if isinstance(zone, Box):
-        return {"kind": "box", "low": vector(zone.low), "high": vector(zone.high)}
+        return {**name, "kind": "box", "low": vector(zone.low), "high": vector(zone.high)}
     centre = [zone.x, zone.y]
-    return {"kind": "cylinder", "centre": centre, "radius": zone.radius, "low": zone.low, "high": zone.high}
+    return {**name, "kind": "cylinder", "centre": centre, "radius": zone.radius, "low": zone.low, "high": zone.high}
 
 
 def _fields(thing: Any) -> Json:
