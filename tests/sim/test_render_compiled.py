@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import threading
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -99,6 +101,30 @@ def test_it_draws_the_plain_way_until_the_kernels_are_compiled(scene: Scene, mon
     assert np.array_equal(renderer.render(state, pose, model), first)
     assert loads == [1]
     assert compiler.problem == ""
+
+
+def test_a_process_that_ends_begins_to_compile_no_other_function(monkeypatch: pytest.MonkeyPatch) -> None:
+    at_exit: list[Callable[[], object]] = []
+    monkeypatch.setattr("atexit.register", at_exit.append)
+    called, going = [], threading.Event()
+
+    def prepare(*_: object) -> int:
+        called.append("prepare")
+        return 0
+
+    def load() -> Kernels:
+        going.wait(30)
+        return Kernels(prepare=prepare)
+
+    compiler = Compiler(load)
+    thread = compiler.start()
+    assert thread.daemon, "the process would wait for it"
+    at_exit[0]()
+    going.set()
+    thread.join(0.1)
+    assert thread.is_alive()
+    assert not called
+    assert compiler.kernels is None
 
 
 @pytest.mark.parametrize(

@@ -6,10 +6,11 @@ cache on the disk. Neither holds up a picture: both happen on a thread of their 
 
 from __future__ import annotations
 
+import atexit
 import logging
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Final
 
 import numpy as np
@@ -40,6 +41,9 @@ class Kernels:
     resolve: Callable[..., int] = kernels.resolve
     shade: Callable[..., None] = kernels.shade
     darken: Callable[..., None] = kernels.darken
+
+
+KERNELS: Final = tuple(field.name for field in fields(Kernels))
 
 
 class CompiledPainter(Painter):
@@ -112,8 +116,11 @@ class CompiledPainter(Painter):
 class Compiler:
     """Compiles the kernels for this process, once, on a thread of its own.
 
+    The end of the process doesn't wait for all of it, only for the function that is being compiled just then: LLVM must
+    not lose the ground under its feet.
+
     Args:
-        load: Compiles them. Raises ``ImportError`` where Numba is not installed.
+        load: Returns them, compiled when they are called first. Raises ``ImportError`` where Numba is not installed.
     """
 
     def __init__(self, load: Callable[[], Kernels] | None = None) -> None:
@@ -121,29 +128,39 @@ class Compiler:
         self.problem = ""  #: why there are no kernels, once that is known
         self._load = load or load_kernels
         self._lock = threading.Lock()
+        self._compiling = threading.Lock()
         self._thread: threading.Thread | None = None
 
     def start(self) -> threading.Thread:
         """Start the compiling unless it was; return its thread."""
         with self._lock:
             if self._thread is None:
-                # Not a daemon: the end of the process would pull the ground from under LLVM.
-                self._thread = threading.Thread(target=self._run, name="skyloop-sim-compiler", daemon=False)
+                self._thread = threading.Thread(target=self._run, name="skyloop-sim-compiler", daemon=True)
+                atexit.register(self._compiling.acquire)  # for good: no other function is begun
                 self._thread.start()
             return self._thread
 
     def _run(self) -> None:
         try:
-            self.kernels = self._load()
+            functions = self._load()
+            _draw_once(Kernels(*(self._one_by_one(getattr(functions, name)) for name in KERNELS)))
+            self.kernels = functions
         except ImportError as error:
             self.problem = f"Numba is not there: {error}"
         except Exception as error:  # noqa: BLE001  of a compiler anything; the other way of drawing needs none
             self.problem = f"Numba can't compile here: {(str(error) or repr(error)).splitlines()[0]}"
             _log.warning("pictures are drawn without compiled code, which takes several times longer: %s", self.problem)
 
+    def _one_by_one(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*args: object) -> object:
+            with self._compiling:
+                return function(*args)
+
+        return call
+
 
 def load_kernels() -> Kernels:
-    """Compile the kernels, or load them from Numba's cache.
+    """Return the kernels as Numba's functions, which it compiles, or loads from its cache, when they are called first.
 
     Raises:
         ImportError: Numba is not installed.
@@ -152,10 +169,7 @@ def load_kernels() -> Kernels:
     import numba
 
     compile_ = numba.njit(cache=True, nogil=True, error_model="numpy")
-    functions: Any = {name: compile_(getattr(kernels, name)) for name in Kernels.__slots__}
-    compiled = Kernels(**functions)
-    _draw_once(compiled)
-    return compiled
+    return Kernels(*(compile_(getattr(kernels, name)) for name in KERNELS))
 
 
 def _draw_once(functions: Kernels) -> None:
