@@ -84,12 +84,14 @@ function grid({ pen, view, size, ink }: Chart): void {
   pen.textBaseline = "alphabetic";
   pen.beginPath();
   const decimals = step < 1 ? 1 : 0;
+  const scale = t.map.grid(`${figure(step, decimals)} ${name}`);
+  const free = size.width - 8 - pen.measureText(scale).width - 14; // no number under the caption
   for (let x = Math.ceil((west * factor) / step) * step; x <= east * factor; x += step) {
     const px = Math.round(toPixels(view, size, x / factor, 0)[0]) + 0.5;
     pen.moveTo(px, 0);
     pen.lineTo(px, size.height);
     pen.textAlign = "center";
-    if (px > 30 && px < size.width - 90) pen.fillText(figure(x, decimals), px, size.height - 5);
+    if (px > 30 && px < free) pen.fillText(figure(x, decimals), px, size.height - 5);
   }
   for (let y = Math.ceil((south * factor) / step) * step; y <= north * factor; y += step) {
     const py = Math.round(toPixels(view, size, 0, y / factor)[1]) + 0.5;
@@ -100,7 +102,7 @@ function grid({ pen, view, size, ink }: Chart): void {
   }
   pen.stroke();
   pen.textAlign = "right";
-  pen.fillText(t.map.grid(`${figure(step, decimals)} ${name}`), size.width - 8, size.height - 5);
+  pen.fillText(scale, size.width - 8, size.height - 5);
 }
 
 function path({ pen, ink, at }: Chart, places: readonly (readonly number[])[], end: Body | null, tone: string): void {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,7 +12,7 @@ import pytest
 import skyloop
 from skyloop.control.controller import Controller, RunSummary
 from skyloop.messages import Feedback
-from tests.docs.pages import ROOT, Block, blocks
+from tests.docs.pages import Block, blocks
 from tests.recordings import recorded
 
 LONGEST_RUN_S = 10.0  # of a controller, whatever the example says
@@ -26,9 +27,9 @@ FILES = {"flight.pave": "ardrone2/video-8s.pave"}
 
 
 @pytest.fixture
-def flights(monkeypatch: pytest.MonkeyPatch) -> list[Flight]:
+def flights(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Flight]:
     """Shortens the runs of controllers, and keeps how each went and where it ended."""
-    monkeypatch.chdir(ROOT)
+    monkeypatch.chdir(tmp_path)  # some write files
     done: list[Flight] = []
     run = Controller.run
 

@@ -13,6 +13,7 @@ from skyloop.sim.world import Vec3
 
 OK: Final = "ok"
 SPIN_UP_S: Final = 0.8  #: before a take-off leaves the ground; airborne after 1.1 s in a recorded flight
+RISES_WITHIN_S: Final = 0.5  #: of simulated time, or it was refused: a battery that is too low
 TAKEOFF_ANSWER_S: Final = 8.7  #: after the command, of the same flight, though it hovers long before
 FLIP_S: Final = 1.5  #: estimate; the simulated vehicle does not turn over
 TURN_RAD_S: Final = 1.0  #: estimate
@@ -37,17 +38,20 @@ class Rising:
 
     def __init__(self, report: Report) -> None:
         self._begun_s = report.truth.time_s
-        self._commanded = False
+        self._commanded_s: float | None = None
 
     def step(self, report: Report) -> Step:
         """Return what to command now, and the answer once it is done."""
-        elapsed_s = report.truth.time_s - self._begun_s
-        state = report.truth.state
-        if not self._commanded:
-            self._commanded = elapsed_s >= SPIN_UP_S
-            return (Takeoff() if self._commanded else None), None
+        now_s, state = report.truth.time_s, report.truth.state
+        elapsed_s = now_s - self._begun_s
+        if self._commanded_s is None:
+            if elapsed_s < SPIN_UP_S:
+                return None, None
+            self._commanded_s = now_s
+            return Takeoff(), None
         if state in (FlightState.LANDED, FlightState.EMERGENCY):
-            return None, "error" if elapsed_s > SPIN_UP_S + 0.5 else None
+            # From the command on: a step may come late, on a busy machine.
+            return None, "error" if now_s - self._commanded_s > RISES_WITHIN_S else None
         return None, OK if state in _FLYING and elapsed_s >= TAKEOFF_ANSWER_S else None
 
 
