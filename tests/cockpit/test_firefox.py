@@ -11,6 +11,7 @@ import skyloop
 from skyloop.messages import FlightState
 from tests.cockpit import fingers
 from tests.cockpit.browser import IN_FIREFOX, Deck, DronePage
+from tests.recording.flights import Plan, write_flight
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -95,3 +96,36 @@ def test_fingers_arrive(deck: Deck) -> None:
     ]
     assert page.page.evaluate("heard") == expected
     assert page.problems == []
+
+
+def test_a_finger_scrubs_a_replay_and_its_end_is_said(deck: Deck, tmp_path: Path) -> None:
+    write_flight(tmp_path / "flight.mcap", Plan(seconds=4.0))
+    deck.address = deck.cockpit("--recordings", str(tmp_path))
+    page = deck.overview(has_touch=True)
+    page.page.get_by_role("button", name="Replay flight.mcap").click()
+    page.page.locator(".replay-slider:visible").wait_for(timeout=30_000)
+    page.pane = page.page.locator(".pane")
+    page.pane.locator(".replay-slider").focus()
+    page.press("Space")
+    page.until(lambda: page.attribute(".replay", "data-paused") == "true", "it is paused", 30.0)
+    rail = page.pane.locator(".replay-rail").bounding_box()
+    assert rail is not None
+    duration_s = float(page.attribute(".replay-slider", "aria-valuemax"))
+    for share in (0.7, 0.3):
+        with fingers.on(page.page) as hand:
+            for at in (0.1, 0.9, share):
+                hand.put("one", rail["x"] + at * rail["width"], rail["y"] + rail["height"] / 2)
+        page.until(
+            lambda at_s=share * duration_s: abs(float(page.attribute(".replay", "data-position")) - at_s) < 0.35,  # type: ignore[misc]
+            f"it is at {share}",
+        )
+        page.until(lambda: page.says(".chip.age") == "paused", "its picture is there")
+    assert page.problems == []
+    name = page.pane.get_attribute("data-drone")
+    stopped = page.page.request.post(
+        f"{deck.address}api/replays/{name}/stop", data={}, headers={"Origin": deck.address.rstrip("/")}
+    )
+    assert stopped.ok, stopped.text()
+    page.wait_for_text(".ended-replay", "This replay has ended.")
+    page.pane.locator(".ended-replay").get_by_role("button", name="Close").click()
+    page.until(lambda: page.pane.count() == 0, "the overview is left")

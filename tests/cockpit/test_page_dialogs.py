@@ -123,9 +123,16 @@ def test_a_gamepad_is_mapped_and_commands_nothing_meanwhile(deck: Deck) -> None:
     assert page.problems == []
 
 
+APART = """
+Object.defineProperty(document, "pictureInPictureEnabled", {get: () => true});
+HTMLVideoElement.prototype.requestPictureInPicture = async function () { window.apart = this; };
+document.exitPictureInPicture = async () => window.apart.dispatchEvent(new Event("leavepictureinpicture"));
+"""
+
+
 def test_pictures_are_saved_shown_on_the_full_screen_and_controlled(deck: Deck, tmp_path: Path) -> None:
     deck.proxy("film")
-    page = deck.page("film")
+    page = deck.page("film", prepare=APART)
     page.wait_for_new_picture()
     camera = page.pane.locator(".camera")
     with page.page.expect_download() as photo:
@@ -147,6 +154,15 @@ def test_pictures_are_saved_shown_on_the_full_screen_and_controlled(deck: Deck, 
     clip.value.save_as(tmp_path / "clip")
     assert (tmp_path / "clip").stat().st_size > 1000
     assert not page.pane.locator(".clip-mark").is_visible()
+    apart = camera.get_by_role("button", name="in a window of its own")
+    apart.click()
+    page.until(lambda: apart.get_attribute("aria-pressed") == "true", "it has a window of its own")
+    page.until(
+        lambda: page.page.evaluate("window.apart.videoWidth === 320 && window.apart.currentTime > 0"), "it moves"
+    )
+    apart.click()
+    page.until(lambda: apart.get_attribute("aria-pressed") == "false", "it is back")
+    assert page.page.evaluate("window.apart.srcObject") is None
     camera.get_by_role("button", name="on the full screen").click()
     page.until(lambda: camera.evaluate("camera => document.fullscreenElement === camera"), "it is full")
     camera.get_by_role("button", name="Motors off").wait_for()  # in reach there, too
