@@ -1,4 +1,4 @@
-"""Flights to a place: the proxy's on simulated vehicles, the autopilots' own on both emulated ones."""
+"""Flights to a place and back to the start: the proxy's on simulated vehicles, the autopilots' own on emulated ones."""
 
 from __future__ import annotations
 
@@ -15,13 +15,15 @@ from skyloop.client.drone import open_drone
 from skyloop.drivers.registry import make_driver
 from skyloop.emulators.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
 from skyloop.emulators.mavlink.places import ORIGIN
+from skyloop.emulators.tello import TelloFirmware, with_tellos
 from skyloop.errors import NoAnswerError, RefusedError, SwarmError, UnknownNameError, UsageError
-from skyloop.messages import Applied, Feedback, FlightState, Hover, Velocity
+from skyloop.messages import Applied, Feedback, FlightState, Hover, Vector, Velocity
 from skyloop.proxy import Proxy
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 from skyloop.transport.memory import MemoryServer
 from tests.client.scripted import WAIT_S
+from tests.drivers.tello.addresses import Addresses
 
 SIM = "sim://?world=empty&seed=2&wind=0&noise=0&cameras=none"
 KINDS = {kind.value: kind for kind in Kind}
@@ -187,3 +189,112 @@ def test_a_swarm_and_asyncio_fly_to_places() -> None:
         assert place(drones["a"].feedback())[2] == pytest.approx(z + 0.3, abs=0.2)
         asyncio.run(aio.Drone(drones["a"]).go_to(x=x, y=y, z=z, timeout_s=WAIT_S))
         assert drones["a"].feedback().state is FlightState.FLYING
+
+
+# Back to the start -----------------------------------------------------------------------------------------------
+
+
+def across(one: Vector, other: Vector) -> float:
+    return math.dist(one[:2], other[:2])
+
+
+def start(drone: Drone) -> Vector:
+    assert drone.start_position is not None
+    return drone.start_position
+
+
+@pytest.mark.parametrize("vehicle", [SIM, *AUTOPILOTS])
+def test_back_to_the_start(vehicle: str) -> None:
+    with flown(vehicle) as drone:
+        x, y, z = place(drone.feedback())
+        assert across(start(drone), (x, y, z)) < 0.3
+        drone.go_to(x=x + 1.3, y=y - 0.6, z=z, speed=1.0, timeout_s=LONG_S)
+        phases = [""]
+        heights = [0.0]
+
+        def watch(feedback: Feedback) -> None:
+            heights.append(place(feedback)[2])
+            if phases[-1] != feedback.return_phase:
+                phases.append(str(feedback.return_phase))
+
+        top = z - start(drone)[2] + 0.8
+        with drone.on_feedback(watch, inline=True):
+            drone.return_to_start(top, timeout_s=LONG_S)
+        assert [phase for phase in phases if phase not in ("", "none")] == ["climbing", "flying", "landing"]
+        assert max(heights) == pytest.approx(start(drone)[2] + top, abs=0.35)
+        assert drone.feedback().state is FlightState.LANDED
+        assert across(place(drone.feedback()), start(drone)) < 0.7
+        with pytest.raises(RefusedError, match="not possible while landed: take off first"):
+            drone.return_to_start()
+        with pytest.raises(UsageError, match="height is -1 m"):
+            drone.return_to_start(-1.0)
+
+
+@pytest.mark.slow
+def test_above_its_start_it_stays_if_it_is_to() -> None:
+    with flown(SIM) as drone:
+        x, y, z = place(drone.feedback())
+        drone.go_to(x=x + 1.5, y=y, z=z, timeout_s=LONG_S)
+        drone.return_to_start(0.0, land=False, timeout_s=LONG_S)
+        assert drone.feedback().return_phase == "arrived"
+        assert across(place(drone.feedback()), start(drone)) < 0.35
+
+
+def test_a_low_battery_flies_it_back() -> None:
+    with flown(SIM + "&battery=0.5") as drone:
+        x, y, z = place(drone.feedback())
+        drone.go_to(x=x + 1.5, y=y, z=z, timeout_s=LONG_S)
+        drone.config["return.height"] = 0.0
+        drone.config["battery.return"] = 0.6
+        with pytest.raises(RefusedError, match=r"returns to its start, because the battery is low|failsafe"):
+            drone.go_to(x=x + 1.5, y=y + 1.0, z=z, timeout_s=LONG_S)
+        drone.wait("landed", LONG_S)
+        assert across(place(drone.feedback()), start(drone)) < 0.7
+        (told,) = [event for event in drone.recent_events() if event.data.get("returns")]
+        assert told.text == "failsafe: return to the start and land there, because the battery is low"
+        with pytest.raises(RefusedError, match=r"it would return at once \(battery\.return\): charge it"):
+            drone.takeoff(timeout_s=WAIT_S)
+
+
+@contextmanager
+def tello() -> Iterator[str]:
+    """The address of an emulated Tello, which reports no position."""
+    world = SimHost(with_tellos(SimOptions(world="empty", seed=4, wind=0.0, speed=2.0)))
+    addresses = Addresses.free()
+    with TelloFirmware(world, bind=addresses.drone):
+        yield addresses.uri()
+
+
+@pytest.mark.parametrize("vehicle", ["sim", pytest.param("tello", marks=pytest.mark.slow)])
+def test_a_vehicle_without_a_position_does_not_return(vehicle: str) -> None:
+    server = MemoryServer("v")
+    with ExitStack() as stack:
+        address = stack.enter_context(tello()) if vehicle == "tello" else SIM + "&position=none"
+        stack.enter_context(Proxy(make_driver(address), server, name="v"))
+        drone = stack.enter_context(open_drone(server.dial, app="me", timeout_s=WAIT_S))
+        drone.wait(lambda feedback: feedback.vehicle_link == "up", LONG_S)
+        drone.takeoff(timeout_s=LONG_S)
+        assert drone.start_position is None
+        with pytest.raises(RefusedError, match="does not report its position"):
+            drone.return_to_start()
+        assert drone.feedback().state.airborne
+
+
+@pytest.mark.slow
+def test_a_swarm_and_asyncio_return() -> None:
+    with ExitStack() as stack:
+        drones = {}
+        for name in ("a", "b"):
+            server = MemoryServer(name)
+            stack.enter_context(Proxy(make_driver(SIM), server, name=name))
+            drones[name] = open_drone(server.dial, app="me", timeout_s=WAIT_S)
+        swarm = stack.enter_context(Swarm(drones, on_error="raise"))
+        swarm.takeoff(timeout_s=LONG_S)
+        swarm.return_to_start(0.0, land=False, timeout_s=LONG_S)
+        asyncio.run(aio.Drone(drones["a"]).return_to_start(timeout_s=LONG_S))
+        assert aio.Drone(drones["a"]).start_position == drones["a"].start_position
+        assert drones["a"].feedback().state is FlightState.LANDED
+        with pytest.raises(UsageError, match="land is 1 and must be True, False or None"):
+            swarm.return_to_start(land=1)  # type: ignore[arg-type]
+        with pytest.raises(SwarmError, match="take off first"):
+            asyncio.run(aio.Swarm(swarm).return_to_start())

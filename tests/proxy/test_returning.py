@@ -101,6 +101,10 @@ def test_a_vehicle_that_is_found_in_the_air_has_none() -> None:
     assert observed((0, FlightState.FLYING, GROUND), (1, FlightState.HOVERING, GROUND)).position is None
 
 
+def test_a_take_off_that_is_found_in_progress_counts_on_the_ground_below() -> None:
+    assert observed((0, FlightState.TAKING_OFF, at(1.0, 2.0, 0.75, altitude_m=0.5))).position == (1.0, 2.0, 0.25)
+
+
 def test_a_position_that_comes_during_the_take_off_counts_on_the_ground_below() -> None:
     start = observed((0, FlightState.LANDED, at(0, 0, 0, position_m=None)))
     start.observe(FlightState.TAKING_OFF, at(0, 0, 0, position_m=None), NOW)

@@ -8,7 +8,7 @@ import time
 from types import TracebackType
 from typing import TYPE_CHECKING, Final, Self
 
-from skyloop.messages import Failsafe
+from skyloop.messages import Failsafe, ReturnPhase
 
 if TYPE_CHECKING:
     from rich.live import Live
@@ -84,6 +84,7 @@ def flight_line(drone: Drone, flown_s: float) -> str:
         feedback.state.value,
         f"{flown_s:.0f} s",
         "" if feedback.failsafe is Failsafe.NONE else f"failsafe {feedback.failsafe.value}",
+        "" if feedback.return_phase is ReturnPhase.NONE else f"return {feedback.return_phase}",
         "" if feedback.altitude_m is None else f"altitude {feedback.altitude_m:.2f} m",
         "" if feedback.battery is None else f"battery {feedback.battery:.0%}",
         f"{rate:.1f} frames/s" if video else "",

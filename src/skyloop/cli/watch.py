@@ -18,7 +18,7 @@ from rich.text import Text
 
 from skyloop.cli.naming import DroneOption, KeysOption, NameArgument, NetworkOption, join_network, one_drone
 from skyloop.cli.text import named
-from skyloop.messages import Event, Failsafe, Feedback, Severity
+from skyloop.messages import Event, Failsafe, Feedback, ReturnPhase, Severity
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
@@ -99,6 +99,7 @@ def state_line(drone: Drone) -> str:
         f"proxy {link.application.value}",
         f"vehicle {link.vehicle.value}",
         *([f"failsafe {feedback.failsafe.value}"] if feedback.failsafe is not Failsafe.NONE else []),
+        *([f"return {feedback.return_phase}"] if feedback.return_phase is not ReturnPhase.NONE else []),
         *rates,
     ]
     return "  ".join(parts)

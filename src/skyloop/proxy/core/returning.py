@@ -61,19 +61,15 @@ class StartPoint:
         since_ns, self._standing_ns = self._standing_ns, None
         flew, self._flew = self._flew, True
         stood = since_ns is not None and (now_ns - since_ns >= STANDING_NS or not flew)
-        if stood or (taking_off and before in _GROUNDED):
+        if stood or (taking_off and not before.airborne):
             self.position, self._open = None, True
-            self._note(feedback, now_ns, 0.0)
-        elif self._open and taking_off:
-            self._note(feedback, now_ns, (feedback and feedback.altitude_m) or 0.0)
-        else:
+        stands = before in _GROUNDED
+        if not (stands or taking_off):
             self._open = False
-
-    def _note(self, feedback: Feedback | None, now_ns: int, above: float) -> None:
-        if feedback is None or feedback.position_m is None or now_ns - feedback.captured_ns > STALE_NS:
-            return
-        x, y, z = feedback.position_m
-        self.position, self._open = (x, y, z - above), False
+        elif self._open and feedback is not None and feedback.position_m is not None:
+            x, y, z = feedback.position_m
+            if now_ns - feedback.captured_ns <= STALE_NS:
+                self.position, self._open = (x, y, z if stands else z - (feedback.altitude_m or 0.0)), False
 
 
 class ReturnDecision(NamedTuple):
