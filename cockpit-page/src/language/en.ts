@@ -359,7 +359,7 @@ export const en = {
     was: (flight: string) => `was ${flight}`,
     recordingFlies: "A recording or a camera: nothing flies here.",
     isOld: "What is shown is old.",
-    noPosition: "It does not report its position: simulate it without position=none, or give it motion capture or GPS.",
+    noPosition: "It does not report its position. Motion capture, GPS or optical flow gives it one; a simulated drone has one unless started with position=none.",
     takeToFly: "Take control to fly to a place.",
     notInAir: "It must be in the air to fly to a place.",
     takeForZones: "Take control to change zones.",
