@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from skyloop.cockpit.feeds import CameraFeed
+from skyloop.cockpit.camera_feed import CameraFeed
 from skyloop.cockpit.small_feed import FPS, WIDTHS, SmallFeed, rounded_width
 from skyloop.cockpit.small_video import MAX_SHOWN
 from skyloop.messages import CameraInfo

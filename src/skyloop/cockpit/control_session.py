@@ -23,6 +23,7 @@ from starlette.websockets import WebSocket
 from skyloop.client.commands import position_action
 from skyloop.client.completion import OF_ONE_PACKET, ReturnWatch
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
+from skyloop.cockpit.broadcast import call_soon
 from skyloop.cockpit.commands import (
     SETTLED_NS,
     Alive,
@@ -48,7 +49,6 @@ from skyloop.cockpit.commands import (
     late_s,
     untimely,
 )
-from skyloop.cockpit.feeds import call_soon
 from skyloop.cockpit.route_session import RouteSession
 from skyloop.cockpit.stream import PageSocket
 from skyloop.cockpit.takeover import QueuePosition, TakeoverDialog

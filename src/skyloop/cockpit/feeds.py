@@ -1,29 +1,25 @@
-"""From the client's threads to the event loop: what a drone sends, and what pages get of it at a steady rate.
+"""From the client's threads to the event loop: what a drone sends besides frames.
 
-That is the newest frame, the newest drawing of each source, the last events, what applications log, and what is
-commanded. Everything here but the callbacks given to the drone runs on the event loop.
+That is the newest drawing of each source, the last events, what applications log, and what is commanded. Everything
+here but the callbacks given to the drone runs on the event loop.
 """
 
 from __future__ import annotations
 
 import asyncio
-import struct
 from collections import deque
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import msgspec
 
 from skyloop.clock import Clock, monotonic_ns, seconds
+from skyloop.cockpit.broadcast import Cancellable, Wake, call_soon
 from skyloop.messages import Annotation, Applied, Event, LogEntry, Points, Polyline, Text
 from skyloop.messages.log import MOCAP as SERIES
 
 if TYPE_CHECKING:
-    from skyloop.client import Drone, Frame
+    from skyloop.client import Drone
 
-JPEG_QUALITY = 80
 KEPT_EVENTS = 256
 KEPT_S = 10.0  #: what was drawn or logged longer ago is no longer shown
 MAX_SERIES = 256  #: logged numbers that are shown of one drone
@@ -32,19 +28,9 @@ MAX_WAYPOINTS = 256  #: of one path that are shown
 WAYPOINTS = "waypoints"  #: name under which a controller logs where it flies to
 MOCAP_S = 0.5  #: a pose of motion capture that is older is not shown
 
-_LENGTH: Final = struct.Struct(">I")
 _KEPT_NS = round(KEPT_S * 1e9)
 
-Wake = Callable[[], None]
 _encode = msgspec.json.Encoder().encode
-#: One thread for all cameras: encoding for many pages must not take the cores that fly.
-_ENCODER: Final = ThreadPoolExecutor(1, thread_name_prefix="jpeg")
-
-
-class _Cancellable(Protocol):
-    """What registering a callback with a drone returns."""
-
-    def cancel(self) -> None: ...
 
 
 K = TypeVar("K")
@@ -83,90 +69,6 @@ class Newest(Generic[K, V]):
     def clear(self) -> None:
         """Forget all values."""
         self._values = {}
-
-
-@dataclass(frozen=True, slots=True)
-class NumberedFrame:
-    """One frame on its way to pages; ``serial`` counts the frames of this process, across restarts of the proxy."""
-
-    serial: int
-    frame: Frame
-
-
-class CameraFeed:
-    """The newest frame of one camera, encoded at most once for all pages, and only while a page wants it.
-
-    Args:
-        drone: The drone.
-        camera: The camera's name.
-        clock: The monotonic clock [ns].
-    """
-
-    def __init__(self, drone: Drone, camera: str, clock: Clock = monotonic_ns) -> None:
-        self.camera = camera
-        self.newest: NumberedFrame | None = None
-        self.encoded = 0  #: frames that were made a JPEG
-        self._drone = drone
-        self._clock = clock
-        self._since_ns = 0  # since when a page wants frames
-        self._listener: _Cancellable | None = None
-        self._wakes: set[Wake] = set()
-        self._serial = 0
-        self._jpeg: tuple[int, asyncio.Future[bytes]] | None = None
-
-    @property
-    def wanted(self) -> bool:
-        """Whether a page watches it."""
-        return bool(self._wakes)
-
-    def subscribe(self, wake: Wake) -> None:
-        """Call ``wake`` on the loop for each newer frame; the first subscriber subscribes to the camera."""
-        self._wakes.add(wake)
-        if self._listener is None:
-            loop = asyncio.get_running_loop()
-            self._since_ns = self._clock()
-            self._listener = self._drone.on_frame(lambda frame: call_soon(loop, self._put, frame), camera=self.camera)
-        elif self.newest is not None:
-            wake()
-
-    def unsubscribe(self, wake: Wake) -> None:
-        """Call ``wake`` no longer; after the last one the camera is no longer subscribed to."""
-        self._wakes.discard(wake)
-        if not self._wakes and self._listener is not None:
-            self._listener.cancel()
-            self._listener = self.newest = self._jpeg = None
-
-    @property
-    def age_s(self) -> float | None:
-        """Age of the newest frame [s], or how long one was waited for in vain.
-
-        None while no page wants any, and before the first that ever came: a vehicle may take seconds to send it.
-        """
-        if self._listener is None or not self._serial:
-            return None
-        return seconds(self._clock() - self._since_ns) if self.newest is None else self.newest.frame.age_s
-
-    async def jpeg(self, picture: NumberedFrame) -> bytes:
-        """Return the picture as a JPEG file; it is encoded once for all pages, on a thread."""
-        if self._jpeg is None or self._jpeg[0] != picture.serial:
-            loop = asyncio.get_running_loop()
-            self._jpeg = picture.serial, loop.run_in_executor(_ENCODER, to_jpeg, picture.frame)
-            self.encoded += 1
-        return await asyncio.shield(self._jpeg[1])
-
-    def close(self) -> None:
-        """Unsubscribe from the camera."""
-        if self._listener is not None:
-            self._listener.cancel()
-            self._listener = None
-
-    def _put(self, frame: Frame) -> None:
-        if self._listener is None:  # cancelled while this was on its way
-            return
-        self._serial += 1
-        self.newest = NumberedFrame(self._serial, frame)
-        for wake in self._wakes:
-            wake()
 
 
 class Drawing:
@@ -223,7 +125,7 @@ class EventFeed:
         self._wakes: set[Wake] = set()
         self._loop = loop = asyncio.get_running_loop()
         self._waking = False  # pages are about to be woken
-        self._listeners: list[_Cancellable] = [
+        self._listeners: list[Cancellable] = [
             drone.on_annotation(self._draw),
             drone.on_event(lambda event: call_soon(loop, self._on_event, event)),
         ]
@@ -280,7 +182,7 @@ class LogFeed:
         self._numbers: Newest[str, float] = Newest(MAX_SERIES, clock)
         self._waypoints: tuple[int, tuple[tuple[float, ...], ...]] | None = None
         self._mocap: tuple[int, tuple[float, ...]] | None = None
-        self._listeners: list[_Cancellable] = []
+        self._listeners: list[Cancellable] = []
 
     def want(self, wanted: bool) -> None:
         """Subscribe, or unsubscribe and forget the values."""
@@ -338,100 +240,3 @@ class LogFeed:
             values = entry.values
             places = tuple(values[row * columns : (row + 1) * columns] for row in range(min(rows, MAX_WAYPOINTS)))
             self._waypoints = self._clock(), places
-
-
-def to_jpeg(frame: Frame, quality: int = JPEG_QUALITY) -> bytes:
-    """Encode a frame (BGR) as a JPEG file.
-
-    Args:
-        frame: The frame.
-        quality: 1 to 100.
-
-    Raises:
-        ValueError: OpenCV could not.
-    """
-    import cv2
-
-    done, data = cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    if not done:
-        raise ValueError(f"frame {frame.seq} of {frame.camera} could not be made a JPEG")
-    return bytes(data.data)
-
-
-def pack(head: dict[str, Any], *jpegs: bytes) -> bytes:
-    """Return a binary message: length of the head (4 bytes, big-endian), the head as JSON, the JPEG files."""
-    text = _encode(head)
-    return b"".join((_LENGTH.pack(len(text)), text, *jpegs))
-
-
-def call_soon(loop: asyncio.AbstractEventLoop, function: Callable[..., None], *arguments: Any) -> None:
-    """Call a function on the loop, from any thread; does nothing if the loop is closed, as it has no pages left."""
-    if not loop.is_closed():
-        loop.call_soon_threadsafe(function, *arguments)
-
-
-class PeriodicBroadcast:
-    """Makes a message at a steady rate while there are subscribers, once for all of them. On the event loop."""
-
-    def __init__(self, period_s: float, make: Callable[[], bytes], on_change: Callable[[bool], None]) -> None:
-        """Prepare it; the first subscriber starts it.
-
-        Args:
-            period_s: Between two messages [s].
-            make: Makes a message.
-            on_change: Called with True before the first subscriber, with False after the last one.
-        """
-        self.message = b""  #: the newest
-        self.closed = False  #: no more messages will come
-        self._period_s = period_s
-        self._make = make
-        self._on_change = on_change
-        self._wakes: set[Wake] = set()
-        self._task: asyncio.Task[None] | None = None
-
-    @property
-    def wanted(self) -> bool:
-        """Whether there are subscribers."""
-        return bool(self._wakes)
-
-    def subscribe(self, wake: Wake) -> None:
-        """Call ``wake`` for each new message, and now: the message is fresh, unless this is closed."""
-        if self.closed:
-            wake()
-            return
-        if not self._wakes:
-            self._on_change(True)
-            self.message = self._make()
-            self._task = asyncio.create_task(self._run())
-        self._wakes.add(wake)
-        wake()
-
-    def unsubscribe(self, wake: Wake) -> None:
-        """Call ``wake`` no longer; does nothing for one that has not subscribed."""
-        if wake in self._wakes:
-            self._wakes.discard(wake)
-            if not self._wakes:
-                self._stop()
-                self._on_change(False)
-
-    def close(self) -> None:
-        """End it for good, and wake all subscribers."""
-        self.closed = True
-        self._stop()
-        for wake in list(self._wakes):
-            wake()
-
-    def _stop(self) -> None:
-        if self._task is not None:
-            self._task.cancel()
-            self._task = None
-
-    async def _run(self) -> None:
-        loop = asyncio.get_running_loop()
-        due = loop.time()
-        while True:
-            due = max(due + self._period_s, loop.time())  # a late one is not made up for
-            await asyncio.sleep(due - loop.time())
-            self.message = self._make()
-            for wake in list(self._wakes):
-                wake()

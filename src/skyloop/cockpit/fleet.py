@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
 from skyloop.cockpit.alarms import Alarm, AlarmSeverity
+from skyloop.cockpit.broadcast import PeriodicBroadcast
 from skyloop.cockpit.discovery import Finder, Found
-from skyloop.cockpit.feeds import PeriodicBroadcast
 from skyloop.cockpit.station import Station
 from skyloop.cockpit.telemetry import encode_json
 from skyloop.errors import SkyloopError

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from skyloop.clock import Clock, monotonic_ns, seconds
-from skyloop.cockpit.feeds import to_jpeg
+from skyloop.cockpit.camera_feed import to_jpeg
 from skyloop.messages import CameraInfo
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from skyloop.clock import monotonic_ns, seconds
-from skyloop.cockpit.feeds import pack
+from skyloop.cockpit.camera_feed import pack
 from skyloop.cockpit.small_feed import FPS, SmallFeed, rounded_width
 from skyloop.errors import SkyloopError
 

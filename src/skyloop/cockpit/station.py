@@ -7,8 +7,10 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
 from skyloop.clock import monotonic_ns, seconds
+from skyloop.cockpit.broadcast import PeriodicBroadcast
+from skyloop.cockpit.camera_feed import CameraFeed
 from skyloop.cockpit.discovery import Found
-from skyloop.cockpit.feeds import CameraFeed, EventFeed, LogFeed, PeriodicBroadcast
+from skyloop.cockpit.feeds import EventFeed, LogFeed
 from skyloop.cockpit.routes import CheckedRoutes
 from skyloop.cockpit.small_feed import SmallFeed
 from skyloop.cockpit.telemetry import TelemetryView

@@ -15,7 +15,9 @@ from typing import Any, Final
 import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from skyloop.cockpit.feeds import CameraFeed, EventFeed, PeriodicBroadcast, pack
+from skyloop.cockpit.broadcast import PeriodicBroadcast
+from skyloop.cockpit.camera_feed import CameraFeed, pack
+from skyloop.cockpit.feeds import EventFeed
 from skyloop.cockpit.station import Station
 from skyloop.cockpit.telemetry import encode_json
 

@@ -10,7 +10,7 @@ import msgspec
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds
 from skyloop.cockpit.alarms import USUAL, Thresholds
-from skyloop.cockpit.feeds import call_soon
+from skyloop.cockpit.broadcast import call_soon
 from skyloop.errors import SkyloopError, UnknownNameError
 from skyloop.messages import Event, EventKind, LinkState, Value
 
