@@ -7,12 +7,12 @@ import { Battery } from "./battery.js";
 import { CameraControls } from "./cameracontrols.js";
 import { Channels } from "./channels.js";
 import { ServerClock } from "./clock.js";
-import { STALE_MS } from "./commands.js";
 import { Deck } from "./deck.js";
 import { h, setAttribute, setHidden, setText, setTone, type Tone } from "./dom.js";
 import { Events } from "./events.js";
 import { corners, FlightHud } from "./flightmode.js";
 import { words } from "./format.js";
+import { Freshness } from "./freshness.js";
 import { History, KEPT_S, Trail } from "./history.js";
 import type { Countdown } from "./hold.js";
 import { Instruments } from "./instruments.js";
@@ -68,10 +68,6 @@ export class Pane {
   private absent = "";
   private dirty = false;
   private readonly clock = new ServerClock();
-  /** When the newest that is known of the drone was true, and when the cockpit answered last, on this page's clock. */
-  private fresh_ms: number | null = null;
-  private answered_ms = performance.now();
-  private isOld = false;
   private readonly socket: LastingSocket;
   private readonly history = new History();
   private readonly trail = new Trail();
@@ -84,10 +80,7 @@ export class Pane {
   private readonly alarms = new AlarmBanner(this.alarmBook);
   private readonly opened_ms = performance.now();
   private wasConnected = false;
-  private readonly oldAge = h("b", { "aria-hidden": "true" });
-  private readonly oldWhat = h("span", {});
-  private readonly oldSeen = h("button", { type: "button", class: "small", "aria-label": t.pane.acknowledgeOld, onclick: () => this.alarmBook.acknowledge("old", performance.now()) && this.update() }, t.alarms.ok);
-  private readonly old = h("p", { class: "banner old", role: "alert", "data-tone": "warn", hidden: true }, h("span", {}, t.pane.old), this.oldAge, this.oldWhat, this.oldSeen);
+  private readonly fresh: Freshness;
   /** Nothing is replayed any more: what is seen is the last of it. */
   private readonly ended = h("p", { class: "banner ended-replay", role: "status", "data-tone": "quiet", hidden: true }, h("span", {}, t.pane.replayEnded), h("button", { type: "button", class: "small", onclick: () => this.host.close(this.name) }, t.modal.close));
   private readonly notice = h("p", { class: "banner notice", role: "alert", "data-tone": "warn" });
@@ -120,6 +113,7 @@ export class Pane {
     pilots: boolean,
     private readonly host: PaneHost,
   ) {
+    this.fresh = new Freshness(name, this.clock, () => this.alarmBook.acknowledge("old", performance.now()) && this.update());
     const base = `/ws/drones/${encodeURIComponent(name)}`;
     this.controls = new CameraControls(name, (parameter, value) => this.pilot?.write(parameter, value));
     this.stage = new Stage(name, this.controls);
@@ -221,12 +215,12 @@ export class Pane {
   }
 
   tick(now_ms: number): void {
-    this.age(now_ms);
+    if (this.fresh.update(now_ms, this.pilot?.age_ms(now_ms))) this.dirty = true;
     if (this.dirty) this.update();
     this.strip.count(this.pilot);
     this.stage.update(now_ms);
     this.bar?.update(this.playback, this.state?.links.vehicle === "closed", now_ms);
-    this.preflight.watch((this.pilot?.mine ?? false) && this.state?.flight === "landed" && !this.isOld, now_ms);
+    this.preflight.watch((this.pilot?.mine ?? false) && this.state?.flight === "landed" && !this.fresh.isOld, now_ms);
     if (this.decks.space.shown === "Map") this.map.draw(now_ms);
     else this.scene?.draw(now_ms);
     this.plots.draw(now_ms);
@@ -244,7 +238,7 @@ export class Pane {
     const close = h("button", { type: "button", class: "bare close", "aria-label": t.pane.close(this.name), onclick: () => this.host.close(this.name) }, "×");
     const head = h("header", { class: "pane-head" }, h("h2", {}, this.name), this.kind, this.endReplay, this.alarms.chip, this.pill, this.battery.element, this.hud.element, this.full, this.fly, close);
     const body = h("div", { class: "pane-body" }, this.stage.element, this.decks.space.element, this.instruments.element, this.decks.plots.element, this.decks.lists.element, this.channels.element);
-    const element = h("article", { class: "pane", "data-drone": this.name, "aria-label": t.pane.drone(this.name), tabindex: -1 }, head, h("div", { class: "over" }, h("div", { class: "stack" }, this.old, this.ended, this.alarms.element, this.notice)), this.alarms.voice, body, this.thumbs.element, this.strip.element);
+    const element = h("article", { class: "pane", "data-drone": this.name, "aria-label": t.pane.drone(this.name), tabindex: -1 }, head, h("div", { class: "over" }, h("div", { class: "stack" }, this.fresh.element, this.ended, this.alarms.element, this.notice)), this.alarms.voice, body, this.thumbs.element, this.strip.element);
     element.addEventListener("pointerdown", () => this.host.select(this.name), { capture: true });
     element.addEventListener("focusin", () => this.host.select(this.name));
     return element;
@@ -255,7 +249,7 @@ export class Pane {
       changed: () => this.update(),
       refused: (command, why) => {
         if (command === "set" && [this.writes, this.parameters, this.controls.parameters].some((list) => list.refused(why))) return;
-        if (command === "fly" && this.isOld) return; // the whole pane shows that
+        if (command === "fly" && this.fresh.isOld) return; // the whole pane shows that
         this.notify(command ? `${words(command)}: ${why}` : why, "warn");
       },
       route: (progress) => this.map.route.update(progress),
@@ -291,7 +285,7 @@ export class Pane {
     } else {
       this.state = message;
       this.absent = "";
-      this.dated(message);
+      this.fresh.received(message, this.isRecording);
       this.alarmBook.update(this.found(), performance.now()); // also while nobody sees the page, and nothing is drawn
       this.remember(message);
       this.events.add(message.events);
@@ -338,36 +332,10 @@ export class Pane {
     this.stage.append(this.bar.element);
   }
 
-  /** When the state was true: it may have been long on its way, and old when it was sent. */
-  private dated(state: State): void {
-    const now_ms = performance.now();
-    this.clock.received(now_ms, state.now_s);
-    if (state.links.application === "lost") return;
-    const feedback_s = this.isRecording ? 0 : (state.feedback?.age_s ?? 0); // what was recorded is old anyhow
-    this.fresh_ms = now_ms - ((this.clock.age_s(state.now_s, now_ms) ?? 0) + feedback_s) * 1000;
-  }
-
-  /** Show how old it is, if it is. */
-  private age(now_ms: number): void {
-    const answer_ms = this.pilot?.age_ms(now_ms) ?? null;
-    if (answer_ms !== null) this.answered_ms = now_ms - answer_ms;
-    const silent_ms = this.pilot === null ? 0 : now_ms - this.answered_ms;
-    const old_ms = this.fresh_ms === null ? 0 : now_ms - this.fresh_ms;
-    const age_ms = Math.max(silent_ms, old_ms);
-    const isOld = age_ms > STALE_MS;
-    if (isOld) {
-      setText(this.oldAge, `${(age_ms / 1000).toFixed(1)} s`);
-      setText(this.oldWhat, old_ms >= silent_ms ? t.pane.nothingNew(this.name) : t.pane.cockpitSilent);
-    }
-    if (isOld === this.isOld) return;
-    this.isOld = isOld;
-    setHidden(this.old, !isOld);
-    this.dirty = true;
-  }
-
   private update(): void {
     this.dirty = false;
-    const { state, vehicle, pilot, isOld, isRecording: recording } = this;
+    const { state, vehicle, pilot, isRecording: recording } = this;
+    const { isOld } = this.fresh;
     // What came before the link broke is not known any more; what is merely old is shown in grey.
     const live = this.connected && state?.links.application !== "lost" ? state : null;
     const over = recording && (live === null || live.links.vehicle === "closed");
@@ -389,7 +357,7 @@ export class Pane {
     for (const list of [this.parameters, this.controls.parameters]) list.allow(mine, recording ? t.pane.asRecorded : t.pane.takeToChange);
     this.alarmBook.update(this.found(), performance.now());
     this.alarms.show();
-    setHidden(this.oldSeen, !this.alarmBook.open.some((alarm) => alarm.id === "old"));
+    this.fresh.offer(this.alarmBook.open.some((alarm) => alarm.id === "old"));
     setAttribute(this.element, "data-lost", String(!live || isOld));
     setAttribute(this.element, "data-old", String(isOld || (!live && !over)));
     setAttribute(this.element, "data-mine", String(mine));
@@ -401,7 +369,7 @@ export class Pane {
     const { state } = this;
     if (this.isRecording && (!this.connected || state?.links.application === "lost" || state?.links.vehicle === "closed")) return []; // it is over
     const severity = state?.airborne || this.pilot?.mine ? "critical" : "warning";
-    const old: Alarm[] = this.isOld ? [{ id: "old", severity, text: t.pane.shownIsOld }] : [];
+    const old: Alarm[] = this.fresh.isOld ? [{ id: "old", severity, text: t.pane.shownIsOld }] : [];
     if (this.connected) return [...old, ...(state?.alarms ?? [])];
     if (this.absent) return [{ id: "absent", severity, text: this.absent }];
     if (!this.wasConnected && performance.now() - this.opened_ms < CONNECT_MS) return [];
