@@ -23,6 +23,7 @@ from starlette.websockets import WebSocket
 from skyloop.client.commands import position_action
 from skyloop.client.completion import OF_ONE_PACKET, ReturnWatch
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
+from skyloop.cockpit.authority_report import AuthorityReport
 from skyloop.cockpit.broadcast import call_soon
 from skyloop.cockpit.commands import (
     SETTLED_NS,
@@ -51,7 +52,7 @@ from skyloop.cockpit.commands import (
 )
 from skyloop.cockpit.route_session import RouteSession
 from skyloop.cockpit.stream import PageSocket
-from skyloop.cockpit.takeover import QueuePosition, TakeoverDialog
+from skyloop.cockpit.takeover import TakeoverDialog
 from skyloop.control.route_flight import check_for
 from skyloop.control.waypoint import Waypoint, lacking, reached
 from skyloop.errors import AuthorityError, DecodeError, LinkError, RefusedError, SkyloopError
@@ -60,7 +61,6 @@ from skyloop.messages import (
     Feedback,
     FlightState,
     Land,
-    LinkState,
     Position,
     ReturnPhase,
     ReturnToStart,
@@ -122,10 +122,7 @@ class ControlSession:
         self._photos = photos / station.found.name
         self._steering = False  # by sticks: the newest set-point is a velocity of this page
         self._silence: asyncio.TimerHandle | None = None
-        #: As the page was sent it last: state, holder, its priority, position in the queue, how control was lost.
-        self._authority: tuple[str, str | None, int | None, QueuePosition | None, str | None] | None = None
-        self._was_mine = False
-        self._loss: str | None = None  # how the control that this page had was lost; None: it was not
+        self._authority = AuthorityReport(station, self.app, GONE_S)
         self._takeover = TakeoverDialog(self._send)
         self._last_command = ""  # what the page commanded last
         self._commands = 0  # how many there were
@@ -347,7 +344,7 @@ class ControlSession:
             if pilot.authority.state == "none":
                 await self._close_pilot()
             if isinstance(error, AuthorityError) and error.code == "busy":
-                raise AuthorityError(self._busy(command.priority), code="busy") from error
+                raise AuthorityError(self._authority.busy(command.priority), code="busy") from error
             raise
         self._send({"type": "done", "do": command.do})
         self._update()
@@ -359,7 +356,7 @@ class ControlSession:
 
     async def _release(self, command: Release) -> None:
         self._hover()
-        self._was_mine, self._loss = False, None  # on purpose
+        self._authority.released()
         self._acknowledge(command)
         await self._close_pilot()
         self._send({"type": "done", "do": command.do})
@@ -409,17 +406,6 @@ class ControlSession:
             if self._goto is asyncio.current_task():
                 self._goto = None
                 self._station.goals.pop(self.app, None)
-
-    def _busy(self, priority: int) -> str:
-        try:
-            feedback = self._station.drone.feedback()
-        except LinkError:
-            return "another application has control"
-        held = "" if feedback.owner_priority is None else f" with priority {feedback.owner_priority}"
-        return (
-            f"{feedback.owner or 'another application'} has control{held}, and {priority} is no higher: "
-            "a lower number is a higher priority"
-        )
 
     def _held(self) -> PilotConnection:
         """Return the connection that holds the authority.
@@ -501,8 +487,11 @@ class ControlSession:
 
     def _update(self) -> None:
         """Send the authority, the page's open questions, and commands that are done, where that has changed."""
-        self._send_authority()
         pilot = self._pilot
+        if (message := self._authority.update(pilot, self._takeover.update(pilot))) is not None:
+            if not message["mine"]:
+                self._end_flight()
+            self._send(message)
         if self._awaited is not None and pilot is not None:
             do, states, from_ns = self._awaited
             if do == TakeOff().do and pilot.proxy_now_ns - from_ns > _TAKEOFF_NS and not self._repeated:
@@ -514,53 +503,6 @@ class ControlSession:
                 if feedback.captured_ns >= from_ns and feedback.state in states:
                     self._awaited = None
                     self._send({"type": "done", "do": do})
-
-    def _send_authority(self) -> None:
-        pilot, drone = self._pilot, self._station.drone
-        state = "none" if pilot is None else pilot.authority.state
-        try:
-            feedback = drone.feedback()
-            holder, priority = self._station.view.holder(feedback), feedback.owner_priority
-        except LinkError:
-            holder, priority = None, None
-        mine = state == "held"
-        lost = drone.link.application in (LinkState.LOST, LinkState.CLOSED)
-        if lost or (holder == self.app and not mine):  # from before
-            holder = None
-        if holder is None:
-            priority = None
-        if mine and pilot is not None:  # known here first
-            holder, priority = self.app, pilot.authority.priority
-        if mine or (self._was_mine and pilot is not None):
-            self._loss = None if mine or pilot is None else _end_of_control(pilot)
-        self._was_mine = mine
-        why = None if self._loss is None else self._why(self._loss, holder, lost)
-        place = self._takeover.update(pilot)
-        if (state, holder, priority, place, why) != self._authority:
-            self._authority = state, holder, priority, place, why
-            if not mine:
-                self._end_flight()
-            message = {
-                "type": "authority",
-                "state": state,
-                "holder": holder,
-                "priority": priority,
-                "mine": mine,
-                "why": why,
-            }
-            self._send(message | {"line": None if place is None else place.to_json(monotonic_ns())})
-
-    def _why(self, ended: str, holder: str | None, lost: bool) -> str:
-        """Return what became of the control that this page had, in words that are true now."""
-        name = self._station.found.name
-        now = f"{holder} has control" if holder else "nobody has control"
-        if ended == "link" and lost:
-            return f"the link to the proxy of {name} is down: nobody has control, and what {name} does is not known"
-        if ended == "link":
-            return f"the link to the proxy of {name} was lost: {now}, and what {name} flew meanwhile is not known"
-        if ended == "silent":
-            return f"the cockpit received nothing from this page for {GONE_S:g} s, so its control ran out: {now}"
-        return f"{now} now"
 
     def _on_event(self, event: Event) -> None:
         """Handle the proxy's refusal of a command of this page, and takeovers by asking."""
@@ -630,12 +572,3 @@ def _fit_for_places(pilot: PilotConnection, what: str) -> Feedback:
     if not feedback.state.airborne:
         raise RefusedError(f"{what}: it is not in the air, take off first")
     return feedback
-
-
-def _end_of_control(pilot: PilotConnection) -> str:
-    """Return how a page lost the control that it had: ``taken``, ``link``, ``silent`` or ``over``."""
-    if pilot.authority.state != "none":
-        return "taken"
-    if not pilot.is_linked:
-        return "link"
-    return "silent" if pilot.is_silent else "over"
