@@ -87,6 +87,7 @@ def test_a_vehicle_that_is_ready_has_good_lines_only() -> None:
         (fed(failsafe=Failsafe.LAND), "failsafe", Level.WARN, "failsafe"),
         (fed(battery=0.05), "battery", Level.FAIL, "5%"),
         (fed(battery=0.15), "battery", Level.WARN, "15%"),
+        (with_parameters(battery__return=0.95), "battery", Level.FAIL, "90% left, below 95% (battery.return)"),
         (fed(battery=None), "battery", Level.WARN, "not reported"),
         (fed(position_m=None), "position", Level.WARN, "position"),
         (fed(position_m=None), "zones", Level.FAIL, "walls"),

@@ -174,19 +174,22 @@ def _flight_state(state: PreflightState) -> Iterator[PreflightFinding]:
 def _battery(state: PreflightState) -> Iterator[PreflightFinding]:
     charge = None if state.feedback is None else state.feedback.battery
     land, warn = _number(state, "battery.land", 0.1), _number(state, "battery.warn", 0.2)
+    back = _number(state, "battery.return", 0.0)
     if charge is None:
         yield PreflightFinding(
             "battery", Level.WARN, "its charge is not reported", "it may come down by itself", "check it by hand"
         )
         return
-    empty = charge < land
-    yield _judged(
-        Level.FAIL if empty else Level.WARN if charge < warn else Level.OK,
-        "battery",
-        f"{charge:.0%} left" + (f", below {land:.0%} (battery.land)" if empty else ""),
-        "it lands as soon as it flies, and takes no other command" if empty else "the flight will be short",
-        "charge or change it",
-    )
+    level, detail, why = Level.OK, f"{charge:.0%} left", "the flight will be short"
+    if charge < land:
+        level, detail = Level.FAIL, f"{detail}, below {land:.0%} (battery.land)"
+        why = "it lands as soon as it flies, and takes no other command"
+    elif charge < back:
+        level, detail = Level.FAIL, f"{detail}, below {back:.0%} (battery.return)"
+        why = "it refuses to take off, as it would return at once"
+    elif charge < warn:
+        level = Level.WARN
+    yield _judged(level, "battery", detail, why, "charge or change it")
 
 
 def _position(state: PreflightState) -> Iterator[PreflightFinding]:

@@ -5,7 +5,7 @@ Not thread-safe: called under the command handler's lock.
 
 from __future__ import annotations
 
-from skyloop.messages import Hover, Position, ReturnPhase, ReturnToStart
+from skyloop.messages import FlightState, Hover, Position, ReturnPhase, ReturnToStart
 from skyloop.proxy.core.command_checks import CommandChecks
 from skyloop.proxy.core.failsafe import FailsafeLadder
 from skyloop.proxy.core.returning import PATIENCE_NS
@@ -81,7 +81,7 @@ class ReturnSupervisor:
         if isinstance(action, Position):
             if not self._executor.fly_to(action, now_ns):
                 problem = "its driver fails to fly it there"
-        else:
+        elif action is None or self._executor.state is not FlightState.LANDING:
             self._executor.failsafe(action or Hover(), now_ns)
         if not problem:
             self._good_ns = now_ns
