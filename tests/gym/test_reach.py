@@ -155,6 +155,7 @@ def test_a_drone_that_leaves_its_cell_has_failed() -> None:
 
 
 def test_many_drones_begin_anew_on_their_own() -> None:
+    register()
     envs = gymnasium.make_vec("skyloop/Reach-v0", num_envs=5, seconds=2.0)
     assert isinstance(envs.unwrapped, ReachVectorEnv)
     seen, _ = envs.reset(seed=2)
