@@ -215,7 +215,8 @@ export class Pane {
   }
 
   tick(now_ms: number): void {
-    if (this.fresh.update(now_ms, this.pilot?.age_ms(now_ms))) this.dirty = true;
+    // Of a replay that has ended nothing new can come: its own banner says so.
+    if (this.ended.hidden && this.fresh.update(now_ms, this.pilot?.age_ms(now_ms))) this.dirty = true;
     if (this.dirty) this.update();
     this.strip.count(this.pilot);
     this.stage.update(now_ms);
@@ -267,7 +268,9 @@ export class Pane {
     if (open) this.events.restart();
     this.absent = code === 4404 ? (this.isRecording ? t.pane.replayEnded : t.pane.gone(this.name)) : "";
     this.bar?.end(this.absent !== "");
-    setHidden(this.ended, !this.isRecording || this.absent === "");
+    const ended = this.isRecording && this.absent !== "";
+    setHidden(this.ended, !ended);
+    if (ended) for (const part of [this.endReplay, this.fresh.element]) setHidden(part, true);
     this.update();
   }
 
