@@ -10,7 +10,7 @@ observes; a page that takes control gets a pilot's connection of its own for as 
   ``telemetry`` and ``values`` are the view model; ``stream`` sends, one object per open socket;
 - ``control`` flies for a page that took control, by ``commands``, through a ``pilot_connection`` of its own, and
   ``takeover`` is asking for control before it is taken; ``fleet_control`` lands and stops all drones;
-- ``recordings`` records and replays, ``reports`` makes reports in a child process;
+- ``recordings`` records and replays, by what ``recorders`` starts; ``reports`` makes reports in a child process;
 - ``testing`` is a page without a browser, ``child`` runs the cockpit beside a program;
 - ``static`` is the page itself, built; nothing is fetched from elsewhere.
 """

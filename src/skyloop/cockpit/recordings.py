@@ -11,14 +11,13 @@ import asyncio
 import itertools
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Protocol
-from urllib.parse import quote
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
 from skyloop.cockpit import recording_files, timeline
+from skyloop.cockpit.recorders import Recorder, Replay, Running, progress, start_recorder, start_replay
 from skyloop.cockpit.recording_files import Mark, Notes
 from skyloop.cockpit.reports import Reports
 from skyloop.errors import FileFormatError, RefusedError, UnknownNameError, UsageError
@@ -27,66 +26,12 @@ from skyloop.messages import Refusal
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
-    from skyloop.recording import Status
 
 Json = dict[str, Any]
 
-REPLAY_S: Final = 20.0
 MAX_CHILDREN: Final = 8  #: recordings at one time, and as many replays: each is a process
 MOST_LISTED: Final = 500
 NOTE_SHOWN: Final = 200  #: characters of a note in the list
-
-
-class Recorder(Protocol):
-    """What records; :class:`skyloop.recording.Recorder` is one."""
-
-    @property
-    def status(self) -> Status: ...
-    def close(self) -> None: ...
-
-
-@dataclass(frozen=True, slots=True)
-class Running:
-    """A recording that goes on."""
-
-    drones: tuple[str, ...]
-    recorder: Recorder
-
-
-def start_recorder(drones: Sequence[str], folder: Path) -> Recorder:
-    """Record proxies to a new file of a folder.
-
-    Raises:
-        SkyloopError: It can't start.
-    """
-    from skyloop.recording import record
-
-    return record(drones, folder)
-
-
-def start_replay(path: Path, drone: str | None = None) -> Drone:
-    """Start a private proxy that plays a file, and connect to it.
-
-    Args:
-        path: The file.
-        drone: Which of the recorded ones; None for the first.
-
-    Raises:
-        SkyloopError: It can't start.
-    """
-    from skyloop.client import connect
-
-    which = "" if drone is None else f"?drone={quote(drone)}"
-    return connect(f"replay://{quote(str(path))}{which}", access="observe", name="cockpit", timeout_s=REPLAY_S)
-
-
-@dataclass(frozen=True, slots=True)
-class Replay:
-    """A recording that is played again."""
-
-    drone: Drone  #: the observer that keeps its proxy running
-    path: Path
-    recorded: str | None  #: the drone's name in the recording; None: the first
 
 
 class Recordings:
@@ -167,7 +112,7 @@ class Recordings:
         entry = self._entry(number)
         running = self._running.pop(number)
         await asyncio.to_thread(running.recorder.close)
-        return {**entry, **_progress(running.recorder.status)}
+        return {**entry, **progress(running.recorder.status)}
 
     async def listing(self) -> Json:
         """Return the running recordings, and those in the folder, the newest first."""
@@ -336,7 +281,7 @@ class Recordings:
 
     def _entry(self, number: str) -> Json:
         running = self._running[number]
-        return {"id": number, "drones": list(running.drones), **_progress(running.recorder.status)}
+        return {"id": number, "drones": list(running.drones), **progress(running.recorder.status)}
 
     async def _change(self, name: str, change: Callable[[Path], str]) -> str:
         """Move a file that nobody here writes or plays."""
@@ -402,15 +347,3 @@ def _noted(path: Path) -> Json:
 def _check_number(what: str, end: str, running: int) -> None:
     if running >= MAX_CHILDREN:
         raise RefusedError(f"{running} {what}, which is all that may at one time: {end} one first", code=Refusal.BUSY)
-
-
-def _progress(status: Status) -> Json:
-    return {
-        "path": status.path,
-        "state": str(status.state),
-        "reason": status.reason,
-        "seconds": round(status.seconds, 3),
-        "bytes": status.bytes,
-        "dropped": status.dropped,
-        "missed": status.missed,
-    }
