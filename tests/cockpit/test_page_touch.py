@@ -178,10 +178,11 @@ def test_an_alarm_moves_nothing_is_felt_and_acknowledged(deck: Deck) -> None:
     with skyloop.connect("low", name="test") as drone:
         page.wait_for_text(".holder", "test")
         before: list[Any] = [box(page, part) for part in (".stage", ".deck.space", ".strip .taking")]
+        felt = page.page.evaluate("felt.length")  # a busy machine may have had an alarm of old feedback
         drone.config["battery.warn"] = 1.0
         page.wait_for_text(".alarms", "battery low")
         assert [box(page, part) for part in (".stage", ".deck.space", ".strip .taking")] == before
-        page.until(lambda: page.page.evaluate("felt.length") == 1, "a vibration")
+        page.until(lambda: page.page.evaluate("felt.length") > felt, "a vibration")
         acknowledge = page.pane.get_by_role("button", name="OK: acknowledge battery low")
         page.page.wait_for_timeout(700)  # until it can have been read
         acknowledge.tap()
@@ -190,7 +191,7 @@ def test_an_alarm_moves_nothing_is_felt_and_acknowledged(deck: Deck) -> None:
         drone.config["alarms.battery_critical"] = 1.0
         drone.takeoff()
         page.wait_for_text(".alarms", "battery critical")
-        page.until(lambda: page.page.evaluate("felt.length") >= 3, "felt again and again")
+        page.until(lambda: page.page.evaluate("felt.length") >= felt + 3, "felt again and again")
         drone.land()
     page.page.get_by_role("button", name="Alarms' sound").tap()
     assert page.page.evaluate("localStorage.getItem('skyloop-sound')") == "off"
