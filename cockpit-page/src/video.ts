@@ -15,6 +15,7 @@ const LATE_S = 0.25;
 const STALE_S = 1;
 const RATE_MS = 2000;
 const TELL_MS = 90;
+const NEAR = "300px"; // pictures come before they are scrolled into sight
 
 interface Shown extends FrameHead {
   captured: bigint;
@@ -38,7 +39,9 @@ export class VideoView {
   private frames: NewestFrame<ImageBitmap> | null = null;
   private shown: Shown | null = null;
   private arrivals: number[] = [];
+  private inSight = true;
   private readonly hide = (): void => this.wantedChanged();
+  private readonly sight = new IntersectionObserver((entries) => this.look(entries), { rootMargin: NEAR });
 
   constructor(
     readonly drone: string,
@@ -47,13 +50,15 @@ export class VideoView {
     this.canvas = h("canvas", { class: "video", role: "img", "aria-label": t.video.none(camera.name), width: camera.width, height: camera.height });
     this.element = h("figure", { class: "camera", "data-camera": camera.name }, this.canvas, this.sheet, this.ageChip, this.rate, this.nothing);
     this.tools = new VideoTools(this);
-    // A page that nobody sees asks for no pictures.
+    // What nobody sees asks for no pictures: a hidden page, or a place that is scrolled away.
     document.addEventListener("visibilitychange", this.hide);
+    this.sight.observe(this.element);
     this.reopen();
   }
 
   close(): void {
     document.removeEventListener("visibilitychange", this.hide);
+    this.sight.disconnect();
     this.tools.close();
     this.socket?.close();
     this.frames?.end();
@@ -102,14 +107,24 @@ export class VideoView {
 
   /** Pictures are asked for while somebody sees them: on the page, in a window apart, or in a clip later. */
   wantedChanged(): void {
-    if ((this.socket !== null) !== (!document.hidden || this.tools.wanted)) this.reopen();
+    if ((this.socket !== null) !== this.isSeen) this.reopen();
+  }
+
+  private get isSeen(): boolean {
+    return (!document.hidden && this.inSight) || this.tools.wanted;
+  }
+
+  private look(entries: readonly IntersectionObserverEntry[]): void {
+    this.inSight = entries.at(-1)?.isIntersecting ?? true;
+    this.wantedChanged();
   }
 
   private reopen(): void {
     this.socket?.close();
     this.frames?.end();
     this.socket = null;
-    if (document.hidden && !this.tools.wanted) return;
+    setAttribute(this.element, "data-asks", String(this.isSeen));
+    if (!this.isSeen) return;
     const socket = new LastingSocket(`/ws/drones/${encodeURIComponent(this.drone)}/video/${encodeURIComponent(this.camera.name)}`, {
       message: (data) => this.onMessage(data),
     });

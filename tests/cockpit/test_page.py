@@ -60,6 +60,17 @@ def test_video_moves_and_is_young(deck: Deck) -> None:
     assert page.problems == []
 
 
+def test_video_that_is_scrolled_away_is_not_asked_for(deck: Deck) -> None:
+    deck.proxy("away")
+    page = deck.page("away", viewport={"width": 390, "height": 500})
+    page.wait_for_new_picture()
+    page.page.evaluate("scrollTo(0, document.body.scrollHeight)")
+    page.until(lambda: page.attribute(".camera", "data-asks") == "false", "nobody sees it")
+    page.page.evaluate("scrollTo(0, 0)")
+    page.wait_for_new_picture()
+    assert page.problems == []
+
+
 def test_horizon_follows_the_attitude(deck: Deck) -> None:
     deck.proxy("roll")
     page = deck.page("roll")
