@@ -128,6 +128,19 @@ def checked(
         intrinsics = getattr(image, "intrinsics", None)
     if intrinsics is None:
         raise UsageError("the image has no intrinsics: give the camera's as intrinsics=Intrinsics(fx, …)")
+    return pixels_of(image, colour=colour), intrinsics
+
+
+def pixels_of(image: NDArray[np.uint8], *, colour: bool = False) -> NDArray[np.uint8]:
+    """Check an image, and return its pixels as a plain array, the same memory.
+
+    Args:
+        image: A :class:`skyloop.Frame` or a uint8 array, (h, w, 3) BGR or, unless ``colour``, (h, w) grey.
+        colour: Whether a grey image is refused.
+
+    Raises:
+        UsageError: The array has another shape or type, or is empty.
+    """
     pixels = np.asarray(image)
     grey = pixels.ndim == 2 and not colour
     if pixels.dtype != np.uint8 or not (grey or (pixels.ndim == 3 and pixels.shape[2] == 3)):
@@ -135,4 +148,4 @@ def checked(
         raise UsageError(f"the image has shape {pixels.shape} and type {pixels.dtype} and must be uint8, {wanted}")
     if pixels.size == 0:
         raise UsageError("the image is empty")
-    return pixels, intrinsics
+    return pixels

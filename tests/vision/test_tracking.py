@@ -1,0 +1,246 @@
+"""Trackers of a box: on drawn sequences with known boxes, and on what is not an image or a box."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from itertools import islice
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from benchmarks.tracking_film import read_film, read_labels
+from benchmarks.tracking_scenes import Sequence, Truth, fixed, moved, scene, texture
+from skyloop.errors import UsageError
+from skyloop.vision import CorrelationTracker, LongTermTracker, MedianFlowTracker, Tracker, TrackResult
+from skyloop.vision.tracking import Box, Image, overlap
+from tests.recordings import recorded
+
+EACH = pytest.mark.parametrize("make", [CorrelationTracker, MedianFlowTracker, LongTermTracker])
+Make = Callable[[], Tracker]
+BOX = (60, 40, 30, 40)
+
+
+def picture(channels: int = 3) -> Image:
+    drawn = texture(np.random.default_rng(1), 160, 120)
+    return drawn if channels == 3 else np.asarray(cv2.cvtColor(drawn, cv2.COLOR_BGR2GRAY), np.uint8)
+
+
+def run(
+    tracker: Tracker, sequence: Sequence, *, most: int | None = None, grey: bool = False
+) -> list[tuple[TrackResult, Truth]]:
+    """Each result and the true box, after the first image, of those that count."""
+    found: list[tuple[TrackResult, Truth]] = []
+    for n, (image, truth, counts) in enumerate(islice(sequence.frames(), most)):
+        seen = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8) if grey else image
+        if n == 0:
+            assert truth is not None
+            tracker.start(seen, truth)
+        else:
+            result = tracker.update(seen)
+            assert 0.0 <= result.score <= 1.0
+            found += [(result, truth)] if counts else []
+    return found
+
+
+def agreement(result: TrackResult, truth: Truth) -> float:
+    return overlap(result.box, truth) if result.box is not None and truth is not None else 0.0
+
+
+@EACH
+@pytest.mark.parametrize("grey", [False, True], ids=["colour", "grey"])
+def test_a_target_that_moves_and_grows_is_tracked(make: Make, grey: bool) -> None:
+    found = run(make(), scene("plain", 3, 120), most=50, grey=grey)
+    assert min(agreement(*one) for one in found) > 0.6
+
+
+@pytest.mark.parametrize("make", [CorrelationTracker, LongTermTracker])
+def test_light_that_changes_does_not_matter(make: Make) -> None:
+    assert min(agreement(*one) for one in run(make(), scene("light", 3, 60))) > 0.7
+
+
+@pytest.mark.parametrize("kind", ["hidden", "look-alike", "leaves"])
+def test_a_target_out_of_view_is_lost_and_found_again(kind: str) -> None:
+    found = run(LongTermTracker(), scene(kind, 4, 80))
+    assert all(result.lost for result, truth in found if truth is None)
+    assert any(truth is None for _, truth in found)
+    assert all(agreement(*one) > 0.5 for one in found if not one[0].lost)
+    assert not any(result.lost for result, _ in found[-10:])
+
+
+def test_median_flow_stays_lost_until_it_is_started_again() -> None:
+    tracker = MedianFlowTracker()
+    frames = [(image, truth) for image, truth, _ in scene("hidden", 4, 60).frames()]
+    found = run(tracker, scene("hidden", 4, 60))
+    assert all(result.lost and result.score == 0.0 for result, _ in found[-5:])
+    image, truth = frames[-1]
+    assert truth is not None
+    tracker.start(image, truth)
+    again = tracker.update(image).box
+    assert again == pytest.approx(truth, abs=0.5)
+
+
+def twins(count: int, *, hidden: range, target_after: bool) -> Sequence:
+    """A target and its exact twin beside it, where a plain wall hides the target, and only the twin may come back."""
+    rng = np.random.default_rng(8)
+    background, what = texture(rng, 320, 240), texture(rng, 40, 40, (60, 120, 180))
+
+    def frames() -> Any:
+        for n in range(count):
+            image = background.copy()
+            image[150:190, 250:290] = what
+            if n < hidden.start or (n >= hidden.stop and target_after):
+                image[60:100, 60 + n // 4 : 100 + n // 4] = what
+                yield image, (60.0 + n // 4, 60.0, 40.0, 40.0), True
+            else:
+                image[50:110, 40:140] = 90
+                yield image, None, True
+
+    return Sequence("twins", frames)
+
+
+def test_an_exact_twin_is_not_adopted() -> None:
+    found = run(LongTermTracker(), twins(90, hidden=range(40, 90), target_after=False))
+    assert not any(result.lost for result, _ in found[:38])
+    assert all(result.lost for result, _ in found[40:])
+
+
+def test_a_target_with_an_exact_twin_stays_lost_after_it_was_hidden_for_long() -> None:
+    found = run(LongTermTracker(), twins(90, hidden=range(40, 60), target_after=True))
+    assert all(result.lost for result, _ in found[60:])
+
+
+def test_the_long_term_tracker_takes_any_tracker() -> None:
+    found = run(LongTermTracker(MedianFlowTracker), scene("hidden", 4, 80))
+    assert all(result.lost for result, truth in found if truth is None)
+    assert not any(result.lost for result, _ in found[-10:])
+
+
+class Scripted(Tracker):
+    """Returns the boxes that it is given."""
+
+    def __init__(self, boxes: list[Box]) -> None:
+        self._boxes = boxes
+        self.started: list[Box] = []
+
+    def _start(self, image: Image, box: Box) -> None:
+        self.started.append(box)
+
+    def _update(self, image: Image) -> TrackResult:
+        return TrackResult(self._boxes.pop(0), 1.0)
+
+
+def test_a_box_that_looks_like_something_else_is_not_returned() -> None:
+    aside = (20.0, 70.0, 30.0, 40.0)
+    right = tuple(map(float, BOX))
+    inner = Scripted([right, aside, right, *[aside] * 10, right, right, right, right])  # type: ignore[list-item]
+    tracker = LongTermTracker(lambda: inner)
+    tracker.start(picture(), BOX)
+    lost = [tracker.update(picture()).lost for _ in range(18)]
+    assert lost == [False, True, False, *[True] * 10, True, True, True, False, False]
+    assert len(inner.started) == 2  # it was searched for once, in the image after the tenth without verification
+    assert overlap(inner.started[1], right) > 0.8  # type: ignore[arg-type]
+
+
+@EACH
+def test_a_score_says_that_nothing_is_there(make: Make) -> None:
+    tracker = make()
+    tracker.start(picture(), BOX)
+    blank = np.full((120, 160, 3), 127, np.uint8)
+    assert [tracker.update(blank).lost for _ in range(15)] == [True] * 15
+
+
+@EACH
+@pytest.mark.parametrize(
+    ("box", "why"),
+    [
+        ((60, 40, 0, 40), "at least 6 pixels"),
+        ((60, 40, -30, 40), "at least 6 pixels"),
+        ((60, math.nan, 30, 40), "finite"),
+        ((60, 40, math.inf, 40), "finite"),
+        ((200, 40, 30, 40), "at least half"),
+        ((-16, 40, 30, 40), "at least half"),
+        ((60, 40, 30), "x, y, width and height"),
+        (("a", 40, 30, 40), "x, y, width and height"),
+        (None, "x, y, width and height"),
+    ],
+)
+def test_a_box_that_is_none_is_refused(make: Make, box: Any, why: str) -> None:
+    tracker = make()
+    with pytest.raises(UsageError, match=why):
+        tracker.start(picture(), box)
+    with pytest.raises(UsageError, match="was not started"):
+        tracker.update(picture())
+
+
+@EACH
+def test_an_image_that_is_none_is_refused(make: Make) -> None:
+    tracker = make()
+    wrong: Any
+    for wrong in (
+        picture().astype(np.float32),
+        picture()[..., :2],
+        np.zeros((0, 4, 3), np.uint8),
+        np.zeros(5, np.uint8),
+    ):
+        with pytest.raises(UsageError, match="the image"):
+            tracker.start(wrong, BOX)
+    tracker.start(picture(), BOX)
+    for other in (picture()[:-1], picture(channels=1)):
+        with pytest.raises(UsageError, match="as at the start"):
+            tracker.update(other)
+    assert not tracker.update(picture()).lost
+
+
+@EACH
+def test_a_box_half_outside_is_tracked(make: Make) -> None:
+    tracker = make()
+    tracker.start(picture(), (-14, 40, 30, 40))
+    result = tracker.update(picture())
+    assert agreement(result, (-14, 40, 30, 40)) > 0.9
+
+
+def test_a_result_knows_its_middle_and_its_corners() -> None:
+    found = TrackResult((10.0, 20.0, 5.0, 7.0), 0.9)
+    assert (found.lost, found.centre) == (False, (12.0, 23.0))
+    assert found.outline == ((10.0, 20.0), (15.0, 20.0), (15.0, 27.0), (10.0, 27.0))
+    lost = TrackResult(None, 0.1)
+    assert (lost.lost, lost.centre, lost.outline) == (True, None, ())
+
+
+def test_things_on_a_recorded_film_keep_their_boxes() -> None:
+    labels = read_labels()
+    film = read_film(recorded(labels.film), 61)
+    assert film.shape[1:] == (labels.size[1], labels.size[0], 3)
+    for name, boxes in labels.objects.items():
+        found = run(LongTermTracker(), fixed(name, film[::10], {n // 10: box for n, box in boxes.items()}))
+        assert len(found) == 6
+        assert min(agreement(*one) for one in found) > 0.8, name
+
+
+def test_a_thing_on_a_recorded_film_is_tracked_by_a_camera_that_moves() -> None:
+    labels = read_labels()
+    boxes = labels.objects["upper label"]
+    found = run(LongTermTracker(), moved("upper label", read_film(recorded(labels.film), 80), boxes, 80, 0))
+    assert min(agreement(*one) for one in found) > 0.7
+
+
+def test_every_tenth_frame_of_the_film_is_labelled() -> None:
+    labels = read_labels()
+    assert len(labels.objects) >= 3
+    assert all(sorted(boxes) == list(range(0, 240, 10)) for boxes in labels.objects.values())
+    assert labels.how
+
+
+def test_trackers_of_other_programs_can_be_used_with_frames() -> None:
+    """A Frame is an array with attributes: only its pixels count."""
+
+    class Framed(np.ndarray[Any, Any]):
+        header = SimpleNamespace(camera="front")
+
+    tracker = CorrelationTracker()
+    tracker.start(picture().view(Framed), BOX)
+    assert agreement(tracker.update(picture().view(Framed)), (60, 40, 30, 40)) > 0.9
