@@ -155,10 +155,10 @@ def test_safety_nets_that_are_off_are_named_with_what_to_set() -> None:
     values = {"FS_GCS_ENABLE": 0, "MAV_GCS_SYSID": 255}
     found = {each.what: each for each in ArduCopterProfile().safety_diagnostics(values, 255)}
     assert not found["loss of this computer"].good
-    assert "mavlink.fs_gcs_enable=7" in found["loss of this computer"].advice
+    assert "mavlink.fs_gcs_enable 7" in found["loss of this computer"].advice
     found = {each.what: each for each in Px4Profile().safety_diagnostics({"NAV_DLL_ACT": 1, "COM_OBL_RC_ACT": 0}, 255)}
     assert found["loss of this computer"].good
-    assert "mavlink.com_obl_rc_act=5" in found["loss of set-points"].advice
+    assert "mavlink.com_obl_rc_act 5" in found["loss of set-points"].advice
     (other,) = ArduCopterProfile().safety_diagnostics({"MAV_GCS_SYSID": 254}, 255)
     assert "own_sysid=254" in other.advice
 
