@@ -53,13 +53,12 @@ def agreement(result: TrackResult, truth: Truth) -> float:
 @EACH
 @pytest.mark.parametrize("grey", [False, True], ids=["colour", "grey"])
 def test_a_target_that_moves_and_grows_is_tracked(make: Make, grey: bool) -> None:
-    found = run(make(), scene("plain", 3, 120), most=50, grey=grey)
+    found = run(make(), scene("plain", 3, 120), most=30, grey=grey)
     assert min(agreement(*one) for one in found) > 0.6
 
 
-@pytest.mark.parametrize("make", [CorrelationTracker, LongTermTracker])
-def test_light_that_changes_does_not_matter(make: Make) -> None:
-    assert min(agreement(*one) for one in run(make(), scene("light", 3, 60))) > 0.7
+def test_light_that_changes_does_not_matter() -> None:
+    assert min(agreement(*one) for one in run(LongTermTracker(), scene("light", 3, 60))) > 0.7
 
 
 @pytest.mark.parametrize("kind", ["hidden", "look-alike", "leaves"])
@@ -72,15 +71,14 @@ def test_a_target_out_of_view_is_lost_and_found_again(kind: str) -> None:
 
 
 def test_median_flow_stays_lost_until_it_is_started_again() -> None:
+    steps = list(islice(scene("hidden", 4, 60).frames(), 24, None))
     tracker = MedianFlowTracker()
-    frames = [(image, truth) for image, truth, _ in scene("hidden", 4, 60).frames()]
-    found = run(tracker, scene("hidden", 4, 60))
+    found = run(tracker, Sequence("hidden", lambda: iter(steps)))
     assert all(result.lost and result.score == 0.0 for result, _ in found[-5:])
-    image, truth = frames[-1]
+    image, truth, _ = steps[-1]
     assert truth is not None
     tracker.start(image, truth)
-    again = tracker.update(image).box
-    assert again == pytest.approx(truth, abs=0.5)
+    assert tracker.update(image).box == pytest.approx(truth, abs=0.5)
 
 
 def twins(count: int, *, hidden: range, target_after: bool) -> Sequence:
@@ -103,20 +101,63 @@ def twins(count: int, *, hidden: range, target_after: bool) -> Sequence:
 
 
 def test_an_exact_twin_is_not_adopted() -> None:
-    found = run(LongTermTracker(), twins(90, hidden=range(40, 90), target_after=False))
-    assert not any(result.lost for result, _ in found[:38])
-    assert all(result.lost for result, _ in found[40:])
+    found = run(LongTermTracker(), twins(60, hidden=range(25, 60), target_after=False))
+    assert not any(result.lost for result, _ in found[:23])
+    assert all(result.lost for result, _ in found[25:])
 
 
 def test_a_target_with_an_exact_twin_stays_lost_after_it_was_hidden_for_long() -> None:
-    found = run(LongTermTracker(), twins(90, hidden=range(40, 60), target_after=True))
-    assert all(result.lost for result, _ in found[60:])
+    found = run(LongTermTracker(), twins(65, hidden=range(25, 42), target_after=True))
+    assert all(result.lost for result, _ in found[42:])
 
 
 def test_the_long_term_tracker_takes_any_tracker() -> None:
     found = run(LongTermTracker(MedianFlowTracker), scene("hidden", 4, 80))
     assert all(result.lost for result, truth in found if truth is None)
     assert not any(result.lost for result, _ in found[-10:])
+
+
+def changing(roll_deg: float, narrowed: float, faded: float) -> Sequence:
+    """A target that rolls to and fro, is narrowed as if it turned its side, and fades into other texture."""
+    rng = np.random.default_rng(2)
+    background, one, other = texture(rng, 320, 240), texture(rng, 60, 60), texture(rng, 60, 60)
+
+    def frames() -> Any:
+        for share in np.arange(60) / 60:
+            what = cv2.addWeighted(one, 1 - faded * share, other, faded * share, 0)
+            roll, narrow = (
+                math.radians(roll_deg) * math.sin(2 * math.pi * share),
+                1 - narrowed * math.sin(math.pi * share),
+            )
+            turn = np.array([[math.cos(roll), math.sin(roll)], [-math.sin(roll), math.cos(roll)]])
+            middle = (150 + 50 * math.sin(4 * share), 120 + 40 * math.sin(7 * share))
+            corners = np.array([[-narrow, -1], [narrow, -1], [narrow, 1], [-narrow, 1]]) * 30 @ turn + middle
+            image = background.copy()
+            at = cv2.getPerspectiveTransform(
+                np.array([[0, 0], [60, 0], [60, 60], [0, 60]], np.float32), corners.astype(np.float32)
+            )
+            cv2.warpPerspective(what, at, (320, 240), dst=image, borderMode=cv2.BORDER_TRANSPARENT)
+            (left, top), (right, bottom) = corners.min(axis=0).tolist(), corners.max(axis=0).tolist()
+            yield image, (left, top, right - left, bottom - top), True
+
+    return Sequence("changing", frames)
+
+
+@pytest.mark.parametrize(("roll_deg", "narrowed", "faded"), [(20.0, 0.0, 0.0), (0.0, 0.4, 0.0), (0.0, 0.0, 1.0)])
+def test_a_target_that_changes_slowly_is_learned(roll_deg: float, narrowed: float, faded: float) -> None:
+    found = run(LongTermTracker(), changing(roll_deg, narrowed, faded))
+    assert min(agreement(*one) for one in found) > 0.5
+
+
+def test_a_target_too_small_to_start_with_is_not_found_again() -> None:
+    """The search also tries smaller sizes than the last one."""
+    blank = np.full((120, 160, 3), 90, np.uint8)
+    first, later = blank.copy(), blank.copy()
+    first[42:46, 62:66] = later[82:84, 102:104] = (40, 60, 230)
+    tracker = LongTermTracker()
+    tracker.start(first, (60, 40, 8, 8))
+    assert all(tracker.update(blank).lost for _ in range(10))
+    assert all(tracker.update(later).lost for _ in range(12))
 
 
 class Scripted(Tracker):

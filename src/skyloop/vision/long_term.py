@@ -13,7 +13,7 @@ from typing import Any, Final
 from skyloop.vision.appearance import Candidate, TargetMemory
 from skyloop.vision.correlation import CorrelationTracker
 from skyloop.vision.opencv import opencv
-from skyloop.vision.tracking import Box, Image, Tracker, TrackResult, checked_box
+from skyloop.vision.tracking import LEAST_PX, Box, Image, Tracker, TrackResult
 
 _VERIFIED: Final = 0.45  # similarity to the memory from which a tracked box is the target's
 _SURE: Final = 0.6  # from which its appearance is learned
@@ -99,8 +99,9 @@ class LongTermTracker(Tracker):
             return TrackResult(None, 0.0)
         best = places[0]
         others = max([best.look_alike, *(place.similarity for place in places[1:])])
-        if best.similarity >= _FOUND and best.similarity - others >= _UNLIKE_OTHERS:
-            self._tracker.start(image, checked_box(best.box, image.shape))
+        clearly = best.similarity >= _FOUND and best.similarity - others >= _UNLIKE_OTHERS
+        if clearly and min(best.box[2:]) >= LEAST_PX:
+            self._tracker.start(image, best.box)
             self._state, self._count = _State.ON_TRIAL, 0
         return TrackResult(None, best.similarity)
 

@@ -21,7 +21,7 @@ from skyloop.vision.planar import pixels_of
 Box = tuple[float, float, float, float]  #: x, y, width, height [px]
 Image = NDArray[np.uint8]
 
-_LEAST_PX: Final = 6.0  # a smaller box has too little in it to be found again
+LEAST_PX: Final = 6.0  #: sides of a box: a smaller one has too little in it to be found again
 _IN_VIEW: Final = 0.5  # of the box, at the start
 
 
@@ -124,8 +124,8 @@ def checked_box(box: Sequence[float], shape: Sequence[int]) -> Box:
     given = f"x={x:g}, y={y:g}, width={width:g}, height={height:g}"
     if not all(math.isfinite(part) for part in (x, y, width, height)):
         raise UsageError(f"the box is {given} and must be of finite numbers")
-    if width < _LEAST_PX or height < _LEAST_PX:
-        raise UsageError(f"the box is {given} and must be at least {_LEAST_PX:g} pixels wide and high")
+    if width < LEAST_PX or height < LEAST_PX:
+        raise UsageError(f"the box is {given} and must be at least {LEAST_PX:g} pixels wide and high")
     rows, columns = shape[:2]
     if overlap_area((x, y, width, height), (0.0, 0.0, columns, rows)) < _IN_VIEW * width * height:
         raise UsageError(f"the box is {given} and at least half of it must be in the image of {columns}×{rows} pixels")
