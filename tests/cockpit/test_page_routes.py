@@ -89,7 +89,7 @@ def test_a_route_of_three_waypoints_is_planned_and_flown(deck: Deck, tmp_path: P
         def arrived() -> bool:
             """It pauses by itself where a busy machine lets the page be silent for half a second."""
             if resume.is_visible():
-                resume.click(timeout=1000)
+                resume.click(timeout=5000)
             return "done" in page.says(".route-progress")
 
         page.until(arrived, "it arrives", 60.0)
