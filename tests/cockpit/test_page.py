@@ -401,51 +401,6 @@ def test_a_waypoint_is_previewed_and_flown_to(deck: Deck) -> None:
         assert abs(there[1] - start[1]) < 0.3
 
 
-def test_a_zone_is_drawn_refused_and_seen_by_another_page(deck: Deck) -> None:
-    deck.proxy("zoned")
-    page, other = deck.page("zoned"), deck.page("zoned")
-    with observe("zoned") as drone:
-        page.take_control()
-        for one in (page, other):
-            one.pane.get_by_role("button", name="Zones").click()
-        canvas = page.pane.locator(".map")
-        page.until(lambda: canvas.get_attribute("data-still") == "true", "it shows the room")
-        box = canvas.bounding_box()
-        assert box is not None
-        page.pane.get_by_role("button", name="Add box").click()
-        # The room, 30 m wide, has 10/13 of the map's height.
-        middle = box["width"] / 2
-        canvas.hover(position={"x": middle + box["height"] * 0.1, "y": box["height"] * 0.4})
-        page.page.mouse.down()
-        page.page.mouse.move(box["x"] + middle + box["height"] * 0.3, box["y"] + box["height"] * 0.6, steps=3)
-        page.page.mouse.up()
-        page.wait_for_text(".zones .answer", "written")
-        drawn = str(drone.config["safety.zones"])
-        assert drawn.startswith("box ")
-        other.wait_for_text(".zones select", "Z1, box")
-        assert other.pane.get_by_role("button", name="Delete").is_disabled(), "the other page has no control"
-        # What makes no sense is refused, and the zone stays.
-        top = page.pane.get_by_label("top in metres")
-        bottom = page.pane.get_by_label("bottom in metres")
-        bottom.fill(top.input_value())
-        page.press("Tab")
-        page.wait_for_text(".zones .answer", "must have an extent")
-        assert drone.config["safety.zones"] == drawn
-        page.until(lambda: bottom.input_value() == "0", "the field shows what is in force")
-        # A place in it is refused before anything flies; then by keys alone: the cursor, and Del.
-        page.pane.get_by_role("button", name="Zones").click()
-        west, south, _, east, north, _ = map(float, drawn.split()[1:])
-        for axis, value in (("x", (west + east) / 2), ("y", (south + north) / 2), ("z", 1.0)):
-            page.pane.get_by_label(f"Waypoint {axis} in metres").fill(f"{value:.2f}")
-        page.wait_for_text(".preview", "in a no-fly zone")
-        page.pane.get_by_role("button", name="Zones").click()
-        canvas.focus()
-        page.press("ArrowRight", "Delete")
-        page.until(lambda: drone.config["safety.zones"] == "", "it is deleted")
-        other.until(lambda: "Z1" not in other.says(".zones select"), "on the other page, too")
-        assert page.problems == []
-
-
 def test_plots_space_and_recordings_work_under_the_pages_policy(deck: Deck) -> None:
     deck.proxy("all")
     page = deck.page("all")
