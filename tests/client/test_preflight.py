@@ -12,10 +12,12 @@ import pytest
 
 import skyloop
 from skyloop.client import Level, LinkStatus, PreflightFinding
+from skyloop.client.inspection import inspect
 from skyloop.client.preflight import PreflightState, check_before_flight
 from skyloop.drivers.ardrone.diagnostics import diagnose
 from skyloop.drivers.mavlink.autopilots import ArduCopterProfile, AutopilotProfile, Px4Profile
 from skyloop.drivers.tello.telemetry import Health
+from skyloop.errors import ClosedError, NoAnswerError
 from skyloop.messages import CameraInfo, Capabilities, Failsafe, Feedback, FlightState, LinkState, Value
 from skyloop.messages.checkup import MAX_TEXT, Diagnostic, decode_checkup, encode_checkup
 from skyloop.wire.ardrone.navdata import State
@@ -215,3 +217,34 @@ def test_a_drone_checks_itself() -> None:
         assert found["video front"].level is Level.OK
         assert found["zones"].level is Level.WARN
         assert math.isfinite(len(found["storage"].detail))
+
+
+class Absent:
+    """In place of a drone whose link is down, or that was closed."""
+
+    name = "alpha"
+    link = LinkStatus(LinkState.LOST, LinkState.LOST)
+    capabilities = Capabilities("test", actions=frozenset({"takeoff", "land"}))
+    clock_uncertainty_ns = 0
+    app_id = 1
+
+    def __init__(self, error: Exception) -> None:
+        self._error = error
+
+    @property
+    def config(self) -> Any:
+        raise self._error
+
+
+def test_a_link_that_is_down_is_a_line_and_no_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def unreadable(_: Path) -> None:
+        raise OSError("not readable")
+
+    monkeypatch.setattr("skyloop.client.inspection.shutil.disk_usage", unreadable)
+    absent: Any = Absent(NoAnswerError("no answer to a read of parameters"))
+    found = {finding.check: finding for finding in inspect(absent, None, 0.0, tmp_path / "not" / "there")}
+    assert found["link"].level is Level.FAIL
+    assert "storage" not in found or found["storage"].level is not Level.OK
+    closed: Any = Absent(ClosedError("drone alpha is closed"))
+    with pytest.raises(ClosedError):
+        inspect(closed, None, 0.0, None)
