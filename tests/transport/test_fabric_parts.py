@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sys
+import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -34,6 +36,7 @@ from skyloop.transport.fabric import (
     TlsFiles,
     config,
     dial,
+    discovery,
     environment,
     layout,
     packets,
@@ -368,3 +371,24 @@ def test_a_router_passes_on_between_proxies_and_applications() -> None:
     filters = [south["filters"] for south in config.make(settings, Part.ROUTER)["gateway"]["south"]]
     assert filters == [[{"region_names": [name]}] for name in regions]
     assert len(set(regions)) == 2
+
+
+def test_a_session_that_does_not_know_a_node_is_retired_once_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    retired: list[object] = []
+    answered = {"known", "new"}
+    monkeypatch.setattr(discovery, "retire", retired.append)
+    monkeypatch.setattr(discovery, "_search", lambda _: answered)
+    info = SimpleNamespace(peers_zid=lambda: ["known"], routers_zid=list)
+    session: Any = SimpleNamespace(
+        settings=SimpleNamespace(multicast=True), opened=time.monotonic() - 60.0, zenoh=SimpleNamespace(info=info)
+    )
+    discovery.proxy_reached()
+    try:
+        assert discovery.renew(session)
+        assert not discovery.renew(session), "a new session was opened for that node already"
+        assert retired == [session]
+        session.opened = time.monotonic()
+        answered.add("another")
+        assert not discovery.renew(session), "a young session searches by itself"
+    finally:
+        discovery.proxy_reached()
