@@ -252,6 +252,12 @@ def write(bench: Bench, pilot: App, name: str, value: Value) -> None:
     pilot.ask(SetParameter(name, value, pilot.lease))
 
 
+def fall_below_the_charge_to_return_at(bench: Bench, pilot: App) -> None:
+    write(bench, pilot, "battery.return", 0.3)
+    bench.driver.report(battery=0.29)
+    bench.tick()
+
+
 def away(bench: Bench, x: float = 5.0) -> App:
     """A pilot whose vehicle took off at (0, 0) and hovers somewhere else."""
     pilot = bench.pilot()
@@ -374,9 +380,7 @@ def test_a_low_battery_brings_it_back_whatever_set_points_come() -> None:
 def test_the_pilot_takes_it_over_by_a_new_hover_until_it_was_charged() -> None:
     with Bench() as bench:
         pilot = away(bench)
-        write(bench, pilot, "battery.return", 0.3)
-        bench.driver.report(battery=0.29)
-        bench.tick()
+        fall_below_the_charge_to_return_at(bench, pilot)
         pilot.command(Hover())
         pilot.command(Velocity(0.1))
         assert bench.driver.told[-2:] == [Hover(), Velocity(0.1)]
@@ -400,9 +404,7 @@ def test_the_pilot_takes_it_over_by_a_new_hover_until_it_was_charged() -> None:
 def test_a_low_battery_without_a_start_lands() -> None:
     with Bench() as bench:
         pilot = bench.airborne()
-        write(bench, pilot, "battery.return", 0.3)
-        bench.driver.report(battery=0.29)
-        bench.tick()
+        fall_below_the_charge_to_return_at(bench, pilot)
         assert bench.driver.told == [Land()]
         assert steps(pilot) == [("land", "battery_return", False)]
         assert "it can't return to its start: the vehicle does not report" in pilot.told(EventKind.FAILSAFE)[0].text
@@ -411,9 +413,7 @@ def test_a_low_battery_without_a_start_lands() -> None:
 def test_a_position_that_is_lost_on_the_way_ends_in_a_landing() -> None:
     with Bench() as bench:
         pilot = away(bench)
-        write(bench, pilot, "battery.return", 0.3)
-        bench.driver.report(battery=0.29)
-        bench.tick()
+        fall_below_the_charge_to_return_at(bench, pilot)
         bench.driver.answers = False
         bench.run(1.0)
         assert bench.driver.told[-1] == Hover(), "it waits for a younger position"
@@ -428,9 +428,7 @@ def test_a_position_that_is_lost_on_the_way_ends_in_a_landing() -> None:
 def test_a_link_that_breaks_on_the_way_and_is_back_does_not_end_it() -> None:
     with Bench() as bench:
         pilot = away(bench)
-        write(bench, pilot, "battery.return", 0.3)
-        bench.driver.report(battery=0.29)
-        bench.tick()
+        fall_below_the_charge_to_return_at(bench, pilot)
         bench.driver.link(LinkState.LOST)
         bench.run(4.0)
         bench.driver.told.clear()
@@ -483,9 +481,7 @@ def test_a_lost_pilots_vehicle_returns_if_it_is_to(actions: frozenset[str]) -> N
 def test_what_others_fly_is_not_brought_back() -> None:
     with Bench() as bench:
         pilot = away(bench)
-        write(bench, pilot, "battery.return", 0.3)
-        bench.driver.report(battery=0.29)
-        bench.tick()
+        fall_below_the_charge_to_return_at(bench, pilot)
         bench.driver.told.clear()
         bench.driver.left = "RTL"
         bench.run(0.1)

@@ -55,9 +55,9 @@ class ReturnSupervisor:
         if not ours:
             checks.back = None
         before = self.start, self.phase
-        flies_back = checks.back is not None and executor.airborne
+        back = checks.back if executor.airborne else None
         self.start = checks.start.position
-        self.phase = checks.back.phase if flies_back and checks.back is not None else ReturnPhase.NONE
+        self.phase = ReturnPhase.NONE if back is None else back.phase
         return (self.start, self.phase) != before
 
     def why_not(self, now_ns: int) -> str:

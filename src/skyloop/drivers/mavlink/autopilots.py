@@ -114,7 +114,7 @@ class _SafetyNet:
     what: str
     good: Callable[[float], bool]  #: whether a value is as it should be
     otherwise: str  #: what comes of another value
-    advice: str  #: the parameter here, and its value
+    advised: float  #: a value that is as it should be
     unit: str = ""
 
     def diagnostic(self, value: float) -> Diagnostic:
@@ -122,7 +122,12 @@ class _SafetyNet:
         detail = f"{self.name} is {value:g} {self.unit}".rstrip()
         if self.good(value):
             return Diagnostic(self.what, True, detail)
-        return Diagnostic(self.what, False, f"{detail}: {self.otherwise}", f"skyloop param NAME mavlink.{self.advice}")
+        return Diagnostic(
+            self.what,
+            False,
+            f"{detail}: {self.otherwise}",
+            f"skyloop param NAME mavlink.{self.name.lower()} {self.advised:g}",
+        )
 
 
 def _on(value: float) -> bool:
@@ -206,23 +211,19 @@ class ArduCopterProfile(AutopilotProfile):
     LEAD_S = 0.0
     BYTEWISE = False
     SAFETY_NETS = (
-        _SafetyNet(
-            "FS_GCS_ENABLE", "loss of this computer", _on, "it hovers until its battery is empty", "fs_gcs_enable 7"
-        ),
+        _SafetyNet("FS_GCS_ENABLE", "loss of this computer", _on, "it hovers until its battery is empty", 7),
         _SafetyNet(
             "FS_GCS_TIMEOUT",
             "time until its loss counts",
             lambda s: s <= 5,
             "it takes longer than 5 s",
-            "fs_gcs_timeout 5",
+            5,
             "s",
         ),
-        _SafetyNet(
-            "GUID_TIMEOUT", "loss of set-points", lambda s: 0 < s <= 3, "it flies on for long", "guid_timeout 1", "s"
-        ),
-        _SafetyNet("FS_EKF_ACTION", "loss of its place", _on, "it does nothing about it", "fs_ekf_action 1"),
-        _SafetyNet("BATT_FS_LOW_ACT", "low battery", _on, "it does nothing about it", "batt_fs_low_act 1"),
-        _SafetyNet("FENCE_ENABLE", "fence", _on, "it has none of its own", "fence_enable 1"),
+        _SafetyNet("GUID_TIMEOUT", "loss of set-points", lambda s: 0 < s <= 3, "it flies on for long", 1, "s"),
+        _SafetyNet("FS_EKF_ACTION", "loss of its place", _on, "it does nothing about it", 1),
+        _SafetyNet("BATT_FS_LOW_ACT", "low battery", _on, "it does nothing about it", 1),
+        _SafetyNet("FENCE_ENABLE", "fence", _on, "it has none of its own", 1),
     )
 
     def mode_of(self, custom_mode: int) -> str:
@@ -299,13 +300,13 @@ class Px4Profile(AutopilotProfile):
     LEAD_S = 1.0
     BYTEWISE = True
     SAFETY_NETS = (
-        _SafetyNet("NAV_DLL_ACT", "loss of this computer", _on, "it only drops the last set-point", "nav_dll_act 1"),
+        _SafetyNet("NAV_DLL_ACT", "loss of this computer", _on, "it only drops the last set-point", 1),
         _SafetyNet(
             "COM_DL_LOSS_T",
             "time until its loss counts",
             lambda s: s <= 10,
             "it takes longer than 10 s",
-            "com_dl_loss_t 5",
+            5,
             "s",
         ),
         _SafetyNet(
@@ -313,7 +314,7 @@ class Px4Profile(AutopilotProfile):
             "time until set-points are missed",
             lambda s: s <= 1,
             "it flies on for long",
-            "com_of_loss_t 1",
+            1,
             "s",
         ),
         _SafetyNet(
@@ -321,15 +322,15 @@ class Px4Profile(AutopilotProfile):
             "loss of set-points",
             lambda action: action in (3, 4, 5),
             "without a remote control it sinks to the ground",
-            "com_obl_rc_act 5",
+            5,
         ),
-        _SafetyNet("COM_LOW_BAT_ACT", "low battery", _on, "there is no more than a warning", "com_low_bat_act 2"),
+        _SafetyNet("COM_LOW_BAT_ACT", "low battery", _on, "there is no more than a warning", 2),
         _SafetyNet(
             "GF_MAX_VER_DIST",
             "ceiling",
             lambda height: height > 0,
             "it has none of its own",
-            "gf_max_ver_dist 30",
+            30,
             "m",
         ),
     )
