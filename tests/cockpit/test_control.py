@@ -397,9 +397,8 @@ def test_who_is_pre_empted_is_told_and_gets_it_back(client: TestClient, node: No
         first.say("fly", forward=0.3)
         until(lambda: node.flyer.state is FlightState.FLYING)
         second.take(5)
-        told = first.wait("authority", mine=False, state="preempted")
+        told = first.wait("authority", mine=False, state="preempted", priority=5)  # once the feedback names the holder
         assert told["holder"].startswith("cockpit")
-        assert told["priority"] == 5
         until(lambda: node.flyer.state is FlightState.HOVERING, "it hovers before it changes hands")
         first.say("fly", forward=0.3)
         assert "has control" in first.wait("refused", do="fly")["why"]
