@@ -18,7 +18,7 @@ FACE = "[[panel]]\nsize = [1, 1]\ntexture = 'door'\n"
 BOARD = "[[target]]\nname = 'b'\nid = 1\nmarker_size = 0.2\n"
 
 
-@pytest.mark.parametrize("name", ["empty", "gates", "pillars", "platform", "room", "windy"])
+@pytest.mark.parametrize("name", ["empty", "gates", "pillars", "platform", "room", "street", "windy", "yard"])
 def test_shipped_worlds_load_and_can_be_flown_in(name: str) -> None:
     assert name in shipped_worlds()
     world = load_world(name, seed=3)

@@ -6,6 +6,7 @@ What is not known is null.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 Json = dict[str, Any]
 
+_TARGET = re.compile(r"truth\.target\d*\.\w+")
 MAX_TEXT = 1000  #: characters of an event that pages get: there may be hundreds for a new one
 
 #: The page's names of feedback's numbers.
@@ -145,7 +147,7 @@ def target_values(native: Mapping[str, Value] | None) -> list[Json]:
     """Return the moving targets of a simulated world: ``truth.target``, ``truth.target2``, …, as JSON values."""
     if native is None:
         return []
-    names = sorted({key.rpartition(".")[0] for key in native if key.startswith("truth.target")})
+    names = sorted({key.rpartition(".")[0] for key in native if _TARGET.fullmatch(key)})
     places = ((name.removeprefix("truth."), _place(native, name)) for name in names)
     return [{"name": name, **place} for name, place in places if place is not None]
 

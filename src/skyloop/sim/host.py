@@ -226,7 +226,7 @@ class ReportPublisher:
             self.pipeline = self._make_pipeline()
         simulation = self._host.simulation
         positions, rotations = simulation.poses()
-        state = SceneState(positions, rotations, simulation.target_states())
+        state = SceneState(positions, rotations, simulation.target_states(), simulation.light())
         rates = {camera.drone: np.array(simulation.truth(camera.drone).angular_velocity_rad_s) for camera in due}
         speed = self._host.options.speed
         self.pipeline.expose([expose(camera, state, rates[camera.drone], captured_ns, speed) for camera in due])

@@ -275,6 +275,14 @@ class Simulation:
         time = self.time_s if time_s is None else time_s
         return tuple(track.at(time) for track in self._tracks)
 
+    def light(self, time_s: float | None = None) -> float:
+        """Return the brightness of the world's light, at most 1; see :class:`~skyloop.sim.world.Light`.
+
+        Args:
+            time_s: Of the simulation; None is now.
+        """
+        return self.world.light.at(self.time_s if time_s is None else time_s, self.world.seed)
+
     def take_occurrences(self) -> list[Occurrence]:
         """Return what happened since the last call, oldest first; only the newest 1000 are kept."""
         with self._lock:

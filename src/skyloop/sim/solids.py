@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from skyloop.sim.streams import Floats
 from skyloop.sim.targets import TargetTrack, top_speed
-from skyloop.sim.world import PlatformTarget, Vec3, World
+from skyloop.sim.world import FigureTarget, PlatformTarget, Vec3, World
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,14 +28,15 @@ class Overlap:
 
 
 class Solids:
-    """Boxes, gate bars, moving platforms, and the walls and ceiling of the room; the floor is not among them."""
+    """Boxes, gate bars, platforms and figures that move, the walls and ceiling of the room; not the floor."""
 
     def __init__(self, world: World, tracks: tuple[TargetTrack, ...]) -> None:
         boxes = world.solids()
-        platforms = [(track, track.target) for track in tracks if isinstance(track.target, PlatformTarget)]
+        movers = [(track, track.target) for track in tracks if isinstance(track.target, PlatformTarget | FigureTarget)]
         self._fixed = len(boxes)
-        self._platforms = [track for track, _ in platforms]
-        sizes = [box.size_m for box in boxes] + [target.size_m for _, target in platforms]
+        self._movers = [track for track, _ in movers]
+        self._lifts = [isinstance(target, PlatformTarget) for _, target in movers]
+        sizes = [box.size_m for box in boxes] + [target.size_m for _, target in movers]
         self._half = np.array(sizes).reshape(-1, 3).T[:, :, None] / 2  # (3, boxes, 1)
         self._centre = np.zeros((3, len(sizes), 1))
         self._cos, self._sin = np.ones((len(sizes), 1)), np.zeros((len(sizes), 1))
@@ -45,21 +46,21 @@ class Solids:
         size_x, size_y, height = world.room.size_m
         self._room_low = np.array([[-size_x / 2], [-size_y / 2], [-np.inf]])
         self._room_high = np.array([[size_x / 2], [size_y / 2], [height]])
-        self.top_speed_m_s = max((top_speed(target.path) for _, target in platforms), default=0.0)
+        self.top_speed_m_s = max((top_speed(target.path) for _, target in movers), default=0.0)
         self.move(0.0)
 
     @property
     def moving(self) -> bool:
         """Whether any of the solids moves."""
-        return bool(self._platforms)
+        return bool(self._movers)
 
     def move(self, time_s: float) -> None:
         """Move the moving solids to where they are at a time."""
-        for number, track in enumerate(self._platforms, self._fixed):
+        for number, (track, lifts) in enumerate(zip(self._movers, self._lifts, strict=True), self._fixed):
             state = track.at(time_s)
-            top = np.array(state.position_m)
-            top[2] -= self._half[2, number, 0]
-            self._place(number, top, state.yaw_rad)
+            centre = np.array(state.position_m)  # of a platform's top, of a figure's foot print
+            centre[2] += self._half[2, number, 0] * (-1.0 if lifts else 1.0)
+            self._place(number, centre, state.yaw_rad)
             self._velocity[:, number] = state.velocity_m_s
 
     def clearance(self, points: Floats, hulls: Floats) -> Floats:
@@ -101,7 +102,7 @@ class Solids:
 
     def _way_out(self, box: int, local: Floats, inside: Floats) -> Overlap:
         axis = int(inside.argmin())
-        if box >= self._fixed and local[2] > 0:
+        if box >= self._fixed and self._lifts[box - self._fixed] and local[2] > 0:
             axis = 2  # a platform lifts what is on it, however it moves
         sign = 1.0 if local[axis] >= 0 else -1.0
         if axis == 2:

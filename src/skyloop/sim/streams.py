@@ -23,6 +23,8 @@ class Purpose(IntEnum):
     BIASES = 4
     INERTIAL = 5
     CAMERA = 6
+    LIGHT = 7
+    LABELS = 8
 
 
 def stream(seed: int, purpose: Purpose, index: int = 0) -> np.random.Generator:

@@ -24,6 +24,7 @@ from skyloop.sim.world import (
     LissajousPath,
     Path,
     RingWalkPath,
+    StillPath,
     Target,
     TargetState,
     TowardsYaw,
@@ -45,6 +46,7 @@ class _Point:
     position: Vec3
     velocity: Vec3
     yaw: float  # unwrapped
+    walked: float
 
 
 class TargetTrack:
@@ -71,7 +73,9 @@ class TargetTrack:
             first, second = self._pair(int(index))
         position = tuple(a + part * (b - a) for a, b in zip(first.position, second.position, strict=True))
         yaw = wrap_angle(first.yaw + part * (second.yaw - first.yaw))
-        return TargetState(self.target.name, time_s, (position[0], position[1], position[2]), yaw, first.velocity)
+        walked = first.walked + part * (second.walked - first.walked)
+        place = (position[0], position[1], position[2])
+        return TargetState(self.target.name, time_s, place, yaw, first.velocity, walked)
 
     def _pair(self, index: int) -> tuple[_Point, _Point]:
         while self._known < index + 2:
@@ -90,6 +94,8 @@ def top_speed(path: Path) -> float:
         return math.hypot(*rates)
     if isinstance(path, WalkPath | RingWalkPath):
         return path.speed_m_s[1]
+    if isinstance(path, StillPath):
+        return 0.0
     return path.speed_m_s
 
 
@@ -101,6 +107,8 @@ def _positions(path: Path, rng: np.random.Generator) -> Iterator[tuple[Vec3, Vec
         return (_circle(path, step * GRID_S) for step in itertools.count())
     if isinstance(path, LissajousPath):
         return (_lissajous(path, step * GRID_S) for step in itertools.count())
+    if isinstance(path, StillPath):
+        return itertools.repeat((path.position_m, (0.0, 0.0, 0.0)))
     if isinstance(path, WalkPath):
         return _steer(_walk_goals(path, rng), path.speed_m_s, path.acceleration_m_s2, rng)
     return _steer(_ring_goals(path, rng), path.speed_m_s, path.acceleration_m_s2, rng)
@@ -179,6 +187,7 @@ def _steer(
 
 def _with_yaw(positions: Iterator[tuple[Vec3, Vec3]], yaw: Yaw) -> Iterator[_Point]:
     heading: float | None = None
+    walked, last = 0.0, None
     for position, velocity in positions:
         wanted = _wanted_yaw(yaw, position, velocity)
         if heading is None:
@@ -186,7 +195,9 @@ def _with_yaw(positions: Iterator[tuple[Vec3, Vec3]], yaw: Yaw) -> Iterator[_Poi
         elif wanted is not None and not isinstance(yaw, FixedYaw):
             most = yaw.turn_rate_rad_s * GRID_S
             heading += max(-most, min(most, wrap_angle(wanted - heading)))
-        yield _Point(position, velocity, heading)
+        walked += 0.0 if last is None else math.dist(position, last)
+        last = position
+        yield _Point(position, velocity, heading, walked)
 
 
 def _wanted_yaw(yaw: Yaw, position: Vec3, velocity: Vec3) -> float | None:

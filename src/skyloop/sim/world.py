@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from skyloop.sim.streams import Purpose, stream
+
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
 Rgb = tuple[int, int, int]
@@ -247,7 +249,14 @@ class RingWalkPath:
     acceleration_m_s2: float = 0.5
 
 
-Path = WaypointPath | CirclePath | LissajousPath | WalkPath | RingWalkPath
+@dataclass(frozen=True, slots=True)
+class StillPath:
+    """Stays at a point: a parked car, somebody who waits."""
+
+    position_m: Vec3
+
+
+Path = WaypointPath | CirclePath | LissajousPath | WalkPath | RingWalkPath | StillPath
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,7 +313,35 @@ class PlatformTarget:
     texture: str = "wood"
 
 
-Target = BoardTarget | PlatformTarget
+FIGURE_SIZES_M: dict[str, Vec3] = {"person": (0.42, 0.56, 1.76), "car": (2.6, 1.3, 1.15)}  #: depth, width, height
+
+
+@dataclass(frozen=True, slots=True)
+class FigureTarget:
+    """A solid dummy that moves along a path on the ground: a person whose legs and arms swing, or a car.
+
+    The path is of the middle of its foot print (z is the ground it stands on), and the yaw is where it faces.
+
+    Attributes:
+        name: The target's name.
+        shape: ``person`` or ``car``, a key of :data:`FIGURE_SIZES_M`.
+        path: Where it goes.
+        yaw: Where it faces.
+        size_m: Along its own x (ahead), y (left) and z.
+        look: What decides its colours and the pattern of its clothes: two of one shape and look are look-alikes.
+        colour: Of a person's top, or a car's body; None is the look's.
+    """
+
+    name: str
+    shape: str
+    path: Path
+    yaw: Yaw
+    size_m: Vec3
+    look: int = 0
+    colour: Rgb | None = None
+
+
+Target = BoardTarget | PlatformTarget | FigureTarget
 
 
 @dataclass(frozen=True, slots=True)
@@ -312,7 +349,7 @@ class TargetState:
     """The state of a moving target at a time of the simulation, in world axes.
 
     Position [m], yaw [rad, within ±π] and velocity [m/s]; for a platform the position is that of the centre of its top
-    face.
+    face, for a figure that of the ground it stands on. ``walked_m`` is the length of the way since the start.
     """
 
     name: str
@@ -320,6 +357,7 @@ class TargetState:
     position_m: Vec3
     yaw_rad: float
     velocity_m_s: Vec3
+    walked_m: float = 0.0
 
     def face(self, target: Target) -> FacePose:
         """The pose of the target's marker at this time."""
@@ -340,6 +378,26 @@ class Wind:
     mean_m_s: Vec3 = (0.0, 0.0, 0.0)
     gust_m_s: float = 0.0
     time_constant_s: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Light:
+    """Daylight that changes slowly, as when clouds pass: between 1 - ``amplitude`` and 1 times the full brightness.
+
+    Two sines of ``period_s`` and of about a third of it, whose phases the world's seed decides.
+    """
+
+    amplitude: float = 0.0
+    period_s: float = 60.0
+
+    def at(self, time_s: float, seed: int = 0) -> float:
+        """Return the brightness at a time of the simulation [s], 1 - amplitude to 1; exactly 1 without amplitude."""
+        if self.amplitude == 0.0:
+            return 1.0
+        first, second = stream(seed, Purpose.LIGHT).uniform(0.0, 2 * math.pi, 2).tolist()
+        turn = 2 * math.pi * time_s / self.period_s
+        wave = 0.7 * math.sin(turn + first) + 0.3 * math.sin(2.7 * turn + second)
+        return 1.0 - self.amplitude * (0.5 - 0.5 * wave)
 
 
 @dataclass(frozen=True, slots=True)
@@ -365,6 +423,7 @@ class World:
     spawns: tuple[Spawn, ...] = ()
     wind: Wind = Wind()
     seed: int = 0
+    light: Light = Light()
 
     def solids(self) -> tuple[Box, ...]:
         """Return every fixed solid: the boxes, and the bars and legs of the gates."""

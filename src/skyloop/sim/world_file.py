@@ -17,14 +17,17 @@ from skyloop.errors import UnknownNameError, UsageError
 from skyloop.files import read_text
 from skyloop.sim.toml_file import MAX_BYTES, Place, parse_toml, read_tables
 from skyloop.sim.world import (
+    FIGURE_SIZES_M,
     MARKER_DICTIONARIES,
     AlongYaw,
     BoardTarget,
     Box,
     CirclePath,
     FacePose,
+    FigureTarget,
     FixedYaw,
     Gate,
+    Light,
     LissajousPath,
     Marker,
     MarkerPattern,
@@ -35,6 +38,7 @@ from skyloop.sim.world import (
     RingWalkPath,
     Room,
     Spawn,
+    StillPath,
     Target,
     TowardsYaw,
     Vec2,
@@ -51,6 +55,7 @@ from skyloop.sim.world_tables import (
     BoxTable,
     CircleTable,
     FaceTable,
+    FigureTable,
     FixedTable,
     GateTable,
     LissajousTable,
@@ -61,6 +66,7 @@ from skyloop.sim.world_tables import (
     PlatformTable,
     RingWalkTable,
     SpawnTable,
+    StillTable,
     TowardsTable,
     WalkTable,
     WaypointsTable,
@@ -146,6 +152,7 @@ def _read_world(text: str, source: str, name: str, seed: int = 0) -> World:
         spawns=make_all("spawn", table.spawn, _spawn),
         wind=Wind(table.wind.mean, table.wind.gust, table.wind.time_constant),
         seed=seed,
+        light=Light(table.light.amplitude, table.light.period),
     )
 
 
@@ -229,7 +236,12 @@ def _mounted(mount: str, along: float, other: float, turn_rad: float, room: Room
     return FacePose((along, other, height - gap), 0.0, -math.pi / 2, turn_rad)
 
 
-def _target(table: BoardTable | PlatformTable, name: str, room: Room, place: Place) -> Target:
+def _target(table: BoardTable | PlatformTable | FigureTable, name: str, room: Room, place: Place) -> Target:
+    if isinstance(table, FigureTable):
+        path, yaw = _path(table.path, room, place.under("path")), _yaw(table.yaw)
+        size = FIGURE_SIZES_M[table.shape] if table.size is None else table.size
+        colour = None if table.colour is None else _colour(table.colour, place)
+        return FigureTarget(name, table.shape, path, yaw, size, table.look, colour)
     pattern, yaw = _pattern(table, place), _yaw(table.yaw)
     path = _path(table.path, room, place.under("path"))
     if not isinstance(table, PlatformTable):
@@ -257,6 +269,9 @@ def _path(table: PathTable, room: Room, place: Place) -> Path:
             return _walk(table, room, place)
         case RingWalkTable():
             return _ring_walk(table, room, place)
+        case StillTable():
+            _require_inside(place, "position", table.position, room)
+            return StillPath(table.position)
 
 
 def _waypoints(table: WaypointsTable, room: Room, place: Place) -> Path:

@@ -151,7 +151,11 @@ class TowardsTable(_Table, kw_only=True, tag_field="mode", tag="towards"):
     turn_rate_deg_s: TurnRate = 40.0
 
 
-PathTable = WaypointsTable | CircleTable | LissajousTable | WalkTable | RingWalkTable
+class StillTable(_Table, kw_only=True, tag_field="kind", tag="still"):
+    position: Position
+
+
+PathTable = WaypointsTable | CircleTable | LissajousTable | WalkTable | RingWalkTable | StillTable
 YawTable = FixedTable | AlongTable | TowardsTable
 
 
@@ -169,6 +173,22 @@ class PlatformTable(BoardTable, kw_only=True, tag_field="kind", tag="platform"):
     texture: Texture = "wood"
 
 
+class FigureTable(Named, kw_only=True, tag_field="kind", tag="figure"):
+    """The path is of the ground it stands on; the heading is that of the path unless given."""
+
+    shape: Literal["person", "car"] = "person"
+    path: PathTable
+    yaw: YawTable = field(default_factory=lambda: AlongTable(turn_rate_deg_s=120.0))
+    size: Size | None = None
+    look: Annotated[int, Meta(ge=0, le=1_000_000)] = 0
+    colour: str | None = None
+
+
+class LightTable(_Table, kw_only=True):
+    amplitude: Annotated[float, Meta(ge=0.0, le=0.9)] = 0.0
+    period: Annotated[float, Meta(ge=1.0, le=3600.0)] = 60.0
+
+
 class SpawnTable(Named, kw_only=True):
     position: Position
     yaw_deg: Degrees = 0.0
@@ -180,6 +200,7 @@ class WorldTable(_Table, kw_only=True):
     gate: list[GateTable] = []
     panel: list[PanelTable] = []
     marker: list[MarkerTable] = []
-    target: list[BoardTable | PlatformTable] = []
+    target: list[BoardTable | PlatformTable | FigureTable] = []
     spawn: list[SpawnTable] = []
     wind: WindTable = field(default_factory=WindTable)
+    light: LightTable = field(default_factory=LightTable)

@@ -48,7 +48,8 @@ class SimDriver(Driver):
 
     Feedback carries the true state too, in ``native``: ``truth.x``, ``.y``, ``.z`` [m], ``.roll``, ``.pitch``, ``.yaw``
     [rad], ``.vx``, ``.vy``, ``.vz`` [m/s], and of each moving target ``truth.target.x``, ``.y``, ``.z``, ``.yaw`` (a
-    second one is ``truth.target2``), all in world axes. ``sim.time_s`` is the simulation's own time.
+    second one is ``truth.target2``; x, y and z also by its name: ``truth.NAME.x``), all in world axes.
+    ``sim.time_s`` is the simulation's own time.
 
     Args:
         uri: The vehicle's address; its options count only without a host.

@@ -43,6 +43,9 @@ def _native(report: Report, options: SimOptions) -> dict[str, Value]:
     native["truth.x"], native["truth.y"], native["truth.z"] = truth.position_m
     native["truth.vx"], native["truth.vy"], native["truth.vz"] = truth.velocity_m_s
     native["truth.roll"], native["truth.pitch"], native["truth.yaw"] = truth.roll_rad, truth.pitch_rad, truth.yaw_rad
+    for target in report.targets:
+        native[f"truth.{target.name}.x"], native[f"truth.{target.name}.y"] = target.position_m[:2]
+        native[f"truth.{target.name}.z"] = target.position_m[2]
     for number, target in enumerate(report.targets, 1):
         name = "truth.target" if number == 1 else f"truth.target{number}"
         native[f"{name}.x"], native[f"{name}.y"], native[f"{name}.z"] = target.position_m

@@ -25,11 +25,13 @@ class SceneState:
         drone_positions_m: Of the bodies' origins, world axes, shape (n, 3).
         drone_rotations: World from body, shape (n, 3, 3).
         targets: One for each target of the world, in the world's order.
+        light: Brightness of the whole picture, 1 is full; see :class:`~skyloop.sim.world.Light`.
     """
 
     drone_positions_m: NDArray[np.float64]
     drone_rotations: NDArray[np.float64]
     targets: tuple[TargetState, ...] = ()
+    light: float = 1.0
 
 
 class Renderer(Protocol):

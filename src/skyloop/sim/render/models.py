@@ -6,13 +6,14 @@ import math
 
 import numpy as np
 
-from skyloop.sim.render.atlas import AtlasBuilder, Texture
+from skyloop.sim.render import figures
+from skyloop.sim.render.atlas import AtlasBuilder
 from skyloop.sim.render.markers import draw_card
 from skyloop.sim.render.noise import finished, tinted
 from skyloop.sim.render.opencv import cv2
 from skyloop.sim.render.quads import QuadBuilder, Quads
-from skyloop.sim.render.textures import draw_paint, draw_surface
-from skyloop.sim.world import BoardTarget, MarkerPattern, PlatformTarget, Rgb
+from skyloop.sim.render.textures import draw_surface, paint
+from skyloop.sim.world import BoardTarget, FigureTarget, MarkerPattern, PlatformTarget, Rgb, Target
 
 # Hull colours, one drone after the other.
 HULLS: tuple[Rgb, ...] = (
@@ -31,11 +32,6 @@ _ROTOR_M = 0.10
 _FEET_M = 0.06  # below the body's origin
 _DARK: Rgb = (46, 48, 52)
 _POLE_M = 12.0  # the stand's pole goes through the floor, which hides the rest
-
-
-def paint(atlas: AtlasBuilder, rgb: Rgb) -> Texture:
-    """Return a small painted surface."""
-    return atlas.add(("paint", rgb), lambda: draw_paint(rgb))
 
 
 def card(builder: QuadBuilder, atlas: AtlasBuilder, pattern: MarkerPattern, priority: int) -> None:
@@ -84,6 +80,15 @@ def _rotor(rgb: Rgb) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
     cv2.circle(picture, (size // 2, size // 2), round(size * 0.44), (232, 232, 232), 2, cv2.LINE_AA)
     cv2.circle(picture, (size // 2, size // 2), 4, (30, 30, 30), -1, cv2.LINE_AA)
     return picture
+
+
+def target(atlas: AtlasBuilder, target: Target) -> Quads:
+    """Return a target's shape without its stand: a figure as it stands still."""
+    if isinstance(target, BoardTarget):
+        return board(atlas, target)
+    if isinstance(target, FigureTarget):
+        return figures.figure(atlas, target).standing()
+    return platform(atlas, target)
 
 
 def board(atlas: AtlasBuilder, target: BoardTarget) -> Quads:

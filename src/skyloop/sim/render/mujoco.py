@@ -15,6 +15,7 @@ from skyloop.errors import MissingExtraError, UnsupportedError, UsageError
 from skyloop.messages.geometry import rotation_from_euler
 from skyloop.sim.camera import CameraModel, CameraPose
 from skyloop.sim.render.base import Image, SceneState
+from skyloop.sim.render.brightness import dimmed
 from skyloop.sim.render.opencv import cv2
 from skyloop.sim.world import World
 
@@ -107,7 +108,7 @@ class MujocoRenderer:
         if raster.places is not None:
             picture = cv2.remap(picture, *raster.places, cv2.INTER_LINEAR)
         cv2.cvtColor(picture, cv2.COLOR_RGB2BGR, dst=out)
-        return out
+        return out if state.light == 1.0 else dimmed(out, state.light)
 
     def close(self) -> None:
         """Free what OpenGL holds, in the thread that used it; the renderer can be used again."""

@@ -65,9 +65,7 @@ def build_stage(world: World, drones: int) -> Stage:
     """Build the model of a world with a number of drones."""
     atlas = AtlasBuilder()
     still = static_quads(world, atlas, painted_shadows=False)
-    targets = [
-        models.board(atlas, t) if isinstance(t, BoardTarget) else models.platform(atlas, t) for t in world.targets
-    ]
+    targets = [models.target(atlas, t) for t in world.targets]
     stand = models.stand(atlas)
     hulls = [models.drone(atlas, models.HULLS[n % len(models.HULLS)]) for n in range(drones)]
     maker = _Maker(atlas)

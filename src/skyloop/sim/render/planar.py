@@ -22,6 +22,7 @@ import numpy as np
 from skyloop.errors import UsageError
 from skyloop.sim.camera import CameraModel, CameraPose
 from skyloop.sim.render.base import Image, SceneState
+from skyloop.sim.render.brightness import dimmed
 from skyloop.sim.render.compiled import COMPILER, CompiledPainter, Compiler
 from skyloop.sim.render.opencv import cv2
 from skyloop.sim.render.painter import Painter
@@ -84,6 +85,12 @@ class PlanarRenderer:
             out = np.empty(shape, np.uint8)
         elif out.shape != shape or out.dtype != np.uint8:
             raise UsageError(f"out is {out.dtype} of shape {out.shape}; this camera's image is uint8 of {shape}")
+        self._sample(state, pose, model, out)
+        if state.light != 1.0:
+            dimmed(out, state.light)
+        return out
+
+    def _sample(self, state: SceneState, pose: CameraPose, model: CameraModel, out: Image) -> None:
         if self.quality is Quality.BEST:
             fine = _doubled(model)
             large = np.empty((fine.height, fine.width, 3), np.uint8)
@@ -92,8 +99,9 @@ class PlanarRenderer:
         elif out.flags.c_contiguous:
             self._draw(state, pose, model, _samples(self.quality), out)
         else:
-            np.copyto(out, self.render(state, pose, model))
-        return out
+            whole = np.empty(out.shape, np.uint8)
+            self._sample(state, pose, model, whole)
+            np.copyto(out, whole)
 
     def _draw(self, state: SceneState, pose: CameraPose, model: CameraModel, samples: int, picture: Image) -> None:
         lens = self._lens(model, samples)

@@ -8,16 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.sim.render.atlas import AtlasBuilder, Texture
-from skyloop.sim.render.models import card, paint
+from skyloop.sim.render.models import card
 from skyloop.sim.render.opencv import cv2
 from skyloop.sim.render.quads import QuadBuilder, Quads, concatenate
-from skyloop.sim.render.textures import draw_surface
+from skyloop.sim.render.textures import draw_surface, paint
 from skyloop.sim.world import Box, Room, World
 
 _FINEST = 128.0  # texels per metre of a room's surfaces, where its size allows
 _LARGEST = 1280.0  # texels along a side of them
 _AFAR_M = 150.0  # how far the open ground goes
 _SKY_M = 400.0
+SIDES = 6  #: quads of a box; in ``static_quads`` the shell comes first, then boxes, panels, markers
 # Where shadows of standing things fall: away from the light of ``shading``, shortened, as in a room lit from all over.
 _LEAN = np.array([-0.16, 0.20])
 

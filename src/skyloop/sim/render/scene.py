@@ -12,10 +12,11 @@ from skyloop.errors import UsageError
 from skyloop.sim.render import models
 from skyloop.sim.render.atlas import AtlasBuilder
 from skyloop.sim.render.base import SceneState
+from skyloop.sim.render.figures import figure
 from skyloop.sim.render.quads import CHANGING, Quads, concatenate, moved_each
-from skyloop.sim.render.room import static_quads
+from skyloop.sim.render.room import SIDES, static_quads
 from skyloop.sim.render.shadows import Shadow
-from skyloop.sim.world import BoardTarget, PlatformTarget, World
+from skyloop.sim.world import BoardTarget, FigureTarget, PlatformTarget, World
 
 _FADES_AT_M = 4.0  # a drone this high above a surface leaves no visible shadow on it
 
@@ -44,7 +45,11 @@ class Scene:
         self.world = world
         self.drones = drones
         self._static = static_quads(world, atlas)
-        self._targets = [_target(target, atlas) for target in world.targets]
+        self._figures = [figure(atlas, t) if isinstance(t, FigureTarget) else None for t in world.targets]
+        self._targets = [
+            models.target(atlas, target) if shape is None else shape.standing()
+            for target, shape in zip(world.targets, self._figures, strict=True)
+        ]
         self._stand = models.stand(atlas)
         hulls = [models.drone(atlas, hull) for hull in models.HULLS[: max(1, drones)]]
         self._hulls = [hulls[k % len(hulls)] for k in range(drones)]
@@ -55,6 +60,20 @@ class Scene:
         ]
         # Everything in the order of ``posed``, for what doesn't change when it moves.
         self._everything = concatenate([self._static, *standing, *self._hulls])
+        #: Which target of the world a quad belongs to, -1 for none, (n,).
+        self.target_of = np.concatenate(
+            [np.full(len(self._static), -1, np.intp)]
+            + [
+                np.full(len(template) + (len(self._stand) if isinstance(target, BoardTarget) else 0), k, np.intp)
+                for k, (target, template) in enumerate(zip(world.targets, self._targets, strict=True))
+            ]
+            + [np.full(len(hull), -1, np.intp) for hull in self._hulls]
+        )
+        #: Which box of the world a quad belongs to, -1 for none, (n,).
+        self.box_of = np.full(len(self.target_of), -1, np.intp)
+        sides = np.repeat(np.arange(len(world.solids())), SIDES)
+        first = len(self._static) - len(world.panels) - len(world.markers) - len(sides)
+        self.box_of[first : first + len(sides)] = np.where(sides < len(world.boxes), sides, -1)
         owners = [np.full(len(self._static) + sum(map(len, standing)), -1, np.intp)]
         owners += [np.full(len(hull), k, np.intp) for k, hull in enumerate(self._hulls)]
         self._owner = np.concatenate(owners)
@@ -88,14 +107,20 @@ class Scene:
             raise UsageError(f"the world has {len(self._targets)} moving targets, the state {len(state.targets)}")
         parts = [self._static]
         shadows: list[Shadow] = []
-        for template, target, now in zip(self._targets, self.world.targets, state.targets, strict=True):
+        for template, figure_, target, now in zip(
+            self._targets, self._figures, self.world.targets, state.targets, strict=True
+        ):
             position, turn = np.array(now.position_m), _yaw(now.yaw_rad)
+            if figure_ is not None:
+                parts.append(figure_.posed(position, turn, now.walked_m))
+                shadows += figure_.shadows(position, turn)
+                continue
             parts.append(template.moved(position, turn))
             on_floor = np.array([position[0], position[1], 0.0])
             if isinstance(target, BoardTarget):
                 parts.append(self._stand.moved(on_floor, turn))
                 shadows.append(Shadow(on_floor, 0.32, 0.45))
-            else:
+            elif isinstance(target, PlatformTarget):
                 shadows.append(Shadow(on_floor, 0.75 * math.hypot(*target.size_m[:2]), 0.45))
         if self._swarm is not None:
             parts.append(moved_each(self._swarm, state.drone_positions_m, state.drone_rotations))
@@ -121,7 +146,3 @@ class Scene:
 def _yaw(angle: float) -> NDArray[np.float64]:
     c, s = math.cos(angle), math.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _target(target: BoardTarget | PlatformTarget, atlas: AtlasBuilder) -> Quads:
-    return models.board(atlas, target) if isinstance(target, BoardTarget) else models.platform(atlas, target)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.errors import UnknownNameError
+from skyloop.sim.render.atlas import AtlasBuilder, Texture
 from skyloop.sim.render.noise import clouds, finished, fractal, grain, tinted
 from skyloop.sim.render.opencv import cv2
 from skyloop.sim.render.pictures import PICTURES
@@ -72,6 +73,11 @@ def draw_paint(rgb: tuple[int, int, int], height: int = 64, width: int = 64) -> 
     picture[:, :edge] *= 0.86
     picture[:, -edge:] *= 0.86
     return finished(picture)
+
+
+def paint(atlas: AtlasBuilder, rgb: tuple[int, int, int]) -> Texture:
+    """Return a small painted surface."""
+    return atlas.add(("paint", rgb), lambda: draw_paint(rgb))
 
 
 def _rows(sheet: Sheet, length_m: float, course_m: float, shift: float) -> tuple[NDArray[np.intp], Picture, Picture]:
