@@ -1,12 +1,14 @@
-"""Computer vision: markers, gates, colours, trackers of a box, optical flow of the ground, lenses and calibration.
+"""Computer vision: markers, gates, colours, trackers of a box, detectors, optical flow, lenses and calibration.
 
-Needs the extra ``vision``; OpenCV is imported when it is first used.
+Needs the extra ``vision``, detectors ``detect``; OpenCV and ONNX Runtime are imported when they are first used.
 """
 
 from skyloop.vision.board import Board, BoardFinder, BoardView
 from skyloop.vision.calibrating import Collector, calibrate
 from skyloop.vision.colour import BlobDetector, BlobSighting
 from skyloop.vision.correlation import CorrelationTracker
+from skyloop.vision.detection import Detection, ObjectDetector
+from skyloop.vision.detector_layouts import Layout
 from skyloop.vision.flow import GroundTracker
 from skyloop.vision.gates import GateDetector, GateSighting
 from skyloop.vision.learned import LearnedTracker
@@ -14,6 +16,7 @@ from skyloop.vision.lens import project, undistort, unproject
 from skyloop.vision.long_term import LongTermTracker
 from skyloop.vision.markers import MarkerDetector, MarkerSighting
 from skyloop.vision.median_flow import MedianFlowTracker
+from skyloop.vision.onnx_detector import OnnxDetector
 from skyloop.vision.planar import PlanarSighting
 from skyloop.vision.tracking import Tracker, TrackResult
 
@@ -25,14 +28,18 @@ __all__ = [
     "BoardView",
     "Collector",
     "CorrelationTracker",
+    "Detection",
     "GateDetector",
     "GateSighting",
     "GroundTracker",
+    "Layout",
     "LearnedTracker",
     "LongTermTracker",
     "MarkerDetector",
     "MarkerSighting",
     "MedianFlowTracker",
+    "ObjectDetector",
+    "OnnxDetector",
     "PlanarSighting",
     "TrackResult",
     "Tracker",
