@@ -27,7 +27,7 @@ EXTRAS: Final = (
     ("fast", "simulator's cameras, several times faster", ("numba", "cv2")),
     ("mujoco", "simulator with meshes and shadows", ("mujoco", "cv2")),
     ("vision", "markers and other vision", ("cv2", "PIL")),
-    ("detect", "detectors from an ONNX file", ("onnxruntime", "cv2")),
+    ("detect", "detectors from an ONNX file", ("onnxruntime", "cv2", "scipy")),
     ("video", "recorded video, H.264", ("av",)),
     ("control", "poses and splines", ("scipy",)),
     ("mavlink", "ArduCopter and PX4", ("pymavlink", "serial")),

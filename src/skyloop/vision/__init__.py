@@ -16,6 +16,7 @@ from skyloop.vision.lens import project, undistort, unproject
 from skyloop.vision.long_term import LongTermTracker
 from skyloop.vision.markers import MarkerDetector, MarkerSighting
 from skyloop.vision.median_flow import MedianFlowTracker
+from skyloop.vision.object_tracks import ObjectTracks, TrackedObject
 from skyloop.vision.onnx_detector import OnnxDetector
 from skyloop.vision.planar import PlanarSighting
 from skyloop.vision.tracking import Tracker, TrackResult
@@ -39,9 +40,11 @@ __all__ = [
     "MarkerSighting",
     "MedianFlowTracker",
     "ObjectDetector",
+    "ObjectTracks",
     "OnnxDetector",
     "PlanarSighting",
     "TrackResult",
+    "TrackedObject",
     "Tracker",
     "calibrate",
     "project",

@@ -1,0 +1,220 @@
+"""Detections of one image after the other, joined into objects that keep their number. Pure.
+
+The way of Zhang et al., "ByteTrack: Multi-Object Tracking by Associating Every Detection Box", ECCV 2022: sure
+detections are matched with all objects first, unsure ones then with the objects that are left, since what is half
+hidden is detected with a low score; only sure ones start an object. Each object has a Kalman filter of constant
+velocity on its box, here with real times instead of counted images, so that a missed frame does no harm. The pairs
+are those of SciPy's ``linear_sum_assignment``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+
+from skyloop.errors import MissingExtraError, UsageError
+from skyloop.vision.detection import Detection, Floats, overlaps
+from skyloop.vision.tracking import Box
+
+# Shares of the box's height, as in ByteTrack's filter, which counts 30 images a second.
+_POSITION: Final = 1 / 20  # standard deviation of a detection
+_SPEED: Final = 1.5  # of the velocity at first [1/s]
+_WANDERING: Final = 0.8  # of the velocity within a second
+
+
+@dataclass(frozen=True, slots=True)
+class TrackedObject:
+    """One object at the time of the newest update."""
+
+    id: int  #: from 1; never given to another object
+    detection: Detection  #: the last one, with its box
+    box: Box  #: x, y, width, height [px], filtered; predicted while the object is not seen
+    velocity: tuple[float, float]  #: of the box's centre, right and down [px/s]
+    seen: bool  #: whether it was detected in this image
+    age_s: float  #: since it was first detected [s]
+    unseen_s: float  #: since it was last detected [s]
+
+
+@dataclass(slots=True, eq=False)
+class _Object:
+    number: int
+    detection: Detection
+    state: Floats  # (4, 2): centre x, centre y, width, height, each with its velocity
+    covariance: Floats  # (4, 2, 2)
+    first_s: float
+    last_s: float
+    hits: int = 1
+    corners: Floats = field(default_factory=lambda: np.zeros(4))
+
+
+class ObjectTracks:
+    """Gives detections of one image after the other numbers that stay with their objects. Not thread-safe."""
+
+    def __init__(
+        self,
+        *,
+        sure: float = 0.5,
+        overlap: float = 0.2,
+        overlap_unsure: float = 0.5,
+        confirm: int = 2,
+        keep_s: float = 1.5,
+    ) -> None:
+        """Start without objects.
+
+        Args:
+            sure: Score from which a detection may start an object, 0 to 1. Let the detector give lower ones, too
+                (``OnnxDetector(…, score=0.1)``): they continue objects.
+            overlap: Least overlap of an object's predicted box with a sure detection, 0 to 1.
+            overlap_unsure: The same with an unsure one.
+            confirm: Detections after which an object is returned; 1 or more.
+            keep_s: How long an object that is not detected is remembered [s].
+
+        Raises:
+            UsageError: An argument is out of its range.
+            MissingExtraError: SciPy is not installed.
+        """
+        for name, value in (("sure", sure), ("overlap", overlap), ("overlap_unsure", overlap_unsure)):
+            if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 <= value <= 1.0:
+                raise UsageError(f"{name} is {value!r} and must be a number from 0 to 1")
+        if isinstance(confirm, bool) or not isinstance(confirm, int) or confirm < 1:
+            raise UsageError(f"confirm is {confirm!r} and must be a whole number of at least 1")
+        if isinstance(keep_s, bool) or not isinstance(keep_s, int | float) or not 0.0 <= keep_s < math.inf:
+            raise UsageError(f"keep_s is {keep_s!r} and must be a finite number of seconds, 0 or more")
+        self._assign = _assignment()
+        self._sure, self._confirm, self._keep_s = float(sure), confirm, float(keep_s)
+        self._overlap, self._overlap_unsure = float(overlap), float(overlap_unsure)
+        self._objects: list[_Object] = []
+        self._time_s: float | None = None
+        self._next = 1
+
+    def update(self, detections: Sequence[Detection], time_s: float) -> list[TrackedObject]:
+        """Match the detections of the next image, and return the objects, also those not seen now, by number.
+
+        Args:
+            detections: Of one image; those that are not finite or empty are left out.
+            time_s: When the image was taken [s], on any clock that does not run backwards.
+
+        Raises:
+            UsageError: The time is not finite, or before that of the last update.
+        """
+        if isinstance(time_s, bool) or not isinstance(time_s, int | float) or not math.isfinite(time_s):
+            raise UsageError(f"time_s is {time_s!r} and must be a finite number of seconds")
+        if self._time_s is not None and time_s < self._time_s:
+            raise UsageError(f"time_s is {time_s!r}, before the last update's {self._time_s!r}: give images in order")
+        elapsed = 0.0 if self._time_s is None else time_s - self._time_s
+        self._time_s = float(time_s)
+        self._objects = [each for each in self._objects if time_s - each.last_s <= self._keep_s]
+        for each in self._objects:
+            _predict(each, elapsed)
+        usable = [each for each in detections if _is_usable(each)]
+        sure = [each for each in usable if each.score >= self._sure]
+        unsure = [each for each in usable if each.score < self._sure]
+        # What is not confirmed comes last, so that a stray detection takes nothing from a known object.
+        known = [each for each in self._objects if each.hits >= self._confirm]
+        young = [each for each in self._objects if each.hits < self._confirm]
+        known, sure = self._match(known, sure, self._overlap, time_s)
+        self._match(known, unsure, self._overlap_unsure, time_s)
+        young, sure = self._match(young, sure, self._overlap, time_s)
+        self._objects = [each for each in self._objects if each not in young]
+        for new in sure:
+            self._objects.append(_started(self._next, new, time_s))
+            self._next += 1
+        return [_tracked(each, time_s) for each in self._objects if each.hits >= self._confirm]
+
+    def _match(
+        self, objects: list[_Object], detections: list[Detection], least: float, time_s: float
+    ) -> tuple[list[_Object], list[Detection]]:
+        """Update the objects that are found among the detections; return what is left of both."""
+        if not objects or not detections:
+            return objects, detections
+        corners = np.array([_corners(each.box) for each in detections])
+        agreement = np.stack([overlaps(each.corners, corners) for each in objects])
+        classes = np.array([[a.detection.class_id == b.class_id for b in detections] for a in objects])
+        # Another class, or too little overlap, costs more than any sum of pairs that are allowed.
+        allowed = classes & (agreement > least)
+        cost = np.where(allowed, 1.0 - agreement, float(len(objects) + len(detections) + 1))
+        pairs = [(int(i), int(j)) for i, j in zip(*self._assign(cost), strict=True) if allowed[i, j]]
+        for i, j in pairs:
+            _correct(objects[i], detections[j], time_s)
+        taken, used = {i for i, _ in pairs}, {j for _, j in pairs}
+        return (
+            [each for i, each in enumerate(objects) if i not in taken],
+            [each for j, each in enumerate(detections) if j not in used],
+        )
+
+
+def _assignment() -> Any:
+    try:
+        from scipy.optimize import linear_sum_assignment
+    except ImportError as error:
+        raise MissingExtraError("matching detections", "detect", cause=str(error)) from error
+    return linear_sum_assignment
+
+
+def _is_usable(detection: Detection) -> bool:
+    numbers = (*detection.box, detection.score)
+    return all(math.isfinite(each) and abs(each) < 1e6 for each in numbers) and min(detection.box[2:]) > 0
+
+
+def _corners(box: Sequence[float]) -> Floats:
+    x, y, width, height = box
+    return np.array([x, y, x + width, y + height], np.float64)
+
+
+def _measured(detection: Detection) -> Floats:
+    x, y, width, height = detection.box
+    return np.array([x + width / 2, y + height / 2, width, height], np.float64)
+
+
+def _started(number: int, detection: Detection, time_s: float) -> _Object:
+    height = detection.box[3]
+    state = np.stack([_measured(detection), np.zeros(4)], axis=1)
+    covariance = np.tile(np.diag([(2 * _POSITION * height) ** 2, (_SPEED * height) ** 2]), (4, 1, 1))
+    return _Object(number, detection, state, covariance, time_s, time_s, corners=_corners(detection.box))
+
+
+def _predict(each: _Object, elapsed_s: float) -> None:
+    step = np.array([[1.0, elapsed_s], [0.0, 1.0]])
+    intensity = (_WANDERING * max(each.state[3, 0], 1.0)) ** 2
+    t = elapsed_s
+    noise = intensity * np.array([[t**3 / 3, t**2 / 2], [t**2 / 2, t]])
+    each.state = each.state @ step.T
+    each.covariance = step @ each.covariance @ step.T + noise
+    each.state[2:, 0] = np.maximum(each.state[2:, 0], 1.0)  # a box that shrinks does not vanish
+    _place(each)
+
+
+def _correct(each: _Object, detection: Detection, time_s: float) -> None:
+    variance = (_POSITION * detection.box[3]) ** 2
+    gain = each.covariance[:, :, 0] / (each.covariance[:, 0, 0] + variance)[:, None]
+    off = _measured(detection) - each.state[:, 0]
+    each.state = each.state + gain * off[:, None]
+    keep = np.tile(np.eye(2), (4, 1, 1))
+    keep[:, :, 0] -= gain
+    own = variance * gain[:, :, None] * gain[:, None, :]
+    each.covariance = keep @ each.covariance @ keep.transpose(0, 2, 1) + own  # in Joseph's form
+    each.detection, each.last_s, each.hits = detection, time_s, each.hits + 1
+    each.state[2:, 0] = np.maximum(each.state[2:, 0], 1.0)
+    _place(each)
+
+
+def _place(each: _Object) -> None:
+    centre, size = each.state[:2, 0], each.state[2:, 0]
+    each.corners = np.concatenate([centre - size / 2, centre + size / 2])
+
+
+def _tracked(each: _Object, time_s: float) -> TrackedObject:
+    x, y, width, height = (float(v) for v in (*each.corners[:2], *each.state[2:, 0]))
+    return TrackedObject(
+        id=each.number,
+        detection=each.detection,
+        box=(x, y, width, height),
+        velocity=(float(each.state[0, 1]), float(each.state[1, 1])),
+        seen=each.last_s == time_s,
+        age_s=time_s - each.first_s,
+        unseen_s=time_s - each.last_s,
+    )
