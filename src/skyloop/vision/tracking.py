@@ -31,6 +31,7 @@ class TrackResult:
 
     box: Box | None  #: x, y, width, height [px]; None while the target is lost
     score: float  #: 0 to 1, how much it looks like the target; a score, not a probability
+    confidence: float | None = None  #: chance that the box overlaps the target by a half or more; None: no estimate
 
     @property
     def lost(self) -> bool:
