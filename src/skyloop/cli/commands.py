@@ -71,6 +71,13 @@ COMMANDS: Final = {
         "Run a class of yours on a drone's frames",
         "process detector.py --drone alpha",
     ),
+    "detect": Entry(
+        Task.SEE,
+        "detect",
+        "detect",
+        "Detect with your ONNX file in a drone's frames, drawn live",
+        "detect my.onnx --on alpha",
+    ),
     "proxy": Entry(Task.SHARE, "proxy", "proxy", "Serve one vehicle under a name", "proxy sim:// --name alpha"),
     "router": Entry(
         Task.SHARE,

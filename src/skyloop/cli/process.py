@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Final, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, Final, NoReturn
 
 import msgspec
 import typer
@@ -18,7 +18,7 @@ from skyloop.cli.naming import AnyNameArgument, DroneOption, KeysOption, Network
 from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
-    from skyloop.processing import Code, Settings, Status
+    from skyloop.processing import Settings, Status
 
 LINE_EVERY_S: Final = 1.0
 _LOOK_S: Final = 0.1
@@ -68,26 +68,32 @@ def process(
     code = load_processor(target)
     settings = Settings(name if name is not None else code.name, code.mark, camera, share, max_age, max_fps, stuck)
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, _interrupt)
-    show = _json if json else _text
+        signal.signal(number, interrupt)
+    show = show_json if json else show_text
     try:
         if workers == 1:
-            _work(code, settings, drone, seconds, show, child=child)
+            work(code.make, settings, drone, seconds, show, child=child)
         else:
             _lead(workers, settings, target, drone, seconds, show)
     except KeyboardInterrupt:
         pass  # how it is meant to end
 
 
-def _work(
-    code: Code, settings: Settings, target: str, seconds: float | None, show: Callable[[Status], str], *, child: bool
+def work(
+    make: Callable[[], Any],
+    settings: Settings,
+    target: str,
+    seconds: float | None,
+    show: Callable[[Status], str],
+    *,
+    child: bool,
 ) -> None:
-    """One worker, in this process."""
+    """Run one worker in this process, of the processor that ``make`` returns, until its end."""
     from skyloop.client import connect
     from skyloop.processing import Worker
     from skyloop.processing.group import end_with_parent
 
-    processor = code.make()
+    processor = make()
     app = f"{settings.name[:32]}@{socket.gethostname()[:20]}:{os.getpid()}"
     with connect(target, access="observe", name=app) as drone:
         worker = Worker(drone, processor, settings, _print)
@@ -151,15 +157,18 @@ def _arguments(settings: Settings, target: str, drone: str, seconds: float | Non
     return ["process", target, *given, "--share" if settings.shared else "--all", "--json", "--child"]
 
 
-def _text(status: Status) -> str:
+def show_text(status: Status) -> str:
+    """Return a line for people."""
     return f"{time.strftime('%H:%M:%S')}  {status}"
 
 
-def _json(status: Status) -> str:
+def show_json(status: Status) -> str:
+    """Return a line for programs."""
     return msgspec.json.encode(status).decode()
 
 
-def _interrupt(number: int, frame: FrameType | None) -> NoReturn:  # noqa: ARG001  as signal handlers are called
+def interrupt(number: int, frame: FrameType | None) -> NoReturn:  # noqa: ARG001  as signal handlers are called
+    """End the command, as a signal handler."""
     raise KeyboardInterrupt
 
 

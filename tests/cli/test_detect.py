@@ -1,0 +1,81 @@
+"""``skyloop detect``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import skyloop
+from skyloop.messages import Annotation, Polyline, Text
+from skyloop.processing.detecting import DetectionProcessor
+from skyloop.vision import Detection
+from tests.cli.conftest import Run
+from tests.processes.conftest import Process
+from tests.vision.networks import write
+
+pytestmark = pytest.mark.process
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    output = np.zeros((1, 300, 6), np.float32)
+    output[0, 0] = [10, 20, 40, 44, 0.9, 1]
+    output[0, 1] = [50, 20, 70, 44, 0.8, 0]
+    return write(tmp_path / "my.onnx", {"output0": output}, metadata={"names": "{0: 'person', 1: 'car', 2: 'box'}"})
+
+
+def test_what_was_detected_becomes_a_result_and_is_drawn() -> None:
+    found = [Detection((1.0, 2.0, 3.0, 4.0), 0.9, 1, "car"), Detection((5.0, 6.0, 7.0, 8.0), 0.8, 0, "person")]
+
+    class Detector:
+        def detect(self, image: object) -> list[Detection]:
+            return found * 40
+
+    every = DetectionProcessor(Detector()).process(np.zeros((9, 9, 3), np.uint8))  # type: ignore[arg-type]
+    assert len(every.value["detections"]) == 64
+    assert len(every.shapes) == 128
+    cars = DetectionProcessor(Detector(), ["car"]).process(np.zeros((9, 9, 3), np.uint8))  # type: ignore[arg-type]
+    assert cars.value["detections"][0] == {
+        "box": [1.0, 2.0, 3.0, 4.0],
+        "score": 0.9,
+        "class_id": 1,
+        "class_name": "car",
+    }
+    assert {each["class_name"] for each in cars.value["detections"]} == {"car"}
+    outline, text = cars.shapes[:2]
+    assert outline == Polyline(((1.0, 2.0), (4.0, 2.0), (4.0, 6.0), (1.0, 6.0)), closed=True)
+    assert text == Text("car 0.90", (1.0, 2.0))
+
+
+def test_what_cannot_be_is_told(run: Run, file: Path) -> None:
+    for arguments, words in [
+        (("nowhere.onnx", "--on", "alpha"), "there is no file nowhere.onnx"),
+        ((str(file), "--on", "alpha", "--classes", "cra"), "did you mean 'car'"),
+        ((str(file), "--on", "alpha", "--layout", "x"), "must be one of"),
+    ]:
+        ended = run("detect", *arguments)
+        assert ended.code == 2
+        assert words in ended.err
+        assert "Traceback" not in ended.err
+
+
+@pytest.mark.daily
+def test_detections_are_drawn_with_the_time_of_their_frame(sockets: Path, file: Path) -> None:
+    proxy = Process("-m", "skyloop", "proxy", "sim://?world=empty&cameras=front&fps=20", "--name", "delta")
+    worker = None
+    try:
+        proxy.until("ready")
+        worker = Process("-m", "skyloop", "detect", str(file), "--on", "delta", "--classes", "car")
+        with skyloop.connect("delta", access="observe") as drone:
+            drawn: list[Annotation] = []
+            drone.on_annotation(drawn.append)
+            result = next(iter(drone.results("detections")))
+            assert [each["class_name"] for each in result.value["detections"]] == ["car"]
+            drone.wait(lambda _: any(one.captured_ns >= result.captured_ns for one in drawn))
+            assert {one.source for one in drawn} == {"detections"}
+    finally:
+        for process in (worker, proxy):
+            if process is not None:
+                process.end()
