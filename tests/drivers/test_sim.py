@@ -27,6 +27,7 @@ from skyloop.messages import (
     Value,
     Velocity,
 )
+from skyloop.sim import load_world
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 
@@ -161,6 +162,8 @@ def test_the_truth_comes_with_the_feedback() -> None:
     assert newest.position_m[0] == number(newest, "truth.x")
     assert 1.5 < math.hypot(number(newest, "truth.target.x"), number(newest, "truth.target.y")) < 2.6
     assert abs(number(newest, "truth.target.yaw")) <= math.pi
+    (board,) = load_world("room").targets
+    assert number(newest, f"truth.{board.name}.x") == number(newest, "truth.target.x")
 
 
 def test_without_truth_feedback_holds_what_a_drone_knows() -> None:

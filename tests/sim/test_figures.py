@@ -18,6 +18,7 @@ from skyloop.sim.camera import CameraModel, CameraPose
 from skyloop.sim.labels import pictures, target_boxes
 from skyloop.sim.render import PlanarRenderer, Scene, SceneState
 from skyloop.sim.render.brightness import dimmed
+from skyloop.sim.render.compiled import Compiler, load_kernels
 from skyloop.sim.world import FigureTarget, Light, StillPath, World
 
 from .helpers import IDEAL, steps
@@ -130,6 +131,21 @@ def test_light_dims_the_whole_picture_and_full_light_changes_no_bit() -> None:
     full, dim = (renderer.render(state(world, light=n), camera(-2, 0, 1.0), MODEL) for n in (1.0, 0.5))
     assert (dim == np.rint(full * 0.5)).all()
     assert (dimmed(full.copy(), 1.0) == full).all()
+
+
+def test_people_and_changing_light_are_the_same_compiled_bit_by_bit() -> None:
+    pytest.importorskip("numba")
+    compiler = Compiler(load_kernels)
+    compiler.start().join()
+    world = load_world("yard")
+    scene = Scene(world, 0)
+    plain = PlanarRenderer(scene, compiler=None)
+    compiled = PlanarRenderer(scene, compiler=compiler)
+    for time_s in (0.0, 7.0):
+        now = state(world, time_s, world.light.at(time_s, world.seed))
+        assert now.light < 1.0
+        pose = camera(-7, 0, 1.5, 10 * time_s)
+        assert (plain.render(now, pose, MODEL) == compiled.render(now, pose, MODEL)).all()
 
 
 def test_boxes_say_where_a_person_is_and_how_much_a_crate_hides() -> None:
