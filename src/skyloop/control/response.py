@@ -46,7 +46,7 @@ class ResponseSettings:
     gain_per_s: float = 2.0  #: acceleration that is asked for by each m/s of the velocity's error
     lag_s: float = 0.1  #: of the lean behind what is asked for; Engel, Sturm and Cremers, IROS 2012: 10 1/s
     delay_s: float = 0.05  #: from a set-point's sending until the loop uses it
-    tilt_rad: float = 0.35  #: the greatest lean that the loop asks for
+    tilt_rad: float = 0.5  #: the greatest lean that the loop asks for; see also ``LandingSettings.within``
     push_m_s3: float = 1.5  #: by how much the air's push wanders within a second [m/s² in √s]
     velocity_noise_m_s: float = 0.05  #: of the velocity in feedback
     trim_s: float = 0.3  #: how fast the trim is learnt
