@@ -50,6 +50,8 @@ def _command(command: Any, name: str, parent: Any, underline: str) -> Iterator[s
                 yield from (f".. option:: {words}", "", f"   {_prose(meaning)}", "")
     for sub, inner in getattr(command, "commands", {}).items():
         yield from _command(inner, sub, context, "^")
+    for word, other in getattr(command, "behaviours", {}).items():
+        yield from _command(other, f"{name} {word}", parent, "^")
 
 
 def _context(command: Any, name: str, parent: Any) -> Any:

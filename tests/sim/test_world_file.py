@@ -19,7 +19,7 @@ BOARD = "[[target]]\nname = 'b'\nid = 1\nmarker_size = 0.2\n"
 
 
 @pytest.mark.parametrize(
-    "name", ["empty", "gates", "pillars", "platform", "platform_fast", "room", "street", "windy", "yard"]
+    "name", ["empty", "gates", "park", "pillars", "platform", "platform_fast", "room", "street", "windy", "yard"]
 )
 def test_shipped_worlds_load_and_can_be_flown_in(name: str) -> None:
     assert name in shipped_worlds()

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from importlib import import_module
 from typing import Annotated, Any, Final
 
 import typer
+import typer.main
 
 from skyloop.cli import wording
-from skyloop.cli.commands import COMMANDS
+from skyloop.cli.commands import COMMANDS, Entry
 from skyloop.cli.naming import with_place
-from skyloop.cli.plain_help import Command, Group, width
+from skyloop.cli.plain_help import Command, Group, WithBehaviours, width
 from skyloop.errors import ParameterError, SkyloopError
 
 _log = logging.getLogger(__name__)
@@ -55,8 +56,22 @@ def build(names: Iterable[str] = COMMANDS) -> typer.Typer:
                 info.cls = Command
             app.add_typer(function, name=name, cls=Group, **shown)
             continue
-        app.command(name, cls=Command, context_settings=dict(entry.settings), **shown)(function)
+        kind = _with_behaviours(entry.behaviours) if entry.behaviours else Command
+        app.command(name, cls=kind, context_settings=dict(entry.settings), **shown)(function)
     return app
+
+
+def _with_behaviours(entries: Mapping[str, Entry]) -> type[Command]:
+    """Return the class of a command that these take the place of, where they are its first word."""
+    return type("Behaviours", (WithBehaviours,), {"behaviours": {n: _alone(n, each) for n, each in entries.items()}})
+
+
+def _alone(name: str, entry: Entry) -> Any:
+    """Return one command, of a command line of its own."""
+    own = typer.Typer(add_completion=False, rich_markup_mode=None)
+    function = getattr(import_module(f"skyloop.cli.{entry.module}"), entry.function)
+    own.command(name, cls=Command, short_help=entry.summary, epilog=f"Example: skyloop {entry.example}")(function)
+    return typer.main.get_command(own)
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -27,6 +27,7 @@ class Entry(NamedTuple):
     summary: str  # up to 60 characters, so that the list fits into 80 columns
     example: str
     settings: Mapping[str, Any] = {}
+    behaviours: Mapping[str, Entry] = {}  # commands that take its place where they are its first word
 
 
 COMMANDS: Final = {
@@ -42,8 +43,17 @@ COMMANDS: Final = {
         Task.FLY,
         "fly",
         "fly",
-        "Fly a controller from a Python file",
+        "Fly a controller from a Python file, or follow a target",
         "fly my_controller.py --drone alpha --seconds 30",
+        behaviours={
+            "follow": Entry(
+                Task.FLY,
+                "fly_follow",
+                "fly_follow",
+                "Follow what is in a box, or of a class",
+                "fly follow --class person --seconds 60",
+            )
+        },
     ),
     "route": Entry(
         Task.FLY, "route", "route", "Check and fly routes of waypoints", "route fly tour.route.json --drone alpha"

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
+from skyloop.cli.demo_follow import FOLLOW_EXAMPLE, follow_anything
 from skyloop.cli.demo_paper import PAPER_EXAMPLE, paper
 from skyloop.cli.demo_parts import interrupted_by_signals, land, show_page
 from skyloop.cli.demo_report import DemoReport, TruthMeter
@@ -32,6 +33,7 @@ _REFRESH_HZ = 4
 
 demo = typer.Typer(invoke_without_command=True, rich_markup_mode=None)
 demo.command("paper", short_help="The paper's test flight and its figures", epilog=PAPER_EXAMPLE)(paper)
+demo.command("follow-anything", short_help="Follow a person who walks about", epilog=FOLLOW_EXAMPLE)(follow_anything)
 
 
 @demo.callback()
@@ -56,7 +58,7 @@ def follow(
 ) -> None:
     """Take off in a simulated room, find the marker, follow it at 1.5 m by the camera. Ctrl-C lands.
 
-    skyloop demo paper flies another one: the paper's experiment, with its table and figures.
+    skyloop demo follow-anything follows a person without any marker; skyloop demo paper flies the paper's experiment.
     """
     if context.invoked_subcommand is not None:
         for given in context.params:

@@ -134,7 +134,7 @@ class DemoReport:
             ("first frame after", "–" if self.first_picture_s is None else f"{self.first_picture_s:.1f} s"),
         ]
         for name, channel in self.channels.items():
-            rows += _channel_rows(name, channel)
+            rows += channel_rows(name, channel)
         if self.page is not None:
             sent, skipped = self.page["frames_sent"], self.page["frames_skipped"]
             rows.append(("page", f"{sent} frames sent, {skipped} left out for slower browsers"))
@@ -147,7 +147,8 @@ def _spread_text(spread: Spread | None) -> str:
     return "not known" if spread is None else f"{spread} (after the first {SETTLING_S:g} s)"
 
 
-def _channel_rows(name: str, channel: ChannelStats) -> list[tuple[str, str]]:
+def channel_rows(name: str, channel: ChannelStats) -> list[tuple[str, str]]:
+    """Return the row of a channel; none for one that nothing came by."""
     if not channel.count:
         return []
     text = f"{channel.count} {'sent' if name == 'command' else 'received'}, {channel.lost} lost"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
+from collections.abc import Callable
 from types import TracebackType
 from typing import TYPE_CHECKING, Final, Self
 
@@ -25,10 +26,21 @@ class FlightProgress:
     Args:
         drone: Who flies.
         live: Whether to keep one line up to date; None: if standard error is a terminal.
+        what: Returns what comes first in the line: how that which flies goes.
+        every_s: How often to print a line where standard error is no terminal.
     """
 
-    def __init__(self, drone: Drone, *, live: bool | None = None) -> None:
+    def __init__(
+        self,
+        drone: Drone,
+        *,
+        live: bool | None = None,
+        what: Callable[[], str] | None = None,
+        every_s: float = LINE_EVERY_S,
+    ) -> None:
         self._drone = drone
+        self._what = what
+        self._every_s = every_s
         self._begun_s = time.monotonic()
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._lines, name="skyloop-progress", daemon=True)
@@ -48,9 +60,11 @@ class FlightProgress:
 
     def line(self) -> str:
         """Return the progress now, what matters most first: a narrow terminal cuts the end."""
-        return flight_line(self._drone, time.monotonic() - self._begun_s)
+        line = flight_line(self._drone, time.monotonic() - self._begun_s)
+        return line if self._what is None else f"{self._what()}  {line}"
 
     def __enter__(self) -> Self:
+        self._begun_s = time.monotonic()
         if self._live is not None:
             self._live.start()
         else:
@@ -67,7 +81,7 @@ class FlightProgress:
             self._thread.join()
 
     def _lines(self) -> None:
-        while not self._ended.wait(LINE_EVERY_S):
+        while not self._ended.wait(self._every_s):
             print(self.line(), file=sys.stderr, flush=True)
 
 

@@ -58,6 +58,8 @@ def fly(
 ) -> None:
     """Take off, run a controller, land. Without NAME a simulated drone flies.
 
+    With the word follow for FILE it follows a person, a car or what is in a box: skyloop fly follow --help.
+
     One line on standard error shows how it goes, in a pipe one every 5 seconds.
 
     Ctrl-C lands too, and so does an error in the controller without --reload.
@@ -73,13 +75,12 @@ def fly(
         sys.dont_write_bytecode = True
     controller_class = load_controller(file, class_name)
     reloader = Reloader(file, class_name) if reload else None
-    for number in (signal.SIGINT, signal.SIGTERM):  # the first is ignored where a shell runs this in the background
-        signal.signal(number, _interrupt)
+    interrupt_by_signals()
     authority = Authority(priority=priority, wait_s=wait)
     with connect_pilot(target, ADVICE, name=file.name[:64], authority=authority) as flown:
         controller = make(controller_class, flown)
-        worked = _run(Flight(flown, controller, _print), flown, seconds, reloader, takeoff=takeoff)
-        _land(flown)
+        worked = run(Flight(flown, controller, say), flown, seconds, reloader, takeoff=takeoff)
+        land(flown)
     if not worked:
         raise typer.Exit(1)
 
@@ -103,41 +104,69 @@ def make(controller_class: type[Controller], drone: Drone) -> Controller:
     return controller
 
 
-def _run(flight: Flight, drone: Drone, seconds: float | None, reloader: Reloader | None, *, takeoff: bool) -> bool:
-    """Whether it ended as it should. Errors of the take-off come out; those of the controller are shown."""
+def run(
+    flight: Flight,
+    drone: Drone,
+    seconds: float | None,
+    reloader: Reloader | None = None,
+    *,
+    takeoff: bool,
+    progress: FlightProgress | None = None,
+) -> bool:
+    """Take off if that is wanted, and fly.
+
+    Args:
+        flight: What flies.
+        drone: Connected as a pilot.
+        seconds: For how long; None until it ends by itself, or Ctrl-C.
+        reloader: Of its file; None: it is not loaded again.
+        takeoff: Whether to take off what is on the ground.
+        progress: Shows how it goes; None: as of any flight.
+
+    Returns:
+        Whether it ended as it should. Errors of the take-off come out; those of the controller are shown.
+    """
+    progress = progress or FlightProgress(drone)
     try:
         if takeoff and drone.capabilities.actions and not drone.feedback().state.airborne:
-            _print(f"taking off with {drone.name}")
+            say(f"taking off with {drone.name}")
             drone.takeoff()
         if reloader is None:
-            with FlightProgress(drone):
+            with progress:
                 return flight.run(seconds)
-        with reloader, FlightProgress(drone):
+        with reloader, progress:
             return flight.run_reloading(seconds, reloader, lambda found: make(found, drone))
     except KeyboardInterrupt:
-        _print("stopped by Ctrl-C")
+        say("stopped by Ctrl-C")
     return True
 
 
-def _land(drone: Drone) -> None:
+def land(drone: Drone) -> None:
     """Land what is in the air and in our hands. Who interrupts that too leaves it to the proxy's failsafe."""
     if not drone.feedback().state.airborne:
         return
     if drone.authority.state in ("queued", "preempted"):
-        _print(f"{drone.authority.holder or 'another application'} took over: the drone is left to it")
+        say(f"{drone.authority.holder or 'another application'} took over: the drone is left to it")
         return
-    _print("landing")
+    say("landing")
     try:
         drone.land()
     except KeyboardInterrupt:
-        _print("left in the air: its proxy lets it hover, then lands it")
+        say("left in the air: its proxy lets it hover, then lands it")
         drone.close()
         raise
+
+
+def interrupt_by_signals() -> None:
+    """Raise KeyboardInterrupt on SIGINT, which a shell ignores for what it runs in the background, and on SIGTERM."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, _interrupt)
 
 
 def _interrupt(number: int, frame: FrameType | None) -> NoReturn:  # noqa: ARG001  as signal handlers are called
     raise KeyboardInterrupt
 
 
-def _print(text: str) -> None:
+def say(text: str) -> None:
+    """Print a line on standard error."""
     typer.echo(text, err=True)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 import shutil
-from typing import Any, Final
+from collections.abc import Mapping
+from typing import Any, ClassVar, Final
 
 from typer.core import TyperCommand, TyperGroup
 
@@ -44,6 +45,23 @@ class Command(TyperCommand):
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the arguments and options."""
         write_options(self, ctx, formatter)
+
+
+class WithBehaviours(Command):
+    """A command whose first word may be the name of another one, with options of its own: ``skyloop fly follow``.
+
+    Attributes:
+        behaviours: These commands by name.
+    """
+
+    behaviours: ClassVar[Mapping[str, Any]] = {}
+
+    def make_context(self, info_name: str | None, args: list[str], parent: Any = None, **extra: Any) -> Any:
+        """Parse the words of whichever command they are for."""
+        other = self.behaviours.get(args[0]) if args else None
+        if other is None:
+            return super().make_context(info_name, args, parent, **extra)
+        return other.make_context(f"{info_name} {args[0]}", args[1:], parent, **extra)
 
 
 class Group(TyperGroup):

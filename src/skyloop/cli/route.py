@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 from contextlib import ExitStack
 from pathlib import Path
@@ -61,14 +60,14 @@ def fly(
     land: Annotated[bool, typer.Option(help="Land at the end, or hover until this program has ended")] = True,
 ) -> None:
     """Check a route, take off, fly it, land. Ctrl-C lands. In a terminal P pauses, R resumes, S skips."""
-    from skyloop.cli.fly import ADVICE, _interrupt, _land
+    from skyloop.cli.fly import ADVICE, interrupt_by_signals
+    from skyloop.cli.fly import land as put_down
     from skyloop.cli.piloting import connect_pilot
     from skyloop.client import Authority
     from skyloop.control import FlyRoute, load_route
 
     plan = load_route(file)
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, _interrupt)
+    interrupt_by_signals()
     authority = Authority(priority=priority, wait_s=wait)
     with connect_pilot(drone, ADVICE, name=file.name[:64], authority=authority) as flown:
         flight = FlyRoute(flown, plan, folder=photos, on_progress=lambda step: _show(plan, step))
@@ -85,7 +84,7 @@ def fly(
             _print("stopped by Ctrl-C")
             land = True
         if land:
-            _land(flown)
+            put_down(flown)
     for path in flight.photos:
         _print(f"photo {path}")
     if flight.law.state != "done":
