@@ -42,6 +42,7 @@ SOUTH_WALL = View("room", eye=(3.6, 4.6, 4.2), at=(0.1, -1.3, 1.0), focal_px=430
 FOUR_WALLS = View("room", eye=(-5.2, -6.4, 6.4), at=(1.1, -0.4, 0.9), focal_px=345.0)
 COURSE = View("gates", eye=(-8.8, -10.6, 8.4), at=(1.55, -1.4, 1.15), focal_px=330.0)
 PLATFORM = View("platform", eye=(-4.9, -6.4, 4.9), at=(0.1, 0.4, 1.0), focal_px=400.0)
+PARK = View("park", eye=(2.5, -12.6, 8.8), at=(2.5, -0.4, 0.5), focal_px=285.0)
 PILLARS = View("pillars", eye=(4.0, -9.5, 7.0), at=(-0.9, 0.0, 0.9), focal_px=300.0)
 FRONT = ("--option", "cameras=front", "--option", "fps=15")
 BELOW = ("--option", "cameras=bottom", "--option", "fps=15")
@@ -170,6 +171,12 @@ def see_and_avoid(folder: Path) -> None:
     keep("see_and_avoid", film(folder / "flight.mcap", PILLARS, captions=True))
 
 
+def follow_anything(folder: Path) -> None:
+    with flight(folder, "alpha", "--world", "park", *FRONT):
+        run("follow_anything", "alpha")
+    keep("follow_anything", film(folder / "flight.mcap", PARK, captions=True))
+
+
 # Those that bring their own -------------------------------------------------------------------------------------------
 
 
@@ -252,6 +259,7 @@ MAKERS: dict[str, Callable[[Path], None]] = {
         land_on_platform,
         orbit_and_map,
         see_and_avoid,
+        follow_anything,
         learn_to_reach,
         first_flight_notebook,
     )

@@ -38,7 +38,9 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> 
     return begin
 
 
-@pytest.mark.parametrize("name", ["fly_gates", "land_on_platform", "orbit_and_map", "approach", "see_and_avoid"])
+@pytest.mark.parametrize(
+    "name", ["fly_gates", "land_on_platform", "orbit_and_map", "approach", "see_and_avoid", "follow_anything"]
+)
 def test_an_example_is_short_and_says_how_to_run_it(name: str) -> None:
     text = (FOLDER / f"{name}.py").read_text()
     assert len(text.splitlines()) < 60
@@ -81,3 +83,13 @@ def test_see_and_avoid(run: Run) -> None:
     printed = run("see_and_avoid")
     assert "and arrived" in printed
     assert "hit" not in printed
+
+
+@pytest.mark.slow
+def test_follow_anything(run: Run) -> None:
+    printed = run("follow_anything")
+    away = {mode: float(m) for mode, m in re.findall(r"(\w+): in view, ([\d.]+) m away", printed)}
+    assert set(away) == {"follow", "orbit", "look"}
+    assert away["follow"] == pytest.approx(4.0, abs=0.7)
+    assert away["orbit"] == pytest.approx(4.0, abs=0.7)
+    assert "lost" not in printed
