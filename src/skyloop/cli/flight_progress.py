@@ -27,7 +27,7 @@ class FlightProgress:
         drone: Who flies.
         live: Whether to keep one line up to date; None: if standard error is a terminal.
         what: Returns what comes first in the line: how that which flies goes.
-        every_s: How often to print a line where standard error is no terminal.
+        every_s: How often to print a line where standard error is no terminal; None: :data:`LINE_EVERY_S`.
     """
 
     def __init__(
@@ -36,11 +36,11 @@ class FlightProgress:
         *,
         live: bool | None = None,
         what: Callable[[], str] | None = None,
-        every_s: float = LINE_EVERY_S,
+        every_s: float | None = None,
     ) -> None:
         self._drone = drone
         self._what = what
-        self._every_s = every_s
+        self._every_s = LINE_EVERY_S if every_s is None else every_s
         self._begun_s = time.monotonic()
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._lines, name="skyloop-progress", daemon=True)

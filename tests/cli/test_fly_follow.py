@@ -1,0 +1,104 @@
+"""``skyloop fly follow``: what it says before it flies, and a flight."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.main import get_command
+
+import skyloop
+from skyloop.cli.app import build
+from skyloop.cli.fly_follow import SIDES
+from tests.cli.conftest import Run
+from tests.processes.conftest import Process
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ((), "give --class CLASS, such as person, or --box X,Y,W,H"),
+        (("--box", "1,2,3"), "must be X,Y,W,H"),
+        (("--box", "1,2,x,4"), "must be X,Y,W,H"),
+        (("--box", "1,2,nan,4"), "must be of finite numbers"),
+        (("--class", "person", "--mode", "folow"), "no mode named 'folow'; did you mean 'follow'?"),
+        (("--class", "person", "--side", "behnd"), "no side named 'behnd'; did you mean 'behind'?"),
+        (("--class", "person", "--distance", "1"), "must be above nearest_m, which is 2"),
+        (("--class", "person", "--distance", "nan"), "must be a finite number"),
+        (("--class", "person", "--detector", "none.onnx"), "there is no file none.onnx"),
+    ],
+)
+def test_what_is_wrong_is_told_before_anything_is_connected(run: Run, words: tuple[str, ...], said: str) -> None:
+    ended = run("fly", "follow", "--drone", "nobody", *words)
+    assert ended.code == 2
+    assert said in ended.err
+    assert len(ended.err.splitlines()) == 1
+
+
+def test_a_wrong_class_of_a_file_is_told_with_what_it_may_have_been(run: Run) -> None:
+    pytest.importorskip("onnxruntime")
+    from skyloop.vision.simulated import SIMULATED_WEIGHTS
+
+    ended = run("fly", "follow", "nobody", "--class", "persn", "--detector", str(SIMULATED_WEIGHTS))
+    assert ended.code == 2
+    assert "named 'persn'; did you mean 'person'?" in ended.err
+
+
+def test_a_file_of_that_name_is_told(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "follow").write_text("x = 1")
+    assert "not the file of that name" in run("fly", "follow").err
+    (tmp_path / "follow.py").write_text("x = 1")
+    assert "follow.py has no controller" in run("fly", "follow.py").err
+
+
+def test_the_word_decides_whose_options_they_are(run: Run) -> None:
+    fly: Any = get_command(build(["fly"])).commands["fly"]  # type: ignore[attr-defined]
+    assert fly.make_context("fly", ["follow", "--side", "left"]).params["side"] == "left"
+    assert fly.make_context("fly", ["--drone", "follow", "mine.py"]).params["file"] == Path("mine.py")
+    assert "skyloop fly follow [OPTIONS] [NAME]" in run("fly", "follow", "--help").out
+    assert "skyloop fly follow --help" in " ".join(run("fly", "--help").out.split())
+
+
+def test_sides_are_bearings_as_the_law_has_them() -> None:
+    assert {"ahead": 0.0, "behind": math.pi, "left": math.pi / 2, "right": -math.pi / 2} == SIDES
+
+
+@pytest.fixture(scope="module")
+def delta(sockets: Path) -> Iterator[Process]:
+    """A proxy of a simulated drone in the park."""
+    process = Process("-m", "skyloop", "proxy", "sim://?world=park&cameras=front&fps=15&wind=0", "--name", "delta")
+    try:
+        process.until("ready")
+        yield process
+    finally:
+        process.end()
+
+
+@pytest.mark.process
+def test_it_follows_a_person_and_lands(run: Run, delta: Process) -> None:
+    for words, said in (
+        (("--box", "900,10,50,50"), "at least half of it must be in the image"),
+        (("--class", "persn"), "no class in Skyloop's detector named 'persn'; did you mean 'person'?"),
+    ):
+        assert said in run("fly", "follow", "delta", *words).err
+    ended = run("fly", "follow", "delta", "--class", "person", "--seconds", "5")
+    assert ended.code == 0, ended.err
+    lines = ended.err.splitlines()
+    assert lines[0] == "taking off with delta"
+    assert lines[-1] == "landing"
+    assert any("following" in line and "m away" in line and "confidence" in line for line in lines)
+    with skyloop.connect("delta", access="observe") as drone:
+        assert drone.feedback().state is skyloop.FlightState.LANDED
+
+
+@pytest.mark.process
+def test_a_class_on_a_vehicle_that_is_not_simulated_needs_a_detector(run: Run) -> None:
+    from tests.recordings import recorded
+
+    ended = run("fly", "follow", f"video://{recorded('ardrone2/video-8s.pave')}", "--class", "person")
+    assert ended.code == 2
+    assert "give --detector FILE.onnx, or the NAME of a running skyloop detect; or --box" in ended.err
