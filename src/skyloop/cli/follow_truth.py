@@ -27,7 +27,7 @@ SETTLING_S: Final = 5.0  #: from the first sighting; after it the distance count
 _SHOWN: Final = 0.3  # overlap of a box with the true one
 _CHEST_M: Final = 0.9  # height of a person's middle
 _EACH: Final = 3  # frame that is judged: drawing what is true of it takes a few milliseconds
-_FOUND_PX: Final = 24.0  # height of a person who can be pointed at
+_FOUND_PX: Final = (8.0, 24.0)  # least width and height of a person who can be pointed at
 
 
 class TargetTruth:
@@ -93,7 +93,10 @@ class FrameTruth:
         people = [
             one
             for one in self.boxes.values()
-            if one.class_name == "person" and not one.cut and one.visible > 0.9 and one.box[3] >= _FOUND_PX
+            if one.class_name == "person"
+            and not one.cut
+            and one.visible > 0.9
+            and min(one.box[2] / _FOUND_PX[0], one.box[3] / _FOUND_PX[1]) >= 1.0
         ]
         return max(people, key=lambda one: one.box[3], default=None)
 
