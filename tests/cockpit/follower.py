@@ -8,28 +8,13 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from skyloop.client import Frame
+from skyloop.control.chase_law import FollowMode
+from skyloop.control.target_follower import FollowStatus
 from skyloop.errors import UsageError
 from skyloop.messages import CameraInfo, Feedback, Polyline, Velocity
 from skyloop.messages.annotation import Shape
 from skyloop.vision import Detection
-
-Box = tuple[float, float, float, float]
-
-
-@dataclass(frozen=True)
-class Status:
-    """What it says of its target."""
-
-    phase: str = "following"
-    box: Box | None = None
-    confidence: float | None = 0.9
-    predicted_px: tuple[float, float] | None = (16.0, 12.0)
-    range_m: float | None = 4.0
-    range_deviation_m: float | None = 0.5
-    bearing_rad: float | None = 0.1
-    speed_m_s: float | None = None
-    lost_s: float = 0.0
-    problem: str = ""
+from skyloop.vision.tracking import Box, outline
 
 
 @dataclass
@@ -51,7 +36,17 @@ class StandIn:
     threads: set[str] = field(default_factory=set)
 
     def __post_init__(self) -> None:
-        self.status = Status(box=self.box)
+        self.status = FollowStatus(
+            phase="following",
+            mode=FollowMode.FOLLOW,
+            box=self.box,
+            confidence=0.9,
+            class_name=self.class_name,
+            predicted_px=(16.0, 12.0),
+            range_m=4.0,
+            range_deviation_m=0.5,
+            bearing_rad=0.1,
+        )
 
     def feedback(self, feedback: Feedback) -> None:
         self.threads.add(threading.current_thread().name)
@@ -64,9 +59,7 @@ class StandIn:
         if self.fails is not None:
             raise self.fails
         self.frames.append(frame.captured_ns)
-        x, y, width, height = self.box
-        corners = ((x, y), (x + width, y), (x + width, y + height), (x, y + height))
-        return [Polyline(corners, closed=True)]
+        return [Polyline(outline(self.box), closed=True)]
 
     def step(self, now_ns: int) -> Velocity:
         assert self.frames, "it has begun"

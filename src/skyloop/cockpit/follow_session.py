@@ -16,14 +16,14 @@ from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
 from skyloop.cockpit.broadcast import call_soon
 from skyloop.cockpit.frame_keeper import FrameKeeper
 from skyloop.cockpit.place_flight import UP
-from skyloop.cockpit.target_tracker import Box, Follower, TargetTracker, TrackReport
+from skyloop.cockpit.target_tracker import Follower, TargetTracker, TrackReport
 from skyloop.cockpit.values import number, vector
 from skyloop.control.chase_law import ChaseSettings, FollowMode
 from skyloop.control.target_follower import TargetFollower
 from skyloop.errors import AuthorityError, LinkError, RefusedError, SkyloopError, UnknownNameError
 from skyloop.messages import CameraInfo, Hover
 from skyloop.vision.opencv import opencv
-from skyloop.vision.tracking import checked_box
+from skyloop.vision.tracking import Box, checked_box
 
 if TYPE_CHECKING:
     from skyloop.client import Drone

@@ -24,39 +24,13 @@ if TYPE_CHECKING:
     from skyloop.client import Drone, Frame
     from skyloop.client.frame import Arrival
     from skyloop.cockpit.frame_keeper import FrameKeeper
+    from skyloop.control.target_follower import FollowStatus
     from skyloop.messages import AnyAction, Feedback
     from skyloop.messages.annotation import Shape
     from skyloop.vision import Detection
 
 PERIOD_S: Final = 0.05  #: between two set-points without a new frame
 SOURCE: Final = "follow"  #: of what is drawn
-
-Box = tuple[float, float, float, float]
-
-
-class FollowStatus(Protocol):
-    """What a follower knows of its target; None is not known."""
-
-    @property
-    def phase(self) -> str: ...
-    @property
-    def box(self) -> Box | None: ...
-    @property
-    def confidence(self) -> float | None: ...
-    @property
-    def predicted_px(self) -> tuple[float, float] | None: ...
-    @property
-    def range_m(self) -> float | None: ...
-    @property
-    def range_deviation_m(self) -> float | None: ...
-    @property
-    def bearing_rad(self) -> float | None: ...
-    @property
-    def speed_m_s(self) -> float | None: ...
-    @property
-    def lost_s(self) -> float: ...
-    @property
-    def problem(self) -> str: ...
 
 
 class Follower(Protocol):

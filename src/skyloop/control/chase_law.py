@@ -13,6 +13,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from skyloop.clock import nanoseconds, seconds
 from skyloop.control.dead_reckoning import DRAG_PER_S
 from skyloop.control.filters import LowPass
 from skyloop.control.limiting import GRAVITY_M_S2, SetpointLimiter, SetpointLimits, clamped, shortened
-from skyloop.control.response import ResponseSettings, VelocityResponse
+from skyloop.control.response import Predicted, ResponseSettings, VelocityResponse
 from skyloop.control.target import Motion
 from skyloop.control.target_estimate import TargetEstimator, TargetState
 from skyloop.errors import UsageError
@@ -151,6 +152,17 @@ class ChaseSettings:
             raise UsageError(f"lowest_m is {self.lowest_m:g} and must be at most highest_m, {self.highest_m:g}")
 
 
+class _Now(NamedTuple):
+    """What a set-point is computed from."""
+
+    own: Motion
+    ahead: Motion  #: when the set-point takes hold
+    predicted: Predicted | None  #: None: by attitude, or before the first feedback
+    altitude_m: float | None
+    dt_s: float  #: since the last step
+    relative: bool  #: the set-point is an attitude
+
+
 class ChaseLaw:
     """Computes set-points from the vehicle's motion and the target's state.
 
@@ -215,38 +227,36 @@ class ChaseLaw:
         unseen_s = seconds(now_ns - (self._since_ns if seen_ns is None else seen_ns))
         self.phase = self._next_phase(unseen_s, never=target is None or seen_ns is None)
         self.held_by, self.off_m = "", None
-        ahead = self._ahead(motion, now_ns, relative=relative)
+        predicted = None if relative else self._response.predict(now_ns)
+        ahead = self._ahead(motion, now_ns, predicted)
+        now = _Now(own, ahead, predicted, altitude_m, dt_s, relative)
         self._limits(own)
+        still = np.zeros(2)
         if target is None or self.phase in (TargetPhase.LOOKING, TargetPhase.SEARCHING):
-            turning = s.search_rad_s * self._direction
-            return self._hold(turning, altitude_m, None, ahead, own, dt_s, relative=relative)
+            return self._steer(still, s.search_rad_s * self._direction, None, now)
         state = target.at(ahead.at_ns)
         if self.phase is TargetPhase.GIVEN_UP:
-            return self._hold(0.0, altitude_m, state, ahead, own, dt_s, relative=relative)
+            return self._steer(still, 0.0, state, now)
         turn = self._turn(ahead, state)
+        if self.phase is TargetPhase.HOVERING or self.mode is FollowMode.LOOK:
+            return self._steer(still, turn, state, now)
         # As fast as before for half of the time, then ever slower.
         fade = clamped(2.0 * (1.0 - (unseen_s - s.seen_s) / s.predict_s), 1.0)
-        if self.phase is TargetPhase.HOVERING or self.mode is FollowMode.LOOK:
-            return self._hold(turn, altitude_m, state, ahead, own, dt_s, relative=relative)
-        up = self._up(altitude_m, state)
         horizontal = self._horizontal(ahead, state) * max(0.0, fade)
         if self.phase is TargetPhase.PREDICTING:
             horizontal = _not_towards(horizontal, state.foot[:2] - ahead.position[:2])
         for other in others:
             horizontal = horizontal + self._clear_of(other, ahead, horizontal)
-        if relative:
-            return self._by_attitude(ahead, np.array(shortened(horizontal, s.speed_m_s)), up, turn)
-        return self._flown(shortened(horizontal, s.speed_m_s), up, turn, ahead, own, dt_s)
+        return self._steer(shortened(horizontal, s.speed_m_s), turn, state, now)
 
     def feedback(self, feedback: Feedback) -> None:
         """Update the model of the vehicle's response with its newest state; a vehicle without velocity has none."""
         self._response.add(feedback)
 
-    def _ahead(self, motion: Motion, now_ns: int, *, relative: bool) -> Motion:
+    def _ahead(self, motion: Motion, now_ns: int, predicted: Predicted | None) -> Motion:
         """Return the motion at which a set-point that is sent now finds the vehicle, with all that is under way."""
         delay_s = self.settings.lead_s
         ahead = motion.moved_to(now_ns + nanoseconds(delay_s))
-        predicted = None if relative else self._response.predict(now_ns)
         if predicted is None:
             return ahead
         way = (motion.velocity[:2] + predicted.velocity) / 2 * delay_s
@@ -257,14 +267,21 @@ class ChaseLaw:
             velocity=np.array([*predicted.velocity, ahead.velocity[2]]),
         )
 
-    def _flown(self, velocity: Array, up: float, turn: float, ahead: Motion, own: Motion, dt_s: float) -> Velocity:
-        """Return the set-point that brings the vehicle to a velocity (2,) in odometry axes, whatever pushes it."""
-        s, predicted = self.settings, self._response.predict(own.at_ns)
+    def _steer(self, velocity: Array, turn: float, state: TargetState | None, now: _Now) -> Velocity | Attitude:
+        """Return the set-point for a velocity (2,) in odometry axes and a yaw rate, at the height that is wanted."""
+        up = self._up(now.altitude_m, state)
+        if now.relative:
+            return self._by_attitude(now.ahead, velocity, up, turn)
+        return self._by_velocity(velocity, up, turn, now)
+
+    def _by_velocity(self, velocity: Array, up: float, turn: float, now: _Now) -> Velocity:
+        """Return the set-point that brings the vehicle to a velocity, whatever pushes it."""
+        s, own = self.settings, now.own
         assert self._limiter is not None
-        if predicted is not None:
-            acceleration = shortened(s.velocity_gain * (velocity - ahead.velocity[:2]), s.acceleration_m_s2)
-            velocity = self._response.setpoint(acceleration, predicted)
-        setpoint = self._limiter.step(np.array([*own.to_body(velocity), up, turn]), dt_s)
+        if now.predicted is not None:
+            acceleration = shortened(s.velocity_gain * (velocity - now.ahead.velocity[:2]), s.acceleration_m_s2)
+            velocity = self._response.setpoint(acceleration, now.predicted)
+        setpoint = self._limiter.step(np.array([*own.to_body(velocity), up, turn]), now.dt_s)
         c, si = math.cos(own.yaw), math.sin(own.yaw)
         sent = (c * setpoint.forward - si * setpoint.left, si * setpoint.forward + c * setpoint.left)
         self._response.sent(np.array(sent), own.at_ns)
@@ -419,22 +436,6 @@ class ChaseLaw:
         return Attitude(
             roll=-math.atan2(left, GRAVITY_M_S2), pitch=math.atan2(forward, GRAVITY_M_S2), climb=up, yaw_rate=turn
         )
-
-    def _hold(
-        self,
-        turn: float,
-        altitude_m: float | None,
-        state: TargetState | None,
-        ahead: Motion,
-        own: Motion,
-        dt_s: float,
-        *,
-        relative: bool,
-    ) -> Velocity | Attitude:
-        up = self._up(altitude_m, state)
-        if relative:
-            return self._by_attitude(ahead, np.zeros(2), up, turn)
-        return self._flown(np.zeros(2), up, turn, ahead, own, dt_s)
 
     def _limits(self, own: Motion) -> None:
         """Take over the limits; the first set-point, too, is limited: by the vehicle's own velocity."""

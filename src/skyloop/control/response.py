@@ -21,14 +21,13 @@ from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.filters import gain
-from skyloop.control.limiting import shortened
+from skyloop.control.limiting import GRAVITY_M_S2, shortened
 from skyloop.errors import UsageError
 from skyloop.messages import Feedback
 from skyloop.messages.geometry import rotation_from_euler
 
 Array = NDArray[np.float64]
 
-_GRAVITY_M_S2 = 9.80665
 _STEP_S = 0.01  # of the prediction
 _LONGEST_GAP_S = 0.25  # feedback that was missing for longer tells nothing of the time in between
 _LONGEST_PREDICTION_S = 0.5
@@ -63,7 +62,7 @@ class ResponseSettings:
     @property
     def most_m_s2(self) -> float:
         """The greatest horizontal acceleration by leaning."""
-        return _GRAVITY_M_S2 * math.tan(self.tilt_rad)
+        return GRAVITY_M_S2 * math.tan(self.tilt_rad)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,7 +106,7 @@ class VelocityResponse:
             return
         turn = rotation_from_euler(0.0, 0.0, feedback.yaw_rad)[:2, :2]
         velocity = turn @ np.asarray(feedback.velocity_m_s[:2])
-        lean = turn @ (np.tan([feedback.pitch_rad, -feedback.roll_rad]) * _GRAVITY_M_S2)
+        lean = turn @ (np.tan([feedback.pitch_rad, -feedback.roll_rad]) * GRAVITY_M_S2)
         before_ns, self._at_ns = self._at_ns, max(feedback.captured_ns, self._at_ns or 0)
         if before_ns is None or seconds(feedback.captured_ns - before_ns) > _LONGEST_GAP_S:
             self._velocity, self._lean = velocity, lean

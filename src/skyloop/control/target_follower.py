@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import msgspec
@@ -27,7 +27,7 @@ from skyloop.messages import Attitude, CameraInfo, Feedback, Points, Polyline, T
 from skyloop.messages.annotation import Colour, Shape
 from skyloop.poses import mounting_rotation
 from skyloop.vision.detection import Detection, ObjectDetector
-from skyloop.vision.tracking import Box
+from skyloop.vision.tracking import Box, outline
 
 if TYPE_CHECKING:
     from skyloop.client import Frame
@@ -51,14 +51,14 @@ class FollowStatus:
     mode: FollowMode
     box: Box | None  #: of the target in the newest frame [px]; None: not seen in it
     confidence: float | None  #: 0 to 1; see :attr:`skyloop.control.target_finder.Sighting.confidence`
-    predicted_px: tuple[float, float] | None  #: where its middle should be in the newest frame
-    range_m: float | None  #: horizontal distance from the camera
-    range_deviation_m: float | None
-    bearing_rad: float | None  #: counter-clockwise from straight ahead
-    speed_m_s: float | None  #: of the target; None where the vehicle does not know its own
     class_name: str | None
-    lost_s: float  #: since it was last seen; 0 while it is seen, or was not seen yet
-    problem: str  #: what keeps it from being followed as wanted; empty for nothing
+    predicted_px: tuple[float, float] | None = None  #: where its middle should be in the newest frame
+    range_m: float | None = None  #: horizontal distance from the camera
+    range_deviation_m: float | None = None
+    bearing_rad: float | None = None  #: counter-clockwise from straight ahead
+    speed_m_s: float | None = None  #: of the target; None where the vehicle does not know its own
+    lost_s: float = 0.0  #: since it was last seen; 0 while it is seen, or was not seen yet
+    problem: str = ""  #: what keeps it from being followed as wanted; empty for nothing
 
 
 class TargetFollower:
@@ -241,30 +241,21 @@ class TargetFollower:
         estimator, at_ns = self._estimator, self._frame_ns
         box, confidence = self._sighting.box, self._sighting.confidence
         class_name = self._class_name if self._finder is None else self._finder.class_name
-        none = None
+        known = FollowStatus(self.phase.value, self.mode, box, confidence, class_name)
         if estimator is None or at_ns is None or self._view is None:
-            return FollowStatus(
-                self.phase.value, self.mode, box, confidence, none, none, none, none, none, class_name, 0.0, ""
-            )
+            return known
         state = estimator.at(at_ns)
         away = state.foot[:2] - self._view.position[:2]
         ahead = self._view.rotation[:, 2]
-        bearing = float(np.arctan2(ahead[0] * away[1] - ahead[1] * away[0], ahead[:2] @ away))
-        speed = None if self._relative else float(np.hypot(*state.velocity))
-        lost_s = 0.0 if box is not None or self._seen_ns is None else seconds(at_ns - self._seen_ns)
-        return FollowStatus(
-            self.phase.value,
-            self.mode,
-            box,
-            confidence,
-            self._view.pixel(state.middle),
-            float(np.hypot(*away)),
-            state.range_deviation_m,
-            bearing,
-            speed,
-            class_name,
-            lost_s,
-            self._problem(),
+        return replace(
+            known,
+            predicted_px=self._view.pixel(state.middle),
+            range_m=float(np.hypot(*away)),
+            range_deviation_m=state.range_deviation_m,
+            bearing_rad=float(np.arctan2(ahead[0] * away[1] - ahead[1] * away[0], ahead[:2] @ away)),
+            speed_m_s=None if self._relative else float(np.hypot(*state.velocity)),
+            lost_s=0.0 if box is not None or self._seen_ns is None else seconds(at_ns - self._seen_ns),
+            problem=self._problem(),
         )
 
     def _problem(self) -> str:
@@ -289,15 +280,11 @@ class TargetFollower:
         if len(trace) > 1 and not self._relative:
             shapes.append(Polyline(tuple(trace), False, colour))
         if box is not None:
-            x, y, width, height = box
-            corners = ((x, y), (x + width, y), (x + width, y + height), (x, y + height))
-            shapes.append(Polyline(corners, True, colour))
+            shapes.append(Polyline(outline(box), True, colour))
         elif self.phase in LOSSES:
             expected = predicted_box(view, state.foot, state.height_m)
             if expected is not None:
-                x, y, width, height = expected
-                corners = ((x, y), (x + width, y), (x + width, y + height), (x, y + height))
-                shapes.append(Polyline(corners, True, _LOST))
+                shapes.append(Polyline(outline(expected), True, _LOST))
         middle = view.pixel(state.middle)
         if middle is not None:
             shapes.append(Points((middle,), colour))

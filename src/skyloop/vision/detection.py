@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from skyloop.vision.tracking import Box, Image
+from skyloop.vision.tracking import Box, Image, outline
 
 Floats = NDArray[np.float64]
 
@@ -31,8 +31,7 @@ class Detection:
     @property
     def outline(self) -> tuple[tuple[float, float], ...]:
         """The four corners of the box [px], for annotations."""
-        x, y, width, height = self.box
-        return (x, y), (x + width, y), (x + width, y + height), (x, y + height)
+        return outline(self.box)
 
 
 @runtime_checkable

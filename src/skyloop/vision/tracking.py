@@ -49,10 +49,7 @@ class TrackResult:
     @property
     def outline(self) -> tuple[tuple[float, float], ...]:
         """The corners of the box, for annotations; none while the target is lost."""
-        if self.box is None:
-            return ()
-        x, y, width, height = self.box
-        return (x, y), (x + width, y), (x + width, y + height), (x, y + height)
+        return () if self.box is None else outline(self.box)
 
 
 class Tracker(ABC):
@@ -138,6 +135,12 @@ def checked_box(box: Sequence[float], shape: Sequence[int]) -> Box:
     if overlap_area((x, y, width, height), (0.0, 0.0, columns, rows)) < _IN_VIEW * width * height:
         raise UsageError(f"the box is {given} and at least half of it must be in the image of {columns}×{rows} pixels")
     return x, y, width, height
+
+
+def outline(box: Box) -> tuple[tuple[float, float], ...]:
+    """Return the four corners of a box [px], for annotations."""
+    x, y, width, height = box
+    return (x, y), (x + width, y), (x + width, y + height), (x, y + height)
 
 
 def overlap_area(one: Box, other: Box) -> float:
