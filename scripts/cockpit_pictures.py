@@ -10,7 +10,7 @@
 ``cockpit-flight-portrait.png``,         the flight mode of a telephone, upright and on its side
 ``cockpit-flight-landscape.png``
 ``cockpit-asked-dark.png``, ``…-phone``  a program asks for the drone that the page flies
-``cockpit-target-dark.png``,             a person on a lawn who was detected, pressed and is followed; on a telephone
+``cockpit-target-dark.png``,             a person in a park who was detected, pressed and is followed; on a telephone
 ``cockpit-target-phone.png``             pressed with a finger, before anything flies
 =======================================  ===========================================================================
 
@@ -62,44 +62,6 @@ INKS = """() => {
   return [...own, ...onPictures].map((ink) => ink.slice(1));
 }"""
 Fly = Callable[[threading.Event], None]
-#: Two people on a lawn before a house: one goes to and fro before the start, the other before the house.
-LAWN = """
-[room]
-size = [50, 40, 12]
-floor = "grass"
-enclosed = false
-[[spawn]]
-position = [-12, 0, 0]
-[[panel]]
-name = "path"
-on = "floor"
-at = [4, 6]
-size = [30, 2.4]
-texture = "concrete"
-[[box]]
-name = "house"
-stands_at = [18, 6]
-size = [3, 16, 6]
-texture = "brick"
-[[box]]
-name = "crate"
-stands_at = [0, -5]
-size = [0.9, 0.9, 0.9]
-texture = "crate"
-[[target]]
-name = "walker"
-kind = "figure"
-shape = "person"
-look = 3
-colour = "#c8282c"
-path = { kind = "waypoints", points = [[-5.5, -3, 0], [-5.5, 3, 0], [-5, 3, 0], [-5, -3, 0]], speed = 0.6 }
-[[target]]
-name = "passer"
-kind = "figure"
-shape = "person"
-look = 9
-path = { kind = "waypoints", points = [[12, -9, 0], [12, 12, 0], [12.5, 12, 0], [12.5, -9, 0]], speed = 1.0 }
-"""
 
 
 def main() -> None:
@@ -216,11 +178,8 @@ def phone() -> None:
 
 
 def target() -> None:
-    """A person on a lawn is marked on the picture, and followed."""
-    folder = tempfile.TemporaryDirectory()
-    world = Path(folder.name) / "lawn.toml"
-    world.write_text(LAWN)
-    command = ["sim", "--name", "alpha", "--world", str(world), "--seed", "4"]
+    """A person in a park is marked on the picture, and followed."""
+    command = ["sim", "--name", "alpha", "--world", "park", "--seed", "4"]
     command += [word for option in ("cameras=front", "width=320", "fps=12") for word in ("--option", option)]
     found: list[Annotation] = []
     with (
@@ -259,7 +218,6 @@ def target() -> None:
         finally:
             detecting.terminate()
             detecting.wait()
-            folder.cleanup()
 
 
 def mark(page: Page, found: Annotation, *, touch: bool) -> None:

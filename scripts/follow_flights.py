@@ -8,7 +8,7 @@ import re
 import statistics
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Final
@@ -30,7 +30,6 @@ AGAIN_S: Final = 3.0  # and this long after it came out of hiding
 JUDGED: Final = 2  # each second frame
 SWAPPED: Final = 3  # judged frames in a row that show something else in the target's box
 _WAIT_S: Final = 60.0
-TUNED: Final = ChaseSettings()
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +72,6 @@ def fly(
     class_name: str | None = None,
     options: str = "",
     radio: Radio | None = None,
-    on_frame: Callable[[Frame, FollowTarget, Truth], None] | None = None,
 ) -> Outcome:
     """Wait until the target is in view, point at it, follow it."""
     with tempfile.TemporaryDirectory() as folder:
@@ -87,7 +85,7 @@ def fly(
             drone.config["sim.gust"] = gust_m_s
             drone.config["limits.speed"] = case.limit_m_s
             drone.takeoff()
-            flight = JudgedFlight(drone, Judge(world, case.target), case, detector, on_frame=on_frame)
+            flight = JudgedFlight(drone, Judge(world, case.target), case, detector)
             return flight.outcome(class_name)
 
 
@@ -105,8 +103,7 @@ class JudgedFlight:
         case: What is followed.
         detector: Of the behaviour.
         state_of: Returns a state with the truth at, or near, a frame's capture.
-        on_frame: Called with each frame that is judged.
-        later: Judge when the flight is over, as a flight in real time has no time for it; without ``on_frame``.
+        later: Judge when the flight is over, as a flight in real time has no time for it.
     """
 
     def __init__(
@@ -117,11 +114,10 @@ class JudgedFlight:
         detector: ObjectDetector | None,
         *,
         state_of: Callable[[Frame], Feedback | None] = reported,
-        on_frame: Callable[[Frame, FollowTarget, Truth], None] | None = None,
         later: bool = False,
     ) -> None:
         self._drone, self._judge, self._case, self._detector = drone, judge, case, detector
-        self._state_of, self._on_frame, self._later = state_of, on_frame, later
+        self._state_of, self._later = state_of, later
         self._unjudged: list[tuple[int, Feedback, Box | None]] = []
         self._truths: list[tuple[int, Truth]] = []
         self._strangers: dict[str, int] = {}
@@ -174,7 +170,7 @@ class JudgedFlight:
             if state is None:
                 continue
             truth = self._judge.at(state, frame.captured_ns)
-            mine = self._judge.box(truth)
+            mine = truth.box
             if mine is not None and not mine.cut and mine.visible > 0.9 and mine.box[3] >= 24 and truth.distance_m < 8:
                 x, y, width, height = mine.box
                 return float(x), float(y), float(width), float(height)
@@ -190,21 +186,18 @@ class JudgedFlight:
         if self._later:
             self._unjudged.append((frame.captured_ns, state, box))
             return
-        truth = self._judged(frame.captured_ns, state, box)
-        if self._on_frame is not None:
-            self._on_frame(frame, pilot, truth)
+        self._judged(frame.captured_ns, state, box)
 
-    def _judged(self, captured_ns: int, state: Feedback, box: Box | None) -> Truth:
+    def _judged(self, captured_ns: int, state: Feedback, box: Box | None) -> None:
         truth = self._judge.at(state, captured_ns)
         self._truths.append((captured_ns, truth))
-        shown = None if box is None else truth.shown_as(box)
+        shown = None if box is None else truth.image.shown_in(box)
         if shown is not None and shown != self._case.target:
             self._strangers[shown] = self._strangers.get(shown, 0) + 1
             self._in_a_row += 1
             self._worst_row = max(self._worst_row, self._in_a_row)
         elif box is not None:
             self._in_a_row = 0
-        return truth
 
     def _longest_hidden(self) -> float:
         longest, since = 0.0, None
@@ -224,7 +217,7 @@ class _Judged(FollowTarget):
         detector: ObjectDetector | None,
         case: Case,
     ) -> None:
-        settings = replace(TUNED, distance_m=case.distance_m, bearing_rad=case.bearing_rad)
+        settings = ChaseSettings(distance_m=case.distance_m, bearing_rad=case.bearing_rad)
         super().__init__(drone, box, class_name=class_name, detector=detector, traits=case.traits, settings=settings)
         self._flight = flight
 

@@ -9,13 +9,15 @@ from enum import StrEnum
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.table import Table
 
 from skyloop.cli.demo_report import channel_rows
 from skyloop.client import ChannelStats, Frame
 from skyloop.clock import NS_PER_S, nanoseconds
+from skyloop.messages import Feedback
 from skyloop.messages.geometry import rotation_from_euler
-from skyloop.sim.camera import FRONT_CAMERA
+from skyloop.sim.camera import FRONT_CAMERA, CameraModel
 from skyloop.sim.labels import Labeller, TargetBox
 from skyloop.sim.render import Scene, SceneState
 from skyloop.sim.targets import TargetTrack
@@ -25,49 +27,74 @@ from skyloop.vision.tracking import Box, overlap
 HIDDEN: Final = 0.25  #: a target of which less is to be seen counts as hidden
 SETTLING_S: Final = 5.0  #: from the first sighting; after it the distance counts
 _SHOWN: Final = 0.3  # overlap of a box with the true one
-_CHEST_M: Final = 0.9  # height of a person's middle
+_MIDDLES_M: Final = {"person": 0.9, "car": 0.6}  # heights of what a camera would be aimed at
 _EACH: Final = 3  # frame that is judged: drawing what is true of it takes a few milliseconds
 _FOUND_PX: Final = (8.0, 24.0)  # least width and height of a person who can be pointed at
 
 
 class TargetTruth:
-    """What is true of the people and cars of a simulated world in a frame of the front camera. For one thread.
+    """What is true of the people and cars of a simulated world in a frame of a camera. For one thread.
 
     Args:
         world: In which the drone flies.
+        camera: Of the drone.
     """
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: World, camera: CameraModel = FRONT_CAMERA) -> None:
         self._names = [target.name for target in world.targets]
+        self._middles = [(0.0, 0.0, _MIDDLES_M.get(getattr(target, "shape", ""), 0.0)) for target in world.targets]
         self._tracks = [TargetTrack(target, world.seed, number) for number, target in enumerate(world.targets)]
         self._labeller = Labeller(Scene(world, 0))
+        self._camera = camera
 
     def at(self, frame: Frame) -> FrameTruth | None:
         """Return what is true at a frame's capture; None where the vehicle did not report the truth."""
-        state = frame.feedback
-        if state is None or state.native is None:
+        return None if frame.feedback is None else self.at_capture(frame.feedback, frame.captured_ns)
+
+    def at_capture(self, state: Feedback, captured_ns: int) -> FrameTruth | None:
+        """Return what is true at a capture, by the state that was reported nearest to it; None: without the truth."""
+        known = _true_numbers(state)
+        if known is None:
             return None
-        known = {name: value for name, value in state.native.items() if isinstance(value, int | float)}
-        if not known.keys() >= {"sim.time_s", "truth.x", "truth.yaw"}:
-            return None
-        late_s = (frame.captured_ns - state.captured_ns) / NS_PER_S
-        place = np.array([known[f"truth.{axis}"] + late_s * known[f"truth.v{axis}"] for axis in "xyz"])
+        place, scene = self._scene(known, captured_ns - state.captured_ns)
+        model = self._camera
         turn = rotation_from_euler(known["truth.roll"], known["truth.pitch"], known["truth.yaw"])
-        targets = tuple(track.at(max(0.0, known["sim.time_s"] + late_s)) for track in self._tracks)
-        scene = SceneState(np.zeros((0, 3)), np.zeros((0, 3, 3)), targets, 1.0)
-        pose = FRONT_CAMERA.pose(place, turn)
+        pose = model.pose(place, turn)
         distances, bearings, centred = {}, {}, set()
-        for name, target in zip(self._names, targets, strict=True):
+        for name, target, middle in zip(self._names, scene.targets, self._middles, strict=True):
             way = np.array(target.position_m) - place
             distances[name] = math.hypot(way[0], way[1])
-            bearing = math.atan2(way[1], way[0]) - known["truth.yaw"]
-            bearings[name] = math.remainder(bearing, math.tau)
-            ray = pose.rotation.T @ (np.array(target.position_m) + np.array([0.0, 0.0, _CHEST_M]) - pose.position_m)
-            across, down = 0.5 * FRONT_CAMERA.width / FRONT_CAMERA.fx, 0.5 * FRONT_CAMERA.height / FRONT_CAMERA.fy
+            bearings[name] = math.remainder(math.atan2(way[1], way[0]) - known["truth.yaw"], math.tau)
+            ray = pose.rotation.T @ (np.array(target.position_m) + middle - pose.position_m)
+            across, down = 0.5 * model.width / model.fx, 0.5 * model.height / model.fy
             if ray[2] > 0.1 and abs(ray[0]) < across * ray[2] and abs(ray[1]) < down * ray[2]:
                 centred.add(name)
-        boxes = {box.name: box for box in self._labeller.boxes(scene, pose, FRONT_CAMERA)}
+        boxes = {box.name: box for box in self._labeller.boxes(scene, pose, model)}
         return FrameTruth(boxes, distances, bearings, frozenset(centred))
+
+    def visible_if_aimed(self, state: Feedback, captured_ns: int, name: str) -> float:
+        """Return the share of a target that nothing would hide, 0 to 1, if the camera were turned to it."""
+        known = _true_numbers(state)
+        if known is None:
+            return 0.0
+        place, scene = self._scene(known, captured_ns - state.captured_ns)
+        number = self._names.index(name)
+        way = np.array(scene.targets[number].position_m) + self._middles[number] - place
+        pitch = -math.atan2(way[2], math.hypot(way[0], way[1]))
+        pose = self._camera.pose(place, rotation_from_euler(0.0, pitch, math.atan2(way[1], way[0])))
+        return next((box.visible for box in self._labeller.boxes(scene, pose, self._camera) if box.name == name), 0.0)
+
+    def _scene(self, known: dict[str, float], late_ns: int) -> tuple[NDArray[np.float64], SceneState]:
+        """Where the vehicle was, (3,) [m], and everything that moves."""
+        late_s = late_ns / NS_PER_S
+        place = np.array([known[f"truth.{axis}"] + late_s * known[f"truth.v{axis}"] for axis in "xyz"])
+        targets = tuple(track.at(max(0.0, known["sim.time_s"] + late_s)) for track in self._tracks)
+        return place, SceneState(np.zeros((0, 3)), np.zeros((0, 3, 3)), targets, 1.0)
+
+
+def _true_numbers(state: Feedback) -> dict[str, float] | None:
+    known = {name: value for name, value in (state.native or {}).items() if isinstance(value, int | float)}
+    return known if known.keys() >= {"sim.time_s", "truth.x", "truth.yaw"} else None
 
 
 @dataclass(frozen=True, slots=True)
