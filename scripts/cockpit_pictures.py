@@ -180,7 +180,9 @@ def phone() -> None:
 def target() -> None:
     """A person in a park is marked on the picture, and followed."""
     command = ["sim", "--name", "alpha", "--world", "park", "--seed", "4"]
-    command += [word for option in ("cameras=front", "width=320", "fps=12") for word in ("--option", option)]
+    command += [
+        word for option in ("cameras=front", "width=320", "fps=12", "battery=0.95") for word in ("--option", option)
+    ]
     found: list[Annotation] = []
     with (
         flight(command, [lambda _: None]) as (chromium, address),  # which waits until it is there
@@ -209,7 +211,7 @@ def target() -> None:
                 page.locator(".follow-figures", has_text="%").wait_for()
                 if not touch:
                     page.keyboard.press("Enter")
-                    page.wait_for_timeout(5000)
+                    page.wait_for_timeout(12_000)  # until it is near
                     # Not while a loaded machine hovers, nor behind a tree.
                     page.locator('.follow-panel[data-tone="busy"] .follow-figures', has_text="%").wait_for()
                 save(page, f"cockpit-target-{name}.png")
