@@ -31,6 +31,7 @@ NEEDED = (
     "skyloop/__init__.pyi",
     "skyloop/cockpit/static/index.html",
     "skyloop/cockpit/static/licences.txt",
+    "skyloop/vision/weights/figures.onnx",
 )
 #: With these a test run is possible from the source package alone.
 SOURCES = ("Makefile", "requirements-dev.txt", "tests/conftest.py", "docs/architecture.md", "cockpit-page/src/main.ts")

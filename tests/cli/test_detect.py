@@ -17,6 +17,23 @@ from tests.vision.networks import write
 
 pytestmark = pytest.mark.process
 
+ONE_PERSON = """
+[room]
+size = [20, 20, 8]
+floor = "grass"
+enclosed = false
+
+[[spawn]]
+position = [-3, 0, 0]
+
+[[target]]
+name = "anna"
+kind = "figure"
+shape = "person"
+path = { kind = "still", position = [0, 0, 0] }
+yaw = { mode = "fixed", yaw_deg = 180 }
+"""
+
 
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
@@ -54,6 +71,7 @@ def test_what_cannot_be_is_told(run: Run, file: Path) -> None:
         (("nowhere.onnx", "--on", "alpha"), "there is no file nowhere.onnx"),
         ((str(file), "--on", "alpha", "--classes", "cra"), "did you mean 'car'"),
         ((str(file), "--on", "alpha", "--layout", "x"), "must be one of"),
+        (("--on", "alpha", "--classes", "persn"), "no class in figures.onnx named 'persn'; did you mean 'person'"),
     ]:
         ended = run("detect", *arguments)
         assert ended.code == 2
@@ -75,6 +93,26 @@ def test_detections_are_drawn_with_the_time_of_their_frame(sockets: Path, file: 
             assert [each["class_name"] for each in result.value["detections"]] == ["car"]
             drone.wait(lambda _: any(one.captured_ns >= result.captured_ns for one in drawn))
             assert {one.source for one in drawn} == {"detections"}
+    finally:
+        for process in (worker, proxy):
+            if process is not None:
+                process.end()
+
+
+def test_without_a_file_the_simulators_figures_are_found(sockets: Path, tmp_path: Path) -> None:
+    world = tmp_path / "one.toml"
+    world.write_text(ONE_PERSON, encoding="utf-8")
+    proxy = Process("-m", "skyloop", "proxy", f"sim://?world={world}&cameras=front&fps=20", "--name", "epsilon")
+    worker = None
+    try:
+        proxy.until("ready")
+        worker = Process("-m", "skyloop", "detect", "--on", "epsilon")
+        with skyloop.connect("epsilon", access="observe") as drone:
+            for result in drone.results("detections"):
+                found = result.value["detections"]
+                if found:
+                    break
+            assert [each["class_name"] for each in found] == ["person"]
     finally:
         for process in (worker, proxy):
             if process is not None:

@@ -1,4 +1,4 @@
-"""``skyloop detect``: runs a detector from an ONNX file on a drone's frames, in a process of its own."""
+"""``skyloop detect``: runs a detector on a drone's frames, in a process of its own."""
 
 from __future__ import annotations
 
@@ -17,7 +17,14 @@ from skyloop.errors import UnknownNameError
 
 
 def detect(
-    file: Annotated[str, typer.Argument(metavar="FILE", help="ONNX file of a detector: YOLO, YOLOX, RT-DETR …")],
+    file: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[FILE]",
+            help="ONNX file of a detector: YOLO, YOLOX, RT-DETR …; without: Skyloop's own, of the simulator's figures",
+            show_default=False,
+        ),
+    ] = None,
     on: Annotated[
         str | None, typer.Option("--on", metavar="NAME", help="Running proxy", autocompletion=drone_names)
     ] = None,
@@ -45,26 +52,29 @@ def detect(
 ) -> None:
     """Detect people, cars or whatever a network of yours knows in a drone's frames, and draw them live. Read-only.
 
+    Without FILE it finds the simulator's people, cars and crates: person, car, box. For a real camera give a FILE.
     The results, with the time of their frame, are those of a processor: drone.results("detections"). Run the same
     command again for another worker that shares the frames. A line each second shows its progress.
     """
     from skyloop.processing import Settings
     from skyloop.processing.detecting import DetectionProcessor
     from skyloop.vision import OnnxDetector
+    from skyloop.vision.simulated import SIMULATED_WEIGHTS
 
     join_network(network, keys)
     drone = one_drone(on, None)
-    detector = OnnxDetector(file, score=score, names=None if names is None else Path(names), layout=layout)
+    path = SIMULATED_WEIGHTS if file is None else Path(file)
+    detector = OnnxDetector(path, score=score, names=None if names is None else Path(names), layout=layout)
     wanted = [each.strip() for each in (classes or "").split(",") if each.strip()]
     for each in wanted:
         if detector.names and each not in detector.names.values():
-            raise UnknownNameError(f"class in {file}", each, detector.names.values())
+            raise UnknownNameError(f"class in {path.name if file is None else file}", each, detector.names.values())
     processor = DetectionProcessor(detector, wanted)
 
     def make() -> Any:
         return processor
 
-    digits = hashlib.sha256(Path(file).read_bytes() + repr((score, sorted(wanted), names, layout)).encode()).hexdigest()
+    digits = hashlib.sha256(path.read_bytes() + repr((score, sorted(wanted), names, layout)).encode()).hexdigest()
     settings = Settings(name, f"DetectionProcessor {digits[:16]}", camera, max_fps=max_fps)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, interrupt)

@@ -112,11 +112,19 @@ def target_boxes(scene: Scene, state: SceneState, pose: CameraPose, model: Camer
 
 
 def pictures(
-    world: World, seed: int, count: int, size: tuple[int, int] = (320, 240), focal_share: float = 0.75
+    world: World,
+    seed: int,
+    count: int,
+    size: tuple[int, int] = (320, 240),
+    focal_share: float = 0.75,
+    *,
+    camera: CameraModel | None = None,
+    tilt_rad: float | None = None,
 ) -> Iterator[tuple[Image, tuple[TargetBox, ...]]]:
     """Yield images of a world from random places at random times, with their labels.
 
-    Cameras are 0.7 to 3 m high, outside of solids, pitched by at most 15°; two of three look roughly at some target.
+    Cameras are 0.7 to 3 m high, outside of solids; two of three look roughly at some target. They are pitched by at
+    most 15° and hardly rolled, or as ``tilt_rad`` says.
 
     Args:
         world: The world.
@@ -124,6 +132,8 @@ def pictures(
         count: How many images.
         size: Width and height [pixel].
         focal_share: Focal length as a share of the width.
+        camera: The camera, instead of ``size`` and ``focal_share``; the flaws of its sensor are left out.
+        tilt_rad: Pitch and roll are anything within ± this.
 
     Raises:
         UsageError: An argument is out of its range, or the world leaves no room for a camera.
@@ -132,7 +142,9 @@ def pictures(
     if isinstance(count, bool) or not isinstance(count, int) or count < 0:
         raise UsageError(f"count must be a whole number of at least 0, not {count!r}")
     focal = focal_share * width
-    model = CameraModel("label", width, height, 30.0, focal, focal, (width - 1) / 2, (height - 1) / 2)
+    model = camera or CameraModel("label", width, height, 30.0, focal, focal, (width - 1) / 2, (height - 1) / 2)
+    if tilt_rad is not None and not 0.0 <= tilt_rad <= math.pi / 4:
+        raise UsageError(f"tilt_rad must be from 0 to π/4, not {tilt_rad!r}")
     rng = stream(seed, Purpose.LABELS)
     tracks = tuple(TargetTrack(target, world.seed, n) for n, target in enumerate(world.targets))
     solids, scene = Solids(world, tracks), Scene(world, 0)
@@ -142,14 +154,18 @@ def pictures(
         time_s += float(rng.uniform(0.1, _LONGEST_STEP_S))
         targets = tuple(track.at(time_s) for track in tracks)
         solids.move(time_s)
-        body, rotation = _camera(world, solids, targets, rng)
+        body, rotation = _camera(world, solids, targets, rng, tilt_rad)
         light = world.light.at(time_s, world.seed)
         state, pose = SceneState(np.zeros((0, 3)), np.zeros((0, 3, 3)), targets, light), model.pose(body, rotation)
         yield renderer.render(state, pose, model), labeller.boxes(state, pose, model)
 
 
 def _camera(
-    world: World, solids: Solids, targets: tuple[TargetState, ...], rng: np.random.Generator
+    world: World,
+    solids: Solids,
+    targets: tuple[TargetState, ...],
+    rng: np.random.Generator,
+    tilt_rad: float | None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     half_x, half_y, top = world.room.size_m[0] / 2, world.room.size_m[1] / 2, world.room.size_m[2]
     hull = np.full((3, 1), _CLEAR_M)
@@ -167,5 +183,7 @@ def _camera(
         if aim is not None:
             yaw = math.atan2(aim.position_m[1] - place[1], aim.position_m[0] - place[0]) + float(rng.normal(0.0, 0.25))
         pitch, roll = float(rng.uniform(-0.12, 0.26)), float(rng.normal(0.0, 0.05))
+        if tilt_rad is not None:
+            pitch, roll = (float(angle) for angle in rng.uniform(-tilt_rad, tilt_rad, 2))
         return place, rotation_from_euler(roll, pitch, yaw)
     raise UsageError(f"world {world.name!r} has no free place for a camera between 0.7 and 3 m")

@@ -19,6 +19,7 @@ from skyloop.vision.median_flow import MedianFlowTracker
 from skyloop.vision.object_tracks import ObjectTracks, TrackedObject
 from skyloop.vision.onnx_detector import OnnxDetector
 from skyloop.vision.planar import PlanarSighting
+from skyloop.vision.simulated import simulated_detector
 from skyloop.vision.tracking import Tracker, TrackResult
 
 __all__ = [
@@ -48,6 +49,7 @@ __all__ = [
     "Tracker",
     "calibrate",
     "project",
+    "simulated_detector",
     "undistort",
     "unproject",
 ]
