@@ -95,8 +95,10 @@ def relit(image: Image, light: float, rng: Rng | None = None, tint: float = 0.0)
 
 def noisy(image: Image, sigma: float, rng: Rng) -> Image:
     """Return the image with the noise of a sensor; ``sigma`` in steps of 0 to 255."""
-    noise = rng.standard_normal(image.shape, dtype=np.float32) * np.float32(sigma)
-    return np.asarray(np.clip(image + noise, 0, 255), np.uint8)
+    noise = np.empty(image.shape, np.int16)
+    cv2.setRNGSeed(int(rng.integers(1 << 31)))
+    cv2.randn(noise, (0, 0, 0), (sigma, sigma, sigma))
+    return np.asarray(cv2.add(image, noise, dtype=cv2.CV_8U), np.uint8)
 
 
 def smeared(image: Image, length: float, angle: float) -> Image:

@@ -128,7 +128,7 @@ class Album:
         classes, visible = rows[:, 1].astype(np.int64), rows[:, 6]
         low, high = rows[:, 2:4].copy(), rows[:, 2:4] + rows[:, 4:6]
         if rng.random() < 0.5:
-            image = np.ascontiguousarray(image[:, ::-1])
+            image = np.asarray(cv2.flip(image, 1), np.uint8)
             low[:, 0], high[:, 0] = WIDTH - high[:, 0], WIDTH - low[:, 0]
         if rng.random() < 0.5:
             image, low, high = zoomed(image, low, high, rng)
@@ -253,9 +253,6 @@ def train(album: Album, minutes: float, seed: int) -> Mapping[str, NDArray[np.fl
     torch.manual_seed(seed)
     rng, layers = np.random.default_rng(seed), network()
     modules = build(torch, layers)
-    kept = torch.optim.swa_utils.AveragedModel(
-        modules, multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(0.998), use_buffers=True
-    )
     optimizer = torch.optim.AdamW(modules.parameters(), lr=_RATE, weight_decay=0.02)
     grid = places(WIDTH, HEIGHT)
     grids = tuple(torch.from_numpy(part) for part in grid)
@@ -284,13 +281,12 @@ def train(album: Album, minutes: float, seed: int) -> Mapping[str, NDArray[np.fl
         error.backward()
         torch.nn.utils.clip_grad_norm_(modules.parameters(), 10.0)
         optimizer.step()
-        kept.update_parameters(modules)
         steps += 1
         total = float(error.detach()) if steps == 1 else 0.99 * total + 0.01 * float(error.detach())
         seen = steps * _BATCH / len(album.rows)
         show(f"{100 * share:.0f} %: {steps} steps, each picture seen {seen:.1f} times, loss {total:.3f}")
     show(f"trained: {steps} steps in {time.monotonic() - begun:.0f} s, loss {total:.3f}", last=True)
-    return folded(layers, kept.module)
+    return folded(layers, modules)
 
 
 def folded(layers: tuple[Layer, ...], modules: Any) -> dict[str, NDArray[np.float32]]:
