@@ -97,7 +97,7 @@ def noisy(image: Image, sigma: float, rng: Rng) -> Image:
     """Return the image with the noise of a sensor; ``sigma`` in steps of 0 to 255."""
     noise = np.empty(image.shape, np.int16)
     cv2.setRNGSeed(int(rng.integers(1 << 31)))
-    cv2.randn(noise, (0, 0, 0), (sigma, sigma, sigma))
+    cv2.randn(noise, np.zeros(3), np.full(3, sigma))
     return np.asarray(cv2.add(image, noise, dtype=cv2.CV_8U), np.uint8)
 
 

@@ -2,17 +2,25 @@
 
 Each flight is the whole of Skyloop in simulated time: a simulated AR.Drone 2 with its sensors' noise and biases and its
 cameras' noise, blur and latency at 15 pictures a second; commands 40 ms, feedback and pictures 20 ms on the way, 5 % of
-each lost; in calm air and in gusts. Every error is that of the truth.
+each lost; in calm air and in gusts. Every error is that of the truth. ``follow-target`` stands for the four that follow
+people and cars (``follow_flights.py``); their commands are 100 ms on the way.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+import random
 import statistics
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
+from importlib import resources
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Final, NamedTuple
+
+import follow_flights
 
 from skyloop.client import Drone
 from skyloop.control import (
@@ -25,11 +33,13 @@ from skyloop.control import (
     OrbitMarker,
     SeeAndAvoid,
 )
+from skyloop.control.landing_settings import LandingSettings
 from skyloop.messages import Event, EventKind, Feedback, FlightState
 from skyloop.sim.render import use_one_core
 from skyloop.sim.world import Gate
 from skyloop.sim.world_file import load_world
 from skyloop.stepping.rehearsal import Radio, rehearse
+from skyloop.vision import simulated_detector
 
 FOLLOW_S: Final = 40.0
 FOLLOW_RMS_M: Final = 0.25
@@ -44,6 +54,7 @@ class Flight(NamedTuple):
     error_m: float  #: what the table shows: see there
     seconds: float  #: simulated, from the behaviour's begin to its end
     note: str = ""  #: why it was no good
+    unsafe: str | None = None  #: how it ended unsafely; empty if it did not; None: not checked
 
 
 @contextmanager
@@ -130,26 +141,117 @@ def gates(seed: int, gust_m_s: float) -> Flight:
     return Flight(good, max((off for _, off in crossings.passed), default=math.nan), run.seconds, note)
 
 
-def landing(seed: int, gust_m_s: float) -> Flight:
-    """Land on the platform that moves at 0.3 m/s; the error is the distance of the vehicle's centre from the marker's
-    two seconds after it stood."""
-    places: list[tuple[Feedback, float, float]] = []
-    with flying("platform", "bottom", seed, gust_m_s) as drone:
+def landing(speed: float, ground: str = "walk") -> Callable[[int, float], Flight]:
+    """Return the flight that lands on a platform; the error is the distance of the vehicle's centre from the marker's
+    two seconds after the end."""
+    return lambda seed, gust_m_s: land(speed, ground, seed, gust_m_s)
 
-        def look(feedback: Feedback) -> None:
-            x, y, z = (a - b for a, b in zip(truth(feedback), truth(feedback, "truth.target"), strict=True))
-            places.append((feedback, math.hypot(x, y), z))
 
-        drone.on_feedback(look)
-        lander = LandOnMarker(drone)
-        run = lander.run(seconds=90.0)
-        stood_ns = places[-1][0].captured_ns
-        while places[-1][0].captured_ns - stood_ns < 2_000_000_000:
-            drone.next_feedback(timeout_s=2.0)
-        newest, off, above = places[-1]
-    on_top = newest.state is FlightState.LANDED and 0.0 < above < 0.1
-    note = "" if on_top else f"{newest.state}, {above:.2f} m above the platform: {lander.phase}"
-    return Flight(lander.landed and on_top and off <= LANDING_M, off, run.seconds, note)
+def land(speed: float, ground: str, seed: int, gust_m_s: float) -> Flight:
+    """Land on a platform: ``walk`` about a room, ``straight`` along a runway, or ``turning`` on a circle."""
+    wait = ground != "walk"
+    settings = LandingSettings(give_up_s=LANDING_S[wait] - 5.0)
+    if wait:  # above the road, as high as it may
+        settings = replace(settings, wait_s=60.0, search_height_m=2.8)
+    places: list[Place] = []
+    with TemporaryDirectory() as folder:
+        world = Path(folder, "platform.toml")
+        world.write_text(platform_world(speed, ground, seed))
+        with flying(str(world), "bottom", seed, gust_m_s) as drone:
+            if speed > 2.0:
+                drone.config["limits.tilt"], drone.config["limits.speed"] = FAST_TILT_RAD, FAST_SPEED_M_S
+            drone.on_feedback(lambda feedback: places.append(Place.of(feedback)))
+            lander = LandOnMarker(drone, settings=settings)
+            run = lander.run(seconds=LANDING_S[wait])
+            ended_ns = places[-1].captured_ns
+            while places[-1].captured_ns - ended_ns < 2_000_000_000:
+                drone.next_feedback(timeout_s=2.0)
+            seen = list(places)  # the drone lands on leaving the block
+    newest = seen[-1]
+    on_top = newest.state is FlightState.LANDED and 0.0 < newest.above < 0.1
+    note = "" if on_top else f"{newest.state}, {newest.above:.2f} m above the platform: {lander.phase}"
+    good = lander.landed and on_top and newest.off <= LANDING_M
+    return Flight(good, newest.off, run.seconds, note, unsafe_end(seen))
+
+
+class Place(NamedTuple):
+    """Where the vehicle truly is."""
+
+    captured_ns: int
+    state: FlightState
+    off: float  #: horizontally from the platform's centre [m]
+    above: float  #: its centre over the platform's top [m]
+    height: float  #: its centre over the floor [m]
+
+    @classmethod
+    def of(cls, feedback: Feedback) -> Place:
+        own, platform = truth(feedback), truth(feedback, "truth.target")
+        return cls(feedback.captured_ns, feedback.state, math.dist(own[:2], platform[:2]), own[2] - platform[2], own[2])
+
+    @property
+    def on_platform(self) -> bool:
+        return 0.0 < self.above < 0.1 and self.off < 0.75
+
+    @property
+    def on_floor(self) -> bool:
+        return self.height < 0.1
+
+
+def unsafe_end(places: list[Place]) -> str:
+    """Why a landing's flight ended unsafely; empty if it stands, or flies at a height where it is safe to hover."""
+    newest = places[-1]
+    landed = [place for place in places if place.state is FlightState.LANDED]
+    if any(place.state is FlightState.EMERGENCY for place in places):
+        return "crashed"
+    if landed and not (landed[0].on_platform or landed[0].on_floor):
+        return "stopped its motors in the air"
+    if landed and landed[0].on_platform and not newest.on_platform:
+        return "fell off the platform"
+    if newest.state is not FlightState.LANDED and newest.height < SAFE_HEIGHT_M:
+        return f"flies on at {newest.height:.1f} m"
+    return ""
+
+
+def platform_world(speed: float, ground: str, seed: int) -> str:
+    """The text of a world file with a platform of 1 m that passes the drone some 14 s after its start."""
+    shipped = resources.files("skyloop.sim") / "worlds" / "platform.toml"
+    if ground == "walk":
+        return shipped.read_text(encoding="utf-8").replace("speed = [0.3, 0.3]", f"speed = [{speed}, {speed}]")
+    chance = random.Random(f"{ground}/{speed}/{seed}")
+    before, side, yaw = speed * chance.uniform(12.0, 16.0), chance.uniform(-0.4, 0.4), chance.uniform(-180.0, 180.0)
+    if ground == "straight":
+        start = 60.0 - before
+        path = f'kind = "oval", centre = [0, 0, 0.2], length = 200, radius = 12, speed = {speed}, start = {start:.2f}'
+        spawn = (-40.0, -12.0 + side)
+    else:
+        start = math.degrees(-before / TURN_M) % 360.0
+        path = f'kind = "circle", centre = [0, 0, 0.2], radius = {TURN_M}, speed = {speed}, start_deg = {start:.2f}'
+        spawn = (TURN_M + side, 0.0)
+    return FIELD.format(x=spawn[0], y=spawn[1], yaw=yaw, path=path)
+
+
+TURN_M: Final = 10.0
+FAST_TILT_RAD: Final = 0.5  # above 2 m/s the drag of the vehicle leaves too little of the usual 0.21 rad, and
+FAST_SPEED_M_S: Final = 8.0  # its loop flies 4 m/s only by set-points of more than the usual 5 m/s
+SAFE_HEIGHT_M: Final = 1.5
+LANDING_S: Final = {False: 90.0, True: 120.0}  # by whether it waits for the platform to pass
+FIELD: Final = """
+[room]
+size = [300, 60, 20]
+floor = "concrete"
+enclosed = false
+[[spawn]]
+position = [{x:.3f}, {y:.3f}, 0]
+yaw_deg = {yaw:.1f}
+[[target]]
+name = "platform"
+kind = "platform"
+id = 30
+marker_size = 0.2
+size = [1.0, 1.0, 0.2]
+path = {{ {path} }}
+yaw = {{ mode = "along", turn_rate_deg_s = 90 }}
+"""
 
 
 class Hits:
@@ -243,6 +345,20 @@ def avoid(seed: int, gust_m_s: float) -> Flight:
     return Flight(pilot.done and not touched, aside, run.seconds, f"touched {touched}, {pilot.phase}")
 
 
+def following(name: str) -> Callable[[int, float], Flight]:
+    """Follow somebody or something; the error is the RMS of the true distance's."""
+
+    def fly(seed: int, gust_m_s: float) -> Flight:
+        detector = simulated_detector()
+        outcome = follow_flights.fly(follow_flights.CASES[name], seed, gust_m_s, detector)
+        note = f"{outcome.note}, {'another one in the box' if outcome.swapped else 'always itself'}"
+        if outcome.hidden_s >= 1.0:
+            note += f", hidden for {outcome.hidden_s:.1f} s"
+        return Flight(outcome.good, outcome.rms_m, outcome.seconds, note)
+
+    return fly
+
+
 class Goal(NamedTuple):
     """What is to come out."""
 
@@ -252,36 +368,54 @@ class Goal(NamedTuple):
     of_20: int  #: good flights of twenty
 
 
+FOLLOWED: Final = "followed: in view 90 %, never mixed up, RMS of the distance within 0.5 m, nothing touched"
 GOALS: Final = {
     "follow": Goal(follow, "a carried marker followed at 1.5 m, RMS of the distance within 0.25 m", "RMS", 20),
     "gates": Goal(gates, "a course of five gates passed, nothing touched", "off the middle", 19),
-    "landing": Goal(landing, "landed on a platform at 0.3 m/s, within 0.2 m of its middle", "off the middle", 18),
+    "landing": Goal(landing(0.3), "landed on a platform at 0.3 m/s, within 0.2 m of its middle", "off the middle", 18),
+    "landing-0.5": Goal(landing(0.5), "landed on a platform at 0.5 m/s", "off the middle", 18),
+    **{
+        f"landing-{speed}-{ground}": Goal(
+            landing(float(speed), ground), f"landed on a platform at {speed} m/s, {ground}", "off the middle", 18
+        )
+        for speed in (1, 2, 3)
+        for ground in ("straight", "turning")
+    },
     "approach": Goal(approach, "flown up to a marker on a wall, within 0.25 m of 1 m before it", "off", 18),
     "servo": Goal(servo, "held before a marker by its picture, within 0.25 m of 1.5 m before it", "RMS", 18),
     "orbit": Goal(orbit, "swung round a marker at 1.5 m, RMS of the distance within 0.25 m", "RMS", 18),
     "flow": Goal(flow, "held the place for a minute by the ground's picture, at most 0.75 m off", "RMS", 18),
+    "follow-walker": Goal(following("walker"), f"a person at 1.5 m/s {FOLLOWED}", "RMS", 19),
+    "follow-car": Goal(following("car"), f"a car at 3 m/s {FOLLOWED}", "RMS", 19),
+    "follow-hidden": Goal(following("hidden"), f"a person whom walls hide for 3 s {FOLLOWED}", "RMS", 19),
+    "follow-twin": Goal(following("twin"), f"a person whose twin crosses {FOLLOWED}", "RMS", 19),
     "avoid": Goal(avoid, "12.5 m ahead among four pillars, none touched", "to the side at the end", 18),
 }
+
+FOLLOW_TARGET: Final = [name for name in GOALS if name.startswith("follow-")]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("which", nargs="*", metavar="behaviour", help=f"{', '.join(GOALS)}; default: all")
     parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--first", type=int, default=0, help="the first seed")
     parser.add_argument("--gust", type=float, nargs="*", default=[0.0, 1.0], help="standard deviations of gusts [m/s]")
     parser.add_argument("--verbose", action="store_true", help="a line for each flight")
     options = parser.parse_args()
-    if unknown := set(options.which) - set(GOALS):
-        parser.error(f"no such behaviour: {', '.join(sorted(unknown))}; there are {', '.join(GOALS)}")
+    which = [each for name in options.which for each in (FOLLOW_TARGET if name == "follow-target" else [name])]
+    if unknown := set(which) - set(GOALS):
+        parser.error(f"no such behaviour: {', '.join(sorted(unknown))}; there are {', '.join(GOALS)}, follow-target")
     use_one_core()
-    for name in options.which or GOALS:
+    for name in which or GOALS:
         goal = GOALS[name]
         for gust in options.gust:
             flights = []
-            for seed in range(options.seeds):
+            for seed in range(options.first, options.first + options.seeds):
                 flights.append(goal.fly(seed, gust))
                 if options.verbose or not flights[-1].good:
-                    good, error, seconds, note = flights[-1]
+                    good, error, seconds, note, unsafe = flights[-1]
+                    note += f" UNSAFE: {unsafe}" if unsafe else ""
                     print(f"  {name} {seed}: {'good' if good else 'BAD'}, {error:.3f} m, {seconds:.0f} s {note}")
             print(summary(goal, gust, flights), flush=True)
 
@@ -290,11 +424,13 @@ def summary(goal: Goal, gust_m_s: float, flights: list[Flight]) -> str:
     """One line of what came out."""
     good = [flight for flight in flights if flight.good]
     met = len(good) * 20 >= goal.of_20 * len(flights)
+    checked = [flight.unsafe for flight in flights if flight.unsafe is not None]
+    unsafe = f"; {len([one for one in checked if one])} ended unsafely" if checked else ""
     errors = [flight.error_m for flight in flights if not math.isnan(flight.error_m)]
     return (
         f"{goal.what}, gusts {gust_m_s:g} m/s: {len(good)} of {len(flights)} "
         f"({goal.error} {statistics.median(errors):.3f} m, worst {max(errors):.3f} m; "
-        f"{statistics.fmean(flight.seconds for flight in flights):.0f} s): {'met' if met else 'missed'}"
+        f"{statistics.fmean(flight.seconds for flight in flights):.0f} s{unsafe}): {'met' if met else 'missed'}"
     )
 
 

@@ -1,5 +1,5 @@
 """Photographs the cockpit: ``python scripts/cockpit_pictures.py``, or with ``one``, ``fleet``, ``swarm``,
-``asked`` or ``phone`` for a part.
+``asked``, ``phone`` or ``target`` for a part.
 
 =======================================  ===========================================================================
 ``cockpit-one-dark.png``, ``…-light``    one simulated drone that follows a marker, with what its controller draws; once
@@ -10,6 +10,8 @@
 ``cockpit-flight-portrait.png``,         the flight mode of a telephone, upright and on its side
 ``cockpit-flight-landscape.png``
 ``cockpit-asked-dark.png``, ``…-phone``  a program asks for the drone that the page flies
+``cockpit-target-dark.png``,             a person on a lawn who was detected, pressed and is followed; on a telephone
+``cockpit-target-phone.png``             pressed with a finger, before anything flies
 =======================================  ===========================================================================
 
 Needs Chromium and ``pip install playwright pillow``.
@@ -18,6 +20,7 @@ Needs Chromium and ``pip install playwright pillow``.
 from __future__ import annotations
 
 import io
+import itertools
 import math
 import os
 import subprocess
@@ -38,6 +41,7 @@ import skyloop
 from skyloop.cockpit.child import CockpitProcess
 from skyloop.control.follow import FollowMarker
 from skyloop.control.waypoint import Waypoint, reached, velocity_to
+from skyloop.messages import Annotation, Polyline, Text
 
 PICTURES = Path(__file__).parents[1] / "docs" / "pictures"
 MARKER_ID = 7
@@ -58,10 +62,48 @@ INKS = """() => {
   return [...own, ...onPictures].map((ink) => ink.slice(1));
 }"""
 Fly = Callable[[threading.Event], None]
+#: Two people on a lawn before a house: one goes to and fro before the start, the other before the house.
+LAWN = """
+[room]
+size = [50, 40, 12]
+floor = "grass"
+enclosed = false
+[[spawn]]
+position = [-12, 0, 0]
+[[panel]]
+name = "path"
+on = "floor"
+at = [4, 6]
+size = [30, 2.4]
+texture = "concrete"
+[[box]]
+name = "house"
+stands_at = [18, 6]
+size = [3, 16, 6]
+texture = "brick"
+[[box]]
+name = "crate"
+stands_at = [0, -5]
+size = [0.9, 0.9, 0.9]
+texture = "crate"
+[[target]]
+name = "walker"
+kind = "figure"
+shape = "person"
+look = 3
+colour = "#c8282c"
+path = { kind = "waypoints", points = [[-5.5, -3, 0], [-5.5, 3, 0], [-5, 3, 0], [-5, -3, 0]], speed = 0.6 }
+[[target]]
+name = "passer"
+kind = "figure"
+shape = "person"
+look = 9
+path = { kind = "waypoints", points = [[12, -9, 0], [12, 12, 0], [12.5, 12, 0], [12.5, -9, 0]], speed = 1.0 }
+"""
 
 
 def main() -> None:
-    makers = {"one": one, "fleet": fleet, "swarm": swarm, "asked": asked, "phone": phone}
+    makers = {"one": one, "fleet": fleet, "swarm": swarm, "asked": asked, "phone": phone, "target": target}
     wanted = sys.argv[1:] or list(makers)
     for name in wanted:
         if name not in makers:
@@ -171,6 +213,75 @@ def phone() -> None:
             page.wait_for_timeout(700)
             save(page, f"cockpit-flight-{name}.png")
             session.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+
+
+def target() -> None:
+    """A person on a lawn is marked on the picture, and followed."""
+    folder = tempfile.TemporaryDirectory()
+    world = Path(folder.name) / "lawn.toml"
+    world.write_text(LAWN)
+    command = ["sim", "--name", "alpha", "--world", str(world), "--seed", "4"]
+    command += [word for option in ("cameras=front", "width=320", "fps=12") for word in ("--option", option)]
+    found: list[Annotation] = []
+    with (
+        flight(command, [lambda _: None]) as (chromium, address),  # which waits until it is there
+        skyloop.connect("alpha", access="observe", name="pictures") as drone,
+    ):
+        drone.on_annotation(lambda one: found.append(one) if one.source == "detections" and one.shapes else None)
+        detecting = subprocess.Popen([sys.executable, "-m", "skyloop", "detect", "--on", "alpha", "--max-fps", "4"])
+        try:
+            views: list[tuple[str, ViewportSize]] = [("phone", PHONE), ("dark", DESK)]
+            for name, size in views:
+                page = open_page(chromium, f"{address}#alpha", size, "dark")
+                touch = size == PHONE
+                take = page.get_by_role("button", name="Take control")
+                take.tap() if touch else take.click()
+                page.locator('.pane[data-mine="true"]').wait_for()
+                page.keyboard.press("t")
+                page.locator(".pill", has_text="hovering").wait_for()
+                page.keyboard.press("f")
+                page.locator(".follow-hint", has_text="Drag a box").wait_for()
+                while not page.locator(".follow-panel").is_visible():
+                    page.wait_for_timeout(150)
+                    if found:
+                        mark(page, found[-1], touch=touch)
+                page.locator(".follow-phase", has_text="Tracked").wait_for()
+                page.wait_for_timeout(800)
+                page.locator(".follow-figures", has_text="%").wait_for()
+                if not touch:
+                    page.keyboard.press("Enter")
+                    page.wait_for_timeout(5000)
+                    # Not while a loaded machine hovers, nor behind a tree.
+                    page.locator('.follow-panel[data-tone="busy"] .follow-figures', has_text="%").wait_for()
+                save(page, f"cockpit-target-{name}.png")
+                page.keyboard.press("l")
+                page.locator(".pill", has_text="landed").wait_for()
+        finally:
+            detecting.terminate()
+            detecting.wait()
+            folder.cleanup()
+
+
+def mark(page: Page, found: Annotation, *, touch: bool) -> None:
+    """Press the middle of the largest person that was detected; on a touch screen with a finger."""
+    people = [
+        outline
+        for outline, text in itertools.pairwise(found.shapes)
+        if isinstance(outline, Polyline) and isinstance(text, Text) and text.text.startswith("person")
+        if outline.points[2][1] - outline.points[0][1] > found.height / 5  # others are too far for a picture
+    ]
+    picture = page.locator(".video").bounding_box()
+    if not people or picture is None:
+        return
+    points = max((one.points for one in people), key=lambda corners: corners[2][1] - corners[0][1])
+    scale = min(picture["width"] / found.width, picture["height"] / found.height)
+    middle = [sum(values) / 4 for values in zip(*points, strict=True)]
+    x = picture["x"] + picture["width"] / 2 + (middle[0] - found.width / 2) * scale
+    y = picture["y"] + picture["height"] / 2 + (middle[1] - found.height / 2) * scale
+    if touch:
+        page.touchscreen.tap(x, y)
+    else:
+        page.mouse.click(x, y)
 
 
 def rounds(name: str, number: int) -> Fly:

@@ -4,7 +4,7 @@ import { t } from "./language/index.js";
 import type { Sticks } from "./model.js";
 import { type Axis, CENTRED } from "./sticks.js";
 
-export type Deed = "takeoff" | "hover" | "land" | "return" | "take" | "release" | "question" | "help";
+export type Deed = "takeoff" | "hover" | "land" | "return" | "take" | "release" | "question" | "follow" | "help";
 
 const STICKS: Readonly<Record<string, [Axis, 1 | -1]>> = {
   KeyW: ["forward", 1],
@@ -25,6 +25,7 @@ const DEEDS: Readonly<Record<string, Deed>> = {
   KeyC: "take",
   KeyR: "release",
   KeyQ: "question",
+  KeyF: "follow",
   Slash: "help",
 };
 
@@ -38,6 +39,7 @@ export const KEY_MAP: readonly { keys: string[]; does: string }[] = [
   { keys: ["H"], does: t.keys.hover },
   { keys: ["L"], does: t.keys.land },
   { keys: ["B"], does: t.keys.back },
+  { keys: ["F"], does: t.keys.follow },
   { keys: ["W", "S"], does: t.keys.along },
   { keys: ["A", "D"], does: t.keys.across },
   { keys: ["↑", "↓"], does: t.keys.vertical },

@@ -8,6 +8,7 @@ import "./style/route.css";
 import "./style/overview.css";
 import "./style/alarms.css";
 import "./style/replay.css";
+import "./style/follow.css";
 import "./style/touch.css";
 import "./style/flightmode.css";
 import { hashOf, namesOf, OVERVIEW } from "./address.js";

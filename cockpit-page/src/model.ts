@@ -1,5 +1,6 @@
 // What the cockpit's server sends and receives: docs/cockpit.md. SI units and radians; what is not known is null.
 
+import type { FollowMessage, FollowMode, Mark } from "./follow.js";
 import type { RouteProgress } from "./route.js";
 
 export type Vector = [number, number, number];
@@ -170,6 +171,7 @@ export type PilotMessage =
   | { type: "asked"; questions: Question[] }
   | { type: "done"; do: string; name?: string; value?: Value }
   | RouteProgress
+  | FollowMessage
   | { type: "sent"; do: string; n: number }
   | { type: "refused"; do: string; n: number; why: string }
   | { type: "pong"; n: number; now_s: number };
@@ -189,6 +191,10 @@ export type Command =
   | { do: "goto"; x: number; y: number; z: number; yaw?: number }
   | { do: "route"; id: string }
   | { do: "route_pause" | "route_resume" | "route_skip" | "route_stop" }
+  | { do: "follow_select"; camera: string | null }
+  | ({ do: "follow" } & Mark)
+  | { do: "follow_mode"; mode: FollowMode; distance_m?: number }
+  | { do: "follow_stop" }
   | { do: "set"; name: string; value: Value };
 
 export interface Session {

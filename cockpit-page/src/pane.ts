@@ -11,6 +11,7 @@ import { Deck } from "./deck.js";
 import { h, setAttribute, setHidden, setText, setTone, type Tone } from "./dom.js";
 import { Events } from "./events.js";
 import { corners, FlightHud } from "./flightmode.js";
+import type { FollowHost } from "./followtool.js";
 import { words } from "./format.js";
 import { Freshness } from "./freshness.js";
 import { History, KEPT_S, Trail } from "./history.js";
@@ -116,7 +117,7 @@ export class Pane {
     this.fresh = new Freshness(name, this.clock, () => this.alarmBook.acknowledge("old", performance.now()) && this.update());
     const base = `/ws/drones/${encodeURIComponent(name)}`;
     this.controls = new CameraControls(name, (parameter, value) => this.pilot?.write(parameter, value));
-    this.stage = new Stage(name, this.controls);
+    this.stage = new Stage(name, this.controls, pilots ? this.marking() : null);
     this.strip = new Strip(name, (deed) => this.act(deed), (id, grant, reason) => this.pilot?.answer(id, grant, reason), {
       countdown: host.countdown,
       deadly: () => (this.target === null ? null : { what: t.safety.motorsOff(name), act: () => this.target?.stop() }),
@@ -201,6 +202,7 @@ export class Pane {
     if (deed === "help") this.host.help();
     else if (this.isRecording) this.notify(t.pane.recording, "quiet");
     else if (this.pilot === null) this.notify(t.pane.watch, "warn");
+    else if (deed === "follow") this.stage.toggleFollow() || this.notify(t.video.nothing, "warn");
     else if (deed === "question") this.strip.question.focus();
     else if (deed === "take") this.pilot.take(this.strip.wanted, this.strip.asks);
     else if (deed === "release") this.pilot.release();
@@ -251,14 +253,26 @@ export class Pane {
       refused: (command, why) => {
         if (command === "set" && [this.writes, this.parameters, this.controls.parameters].some((list) => list.refused(why))) return;
         if (command === "fly" && this.fresh.isOld) return; // the whole pane shows that
+        if (this.stage.followRefused(command, why)) return;
         this.notify(command ? `${words(command)}: ${why}` : why, "warn");
       },
       route: (progress) => this.map.route.update(progress),
+      follow: (message) => (message ? this.stage.followed(message) : this.stage.forgetTarget()),
       done: (command, name, value) => {
         if (command === "set" && name !== undefined && value !== undefined && !this.writes.done(name)) for (const list of [this.parameters, this.controls.parameters]) list.done(name, value);
         if (command === "stop") this.notify(t.pane.stopSent, "bad");
         if (command === "goto") this.notify(t.pane.reached, "ok");
       },
+    };
+  }
+
+  private marking(): FollowHost {
+    return {
+      select: (camera) => this.pilot?.selectTarget(camera),
+      mark: (mark) => this.pilot?.markTarget(mark),
+      go: (mode, distance_m) => this.pilot?.flyAfter(mode, distance_m),
+      stop: () => this.pilot?.stopFollowing(),
+      notify: (text) => this.notify(text, "warn"),
     };
   }
 
@@ -357,6 +371,7 @@ export class Pane {
     const inAir = live?.airborne ?? false;
     const nowhere = recording ? t.pane.recordingFlies : isOld ? t.pane.isOld : !placed ? t.pane.noPosition : !mine ? t.pane.takeToFly : t.pane.notInAir;
     this.map.allow(mine && placed && inAir ? "" : nowhere, mine ? "" : isOld ? t.pane.isOld : t.pane.takeForZones);
+    this.stage.allowFollow(mine && inAir ? "" : recording ? t.pane.recordingFlies : isOld ? t.pane.isOld : mine ? t.follow.takeOff : t.follow.take);
     for (const list of [this.parameters, this.controls.parameters]) list.allow(mine, recording ? t.pane.asRecorded : t.pane.takeToChange);
     this.alarmBook.update(this.found(), performance.now());
     this.alarms.show();

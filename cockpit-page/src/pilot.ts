@@ -6,6 +6,7 @@
 
 import type { ServerClock } from "./clock.js";
 import { CommandSender, type CommandSocket, type Result } from "./commands.js";
+import type { FollowMessage, FollowMode, Mark } from "./follow.js";
 import { t } from "./language/index.js";
 import type { Authority, Command, PilotMessage, Question, Sticks, Value } from "./model.js";
 import type { RouteProgress } from "./route.js";
@@ -23,6 +24,8 @@ export interface PilotListener {
   done(command: string, name?: string, value?: Value): void;
   /** A flight along a route goes on. */
   route?(progress: RouteProgress): void;
+  /** What becomes of a target that was marked; null: the connection is gone, and the target with it. */
+  follow?(message: FollowMessage | null): void;
 }
 
 const NOBODY: Authority = { type: "authority", state: "none", holder: null, priority: null, mine: false, why: null, line: null };
@@ -34,6 +37,8 @@ export class Pilot {
   connected = false;
   /** On the way to a place that was chosen on this page. */
   going = false;
+  /** After a target that was marked on this page. */
+  following = false;
   /** How this page lost the control that it had; it stays until the person takes control or puts it away. */
   ended = "";
   private steering = false;
@@ -138,6 +143,26 @@ export class Pilot {
     this.send({ do: deed });
   }
 
+  /** A box is about to be drawn on a frame of this camera; null: no longer. */
+  selectTarget(camera: string | null): void {
+    this.send({ do: "follow_select", camera });
+  }
+
+  /** Track it; nothing flies. */
+  markTarget(mark: Mark): void {
+    this.send({ do: "follow", ...mark });
+  }
+
+  /** Fly after what is tracked, or go on in another way. */
+  flyAfter(mode: FollowMode, distance_m: number | null): void {
+    this.end();
+    this.following = this.send({ do: "follow_mode", mode, ...(distance_m === null ? {} : { distance_m }) });
+  }
+
+  stopFollowing(): void {
+    this.send({ do: "follow_stop" });
+  }
+
   write(name: string, value: Value): void {
     this.send({ do: "set", name, value });
   }
@@ -151,7 +176,7 @@ export class Pilot {
   /** Called every STEER_MS with the sticks as they are, as velocities. */
   steer(sticks: Sticks): void {
     if (this.mine && !isCentred(sticks)) {
-      this.going = false;
+      this.going = this.following = false;
       this.steering = this.commands.steer({ do: "fly", ...sticks } satisfies Command);
     } else if (this.steering) {
       this.rest();
@@ -161,7 +186,7 @@ export class Pilot {
 
   /** Hover if this page has it under way: when it loses the focus, or what it is flown with. */
   rest(): void {
-    const moving = this.steering || this.going;
+    const moving = this.steering || this.going || this.following;
     this.end();
     if (moving && this.mine) this.commands.steer({ do: "hover" } satisfies Command);
   }
@@ -175,7 +200,7 @@ export class Pilot {
   }
 
   private end(): void {
-    this.steering = this.going = false;
+    this.steering = this.going = this.following = false;
   }
 
   private linked(open: boolean): void {
@@ -184,11 +209,12 @@ export class Pilot {
     this.end();
     this.authority = NOBODY;
     this.questions = [];
+    this.listener.follow?.(null);
     this.listener.changed();
   }
 
   private refused(command: string, why: string): void {
-    if (command === "goto" || command === "fly" || command === "route" || command === "return") this.end();
+    if (["goto", "fly", "route", "return", "follow_mode"].includes(command)) this.end();
     this.listener.refused(command, why);
   }
 
@@ -208,6 +234,9 @@ export class Pilot {
     } else if (message.type === "route") {
       this.going = message.state === "flying" || message.state === "acting";
       this.listener.route?.(message);
+    } else if (message.type === "follow") {
+      this.following = message.state === "flying" || message.state === "waiting";
+      this.listener.follow?.(message);
     } else if (message.type === "done") {
       if (message.do === "goto" || message.do === "return") this.going = false;
       this.listener.done(message.do, message.name, message.value);

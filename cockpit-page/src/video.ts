@@ -3,6 +3,8 @@
 import type { CameraControls } from "./cameracontrols.js";
 import { fit, h, setAttribute, setHidden, setText, setTone } from "./dom.js";
 import { contain, draw } from "./drawing.js";
+import { type FollowMessage, REACH_NS, SOURCE } from "./follow.js";
+import { type FollowHost, FollowTool } from "./followtool.js";
 import { duration } from "./format.js";
 import { t } from "./language/index.js";
 import type { Camera, Drawing, FrameHead } from "./model.js";
@@ -10,7 +12,6 @@ import { NewestFrame, type Received, unpack } from "./newest.js";
 import { LastingSocket } from "./socket.js";
 import { VideoTools } from "./videotools.js";
 
-const REACH_NS = 300_000_000n; // drawings of a frame further away than this are not shown
 const LATE_S = 0.25;
 const STALE_S = 1;
 const RATE_MS = 2000;
@@ -28,6 +29,8 @@ export class VideoView {
   /** Why no new pictures come from what was recorded, which is no fault; empty while they do. */
   still = "";
   readonly canvas: HTMLCanvasElement;
+  /** Null for who only watches. */
+  readonly follow: FollowTool | null;
   private readonly tools: VideoTools;
   private readonly sheet = h("canvas", { class: "overlay", "aria-hidden": "true" });
   private readonly age = h("span");
@@ -46,10 +49,12 @@ export class VideoView {
   constructor(
     readonly drone: string,
     readonly camera: Camera,
+    host: FollowHost | null,
   ) {
     this.canvas = h("canvas", { class: "video", role: "img", "aria-label": t.video.none(camera.name), width: camera.width, height: camera.height });
     this.element = h("figure", { class: "camera", "data-camera": camera.name }, this.canvas, this.sheet, this.ageChip, this.rate, this.nothing);
-    this.tools = new VideoTools(this);
+    this.follow = host && new FollowTool(this, host);
+    this.tools = new VideoTools(this, this.follow?.button ?? null);
     // What nobody sees asks for no pictures: a hidden page, or a place that is scrolled away.
     document.addEventListener("visibilitychange", this.hide);
     this.sight.observe(this.element);
@@ -59,6 +64,7 @@ export class VideoView {
   close(): void {
     document.removeEventListener("visibilitychange", this.hide);
     this.sight.disconnect();
+    this.follow?.end();
     this.tools.close();
     this.socket?.close();
     this.frames?.end();
@@ -67,6 +73,16 @@ export class VideoView {
   /** Age of what is on the screen now [s]: its age when it was sent, and the time since it came. */
   age_s(now_ms: number): number | null {
     return this.shown && this.shown.age_s + (now_ms - this.shown.received_ms) / 1000;
+  }
+
+  /** The frame that is on the screen. */
+  get frame(): FrameHead | null {
+    return this.shown;
+  }
+
+  /** The newest of each source. */
+  get allDrawings(): Iterable<Drawing> {
+    return this.drawings.values();
   }
 
   /** Show age and rate. */
@@ -93,13 +109,14 @@ export class VideoView {
     const pen = this.sheet.getContext("2d");
     if (!pen || !this.shown) return;
     pen.clearRect(0, 0, this.sheet.width, this.sheet.height);
-    if (this.overlay) this.paint(pen, this.sheet, density);
+    this.paint(pen, this.sheet, density, this.overlay ? undefined : SOURCE);
   }
 
-  /** Draw what was published about the picture that is shown, as far as the box lets it. */
-  paint(pen: CanvasRenderingContext2D, box: HTMLCanvasElement, density: number): void {
+  /** Draw what was published about the picture that is shown, as far as the box lets it; `only`: by this source. */
+  paint(pen: CanvasRenderingContext2D, box: HTMLCanvasElement, density: number, only?: string): void {
     if (!this.shown) return;
     for (const drawing of this.drawings.values()) {
+      if (only !== undefined && drawing.source !== only) continue;
       const apart = this.shown.captured - BigInt(drawing.captured_ns);
       if (apart < REACH_NS && apart > -REACH_NS) draw(pen, drawing.shapes, contain(drawing.width, drawing.height, box, density));
     }
@@ -166,11 +183,13 @@ export class Stage {
   private readonly nothing = h("p", { class: "empty" }, t.video.noCamera);
   private readonly views = new Map<string, VideoView>();
   private known = "";
+  private canFollow = "";
   private told_ms = 0;
 
   constructor(
     private readonly drone: string,
     private readonly controls: CameraControls,
+    private readonly host: FollowHost | null,
   ) {
     const head = h("header", { class: "deck-head" }, this.choices, h("div", { class: "choices" }, this.overlay, controls.button));
     this.element = h("section", { class: "stage", "aria-label": t.video.cameras }, head, this.pictures, controls.element);
@@ -203,6 +222,35 @@ export class Stage {
     for (const view of this.views.values()) view.still = still;
   }
 
+  /** Mark something in the first camera that is shown, or stop that. False: none is shown. */
+  toggleFollow(): boolean {
+    const tools = [...this.views.values()].flatMap((view) => view.follow ?? []);
+    const tool = tools.find((one) => one.isOn) ?? tools[0];
+    tool?.toggle();
+    return tool !== undefined;
+  }
+
+  /** Why nothing can be flown after a target now; empty: it can. */
+  allowFollow(why: string): void {
+    this.canFollow = why;
+    for (const view of this.views.values()) view.follow?.allow(why);
+  }
+
+  /** What the cockpit says of the target of this page. */
+  followed(message: FollowMessage): void {
+    this.views.get(message.camera)?.follow?.update(message);
+  }
+
+  /** A command was refused: true if that is shown at its tool. */
+  followRefused(command: string, why: string): boolean {
+    return [...this.views.values()].some((view) => view.follow?.refused(command, why));
+  }
+
+  /** The connection by which targets are followed is gone. */
+  forgetTarget(): void {
+    for (const view of this.views.values()) view.follow?.forget();
+  }
+
   /** Below the pictures. */
   append(element: HTMLElement): void {
     this.element.append(element);
@@ -212,7 +260,8 @@ export class Stage {
     const shown = this.views.has(camera.name);
     if (shown) this.hide(camera.name);
     else {
-      const view = new VideoView(this.drone, camera);
+      const view = new VideoView(this.drone, camera, this.host);
+      view.follow?.allow(this.canFollow);
       view.overlay = this.overlay.getAttribute("aria-pressed") === "true";
       this.views.set(camera.name, view);
       this.pictures.append(view.element);

@@ -55,7 +55,11 @@ export class VideoTools {
   private saying: ReturnType<typeof setTimeout> | undefined;
   private readonly full = (): void => this.onFullScreen();
 
-  constructor(private readonly pictures: Pictures) {
+  /** @param first A tool that comes before these. */
+  constructor(
+    private readonly pictures: Pictures,
+    first: HTMLButtonElement | null,
+  ) {
     const button = (name: keyof typeof ICONS, act: () => void): HTMLButtonElement => {
       const label = t.video[name](pictures.camera.name);
       return h("button", { type: "button", class: "tool", "data-tool": name, "aria-label": label, title: label, onclick: act }, icon(name));
@@ -67,7 +71,7 @@ export class VideoTools {
       full: button("full", () => void this.toggleFull()),
     };
     for (const name of ["clip", "apart"] as const) setAttribute(this.buttons[name], "aria-pressed", "false");
-    this.element = h("div", { class: "tools", role: "group", "aria-label": t.video.tools(pictures.camera.name) }, ...Object.values(this.buttons));
+    this.element = h("div", { class: "tools", role: "group", "aria-label": t.video.tools(pictures.camera.name) }, first, ...Object.values(this.buttons));
     pictures.element.append(this.mark, this.said, this.element, this.reach);
     document.addEventListener("fullscreenchange", this.full);
     this.screen.addEventListener("leavepictureinpicture", () => this.endApart());

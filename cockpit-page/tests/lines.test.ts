@@ -409,3 +409,28 @@ test("who asks first waits, and sees for how long", () => {
   assert.equal(pilot.wait_s, null);
   assert.equal(pilot.ended, "", "control that was never had is not lost");
 });
+
+test("what is marked is followed until something else is commanded; a page that loses the focus hovers", () => {
+  const { pilot, sent, receive, live } = flown();
+  live();
+  pilot.selectTarget("front");
+  pilot.markTarget({ camera: "front", captured_ns: "17", box: [1, 2, 30, 40], class_name: "person" });
+  const follow = sent.findLast((message) => message["do"] === "follow");
+  assert.deepEqual([follow?.["camera"], follow?.["captured_ns"], follow?.["box"]], ["front", "17", [1, 2, 30, 40]]);
+  receive(held(true));
+  receive({ type: "follow", state: "tracking", camera: "front" });
+  pilot.rest();
+  assert.deepEqual(doings(sent), ["follow_select", "follow"], "nothing flies yet");
+  pilot.flyAfter("orbit", 5);
+  receive({ type: "follow", state: "flying", camera: "front", mode: "orbit" });
+  pilot.rest();
+  assert.deepEqual(doings(sent).slice(2), ["follow_mode", "hover"]);
+  receive({ type: "follow", state: "flying", camera: "front", mode: "orbit" });
+  receive({ type: "follow", state: "ended", camera: "front", problem: "" });
+  pilot.rest();
+  pilot.flyAfter("follow", null);
+  receive({ type: "refused", do: "follow_mode", n: 0, why: "take off first" });
+  pilot.rest();
+  assert.deepEqual(doings(sent).slice(4), ["follow_mode"]);
+  assert.ok(!("distance_m" in (sent.findLast((message) => message["do"] === "follow_mode") ?? {})));
+});

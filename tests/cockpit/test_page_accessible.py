@@ -43,6 +43,16 @@ def test_axe_finds_no_fault(deck: Deck, open_cockpit: tuple[Browser, str], tmp_p
     page.wait_for_new_picture()
     page.take_off()
     found["one drone"] = faults(page.page)
+    page.press("f")
+    page.wait_for_text(".follow-hint", "Drag a box")
+    page.press("ArrowUp", "Shift+ArrowRight")
+    page.pane.locator(".follow-box").wait_for()
+    found["marking a target"] = faults(page.page)
+    page.press("Enter")
+    page.pane.get_by_role("region", name="Target").wait_for()
+    found["a target"] = faults(page.page)
+    page.press("Escape")
+    page.until(lambda: not page.pane.locator(".follow-panel").is_visible(), "it is forgotten")
     for name in ("Controls", "Parameters"):
         page.pane.get_by_role("button", name=name).dispatch_event("click")  # whatever banner lies over it
     page.pane.locator('.deck [data-parameter="limits.speed"]').wait_for()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import math
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
@@ -20,21 +21,23 @@ from tests.client.scripted import WAIT_S, flown, scripted
 
 
 @pytest.fixture(scope="module")
-def script() -> ModuleType:
+def script() -> Iterator[ModuleType]:
     """The script that measures."""
     path = Path(__file__).parents[2] / "scripts" / "behaviours.py"
     spec = importlib.util.spec_from_file_location("behaviours", path)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(path.parent))  # it has modules beside it
+        spec.loader.exec_module(module)
+        yield module
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "seed", "gust"),
-    [("gates", 0, 0.0), ("gates", 3, 1.0), ("landing", 0, 0.0), ("landing", 5, 1.0), ("approach", 1, 1.0)],
+    [("gates", 0, 0.0), ("gates", 3, 1.0), ("landing", 0, 0.0), ("landing", 3, 1.0), ("approach", 1, 1.0)],
 )
 def test_does_what_it_should(script: ModuleType, name: str, seed: int, gust: float) -> None:
     flight = script.GOALS[name].fly(seed, gust)

@@ -11,12 +11,16 @@ from hypothesis import strategies as st
 
 from skyloop.clock import NS_PER_S, nanoseconds
 from skyloop.control.landing_law import LandingLaw, LandingPhase
+from skyloop.control.landing_settings import LandingSettings
+from skyloop.control.response import ResponseSettings
 from skyloop.control.spiral import SpiralSearch
 from skyloop.errors import UsageError
 from skyloop.messages import Feedback, Velocity
 
 DT = 1 / 15
 TOP_M = 0.2
+#: Of a vehicle that has the velocity that it is asked for at the next step, and does not lean for it.
+EXACT = ResponseSettings(gain_per_s=1 / DT, lag_s=0.001, delay_s=0.0)
 
 
 class World:
@@ -26,7 +30,7 @@ class World:
         self.position, self.velocity = np.array(position), Velocity()
         self.platform, self.speed = np.array([0.0, 0.0, TOP_M]), np.array([speed, 0.0, 0.0])
         self.now_ns = NS_PER_S
-        self.law = LandingLaw()
+        self.law = LandingLaw(LandingSettings(response=EXACT))
 
     def step(self, *, visible: bool = True) -> None:
         v = self.velocity

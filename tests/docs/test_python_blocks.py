@@ -21,7 +21,7 @@ FIRST = next(block for block in BLOCKS if block.page.name == "README.md")
 Flight = tuple[RunSummary, Feedback]
 
 #: What an example must have printed.
-PRINTS = {"video://flight.pave": "pictures, in order: True"}
+PRINTS = {"pictures, in order": "pictures, in order: True", "lost in {": "lost in 0 of 20 frames"}
 #: What stands for a file of the reader's: something that was recorded from a real vehicle.
 FILES = {"flight.pave": "ardrone2/video-8s.pave"}
 

@@ -173,6 +173,18 @@ def test_without_truth_feedback_holds_what_a_drone_knows() -> None:
     assert newest.native is not None
     assert set(newest.native) == {"sim.time_s"}
     assert newest.position_m is None
+    assert newest.velocity_m_s is not None
+
+
+@pytest.mark.parametrize("value", ["none", "0"])
+def test_a_vehicle_that_reports_no_velocity_still_flies_by_it(value: str) -> None:
+    with opened(f"sim://?world=empty&cameras=none&speed=10&velocity={value}&{CALM}") as (driver, sink):
+        in_the_air(driver, sink)
+        driver.apply(Velocity(forward=1.0))
+        assert sink.wait(lambda: sink.newest is not None and number(sink.newest, "truth.vx") > 0.8, 10.0)
+        newest = sink.newest
+    assert newest is not None
+    assert newest.velocity_m_s is None
 
 
 def test_a_bump_is_told_and_a_crash_is_an_emergency() -> None:

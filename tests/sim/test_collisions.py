@@ -147,6 +147,38 @@ def test_a_drone_rides_on_a_moving_platform() -> None:
     assert truth.velocity_m_s[0] == pytest.approx(0.3, abs=0.02)
 
 
+@pytest.mark.parametrize(("speed", "radius"), [(2.0, 4.0), (3.0, 8.0)])
+def test_a_fast_platform_that_turns_takes_a_drone_along(speed: float, radius: float) -> None:
+    world = parse_world(
+        f"""
+        [room]
+        size = [40, 40, 5]
+        [[spawn]]
+        position = [{radius + 0.1}, 0.15, 0.2]
+        yaw_deg = 90
+        [[target]]
+        kind = "platform"
+        id = 1
+        marker_size = 0.2
+        size = [4, 4, 0.2]
+        path = {{ kind = "circle", centre = [0, 0, 0.2], radius = {radius}, speed = {speed} }}
+        yaw = {{ mode = "along", turn_rate_deg_s = 90 }}
+        """
+    )
+    simulation = Simulation(world, parameters=IDEAL)
+    places = []
+    for wait in (1.0, 8.0):  # it slides while the platform, which does not start from rest, accelerates it
+        simulation.step(steps(wait))
+        truth, (platform,) = simulation.truth(0), simulation.target_states()
+        east, north = truth.position_m[0] - platform.position_m[0], truth.position_m[1] - platform.position_m[1]
+        c, s = math.cos(platform.yaw_rad), math.sin(platform.yaw_rad)
+        turned = (truth.yaw_rad - platform.yaw_rad) % (2 * math.pi)
+        places.append((c * east + s * north, c * north - s * east, turned))
+    assert truth.state is FlightState.LANDED
+    assert truth.position_m[2] == pytest.approx(0.2 + IDEAL.half_height_m, abs=5e-3)
+    assert places[1] == pytest.approx(places[0], abs=0.03), "where it stands on the platform, and how it is turned"
+
+
 def test_a_gate_lets_a_drone_through_its_opening_and_stops_it_at_its_frame() -> None:
     text = "[room]\nsize = [10, 10, 5]\n[[gate]]\nposition = [2, {y}, 1.1]\ninner_size = [1, 1]\n"
     through, against = (flying(parse_world(text.format(y=y)), parameters=TOUGH) for y in (0.0, 0.6))

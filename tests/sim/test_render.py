@@ -208,8 +208,9 @@ def test_every_shipped_world_is_drawn_whole_and_with_detail(name: str) -> None:
         assert picture.std() > 4.0
 
 
-def test_open_ground_has_a_sky() -> None:
-    scene = Scene(World("field", Room((20.0, 20.0, 10.0), floor="grass", enclosed=False)), drones=0)
+@pytest.mark.parametrize("length_m", [20.0, 300.0, 400.0])
+def test_open_ground_has_a_sky(length_m: float) -> None:
+    scene = Scene(World("field", Room((length_m, 20.0, 10.0), floor="grass", enclosed=False)), drones=0)
     state = SceneState(np.zeros((0, 3)), np.zeros((0, 3, 3)))
     picture = view_from(scene, state, (0.0, 0.0, 2.0), model=FRONT_CAMERA)
     blue, green, red = picture[20].mean(axis=0)

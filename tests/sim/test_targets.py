@@ -14,6 +14,7 @@ from skyloop.sim.world import (
     FixedYaw,
     LissajousPath,
     MarkerPattern,
+    OvalPath,
     Path,
     RingWalkPath,
     TowardsYaw,
@@ -30,6 +31,8 @@ PATHS: list[Path] = [
     LissajousPath((0, 0, 1), (1, 2, 0.3), (1, 2, 3), (0, 0.5, 0), 30.0),
     WalkPath((-1, -2, 0.5), (1, 2, 1.5), (0.3, 0.8)),
     RingWalkPath((0.5, 0.2), (1.8, 2.2), (1.2, 1.6), (0.3, 0.5)),
+    OvalPath((0, 0, 0.2), 2.0, 0.8, 0.9, start_m=1.5),
+    OvalPath((0, 0, 0.2), 2.0, 0.8, 0.9, clockwise=True),
 ]
 
 
@@ -53,6 +56,19 @@ def test_the_velocity_is_that_of_the_motion(path: Path) -> None:
         before, after = moving.at(time - 0.02), moving.at(time + 0.02)
         measured = (np.array(after.position_m) - np.array(before.position_m)) / 0.04
         assert moving.at(time).velocity_m_s == pytest.approx(measured, abs=0.02)
+
+
+@pytest.mark.parametrize(("clockwise", "side"), [(False, -1.0), (True, 1.0)])
+def test_an_oval_has_two_straights_and_two_half_circles(clockwise: bool, side: float) -> None:
+    oval = track(OvalPath((1.0, 2.0, 0.2), 4.0, 1.0, 1.0, clockwise=clockwise), AlongYaw(0.0, 10.0))
+    assert oval.at(1.0).position_m == pytest.approx((0.0, 2.0 + side, 0.2), abs=1e-3)
+    assert oval.at(1.0).velocity_m_s == pytest.approx((1.0, 0.0, 0.0), abs=1e-9)
+    assert oval.at(1.0).yaw_rate_rad_s == pytest.approx(0.0, abs=1e-9)
+    half_turn = oval.at(4.0 + math.pi / 2)
+    assert half_turn.position_m == pytest.approx((4.0, 2.0, 0.2), abs=1e-3)
+    assert half_turn.velocity_m_s == pytest.approx((0.0, -side, 0.0), abs=0.02)
+    assert half_turn.yaw_rate_rad_s == pytest.approx(-side, abs=0.01)
+    assert oval.at(2 * (4.0 + math.pi)).position_m == pytest.approx(oval.at(0.0).position_m, abs=1e-3)
 
 
 def test_where_a_target_is_depends_on_the_time_and_the_seed_alone() -> None:

@@ -18,7 +18,9 @@ FACE = "[[panel]]\nsize = [1, 1]\ntexture = 'door'\n"
 BOARD = "[[target]]\nname = 'b'\nid = 1\nmarker_size = 0.2\n"
 
 
-@pytest.mark.parametrize("name", ["empty", "gates", "pillars", "platform", "room", "street", "windy", "yard"])
+@pytest.mark.parametrize(
+    "name", ["empty", "gates", "pillars", "platform", "platform_fast", "room", "street", "windy", "yard"]
+)
 def test_shipped_worlds_load_and_can_be_flown_in(name: str) -> None:
     assert name in shipped_worlds()
     world = load_world(name, seed=3)
@@ -105,6 +107,10 @@ BAD = [
     (ROOM + BOARD, r"\[target 'b'\], key 'path': missing"),
     (ROOM + BOARD + "path = { kind = 'spiral' }\n", r"\[target 'b'.path\], key 'kind': 'spiral' is not known"),
     (ROOM + BOARD + "path = { kind = 'circle', centre = [3, 0, 1], radius = 2, speed = 1 }\n", "x = 1 to 5 is outside"),
+    (
+        ROOM + BOARD + "path = { kind = 'oval', centre = [0, 0, 1], length = 6, radius = 2, speed = 1 }\n",
+        "x = -5 to 5 is outside",
+    ),
     (ROOM + BOARD + "path = { kind = 'circle', centre = [0, 0, 1], radius = 1, speed = 0 }\n", "'speed': 0"),
     (ROOM + BOARD + "path = { kind = 'waypoints', points = [[0, 0, 1]], speed = 1 }\n", "at least 2 lists"),
     (ROOM + BOARD + "path = { kind = 'waypoints', points = [[0,0,1],[0,0,1]], speed = 1 }\n", "stands twice"),

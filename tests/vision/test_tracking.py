@@ -16,6 +16,7 @@ from benchmarks.tracking_film import read_film, read_labels
 from benchmarks.tracking_scenes import Sequence, Truth, fixed, moved, scene, texture
 from skyloop.errors import UsageError
 from skyloop.vision import CorrelationTracker, LongTermTracker, MedianFlowTracker, Tracker, TrackResult
+from skyloop.vision.appearance import colours
 from skyloop.vision.tracking import Box, Image, overlap
 from tests.recordings import recorded
 
@@ -274,6 +275,136 @@ def test_every_tenth_frame_of_the_film_is_labelled() -> None:
     assert len(labels.objects) >= 3
     assert all(sorted(boxes) == list(range(0, 240, 10)) for boxes in labels.objects.values())
     assert labels.how
+
+
+# What something else knows of the target ---------------------------------------------------------------------------
+
+
+def at(x: int, y: int, what: int | None = 5) -> Image:
+    """A picture of a textured thing of 30×40 pixels at a place; None: without it."""
+    image = texture(np.random.default_rng(8), 320, 240)
+    if what is not None:
+        image[y : y + 40, x : x + 30] = texture(np.random.default_rng(what), 30, 40, (60, 120, 180))
+    return image
+
+
+@pytest.mark.parametrize("make", [CorrelationTracker, LongTermTracker])
+def test_a_target_that_jumps_with_the_camera_is_found_if_the_tracker_is_told(make: Make) -> None:
+    told, untold = make(), make()
+    for tracker in (told, untold):
+        tracker.start(at(60, 40), BOX)
+    told.shift(120.0, 70.0)
+    moved = (182.0, 108.0, 30.0, 40.0)
+    assert agreement(told.update(at(182, 108)), moved) > 0.7
+    assert agreement(untold.update(at(182, 108)), moved) == 0.0
+
+
+def test_a_tracker_that_looks_by_the_images_own_motion_ignores_shifts() -> None:
+    tracker = MedianFlowTracker()
+    tracker.start(at(60, 40), BOX)
+    tracker.shift(120.0, 70.0)
+    assert agreement(tracker.update(at(62, 41)), (62.0, 41.0, 30.0, 40.0)) > 0.7
+
+
+def test_the_similarity_is_that_of_looks() -> None:
+    tracker = LongTermTracker()
+    tracker.start(at(60, 40), BOX)
+    assert tracker.similarity(at(150, 100), (150, 100, 30, 40)) > 0.8
+    assert tracker.similarity(at(150, 100, 6), (150, 100, 30, 40)) < 0.45
+    assert tracker.similarity(at(0, 0, None), (150, 100, 30, 40)) < 0.45
+
+
+def test_what_looks_more_like_a_known_look_alike_has_no_similarity() -> None:
+    mixed = np.asarray(cv2.addWeighted(at(60, 40, 5), 0.6, at(60, 40, 6), 0.4, 0), np.uint8)
+    tracker = LongTermTracker()
+    tracker.start(at(60, 40), BOX)
+    assert tracker.similarity(mixed, BOX) > 0.0
+    tracker._memory.learn_look_alike(mixed, tuple(map(float, BOX)))  # type: ignore[arg-type]
+    assert tracker.similarity(mixed, BOX) == 0.0
+    assert tracker.similarity(at(60, 40), BOX) > 0.9
+
+
+def test_it_goes_on_from_where_something_else_found_the_target() -> None:
+    tracker = LongTermTracker()
+    tracker.start(at(60, 40), BOX)
+    assert all(tracker.update(at(0, 0, None)).lost for _ in range(15))
+    tracker.resume(at(200, 120), (200, 120, 30, 40))
+    result = tracker.update(at(203, 121))
+    assert agreement(result, (203.0, 121.0, 30.0, 40.0)) > 0.7, "at once, without a trial"
+    assert tracker.similarity(at(60, 40), BOX) > 0.9, "its looks are remembered"
+
+
+def test_what_was_refused_is_lost_until_it_is_found_again() -> None:
+    tracker = LongTermTracker()
+    tracker.start(at(60, 40), BOX)
+    assert not tracker.update(at(60, 40)).lost
+    tracker.refuse()
+    tracker.shift(500.0, 500.0)  # what is lost is looked for everywhere
+    assert tracker.update(at(60, 40)).lost
+    assert not all(tracker.update(at(60, 40)).lost for _ in range(12))
+
+
+def test_a_tracker_that_was_not_started_can_not_go_on() -> None:
+    tracker = LongTermTracker()
+    tracker.shift(3.0, 4.0)
+    for call in (tracker.refuse, lambda: tracker.resume(picture(), BOX), lambda: tracker.similarity(picture(), BOX)):
+        with pytest.raises(UsageError, match="was not started"):
+            call()
+    tracker.start(picture(), BOX)
+    for wrong in ((60, 40, 0, 40), (60, math.nan, 30, 40), (500, 40, 30, 40), None):
+        with pytest.raises(UsageError, match="the box is"):
+            tracker.resume(picture(), wrong)  # type: ignore[arg-type]
+        with pytest.raises(UsageError, match="the box is"):
+            tracker.similarity(picture(), wrong)  # type: ignore[arg-type]
+    assert not tracker.update(picture()).lost, "it goes on as before"
+
+
+# Colours -----------------------------------------------------------------------------------------------------------
+
+
+def dressed(shirt: tuple[int, int, int], trousers: tuple[int, int, int]) -> Image:
+    image = np.full((120, 160, 3), 127, np.uint8)
+    image[20:60, 60:90], image[60:100, 60:90] = shirt, trousers
+    return image
+
+
+@pytest.mark.parametrize(
+    ("colour", "lab"),
+    [
+        ((255, 255, 255), (100, 0, 0)),
+        ((0, 0, 0), (0, 0, 0)),
+        ((0, 0, 255), (53, 80, 67)),
+        ((255, 0, 0), (32, 79, -108)),
+    ],
+    ids=["white", "black", "red", "blue"],
+)
+def test_the_colours_are_those_of_the_upper_and_the_lower_half(
+    colour: tuple[int, int, int], lab: tuple[int, int, int]
+) -> None:
+    """Values of CIELAB by the standard's formulas, for D65."""
+    for image, half in ((dressed(colour, (90, 90, 90)), slice(0, 3)), (dressed((90, 90, 90), colour), slice(3, 6))):
+        found = colours(image, (60.0, 20.0, 30.0, 80.0))
+        assert found.shape == (6,)
+        assert found.dtype == np.float32
+        assert found[half] == pytest.approx(lab, abs=1.5)
+
+
+def test_the_background_beside_a_thing_hardly_matters_for_its_colours() -> None:
+    image = dressed((40, 60, 190), (150, 80, 30))
+    inside, wide = colours(image, (60, 20, 30, 80)), colours(image, (52, 20, 46, 80))
+    assert wide == pytest.approx(inside, abs=1.0)
+
+
+@pytest.mark.parametrize("box", [(-50, -50, 20, 20), (150, 110, 400, 400), (60, 20, 0.1, 0.1), (-10, -10, 500, 500)])
+def test_colours_of_any_box_are_finite(box: Box) -> None:
+    for image in (dressed((40, 60, 190), (150, 80, 30)), picture(channels=1)):
+        assert np.isfinite(colours(image, box)).all()
+
+
+def test_a_grey_image_has_no_colours_but_light() -> None:
+    found = colours(picture(channels=1), tuple(map(float, BOX)))  # type: ignore[arg-type]
+    assert found[[1, 2, 4, 5]] == pytest.approx(0.0, abs=0.01)
+    assert found[0] > 10.0
 
 
 def test_trackers_of_other_programs_can_be_used_with_frames() -> None:

@@ -18,7 +18,8 @@ from skyloop.clock import Clock
 from skyloop.errors import DecodeError, MissingExtraError
 from skyloop.messages import Encoding, Feedback, FrameHeader, Intrinsics
 from skyloop.messages.image_header import image_size, why_not_decoded
-from skyloop.transport.frame_encoding import resized, scaled_header
+from skyloop.messages.video import VideoRequest
+from skyloop.transport.frame_encoding import encode_frame, resized, scaled_header
 
 if TYPE_CHECKING:
     from skyloop.client.feedback_history import FeedbackHistory
@@ -290,6 +291,25 @@ class SmallArrival(Arrival):
         assert self._pixels is not None
         picture: NDArray[np.uint8] = resized(to_bgr(self._full, self._pixels), self.header)
         return picture
+
+
+def compressed(frame: Frame, quality: int = 95) -> Arrival:
+    """Return a frame as a JPEG, to keep many of them: :meth:`Arrival.frame` makes it a frame again.
+
+    Args:
+        frame: As it was delivered.
+        quality: Of the JPEG, 1 to 100.
+
+    Raises:
+        MissingExtraError: OpenCV is not installed.
+        LinkError: OpenCV could not make a JPEG of it.
+    """
+    from_ = frame._arrival
+    plain = msgspec.structs.replace(frame.header, encoding=Encoding.BGR8, size=frame.size)
+    request = VideoRequest(frame.camera, encoding="jpeg", quality=quality)
+    header, jpeg = encode_frame(plain, np.asarray(frame).reshape(-1), request)
+    pixels = np.frombuffer(jpeg, np.uint8)
+    return Arrival(header, pixels, from_.received_ns, from_._offset_ns, from_._history, from_._clock)
 
 
 def size_error(header: FrameHeader, size: int) -> str:

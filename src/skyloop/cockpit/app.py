@@ -34,6 +34,7 @@ from skyloop.cockpit.api import Api
 from skyloop.cockpit.control_session import ControlSession
 from skyloop.cockpit.fleet import Fleet, Overview
 from skyloop.cockpit.fleet_control import FleetSession
+from skyloop.cockpit.follow_session import FollowerFactory
 from skyloop.cockpit.page_files import PageFiles
 from skyloop.cockpit.recordings import Recordings
 from skyloop.cockpit.recordings_api import RecordingsApi
@@ -44,6 +45,7 @@ from skyloop.cockpit.small_video import SmallVideoSender
 from skyloop.cockpit.station import Station
 from skyloop.cockpit.stream import UNKNOWN, BroadcastSender, PageCounts, TelemetrySender, VideoSender
 from skyloop.cockpit.world_api import WorldApi
+from skyloop.control.target_follower import TargetFollower
 from skyloop.messages import Role
 from skyloop.messages.world import WorldGeometry
 
@@ -58,14 +60,16 @@ class Cockpit:
         fleet: The drones.
         recordings: Of the same drones.
         static: The folder of the page.
+        follower: Makes what tracks a target that a page marks, and flies after it.
     """
 
-    def __init__(self, fleet: Fleet, recordings: Recordings, static: Path) -> None:
+    def __init__(self, fleet: Fleet, recordings: Recordings, static: Path, follower: FollowerFactory) -> None:
         self.counts = PageCounts()
         self.files = PageFiles(static)
         self._fleet = fleet
         self._recordings = recordings
         self._overview = Overview(fleet, recordings)
+        self._follower = follower
 
     @asynccontextmanager
     async def lifespan(self, _: Starlette) -> AsyncIterator[None]:
@@ -133,7 +137,8 @@ class Cockpit:
         if person is None or not person.may(Role.PILOT):
             await socket.close(NOT_ALLOWED, "this needs a pilot")
             return
-        await ControlSession(socket, station, person.name, photos=self._recordings.folder / "photos").run()
+        photos = self._recordings.folder / "photos"
+        await ControlSession(socket, station, person.name, photos=photos, follower=self._follower).run()
 
     async def _accept(self, socket: WebSocket) -> Station | None:
         """Return the station of the drone that is asked for; None, and the socket is closed, if there is none."""
@@ -153,6 +158,7 @@ def create_app(
     static: Path = STATIC,
     admission: Admission | None = None,
     world: WorldGeometry | None = None,
+    follower: FollowerFactory = TargetFollower,
 ) -> Starlette:
     """Make the cockpit's application.
 
@@ -164,8 +170,9 @@ def create_app(
         static: The folder of the page.
         admission: Counts the connections.
         world: What stands around drones that don't know it themselves.
+        follower: Makes what tracks a target that a page marks, and flies after it.
     """
-    cockpit = Cockpit(fleet, recordings, static)
+    cockpit = Cockpit(fleet, recordings, static, follower)
     api = Api(fleet, gate, cockpit.counts, names.scheme, admission or Admission())
     return Starlette(
         routes=[

@@ -11,6 +11,8 @@ from skyloop.messages import HIGHEST_PRIORITY, LOWEST_PRIORITY
 from skyloop.messages.config import Reason
 
 Priority = Annotated[int, msgspec.Meta(ge=HIGHEST_PRIORITY, le=LOWEST_PRIORITY)]
+CameraName = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
+Word = Annotated[str, msgspec.Meta(max_length=64)]
 
 LATE_S: Final = 0.5  #: a command that may be older is refused: the person no longer expects it to happen
 #: An emergency stop may be this late: as long as the page shows it as pending.
@@ -113,6 +115,34 @@ class StopRoute(Command, frozen=True, tag="route_stop"):
     """Hover, and end the route."""
 
 
+class SelectTarget(Command, frozen=True, tag="follow_select"):
+    """Keep the frames of a camera, as a box is about to be drawn on one of them; None: no longer."""
+
+    camera: CameraName | None
+
+
+class FollowTarget(Command, frozen=True, tag="follow"):
+    """Track what is in a box, and fly after it if there is a mode."""
+
+    camera: CameraName
+    captured_ns: Annotated[str, msgspec.Meta(pattern=r"^[0-9]{1,19}$")]  #: of the frame that it was drawn on [ns]
+    box: tuple[float, float, float, float]  #: x, y of its upper left corner, width and height [pixels of the frame]
+    mode: Word | None = None  #: None: track it, and fly nothing before there is one
+    class_name: Word | None = None  #: of a detection that was chosen
+    distance_m: float | None = None  #: to keep; None: the follower's own
+
+
+class SetFollowMode(Command, frozen=True, tag="follow_mode"):
+    """Fly after the target that is tracked, or go on in another mode."""
+
+    mode: Word
+    distance_m: float | None = None  #: to keep; None: as it is
+
+
+class StopFollowing(Command, frozen=True, tag="follow_stop"):
+    """Forget the target; hover if it was flown after."""
+
+
 class Write(Command, frozen=True, tag="set"):
     """Write a parameter."""
 
@@ -153,6 +183,10 @@ AnyCommand = (
     | ResumeRoute
     | SkipWaypoint
     | StopRoute
+    | SelectTarget
+    | FollowTarget
+    | SetFollowMode
+    | StopFollowing
 )
 
 AnyFleetCommand = LandAll | StopAll | Alive

@@ -20,8 +20,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from starlette.websockets import WebSocket
 
-from skyloop.client.commands import position_action
-from skyloop.client.completion import OF_ONE_PACKET, ReturnWatch
+from skyloop.client.completion import OF_ONE_PACKET
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
 from skyloop.cockpit.authority_report import AuthorityReport
 from skyloop.cockpit.broadcast import call_soon
@@ -33,6 +32,7 @@ from skyloop.cockpit.commands import (
     Fly,
     FlyBack,
     FlyRoute,
+    FollowTarget,
     GoTo,
     HoverHere,
     LandHere,
@@ -40,8 +40,11 @@ from skyloop.cockpit.commands import (
     Release,
     Reset,
     ResumeRoute,
+    SelectTarget,
+    SetFollowMode,
     SkipWaypoint,
     Stop,
+    StopFollowing,
     StopRoute,
     Take,
     TakeOff,
@@ -50,36 +53,27 @@ from skyloop.cockpit.commands import (
     late_s,
     untimely,
 )
+from skyloop.cockpit.follow_session import NO_CONTROL, FollowerFactory, FollowSession
+from skyloop.cockpit.place_flight import UP, Leg, PlaceFlight, to_place, to_start
 from skyloop.cockpit.route_session import RouteSession
 from skyloop.cockpit.stream import PageSocket
 from skyloop.cockpit.takeover import TakeoverDialog
 from skyloop.control.route_flight import check_for
-from skyloop.control.waypoint import Waypoint, lacking, reached
+from skyloop.control.target_follower import TargetFollower
 from skyloop.errors import AuthorityError, DecodeError, LinkError, RefusedError, SkyloopError
-from skyloop.messages import (
-    EventKind,
-    Feedback,
-    FlightState,
-    Land,
-    Position,
-    ReturnPhase,
-    ReturnToStart,
-    Takeoff,
-)
+from skyloop.messages import EventKind, FlightState, Land, Refusal, Takeoff
 
 if TYPE_CHECKING:
     from skyloop.cockpit.pilot_connection import PilotConnection
     from skyloop.cockpit.station import Station
+    from skyloop.control.waypoint import Waypoint
     from skyloop.messages import Event
 
 SILENT_S: Final = 0.5  #: a page that flies and sends nothing for so long counts as dead
 GONE_S: Final = (
     2.0  #: a page that receives nothing from the cockpit for so long flies nothing, and its control runs out
 )
-GOTO_M_S: Final = 1.0  #: greatest speed on the way to a place
-GOTO_PERIOD_S: Final = 0.05  #: between looks whether it is there
 _REFUSE_AGAIN_S: Final = 1.0  # the same refusal of sticks, which come twenty times a second
-_UP: Final = frozenset({FlightState.HOVERING, FlightState.FLYING})
 _DOWN: Final = frozenset({FlightState.LANDED})
 _TAKEOFF_NS: Final = 1_000_000_000  # a take-off is repeated for so long, in case packets are lost
 _numbers = itertools.count(1)
@@ -98,6 +92,7 @@ class ControlSession:
         clock: Clock = monotonic_ns,
         *,
         photos: Path = Path("photos"),
+        follower: FollowerFactory = TargetFollower,
     ) -> None:
         """Prepare the session; :meth:`run` serves it.
 
@@ -107,6 +102,7 @@ class ControlSession:
             person: The name of who flies, if it is known.
             clock: The monotonic clock [ns].
             photos: Where photos of routes are saved, in a folder of the drone's name.
+            follower: Makes what tracks a target that the page marks, and flies after it.
         """
         self._page = PageSocket(socket)
         self._send = self._page.send
@@ -117,7 +113,8 @@ class ControlSession:
         self._pilot: PilotConnection | None = None
         self._jobs: set[asyncio.Task[None]] = set()
         self._turn = asyncio.Lock()  # what waits for the proxy is done one after the other
-        self._goto: asyncio.Task[None] | None = None
+        self._place = PlaceFlight(station, self.app, self._done, self._refuse)
+        self._follow = FollowSession(station.drone, self._send, self._end_flight, follower, clock)
         self._route: RouteSession | None = None
         self._photos = photos / station.found.name
         self._steering = False  # by sticks: the newest set-point is a velocity of this page
@@ -134,19 +131,23 @@ class ControlSession:
             Take: lambda command: self._run_in_turn(command, self._take),
             Release: lambda command: self._run_in_turn(command, self._release),
             Answer: lambda command: self._run_in_turn(command, self._answer),
-            TakeOff: lambda command: self._send_command(command, lambda pilot: pilot.command(Takeoff()), _UP),
+            TakeOff: lambda command: self._send_command(command, lambda pilot: pilot.command(Takeoff()), UP),
             HoverHere: lambda command: self._send_command(command, lambda pilot: pilot.hover()),
             LandHere: lambda command: self._send_command(command, lambda pilot: pilot.command(Land()), _DOWN),
             Reset: lambda command: self._send_command(command, lambda pilot: pilot.reset_emergency()),
             Stop: self._stop_motors,
             Fly: self._fly,
-            GoTo: self._go_to,
-            FlyBack: self._return,
+            GoTo: lambda command: self._set_out(command, lambda pilot: to_place(command, pilot)),
+            FlyBack: lambda command: self._set_out(command, to_start),
             FlyRoute: lambda command: self._run_in_turn(command, self._fly_route),
             PauseRoute: lambda command: self._steer_route(command, RouteSession.pause),
             ResumeRoute: lambda command: self._steer_route(command, RouteSession.resume),
             SkipWaypoint: lambda command: self._steer_route(command, RouteSession.skip),
             StopRoute: lambda command: self._steer_route(command, RouteSession.end),
+            SelectTarget: lambda command: self._run_in_turn(command, self._select_target),
+            FollowTarget: lambda command: self._run_in_turn(command, self._follow_target),
+            SetFollowMode: self._set_follow_mode,
+            StopFollowing: self._stop_following,
             Write: lambda command: self._run_in_turn(command, self._write),
         }
 
@@ -217,11 +218,11 @@ class ControlSession:
         if until:
             self._awaited, self._repeated = (command.do, until, pilot.proxy_now_ns + SETTLED_NS), False
         else:
-            self._send({"type": "done", "do": command.do})
+            self._done(command.do)
 
     def _send_now(self, pilot: PilotConnection, act: Callable[[PilotConnection], bool], command: AnyCommand) -> None:
         """End what the page flew before, and send a command; :class:`LinkError` if it was not sent."""
-        self._end_flight()
+        self._end_flight(f"{command.do} was commanded")
         if not act(pilot):
             with suppress(SkyloopError):
                 pilot.idle()  # or it would be done after all when the link is back soon
@@ -229,44 +230,17 @@ class ControlSession:
 
     def _fly(self, command: Fly) -> None:
         pilot = self._held()
-        self._end_flight()
+        self._end_flight("the sticks were moved")
         pilot.velocity(forward=command.forward, left=command.left, up=command.up, yaw_rate=command.yaw_rate)
         self._steering = True
         self._restart_silence_timer()
 
-    def _go_to(self, command: GoTo) -> None:
+    def _set_out(self, command: AnyCommand, plan: Callable[[PilotConnection], Leg]) -> None:
+        """Send a flight to a place, and watch it until it is over."""
         pilot = self._held()
-        _fit_for_places(pilot, "it can't be flown to a place")
-        goal = Waypoint(command.x, command.y, command.z, command.yaw)
-        place = position_action(goal.x, goal.y, goal.z, goal.yaw, GOTO_M_S)
-        self._set_out(command, pilot, place, goal, lambda feedback: reached(goal, feedback))
-
-    def _return(self, command: FlyBack) -> None:
-        pilot = self._held()
-        start = _fit_for_places(pilot, "it can't return to its start").start_position_m
-        if start is None:
-            raise RefusedError("it can't return to its start: where it took off is not known")
-        over = ReturnWatch()
-        self._set_out(
-            command,
-            pilot,
-            ReturnToStart(),
-            Waypoint(*start),
-            lambda feedback: over(feedback) or feedback.return_phase is ReturnPhase.LANDING,
-        )
-
-    def _set_out(
-        self,
-        command: AnyCommand,
-        pilot: PilotConnection,
-        action: Position | ReturnToStart,
-        goal: Waypoint,
-        is_over: Callable[[Feedback], bool],
-    ) -> None:
-        """Send a flight to a place, show its goal, and watch it until it is over."""
-        self._send_now(pilot, lambda pilot: pilot.command(action), command)
-        self._station.goals[self.app] = goal
-        self._goto = self._start_job(self._follow(command.do, pilot, action, is_over))
+        leg = plan(pilot)
+        self._send_now(pilot, lambda pilot: pilot.command(leg.action), command)
+        self._place.watch(command.do, pilot, leg)
         self._acknowledge(command)
         self._restart_silence_timer()
 
@@ -297,6 +271,25 @@ class ControlSession:
         self._acknowledge(command)
         self._restart_silence_timer()
 
+    async def _select_target(self, command: SelectTarget) -> None:
+        await self._follow.select(command)
+        self._acknowledge(command)
+
+    async def _follow_target(self, command: FollowTarget) -> None:
+        """Track what is in a box; without a mode that needs no authority."""
+        await self._follow.begin(command, self._held)
+        self._acknowledge(command)
+        self._restart_silence_timer()
+
+    def _set_follow_mode(self, command: SetFollowMode) -> None:
+        self._follow.fly(command, self._held())
+        self._acknowledge(command)
+        self._restart_silence_timer()
+
+    def _stop_following(self, command: StopFollowing) -> None:
+        self._follow.end()
+        self._acknowledge(command)
+
     def _aim(self, goal: Waypoint | None) -> None:
         """Show where a route flies to."""
         if goal is None:
@@ -311,7 +304,7 @@ class ControlSession:
             self._route = None
 
     def _stop_motors(self, command: Stop) -> None:
-        self._end_flight()
+        self._end_flight("the motors were stopped")
         self._start_job(self._cut_motors(command))
 
     async def _cut_motors(self, command: Stop) -> None:
@@ -324,7 +317,7 @@ class ControlSession:
             self._refuse_command(command, str(error))
         else:
             self._acknowledge(command)
-            self._send({"type": "done", "do": command.do})
+            self._done(command.do)
 
     async def _take(self, command: Take) -> None:
         pilot = self._pilot
@@ -346,20 +339,20 @@ class ControlSession:
             if isinstance(error, AuthorityError) and error.code == "busy":
                 raise AuthorityError(self._authority.busy(command.priority), code="busy") from error
             raise
-        self._send({"type": "done", "do": command.do})
+        self._done(command.do)
         self._update()
 
     async def _answer(self, command: Answer) -> None:
         self._acknowledge(command)
         await self._takeover.answer(command, self._held())
-        self._send({"type": "done", "do": command.do})
+        self._done(command.do)
 
     async def _release(self, command: Release) -> None:
         self._hover()
         self._authority.released()
         self._acknowledge(command)
         await self._close_pilot()
-        self._send({"type": "done", "do": command.do})
+        self._done(command.do)
         self._update()
 
     async def _close_pilot(self) -> None:
@@ -380,32 +373,6 @@ class ControlSession:
 
         value = await asyncio.to_thread(write)
         self._send({"type": "done", "do": command.do, "name": command.name, "value": value})
-
-    async def _follow(
-        self,
-        do: str,
-        pilot: PilotConnection,
-        action: Position | ReturnToStart,
-        is_over: Callable[[Feedback], bool],
-    ) -> None:
-        """Watch the way to a place. Ends there, with the first thing that goes wrong, and with the next command."""
-        try:
-            while not is_over(pilot.feedback(max_age_s=1.0)):
-                if pilot.has_ended(action):
-                    raise RefusedError("it was ended on the way, by a failsafe or a lost link")
-                await asyncio.sleep(GOTO_PERIOD_S)
-            if pilot.feedback().return_phase is ReturnPhase.LANDING:  # which ends by itself from here on
-                pilot.command(Land())
-            elif pilot.feedback().state in _UP:
-                pilot.hover()
-            self._send({"type": "done", "do": do})
-        except SkyloopError as error:
-            self._refuse(do, str(error))
-            self._hover_if_held(pilot)
-        finally:
-            if self._goto is asyncio.current_task():
-                self._goto = None
-                self._station.goals.pop(self.app, None)
 
     def _held(self) -> PilotConnection:
         """Return the connection that holds the authority.
@@ -433,39 +400,32 @@ class ControlSession:
     def _on_silence(self) -> None:
         self._silence = None
         if self._is_under_way:
-            self._hover()
-            self._refuse(self._last_command, f"the page was silent for {SILENT_S:g} s: the vehicle hovers")
+            why = f"the page was silent for {SILENT_S:g} s: the vehicle hovers"
+            self._hover(why)
+            self._refuse(self._last_command, why)
 
     @property
     def _is_under_way(self) -> bool:
-        """Whether this page has the vehicle under way: by sticks, to a waypoint or along a route."""
-        return self._steering or self._goto is not None or (self._route is not None and self._route.is_under_way)
+        """Whether this page has the vehicle under way: by sticks, to a waypoint, along a route or after a target."""
+        route = self._route is not None and self._route.is_under_way
+        return self._steering or self._place.is_under_way or route or self._follow.is_under_way
 
-    def _end_flight(self) -> None:
+    def _end_flight(self, why: str = "something else was commanded, or the page was away") -> None:
         """End what the page flew before; a route is paused, and may be resumed."""
         self._steering = False
+        self._follow.interrupt(why)
         if self._route is not None:
-            self._route.pause("something else was commanded, or the page was away", hover=False)
+            self._route.pause(why, hover=False)
         self._awaited = None
-        if self._goto is not None:
-            self._goto.cancel()
-            self._goto = None
-        self._station.goals.pop(self.app, None)
+        self._place.cancel()
 
-    def _hover(self) -> None:
+    def _hover(self, why: str = "the page was away, or gave control back") -> None:
         """Hover if this page has the vehicle under way; a take-off or landing under way ends safely by itself."""
         flies = self._is_under_way
-        self._end_flight()
+        self._end_flight(why)
         pilot = self._pilot
         if pilot is not None and (flies or pilot.is_flying):
-            self._hover_if_held(pilot)
-
-    def _hover_if_held(self, pilot: PilotConnection) -> None:
-        try:
-            if pilot.authority.state == "held":
-                pilot.hover()
-        except SkyloopError:
-            pass  # somebody else has it, or the link is lost: then the proxy sees to it
+            pilot.hover_if_held()
 
     # The end ---------------------------------------------------------------------------------------------------
 
@@ -479,6 +439,7 @@ class ControlSession:
     async def _close(self) -> None:
         """Wait for what is under way, and give the authority back."""
         await asyncio.gather(*self._jobs, return_exceptions=True)
+        await self._follow.close()
         self._hover()  # what was taken, or begun, only just now
         await self._close_pilot()
         await self._station.pilot_went()
@@ -490,7 +451,7 @@ class ControlSession:
         pilot = self._pilot
         if (message := self._authority.update(pilot, self._takeover.update(pilot))) is not None:
             if not message["mine"]:
-                self._end_flight()
+                self._end_flight(NO_CONTROL)
             self._send(message)
         if self._awaited is not None and pilot is not None:
             do, states, from_ns = self._awaited
@@ -502,7 +463,7 @@ class ControlSession:
                 feedback = pilot.feedback()
                 if feedback.captured_ns >= from_ns and feedback.state in states:
                     self._awaited = None
-                    self._send({"type": "done", "do": do})
+                    self._done(do)
 
     def _on_event(self, event: Event) -> None:
         """Handle the proxy's refusal of a command of this page, and takeovers by asking."""
@@ -514,14 +475,18 @@ class ControlSession:
         if ours and self._route is not None and self._route.is_under_way:
             if event.data.get("reason") not in OF_ONE_PACKET:
                 self._route.pause(event.text, hover=False)
-                self._hover_if_held(pilot)
+                pilot.hover_if_held()
+            return
+        if ours and self._follow.is_under_way:
+            if event.data.get("reason") not in (*OF_ONE_PACKET, Refusal.FOREIGN_LEASE, Refusal.NO_AUTHORITY):
+                self._follow.end(event.text)  # of who has control the authority tells
             return
         if not ours or self._refused_command == self._commands or event.data.get("reason") in OF_ONE_PACKET:
             return  # its repeats are refused too: nothing new
         self._refused_command = self._commands
         self._awaited = None
         self._refuse(self._last_command, event.text)
-        if self._goto is not None:
+        if self._place.is_under_way:
             self._hover()
         if self._last_command == TakeOff().do:
             with suppress(SkyloopError):
@@ -529,6 +494,9 @@ class ControlSession:
 
     def _refuse(self, do: str, why: str) -> None:
         self._send({"type": "refused", "do": do, "n": 0, "why": why})
+
+    def _done(self, do: str) -> None:
+        self._send({"type": "done", "do": do})
 
     def _refuse_command(self, command: AnyCommand, why: str) -> None:
         if isinstance(command, Fly):  # comes twenty times a second
@@ -561,14 +529,3 @@ class ControlSession:
                 await work(command)
         except SkyloopError as error:
             self._refuse_command(command, str(error))
-
-
-def _fit_for_places(pilot: PilotConnection, what: str) -> Feedback:
-    """Return the newest feedback of a vehicle that can be flown to places now; :class:`RefusedError` if it can't."""
-    feedback = pilot.feedback()
-    problem = lacking(feedback)
-    if problem:
-        raise RefusedError(f"{what}: {problem}")
-    if not feedback.state.airborne:
-        raise RefusedError(f"{what}: it is not in the air, take off first")
-    return feedback

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Self
 
 from skyloop.client import AuthorityStatus, Drone
 from skyloop.client.commands import ANSWER_S
 from skyloop.client.core import DroneCore
 from skyloop.clock import monotonic_ns
-from skyloop.errors import LinkError, RefusedError
+from skyloop.errors import LinkError, RefusedError, SkyloopError
 from skyloop.messages import AnswerTakeover, AnyAction, FlightState, LinkState, Refused
 from skyloop.transport.base import Dialer
 
@@ -90,6 +91,12 @@ class PilotConnection(Drone):
     def has_ended(self, action: AnyAction) -> bool:
         """Whether a failsafe, a lost link or a lost lease ended this action, while it was the newest."""
         return self._core.commands.lapsed(action)
+
+    def hover_if_held(self) -> None:
+        """Hover; if somebody else has the authority, or the link is lost, the proxy sees to it."""
+        with suppress(SkyloopError):
+            if self.authority.state == "held":
+                self.hover()
 
     @property
     def is_flying(self) -> bool:

@@ -3,9 +3,11 @@
 from skyloop.control.approach import ApproachMarker, OrbitMarker, OrbitPlace
 from skyloop.control.avoid import SeeAndAvoid
 from skyloop.control.behaviour import Behaviour
+from skyloop.control.chase_law import ChaseSettings, FollowMode
 from skyloop.control.controller import Controller, RunSummary
 from skyloop.control.flow_hover import FlowHover
 from skyloop.control.follow import FollowMarker
+from skyloop.control.follow_target import FollowTarget
 from skyloop.control.gates import FIVE_GATES, FlyThroughGates, GateKind
 from skyloop.control.heading import AlongPath, FixedYaw, LookAt, YawMode
 from skyloop.control.image_servo import ImageServo
@@ -23,6 +25,7 @@ __all__ = [
     "AlongPath",
     "ApproachMarker",
     "Behaviour",
+    "ChaseSettings",
     "Circle",
     "Controller",
     "DeadReckoning",
@@ -34,7 +37,9 @@ __all__ = [
     "FlyThroughGates",
     "FlyRoute",
     "FollowMarker",
+    "FollowMode",
     "FollowPath",
+    "FollowTarget",
     "FunctionPath",
     "GateKind",
     "ImageServo",

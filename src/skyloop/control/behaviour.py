@@ -99,12 +99,20 @@ class Behaviour(Controller):
             self.blind = False
             self.emit("frames arrive again")
         shapes = self.look(frame)
-        wanted = self._law.step(frame.captured_ns + nanoseconds(frame.age_s))
+        self.fly(frame.captured_ns + nanoseconds(frame.age_s))
+        with suppress(UsageError):  # a shape that can't be drawn must not end the flight
+            self.drone.annotate(frame, shapes, source=self.name)
+
+    def fly(self, now_ns: int) -> None:
+        """Compute the law's set-point and send it, and report a new phase.
+
+        Args:
+            now_ns: On the proxy's clock.
+        """
+        wanted = self._law.step(now_ns)
         self._report_phase()
         if not self.done:
             self.steer(wanted)
-        with suppress(UsageError):  # a shape that can't be drawn must not end the flight
-            self.drone.annotate(frame, shapes, source=self.name)
 
     def steer(self, wanted: Velocity | Attitude) -> None:
         """Send a set-point to the vehicle.
@@ -117,14 +125,15 @@ class Behaviour(Controller):
         else:
             self.drone.velocity(forward=wanted.forward, left=wanted.left, up=wanted.up, yaw_rate=wanted.yaw_rate)
 
-    def finish(self, text: str) -> None:
+    def finish(self, text: str, severity: Severity = Severity.INFO) -> None:
         """End the behaviour: publish an event, hover, and let :meth:`run` return.
 
         Args:
             text: What was achieved; the event's text after the name.
+            severity: How important it is.
         """
         self.done = True
-        self.emit(text)
+        self.emit(text, severity)
         self.drone.hover()
         self.stop()
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from skyloop.clock import nanoseconds, seconds
 from skyloop.control.behaviour import Behaviour
 from skyloop.control.kalman import ConstantVelocityFilter
-from skyloop.control.limiting import clamped, shortened
+from skyloop.control.limiting import GRAVITY_M_S2, clamped, shortened
 from skyloop.errors import UsageError
 from skyloop.messages import Attitude, Feedback, Points, Text
 from skyloop.messages.annotation import Colour, Shape
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from skyloop.client import Drone, Frame
 
 Array = NDArray[np.float64]
-GRAVITY_M_S2 = 9.80665
 _SEEN: Colour = (64, 220, 100)
 _LOST: Colour = (255, 180, 60)
 

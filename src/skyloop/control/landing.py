@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from skyloop.control.behaviour import Behaviour
-from skyloop.control.landing_law import LandingLaw, LandingPhase, LandingSettings
+from skyloop.control.landing_law import LandingLaw, LandingPhase
+from skyloop.control.landing_settings import LandingSettings
 from skyloop.errors import UsageError
-from skyloop.messages import FlightState, Land, Polyline, Text
+from skyloop.messages import FlightState, Land, Polyline, Severity, Text
 from skyloop.messages.annotation import Colour, Shape
 from skyloop.vision import MarkerDetector
 
@@ -23,8 +24,10 @@ class LandOnMarker(Behaviour):
     """Searches the marker on a spiral, flies over it, descends with it, and stops the motors when it has landed.
 
     A marker that is lost on the way makes the vehicle climb where the marker must be, then search. Low over the marker,
-    where it no longer fits into the image, the vehicle descends by the marker's last known motion. The vehicle must be
-    airborne when :meth:`run` is called.
+    where it no longer fits into the image, the vehicle descends by the marker's predicted motion; it aborts and tries
+    again where it would miss. After too many aborted attempts, or too long a time, it climbs to a safe height, hovers
+    there, and :meth:`run` returns with :attr:`landed` false. The vehicle must be airborne when :meth:`run` is called;
+    a :meth:`run` that ends earlier leaves it hovering where it is.
 
     Attributes:
         marker_id: Which marker.
@@ -51,7 +54,7 @@ class LandOnMarker(Behaviour):
             size_m: Edge of the marker's black square.
             dictionary: The marker's dictionary.
             camera: One that looks down.
-            settings: Of the law; None are the defaults.
+            settings: Of the law; None are the defaults. They are brought within the drone's ``limits.*``.
 
         Raises:
             UnknownNameError: There is no such camera or dictionary.
@@ -60,7 +63,8 @@ class LandOnMarker(Behaviour):
         """
         if "land" not in drone.capabilities.actions:
             raise UsageError("this vehicle can't land by itself")
-        self._landing_law = LandingLaw(settings)
+        limits = {parameter.name: parameter.value for parameter in drone.config.parameters()}
+        self._landing_law = LandingLaw((settings or LandingSettings()).within(limits))
         self._detector = MarkerDetector(dictionary, size_m)
         self.marker_id = marker_id
         super().__init__(drone, self._landing_law, camera)
@@ -73,16 +77,25 @@ class LandOnMarker(Behaviour):
     @property
     def landed(self) -> bool:
         """Whether the vehicle stands on the marker."""
-        return self.done
+        return self.done and self.phase is LandingPhase.DOWN
 
     def on_feedback(self, feedback: Feedback) -> None:
-        """Update the law; once it is down, wait until the vehicle reports that it has landed."""
-        if self.phase is not LandingPhase.DOWN:
-            super().on_feedback(feedback)
-        elif feedback.state is FlightState.LANDED and not self.done:
-            self.done = True
-            self.emit("standing on the marker")
-            self.stop()
+        """Update the law and send its set-point; once it is down, wait until the vehicle reports that it has landed."""
+        if self.phase is LandingPhase.DOWN:
+            if feedback.state is FlightState.LANDED and not self.done:
+                self.done = True
+                self.emit("standing on the marker")
+                self.stop()
+            return
+        super().on_feedback(feedback)
+        if self._frame_ns is not None and not self.blind and not self.done:
+            self.fly(self.drone.now_ns)  # by each sample, and not by frames alone: gusts are answered sooner
+
+    def on_frame(self, frame: Frame) -> None:
+        """Search the frame; end the behaviour where the law has given up."""
+        super().on_frame(frame)
+        if not self.done and self._landing_law.safe(frame.captured_ns):
+            self.finish("gave up: hovering at a safe height", Severity.WARNING)
 
     def look(self, frame: Frame) -> list[Shape]:
         """Detect the marker and update the law."""

@@ -1,15 +1,18 @@
 """The law that lands on a marker that may move: sightings and feedback in, velocities out. Pure: no clock, no thread.
 
-The marker's position and velocity come from a constant-velocity filter in odometry axes (see :mod:`.kalman`). The
-vehicle takes up that velocity, and descends while it is within a cone over the marker, as in Saripalli, Montgomery and
-Sukhatme, "Visually Guided Landing of an Unmanned Aerial Vehicle", IEEE T-RA 19(3), 2003: outside of the cone it keeps
-its height and closes up first. The last part, where the marker no longer fits into the image, is flown by the filter's
-prediction; when the feet touch, or must have touched, the motors are to stop.
+The marker's motion is that of a filter which knows straight motion and steady turns (:mod:`.turning`), in odometry
+axes. The vehicle flies where the marker will be when the set-point is in force, with the marker's velocity and
+acceleration, by its own predicted motion (:mod:`.response`). It descends while it is within a cone over the marker, as
+in Saripalli, Montgomery and Sukhatme, "Visually Guided Landing of an Unmanned Aerial Vehicle", IEEE T-RA 19(3), 2003:
+outside of the cone it keeps its height, or climbs to see more, and closes up first. The last part, where the marker no
+longer fits into the image, is flown by prediction. It is aborted, by a climb along the marker's predicted path, where
+the vehicle would touch down too far off. After a number of aborted attempts it gives up and hovers at a safe height.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -17,58 +20,47 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
-from skyloop.control.filters import LowPass
-from skyloop.control.kalman import ConstantVelocityFilter
+from skyloop.control.landing_settings import LandingSettings
 from skyloop.control.limiting import SetpointLimiter, SetpointLimits, clamped, shortened
+from skyloop.control.response import Predicted, VelocityResponse
 from skyloop.control.spiral import SpiralSearch
 from skyloop.control.target import Motion, Odometry
+from skyloop.control.turning import TurnEstimate, TurningTargetFilter
 from skyloop.messages import Feedback, Velocity
 
+__all__ = ["LandingLaw", "LandingPhase", "LandingSettings"]
+
 Array = NDArray[np.float64]
+
+_KEPT_S = 2.0  # estimates of the past, to see how well the marker's motion was foreseen
+_MOST_REFUSED = 4  # sightings in a row that don't fit the filter: then it restarts
+_REACTION_S = 0.25  # for which a difference of velocity counts: the vehicle takes it out within this time
+_JUST = 0.999  # of a limit: turned into body axes, a speed may be longer by the last digit
+_MOVES_M_S = 0.1  # what is slower has no direction that could turn
+_GIVEN_UP_CLIMB_S = 4.0  # a vehicle without an altimeter climbs for so long
 
 
 class LandingPhase(StrEnum):
     """What :class:`LandingLaw` is doing."""
 
-    SEARCHING = "searching the marker"  #: on a square spiral, at the search height
+    SEARCHING = "searching the marker"  #: waiting, then on a square spiral, at the search height
     CHASING = "going over the marker"
     DESCENDING = "going down over the marker"
     RECOVERING = "lost the marker: climbing where it must be"
     COMMITTED = "touching down"  #: too near to see the marker whole
     DOWN = "down"
+    GIVEN_UP = "giving up: climbing to a safe height"
 
 
-@dataclass(frozen=True, slots=True)
-class LandingSettings:
-    """Gains, limits and heights of :class:`LandingLaw`. Heights are of the feet over the marker by default."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Relative:
+    """The marker relative to the vehicle, when the set-point of now is in force."""
 
-    lead_s: float = 0.12  #: from a command's decision to its taking hold
-    #: Share of the velocity's error that is asked for on top: gusts push a vehicle with a soft velocity loop less far.
-    velocity_gain: float = 1.0
-    speed_m_s: float = 1.2  #: greatest, horizontally
-    acceleration_m_s2: float = 2.0
-    gain: float = 1.6  #: velocity by horizontal offset [1/s]
-    descent_m_s: float = 0.35
-    cone_m: float = 0.06  #: radius of the cone at the marker
-    cone: float = 0.2  #: how much wider it is for each metre of height
-    #: Below this it descends by the filter, whether it sees the marker or not, if it is near the marker's centre and
-    #: the marker's velocity is steady: it waits for a marker that is turning.
-    commit_m: float = 0.55
-    commit_off_m: float = 0.07
-    steady_m_s: float = 0.06  #: between the marker's velocity and that velocity through a low pass of ``steady_s``
-    steady_s: float = 0.6
-    final_descent_m_s: float = 0.6
-    #: Farther off than this, or unseen for longer than ``blind_s``, it does not go on, unless it is all but down.
-    abort_off_m: float = 0.15
-    blind_s: float = 0.9
-    nearly_m: float = 0.12
-    touch_m: float = 0.03  #: so near it counts as touched
-    feet_m: float = 0.06  #: below the body's centre
-    fresh_s: float = 0.35  #: since last seen: it flies on
-    recovering_s: float = 3.5
-    search_height_m: float = 2.6  #: above the ground
-    search_speed_m_s: float = 0.7
-    search_lane_m: float = 1.1  #: between the lanes of the spiral: what the camera sees from there, less a margin
+    target: TurnEstimate
+    offset: Array  #: (3,) [m], from the vehicle's centre
+    velocity: Array  #: (2,) [m/s]
+    height: float  #: of the feet over the marker [m]
+    touching_off: float  #: how far off the vehicle would touch if it went down now [m]
 
 
 class LandingLaw:
@@ -77,9 +69,11 @@ class LandingLaw:
     Times are on the proxy's clock [ns].
 
     Attributes:
+        settings: As given.
         phase: As of the last step.
         height_m: Of the feet over the marker, as of the last step; None while searching.
         off_m: Horizontal distance from the marker's centre, as of the last step; None while searching.
+        aborted: Touch-downs that were aborted so far.
     """
 
     def __init__(self, settings: LandingSettings | None = None) -> None:
@@ -88,17 +82,24 @@ class LandingLaw:
         self.phase = LandingPhase.SEARCHING
         self.height_m: float | None = None  #: of the feet over the marker, as of the last step
         self.off_m: float | None = None  #: horizontally from the marker's centre, as of the last step
+        self.aborted = 0  #: touch-downs that were aborted so far
         self._odometry = Odometry()
+        self._response = VelocityResponse(s.response)
         self._altitude: float | None = None
-        self._target = _new_filter()
+        self._target = TurningTargetFilter()
+        self._past: deque[TurnEstimate] = deque()
         self._seen_ns: int | None = None
-        self._search = SpiralSearch(s.search_lane_m, s.search_speed_m_s)
-        self._limiter = SetpointLimiter(
-            SetpointLimits(s.speed_m_s, acceleration_m_s2=s.acceleration_m_s2, climb_acceleration_m_s2=2.0)
-        )
-        self._last_ns: int | None = None
+        self._began_ns: int | None = None
+        self._searching_ns: int | None = None  # since when it searches
+        self._gave_up_ns: int | None = None
+        self._search = SpiralSearch(s.search_lane_m, s.search_speed_m_s, s.search_largest_m)
+        self._place: Array | None = None  # where it waits
         self._committed_ns: int | None = None
-        self._of_late: LowPass[Array] = LowPass(s.steady_s)  # the marker's velocity
+        self._last_ns: int | None = None
+        limits = SetpointLimits(
+            s.speed_m_s, acceleration_m_s2=s.acceleration_m_s2, climb_acceleration_m_s2=s.climb_acceleration_m_s2
+        )
+        self._limiter = SetpointLimiter(limits)
 
     @property
     def target_speed_m_s(self) -> float | None:
@@ -106,9 +107,18 @@ class LandingLaw:
         newest = self._target.newest
         return None if newest is None else float(np.hypot(*newest.velocity[:2]))
 
+    def safe(self, now_ns: int) -> bool:
+        """Whether it has given up and reached the height at which it is safe to hover."""
+        if self._gave_up_ns is None:
+            return False
+        if self._altitude is None:
+            return seconds(now_ns - self._gave_up_ns) > _GIVEN_UP_CLIMB_S
+        return self._altitude > self.settings.search_height_m - 0.3
+
     def feedback(self, feedback: Feedback) -> None:
         """Update with the vehicle's newest state."""
         self._odometry.add(feedback)
+        self._response.add(feedback)
         self._altitude = feedback.altitude_m
 
     def see(self, position: Array, at_capture: Feedback, captured_ns: int) -> None:
@@ -123,90 +133,175 @@ class LandingLaw:
         if motion is None or at_capture.roll_rad is None or at_capture.pitch_rad is None or at_capture.yaw_rad is None:
             return
         place = motion.position + at_capture.rotation @ position
-        # Tilt's error of half a degree moves the place by a hundredth of the distance.
-        deviation = 0.01 + 0.015 * float(np.linalg.norm(position))
-        if self._target.update(place, deviation, captured_ns):
-            self._of_late.step(
-                self._target.at(captured_ns).velocity, seconds(captured_ns - (self._seen_ns or captured_ns))
-            )
-            self._seen_ns = captured_ns
-        elif self._target.refused > 4:
+        deviation = self.settings.sight_m + self.settings.sight_share * float(np.linalg.norm(position))
+        unseen_s = self._unseen_s(captured_ns)
+        if unseen_s > self.settings.recovering_s or self._target.refused >= _MOST_REFUSED:
             self._target.start(place, deviation, captured_ns)
+            self._past.clear()
+        elif not self._target.update(place, deviation, captured_ns):
+            return
+        self._seen_ns = captured_ns
+        self._past.append(self._target.at(captured_ns))
+        while seconds(captured_ns - self._past[0].at_ns) > _KEPT_S:
+            self._past.popleft()
 
     def step(self, now_ns: int) -> Velocity:
         """Compute the set-point for now. All zero until the vehicle's motion is known, and when it is down."""
-        motion = self._odometry.at(now_ns)
-        if motion is None or self.phase is LandingPhase.DOWN:
+        newest, ahead = self._odometry.newest, self._response.predict(now_ns)
+        if newest is None or ahead is None or self.phase is LandingPhase.DOWN:
             return Velocity()
-        ahead = motion.moved_to(now_ns + nanoseconds(self.settings.lead_s))
-        wanted = self._wanted(motion, ahead, now_ns)
+        if self._began_ns is None:
+            self._began_ns = now_ns
+        own = _then(newest, ahead)
+        relative = self._relative(own, now_ns)
+        self.off_m = None if relative is None else float(np.hypot(*relative.offset[:2]))
+        self.height_m = None if relative is None else relative.height
+        self.phase = self._next_phase(relative, now_ns)
+        acceleration, up = self._wanted(own, relative, now_ns)
+        velocity = shortened(self._response.setpoint(acceleration, ahead), _JUST * self.settings.speed_m_s)
         dt_s = 0.0 if self._last_ns is None else seconds(now_ns - self._last_ns)
         self._last_ns = now_ns
-        return self._limiter.step(wanted, dt_s)
+        up = self._allowed(up + self.settings.climb_gain * (up - float(own.velocity[2])))
+        wanted = self._limiter.step(np.array([*velocity, up, self._turn(own)]), dt_s)
+        self._response.sent(np.array([wanted.forward, wanted.left]), now_ns)
+        forward, left = own.to_body(np.array([wanted.forward, wanted.left]))
+        return Velocity(forward=forward, left=left, up=wanted.up, yaw_rate=wanted.yaw_rate)
 
-    def _wanted(self, now: Motion, ahead: Motion, now_ns: int) -> Array:
-        """Return forward, left, up [m/s] and yaw rate [rad/s]; sets the phase."""
-        s = self.settings
-        unseen_s = math.inf if self._seen_ns is None else seconds(now_ns - self._seen_ns)
-        if self._seen_ns is None or (unseen_s > s.recovering_s and self._committed_ns is None):
-            return self._look_for_it(ahead)
-        present = self._target.at(now_ns)
-        offset = present.position - now.position
-        self.off_m = off = float(np.hypot(*offset[:2]))
-        self.height_m = height = -float(offset[2]) - s.feet_m
-        self.phase = self._next_phase(off, height, unseen_s, now_ns)
-        self._search.restart()
-        target = self._target.at(ahead.at_ns)
-        horizontal = target.velocity[:2] + s.gain * (target.position - ahead.position)[:2]
-        up = float(target.velocity[2]) + self._climb(off, height)
-        velocity = ahead.stiffened(np.array([*shortened(horizontal, s.speed_m_s), up]), s.velocity_gain)
-        return np.array([*ahead.to_body(velocity[:2]), velocity[2], 0.0])
+    def _turn(self, own: Motion) -> float:
+        """Return the yaw rate that lays the image's longer side along a fast marker's way [rad/s]."""
+        s, newest = self.settings, self._target.newest
+        if newest is None or float(np.hypot(*newest.velocity[:2])) < s.turn_from_m_s:
+            return 0.0
+        way = math.atan2(newest.velocity[1], newest.velocity[0])
+        error = math.remainder(way - own.yaw - s.long_side_rad, math.pi)  # either end first
+        return clamped(1.5 * error, s.turn_rad_s)
 
-    def _next_phase(self, off: float, height: float, unseen_s: float, now_ns: int) -> LandingPhase:
+    def _relative(self, own: Motion, now_ns: int) -> _Relative | None:
+        """Return the marker relative to the vehicle; None if it was never seen, or not for too long."""
         s = self.settings
-        seen, low = unseen_s <= s.fresh_s, height < s.commit_m
-        if self._committed_ns is None and seen and low and off < s.commit_off_m and self._steady:
-            self._committed_ns = now_ns
-        elif height > s.nearly_m and (unseen_s > s.blind_s or off > s.abort_off_m):
+        if self._seen_ns is None or (self._committed_ns is None and self._unseen_s(now_ns) > s.recovering_s):
+            return None
+        target = self._target.at(own.at_ns)
+        if self.phase is LandingPhase.SEARCHING and target.speed_deviation_m_s > s.known_m_s:
+            return None  # by its place alone, it would meet a fast marker the wrong way
+        offset, velocity = target.position - own.position, (target.velocity - own.velocity)[:2]
+        height = -float(offset[2]) - s.feet_m
+        left_s = clamped(height / s.final_descent_m_s, _REACTION_S)
+        return _Relative(target, offset, velocity, height, float(np.hypot(*(offset[:2] + velocity * left_s))))
+
+    def _unseen_s(self, now_ns: int) -> float:
+        return math.inf if self._seen_ns is None else seconds(now_ns - self._seen_ns)
+
+    def _next_phase(self, relative: _Relative | None, now_ns: int) -> LandingPhase:
+        s = self.settings
+        if self._gave_up_ns is not None:
+            return LandingPhase.GIVEN_UP
+        late = seconds(now_ns - (self._began_ns or now_ns)) > s.give_up_s
+        if self._committed_ns is not None and relative is not None:
+            if relative.height <= s.touch_m:
+                return LandingPhase.DOWN
+            if not self._misses(relative, now_ns):
+                return LandingPhase.COMMITTED
             self._committed_ns = None
-        if self._committed_ns is not None:
-            return LandingPhase.DOWN if height <= s.touch_m else LandingPhase.COMMITTED
-        if not seen:
+            self.aborted += 1
+        if late or self.aborted >= s.attempts:
+            self._gave_up_ns = now_ns
+            return LandingPhase.GIVEN_UP
+        if relative is None:
+            return LandingPhase.SEARCHING
+        if self._unseen_s(now_ns) > s.fresh_s:
             return LandingPhase.RECOVERING
-        within = off < s.cone_m + s.cone * height and not low
+        if relative.height < s.commit_m:
+            if not self._sure(relative):
+                return LandingPhase.CHASING
+            self._committed_ns = now_ns
+            return LandingPhase.COMMITTED
+        within = relative.touching_off < s.cone_m + s.cone * relative.height
         return LandingPhase.DESCENDING if within else LandingPhase.CHASING
 
-    @property
-    def _steady(self) -> bool:
-        """Whether the marker has kept its velocity lately."""
-        newest, late = self._target.newest, self._of_late.value
-        if newest is None or late is None:
-            return False
-        return float(np.hypot(*(newest.velocity - late)[:2])) < self.settings.steady_m_s
-
-    def _climb(self, off: float, height: float) -> float:
-        """Return the vertical speed relative to the marker [m/s]."""
+    def _misses(self, relative: _Relative, now_ns: int) -> bool:
+        """Whether a touch-down under way is to be aborted."""
         s = self.settings
+        if relative.height < s.nearly_m:
+            return relative.touching_off > s.pad_m
+        return relative.touching_off > s.abort_off_m or self._unseen_s(now_ns) > s.blind_s
+
+    def _sure(self, relative: _Relative) -> bool:
+        """Whether to touch down: over the marker, as fast as it, and it does what was foreseen."""
+        s = self.settings
+        if relative.touching_off > s.commit_off_m or float(np.hypot(*relative.velocity)) > s.commit_m_s:
+            return False
+        newest = self._past[-1]
+        if newest.turning_rad_s > s.commit_turn_rad_s and float(np.hypot(*newest.velocity[:2])) > _MOVES_M_S:
+            return False
+        since_ns = newest.at_ns - nanoseconds(s.foresight_s)
+        before = next((one for one in reversed(self._past) if one.at_ns <= since_ns), None)
+        if before is None:
+            return False
+        foreseen = self._target.predicted(before, newest.at_ns)
+        return float(np.hypot(*(foreseen.position - newest.position)[:2])) < s.foreseen_m
+
+    def _wanted(self, own: Motion, relative: _Relative | None, now_ns: int) -> tuple[Array, float]:
+        """Return the horizontal acceleration (2,) [m/s²], in odometry axes, and the climb [m/s]."""
+        s = self.settings
+        if self.phase is LandingPhase.SEARCHING:
+            return s.velocity_gain * (self._searched(own, now_ns) - own.velocity[:2]), self._to_search_height()
+        self._search.restart()
+        self._searching_ns = None
+        if self.phase is LandingPhase.GIVEN_UP or relative is None:
+            return s.velocity_gain * -own.velocity[:2], self._to_search_height()
+        target = relative.target
+        velocity = shortened(target.velocity[:2] + self._closing(relative.offset[:2]), s.speed_m_s)
+        acceleration = target.acceleration + s.velocity_gain * (velocity - own.velocity[:2])
+        return acceleration, float(target.velocity[2]) + self._climb(relative)
+
+    def _closing(self, offset: Array) -> Array:
+        """Return the velocity towards the marker, relative to it, (2,) [m/s]: it can be taken out on arrival."""
+        s = self.settings
+        rate, off = s.position_gain / s.velocity_gain, float(np.hypot(*offset))
+        near = s.braking_m_s2 / rate**2
+        speed = rate * off if off < near else math.sqrt(2 * s.braking_m_s2 * (off - near / 2))
+        return offset * (min(speed, s.closing_m_s) / max(off, 1e-9))
+
+    def _climb(self, relative: _Relative) -> float:
+        """Return the vertical speed relative to the marker [m/s]."""
+        s, height, off = self.settings, relative.height, relative.touching_off
         if self.phase is LandingPhase.COMMITTED:
             return -s.final_descent_m_s
         if self.phase is LandingPhase.DESCENDING:
             return -s.descent_m_s * clamped(2.0 * (1.0 - off / (s.cone_m + s.cone * height)), 1.0)
         if self.phase is LandingPhase.RECOVERING:
-            return self._to_search_height(0.5)
-        return clamped(1.0 * (s.commit_m + 0.05 - height), 0.3) if height < s.commit_m + 0.1 else 0.0
+            return self._to_search_height()
+        if height < s.commit_m + 0.1:
+            return clamped(s.commit_m + 0.05 - height, 0.3)
+        return clamped(max(0.0, off / s.view - height), s.climb_m_s)
 
-    def _look_for_it(self, own: Motion) -> Array:
-        self.phase = LandingPhase.SEARCHING
-        self.height_m = self.off_m = None
-        forward, left = own.to_body(self._search.step(own.position[:2]))
-        return np.array([forward, left, self._to_search_height(0.5), 0.0])
+    def _searched(self, own: Motion, now_ns: int) -> Array:
+        """Return the velocity of the search: waiting where the marker passed last, or here; then on the spiral."""
+        s = self.settings
+        if self._searching_ns is None:
+            self._searching_ns = now_ns
+            newest = self._target.newest
+            self._place = own.position[:2] if newest is None else newest.position[:2]
+        if self._place is not None and seconds(now_ns - self._searching_ns) < s.wait_s:
+            return shortened(self._place - own.position[:2], s.search_speed_m_s)
+        return self._search.step(own.position[:2])
 
-    def _to_search_height(self, most_m_s: float) -> float:
+    def _allowed(self, up: float) -> float:
+        """Limit a climb [m/s]; towards the ceiling it slows down, as the proxy would do it."""
+        most = self.settings.climb_m_s
+        room = math.inf if self._altitude is None else max(0.0, self.settings.ceiling_m - self._altitude)
+        return max(-most, min(most, room, up))
+
+    def _to_search_height(self) -> float:
         if self._altitude is None:
-            return 0.0
-        return clamped(1.0 * (self.settings.search_height_m - self._altitude), most_m_s)
+            return 0.0 if self._gave_up_ns is None else self.settings.climb_m_s
+        return clamped(self.settings.search_height_m - self._altitude, self.settings.climb_m_s)
 
 
-def _new_filter() -> ConstantVelocityFilter:
-    """Create a filter for a thing that moves on a floor and seldom changes its velocity."""
-    return ConstantVelocityFilter(3, intensity_m2_s3=0.03, speed_m_s=0.4, gate=6.0)
+def _then(newest: Motion, ahead: Predicted) -> Motion:
+    """Return the vehicle's motion when the set-point of now is in force."""
+    dt = seconds(ahead.at_ns - newest.at_ns)
+    position = newest.position + np.array([*ahead.moved, newest.velocity[2] * dt])
+    velocity = np.array([*ahead.velocity, newest.velocity[2]])
+    return Motion(ahead.at_ns, position, velocity, newest.yaw + newest.yaw_rate * dt, newest.yaw_rate)

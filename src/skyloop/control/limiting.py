@@ -12,6 +12,7 @@ from skyloop.errors import UsageError
 from skyloop.messages import Velocity
 
 Array = NDArray[np.float64]
+GRAVITY_M_S2 = 9.80665  #: standard gravity
 _LONGEST_STEP_S = 0.2  # a longer pause gives no right to a larger step
 
 

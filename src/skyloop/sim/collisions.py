@@ -10,9 +10,8 @@ import numpy as np
 
 from skyloop.sim.dynamics import STEP_S, Bodies, column
 from skyloop.sim.parameters import VehicleParameters
-from skyloop.sim.solids import Indices, Solids
+from skyloop.sim.solids import Indices, Overlap, Solids
 from skyloop.sim.streams import Floats
-from skyloop.sim.world import Vec3
 
 _MOST_ACCELERATION_M_S2 = 60.0  # above what thrust, gravity and drag at 10 m/s of headwind give together
 _STILL_M_S = 0.3  # along the normal: slower contacts don't bounce, or things would never come to rest
@@ -100,7 +99,10 @@ class Collisions:
                 break
             position += np.array(overlap.normal) * overlap.depth_m
             position[2] = max(position[2], hull[2])
-            impact = self._rebound(drone, overlap.normal, overlap.surface_m_s)
+            before = self._bodies.velocity[:2, drone].copy()
+            impact = self._rebound(drone, overlap)
+            # Friction acts on this step's motion too, or a drone that stands in wind would creep.
+            position[:2] += (self._bodies.velocity[:2, drone] - before) * STEP_S
             if overlap.normal[2] > 0.5:
                 contacts.standing.add(drone)
             if impact > _STILL_M_S:
@@ -132,9 +134,9 @@ class Collisions:
         overlap = self._solids.overlap(position, hull, moving=False)
         return overlap is not None and overlap.depth_m > _TOUCH_M
 
-    def _rebound(self, drone: int, normal: Vec3, surface_m_s: Vec3) -> float:
+    def _rebound(self, drone: int, overlap: Overlap) -> float:
         """Take the velocity into the surface back, and rub; returns that velocity [m/s]."""
-        direction, surface = np.array(normal), np.array(surface_m_s)
+        direction, surface = np.array(overlap.normal), np.array(overlap.surface_m_s)
         relative = self._bodies.velocity[:, drone] - surface
         into = -float(relative @ direction)
         if into <= 0:
@@ -145,7 +147,19 @@ class Collisions:
         if sliding > 0:
             along *= max(0.0, 1.0 - self._friction[drone] * (into + back) / sliding)
         self._bodies.velocity[:, drone] = surface + along + back * direction
+        if overlap.normal[2] > 0.5:
+            self._turn_along(drone, overlap.spin_rad_s, into + back)
         return into
+
+    def _turn_along(self, drone: int, spin_rad_s: float, impulse_m_s: float) -> None:
+        """Let a surface that turns take a drone on it along: friction all over the foot print of a disk.
+
+        With pressure p = F / πR² its torque is 2/3 μ F R, against the disk's moment of inertia m R² / 2.
+        """
+        most = self._friction[drone] * impulse_m_s * (4 / 3) / self._hull[0, drone]
+        change = max(-most, min(most, spin_rad_s - float(self._bodies.rates[2, drone])))
+        self._bodies.rates[2, drone] += change
+        self._bodies.angles[2, drone] += change * STEP_S
 
     def _meet_drones(self, who: Indices, contacts: Contacts) -> list[int]:
         """Part the drones that overlap; returns those that were pushed."""

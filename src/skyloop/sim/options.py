@@ -32,6 +32,7 @@ class SimOptions:
         quality: Of the planar renderer.
         native: Actions that the drone's driver supports natively.
         position: Whether the drone reports its position.
+        velocity: Whether the drone reports its velocity; it flies by it all the same.
         truth: Whether the drone reports its true state too.
         rate_hz: Of the reports.
         parameters: Of the vehicles.
@@ -48,6 +49,7 @@ class SimOptions:
     quality: str = "smooth"
     native: frozenset[str] = EVERY_ACTION
     position: bool = True
+    velocity: bool = True
     truth: bool = True
     rate_hz: float = 40.0
     parameters: VehicleParameters = STANDARD_VEHICLE

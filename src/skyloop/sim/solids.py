@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from skyloop.sim.streams import Floats
 from skyloop.sim.targets import TargetTrack, top_speed
-from skyloop.sim.world import FigureTarget, PlatformTarget, Vec3, World
+from skyloop.sim.world import FigureTarget, FixedYaw, PlatformTarget, Vec3, World
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,12 +20,14 @@ class Overlap:
     Attributes:
         normal: The way out.
         depth_m: How far.
-        surface_m_s: Velocity of the solid.
+        surface_m_s: Velocity of the solid's surface at the drone's centre.
+        spin_rad_s: How fast the surface turns, counter-clockwise from above.
     """
 
     normal: Vec3
     depth_m: float
     surface_m_s: Vec3 = (0.0, 0.0, 0.0)
+    spin_rad_s: float = 0.0
 
 
 class Solids:
@@ -41,12 +44,13 @@ class Solids:
         self._centre = np.zeros((3, len(sizes), 1))
         self._cos, self._sin = np.ones((len(sizes), 1)), np.zeros((len(sizes), 1))
         self._velocity = np.zeros((3, len(sizes)))
+        self._spin = np.zeros(len(sizes))
         for number, box in enumerate(boxes):
             self._place(number, np.array(box.position_m), box.yaw_rad)
         size_x, size_y, height = world.room.size_m
         self._room_low = np.array([[-size_x / 2], [-size_y / 2], [-np.inf]])
         self._room_high = np.array([[size_x / 2], [size_y / 2], [height]])
-        self.top_speed_m_s = max((top_speed(target.path) for _, target in movers), default=0.0)
+        self.top_speed_m_s = max((_top_speed(target) for _, target in movers), default=0.0)
         self.move(0.0)
 
     @property
@@ -62,6 +66,7 @@ class Solids:
             centre[2] += self._half[2, number, 0] * (-1.0 if lifts else 1.0)
             self._place(number, centre, state.yaw_rad)
             self._velocity[:, number] = state.velocity_m_s
+            self._spin[number] = state.yaw_rate_rad_s
 
     def clearance(self, points: Floats, hulls: Floats) -> Floats:
         """Return the distance to the nearest solid, wall or ceiling, (m,).
@@ -105,13 +110,15 @@ class Solids:
         if box >= self._fixed and self._lifts[box - self._fixed] and local[2] > 0:
             axis = 2  # a platform lifts what is on it, however it moves
         sign = 1.0 if local[axis] >= 0 else -1.0
+        c, s = float(self._cos[box, 0]), float(self._sin[box, 0])
         if axis == 2:
             normal = (0.0, 0.0, sign)
         else:
-            c, s = float(self._cos[box, 0]) * sign, float(self._sin[box, 0]) * sign
-            normal = (c, s, 0.0) if axis == 0 else (-s, c, 0.0)
+            normal = (c * sign, s * sign, 0.0) if axis == 0 else (-s * sign, c * sign, 0.0)
         vx, vy, vz = self._velocity[:, box].tolist()
-        return Overlap(normal, float(inside[axis]), (vx, vy, vz))
+        spin, (x, y, _) = float(self._spin[box]), local.tolist()
+        surface = (vx - spin * (s * x + c * y), vy + spin * (c * x - s * y), vz)
+        return Overlap(normal, float(inside[axis]), surface, spin)
 
     def _place(self, number: int, centre: Floats, yaw_rad: float) -> None:
         self._centre[:, number, 0] = centre
@@ -124,6 +131,12 @@ class Solids:
         local[0] = self._cos * away[0] + self._sin * away[1]
         local[1] = self._cos * away[1] - self._sin * away[0]
         return local
+
+
+def _top_speed(target: PlatformTarget | FigureTarget) -> float:
+    """Return a speed [m/s] that no point of a target exceeds, those at its corners included."""
+    turn = 0.0 if isinstance(target.yaw, FixedYaw) else target.yaw.turn_rate_rad_s
+    return top_speed(target.path) + turn * math.hypot(*target.size_m[:2]) / 2
 
 
 Indices = NDArray[np.intp]

@@ -22,6 +22,7 @@ from skyloop.sim.world import (
     CirclePath,
     FixedYaw,
     LissajousPath,
+    OvalPath,
     Path,
     RingWalkPath,
     StillPath,
@@ -75,7 +76,10 @@ class TargetTrack:
         yaw = wrap_angle(first.yaw + part * (second.yaw - first.yaw))
         walked = first.walked + part * (second.walked - first.walked)
         place = (position[0], position[1], position[2])
-        return TargetState(self.target.name, time_s, place, yaw, first.velocity, walked)
+        # The velocity of the motion between the points, not at the first one: what stands on a platform would creep.
+        velocity = _vec3((np.array(second.position) - np.array(first.position)) / GRID_S)
+        rate = (second.yaw - first.yaw) / GRID_S
+        return TargetState(self.target.name, time_s, place, yaw, velocity, walked, rate)
 
     def _pair(self, index: int) -> tuple[_Point, _Point]:
         while self._known < index + 2:
@@ -105,6 +109,8 @@ def _positions(path: Path, rng: np.random.Generator) -> Iterator[tuple[Vec3, Vec
         return _waypoints(path)
     if isinstance(path, CirclePath):
         return (_circle(path, step * GRID_S) for step in itertools.count())
+    if isinstance(path, OvalPath):
+        return (_oval(path, step * GRID_S) for step in itertools.count())
     if isinstance(path, LissajousPath):
         return (_lissajous(path, step * GRID_S) for step in itertools.count())
     if isinstance(path, StillPath):
@@ -135,6 +141,23 @@ def _circle(path: CirclePath, time_s: float) -> tuple[Vec3, Vec3]:
     x, y, z = path.centre_m
     speed = sense * path.speed_m_s
     return (x + path.radius_m * c, y + path.radius_m * s, z), (-speed * s, speed * c, 0.0)
+
+
+def _oval(path: OvalPath, time_s: float) -> tuple[Vec3, Vec3]:
+    half, radius, bend = path.length_m / 2, path.radius_m, math.pi * path.radius_m
+    along = (path.start_m + path.speed_m_s * time_s) % (2 * (path.length_m + bend))
+    back = along >= path.length_m + bend  # the other half is this one, turned by half a turn
+    along -= (path.length_m + bend) * back
+    if along < path.length_m:
+        x, y, c, s = along - half, -radius, 1.0, 0.0
+    else:
+        angle = (along - path.length_m) / radius
+        c, s = math.cos(angle), math.sin(angle)
+        x, y = half + radius * s, -radius * c
+    side = -1.0 if back else 1.0
+    turn = -side if path.clockwise else side
+    centre, speed = path.centre_m, path.speed_m_s
+    return (centre[0] + side * x, centre[1] + turn * y, centre[2]), (side * speed * c, turn * speed * s, 0.0)
 
 
 def _lissajous(path: LissajousPath, time_s: float) -> tuple[Vec3, Vec3]:

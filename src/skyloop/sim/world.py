@@ -214,6 +214,21 @@ class CirclePath:
 
 
 @dataclass(frozen=True, slots=True)
+class OvalPath:
+    """A level race track at a constant speed: two straights along x, joined by half circles; counter-clockwise.
+
+    It starts ``start_m`` along the track from where the southern straight begins; clockwise, the northern one.
+    """
+
+    centre_m: Vec3
+    length_m: float  #: of each straight
+    radius_m: float
+    speed_m_s: float
+    start_m: float = 0.0
+    clockwise: bool = False
+
+
+@dataclass(frozen=True, slots=True)
 class LissajousPath:
     """position = centre + amplitude · sin(2π · cycles · t / period + phase), axis by axis."""
 
@@ -256,7 +271,7 @@ class StillPath:
     position_m: Vec3
 
 
-Path = WaypointPath | CirclePath | LissajousPath | WalkPath | RingWalkPath | StillPath
+Path = WaypointPath | CirclePath | OvalPath | LissajousPath | WalkPath | RingWalkPath | StillPath
 
 
 @dataclass(frozen=True, slots=True)
@@ -349,7 +364,8 @@ class TargetState:
     """The state of a moving target at a time of the simulation, in world axes.
 
     Position [m], yaw [rad, within ±π] and velocity [m/s]; for a platform the position is that of the centre of its top
-    face, for a figure that of the ground it stands on. ``walked_m`` is the length of the way since the start.
+    face, for a figure that of the ground it stands on. ``walked_m`` is the length of the way since the start, and
+    ``yaw_rate_rad_s`` how fast it turns.
     """
 
     name: str
@@ -358,6 +374,7 @@ class TargetState:
     yaw_rad: float
     velocity_m_s: Vec3
     walked_m: float = 0.0
+    yaw_rate_rad_s: float = 0.0
 
     def face(self, target: Target) -> FacePose:
         """The pose of the target's marker at this time."""

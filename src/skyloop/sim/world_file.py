@@ -31,6 +31,7 @@ from skyloop.sim.world import (
     LissajousPath,
     Marker,
     MarkerPattern,
+    OvalPath,
     Panel,
     Path,
     PlatformTarget,
@@ -61,6 +62,7 @@ from skyloop.sim.world_tables import (
     LissajousTable,
     MarkerTable,
     Named,
+    OvalTable,
     PanelTable,
     PathTable,
     PlatformTable,
@@ -261,6 +263,10 @@ def _path(table: PathTable, room: Room, place: Place) -> Path:
             _require_box_inside(place, "radius", table.centre, (table.radius, table.radius, 0.0), room)
             start = math.radians(table.start_deg)
             return CirclePath(table.centre, table.radius, table.speed, start, table.clockwise)
+        case OvalTable():
+            _require_box_inside(place, "length", table.centre, (table.length / 2 + table.radius, 0.0, 0.0), room)
+            _require_box_inside(place, "radius", table.centre, (0.0, table.radius, 0.0), room)
+            return OvalPath(table.centre, table.length, table.radius, table.speed, table.start, table.clockwise)
         case LissajousTable():
             _require_box_inside(place, "amplitude", table.centre, table.amplitude, room)
             x, y, z = map(math.radians, table.phase_deg)

@@ -114,6 +114,15 @@ class CircleTable(_Table, kw_only=True, tag_field="kind", tag="circle"):
     clockwise: bool = False
 
 
+class OvalTable(_Table, kw_only=True, tag_field="kind", tag="oval"):
+    centre: Position
+    length: Length
+    radius: Annotated[float, Meta(ge=0.05, le=1000.0)]
+    speed: Speed
+    start: Annotated[float, Meta(ge=0.0, le=10_000.0)] = 0.0
+    clockwise: bool = False
+
+
 class LissajousTable(_Table, kw_only=True, tag_field="kind", tag="lissajous"):
     centre: Position
     amplitude: tuple[Amplitude, Amplitude, Amplitude]
@@ -155,7 +164,7 @@ class StillTable(_Table, kw_only=True, tag_field="kind", tag="still"):
     position: Position
 
 
-PathTable = WaypointsTable | CircleTable | LissajousTable | WalkTable | RingWalkTable | StillTable
+PathTable = WaypointsTable | CircleTable | OvalTable | LissajousTable | WalkTable | RingWalkTable | StillTable
 YawTable = FixedTable | AlongTable | TowardsTable
 
 

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from skyloop.vision.opencv import opencv
 from skyloop.vision.patches import Floats, features, patch
 from skyloop.vision.tracking import Box, Image, overlap
 
@@ -46,6 +47,38 @@ class Appearance:
         texture = min(max(float(self.texture @ other.texture), 0.0), 1.0)
         colour = float(np.abs(self.colour - other.colour).mean()) if self.colour.size else 0.0
         return texture * math.exp(-_COLOUR_WEIGHT * colour)
+
+
+def colours(image: Image, box: Box) -> Floats:
+    """Return the colours of the upper and the lower half of what is in a box, (6,) float32: L, a, b of each (CIELAB).
+
+    The middle of its width only, where there is least of the background.
+
+    Args:
+        image: uint8, (h, w, 3) BGR or (h, w) grey.
+        box: x, y, width, height [px].
+
+    Raises:
+        MissingExtraError: OpenCV is not installed.
+    """
+    cv = opencv("comparing colours")
+    x, y, width, height = box
+    left, right = _within(x + 0.3 * width, x + 0.7 * width, image.shape[1])
+    halves = []
+    for low, high in ((0.18, 0.48), (0.55, 0.85)):
+        top, bottom = _within(y + low * height, y + high * height, image.shape[0])
+        part = np.ascontiguousarray(image[top:bottom, left:right])
+        if part.ndim == 2:
+            part = cv.cvtColor(part, cv.COLOR_GRAY2BGR)
+        mean = cv.resize(part, (1, 1), interpolation=cv.INTER_AREA).astype(np.float32) / 255.0
+        halves.append(cv.cvtColor(mean, cv.COLOR_BGR2LAB).reshape(3))
+    return np.asarray(np.concatenate(halves), np.float32)
+
+
+def _within(low: float, high: float, most: int) -> tuple[int, int]:
+    """Return the pixels from low to high that are within the image, one at least."""
+    first = min(max(0, math.floor(low)), most - 1)
+    return first, min(max(first + 1, math.ceil(high)), most)
 
 
 @dataclass(frozen=True, slots=True)

@@ -85,6 +85,11 @@ class CorrelationTracker(Tracker):
         """
         self._cv: Any = opencv("tracking")
         self._lost_below, self._learn_above = lost_below, learn_above
+        self._centre: NDArray[np.float64] = np.zeros(2)  # of the target [px]
+
+    def shift(self, right: float, down: float) -> None:
+        """Look for the target so much farther right and down in the next image [px]; it was started before."""
+        self._centre = np.add(self._centre, (right, down))
 
     def _start(self, image: Image, box: Box) -> None:
         x, y, width, height = box

@@ -6,16 +6,18 @@ Matas, "Tracking-learning-detection", TPAMI 34, 2012.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from enum import Enum
 from typing import Any, Final
 
 import numpy as np
 
+from skyloop.errors import UsageError
 from skyloop.vision.appearance import Candidate, TargetMemory
 from skyloop.vision.correlation import CorrelationTracker
 from skyloop.vision.opencv import opencv
-from skyloop.vision.tracking import LEAST_PX, Box, Image, Tracker, TrackResult
+from skyloop.vision.planar import pixels_of
+from skyloop.vision.tracking import LEAST_PX, Box, Image, Tracker, TrackResult, checked_box
 
 _VERIFIED: Final = 0.45  # similarity to the memory from which a tracked box is the target's
 _SURE: Final = 0.6  # from which its appearance is learned
@@ -67,6 +69,55 @@ class LongTermTracker(Tracker):
         """
         self._cv: Any = opencv("tracking")
         self._tracker = tracker()
+
+    def shift(self, right: float, down: float) -> None:
+        """Look for the target so much farther right and down in the next image [px], unless it is lost."""
+        if self._shape is not None and self._state is not _State.LOST:
+            self._tracker.shift(right, down)
+
+    def similarity(self, image: Image, box: Sequence[float]) -> float:
+        """Return how much what is in a box looks like the target, 0 to 1; 0 if it looks more like a known look-alike.
+
+        Args:
+            image: As in :meth:`update`.
+            box: x, y, width, height [px].
+
+        Raises:
+            UsageError: The tracker was not started, or the box is not one.
+        """
+        pixels, checked = self._known(image, box)
+        seen = self._memory.judged(pixels, checked)
+        return 0.0 if _is_other(seen) else seen.similarity
+
+    def resume(self, image: Image, box: Sequence[float]) -> None:
+        """Go on from a box, in which something else found the target, with all that is remembered of its looks.
+
+        Args:
+            image: As in :meth:`update`, which is called with the next one.
+            box: x, y, width, height [px].
+
+        Raises:
+            UsageError: The tracker was not started, or the box is not one.
+        """
+        pixels, checked = self._known(image, box)
+        self._tracker.start(pixels, checked)
+        self._state, self._count, self._size = _State.TRACKING, 0, checked[2:]
+
+    def refuse(self) -> None:
+        """Take the target for lost, because something else shows that what was followed is not the target.
+
+        Raises:
+            UsageError: The tracker was not started.
+        """
+        if self._shape is None:
+            raise UsageError("the tracker was not started: call start(image, box) first")
+        self._state, self._count = _State.LOST, 0
+
+    def _known(self, image: Image, box: Sequence[float]) -> tuple[Image, Box]:
+        if self._shape is None:
+            raise UsageError("the tracker was not started: call start(image, box) first")
+        pixels = pixels_of(image)
+        return pixels, checked_box(box, pixels.shape)
 
     def _start(self, image: Image, box: Box) -> None:
         self._tracker.start(image, box)

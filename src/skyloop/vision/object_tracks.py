@@ -84,7 +84,7 @@ class ObjectTracks:
             raise UsageError(f"confirm is {confirm!r} and must be a whole number of at least 1")
         if isinstance(keep_s, bool) or not isinstance(keep_s, int | float) or not 0.0 <= keep_s < math.inf:
             raise UsageError(f"keep_s is {keep_s!r} and must be a finite number of seconds, 0 or more")
-        self._assign = _assignment()
+        self._assign = assignment()
         self._sure, self._confirm, self._keep_s = float(sure), confirm, float(keep_s)
         self._overlap, self._overlap_unsure = float(overlap), float(overlap_unsure)
         self._objects: list[_Object] = []
@@ -147,7 +147,12 @@ class ObjectTracks:
         )
 
 
-def _assignment() -> Any:
+def assignment() -> Any:
+    """Return SciPy's ``linear_sum_assignment``.
+
+    Raises:
+        MissingExtraError: SciPy is not installed.
+    """
     try:
         from scipy.optimize import linear_sum_assignment
     except ImportError as error:

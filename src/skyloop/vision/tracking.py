@@ -99,6 +99,13 @@ class Tracker(ABC):
             )
         return self._update(pixels)
 
+    def shift(self, right: float, down: float) -> None:  # noqa: B027 - to ignore it is allowed
+        """Say how far the target moved in the image since the last one, as is known when the camera turned [px].
+
+        It is looked for there in the next image. Trackers that look for it everywhere, or by the image's own motion,
+        ignore it; so it may be left out.
+        """
+
     @abstractmethod
     def _start(self, image: Image, box: Box) -> None:
         """Start with a checked image and box."""

@@ -6,9 +6,9 @@ Options: ``world`` its name or file (``room``); ``seed`` (0); ``speed`` seconds 
 charge at the start, 0 to 1 (1); ``renderer`` what draws the pictures, ``planar`` or ``mujoco`` (``planar``);
 ``quality`` of the planar ones, ``fast``, ``smooth`` or ``best`` (``smooth``); ``native`` the actions that the vehicle
 itself takes, the others being left to the proxy (all); ``position`` whether the vehicle knows its position, as with an
-indoor positioning system (1; ``none`` for one without); ``truth`` whether feedback carries the true state too (1);
-``rate`` of feedback [1/s] (40); ``vehicle`` whose response it has, ``quadrotor`` or ``ardrone``, as identified
-(``quadrotor``).
+indoor positioning system (1; ``none`` for one without); ``velocity`` whether it reports its velocity (1;
+``none`` for one that does not); ``truth`` whether feedback carries the true state too (1); ``rate`` of feedback [1/s]
+(40); ``vehicle`` whose response it has, ``quadrotor`` or ``ardrone``, as identified (``quadrotor``).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ VEHICLES: Final = {"quadrotor": STANDARD_VEHICLE, "ardrone": AR_DRONE}
 ALWAYS_NATIVE: Final = frozenset({"idle", "emergency_stop", "reset_emergency"})
 KNOWN: Final = {
     *("world", "seed", "speed", "cameras", "width", "height", "fps", "latency", "noise", "wind", "battery"),
-    *("renderer", "quality", "native", "position", "truth", "rate", "vehicle"),
+    *("renderer", "quality", "native", "position", "velocity", "truth", "rate", "vehicle"),
 }
 
 
@@ -67,6 +67,7 @@ def options_of(uri: VehicleUri) -> SimOptions:
         quality=quality,
         native=_native(options.get("native")),
         position=options.get("position") != "none" and uri.flag("position", default=True),
+        velocity=options.get("velocity") != "none" and uri.flag("velocity", default=True),
         truth=uri.flag("truth", default=True),
         rate_hz=uri.number("rate", 40.0, minimum=1.0, maximum=200.0),
         parameters=VEHICLES[vehicle],

@@ -13,7 +13,7 @@ def feedback_of(report: Report, state: FlightState, options: SimOptions) -> Feed
     Args:
         report: The drone as it believes to be and as it is, on this host's clock.
         state: The flight state to report, which is less detailed for a vehicle that flies by set-points alone.
-        options: Whether the vehicle knows its position, and whether the truth is reported too.
+        options: Whether the vehicle reports its position and its velocity, and whether the truth is reported too.
     """
     believed = report.believed
     return Feedback(
@@ -25,7 +25,7 @@ def feedback_of(report: Report, state: FlightState, options: SimOptions) -> Feed
         pitch_rad=believed.pitch_rad,
         yaw_rad=believed.yaw_rad,
         altitude_m=believed.altitude_m,
-        velocity_m_s=believed.velocity_m_s,
+        velocity_m_s=believed.velocity_m_s if options.velocity else None,
         angular_velocity_rad_s=believed.angular_velocity_rad_s,
         acceleration_m_s2=believed.acceleration_m_s2,
         position_m=report.truth.position_m if options.position else None,

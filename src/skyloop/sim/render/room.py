@@ -166,6 +166,8 @@ def _outdoors(shapes: QuadBuilder, atlas: AtlasBuilder, room: Room) -> None:
         ((-far, -y), (-x, y)),
         ((x, -y), (far, y)),
     ):
+        if high[0] <= low[0] or high[1] <= low[1]:
+            continue  # the floor reaches as far
         texels = ground.width / (2 * far)
         uv = ((low[0] + far) * texels, (far - high[1]) * texels, (high[0] + far) * texels, (far - low[1]) * texels)
         shapes.rectangle((*low, 0), (high[0] - low[0], 0, 0), (0, high[1] - low[1], 0), ground, uv=uv)

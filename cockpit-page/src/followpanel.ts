@@ -1,0 +1,110 @@
+// The panel of a target that was marked: what to do about it, how it goes, and Stop.
+
+import { h, setAttribute, setDisabled, setHidden, setText, setTone } from "./dom.js";
+import { FOLLOW_MODES, type FollowMessage, type FollowMode, type Point, type Size } from "./follow.js";
+import { figure } from "./format.js";
+import { named, t } from "./language/index.js";
+import { lengthText } from "./units.js";
+
+export interface FollowDeeds {
+  go(mode: FollowMode, distance_m: number | null): void;
+  /** Stop, or forget what was marked. */
+  stop(): void;
+}
+
+/** Confidence, distance and how well it is known, in a line; what is not known is left out. Pure. */
+export function figures({ confidence = null, range_m = null, range_deviation_m = null, lost_s = null }: Partial<FollowMessage>): string {
+  const range = range_m === null ? "" : `${lengthText(range_m, 1)}${range_deviation_m === null ? "" : ` ± ${lengthText(range_deviation_m, 1)}`}`;
+  return [confidence === null ? "" : t.follow.sure(Math.round(confidence * 100)), range, lost_s ? t.follow.lostFor(figure(lost_s, 1)) : ""].filter(Boolean).join(" · ");
+}
+
+export class FollowPanel {
+  readonly element: HTMLElement;
+  private readonly state = h("b", { class: "follow-phase", role: "status" });
+  private readonly figures = h("span", { class: "follow-figures" });
+  private readonly why = h("p", { class: "note", role: "status", "data-tone": "warn" });
+  private readonly modes: Record<FollowMode, HTMLButtonElement>;
+  private readonly distance = h("input", { type: "number", min: 0, max: 100, step: 0.5, "aria-label": t.follow.distance, title: t.follow.distance });
+  private readonly stop = h("button", { type: "button", class: "follow-stop", onclick: () => this.deeds.stop() });
+  private problem = "";
+  private can = "";
+  private at: ((size: Size) => Point) | null = null;
+  private height = 0;
+
+  constructor(private readonly deeds: FollowDeeds) {
+    const button = (mode: FollowMode): HTMLButtonElement => h("button", { type: "button", "data-mode": mode, title: t.follow.explained[mode], "aria-pressed": "false", onclick: () => this.go(mode) }, t.follow.modes[mode]);
+    this.modes = { follow: button("follow"), orbit: button("orbit"), look: button("look") };
+    this.distance.addEventListener("keydown", (event) => event.key === "Enter" && this.go(this.mode ?? "follow"));
+    const choices = h("div", { class: "choices", role: "group", "aria-label": t.follow.what }, ...Object.values(this.modes));
+    const distance = h("label", { class: "follow-distance" }, this.distance, t.follow.metres);
+    const head = h("div", { class: "follow-head" }, h("p", {}, this.state, this.figures), distance);
+    this.element = h("section", { class: "follow-panel", tabindex: -1, hidden: true, "aria-label": t.follow.label }, head, choices, this.stop, this.why);
+  }
+
+  get isOpen(): boolean {
+    return !this.element.hidden;
+  }
+
+  /** What was marked is being tracked; nothing flies. `at`: where a panel of that size lies in the view. */
+  open(at: (size: Size) => Point): void {
+    this.at = at;
+    this.distance.value = "";
+    this.show({ type: "follow", state: "tracking", camera: "", phase: "starting" });
+    (this.modes.follow.disabled ? this.element : this.modes.follow).focus({ preventScroll: true });
+  }
+
+  close(): void {
+    // What had the focus here would leave it nowhere, and a text field would go on keeping the keys.
+    if (this.element.contains(document.activeElement)) this.element.closest<HTMLElement>(".pane")?.focus({ preventScroll: true });
+    setHidden(this.element, true);
+    this.height = 0;
+  }
+
+  /** Why nothing can be flown now, in words; empty: it can. */
+  allow(why: string): void {
+    this.can = why;
+    for (const mode of FOLLOW_MODES) setDisabled(this.modes[mode], why !== "");
+    this.explain();
+  }
+
+  show(message: FollowMessage): void {
+    const flies = message.state === "flying" || message.state === "waiting";
+    setHidden(this.element, false);
+    setAttribute(this.element, "data-state", flies ? "flying" : "tracking");
+    const lost = (message.lost_s ?? 0) > 0.5 || (message.state === "tracking" && message.phase !== "starting" && !message.box);
+    setTone(this.element, message.state === "waiting" || lost ? "warn" : flies ? "busy" : "quiet");
+    setText(this.state, message.state === "waiting" ? t.follow.waiting : message.phase === "starting" ? t.follow.starting : flies ? named(t.follow.phases, message.phase ?? "") : lost ? t.follow.lost : t.follow.tracked);
+    setText(this.figures, figures(message));
+    for (const mode of FOLLOW_MODES) setAttribute(this.modes[mode], "aria-pressed", String(flies && message.mode === mode));
+    setText(this.stop, flies ? t.follow.stop : t.follow.cancel);
+    setAttribute(this.stop, "aria-keyshortcuts", flies ? "F" : "Escape");
+    if (message.distance_m) this.distance.placeholder = String(message.distance_m);
+    this.problem = message.problem ?? "";
+    this.explain();
+  }
+
+  /** It stays where it is, unless it grows. */
+  private place(): void {
+    const { offsetWidth: width, offsetHeight: height } = this.element;
+    if (this.at === null || height === this.height) return;
+    this.height = height;
+    const [x, y] = this.at({ width, height });
+    this.element.style.setProperty("--x", `${x}px`);
+    this.element.style.setProperty("--y", `${y}px`);
+  }
+
+  private get mode(): FollowMode | null {
+    return FOLLOW_MODES.find((mode) => this.modes[mode].getAttribute("aria-pressed") === "true") ?? null;
+  }
+
+  private explain(): void {
+    setText(this.why, this.problem || this.can);
+    setHidden(this.why, !this.why.textContent);
+    if (this.isOpen) this.place();
+  }
+
+  private go(mode: FollowMode): void {
+    const distance = this.distance.valueAsNumber;
+    if (!this.can) this.deeds.go(mode, Number.isFinite(distance) ? distance : null);
+  }
+}

@@ -1,0 +1,344 @@
+"""One page's flight after a target that it marked: from its box to set-points, and what the page is told. On the loop.
+
+A box is tracked first, and nothing flies before the page says how (:meth:`FollowSession.fly`), or said so with the
+box. While it flies, each report of the :class:`~skyloop.cockpit.target_tracker.TargetTracker` is one set-point; without
+a new frame for :data:`STOPPED_S` it is hover, until they come back.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final, Protocol
+
+from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
+from skyloop.cockpit.broadcast import call_soon
+from skyloop.cockpit.frame_keeper import FrameKeeper
+from skyloop.cockpit.place_flight import UP
+from skyloop.cockpit.target_tracker import Box, Follower, TargetTracker, TrackReport
+from skyloop.cockpit.values import number, vector
+from skyloop.control.chase_law import ChaseSettings, FollowMode
+from skyloop.control.target_follower import TargetFollower
+from skyloop.errors import AuthorityError, LinkError, RefusedError, SkyloopError, UnknownNameError
+from skyloop.messages import CameraInfo, Hover
+from skyloop.vision.opencv import opencv
+from skyloop.vision.tracking import checked_box
+
+if TYPE_CHECKING:
+    from skyloop.client import Drone
+    from skyloop.cockpit.commands import FollowTarget, SelectTarget, SetFollowMode
+    from skyloop.cockpit.pilot_connection import PilotConnection
+    from skyloop.messages import AnyAction
+
+STOPPED_S: Final = 0.5  #: without a new frame for so long it hovers
+OLD_S: Final = 1.0  #: frames that are older when they are tracked are not flown by either
+OLD_FEEDBACK_S: Final = 1.0
+WATCH_S: Final = 0.1  #: between looks whether the tracker still reports
+TELL_S: Final = 0.2  #: between two messages of which only numbers differ
+JOIN_S: Final = 2.0
+NO_CONTROL: Final = "this page has no control any more"
+_WHAT: Final = "following a target"
+
+Json = dict[str, Any]
+
+
+class FollowerFactory(Protocol):
+    """Makes a follower for one target; as :class:`skyloop.control.target_follower.TargetFollower` is made."""
+
+    def __call__(
+        self,
+        camera: CameraInfo,
+        *,
+        box: Box,
+        class_name: str | None,
+        mode: FollowMode,
+        settings: ChaseSettings | None,
+    ) -> Follower: ...
+
+
+class FollowSession:
+    """Tracks one target at a time for a page, and flies after it. On the event loop.
+
+    Args:
+        drone: Whose frames are tracked; may be an observer's.
+        send: Sends a message to the page.
+        clear: Ends whatever else the page flies; called before the first set-point.
+        make: Makes followers; called on a thread.
+        clock: This process's monotonic clock [ns].
+    """
+
+    def __init__(
+        self,
+        drone: Drone,
+        send: Callable[[Json], None],
+        clear: Callable[[], None],
+        make: FollowerFactory = TargetFollower,
+        clock: Clock = monotonic_ns,
+    ) -> None:
+        self._drone = drone
+        self._send = send
+        self._clear = clear
+        self._make = make
+        self._clock = clock
+        self._keeper: FrameKeeper | None = None  # while a box is drawn
+        self._tracker: TargetTracker | None = None
+        self._camera = ""
+        self._mode = ""
+        self._distance_m = 0.0
+        self._pilot: PilotConnection | None = None  # while it flies, or is about to
+        self._flying = False
+        self._waits = ""  # why it hovers meanwhile
+        self._action: AnyAction | None = None  # the last set-point
+        self._report: TrackReport | None = None
+        self._reported_ns = 0
+        self._told: tuple[Any, ...] = ()
+        self._told_ns = 0
+        self._watch: asyncio.TimerHandle | None = None
+        self._ending: set[asyncio.Task[None]] = set()
+
+    @property
+    def is_under_way(self) -> bool:
+        """Whether it commands the vehicle, or is about to."""
+        return self._pilot is not None
+
+    # What the page asks for ------------------------------------------------------------------------------------
+
+    async def select(self, command: SelectTarget) -> None:
+        """Keep the frames of a camera, until a box comes or the page changes its mind.
+
+        Raises:
+            UnknownNameError: The vehicle has no such camera.
+            MissingExtraError: OpenCV is not installed.
+        """
+        if self._keeper is not None:
+            self._keeper.close()
+            self._keeper = None
+        if command.camera is None:
+            return
+        camera = self._camera_info(command.camera)
+        await asyncio.to_thread(opencv, _WHAT)
+        loop = asyncio.get_running_loop()
+        self._keeper = FrameKeeper(
+            self._drone, camera.name, lambda since_ns: call_soon(loop, self._selecting, camera.name, since_ns)
+        )
+
+    async def begin(self, command: FollowTarget, held: Callable[[], PilotConnection]) -> None:
+        """Track what is in a box; fly after it, once the tracker has caught up, if there is a mode.
+
+        Args:
+            command: The page's.
+            held: Returns the connection that holds the authority; called if there is a mode.
+
+        Raises:
+            AuthorityError: There is a mode, and none does.
+            RefusedError: The frame is not kept, or the vehicle is not in the air.
+            UsageError: The box, mode, distance or camera can't be used.
+            MissingExtraError: OpenCV is not installed.
+        """
+        camera = self._camera_info(command.camera)
+        settings = None if command.distance_m is None else _settings(command.distance_m)
+        pilot = None
+        if command.mode is not None:
+            _check_mode(command.mode)
+            pilot = held()
+            _check_in_air(pilot)
+        await asyncio.to_thread(opencv, _WHAT)
+        keeper = self._keeper
+        if keeper is None or keeper.camera != camera.name:
+            raise RefusedError(f"no frames of {camera.name} are kept: choose the camera first (follow_select)")
+        first = keeper.find(int(command.captured_ns))
+        box = checked_box(command.box, (first.header.height, first.header.width))
+        self.end("another target was marked")
+        self._keeper = None  # it is the tracker's now
+        self._camera, self._mode, self._pilot = camera.name, command.mode or "", pilot
+        self._distance_m = (settings or ChaseSettings()).distance_m
+        mode = FollowMode(command.mode or FollowMode.FOLLOW)
+        make = partial(self._make, camera, box=box, class_name=command.class_name, mode=mode, settings=settings)
+        loop = asyncio.get_running_loop()
+
+        def report(made: TrackReport) -> None:
+            call_soon(loop, self._on_report, tracker, made)
+
+        self._report, self._reported_ns = None, self._clock()
+        tracker = self._tracker = TargetTracker(self._drone, keeper, first, make, report, self._clock)
+        tracker.steers = pilot is not None
+        tracker.start()
+        self._tell()
+
+    def fly(self, command: SetFollowMode, pilot: PilotConnection) -> None:
+        """Fly after the target that is tracked, or go on in another mode.
+
+        Raises:
+            RefusedError: Nothing is tracked, or the vehicle is not in the air.
+            UsageError: The mode or distance can't be used.
+        """
+        tracker = self._tracker
+        if tracker is None:
+            raise RefusedError("no target is tracked: mark one first")
+        _check_mode(command.mode)
+        if not self._flying:
+            _check_in_air(pilot)
+        if command.distance_m is not None:
+            tracker.settings = _settings(command.distance_m)
+            self._distance_m = command.distance_m
+        self._mode = tracker.mode = command.mode
+        self._pilot = pilot  # who sets off with the next report, at the latest when the tracker has caught up
+        tracker.steers = True
+        self._tell()
+
+    def interrupt(self, why: str) -> None:
+        """End a flight, as something else is commanded or the control is gone; what is only tracked goes on."""
+        if self._pilot is not None:
+            self.end(why, hover=False)
+
+    def end(self, why: str = "", *, hover: bool = True) -> None:
+        """Forget the target.
+
+        Args:
+            why: For the page; empty if the person wanted it.
+            hover: Hover, if it was flown after; False because something else is commanded.
+        """
+        tracker, pilot, flying = self._tracker, self._pilot, self._flying
+        if tracker is None:
+            return
+        tracker.close()
+        ending = asyncio.create_task(asyncio.to_thread(tracker.join, JOIN_S))
+        self._ending.add(ending)
+        ending.add_done_callback(self._ending.discard)
+        self._tracker = self._pilot = self._action = None
+        self._flying, self._waits = False, ""
+        if self._watch is not None:
+            self._watch.cancel()
+            self._watch = None
+        if hover and flying and pilot is not None:
+            pilot.hover_if_held()
+        self._tell("ended", why)
+        self._report = None
+
+    async def close(self) -> None:
+        """Forget the target and the frames, and wait for their threads."""
+        self.end()
+        if self._keeper is not None:
+            self._keeper.close()
+            self._keeper = None
+        await asyncio.gather(*self._ending, return_exceptions=True)
+
+    # While it is tracked ---------------------------------------------------------------------------------------
+
+    def _on_report(self, tracker: TargetTracker, report: TrackReport) -> None:
+        if tracker is not self._tracker:  # of one that has ended
+            return
+        self._report, self._reported_ns = report, self._clock()
+        if report.problem or report.over:
+            self.end(report.problem or (report.status and report.status.problem) or "the target was lost")
+            return
+        if report.action is not None and self._pilot is not None:
+            if not self._flying:
+                self._set_off()
+            else:
+                self._steer(report.action)
+        self._tell()
+
+    def _set_off(self) -> None:
+        """Send the first set-point; whatever else flew until now ends."""
+        pilot, self._pilot = self._pilot, None  # or this would end, too
+        self._clear()
+        self._pilot, self._flying, self._action = pilot, True, None
+        self._watch = asyncio.get_running_loop().call_later(WATCH_S, self._on_watch)
+        if self._report is not None and self._report.action is not None:
+            self._steer(self._report.action)
+
+    def _steer(self, action: AnyAction) -> None:
+        """Send a set-point, or hover without new frames; ends with the first thing that goes wrong."""
+        pilot = self._pilot
+        assert pilot is not None
+        self._waits = self._stopped()
+        try:
+            _check_in_air(pilot)
+            if self._action is not None and pilot.has_ended(self._action):
+                raise RefusedError("it was ended on the way, by a failsafe or a lost link")
+            action = Hover() if self._waits else action
+            if not pilot.command(action):
+                pilot.idle()  # or it would be done after all when the link is back soon
+                raise LinkError(f"nothing can be sent: the link to the proxy is {pilot.link.application}")
+            self._action = action
+        except AuthorityError:
+            self.end(NO_CONTROL)
+        except SkyloopError as error:
+            self.end(str(error))
+
+    def _stopped(self) -> str:
+        """Return why there are no frames to fly by; empty if there are."""
+        report = self._report
+        if report is None:
+            return ""
+        since_s = seconds(self._clock() - report.frame_ns)
+        if since_s > STOPPED_S:
+            return f"no new frame of {self._camera} for {since_s:.1f} s: it hovers until they come back"
+        if report.frame_age_s > OLD_S:
+            return f"the frames of {self._camera} are {report.frame_age_s:.1f} s old: it hovers until they are newer"
+        return ""
+
+    def _on_watch(self) -> None:
+        """Hover if the tracker has not reported for too long: its thread is stuck, or starved."""
+        self._watch = asyncio.get_running_loop().call_later(WATCH_S, self._on_watch)
+        if self._clock() - self._reported_ns > nanoseconds(STOPPED_S):
+            self._steer(Hover())
+            self._tell()
+
+    # What the page is told -------------------------------------------------------------------------------------
+
+    def _selecting(self, camera: str, since_ns: int) -> None:
+        if self._keeper is not None and self._keeper.camera == camera:
+            self._send({"type": "follow", "state": "selecting", "camera": camera, "since_ns": str(since_ns)})
+
+    def _tell(self, state: str = "", why: str = "") -> None:
+        """Send the state: each change at once, numbers no more often than every :data:`TELL_S`."""
+        if not state:
+            if self._tracker is None:
+                return
+            state = "tracking" if not self._flying else "waiting" if self._waits else "flying"
+        report = self._report
+        status = None if report is None else report.status
+        phase = "starting" if status is None or report is None or not report.caught_up else str(status.phase)
+        if phase != "starting" and not self._flying and state != "ended":
+            phase = ""  # of a law that does not fly
+        problem = why if state == "ended" or status is None else self._waits or status.problem
+        now_ns = self._clock()
+        # Of what waits the age grows: that is no change.
+        told = state, phase if state != "ended" else "", self._mode, self._distance_m, "" if self._waits else problem
+        if told == self._told and now_ns - self._told_ns < nanoseconds(TELL_S):
+            return
+        self._told, self._told_ns = told, now_ns
+        message: Json = {"type": "follow", "state": state, "camera": self._camera, "mode": self._mode or None}
+        message |= {"phase": phase, "problem": problem, "distance_m": number(self._distance_m)}
+        message["size"] = None if report is None else list(report.size)
+        for name in ("confidence", "range_m", "range_deviation_m", "bearing_rad", "speed_m_s", "lost_s"):
+            message[name] = None if status is None else number(getattr(status, name))
+        for name in ("box", "predicted_px"):
+            message[name] = None if status is None else vector(getattr(status, name))
+        self._send(message)
+
+    def _camera_info(self, name: str) -> CameraInfo:
+        cameras = self._drone.capabilities.cameras
+        for camera in cameras:
+            if camera.name == name:
+                return camera
+        raise UnknownNameError("camera", name, [camera.name for camera in cameras])
+
+
+def _check_mode(mode: str) -> None:
+    if mode not in list(FollowMode):
+        raise UnknownNameError("mode of following", mode, FollowMode)
+
+
+def _settings(distance_m: float) -> ChaseSettings:
+    return ChaseSettings(distance_m=distance_m)
+
+
+def _check_in_air(pilot: PilotConnection) -> None:
+    state = pilot.feedback(max_age_s=OLD_FEEDBACK_S).state
+    if state not in UP:
+        hint = "" if state.airborne else ": take off first"
+        raise RefusedError(f"it can't be flown after a target: it is {state.replace('_', ' ')}{hint}")

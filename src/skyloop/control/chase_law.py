@@ -1,0 +1,460 @@
+"""The law that keeps a target in view, at a distance, or circles it. Pure: times are on the proxy's clock.
+
+Yaw keeps the target in the middle of the image, the distance is kept along the line of sight, height and side are
+controlled apart from both: the decoupling of Pestana, Sanchez-Lopez, Campoy and Saripalli ("Vision based GPS-denied
+object tracking and following for unmanned aerial vehicles", SSRR 2013), here on estimated metres, so that gains do not
+depend on the lens or the size, with the target's velocity fed forward. A vehicle that does not report its own velocity
+is flown by its attitude, to the same velocity, against one that comes by dead reckoning (:mod:`.dead_reckoning`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.clock import nanoseconds, seconds
+from skyloop.control.dead_reckoning import DRAG_PER_S
+from skyloop.control.filters import LowPass
+from skyloop.control.limiting import GRAVITY_M_S2, SetpointLimiter, SetpointLimits, clamped, shortened
+from skyloop.control.response import ResponseSettings, VelocityResponse
+from skyloop.control.target import Motion
+from skyloop.control.target_estimate import TargetEstimator, TargetState
+from skyloop.errors import UsageError
+from skyloop.messages import Attitude, Feedback, Velocity
+from skyloop.messages.geometry import wrap_angle
+
+Array = NDArray[np.float64]
+
+_SMOOTHING_S = 0.4  # of the target's acceleration
+_SETPOINT_AHEAD = 4.0  # times as fast as the vehicle a set-point may change, to make it change
+_COMING_S = 3.0  # a target that comes by sooner is made way for
+_ALONG_M_S = 0.4  # a target that is slower has no direction to be behind or beside of
+
+
+class FollowMode(StrEnum):
+    """What to do about a target."""
+
+    FOLLOW = "follow"  #: keep a distance, and a side if one was given
+    ORBIT = "orbit"  #: circle it, also while it moves
+    LOOK = "look"  #: turn to it, and stay
+
+
+class TargetPhase(StrEnum):
+    """What becomes of it."""
+
+    LOOKING = "looking for the target"  #: it was not seen yet: turning on the spot
+    FOLLOWING = "following"
+    ORBITING = "orbiting"
+    WATCHING = "looking at it"
+    PREDICTING = "hidden: on by its last motion"
+    HOVERING = "lost: hovering where it went out of sight"
+    SEARCHING = "lost: looking around"
+    GIVEN_UP = "lost for too long: given up"
+
+
+LOSSES = frozenset({TargetPhase.PREDICTING, TargetPhase.HOVERING, TargetPhase.SEARCHING, TargetPhase.GIVEN_UP})
+
+
+@dataclass(frozen=True, slots=True)
+class ChaseSettings:
+    """Goal, gains and limits of :class:`ChaseLaw`.
+
+    Attributes:
+        distance_m: Horizontal, from the vehicle's centre to the target's.
+        nearest_m: It never flies nearer, and backs off from a target that comes nearer.
+        clear_m: The same for others that the detector sees.
+        bearing_rad: Where to be as seen from the target, counter-clockwise from the direction in which it moves: 0 is
+            ahead of it, π behind, π/2 on its left. None: on whichever side it is.
+        orbit_m_s: Speed round the target, counter-clockwise from above if above 0.
+        leash_m: Farthest horizontal distance from where it began; it stays there, turning. None: no leash. Needs the
+            vehicle's velocity.
+        height_m: Above the ground; None: the height at the start.
+        lowest_m: Above the ground.
+        highest_m: Above the ground.
+        steep_rad: Farthest elevation of the target's middle, up or down, at which the height is kept.
+        lead_s: From a command's decision to its taking hold: delays of commands and feedback together.
+        response_s: From a velocity's set-point to that velocity: the target's acceleration is fed forward by as much.
+        range_gain: [1/s]
+        velocity_gain: How hard it takes up a velocity [1/s].
+        yaw_gain: [1/s]
+        height_gain: [1/s]
+        round_gain: How fast to come round to the side [1/s].
+        speed_m_s: Greatest, horizontally. The proxy's ``limits.speed`` holds as well.
+        climb_m_s: Greatest, up and down.
+        turn_rad_s: Greatest.
+        acceleration_m_s2: Of the set-point, horizontally: a harder one tilts the camera off the target.
+        react_s: How late the vehicle answers, at worst: it flies no faster towards the target than it can stop.
+        brake_m_s2: How hard it brakes then.
+        tilt_rad: Greatest, of a vehicle that is flown by attitude.
+        tilt_gain: Acceleration per velocity's error of such a vehicle [1/s].
+        seen_s: Since last seen, up to which the target counts as seen.
+        predict_s: How long it flies on by the target's last motion, ever slower.
+        hover_s: How long it hovers after that, turned to where the target should be.
+        give_up_s: Since last seen, after which it gives up.
+        search_rad_s: Yaw rate of the search.
+
+    Raises:
+        UsageError: A number is out of its range, or the distance is not beyond the nearest one.
+    """
+
+    distance_m: float = 4.0
+    nearest_m: float = 2.0
+    clear_m: float = 1.5
+    bearing_rad: float | None = None
+    orbit_m_s: float = 0.8
+    leash_m: float | None = None
+    height_m: float | None = None
+    lowest_m: float = 0.8
+    highest_m: float = 4.0
+    steep_rad: float = 0.25
+    lead_s: float = 0.12
+    response_s: float = 0.4
+    range_gain: float = 1.0
+    velocity_gain: float = 3.0
+    yaw_gain: float = 2.2
+    height_gain: float = 1.0
+    round_gain: float = 0.8
+    speed_m_s: float = 4.0
+    climb_m_s: float = 0.6
+    turn_rad_s: float = 1.8
+    acceleration_m_s2: float = 3.0
+    react_s: float = 0.5
+    brake_m_s2: float = 1.5
+    tilt_rad: float = 0.33
+    tilt_gain: float = 3.0
+    seen_s: float = 0.4
+    predict_s: float = 2.0
+    hover_s: float = 4.0
+    give_up_s: float = 25.0
+    search_rad_s: float = 0.7
+
+    def __post_init__(self) -> None:
+        free = {"bearing_rad", "orbit_m_s", "leash_m", "height_m"}
+        for name in self.__dataclass_fields__:
+            value = getattr(self, name)
+            if value is None and name in free:
+                continue
+            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+                raise UsageError(f"{name} is {value!r} and must be a finite number")
+            if value <= 0.0 and name not in {"bearing_rad", "orbit_m_s", "velocity_gain"}:
+                raise UsageError(f"{name} is {value!r} and must be above 0")
+        if self.distance_m <= self.nearest_m:
+            raise UsageError(
+                f"distance_m is {self.distance_m:g} and must be above nearest_m, which is {self.nearest_m:g}"
+            )
+        if self.lowest_m > self.highest_m:
+            raise UsageError(f"lowest_m is {self.lowest_m:g} and must be at most highest_m, {self.highest_m:g}")
+
+
+class ChaseLaw:
+    """Computes set-points from the vehicle's motion and the target's state.
+
+    Attributes:
+        settings: May be replaced in flight.
+        mode: May be changed in flight.
+        phase: As of the last step.
+        off_m: Estimated minus wanted distance, as of the last step; None while the target is not seen.
+        held_by: What keeps it from flying to where it is wanted: "leash"; empty for nothing.
+    """
+
+    def __init__(self, settings: ChaseSettings | None = None, mode: FollowMode = FollowMode.FOLLOW) -> None:
+        """Initialise the law."""
+        self.settings = settings or ChaseSettings()
+        self.mode = mode
+        self.phase = TargetPhase.LOOKING
+        self.off_m: float | None = None
+        self.held_by = ""
+        self._heading: float | None = None  # in which the target moved when it last did
+        self._begin: Array | None = None
+        self._height: float | None = None
+        self._since_ns: int | None = None  # when the search began
+        self._direction = 1.0
+        self._was: tuple[int, Array] | None = None  # the target's velocity, and when
+        self._acceleration: LowPass[Array] = LowPass(_SMOOTHING_S)
+        self._response = VelocityResponse(ResponseSettings(delay_s=self.settings.lead_s))
+        self._limiter: SetpointLimiter | None = None
+        self._last_ns: int | None = None
+
+    def step(
+        self,
+        now_ns: int,
+        motion: Motion,
+        altitude_m: float | None,
+        target: TargetEstimator | None,
+        seen_ns: int | None,
+        others: Sequence[TargetState] = (),
+        *,
+        relative: bool = False,
+    ) -> Velocity | Attitude:
+        """Compute the set-point for now.
+
+        Args:
+            now_ns: On the proxy's clock.
+            motion: The vehicle's newest motion; with ``relative`` by dead reckoning.
+            altitude_m: Height above the ground; None: the height is left as it is.
+            target: Its filter; None before it was seen.
+            seen_ns: When it was last in view for certain, or perhaps; None: never.
+            others: Who else was seen lately, and is kept clear of.
+            relative: The vehicle does not report its velocity (see :mod:`.dead_reckoning`): the set-point is an
+                attitude.
+        """
+        s = self.settings
+        dt_s = 0.0 if self._last_ns is None else max(0.0, min(0.2, seconds(now_ns - self._last_ns)))
+        self._last_ns = now_ns
+        own = motion.moved_to(now_ns)
+        self._begin = own.position[:2] if self._begin is None else self._begin
+        if self._height is None and altitude_m is not None:
+            self._height = altitude_m
+        if self._since_ns is None:
+            self._since_ns = now_ns
+        unseen_s = seconds(now_ns - (self._since_ns if seen_ns is None else seen_ns))
+        self.phase = self._next_phase(unseen_s, never=target is None or seen_ns is None)
+        self.held_by, self.off_m = "", None
+        ahead = self._ahead(motion, now_ns, relative=relative)
+        self._limits(own)
+        if target is None or self.phase in (TargetPhase.LOOKING, TargetPhase.SEARCHING):
+            turning = s.search_rad_s * self._direction
+            return self._hold(turning, altitude_m, None, ahead, own, dt_s, relative=relative)
+        state = target.at(ahead.at_ns)
+        if self.phase is TargetPhase.GIVEN_UP:
+            return self._hold(0.0, altitude_m, state, ahead, own, dt_s, relative=relative)
+        turn = self._turn(ahead, state)
+        # As fast as before for half of the time, then ever slower.
+        fade = clamped(2.0 * (1.0 - (unseen_s - s.seen_s) / s.predict_s), 1.0)
+        if self.phase is TargetPhase.HOVERING or self.mode is FollowMode.LOOK:
+            return self._hold(turn, altitude_m, state, ahead, own, dt_s, relative=relative)
+        up = self._up(altitude_m, state)
+        horizontal = self._horizontal(ahead, state) * max(0.0, fade)
+        if self.phase is TargetPhase.PREDICTING:
+            horizontal = _not_towards(horizontal, state.foot[:2] - ahead.position[:2])
+        for other in others:
+            horizontal = horizontal + self._clear_of(other, ahead, horizontal)
+        if relative:
+            return self._by_attitude(ahead, np.array(shortened(horizontal, s.speed_m_s)), up, turn)
+        return self._flown(shortened(horizontal, s.speed_m_s), up, turn, ahead, own, dt_s)
+
+    def feedback(self, feedback: Feedback) -> None:
+        """Update the model of the vehicle's response with its newest state; a vehicle without velocity has none."""
+        self._response.add(feedback)
+
+    def _ahead(self, motion: Motion, now_ns: int, *, relative: bool) -> Motion:
+        """Return the motion at which a set-point that is sent now finds the vehicle, with all that is under way."""
+        delay_s = self.settings.lead_s
+        ahead = motion.moved_to(now_ns + nanoseconds(delay_s))
+        predicted = None if relative else self._response.predict(now_ns)
+        if predicted is None:
+            return ahead
+        way = (motion.velocity[:2] + predicted.velocity) / 2 * delay_s
+        position = motion.position + motion.velocity * seconds(now_ns - motion.at_ns)
+        return replace(
+            ahead,
+            position=np.array([*(position[:2] + way), ahead.position[2]]),
+            velocity=np.array([*predicted.velocity, ahead.velocity[2]]),
+        )
+
+    def _flown(self, velocity: Array, up: float, turn: float, ahead: Motion, own: Motion, dt_s: float) -> Velocity:
+        """Return the set-point that brings the vehicle to a velocity (2,) in odometry axes, whatever pushes it."""
+        s, predicted = self.settings, self._response.predict(own.at_ns)
+        assert self._limiter is not None
+        if predicted is not None:
+            acceleration = shortened(s.velocity_gain * (velocity - ahead.velocity[:2]), s.acceleration_m_s2)
+            velocity = self._response.setpoint(acceleration, predicted)
+        setpoint = self._limiter.step(np.array([*own.to_body(velocity), up, turn]), dt_s)
+        c, si = math.cos(own.yaw), math.sin(own.yaw)
+        sent = (c * setpoint.forward - si * setpoint.left, si * setpoint.forward + c * setpoint.left)
+        self._response.sent(np.array(sent), own.at_ns)
+        return setpoint
+
+    def _next_phase(self, unseen_s: float, *, never: bool) -> TargetPhase:
+        s = self.settings
+        if unseen_s > s.give_up_s:
+            return TargetPhase.GIVEN_UP
+        if never:
+            return TargetPhase.LOOKING
+        if unseen_s > s.seen_s + s.predict_s + s.hover_s:
+            return TargetPhase.SEARCHING
+        if unseen_s > s.seen_s + s.predict_s:
+            return TargetPhase.HOVERING
+        if unseen_s > s.seen_s:
+            return TargetPhase.PREDICTING
+        return {
+            FollowMode.FOLLOW: TargetPhase.FOLLOWING,
+            FollowMode.ORBIT: TargetPhase.ORBITING,
+            FollowMode.LOOK: TargetPhase.WATCHING,
+        }[self.mode]
+
+    def _turn(self, own: Motion, state: TargetState) -> float:
+        """Return the yaw rate that brings the target to the middle, and keeps it there."""
+        offset = state.foot[:2] - own.position[:2]
+        across = max(0.5, float(np.hypot(*offset)))
+        error = wrap_angle(math.atan2(offset[1], offset[0]) - own.yaw)
+        moving = state.velocity - own.velocity[:2]
+        sweep = float(offset[0] * moving[1] - offset[1] * moving[0]) / across**2
+        turn = clamped(self.settings.yaw_gain * error + 0.9 * sweep, self.settings.turn_rad_s)
+        if abs(turn) > 0.05:
+            self._direction = math.copysign(1.0, turn)
+        return turn
+
+    def _horizontal(self, own: Motion, state: TargetState) -> Array:
+        """Return the wanted velocity, (2,) in odometry axes [m/s]."""
+        s = self.settings
+        offset = state.foot[:2] - own.position[:2]
+        across = max(0.3, float(np.hypot(*offset)))
+        sight = offset / across
+        aside = np.array([-sight[1], sight[0]])
+        self.off_m = across - s.distance_m
+        # Towards it no faster than it can stop again; away from it as the gain says.
+        approach = min(s.range_gain * self.off_m, _stoppable(self.off_m, s))
+        moving = self._soon(state, own.at_ns)
+        wanted = moving + sight * approach
+        if self.mode is FollowMode.ORBIT:
+            wanted = wanted - aside * s.orbit_m_s  # counter-clockwise as seen from above: the target on the left
+        elif s.bearing_rad is None:
+            # No side was asked for: what the target does across the line of sight is left to yaw.
+            wanted = wanted - aside * float(moving @ aside)
+        else:
+            wanted = wanted + aside * self._round(state, sight, across)
+        wanted = wanted + self._evading(own, state)
+        return self._leashed(own, self._kept_off(wanted, state, sight, across))
+
+    def _soon(self, state: TargetState, at_ns: int) -> Array:
+        """Return the target's velocity as it will be when the vehicle has taken it up, (2,) [m/s]."""
+        s, velocity = self.settings, state.velocity
+        if self._was is not None and at_ns > self._was[0]:
+            dt_s = seconds(at_ns - self._was[0])
+            if dt_s > 0.5:
+                self._acceleration = LowPass(_SMOOTHING_S)
+            change = shortened((velocity - self._was[1]) / dt_s, s.acceleration_m_s2)
+            self._acceleration.step(change, min(dt_s, 0.5))
+        self._was = (at_ns, velocity)
+        change = np.zeros(2) if self._acceleration.value is None else self._acceleration.value
+        return velocity + s.response_s * change
+
+    def _round(self, state: TargetState, sight: Array, across: float) -> float:
+        """Return the speed to the left of the line of sight that brings the vehicle to its side of the target."""
+        s = self.settings
+        if float(np.hypot(*state.velocity)) > _ALONG_M_S:
+            self._heading = math.atan2(state.velocity[1], state.velocity[0])
+        if self._heading is None or s.bearing_rad is None:
+            return 0.0
+        here = math.atan2(-sight[1], -sight[0])  # the vehicle as seen from the target
+        off = wrap_angle(self._heading + s.bearing_rad - here)
+        return -clamped(s.round_gain * off * across, 0.6 * s.speed_m_s)
+
+    def _evading(self, own: Motion, state: TargetState) -> Array:
+        """Return the velocity that leaves the way of a target that comes by nearer than allowed, (2,) [m/s]."""
+        s, velocity = self.settings, state.velocity
+        speed = float(np.hypot(*velocity))
+        if speed < _ALONG_M_S:
+            return np.zeros(2)
+        here = own.position[:2] - state.foot[:2]
+        left = np.array([-velocity[1], velocity[0]]) / speed
+        in_s, aside = float(here @ velocity) / speed**2, float(here @ left)
+        if not 0.0 < in_s < _COMING_S or abs(aside) >= s.nearest_m:
+            return np.zeros(2)
+        needed = (s.nearest_m - abs(aside)) / max(0.5, in_s)
+        return left * math.copysign(min(needed, 0.7 * s.speed_m_s), aside)
+
+    def _clear_of(self, other: TargetState, own: Motion, wanted: Array) -> Array:
+        """Return the velocity that keeps clear of somebody else, (2,) [m/s]."""
+        clear_m = self.settings.clear_m
+        here, moving = own.position[:2] - other.foot[:2], wanted - other.velocity
+        square = float(moving @ moving)
+        in_s = clamped(-float(here @ moving) / square, _COMING_S) if square > 0.01 else 0.0
+        nearest = here + moving * max(0.0, in_s)
+        away = float(np.hypot(*nearest))
+        if in_s >= _COMING_S or away >= clear_m:
+            return np.zeros(2)
+        left = np.array([-moving[1], moving[0]]) / max(0.1, math.sqrt(square))
+        direction = nearest / away if away > 0.1 else left
+        return direction * min((clear_m - away) / max(0.5, in_s), 0.7 * self.settings.speed_m_s)
+
+    def _kept_off(self, wanted: Array, state: TargetState, sight: Array, across: float) -> Array:
+        """Take away what would bring it so near, and so fast, that it could not stop before the nearest distance."""
+        closing = float((wanted - state.velocity) @ sight)
+        gap = across - self.settings.nearest_m
+        allowed = _stoppable(gap, self.settings) if gap > 0.0 else 2.0 * gap
+        return wanted if closing <= allowed else wanted - sight * (closing - allowed)
+
+    def _leashed(self, own: Motion, wanted: Array) -> Array:
+        """Take away what would lead farther out than the leash."""
+        leash = self.settings.leash_m
+        if leash is None or self._begin is None:
+            return wanted
+        out = own.position[:2] - self._begin
+        length = float(np.hypot(*out))
+        if length < 0.1:
+            return wanted
+        direction = out / length
+        outwards = float(wanted @ direction)
+        allowed = 1.2 * (leash - length)
+        if outwards <= allowed:
+            return wanted
+        self.held_by = "leash"
+        return wanted - direction * (outwards - allowed)
+
+    def _up(self, altitude_m: float | None, state: TargetState | None) -> float:
+        """Return the climb that keeps the height, or brings the target's middle back into the image's middle part."""
+        s = self.settings
+        if altitude_m is None:
+            return 0.0
+        height = s.height_m if s.height_m is not None else (self._height if self._height is not None else altitude_m)
+        if state is not None:
+            reach = math.tan(s.steep_rad) * state.range_m
+            middle = float(state.middle[2])
+            height = max(middle - reach, min(middle + reach, height))
+        height = max(s.lowest_m, min(s.highest_m, height))
+        return clamped(s.height_gain * (height - altitude_m), s.climb_m_s)
+
+    def _by_attitude(self, own: Motion, wanted: Array, up: float, turn: float) -> Attitude:
+        """Return the attitude that accelerates to a velocity, (2,) in odometry axes [m/s]; against drag as well."""
+        s = self.settings
+        push = s.tilt_gain * (wanted - own.velocity[:2]) + DRAG_PER_S * own.velocity[:2]
+        forward, left = own.to_body(shortened(push, GRAVITY_M_S2 * math.tan(s.tilt_rad)))
+        return Attitude(
+            roll=-math.atan2(left, GRAVITY_M_S2), pitch=math.atan2(forward, GRAVITY_M_S2), climb=up, yaw_rate=turn
+        )
+
+    def _hold(
+        self,
+        turn: float,
+        altitude_m: float | None,
+        state: TargetState | None,
+        ahead: Motion,
+        own: Motion,
+        dt_s: float,
+        *,
+        relative: bool,
+    ) -> Velocity | Attitude:
+        up = self._up(altitude_m, state)
+        if relative:
+            return self._by_attitude(ahead, np.zeros(2), up, turn)
+        return self._flown(np.zeros(2), up, turn, ahead, own, dt_s)
+
+    def _limits(self, own: Motion) -> None:
+        """Take over the limits; the first set-point, too, is limited: by the vehicle's own velocity."""
+        s = self.settings
+        # A set-point leads the velocity by what accelerates the vehicle: it may change faster than that does.
+        limits = SetpointLimits(s.speed_m_s, s.climb_m_s, s.turn_rad_s, _SETPOINT_AHEAD * s.acceleration_m_s2)
+        if self._limiter is None:
+            self._limiter = SetpointLimiter(limits)
+            forward, left = own.to_body(own.velocity[:2])
+            self._limiter.reset(Velocity(forward=forward, left=left))
+        self._limiter.limits = limits
+
+
+def _stoppable(gap_m: float, settings: ChaseSettings) -> float:
+    """Return the speed from which it stops within a gap, after a moment of reaction [m/s]; 0 for none."""
+    react_s, brake = settings.react_s, settings.brake_m_s2
+    return brake * (math.sqrt(react_s**2 + 2.0 * max(0.0, gap_m) / brake) - react_s)
+
+
+def _not_towards(velocity: Array, sight: Array) -> Array:
+    """Take away what leads towards a target that is hidden: what hides it may be in the way."""
+    direction = sight / max(1e-6, float(np.hypot(*sight)))
+    return velocity - direction * max(0.0, float(velocity @ direction))

@@ -1,0 +1,177 @@
+"""How a vehicle answers velocity set-points: predicts its motion, and inverts the answer. Pure.
+
+The model of the vehicle's own loop: a set-point, ``delay_s`` after it was sent, asks for a lean in proportion to the
+velocity's error (and to a trim that the loop learns); the lean follows within ``lag_s``; lean and the air's push
+accelerate the vehicle. The lean is measured, so that the push is what else accelerates it, by a Kalman filter of
+velocity and push; the trim is what else makes it lean. As everything that is under way is known, a law can use the
+velocity at which its set-point will find the vehicle, and gains that would make it swing without (O. J. M. Smith,
+"Closer Control of Loops with Dead Time", Chemical Engineering Progress 53(5), 1957), and takes out the push before it
+has become an error (a disturbance observer: Ohnishi, Shibata and Murakami, "Motion Control for Advanced Mechatronics",
+IEEE/ASME Trans. Mechatronics 1(1), 1996).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.clock import nanoseconds, seconds
+from skyloop.control.filters import gain
+from skyloop.control.limiting import shortened
+from skyloop.errors import UsageError
+from skyloop.messages import Feedback
+from skyloop.messages.geometry import rotation_from_euler
+
+Array = NDArray[np.float64]
+
+_GRAVITY_M_S2 = 9.80665
+_STEP_S = 0.01  # of the prediction
+_LONGEST_GAP_S = 0.25  # feedback that was missing for longer tells nothing of the time in between
+_LONGEST_PREDICTION_S = 0.5
+_KEPT_SETPOINTS = 64
+
+
+@dataclass(frozen=True, slots=True)
+class ResponseSettings:
+    """The answer of a vehicle's velocity loop. Defaults: the AR.Drone's, as far as public sources give it.
+
+    Raises:
+        UsageError: A number is out of its range.
+    """
+
+    gain_per_s: float = 2.0  #: acceleration that is asked for by each m/s of the velocity's error
+    lag_s: float = 0.1  #: of the lean behind what is asked for; Engel, Sturm and Cremers, IROS 2012: 10 1/s
+    delay_s: float = 0.05  #: from a set-point's sending until the loop uses it
+    tilt_rad: float = 0.5  #: the greatest lean that the loop asks for; see also ``LandingSettings.within``
+    push_m_s3: float = 1.5  #: by how much the air's push wanders within a second [m/s² in √s]
+    velocity_noise_m_s: float = 0.05  #: of the velocity in feedback
+    trim_s: float = 0.3  #: how fast the trim is learnt
+
+    def __post_init__(self) -> None:
+        for name in self.__dataclass_fields__:
+            value = getattr(self, name)
+            lowest_is_fine = name == "delay_s" and value == 0.0
+            if not (0.0 < value < math.inf or lowest_is_fine):
+                raise UsageError(f"{name} is {value!r} and must be a finite number above 0")
+        if not self.tilt_rad < math.pi / 2:
+            raise UsageError(f"tilt_rad is {self.tilt_rad!r} and must be below a quarter turn")
+
+    @property
+    def most_m_s2(self) -> float:
+        """The greatest horizontal acceleration by leaning."""
+        return _GRAVITY_M_S2 * math.tan(self.tilt_rad)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Predicted:
+    """The motion at the time from which a set-point that is sent now is in force; horizontal axes with x along yaw 0.
+
+    Attributes:
+        at_ns: That time.
+        moved: Since the last feedback, (2,) [m].
+        velocity: (2,) [m/s].
+        push: Acceleration by the air, (2,) [m/s²].
+        trim: Acceleration that the loop adds to what the velocity's error asks for, (2,) [m/s²].
+    """
+
+    at_ns: int
+    moved: Array
+    velocity: Array
+    push: Array
+    trim: Array
+
+
+class VelocityResponse:
+    """Predicts a vehicle's horizontal motion from its feedback and the set-points that are under way."""
+
+    def __init__(self, settings: ResponseSettings | None = None) -> None:
+        """Initialise the model."""
+        self.settings = settings or ResponseSettings()
+        self._setpoints: deque[tuple[int, Array]] = deque(maxlen=_KEPT_SETPOINTS)  #: in force from, velocity
+        self._at_ns: int | None = None
+        self._velocity = np.zeros(2)
+        self._push = np.zeros(2)
+        self._trim = np.zeros(2)
+        self._lean = np.zeros(2)  # acceleration by it
+        self._covariance = np.diag([self.settings.velocity_noise_m_s**2, 1.0])  # of velocity and push, in each axis
+
+    def add(self, feedback: Feedback) -> None:
+        """Update with the next sample. Ignored without velocity or attitude, or if not newer than the last."""
+        if feedback.velocity_m_s is None or feedback.yaw_rad is None:
+            return
+        if feedback.roll_rad is None or feedback.pitch_rad is None:
+            return
+        turn = rotation_from_euler(0.0, 0.0, feedback.yaw_rad)[:2, :2]
+        velocity = turn @ np.asarray(feedback.velocity_m_s[:2])
+        lean = turn @ (np.tan([feedback.pitch_rad, -feedback.roll_rad]) * _GRAVITY_M_S2)
+        before_ns, self._at_ns = self._at_ns, max(feedback.captured_ns, self._at_ns or 0)
+        if before_ns is None or seconds(feedback.captured_ns - before_ns) > _LONGEST_GAP_S:
+            self._velocity, self._lean = velocity, lean
+        elif feedback.captured_ns > before_ns:
+            self._learn_trim(lean, before_ns, feedback.captured_ns)
+            self._correct((self._lean + lean) / 2, velocity, seconds(feedback.captured_ns - before_ns))
+            self._lean = lean
+
+    def sent(self, velocity: Array, now_ns: int) -> None:
+        """Note a velocity set-point (2,) [m/s] that is sent now."""
+        self._setpoints.append((now_ns + nanoseconds(self.settings.delay_s), np.asarray(velocity, dtype=np.float64)))
+
+    def predict(self, now_ns: int) -> Predicted | None:
+        """Predict the motion at the time from which a set-point that is sent now is in force; None before feedback."""
+        if self._at_ns is None:
+            return None
+        end_ns = now_ns + nanoseconds(self.settings.delay_s)
+        horizon_s = max(0.0, min(_LONGEST_PREDICTION_S, seconds(end_ns - self._at_ns)))
+        steps = max(1, round(horizon_s / _STEP_S))
+        dt = horizon_s / steps
+        moved, velocity, lean = np.zeros(2), self._velocity, self._lean
+        for step in range(steps):
+            asked = self._asked(velocity, self._at_ns + nanoseconds((step + 0.5) * dt))
+            lean = lean + gain(self.settings.lag_s, dt) * (asked - lean)
+            moved = moved + velocity * dt
+            velocity = velocity + (lean + self._push) * dt
+        return Predicted(end_ns, moved, velocity, self._push, self._trim)
+
+    def setpoint(self, acceleration: Array, motion: Predicted) -> Array:
+        """Return the velocity set-point (2,) [m/s] that accelerates a vehicle in a predicted motion.
+
+        Args:
+            acceleration: Wanted, (2,) [m/s²]; shortened to what the lean can give against the air's push.
+            motion: From :meth:`predict`.
+        """
+        by_lean = shortened(acceleration - motion.push, self.settings.most_m_s2)
+        return motion.velocity + (by_lean - motion.trim) / self.settings.gain_per_s
+
+    def _asked(self, velocity: Array, at_ns: int) -> Array:
+        """Return the acceleration that the vehicle's loop asks of the lean."""
+        setpoint = velocity  # none yet: it keeps its velocity
+        for from_ns, asked in reversed(self._setpoints):
+            if from_ns <= at_ns:
+                setpoint = asked
+                break
+        wanted = self.settings.gain_per_s * (setpoint - velocity) + self._trim
+        return shortened(wanted, self.settings.most_m_s2)
+
+    def _learn_trim(self, lean: Array, from_ns: int, to_ns: int) -> None:
+        dt = seconds(to_ns - from_ns)
+        asked = self._asked(self._velocity, (from_ns + to_ns) // 2)
+        expected = self._lean + gain(self.settings.lag_s, dt) * (asked - self._lean)
+        self._trim = self._trim + gain(self.settings.trim_s, dt) * (lean - expected) / gain(self.settings.lag_s, dt)
+        self._trim = shortened(self._trim, self.settings.most_m_s2)
+
+    def _correct(self, lean: Array, measured: Array, dt: float) -> None:
+        """One step of the Kalman filter of velocity and push."""
+        s = self.settings
+        move = np.array([[1.0, dt], [0.0, 1.0]])
+        wander = s.push_m_s3**2 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+        covariance = move @ self._covariance @ move.T + wander
+        velocity = self._velocity + (lean + self._push) * dt
+        share = covariance[:, 0] / (covariance[0, 0] + s.velocity_noise_m_s**2)
+        innovation = measured - velocity
+        self._velocity = velocity + share[0] * innovation
+        self._push = shortened(self._push + share[1] * innovation, s.most_m_s2)
+        self._covariance = covariance - np.outer(share, covariance[0])

@@ -1,0 +1,327 @@
+"""Finds one target in image after image: a tracker of its box, and, where there is a detector, its detections.
+
+No drone, thread or clock; call it from one thread. The tracker (:class:`skyloop.vision.LongTermTracker`) knows the
+target's looks, the scene (:mod:`.target_scene`) where everything is and how it moves. Either finds the target where the
+other does not, and neither may take something else for it: what the tracker returns must be where the target can be,
+and a thing that comes into view after a loss must be where the target can be, look like it, and be the only such one.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from skyloop.clock import seconds
+from skyloop.control.target_estimate import TRAITS, UNKNOWN, TargetEstimator, TargetState, Traits
+from skyloop.control.target_scene import Scene, SceneObject, unlikeness
+from skyloop.control.target_view import BoxView, Camera
+from skyloop.errors import UsageError
+from skyloop.vision import LongTermTracker
+from skyloop.vision.appearance import colours
+from skyloop.vision.detection import Detection
+from skyloop.vision.tracking import LEAST_PX, Box, Image, TrackResult, overlap
+
+_SAME: Final = 0.4  # overlap of two boxes of one thing
+_POINTED_AT: Final = 0.3  # of the user's box with a detection
+_TRACKER_NOISE: Final = 0.06  # of the edges of its boxes, as a share of their height: less sharp than a detector's
+_FITS: Final = 12.0  # squared Mahalanobis distance by what was measured, up to which a box can be the target's
+_DOUBT: Final = 6  # images in a row in which the tracker's box is not where the target can be
+_LATELY_S: Final = 1.0  # others are kept clear of for so long after they were seen
+_DORMANT_S: Final = 1.0  # unseen for longer, it must be recognised
+_SIMILAR: Final = 9.0  # unlikeness of a newcomer's colours, up to which it may be the target
+_CLEARLY: Final = 4.0  # by which any other newcomer must be more unlike
+_FAST_M_S: Final = 4.0  # what an unseen thing may have moved at
+_KEPT_FRAMES: Final = 12  # for detections that come later than their frames
+
+
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """What was found in one image."""
+
+    box: Box | None  #: x, y, width, height [px]; None: the target was not found
+    confidence: float | None  #: 0 to 1: of the tracker's box its chance to be right, of a detection its score
+    contested: bool = False  #: the target may be in view, but something else may be what was seen
+
+
+@dataclass(slots=True, eq=False)
+class _Seen:
+    image: Image
+    camera: Camera
+    captured_ns: int
+
+
+class TargetFinder:
+    """Keeps one target.
+
+    Attributes:
+        estimator: Where the target is; None before it was seen.
+        class_name: Of the target, as far as it is known.
+        detections: Of the newest image that was searched by a detector.
+    """
+
+    def __init__(
+        self,
+        *,
+        box: Box | None = None,
+        class_name: str | None = None,
+        traits: Traits | None = None,
+        nominal_m: float = 4.0,
+        relative: bool = False,
+    ) -> None:
+        """Initialise the finder.
+
+        Args:
+            box: The target in the first image: x, y, width, height [px].
+            class_name: Whose largest detection is the target if there is no box; with a box, what it must be.
+            traits: Of the target; None: those of its class.
+            nominal_m: Its distance at the start where nothing tells it.
+            relative: Whether the vehicle does not know its own velocity.
+
+        Raises:
+            UsageError: There is neither a box nor a class.
+            MissingExtraError: OpenCV is not installed.
+        """
+        if box is None and class_name is None:
+            raise UsageError("a target needs a box in the image, or the name of a class that the detector knows")
+        self.estimator: TargetEstimator | None = None
+        self.class_name = class_name
+        self.detections: tuple[Detection, ...] = ()
+        self._first_box = box
+        self._given = traits
+        self._nominal_m = nominal_m
+        self._relative = relative
+        self._tracker = LongTermTracker()
+        self._tracking = False
+        self._scene: Scene | None = None
+        self._number: int | None = None  # of the target in the scene
+        self._frames: deque[_Seen] = deque(maxlen=_KEPT_FRAMES)
+        self._middle: tuple[float, float] | None = None  # where the target should be in the newest image [px]
+        self._doubts = 0
+        self._agreed = 0  # images in a row in which tracker and a detection agree
+
+    def see(
+        self, image: Image, camera: Camera, captured_ns: int, *, ground: bool, detections: Sequence[Detection] | None
+    ) -> Sighting:
+        """Find the target in the next image.
+
+        Args:
+            image: A :class:`skyloop.Frame` or array as trackers take it.
+            camera: That took it.
+            captured_ns: Its capture, on the proxy's clock.
+            ground: Whether the camera's height above the ground is known.
+            detections: What a detector found in it; None: it was not searched.
+
+        Raises:
+            UsageError: The first box does not fit into the image.
+        """
+        self._frames.append(_Seen(image, camera, captured_ns))
+        tracked = TrackResult(None, 0.0)
+        if self._tracking:
+            self._shift(camera, captured_ns)
+            tracked = self._tracker.update(image)
+        elif self._first_box is not None:
+            self._tracker.start(image, self._first_box)
+            self._tracking = True
+            tracked = TrackResult(self._first_box, 1.0, 1.0)
+            self._begin(self._first_box, camera, captured_ns, ground=ground)
+            self._first_box = None
+        if detections is not None:
+            self._use(detections, self._frames[-1], tracked, ground=ground)
+        sighting = self._decide(image, camera, captured_ns, tracked)
+        self._middle = None if self.estimator is None else camera.pixel(self.estimator.at(captured_ns).middle)
+        return sighting
+
+    def detected(self, detections: Sequence[Detection], captured_ns: int, *, ground: bool) -> None:
+        """Use detections that come later than the image that they were found in.
+
+        Args:
+            detections: Of one of the last images given to :meth:`see`; of another image they are ignored.
+            captured_ns: Of that image.
+            ground: Whether the camera's height above the ground is known.
+        """
+        frame = next((one for one in self._frames if one.captured_ns == captured_ns), None)
+        if frame is not None:
+            self._use(detections, frame, TrackResult(None, 0.0), ground=ground)
+
+    @property
+    def target(self) -> SceneObject | None:
+        """The target among the detected things; None where no detector knows it."""
+        return None if self._scene is None or self._number is None else self._scene.objects.get(self._number)
+
+    def others(self, at_ns: int) -> list[TargetState]:
+        """Where people and other things are that were detected in the last second, without the target."""
+        if self._scene is None:
+            return []
+        return [
+            each.estimator.at(at_ns)
+            for number, each in self._scene.objects.items()
+            if number != self._number and each.confirmed and seconds(at_ns - (each.estimator.seen_ns or 0)) < _LATELY_S
+        ]
+
+    def _shift(self, camera: Camera, captured_ns: int) -> None:
+        """Tell the tracker how far turning, flying and the target's own motion have moved the target in the image."""
+        if self.estimator is None or self._middle is None:
+            return
+        middle = camera.pixel(self.estimator.at(captured_ns).middle)
+        if middle is not None:
+            self._tracker.shift(middle[0] - self._middle[0], middle[1] - self._middle[1])
+
+    # The tracker ---------------------------------------------------------------------------------------------------
+
+    def _begin(self, box: Box, camera: Camera, captured_ns: int, *, ground: bool) -> None:
+        traits = self._given or (TRAITS.get(self.class_name, UNKNOWN) if self.class_name else UNKNOWN)
+        view = BoxView.of(box, camera, _TRACKER_NOISE)
+        if view is None:
+            raise UsageError("the box is straight above or below the vehicle, where it has no bearing: turn or move")
+        self.estimator = TargetEstimator(traits, nominal_m=self._nominal_m, relative=self._relative)
+        self.estimator.start(view, camera, captured_ns, ground=ground)
+
+    def _decide(self, image: Image, camera: Camera, captured_ns: int, tracked: TrackResult) -> Sighting:
+        """Say where the target is in this image, by its detection in it or by the tracker."""
+        target, estimator = self.target, self.estimator
+        if estimator is None:
+            return Sighting(None, None)
+        if target is not None and target.seen and target.estimator.seen_ns == captured_ns:
+            box = target.detection.box
+            agrees = tracked.box is not None and overlap(tracked.box, box) >= _SAME
+            if not agrees:
+                self._resume(image, box)
+            return Sighting(box, tracked.confidence if agrees else target.detection.score)
+        contested = target is not None and target.contested
+        if tracked.box is None or contested or self._is_taken(tracked.box):
+            return Sighting(None, None, contested)
+        return self._by_tracker(tracked, tracked.box, camera, captured_ns, estimator)
+
+    def _by_tracker(
+        self, tracked: TrackResult, box: Box, camera: Camera, captured_ns: int, estimator: TargetEstimator
+    ) -> Sighting:
+        view = BoxView.of(box, camera, _TRACKER_NOISE)
+        if view is None or estimator.seen_ns is None:
+            return Sighting(None, None)
+        if estimator.seen_ns == captured_ns:  # the box that it was started with
+            return Sighting(box, tracked.confidence)
+        fit, _ = estimator.distance(view, camera, captured_ns)
+        if fit > _FITS and not self._is_within_reach(view, camera, captured_ns, estimator):
+            self._doubts += 1
+            if self._doubts >= _DOUBT:
+                self._tracker.refuse()
+                self._doubts = 0
+            return Sighting(None, None)
+        self._doubts = 0
+        if fit > _FITS or not estimator.update(view, camera, captured_ns):
+            return Sighting(None, None)
+        return Sighting(box, tracked.confidence)
+
+    def _is_within_reach(self, view: BoxView, camera: Camera, captured_ns: int, estimator: TargetEstimator) -> bool:
+        """Whether an unseen target may have gone to where the tracker recognised it; it is taken to be there then."""
+        assert estimator.seen_ns is not None
+        unseen_s = seconds(captured_ns - estimator.seen_ns)
+        if unseen_s < _DORMANT_S or self._number is not None:
+            return False
+        before = estimator.at(captured_ns)
+        again = TargetEstimator(estimator.traits, nominal_m=before.range_m, relative=self._relative)
+        again.start(view, camera, captured_ns, ground=estimator.traits.on_ground)
+        way = again.at(captured_ns).foot[:2] - before.foot[:2]
+        if float((way @ way) ** 0.5) > _FAST_M_S * unseen_s + before.place_m:
+            return False
+        self.estimator = again
+        return True
+
+    def _is_taken(self, box: Box) -> bool:
+        """Whether the box is that of another thing, by its detection in this image."""
+        if self._scene is None or self._number is None:
+            return False
+        now = self._frames[-1].captured_ns
+        return any(
+            each.seen and each.estimator.seen_ns == now and overlap(each.detection.box, box) >= 0.5
+            for number, each in self._scene.objects.items()
+            if number != self._number
+        )
+
+    def _resume(self, image: Image, box: Box) -> None:
+        if min(box[2:]) < LEAST_PX:
+            return
+        if self._tracking:
+            self._tracker.resume(image, box)
+        else:
+            self._tracker.start(image, box)
+            self._tracking = True
+
+    # Detections ----------------------------------------------------------------------------------------------------
+
+    def _use(self, detections: Sequence[Detection], frame: _Seen, tracked: TrackResult, *, ground: bool) -> None:
+        if self._scene is None:
+            given = {} if self._given is None or self.class_name is None else {self.class_name: self._given}
+            self._scene = Scene(relative=self._relative, traits=given)
+        scene = self._scene
+        self.detections = tuple(detections)
+        target = self.target
+        if target is not None and target.estimator.seen_ns is not None:
+            gone = seconds(frame.captured_ns - target.estimator.seen_ns) > _DORMANT_S
+            scene.dormant = {target.number} if gone else set()
+        looks = [colours(frame.image, one.box) for one in detections]
+        scene.update(detections, looks, frame.camera, frame.captured_ns, ground=ground)
+        if target is not None:
+            self.estimator = target.estimator  # two that had been taken for each other may have been exchanged
+        if target is None:
+            self._choose(scene, frame, tracked)
+        elif target.number in scene.dormant:
+            self._recognise(scene, target, frame)
+
+    def _choose(self, scene: Scene, frame: _Seen, tracked: TrackResult) -> None:
+        """Take the detection that the user's box, or the tracker, or else the class means."""
+        candidates = [each for each in scene.objects.values() if each.seen and self._may_be(each)]
+        if not self._tracking:
+            confirmed = [each for each in candidates if each.confirmed]
+            if self.class_name is not None and confirmed:
+                self._adopt(scene, max(confirmed, key=lambda each: each.detection.box[3]))
+                self._resume(frame.image, self.target.detection.box if self.target else (0, 0, 0, 0))
+            return
+        box = tracked.box
+        if box is None:
+            return
+        best = max(candidates, key=lambda each: overlap(each.detection.box, box), default=None)
+        at_start = len(self._frames) == 1
+        if best is None or overlap(best.detection.box, box) < (_POINTED_AT if at_start else _SAME):
+            self._agreed = 0
+            return
+        self._agreed += 1
+        if at_start or self._agreed >= 3:
+            self._adopt(scene, best)
+
+    def _recognise(self, scene: Scene, target: SceneObject, frame: _Seen) -> None:
+        """Take a newcomer for the target if it can be it, looks like it, and is the only such one."""
+        assert target.estimator.seen_ns is not None
+        likely: list[tuple[float, SceneObject]] = []
+        for each in scene.objects.values():
+            newcomer = each.first_ns > target.estimator.seen_ns and each.seen and self._may_be(each)
+            if not newcomer or each.number == target.number or min(each.detection.box[2:]) < LEAST_PX:
+                continue
+            view = BoxView.of(each.detection.box, frame.camera)
+            if view is None or target.estimator.distance(view, frame.camera, frame.captured_ns)[0] > _FITS:
+                continue
+            likely.append((unlikeness(target.looks, each.looks), each))
+        likely.sort(key=lambda one: one[0])
+        if not likely or likely[0][0] > _SIMILAR or not likely[0][1].confirmed:
+            return
+        if len(likely) > 1 and likely[1][0] - likely[0][0] < _CLEARLY:
+            return  # nothing tells them apart
+        self._adopt(scene, likely[0][1])
+        del scene.objects[target.number]
+
+    def _may_be(self, each: SceneObject) -> bool:
+        return self.class_name is None or each.class_name == self.class_name
+
+    def _adopt(self, scene: Scene, thing: SceneObject) -> None:
+        if self._given is not None and self.class_name is None:  # what is known of it goes before its class
+            scene.traits[thing.class_name] = self._given
+            if self.estimator is not None:
+                thing.estimator = self.estimator
+        self._number = thing.number
+        self.class_name = thing.class_name
+        self.estimator = thing.estimator
+        scene.kept = {thing.number}
+        scene.dormant = set()
+        self._doubts = 0

@@ -1,0 +1,313 @@
+"""Finds one target in frames and computes the set-points that keep it: all of following but the drone.
+
+No thread and no clock: a behaviour (:class:`skyloop.control.FollowTarget`), or a page, gives frames and feedback, and
+sends the set-points.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.clock import seconds
+from skyloop.control.chase_law import LOSSES, ChaseLaw, ChaseSettings, FollowMode, TargetPhase
+from skyloop.control.dead_reckoning import TiltVelocity
+from skyloop.control.target import Odometry
+from skyloop.control.target_estimate import TargetEstimator, Traits
+from skyloop.control.target_finder import Sighting, TargetFinder
+from skyloop.control.target_view import Camera, predicted_box
+from skyloop.errors import UsageError
+from skyloop.messages import Attitude, CameraInfo, Feedback, Points, Polyline, Text, Velocity
+from skyloop.messages.annotation import Colour, Shape
+from skyloop.poses import mounting_rotation
+from skyloop.vision.detection import Detection, ObjectDetector
+from skyloop.vision.tracking import Box
+
+if TYPE_CHECKING:
+    from skyloop.client import Frame
+
+Array = NDArray[np.float64]
+
+_SEEN: Final[Colour] = (64, 220, 100)
+_LOST: Final[Colour] = (255, 180, 60)
+_OTHER: Final[Colour] = (150, 150, 150)
+_TRACE_S: Final = 4.0
+_TRACE_EACH_S: Final = 0.2
+_FEET_M: Final = 0.08  # below the body's centre: what heights above the ground are measured from
+_STALE_S: Final = 0.5  # the vehicle's motion is not known for longer: it is held
+
+
+@dataclass(frozen=True, slots=True)
+class FollowStatus:
+    """How following goes."""
+
+    phase: str
+    mode: FollowMode
+    box: Box | None  #: of the target in the newest frame [px]; None: not seen in it
+    confidence: float | None  #: 0 to 1; see :attr:`skyloop.control.target_finder.Sighting.confidence`
+    predicted_px: tuple[float, float] | None  #: where its middle should be in the newest frame
+    range_m: float | None  #: horizontal distance from the camera
+    range_deviation_m: float | None
+    bearing_rad: float | None  #: counter-clockwise from straight ahead
+    speed_m_s: float | None  #: of the target; None where the vehicle does not know its own
+    class_name: str | None
+    lost_s: float  #: since it was last seen; 0 while it is seen, or was not seen yet
+    problem: str  #: what keeps it from being followed as wanted; empty for nothing
+
+
+class TargetFollower:
+    """Follows one target. Call it from one thread.
+
+    Attributes:
+        mode: What to do; may be changed in flight.
+        over: It gave up: the target was lost for too long.
+    """
+
+    def __init__(
+        self,
+        camera: CameraInfo,
+        *,
+        box: Box | None = None,
+        class_name: str | None = None,
+        mode: FollowMode = FollowMode.FOLLOW,
+        detector: ObjectDetector | None = None,
+        detects: bool = False,
+        traits: Traits | None = None,
+        settings: ChaseSettings | None = None,
+    ) -> None:
+        """Initialise the follower.
+
+        Args:
+            camera: How the camera is mounted; it looks forward.
+            box: The target in the first frame given to :meth:`look`: x, y, width, height [px].
+            class_name: Follow the largest thing of this class, if there is no box; needs detections.
+            mode: What to do.
+            detector: Searched in every frame, on the thread that calls :meth:`look`.
+            detects: Detections come from elsewhere, by :meth:`detected`.
+            traits: What is known of the target; None: what is known of its class.
+            settings: Of the law; None are the defaults.
+
+        Raises:
+            UsageError: There is neither a box nor a class, a class without detections, or the camera does not look
+                forward, or not say how it is mounted.
+            MissingExtraError: OpenCV or, for detections, SciPy is not installed.
+        """
+        if mounting_rotation(camera)[0, 2] < 0.5:
+            raise UsageError(f"camera {camera.name!r} does not look forward, as following needs")
+        if box is None and class_name is None:
+            raise UsageError("a target needs a box in the image, or the name of a class that the detector knows")
+        if box is None and detector is None and not detects:
+            raise UsageError(f"to follow any {class_name!r} a detector is needed: give detector=…, or a box")
+        if box is not None and not all(np.isfinite(part) for part in box):
+            raise UsageError(f"the box is {box!r} and must be of finite numbers")
+        self._law = ChaseLaw(settings, FollowMode(mode))
+        self._camera = camera
+        self._detector = detector
+        self._box, self._class_name, self._traits = box, class_name, traits
+        self._finder: TargetFinder | None = None
+        self._odometry = Odometry()
+        self._newest: Feedback | None = None
+        self._relative = False
+        self._reckoning = TiltVelocity()
+        self._seen_ns: int | None = None  # capture of the last frame that showed the target, or may have
+        self._sighting = Sighting(None, None)
+        self._view: Camera | None = None  # of the newest frame
+        self._frame_ns: int | None = None
+        self._trace: deque[tuple[int, Array]] = deque()
+
+    @property
+    def settings(self) -> ChaseSettings:
+        """Goal, gains and limits; may be replaced in flight."""
+        return self._law.settings
+
+    @settings.setter
+    def settings(self, settings: ChaseSettings) -> None:
+        self._law.settings = settings
+
+    @property
+    def mode(self) -> FollowMode:
+        """What to do; may be changed in flight."""
+        return self._law.mode
+
+    @mode.setter
+    def mode(self, mode: FollowMode) -> None:
+        self._law.mode = FollowMode(mode)
+
+    @property
+    def phase(self) -> TargetPhase:
+        """As of the last set-point."""
+        return self._law.phase
+
+    @property
+    def over(self) -> bool:
+        """Whether it gave up."""
+        return self.phase is TargetPhase.GIVEN_UP
+
+    @property
+    def sighting(self) -> Sighting:
+        """What was found in the newest frame."""
+        return self._sighting
+
+    @property
+    def finder(self) -> TargetFinder | None:
+        """What finds the target; None before the first frame."""
+        return self._finder
+
+    def feedback(self, feedback: Feedback) -> None:
+        """Update with the vehicle's newest state."""
+        self._newest = feedback
+        if self._finder is None:
+            self._relative = feedback.velocity_m_s is None
+        if self._relative:
+            feedback = msgspec.structs.replace(feedback, velocity_m_s=self._reckoning.step(feedback))
+        self._odometry.add(feedback)
+        if not self._relative:
+            self._law.feedback(feedback)
+
+    def look(self, frame: Frame) -> list[Shape]:
+        """Find the target in the next frame. The first call starts with the box that was given.
+
+        Returns:
+            What to draw: the box, where it came along, where it should be, and the phase.
+
+        Raises:
+            UsageError: The first box does not fit into the image, or the camera's intrinsics are not known.
+        """
+        state = frame.feedback
+        motion = self._odometry.at(frame.captured_ns)
+        if state is None or motion is None:
+            return [Text("the vehicle's attitude is not known yet", (8.0, 16.0), _LOST)]
+        if frame.intrinsics is None:
+            raise UsageError(f"camera {self._camera.name!r} has no intrinsics: calibrate it (skyloop camera calibrate)")
+        ground = state.altitude_m is not None
+        body = motion.position.copy()
+        if state.altitude_m is not None:
+            body[2] = state.altitude_m + _FEET_M
+        view = Camera.at(self._camera, state, body, frame.intrinsics, (frame.shape[1], frame.shape[0]))
+        if view is None:
+            return [Text("the vehicle's attitude is not known yet", (8.0, 16.0), _LOST)]
+        if self._finder is None:
+            self._finder = TargetFinder(
+                box=self._box,
+                class_name=self._class_name,
+                traits=self._traits,
+                nominal_m=self.settings.distance_m,
+                relative=self._relative,
+            )
+        found = None if self._detector is None else self._detector.detect(frame)
+        self._view, self._frame_ns = view, frame.captured_ns
+        self._sighting = self._finder.see(frame, view, frame.captured_ns, ground=ground, detections=found)
+        if self._sighting.box is not None or self._sighting.contested:
+            self._seen_ns = frame.captured_ns
+        return self._drawing(frame.captured_ns)
+
+    def detected(self, detections: Sequence[Detection], captured_ns: int) -> None:
+        """Use detections of a processor, which come later than their frame.
+
+        Args:
+            detections: Of one of the last frames.
+            captured_ns: Of that frame.
+        """
+        if self._finder is not None:
+            ground = self._newest is not None and self._newest.altitude_m is not None
+            self._finder.detected(detections, captured_ns, ground=ground)
+
+    def step(self, now_ns: int) -> Velocity | Attitude:
+        """Compute the set-point for now [ns on the proxy's clock]; it holds the vehicle while its motion is not known.
+
+        A vehicle that does not report its velocity is flown by attitude.
+        """
+        motion, newest = self._odometry.at(now_ns), self._newest
+        if motion is None or newest is None or seconds(now_ns - newest.captured_ns) > _STALE_S:
+            return Attitude() if self._relative else Velocity()
+        others = () if self._finder is None else self._finder.others(now_ns)
+        return self._law.step(
+            now_ns, motion, newest.altitude_m, self._estimator, self._seen_ns, others, relative=self._relative
+        )
+
+    @property
+    def _estimator(self) -> TargetEstimator | None:
+        return None if self._finder is None else self._finder.estimator
+
+    @property
+    def status(self) -> FollowStatus:
+        """How it goes, as of the newest frame and set-point."""
+        estimator, at_ns = self._estimator, self._frame_ns
+        box, confidence = self._sighting.box, self._sighting.confidence
+        class_name = self._class_name if self._finder is None else self._finder.class_name
+        none = None
+        if estimator is None or at_ns is None or self._view is None:
+            return FollowStatus(
+                self.phase.value, self.mode, box, confidence, none, none, none, none, none, class_name, 0.0, ""
+            )
+        state = estimator.at(at_ns)
+        away = state.foot[:2] - self._view.position[:2]
+        ahead = self._view.rotation[:, 2]
+        bearing = float(np.arctan2(ahead[0] * away[1] - ahead[1] * away[0], ahead[:2] @ away))
+        speed = None if self._relative else float(np.hypot(*state.velocity))
+        lost_s = 0.0 if box is not None or self._seen_ns is None else seconds(at_ns - self._seen_ns)
+        return FollowStatus(
+            self.phase.value,
+            self.mode,
+            box,
+            confidence,
+            self._view.pixel(state.middle),
+            float(np.hypot(*away)),
+            state.range_deviation_m,
+            bearing,
+            speed,
+            class_name,
+            lost_s,
+            self._problem(),
+        )
+
+    def _problem(self) -> str:
+        if self._sighting.contested:
+            return "something like it is where it should be"
+        return "at the end of the leash" if self._law.held_by else ""
+
+    def _drawing(self, captured_ns: int) -> list[Shape]:
+        assert self._finder is not None
+        view, estimator = self._view, self._finder.estimator
+        assert view is not None
+        box = self._sighting.box
+        colour = _SEEN if box is not None else _LOST
+        shapes: list[Shape] = [
+            Polyline(one.outline, True, _OTHER) for one in self._finder.detections[:16] if box is None or one.box != box
+        ]
+        if estimator is None:
+            return [*shapes, Text(self.phase.value, (8.0, 16.0), colour)]
+        state = estimator.at(captured_ns)
+        self._remember(captured_ns, state.foot)
+        trace = [pixel for _, foot in self._trace if (pixel := view.pixel(foot)) is not None]
+        if len(trace) > 1 and not self._relative:
+            shapes.append(Polyline(tuple(trace), False, colour))
+        if box is not None:
+            x, y, width, height = box
+            corners = ((x, y), (x + width, y), (x + width, y + height), (x, y + height))
+            shapes.append(Polyline(corners, True, colour))
+        elif self.phase in LOSSES:
+            expected = predicted_box(view, state.foot, state.height_m)
+            if expected is not None:
+                x, y, width, height = expected
+                corners = ((x, y), (x + width, y), (x + width, y + height), (x, y + height))
+                shapes.append(Polyline(corners, True, _LOST))
+        middle = view.pixel(state.middle)
+        if middle is not None:
+            shapes.append(Points((middle,), colour))
+        sure = "" if self._sighting.confidence is None else f" {self._sighting.confidence:.0%}"
+        name = self._finder.class_name or "target"
+        text = f"{name}{sure}  {self.phase.value}  {state.range_m:.1f} ± {state.range_deviation_m:.1f} m"
+        return [*shapes, Text(text, (8.0, 16.0), colour)]
+
+    def _remember(self, captured_ns: int, foot: Array) -> None:
+        if not self._trace or seconds(captured_ns - self._trace[-1][0]) >= _TRACE_EACH_S:
+            self._trace.append((captured_ns, foot))
+        while self._trace and seconds(captured_ns - self._trace[0][0]) > _TRACE_S:
+            self._trace.popleft()

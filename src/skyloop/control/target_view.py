@@ -1,0 +1,177 @@
+"""What the box of a thing in an image says about where the thing is. Pure.
+
+Directions are in *odometry axes* (see :mod:`.target`): the attitude at the capture levels them, so that neither roll
+nor pitch of the vehicle moves a thing. Of an edge that the image cuts off only a bound is known.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.messages import CameraInfo, Feedback, Intrinsics
+from skyloop.poses import mounting_rotation
+from skyloop.vision.lens import project, unproject
+from skyloop.vision.tracking import Box
+
+Array = NDArray[np.float64]
+
+_CUT_PX: Final = 2.0  # nearer to the image's edge than this, and than this share of its size, a box may be cut off
+_CUT: Final = 0.04
+_BESIDE: Final = 0.75  # of the image's size from the optical axis: a half is its edge
+_STEEPEST: Final = 0.15  # cosine of the elevation: what is nearly straight above or below has no azimuth
+_TILT_RAD: Final = 0.008  # error of the attitude at the capture, which moves both edges alike
+_YAW_RAD: Final = 0.006
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Camera:
+    """Where a camera was and how it was turned when it captured an image.
+
+    Attributes:
+        position: In odometry axes, but the third is its height above the ground where that is known, (3,) [m].
+        rotation: From optical axes to odometry axes, (3, 3).
+        intrinsics: Of the image.
+        size: Width and height of the image [px].
+    """
+
+    position: Array
+    rotation: Array
+    intrinsics: Intrinsics
+    size: tuple[int, int]
+
+    @classmethod
+    def at(
+        cls,
+        mounting: CameraInfo,
+        feedback: Feedback,
+        body: Array,
+        intrinsics: Intrinsics,
+        size: tuple[int, int],
+    ) -> Camera | None:
+        """Place a camera.
+
+        Args:
+            mounting: How it is mounted.
+            feedback: The vehicle's state at the capture.
+            body: Position of the vehicle, (3,) [m]; the third is its height above the ground where that is known.
+            intrinsics: In pixels of the image.
+            size: Width and height of the image [px].
+
+        Returns:
+            None while the attitude is not known.
+
+        Raises:
+            UsageError: The camera does not say how it is mounted.
+        """
+        if feedback.roll_rad is None or feedback.pitch_rad is None or feedback.yaw_rad is None:
+            return None
+        to_level = feedback.rotation
+        offset = np.zeros(3) if mounting.position_m is None else np.asarray(mounting.position_m)
+        return cls(body + to_level @ offset, to_level @ mounting_rotation(mounting), intrinsics, size)
+
+    def pixel(self, point: Array) -> tuple[float, float] | None:
+        """Return where a point (3,) is in the image, or a little beside it [px]; None farther off.
+
+        A lens model holds within the image: far beside it, a polynomial of the distortion leads back into it.
+        """
+        ray = self.rotation.T @ (point - self.position)
+        lens, (columns, rows) = self.intrinsics, self.size
+        beside = np.abs(ray[:2]) > _BESIDE * ray[2] * np.array([columns / lens.fx, rows / lens.fy])
+        if ray[2] <= 0.0 or beside.any():
+            return None
+        x, y = project(ray[None, :], self.intrinsics)[0].tolist()
+        return (x, y) if math.isfinite(x) and math.isfinite(y) else None
+
+    def shows(self, point: Array) -> bool:
+        """Whether a point (3,) is within the image, if nothing hides it."""
+        pixel = self.pixel(point)
+        return pixel is not None and 0.0 <= pixel[0] < self.size[0] and 0.0 <= pixel[1] < self.size[1]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoxView:
+    """Where a box's middle and edges are seen.
+
+    Attributes:
+        azimuth: Of the middle, counter-clockwise from x of odometry axes [rad].
+        bottom: Tangent of the lower edge's elevation; None where the image cuts it off.
+        top: The same of the upper edge.
+        below: Tangent of the elevation that a lower edge is below of, where the image cuts it off; None elsewhere.
+        above: The same of an upper edge, which is above of it.
+        azimuth_rad: Standard deviation of the azimuth.
+        edge: Standard deviation of each edge by itself.
+        tilt: Standard deviation that both edges have in common.
+    """
+
+    azimuth: float
+    bottom: float | None
+    top: float | None
+    azimuth_rad: float
+    edge: float
+    below: float | None = None
+    above: float | None = None
+    tilt: float = _TILT_RAD
+
+    @classmethod
+    def of(cls, box: Sequence[float], camera: Camera, noise: float = 0.04) -> BoxView | None:
+        """Return what a box shows.
+
+        Args:
+            box: x, y, width, height [px].
+            camera: That took the image.
+            noise: Standard deviation of an edge, as a share of the box's height; a pixel is added.
+
+        Returns:
+            None for a box that no camera of this kind can show, or nearly straight above or below.
+        """
+        x, y, width, height = box
+        columns, rows = camera.size
+        middle = x + (width - 1) / 2
+        edges = [(middle, y), (middle, y + height - 1), (middle, y + (height - 1) / 2)]
+        rays = unproject(edges, camera.intrinsics) @ camera.rotation.T
+        flat = np.hypot(rays[:, 0], rays[:, 1])
+        if not (np.isfinite(rays).all() and (flat > _STEEPEST).all()):
+            return None
+        top, bottom, _ = (rays[:, 2] / flat).tolist()
+        focal = math.sqrt(camera.intrinsics.fx * camera.intrinsics.fy)
+        edge = (1.0 + noise * height) / focal
+        across = (1.0 + noise * width) / focal
+        near = max(_CUT_PX, _CUT * height)
+        if x < near or x + width > columns - near:
+            across += 0.3 * width / focal  # the middle of what is left is not that of the thing
+        cut_below, cut_above = y + height > rows - near, y < near
+        return cls(
+            azimuth=math.atan2(rays[2, 1], rays[2, 0]),
+            bottom=None if cut_below else bottom,
+            top=None if cut_above else top,
+            azimuth_rad=math.hypot(across, _YAW_RAD),
+            edge=edge,
+            below=bottom if cut_below else None,
+            above=top if cut_above else None,
+        )
+
+
+def predicted_box(camera: Camera, foot: Array, height_m: float, share: float = 0.4) -> Box | None:
+    """Return about where an upright thing is in the image: x, y, width, height [px].
+
+    Args:
+        camera: That takes the image.
+        foot: Where it stands, (3,) [m].
+        height_m: How high it is.
+        share: Width of the box, as a share of its height.
+
+    Returns:
+        None where the camera can't show it whole.
+    """
+    low, high = camera.pixel(foot), camera.pixel(foot + np.array([0.0, 0.0, height_m]))
+    if low is None or high is None or low[1] - high[1] < 1.0:
+        return None
+    height = low[1] - high[1] + 1.0
+    width = share * height
+    return (low[0] + high[0]) / 2 - (width - 1.0) / 2, high[1], width, height

@@ -1,0 +1,359 @@
+"""Following what a page marked: a real proxy, a vehicle that flies as it is told, and a stand-in that follows."""
+
+from __future__ import annotations
+
+import gc
+import itertools
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from skyloop.client import Drone, Frame
+from skyloop.cockpit import follow_session
+from skyloop.cockpit.commands import decode_command
+from skyloop.cockpit.fleet import Fleet
+from skyloop.cockpit.follow_session import NO_CONTROL
+from skyloop.errors import DecodeError, MissingExtraError
+from skyloop.messages import Annotation, FlightState, Hover, Velocity
+from skyloop.processing import Settings, Worker
+from tests.cockpit.fake import Node, Nodes, cockpit, until
+from tests.cockpit.follower import StandIn, StandIns
+from tests.cockpit.test_control import Page, count, page
+from tests.cockpit.testclient import TestClient
+
+BOX = [4.0, 4.0, 10.0, 12.0]
+FORWARD = Velocity(forward=0.25)
+
+
+@pytest.fixture
+def stand_ins() -> StandIns:
+    return StandIns()
+
+
+@pytest.fixture
+def client(node: Node, stand_ins: StandIns) -> Iterator[TestClient]:
+    with cockpit(Fleet(Nodes(node), look_s=0.05), follower=stand_ins) as client:
+        yield client
+
+
+class Marker(Page):
+    """A page that marks what it sees."""
+
+    def __init__(self, pilot: Page) -> None:
+        super().__init__(pilot.socket)
+        self.since_ns = 0
+
+    def select(self) -> None:
+        self.say("follow_select", camera="front")
+        self.since_ns = int(self.wait("follow", state="selecting")["since_ns"])
+
+    def mark(self, **values: Any) -> None:
+        """The first frame that is kept has a box."""
+        self.select()
+        self.say("follow", **({"camera": "front", "captured_ns": str(self.since_ns), "box": BOX} | values))
+
+
+@contextmanager
+def marker(client: TestClient) -> Iterator[Marker]:
+    with page(client) as pilot:
+        yield Marker(pilot)
+
+
+def refused(pilot: Page, do: str) -> str:
+    return str(pilot.wait("refused", do=do)["why"])
+
+
+def draws(watcher: Drone, frames: int) -> None:
+    """A person takes as long as so many frames."""
+    for _ in itertools.islice(watcher.frames("front"), frames):
+        pass
+
+
+def test_what_is_marked_is_tracked_then_flown_after_and_stopped(
+    client: TestClient, node: Node, stand_ins: StandIns
+) -> None:
+    drawn: list[Annotation] = []
+    with marker(client) as pilot, node.connect("watcher", access="observe") as watcher:
+        watcher.on_annotation(drawn.append)
+        pilot.mark()
+        told = pilot.wait("follow", state="tracking", phase="")
+        assert told["box"] == BOX
+        assert told["size"] == [32, 24]
+        assert (told["confidence"], told["range_m"], told["speed_m_s"]) == (0.9, 4.0, None)
+        assert told["mode"] is None
+        one = stand_ins.last
+        assert one.frames[0] == pilot.since_ns, "it begins on the frame that the box was drawn on"
+        assert one.samples[0].captured_ns <= one.frames[0], "and knows the vehicle's motion from then on"
+        until(lambda: drawn)
+        assert (drawn[0].source, drawn[0].captured_ns) == ("follow", pilot.since_ns)
+        pilot.say("follow_mode", mode="follow")
+        assert refused(pilot, "follow_mode") == "take control first"
+        pilot.take().say("follow_mode", mode="follow")
+        assert "take off first" in refused(pilot, "follow_mode")
+        pilot.take_off()
+        assert not count(node, FORWARD)
+        with pilot.staying():
+            pilot.say("follow_mode", mode="orbit", distance_m=6.0)
+            assert pilot.wait("follow", state="flying")["mode"] == "orbit"
+            until(lambda: count(node, FORWARD) > 3 and node.flyer.state is FlightState.FLYING)
+            assert (one.mode, one.settings.distance_m) == ("orbit", 6.0)
+            pilot.say("follow_mode", mode="look")
+            until(lambda: one.mode == "look")
+            one.says(phase="lost", lost_s=1.5, box=None, problem="hidden")
+            told = pilot.wait("follow", phase="lost")
+            assert (told["state"], told["box"], told["lost_s"], told["problem"]) == ("flying", None, 1.5, "hidden")
+            pilot.say("follow_stop")
+            assert pilot.wait("follow", state="ended")["problem"] == ""
+            until(lambda: node.flyer.applied[-1] == Hover())
+        assert one.threads == {"skyloop-follow"}, "it is called from one thread"
+    until(lambda: not any(thread.name == "skyloop-follow" for thread in threading.enumerate()))
+
+
+def test_a_box_with_a_mode_is_flown_after_at_once(client: TestClient, node: Node, stand_ins: StandIns) -> None:
+    with marker(client) as pilot:
+        pilot.take()
+        pilot.mark(mode="follow")
+        assert "take off first" in refused(pilot, "follow")
+        pilot.take_off()
+        with pilot.staying():
+            pilot.mark(mode="follow", class_name="person", distance_m=3.0)
+            pilot.wait("follow", state="flying")
+            until(lambda: count(node, FORWARD))
+            assert (stand_ins.last.class_name, stand_ins.last.settings.distance_m) == ("person", 3.0)
+            pilot.mark(mode="look", box=[1, 1, 8, 8])
+            assert pilot.wait("follow", state="ended")["problem"] == "another target was marked"
+            until(lambda: Hover() in node.flyer.applied)
+            pilot.wait("follow", state="flying")
+            assert stand_ins.last.box == (1, 1, 8, 8)
+
+
+def test_it_catches_up_frame_by_frame_before_it_steers(client: TestClient, node: Node, stand_ins: StandIns) -> None:
+    with marker(client) as pilot, node.connect("watcher", access="observe") as watcher:
+        pilot.take().take_off()
+        pilot.select()
+        with pilot.staying():
+            draws(watcher, frames=40)
+            pilot.say("follow", camera="front", captured_ns=str(pilot.since_ns), box=BOX, mode="follow")
+            pilot.wait("follow", state="flying")
+            frames = list(stand_ins.last.frames)
+            assert len(frames) > 8
+            steps = [after - before for before, after in itertools.pairwise(frames)]
+            assert min(steps) > 0
+            assert sorted(steps)[len(steps) // 2] <= 90_000_000, "in steps of at most 70 ms, unless frames are missing"
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"camera": "rear"}, "no camera named 'rear'; known: front"),
+        ({"box": [4, 4, 2, 12]}, "width=2, height=12 and must be at least 6 pixels"),
+        ({"box": [40, 4, 10, 12]}, "at least half of it must be in the image of 32×24"),
+        ({"captured_ns": "17"}, "s old when its box came"),
+        ({"captured_ns": "9" * 18}, "newer than any"),
+        ({"mode": "chase"}, "no mode of following named 'chase'"),
+        ({"mode": "follow"}, "take control first"),
+        ({"distance_m": -1.0}, "distance_m is -1.0 and must be above 0"),
+        ({"distance_m": 0.5}, "distance_m is 0.5 and must be above nearest_m, which is 2"),
+    ],
+)
+def test_what_can_not_be_followed_is_refused_with_what_is_allowed(
+    client: TestClient, stand_ins: StandIns, values: dict[str, Any], words: str
+) -> None:
+    with marker(client) as pilot:
+        pilot.mark(**values)
+        assert words in refused(pilot, "follow")
+        assert not stand_ins.made
+        pilot.say("follow_mode", mode="follow")
+        assert refused(pilot, "follow_mode") == "take control first"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{"do":"follow"}',
+        '{"do":"follow","camera":"front","captured_ns":5,"box":[1,2,3,4]}',
+        '{"do":"follow","camera":"front","captured_ns":"-5","box":[1,2,3,4]}',
+        '{"do":"follow","camera":"front","captured_ns":"5","box":[1,2,3]}',
+        '{"do":"follow","camera":"front","captured_ns":"5","box":[1,2,NaN,4]}',
+        '{"do":"follow","camera":"front","captured_ns":"5","box":[1,2,"3",4]}',
+        '{"do":"follow","camera":"","captured_ns":"5","box":[1,2,3,4]}',
+        '{"do":"follow_mode"}',
+        '{"do":"follow_mode","mode":7}',
+        '{"do":"follow_select"}',
+    ],
+)
+def test_what_makes_no_sense_is_no_command(text: str) -> None:
+    with pytest.raises(DecodeError, match="not understood"):
+        decode_command(text)
+
+
+def test_without_frames_or_a_target_there_is_nothing_to_follow(client: TestClient) -> None:
+    with marker(client) as pilot:
+        pilot.say("follow", camera="front", captured_ns="5", box=BOX)
+        assert "choose the camera first" in refused(pilot, "follow")
+        pilot.say("follow_select", camera="rear")
+        assert "no camera named 'rear'" in refused(pilot, "follow_select")
+        pilot.take().say("follow_mode", mode="follow")
+        assert "mark one first" in refused(pilot, "follow_mode")
+        pilot.say("follow_stop", n=3)
+        pilot.wait("sent", do="follow_stop", n=3)
+        pilot.select()
+        pilot.say("follow_select", camera=None, n=4)
+        pilot.wait("sent", n=4)
+        pilot.say("follow", camera="front", captured_ns=str(pilot.since_ns), box=BOX)
+        assert "choose the camera first" in refused(pilot, "follow")
+
+
+def test_without_opencv_the_refusal_names_the_extra(client: TestClient, monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(what: str) -> None:
+        raise MissingExtraError(what, "vision")
+
+    monkeypatch.setattr(follow_session, "opencv", missing)
+    with marker(client) as pilot:
+        pilot.say("follow_select", camera="front")
+        assert "pip install 'skyloop[vision]'" in refused(pilot, "follow_select")
+
+
+@contextmanager
+def following(client: TestClient, node: Node) -> Iterator[Marker]:
+    with marker(client) as pilot:
+        pilot.take().take_off()
+        with pilot.staying():
+            pilot.mark(mode="follow")
+            pilot.wait("follow", state="flying")
+            until(lambda: node.flyer.state is FlightState.FLYING)
+            yield pilot
+
+
+@pytest.mark.parametrize(
+    ("do", "values", "then"),
+    [
+        ("hover", {}, FlightState.HOVERING),
+        ("land", {}, FlightState.LANDED),
+        ("fly", {"up": 0.1}, FlightState.FLYING),
+        ("goto", {"x": 5.0, "y": 0.0, "z": 1.0}, FlightState.FLYING),
+        ("release", {}, FlightState.HOVERING),
+        ("stop", {}, FlightState.EMERGENCY),
+    ],
+)
+def test_anything_else_that_is_commanded_ends_it(
+    client: TestClient, node: Node, do: str, values: dict[str, Any], then: FlightState
+) -> None:
+    with following(client, node) as pilot:
+        pilot.say(do, **values)
+        assert pilot.wait("follow", state="ended")["problem"]
+        until(lambda: node.flyer.state is then)
+        flown = count(node, FORWARD)
+        pilot.say("ping", n=9)
+        pilot.wait("pong", n=9)
+        assert count(node, FORWARD) == flown, "nothing more comes from what was followed"
+
+
+def test_who_takes_control_ends_it(client: TestClient, node: Node) -> None:
+    with following(client, node) as pilot, node.connect("other", priority=0) as other:
+        assert pilot.wait("follow", state="ended")["problem"] == NO_CONTROL
+        other.hover()
+        until(lambda: node.flyer.state is FlightState.HOVERING)
+
+
+def test_a_silent_page_hovers(client: TestClient, node: Node) -> None:
+    with marker(client) as pilot:
+        pilot.take().take_off()
+        pilot.mark(mode="follow")
+        pilot.wait("follow", state="flying")
+        assert "the page was silent" in pilot.wait("follow", state="ended")["problem"]
+        until(lambda: node.flyer.applied[-1] == Hover())
+
+
+def test_a_page_that_is_gone_hovers(client: TestClient, node: Node) -> None:
+    with following(client, node):
+        pass
+    until(lambda: node.flyer.state is not FlightState.FLYING)
+    until(lambda: not any(thread.name == "skyloop-follow" for thread in threading.enumerate()))
+
+
+def test_it_hovers_while_no_frames_come_and_goes_on_when_they_do(
+    client: TestClient, node: Node, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with following(client, node) as pilot:
+        flows = threading.Event()
+        frame = node.flyer._sink.frame  # type: ignore[union-attr]
+        monkeypatch.setattr(node.flyer._sink, "frame", lambda *a, **k: flows.is_set() and frame(*a, **k))
+        told = pilot.wait("follow", state="waiting")
+        assert "no new frame of front for 0." in told["problem"]
+        until(lambda: node.flyer.state is FlightState.HOVERING)
+        flows.set()
+        pilot.wait("follow", state="flying")
+        until(lambda: node.flyer.state is FlightState.FLYING)
+
+
+def test_a_tracker_that_is_stuck_flies_nothing(client: TestClient, node: Node, stand_ins: StandIns) -> None:
+    with following(client, node) as pilot:
+        stand_ins.last.waits = threading.Event()
+        pilot.wait("follow", state="waiting")
+        until(lambda: node.flyer.state is FlightState.HOVERING)
+        stand_ins.last.waits.set()
+        pilot.wait("follow", state="flying")
+
+
+def test_it_ends_hovering_when_it_gives_up_or_fails(client: TestClient, node: Node, stand_ins: StandIns) -> None:
+    with following(client, node) as pilot:
+        stand_ins.last.says(problem="lost for too long")
+        stand_ins.last.over = True
+        until(lambda: pilot.wait("follow", state="ended")["problem"] == "lost for too long")
+        until(lambda: node.flyer.applied[-1] == Hover())
+
+        def hostile(one: StandIn) -> None:
+            one.fails = RuntimeError("no such thing")
+
+        stand_ins.prepare = hostile
+        pilot.mark(mode="follow")
+        assert pilot.wait("follow", state="ended")["problem"] == "tracking failed: RuntimeError: no such thing"
+        stand_ins.prepare = lambda _: None
+        pilot.mark(class_name="unicorn")
+        assert "there are no unicorns" in pilot.wait("follow", state="ended")["problem"]
+
+
+def test_detections_of_processors_are_used(client: TestClient, node: Node, stand_ins: StandIns) -> None:
+    class Finds:
+        def process(self, frame: Frame) -> dict[str, Any]:
+            one = {"box": [1.0, 2.0, 8.0, 9.0], "score": 0.8, "class_id": 0, "class_name": "person"}
+            return {"detections": [one, {"box": "?"}]}
+
+    with marker(client) as pilot, node.connect("finds", access="observe") as drone:
+        pilot.mark()
+        pilot.wait("follow", state="tracking", phase="")
+        worker = Worker(drone, Finds(), Settings("detections", "Finds 1"))
+        worker.run(seconds=0.3)
+        until(lambda: stand_ins.last.detections)
+        (found, captured_ns) = stand_ins.last.detections[0]
+        assert [(one.class_name, one.box) for one in found] == [("person", (1.0, 2.0, 8.0, 9.0))]
+        assert captured_ns > pilot.since_ns
+
+
+def test_a_command_that_the_proxy_refuses_ends_it(client: TestClient, node: Node, stand_ins: StandIns) -> None:
+    with following(client, node) as pilot:
+        node.flyer.state = FlightState.LANDING  # somebody else's doing
+        assert "it is landing" in pilot.wait("follow", state="ended")["problem"]
+        assert stand_ins.last.frames
+
+
+def test_numbers_come_five_times_a_second_at_most(client: TestClient, node: Node) -> None:
+    with following(client, node) as pilot:
+        began_s = time.monotonic()
+        for _ in range(5):
+            pilot.wait("follow", state="flying")
+        assert time.monotonic() - began_s > 0.75
+
+
+def test_frames_that_are_kept_are_not_held(client: TestClient, node: Node) -> None:
+    """What is kept is a JPEG: the proxy has its memory back."""
+    with marker(client) as pilot, node.connect("watcher", access="observe") as watcher:
+        pilot.select()
+        draws(watcher, frames=30)
+        gc.collect()
+        assert sum(isinstance(one, Frame) for one in gc.get_objects()) < 10

@@ -1,0 +1,438 @@
+"""The following law, in a small world with lag and noise: distances, sides, circles, losses, limits."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from skyloop.clock import nanoseconds
+from skyloop.control.chase_law import LOSSES, ChaseLaw, ChaseSettings, FollowMode, TargetPhase
+from skyloop.control.target import Motion
+from skyloop.control.target_estimate import TargetEstimator
+from skyloop.errors import UsageError
+from skyloop.messages import Attitude, Velocity
+from skyloop.messages.geometry import wrap_angle
+from tests.control.target_world import PERIOD_S, PERSON, ChaseWorld, Path, camera_at, view_of, walk
+
+PER_S = round(1 / PERIOD_S)
+
+
+def rms(values: list[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def ring(radius: float, speed: float) -> Path:
+    return lambda t: (4.0 + radius * math.sin(speed * t / radius), radius * (1 - math.cos(speed * t / radius)))
+
+
+def after(hidden_at: float) -> Callable[[float], bool]:
+    return lambda t: t >= hidden_at
+
+
+def settled(values: list[float], seconds: float) -> list[float]:
+    return values[round(seconds * PER_S) :]
+
+
+def still_law(*, at_s: float = 1.0, away: tuple[float, float] = (4.0, 0.0)) -> tuple[ChaseLaw, TargetEstimator]:
+    estimator, camera = TargetEstimator(PERSON), camera_at()
+    for n in range(15):
+        view = view_of(camera, np.array([*away, 0.0]))
+        if n == 0:
+            estimator.start(view, camera, nanoseconds(at_s - 1), ground=True)
+        estimator.update(view, camera, nanoseconds(at_s - 1 + n * PERIOD_S))
+    return ChaseLaw(), estimator
+
+
+def motion(at_s: float = 1.0, **values: Any) -> Motion:
+    known: dict[str, Any] = {"position": np.zeros(3), "velocity": np.zeros(3), "yaw": 0.0, "yaw_rate": 0.0}
+    return Motion(nanoseconds(at_s), **(known | values))
+
+
+# Following ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "path",
+    [walk(4.0, 0.0), walk(6.5, 0.5), walk(4.0, 0.0, 1.5), walk(4.0, 0.0, 0.8, 0.8), ring(3.0, 1.3)],
+    ids=["stands", "stands farther off", "goes away", "goes across", "goes round"],
+)
+@pytest.mark.parametrize("relative", [False, True], ids=["velocity", "attitude"])
+def test_the_distance_is_kept(path: Path, relative: bool) -> None:
+    world = ChaseWorld(path, relative=relative)
+    world.run(16.0)
+    errors = [one - 4.0 for one in settled(world.ranges, 6.0)]
+    assert rms(errors) < (0.8 if relative else 0.5)
+    assert rms(settled(world.azimuths, 4.0)) < 0.2, "it stays in the middle of the image"
+    assert set(world.phases[1:]) == {TargetPhase.FOLLOWING}
+    kinds = {type(one) for one in world.commands}
+    assert kinds == {Attitude if relative else Velocity}
+
+
+@pytest.mark.parametrize("distance_m", [3.0, 5.0, 7.0])
+def test_the_distance_is_the_one_that_was_set(distance_m: float) -> None:
+    world = ChaseWorld(walk(5.0, 0.0, 0.0, 0.3), settings=ChaseSettings(distance_m=distance_m))
+    world.run(14.0)
+    assert rms([one - distance_m for one in settled(world.ranges, 9.0)]) < 0.5
+    assert world.law.off_m is not None
+    assert abs(world.law.off_m) < 0.6
+
+
+@pytest.mark.parametrize("bearing_deg", [180, 90, -90, 135, 0])
+def test_it_comes_round_to_a_bearing(bearing_deg: int) -> None:
+    bearing = math.radians(bearing_deg)
+    world = ChaseWorld(walk(4.0, 0.0, 0.4, 0.8), settings=ChaseSettings(bearing_rad=bearing))
+    world.run(25.0)
+    heading = math.atan2(0.8, 0.4)
+    off = [wrap_angle(one - heading - bearing) for one in settled(world.bearings, 18.0)]
+    assert rms(off) < 0.3
+    assert rms([one - 4.0 for one in settled(world.ranges, 18.0)]) < 0.6
+    assert min(world.ranges) > 2.0
+
+
+def test_a_thing_that_stands_has_no_side() -> None:
+    world = ChaseWorld(walk(4.0, 0.0), settings=ChaseSettings(bearing_rad=math.pi), seed=None)
+    world.run(8.0)
+    assert world.places[-1][:2] == pytest.approx([0.0, 0.0], abs=0.3)
+
+
+@pytest.mark.parametrize("orbit_m_s", [0.8, -0.8], ids=["counter-clockwise", "clockwise"])
+@pytest.mark.parametrize("path", [walk(4.0, 0.0), walk(4.0, 0.0, 0.5, 0.0)], ids=["stands", "walks"])
+def test_an_orbit_goes_round_at_the_distance(orbit_m_s: float, path: Path) -> None:
+    world = ChaseWorld(path, mode=FollowMode.ORBIT, settings=ChaseSettings(orbit_m_s=orbit_m_s))
+    world.run(24.0)
+    assert rms([one - 4.0 for one in settled(world.ranges, 6.0)]) < 0.5
+    turned = np.unwrap(settled(world.bearings, 6.0))
+    assert (turned[-1] - turned[0]) / 18.0 == pytest.approx(orbit_m_s / 4.0, rel=0.25)
+    assert world.phases[-1] is TargetPhase.ORBITING
+
+
+def test_an_orbit_by_attitude_goes_round_too() -> None:
+    world = ChaseWorld(walk(4.0, 0.0), mode=FollowMode.ORBIT, relative=True)
+    world.run(24.0)
+    assert rms([one - 4.0 for one in settled(world.ranges, 6.0)]) < 1.0
+    turned = np.unwrap(settled(world.bearings, 6.0))
+    assert turned[-1] - turned[0] > 1.0, "counter-clockwise"
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("aside", [0.0, 0.5])
+def test_it_never_comes_too_near_to_what_walks_towards_it(seed: int, aside: float) -> None:
+    world = ChaseWorld(walk(7.0, aside, -1.5, 0.0), seed=seed)
+    world.run(10.0)
+    assert min(world.ranges) > 2.0 - 0.3
+
+
+def test_it_never_flies_into_what_stops_suddenly() -> None:
+    world = ChaseWorld(lambda t: (4.0 + 2.0 * min(t, 6.0), 0.0))
+    world.run(12.0)
+    assert min(world.ranges) > 1.4, "from 2 m/s at once; it takes a moment to be believed"
+    assert rms([one - 4.0 for one in settled(world.ranges, 10.0)]) < 0.4
+
+
+@pytest.mark.parametrize("aside", [0.4, -0.4])
+def test_it_leaves_the_way_of_what_comes_by(aside: float) -> None:
+    law, estimator = still_law()
+    coming = replace(estimator.at(nanoseconds(1.0)), velocity=np.array([-1.5, 0.0]))
+
+    class Coming(TargetEstimator):
+        def at(self, at_ns: int) -> Any:
+            return coming
+
+    for n in range(10):
+        at = motion(1.0 + n * PERIOD_S, position=np.array([0.0, aside, 0.0]))
+        command = law.step(at.at_ns, at, 1.2, Coming(PERSON), at.at_ns)
+    assert isinstance(command, Velocity)
+    assert command.forward < -0.5
+    assert command.left * aside > 0.0
+    assert abs(command.left) > 0.2
+
+
+def pushed(place: tuple[float, float], velocity: tuple[float, float] = (0.0, 0.0)) -> tuple[float, float]:
+    """How much faster to the front and to the left it flies because of somebody else at a place, after a second."""
+    found = []
+    for beside in (False, True):
+        law, estimator = still_law()
+        other = replace(
+            estimator.at(nanoseconds(1.0)), foot=np.array([*place, 0.0]), velocity=np.array(velocity, np.float64)
+        )
+        for n in range(15):
+            at = motion(1.0 + n * PERIOD_S)
+            command = law.step(at.at_ns, at, 1.2, estimator, at.at_ns, [other] if beside else [])
+        assert isinstance(command, Velocity)
+        found.append(command)
+    return found[1].forward - found[0].forward, found[1].left - found[0].left
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_it_keeps_clear_of_others(side: float) -> None:
+    assert pushed((0.0, side))[1] * side < -0.1, "who stands beside it"
+    assert pushed((2.0, 0.3 * side), (-1.5, 0.0))[1] * side < -0.1, "who comes"
+    assert pushed((-1.0, 0.0))[0] > 0.1, "who stands behind it"
+    assert pushed((0.0, 5.0 * side)) == pytest.approx((0.0, 0.0), abs=1e-6), "who is far off"
+    assert pushed((-2.0, side), (-1.5, 0.0)) == pytest.approx((0.0, 0.0), abs=0.05), "who goes away"
+    assert math.isfinite(sum(pushed((0.0, 0.0)))), "who is where it is"
+
+
+def test_the_first_set_point_is_one_that_the_vehicle_can_fly_on_from() -> None:
+    for speed in (0.0, 1.0):
+        law, estimator = still_law(away=(8.0, 0.0))
+        at = motion(velocity=np.array([speed, 0.0, 0.0]))
+        command = law.step(at.at_ns, at, 1.2, estimator, at.at_ns)
+        assert isinstance(command, Velocity)
+        assert command.forward == pytest.approx(speed, abs=0.05)
+
+
+def test_limits_may_be_changed_in_flight_without_a_step() -> None:
+    world = ChaseWorld(walk(4.0, 0.0, 1.5))
+    world.run(5.0)
+    world.law.settings = replace(world.law.settings, acceleration_m_s2=1.0)
+    world.run(0.3)
+    fast = [one.forward for one in world.commands[-6:] if isinstance(one, Velocity)]
+    assert max(abs(a - b) for a, b in itertools.pairwise(fast)) < 4 * 3.0 * PERIOD_S + 0.01
+
+
+@pytest.mark.parametrize("leash_m", [1.0, 3.0])
+def test_a_leash_is_not_left(leash_m: float) -> None:
+    world = ChaseWorld(walk(4.0, 0.0, 0.6, 0.3), settings=ChaseSettings(leash_m=leash_m))
+    world.run(14.0)
+    out = [float(np.hypot(*place[:2])) for place in world.places]
+    assert max(out) < leash_m + 0.4
+    assert out[-1] > leash_m - 0.4
+    assert world.law.held_by == "leash"
+    assert abs(world.azimuths[-1]) < 0.2, "it goes on to turn to the target"
+    free = ChaseWorld(walk(4.0, 0.0), settings=ChaseSettings(leash_m=leash_m))
+    free.run(4.0)
+    assert free.law.held_by == ""
+
+
+def test_to_look_is_to_stay_and_to_turn() -> None:
+    world = ChaseWorld(walk(3.0, -2.0, 0.0, 0.7), mode=FollowMode.LOOK)
+    world.run(8.0)
+    assert world.places[-1][:2] == pytest.approx([0.0, 0.0], abs=1e-9)
+    assert all(one.forward == 0.0 == one.left for one in world.commands if isinstance(one, Velocity))
+    assert rms(settled(world.azimuths, 2.0)) < 0.15
+    assert world.phases[-1].value == TargetPhase.WATCHING.value
+
+
+def test_to_look_by_attitude_is_to_stay_level() -> None:
+    world = ChaseWorld(walk(3.0, -1.0, 0.0, 0.4), mode=FollowMode.LOOK, relative=True)
+    world.run(4.0)
+    assert all(one.roll == 0.0 == one.pitch for one in world.commands if isinstance(one, Attitude))
+    assert rms(settled(world.azimuths, 2.0)) < 0.15
+
+
+def test_the_mode_may_be_changed_in_flight() -> None:
+    world = ChaseWorld(walk(4.0, 0.0))
+    world.run(2.0)
+    world.law.mode = FollowMode.ORBIT
+    world.run(6.0)
+    assert abs(world.bearings[-1] - world.bearings[0]) > 0.5
+    world.law.mode = FollowMode.LOOK
+    world.run(3.0)
+    assert [phase for phase in dict.fromkeys(world.phases) if phase is not TargetPhase.LOOKING] == [
+        TargetPhase.FOLLOWING,
+        TargetPhase.ORBITING,
+        TargetPhase.WATCHING,
+    ]
+    world.law.settings = replace(world.law.settings, distance_m=3.0)
+    world.law.mode = FollowMode.FOLLOW
+    world.run(8.0)
+    assert world.ranges[-1] == pytest.approx(3.0, abs=0.4)
+
+
+def test_set_points_are_within_the_limits() -> None:
+    settings = ChaseSettings(speed_m_s=1.5, climb_m_s=0.3, turn_rad_s=0.9, acceleration_m_s2=2.0, height_m=2.5)
+    world = ChaseWorld(walk(7.0, 3.0, 1.8, 0.6), settings=settings)
+    world.run(5.0)
+    commands = [one for one in world.commands if isinstance(one, Velocity)]
+    assert max(math.hypot(one.forward, one.left) for one in commands) <= 1.5 + 1e-9
+    assert max(abs(one.up) for one in commands) <= 0.3 + 1e-9
+    assert max(abs(one.yaw_rate) for one in commands) <= 0.9 + 1e-9
+    steps = [math.hypot(b.forward - a.forward, b.left - a.left) for a, b in itertools.pairwise(commands)]
+    assert max(steps) <= 4 * 2.0 * PERIOD_S + 1e-6  # set-points lead the velocity, to change it
+
+
+def test_the_tilt_is_within_the_limit() -> None:
+    settings = ChaseSettings(tilt_rad=0.1)
+    world = ChaseWorld(walk(8.0, 1.0, 1.5), settings=settings, relative=True)
+    world.run(5.0)
+    tilts = [math.hypot(one.roll, one.pitch) for one in world.commands if isinstance(one, Attitude)]
+    assert 0.08 < max(tilts) < 0.102
+
+
+# Losses ------------------------------------------------------------------------------------------------------------
+
+
+def first(world: ChaseWorld, phase: TargetPhase) -> float:
+    return world.phases.index(phase) * PERIOD_S
+
+
+@pytest.mark.parametrize("relative", [False, True], ids=["velocity", "attitude"])
+def test_a_target_that_is_lost_is_waited_for_looked_for_and_given_up(relative: bool) -> None:
+    settings = ChaseSettings(predict_s=2.0, hover_s=3.0, give_up_s=12.0)
+    world = ChaseWorld(walk(4.0, 0.0, 0.0, 1.0), settings=settings, hidden=after(5.0), relative=relative)
+    world.run(20.0)
+    order = list(dict.fromkeys(world.phases))
+    assert order[-5:] == [
+        TargetPhase.FOLLOWING,
+        TargetPhase.PREDICTING,
+        TargetPhase.HOVERING,
+        TargetPhase.SEARCHING,
+        TargetPhase.GIVEN_UP,
+    ]
+    assert set(order[-4:]) == LOSSES
+    lost_s = 5.0 + settings.seen_s
+    assert first(world, TargetPhase.PREDICTING) == pytest.approx(lost_s, abs=0.15)
+    assert first(world, TargetPhase.HOVERING) == pytest.approx(lost_s + 2.0, abs=0.15)
+    assert first(world, TargetPhase.SEARCHING) == pytest.approx(lost_s + 5.0, abs=0.15)
+    assert first(world, TargetPhase.GIVEN_UP) == pytest.approx(17.0, abs=0.15)
+    assert world.law.off_m is None
+    for phase, command in zip(world.phases, world.commands, strict=True):
+        if phase is TargetPhase.SEARCHING:
+            assert abs(turn(command)) == pytest.approx(settings.search_rad_s)
+            assert turn(command) > 0.0, "it went out of sight on the left"
+        if phase is TargetPhase.GIVEN_UP:
+            assert turn(command) == 0.0
+        if phase in LOSSES - {TargetPhase.PREDICTING} and isinstance(command, Attitude):
+            assert math.hypot(command.roll, command.pitch) < 0.05, "no more than brings it to rest"
+    assert translation(world.commands[-1]) < 0.01
+
+
+def turn(command: object) -> float:
+    assert isinstance(command, Velocity | Attitude)
+    return command.yaw_rate
+
+
+def translation(command: object) -> float:
+    if isinstance(command, Attitude):
+        return math.hypot(command.roll, command.pitch)
+    assert isinstance(command, Velocity)
+    return math.hypot(command.forward, command.left)
+
+
+@pytest.mark.parametrize("speed", [0.5, 1.5])
+def test_it_does_not_fly_towards_where_the_target_is_hidden(speed: float) -> None:
+    """What hides it may be in the way: the set-point has no part towards it, and fades."""
+    world = ChaseWorld(walk(4.0, 0.0, speed, 0.5), hidden=after(5.0))
+    world.run(9.0)
+    lost = [n for n, phase in enumerate(world.phases) if phase is TargetPhase.PREDICTING]
+    towards = [command.forward for n in lost[10:] if isinstance(command := world.commands[n], Velocity)]
+    assert max(towards) < 0.1, "once the limit of the acceleration lets it brake"
+    sizes = [translation(world.commands[n]) for n in lost]
+    assert sizes[-1] < 0.25 * sizes[0] + 0.05
+    hovering = [n for n, phase in enumerate(world.phases) if phase is TargetPhase.HOVERING]
+    assert all(translation(world.commands[n]) < 1e-6 for n in hovering[PER_S // 2 :])
+
+
+def test_a_target_that_comes_back_is_followed_again() -> None:
+    world = ChaseWorld(walk(4.0, 0.0, 0.0, 0.5), hidden=lambda t: 5.0 <= t < 7.0)
+    world.run(14.0)
+    assert TargetPhase.PREDICTING in world.phases
+    assert world.phases[-1] is TargetPhase.FOLLOWING
+    assert world.ranges[-1] == pytest.approx(4.0, abs=0.5)
+
+
+def test_a_target_that_was_never_seen_is_looked_for_on_the_spot() -> None:
+    world = ChaseWorld(walk(-4.0, 0.0), hidden=lambda t: True)
+    world.run(4.0)
+    assert set(world.phases) == {TargetPhase.LOOKING}
+    assert all(turn(one) == pytest.approx(0.7) for one in world.commands)
+    assert world.places[-1][:2].tolist() == [0.0, 0.0]
+    world.run(25.0)
+    assert world.phases[-1] is TargetPhase.GIVEN_UP
+
+
+# Heights -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("given", "height"),
+    [
+        ({}, 1.2),
+        ({"height_m": 1.6}, 1.6),
+        ({"height_m": 0.9}, 0.9),
+        ({"lowest_m": 1.5}, 1.5),
+        ({"highest_m": 1.0}, 1.0),
+    ],
+)
+@pytest.mark.parametrize("relative", [False, True], ids=["velocity", "attitude"])
+def test_the_height_is_kept(given: dict[str, float], height: float, relative: bool) -> None:
+    world = ChaseWorld(walk(4.0, 0.0), settings=ChaseSettings(**given), relative=relative)
+    world.run(8.0)
+    assert world.places[-1][2] == pytest.approx(height, abs=0.12)
+
+
+def test_it_does_not_climb_out_of_sight_of_the_target() -> None:
+    settings = ChaseSettings(height_m=4.0, steep_rad=0.25)
+    world = ChaseWorld(walk(4.0, 0.0), settings=settings)
+    world.run(10.0)
+    assert 1.5 < world.places[-1][2] < 0.86 + 4.4 * math.tan(0.25) + 0.1
+
+
+def test_without_a_height_above_the_ground_it_is_left_as_it_is() -> None:
+    world = ChaseWorld(walk(4.0, 0.0, 0.3), altitude=False, settings=ChaseSettings(height_m=2.0))
+    world.run(4.0)
+    assert all(one.up == 0.0 for one in world.commands if isinstance(one, Velocity))
+
+
+# Hostile times and settings ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("later_s", [-0.5, 0.0, 0.02, 3.0, 1000.0])
+def test_any_time_gives_a_finite_set_point(later_s: float) -> None:
+    for relative in (False, True):
+        law, estimator = still_law()
+        law.step(nanoseconds(1.0), motion(), 1.2, estimator, estimator.seen_ns, relative=relative)
+        command = law.step(nanoseconds(1.0 + later_s), motion(), 1.2, estimator, estimator.seen_ns, relative=relative)
+        parts = [getattr(command, name) for name in command.__struct_fields__]
+        assert np.isfinite([one for one in parts if isinstance(one, float)]).all()
+
+
+def test_a_target_at_its_own_place_gives_a_finite_set_point() -> None:
+    for relative in (False, True):
+        for mode in FollowMode:
+            law, estimator = still_law()
+            law.mode = mode
+            at = motion(position=np.array([*estimator.at(nanoseconds(1.15)).foot[:2], 0.0]))
+            command = law.step(at.at_ns, at, 1.2, estimator, at.at_ns, relative=relative)
+            assert math.isfinite(translation(command) + turn(command))
+
+
+@pytest.mark.parametrize(
+    ("given", "why"),
+    [
+        ({"distance_m": 2.0}, r"distance_m is 2 and must be above nearest_m, which is 2"),
+        ({"distance_m": 0.0}, r"distance_m is 0\.0 and must be above 0"),
+        ({"distance_m": math.nan}, "distance_m is nan and must be a finite number"),
+        ({"distance_m": math.inf}, "distance_m is inf and must be a finite number"),
+        ({"distance_m": "4"}, "distance_m is '4' and must be a finite number"),
+        ({"distance_m": None}, "distance_m is None and must be a finite number"),
+        ({"nearest_m": -1.0}, r"nearest_m is -1\.0 and must be above 0"),
+        ({"bearing_rad": math.nan}, "bearing_rad is nan"),
+        ({"leash_m": 0.0}, "leash_m is 0.0 and must be above 0"),
+        ({"leash_m": -2}, "leash_m is -2 and must be above 0"),
+        ({"height_m": -1.0}, "height_m is -1.0 and must be above 0"),
+        ({"orbit_m_s": math.inf}, "orbit_m_s is inf"),
+        ({"lowest_m": 5.0}, "lowest_m is 5 and must be at most highest_m, 4"),
+        ({"range_gain": 0.0}, "range_gain is 0.0 and must be above 0"),
+        ({"speed_m_s": True}, "speed_m_s is True and must be a finite number"),
+        ({"give_up_s": -1.0}, "give_up_s is -1.0"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(given: dict[str, Any], why: str) -> None:
+    with pytest.raises(UsageError, match=why):
+        ChaseSettings(**given)
+
+
+@pytest.mark.parametrize(
+    "given", [{"bearing_rad": -3.0}, {"bearing_rad": 0}, {"orbit_m_s": -1.0}, {"velocity_gain": 0.0}, {"leash_m": 5}]
+)
+def test_settings_that_make_sense_are_taken(given: dict[str, Any]) -> None:
+    settings = ChaseSettings(**given)
+    assert all(getattr(settings, name) == value for name, value in given.items())

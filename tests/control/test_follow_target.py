@@ -1,0 +1,452 @@
+"""The behaviour around the following law: a rehearsed flight, what it tells and draws, and what it refuses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.tracking_scenes import texture
+from skyloop.client import Drone
+from skyloop.client.feedback_history import FeedbackHistory
+from skyloop.client.frame import Arrival, Frame
+from skyloop.clock import nanoseconds
+from skyloop.control import ChaseSettings, FollowTarget
+from skyloop.control.chase_law import FollowMode, TargetPhase
+from skyloop.control.follow_target import detections_of
+from skyloop.control.target_estimate import Traits
+from skyloop.control.target_follower import TargetFollower
+from skyloop.errors import UnknownNameError, UsageError
+from skyloop.messages import (
+    Attitude,
+    CameraInfo,
+    Capabilities,
+    Encoding,
+    EventKind,
+    Feedback,
+    FrameHeader,
+    Points,
+    Polyline,
+    Severity,
+    Text,
+    Velocity,
+)
+from skyloop.sim.camera import FRONT_CAMERA
+from skyloop.stepping.rehearsal import rehearse
+from skyloop.vision import simulated_detector
+from skyloop.vision.detection import Detection
+from skyloop.vision.tracking import Box
+from tests.control.target_world import PERIOD_S, box_of, camera_at
+
+WORLD = """
+[room]
+size = [30, 24, 10]
+floor = "grass"
+enclosed = false
+[[spawn]]
+position = [0, 0, 0]
+[[target]]
+name = "walker"
+kind = "figure"
+shape = "person"
+look = 4
+path = { kind = "waypoints", points = [[5, -2, 0], [5, 9, 0], [5.5, 9, 0], [5.5, -2, 0]], speed = 0.9 }
+"""
+INTRINSICS = FRONT_CAMERA.intrinsics()
+
+
+@contextmanager
+def yard(folder: Path, options: str = "") -> Iterator[Drone]:
+    file = folder / "world.toml"
+    file.write_text(WORLD)
+    with rehearse(f"sim://?world={file}&cameras=front&fps=10&seed=1&wind=0{options}") as drone:
+        drone.takeoff()
+        yield drone
+
+
+def truth(frame: Frame) -> tuple[float, float]:
+    """Distance and bearing from the vehicle to the walker, who is still on the first leg of the way."""
+    assert frame.feedback is not None
+    native = frame.feedback.native
+    assert native is not None
+    x, y, yaw, at_s = (float(native[name]) for name in ("truth.x", "truth.y", "truth.yaw", "sim.time_s"))  # type: ignore[arg-type]
+    dx, dy = 5.0 - x, -2.0 + 0.9 * at_s - y
+    return math.hypot(dx, dy), math.atan2(dy, dx) - yaw
+
+
+class Watched(FollowTarget):
+    """Notes the truth and the drawings of each frame."""
+
+    def __init__(self, *args: Any, **values: Any) -> None:
+        self.seen: list[tuple[float, float]] = []
+        self.drawn: list[Any] = []
+        super().__init__(*args, **values)
+
+    def look(self, frame: Frame) -> list[Any]:
+        self.drawn = super().look(frame)
+        self.seen.append(truth(frame))
+        return self.drawn
+
+
+@pytest.mark.slow
+def test_a_person_is_followed_from_a_box(tmp_path: Path) -> None:
+    detector = simulated_detector()
+    with yard(tmp_path) as drone:
+        pick: Box | None = None
+        for frame in drone.frames():
+            people = [one for one in detector.detect(frame) if one.class_name == "person" and one.box[3] > 30]
+            if people:
+                pick = people[0].box
+                break
+        assert pick is not None
+        pilot = Watched(drone, pick, detector=detector, distance_m=3.5)
+        assert pilot.status.range_m is None
+        pilot.run(seconds=6.0)
+        assert pilot.phase is TargetPhase.FOLLOWING
+        status = pilot.status
+    assert status.class_name == "person"
+    distance_m, bearing_rad = pilot.seen[-1]
+    assert distance_m == pytest.approx(3.5, abs=0.6)
+    assert all(abs(bearing) < 0.5 for _, bearing in pilot.seen), "it stays in view"
+    assert status.range_m == pytest.approx(distance_m, abs=0.6)
+    assert status.bearing_rad == pytest.approx(bearing_rad, abs=0.15)
+    assert status.speed_m_s == pytest.approx(0.9, abs=0.5)
+    assert status.box is not None
+    assert status.predicted_px is not None
+    assert status.box[0] < status.predicted_px[0] < status.box[0] + status.box[2]
+    assert (status.lost_s, status.problem) == (0.0, "")
+    texts = [one.text for one in pilot.drawn if isinstance(one, Text)]
+    assert len(texts) == 1
+    assert texts[0].startswith("person ")
+    assert "following" in texts[0]
+    assert any(isinstance(one, Polyline) and one.closed for one in pilot.drawn)
+    assert any(isinstance(one, Polyline) and not one.closed for one in pilot.drawn), "where it came along"
+
+
+def test_what_makes_no_sense_is_refused() -> None:
+    detector = simulated_detector()
+    box = (100.0, 50.0, 40.0, 90.0)
+    bad: list[tuple[dict[str, Any], str]] = [
+        ({"class_name": "person"}, "a detector is needed"),
+        ({"box": box, "mode": "chase"}, "mode is 'chase' and must be one of follow, orbit, look"),
+        ({"box": box, "mode": None}, "mode is None"),
+        ({"box": box, "detector": 7}, "detector is 7 and must have detect"),
+        ({"box": (math.nan, 1, 20, 20)}, "must be of finite numbers"),
+        ({"box": (1, 2, 3)}, "must be x, y, width and height"),
+        ({"box": "here"}, "must be x, y, width and height"),
+        ({"box": 4}, "must be x, y, width and height"),
+        ({"box": box, "distance_m": 1.0}, "distance_m is 1 and must be above nearest_m"),
+        ({"box": box, "distance_m": math.nan}, "distance_m is nan"),
+        ({"box": box, "bearing_rad": math.inf}, "bearing_rad is inf"),
+        ({"box": box, "height_m": -1.0}, "height_m is -1.0"),
+        ({"box": box, "camera": "bottom"}, "does not look forward"),
+    ]
+    with rehearse("sim://?world=empty&cameras=front,bottom") as drone:
+        for given, why in bad:
+            with pytest.raises(UsageError, match=why):
+                FollowTarget(drone, **given)
+        with pytest.raises(UnknownNameError, match="rear"):
+            FollowTarget(drone, box, camera="rear")
+        named = FollowTarget(drone, class_name="person", detector="detect", height_m=1.6)
+        assert named.processors == ("detect",)
+        assert FollowTarget(drone, box, detector=detector).processors == ()
+
+
+def test_a_target_is_needed() -> None:
+    with rehearse("sim://?world=empty&cameras=front") as drone, pytest.raises(UsageError, match="needs a box"):
+        FollowTarget(drone)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        None,
+        7,
+        [],
+        "detections",
+        {},
+        {"detections": None},
+        {"detections": 5},
+        {"detections": "abc"},
+        {"detections": [None, 4, "x", [], {}]},
+        {"detections": [{"box": [1, 2, 3], "score": 0.5, "class_id": 0, "class_name": "person"}]},
+        {"detections": [{"box": [1, 2, 3, "x"], "score": 0.5, "class_id": 0, "class_name": "person"}]},
+        {"detections": [{"box": [1, 2, 3, math.nan], "score": 0.5, "class_id": 0, "class_name": "person"}]},
+        {"detections": [{"box": [1, 2, 0, 4], "score": 0.5, "class_id": 0, "class_name": "person"}]},
+        {"detections": [{"box": [1, 2, 3, -4], "score": 0.5, "class_id": 0, "class_name": "person"}]},
+        {"detections": [{"box": [1, 2, 3, 4], "score": math.inf, "class_id": 0, "class_name": "person"}]},
+        {"detections": [{"box": [1, 2, 3, 4], "score": 0.5, "class_id": math.inf, "class_name": "person"}]},
+        {"detections": [{"box": None, "score": 0.5, "class_id": 0, "class_name": "person"}]},
+    ],
+)
+def test_what_is_no_detection_is_left_out(value: Any) -> None:
+    assert detections_of(value) == []
+
+
+def test_detections_of_a_processor_are_taken() -> None:
+    one = {"box": [1, 2.5, 3, 4], "score": 0.5, "class_id": 1, "class_name": "car"}
+    assert detections_of({"detections": [one, {"box": 3}]}) == [Detection((1.0, 2.5, 3.0, 4.0), 0.5, 1, "car")]
+
+
+# Without a drone ---------------------------------------------------------------------------------------------------
+
+
+def state(at_s: float, **values: Any) -> Feedback:
+    known: dict[str, Any] = {
+        "roll_rad": 0.0,
+        "pitch_rad": 0.0,
+        "yaw_rad": 0.0,
+        "altitude_m": 1.2,
+        "velocity_m_s": (0.0, 0.0, 0.0),
+    }
+    return Feedback(captured_ns=nanoseconds(at_s), **(known | values))
+
+
+FOOT = np.array([4.0, -0.5, 0.0])
+
+
+def picture(
+    at_s: float, *, shown: bool = True, known: bool = True, intrinsics: Any = INTRINSICS, **values: Any
+) -> Frame:
+    """A frame with a thing in it, whose feedback is that of its capture."""
+    image = texture(np.random.default_rng(7), 320, 240)
+    box = the_box()
+    if shown:
+        x, y, width, height = (round(part) for part in box)
+        image[y : y + height, x : x + width] = texture(np.random.default_rng(3), width, height, (180, 90, 40))
+    history = FeedbackHistory()
+    if known:
+        history.add(state(at_s, **values))
+    at_ns = nanoseconds(at_s)
+    header = FrameHeader("front", 1, at_ns, at_ns, 320, 240, Encoding.BGR8, image.size, intrinsics)
+    return Arrival(header, image.reshape(-1), at_ns, 0, history).frame()
+
+
+def the_box() -> Box:
+    box = box_of(camera_at(), FOOT)
+    assert box is not None
+    return box
+
+
+def flown(
+    follower: TargetFollower, seconds: float, *, start: float = 1.0, shown: bool = True, **values: Any
+) -> list[Any]:
+    command: Any = None
+    for n in range(round(seconds / PERIOD_S)):
+        at_s = start + n * PERIOD_S
+        follower.feedback(state(at_s, **values))
+        drawn = follower.look(picture(at_s, shown=shown, **values))
+        command = follower.step(nanoseconds(at_s))
+    return [command, drawn]
+
+
+def follower_of(**values: Any) -> TargetFollower:
+    return TargetFollower(FRONT_CAMERA.info(), **({"box": the_box()} | values))
+
+
+def test_a_vehicle_without_velocity_is_flown_by_attitude() -> None:
+    follower = follower_of(settings=ChaseSettings(distance_m=3.0, nearest_m=1.0), traits=Traits(height_m=1.72))
+    command, drawn = flown(follower, 1.5, velocity_m_s=None)
+    assert isinstance(command, Attitude)
+    assert command.pitch > 0.01, "forward, as it is a metre too far off"
+    assert command.yaw_rate < -0.05, "to the right"
+    assert follower.status.speed_m_s is None
+    assert follower.status.range_m == pytest.approx(4.0 - 0.12, abs=0.5)
+    assert not any(isinstance(one, Polyline) and not one.closed for one in drawn), "it moves with the vehicle's drift"
+    assert follower.step(nanoseconds(9.0)) == Attitude(), "the vehicle's motion is not known any longer"
+
+
+def test_the_vehicle_is_held_while_nothing_is_known() -> None:
+    follower = follower_of()
+    assert follower.step(nanoseconds(1.0)) == Velocity()
+    assert follower.finder is None
+    for frame in (picture(1.0), picture(1.0, known=False)):
+        shapes = follower.look(frame)
+        assert [one.text for one in shapes if isinstance(one, Text)] == ["the vehicle's attitude is not known yet"]
+    follower.feedback(state(1.0))
+    shapes = follower.look(picture(1.0, roll_rad=None))
+    assert [one.text for one in shapes if isinstance(one, Text)] == ["the vehicle's attitude is not known yet"]
+    status = follower.status
+    assert (status.range_m, status.box, status.lost_s, status.problem) == (None, None, 0.0, "")
+    assert status.phase == TargetPhase.LOOKING.value
+    assert not follower.over
+    flown(follower, 1.0)
+    assert follower.step(nanoseconds(9.0)) == Velocity(), "the vehicle's motion is not known any longer"
+
+
+def test_it_says_since_when_the_target_is_lost_and_where_it_should_be() -> None:
+    follower = follower_of()
+    flown(follower, 1.5)
+    assert follower.sighting.box is not None
+    assert follower.finder is not None
+    _, drawn = flown(follower, 1.2, start=2.5, shown=False)
+    assert follower.phase is TargetPhase.PREDICTING
+    status = follower.status
+    assert status.box is None
+    assert status.lost_s == pytest.approx(1.2, abs=0.15)
+    assert any(isinstance(one, Polyline) and one.closed for one in drawn), "where it should be"
+    assert any(isinstance(one, Points) for one in drawn)
+
+
+class Recorder:
+    """Stands for the drone: keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.capabilities = Capabilities("sim", frozenset({"velocity"}), (FRONT_CAMERA.info(),))
+        self.velocities: list[dict[str, float]] = []
+        self.attitudes: list[Attitude] = []
+        self.hovers = 0
+        self.drawn: list[Any] = []
+        self.told: list[tuple[str, Severity]] = []
+
+    def velocity(self, **values: float) -> None:
+        self.velocities.append(values)
+
+    def command(self, attitude: Attitude) -> None:
+        self.attitudes.append(attitude)
+
+    def hover(self) -> None:
+        self.hovers += 1
+
+    def emit(self, kind: EventKind, text: str, severity: Severity) -> None:
+        self.told.append((text, severity))
+
+    def annotate(self, frame: Frame, shapes: list[Any], source: str) -> None:
+        self.drawn = shapes
+
+
+def given(pilot: FollowTarget, seconds: float, *, start: float = 1.0, shown: bool = True, **values: Any) -> None:
+    for n in range(round(seconds / PERIOD_S)):
+        pilot.on_feedback(state(start + n * PERIOD_S, **values))
+        pilot.on_frame(picture(start + n * PERIOD_S, shown=shown, **values))
+
+
+@pytest.fixture
+def _no_age(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Frame, "age_s", 0.0)
+
+
+@pytest.mark.usefixtures("_no_age")
+def test_the_behaviour_flies_tells_and_ends_after_the_loss() -> None:
+    drone = Recorder()
+    settings = ChaseSettings(distance_m=3.0, give_up_s=1.5, predict_s=0.4, hover_s=0.3)
+    pilot = FollowTarget(drone, the_box(), height_m=1.72, settings=settings)  # type: ignore[arg-type]
+    given(pilot, 1.0)
+    assert pilot.phase is TargetPhase.FOLLOWING
+    assert drone.velocities[-1]["forward"] > 0.2
+    assert drone.velocities[-1]["yaw_rate"] < -0.05
+    assert pilot.status.range_m == pytest.approx(4.0 - 0.12, abs=0.5)
+    assert drone.drawn
+    given(pilot, 2.5, start=2.0, shown=False)
+    assert pilot.done
+    assert drone.hovers == 1
+    assert drone.told == [
+        ("follow target: following", Severity.INFO),
+        ("follow target: hidden: on by its last motion", Severity.WARNING),
+        ("follow target: lost: hovering where it went out of sight", Severity.WARNING),
+        ("follow target: lost: looking around", Severity.WARNING),
+        ("follow target: lost for too long: given up", Severity.WARNING),
+        ("follow target: gave up: the target was lost for too long", Severity.INFO),
+    ]
+
+
+@pytest.mark.usefixtures("_no_age")
+def test_the_behaviour_sends_attitudes_where_there_is_no_velocity() -> None:
+    drone = Recorder()
+    pilot = FollowTarget(drone, the_box(), mode="look")  # type: ignore[arg-type]
+    given(pilot, 0.5, velocity_m_s=None)
+    assert not drone.velocities
+    assert drone.attitudes[-1].yaw_rate < -0.05
+    assert pilot.phase is TargetPhase.WATCHING
+
+
+@pytest.mark.usefixtures("_no_age")
+def test_the_behaviour_takes_the_results_of_a_processor() -> None:
+    drone = Recorder()
+    pilot = FollowTarget(drone, class_name="person", detector="detect")  # type: ignore[arg-type]
+    one = {"box": list(the_box()), "score": 0.9, "class_id": 0, "class_name": "person"}
+    for n in range(6):
+        at_s = 1.0 + n * PERIOD_S
+        given(pilot, PERIOD_S, start=at_s)
+        value: Any = {"detections": [one]}
+        pilot.on_result(SimpleNamespace(value=value, captured_ns=nanoseconds(at_s)))  # type: ignore[arg-type]
+    given(pilot, 0.2, start=1.4)
+    assert pilot.phase is TargetPhase.FOLLOWING
+    assert pilot.status.class_name == "person"
+
+
+def test_mode_and_settings_may_be_changed_in_flight() -> None:
+    follower = follower_of()
+    flown(follower, 0.5)
+    follower.mode = FollowMode("orbit")
+    follower.settings = ChaseSettings(distance_m=3.0)
+    assert follower.mode is FollowMode.ORBIT
+    assert follower.settings.distance_m == 3.0
+    command, _ = flown(follower, 0.5, start=1.5)
+    assert follower.phase is TargetPhase.ORBITING
+    assert isinstance(command, Velocity)
+    assert command.left < -0.1, "counter-clockwise: it goes to the right"
+
+
+def test_detections_that_come_late_are_used() -> None:
+    follower = follower_of(box=None, class_name="person", detects=True)
+    follower.detected([], nanoseconds(1.0))
+    assert follower.finder is None
+    for n in range(8):
+        at_s = 1.0 + n * PERIOD_S
+        follower.feedback(state(at_s))
+        drawn = follower.look(picture(at_s))
+        follower.detected([Detection(the_box(), 0.9, 0, "person")], nanoseconds(at_s))
+    assert [one.text for one in drawn if isinstance(one, Text)] != []
+    assert follower.status.class_name == "person"
+    assert follower.finder is not None
+    assert follower.finder.target is not None
+    assert follower.status.range_m == pytest.approx(4.0 - 0.12, abs=0.5)
+
+
+def test_other_things_are_drawn_and_what_is_contested_is_said() -> None:
+    class Both:
+        def detect(self, image: Any) -> list[Detection]:
+            return [Detection(the_box(), 0.9, 0, "person"), Detection((20.0, 60.0, 30.0, 90.0), 0.8, 0, "person")]
+
+    follower = follower_of(detector=Both())
+    _, drawn = flown(follower, 0.6)
+    assert sum(isinstance(one, Polyline) and one.closed for one in drawn) == 2
+    assert follower.finder is not None
+    assert follower.status.problem == ""
+    target = follower.finder.target
+    assert target is not None
+
+
+def test_the_end_of_the_leash_is_a_problem() -> None:
+    follower = follower_of(settings=ChaseSettings(distance_m=3.0, leash_m=0.5))
+    for n in range(30):
+        at_s = 1.0 + n * PERIOD_S
+        follower.feedback(state(at_s, velocity_m_s=(0.4, 0.0, 0.0)))
+        follower.step(nanoseconds(at_s))
+        if n == 0:
+            follower.look(picture(at_s))
+        else:
+            follower._seen_ns = nanoseconds(at_s)
+    assert follower.status.problem == "at the end of the leash"
+
+
+def test_a_camera_without_intrinsics_can_not_be_used() -> None:
+    follower = follower_of()
+    follower.feedback(state(1.0))
+    with pytest.raises(UsageError, match="'front' has no intrinsics: calibrate it"):
+        follower.look(picture(1.0, intrinsics=None))
+
+
+def test_a_camera_must_look_forward_and_say_how_it_is_mounted() -> None:
+    with pytest.raises(UsageError, match="mounted"):
+        TargetFollower(CameraInfo("front", 320, 240, 15.0), box=the_box())
+    down = (0.0, -1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, -1.0)
+    with pytest.raises(UsageError, match="'bottom' does not look forward"):
+        TargetFollower(CameraInfo("bottom", 320, 240, 15.0, rotation=down), box=the_box())

@@ -1,0 +1,266 @@
+"""Where a thing is, from its boxes: with what is known of it, with the ground, and with neither."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from skyloop.clock import nanoseconds
+from skyloop.control.target_estimate import TRAITS, UNKNOWN, TargetEstimator, TargetState, Traits
+from skyloop.control.target_view import BoxView, Camera
+from skyloop.errors import UsageError
+from tests.control.target_world import PERIOD_S, PERSON, Path, camera_at, view_of, walk
+
+CASE_OF_SIZE = replace(PERSON, on_ground=False)
+CASE_OF_GROUND = replace(UNKNOWN, radius_m=0.25)
+
+
+def watched(
+    traits: Traits,
+    path: Path,
+    *,
+    seconds: float = 6.0,
+    ground: bool = False,
+    seed: int = 1,
+    eye: Callable[[float], tuple[float, float]] = lambda t: (0.0, 0.0),
+    at: list[TargetState] | None = None,
+) -> TargetEstimator:
+    """A filter that was given the boxes of a person who walks along a path, seen from a vehicle that moves."""
+    estimator, rng = TargetEstimator(traits), np.random.default_rng(seed)
+    for n in range(round(seconds / PERIOD_S) + 1):
+        now = n * PERIOD_S
+        x, y = path(now)
+        ex, ey = eye(now)
+        camera = camera_at(ex, ey, yaw=math.atan2(y - ey, x - ex))
+        foot, at_ns = np.array([x, y, 0.0]), nanoseconds(now)
+        view = view_of(camera, foot, rng=rng)
+        if n == 0:
+            estimator.start(view, camera, at_ns, ground=ground)
+        else:
+            assert estimator.update(view, camera, at_ns)
+        if at is not None:
+            at.append(estimator.at(at_ns))
+    return estimator
+
+
+def off(state: TargetState, path: Path, seconds: float) -> float:
+    return float(np.hypot(*(state.foot[:2] - np.array(path(seconds)))))
+
+
+@pytest.mark.parametrize(
+    ("traits", "ground"),
+    [(CASE_OF_SIZE, False), (CASE_OF_GROUND, True), (PERSON, True)],
+    ids=["size", "ground", "both"],
+)
+@pytest.mark.parametrize("path", [walk(5.0, -2.0, 0.0, 0.8), walk(6.0, 1.0, -0.5, -0.3)], ids=["across", "nearer"])
+def test_place_and_velocity_become_true(traits: Traits, ground: bool, path: Path) -> None:
+    found = watched(traits, path, ground=ground).at(nanoseconds(6.0))
+    assert off(found, path, 6.0) < 0.5
+    velocity = np.subtract(path(1.0), path(0.0))
+    assert found.velocity == pytest.approx(velocity, abs=0.35)
+    assert found.range_deviation_m < 0.5
+    assert found.height_m == pytest.approx(1.72, rel=0.12)
+    assert found.middle == pytest.approx(np.add(found.foot, [0.0, 0.0, found.height_m / 2]))
+
+
+def test_what_nothing_is_known_of_is_taken_to_be_at_the_nominal_distance() -> None:
+    camera = camera_at()
+    for nominal_m in (2.0, 4.0, 7.0):
+        estimator = TargetEstimator(nominal_m=nominal_m)
+        estimator.start(view_of(camera, np.array([6.0, 0.0, 0.0])), camera, 0, ground=False)
+        found = estimator.at(0)
+        assert found.range_m == pytest.approx(nominal_m)
+        assert found.range_deviation_m > 0.3 * nominal_m
+
+
+def test_the_vehicles_own_motion_tells_the_range_of_what_nothing_is_known_of() -> None:
+    still, path = replace(UNKNOWN, intensity_m2_s3=0.02), walk(6.5, 0.0)
+    for seed in range(3):
+        standing = watched(still, path, seconds=7.0, seed=seed).at(nanoseconds(7.0))
+        moving = watched(still, path, eye=lambda t: (0.4 * t, 0.2 * t), seconds=7.0, seed=seed).at(nanoseconds(7.0))
+        assert moving.range_deviation_m < 0.7 * standing.range_deviation_m < 0.7 * 2.0
+        assert off(moving, path, 7.0) < 0.7 * off(standing, path, 7.0)
+
+
+@pytest.mark.parametrize(
+    ("traits", "ground"),
+    [(CASE_OF_SIZE, False), (CASE_OF_GROUND, True), (PERSON, True)],
+    ids=["size", "ground", "both"],
+)
+def test_the_deviation_is_honest(traits: Traits, ground: bool) -> None:
+    path, within, total = walk(4.0, -2.0, 0.1, 0.7), 0, 0
+    for seed in range(6):
+        states: list[TargetState] = []
+        watched(traits, path, seconds=4.0, ground=ground, seed=seed, at=states)
+        for n, each in list(enumerate(states))[5:]:
+            total += 1
+            within += off(each, path, n * PERIOD_S) < 3.0 * max(each.place_m, 0.05)
+    assert within / total > 0.9
+
+
+def test_a_thing_that_is_larger_than_its_class_is_not_far_off_with_the_ground() -> None:
+    tall = replace(PERSON, height_m=1.5)
+    found = watched(tall, walk(5.0, 0.0), ground=True).at(nanoseconds(6.0))
+    assert found.range_m == pytest.approx(5.0 - 0.12, abs=0.7)
+
+
+def test_it_is_less_and_less_certain_of_what_it_does_not_see() -> None:
+    estimator = watched(PERSON, walk(5.0, 0.0, 0.0, 0.5), ground=True, seconds=3.0)
+    states = [estimator.at(nanoseconds(3.0 + later)) for later in (0.0, 1.0, 2.0, 5.0)]
+    assert [one.place_m for one in states] == sorted(one.place_m for one in states)
+    assert states[-1].place_m > 3 * states[0].place_m
+    # It is not moved on for ever.
+    way = states[3].foot[:2] - states[0].foot[:2]
+    assert float(np.hypot(*way)) == pytest.approx(3.0 * float(np.hypot(*states[0].velocity)), rel=0.01)
+
+
+def test_a_box_in_another_direction_is_refused() -> None:
+    estimator = watched(PERSON, walk(5.0, 0.0), ground=True, seconds=2.0)
+    camera, before = camera_at(), estimator.at(nanoseconds(2.1))
+    elsewhere = view_of(camera, np.array([5.0, 2.5, 0.0]))
+    assert not estimator.update(elsewhere, camera, nanoseconds(2.1))
+    assert estimator.refused == 1
+    assert estimator.at(nanoseconds(2.1)).foot == pytest.approx(before.foot)
+    assert estimator.seen_ns == nanoseconds(2.0)
+    fit, _ = estimator.distance(elsewhere, camera, nanoseconds(2.1))
+    own, _ = estimator.distance(view_of(camera, np.array([5.0, 0.0, 0.0])), camera, nanoseconds(2.1))
+    assert own < 3.0 < 20.0 < fit
+    assert estimator.update(view_of(camera, np.array([5.0, 0.0, 0.0])), camera, nanoseconds(2.2))
+    assert estimator.refused == 0
+
+
+@pytest.mark.parametrize("hidden", ["foot", "head"])
+def test_an_edge_that_something_hides_is_left_out(hidden: str) -> None:
+    estimator = watched(PERSON, walk(5.0, 0.0), ground=True, seconds=3.0)
+    camera = camera_at()
+    whole = view_of(camera, np.array([5.0, 0.0, 0.0]))
+    assert whole.top is not None
+    assert whole.bottom is not None
+    middle = (whole.top + whole.bottom) / 2
+    half = replace(whole, bottom=middle) if hidden == "foot" else replace(whole, top=middle)
+    for n in range(1, 16):
+        assert estimator.update(half, camera, nanoseconds(3.0 + n * PERIOD_S))
+    found = estimator.at(nanoseconds(4.0))
+    assert found.range_m == pytest.approx(5.0 - 0.12, abs=0.5)
+    assert found.height_m == pytest.approx(1.72, rel=0.1)
+
+
+def test_a_bound_moves_only_what_is_beyond_it() -> None:
+    camera = camera_at()
+    foot = np.array([4.0, 0.0, 0.0])
+    for below, nearer in ((-0.28, False), (-0.37, True)):
+        estimator = watched(PERSON, walk(4.0, 0.0), ground=True, seconds=0.2)
+        before = estimator.at(nanoseconds(0.3)).range_m
+        cut = replace(view_of(camera, foot), top=None, bottom=None, below=below)
+        assert estimator.update(cut, camera, nanoseconds(0.3))
+        after = estimator.at(nanoseconds(0.3)).range_m
+        assert (after < before - 0.02) is nearer
+        assert after <= before + 0.02
+
+
+@pytest.mark.parametrize(("late_s", "used"), [(0.1, True), (0.3, True), (0.45, True), (0.55, False), (3.0, False)])
+def test_a_box_that_comes_late_is_used_for_half_a_second(late_s: float, used: bool) -> None:
+    path = walk(5.0, -1.0, 0.0, 1.0)
+    estimator, camera = watched(CASE_OF_SIZE, path, seconds=2.0), camera_at()
+    before = estimator.at(nanoseconds(2.0))
+    late = view_of(camera, np.array([*path(2.0 - late_s), 0.0]))
+    assert estimator.update(late, camera, nanoseconds(2.0 - late_s)) is used
+    after = estimator.at(nanoseconds(2.0))
+    assert (after.place_m < before.place_m) is used
+    assert off(after, path, 2.0) < off(before, path, 2.0) + 0.1
+    assert estimator.seen_ns == nanoseconds(2.0), "a newer box was seen"
+
+
+def test_a_thing_that_turns_is_caught_up_with() -> None:
+    def path(t: float) -> tuple[float, float]:
+        return (5.0, -1.5 + 1.2 * t) if t < 3.0 else (5.0 - 1.2 * (t - 3.0), 2.1)
+
+    found = watched(PERSON, path, ground=True, seconds=5.0).at(nanoseconds(5.0))
+    assert off(found, path, 5.0) < 0.5
+    assert found.velocity == pytest.approx([-1.2, 0.0], abs=0.5)
+
+
+def test_without_the_vehicles_velocity_it_expects_harder_turns() -> None:
+    camera, foot = camera_at(), np.array([5.0, 0.0, 0.0])
+    deviations = []
+    for relative in (False, True):
+        estimator = TargetEstimator(PERSON, relative=relative)
+        estimator.start(view_of(camera, foot), camera, 0, ground=True)
+        deviations.append(estimator.at(nanoseconds(1.0)).place_m)
+    assert deviations[1] > 1.04 * deviations[0]
+
+
+def cut_off(**edges: float | None) -> tuple[BoxView, Camera]:
+    camera = camera_at()
+    return replace(view_of(camera, np.array([4.0, 0.0, 0.0])), **edges), camera  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("traits", [PERSON, UNKNOWN, CASE_OF_SIZE], ids=["person", "unknown", "size"])
+@pytest.mark.parametrize("ground", [True, False])
+@pytest.mark.parametrize(
+    "edges",
+    [{"bottom": None}, {"top": None}, {"bottom": None, "top": None}, {"bottom": 0.01}, {"top": -0.01}, {"top": 0.0}],
+    ids=["no foot", "no head", "neither", "level foot", "head below", "level head"],
+)
+def test_it_starts_with_whatever_is_seen(traits: Traits, ground: bool, edges: dict[str, float | None]) -> None:
+    view, camera = cut_off(**edges)
+    estimator = TargetEstimator(traits)
+    estimator.start(view, camera, 0, ground=ground)
+    found = estimator.at(0)
+    assert 0.3 <= found.range_m < 100.0
+    assert found.range_deviation_m > 0.0
+    assert found.height_m > 0.0
+    assert np.isfinite([*found.foot, *found.velocity, found.place_m]).all()
+    assert math.atan2(found.foot[1], found.foot[0]) == pytest.approx(0.0, abs=0.02)
+    for n in range(1, 5):
+        assert estimator.update(view, camera, nanoseconds(n * PERIOD_S))
+    assert np.isfinite(estimator.at(nanoseconds(1.0)).foot).all()
+
+
+def test_the_head_and_the_ground_tell_the_range_of_a_person_whose_feet_are_not_seen() -> None:
+    camera = camera_at()
+    estimator = TargetEstimator(PERSON)
+    view = replace(view_of(camera, np.array([3.0, 0.0, 0.0])), bottom=None, below=-0.2)
+    estimator.start(view, camera, 0, ground=True)
+    found = estimator.at(0)
+    assert found.range_m == pytest.approx(2.88, rel=0.15)
+    assert found.range_deviation_m < 1.5, "without, it is 2 m"
+
+
+def test_a_filter_that_was_not_started_says_so() -> None:
+    estimator, camera = TargetEstimator(), camera_at()
+    with pytest.raises(UsageError, match="never seen"):
+        estimator.at(0)
+    with pytest.raises(UsageError, match="never seen"):
+        estimator.update(view_of(camera, np.array([4.0, 0.0, 0.0])), camera, 0)
+
+
+@pytest.mark.parametrize(
+    ("given", "why"),
+    [
+        ({"height_m": 0.0}, r"height_m is 0\.0 and must be from 0\.01 to 100"),
+        ({"height_m": -1.7}, "height_m is -1.7"),
+        ({"height_m": 101.0}, "height_m is 101"),
+        ({"height_m": math.nan}, "height_m is nan"),
+        ({"height_m": math.inf}, "height_m is inf"),
+        ({"height_m": "1.7"}, "height_m is '1.7'"),
+        ({"height_share": -0.1}, r"height_share is -0\.1 and must be a finite number, 0 or more"),
+        ({"height_share": math.nan}, "height_share is nan"),
+        ({"radius_m": math.inf}, "radius_m is inf"),
+        ({"radius_m": None}, "radius_m is None"),
+        ({"intensity_m2_s3": -1.0}, "intensity_m2_s3 is -1"),
+    ],
+)
+def test_traits_that_make_no_sense_are_refused(given: dict[str, object], why: str) -> None:
+    with pytest.raises(UsageError, match=why):
+        Traits(**given)  # type: ignore[arg-type]
+
+
+def test_known_kinds_are_sensible() -> None:
+    assert {"person", "car"} <= set(TRAITS)
+    assert all(each.radius_m < 3.0 for each in TRAITS.values())
+    assert UNKNOWN.height_m is None

@@ -1,0 +1,382 @@
+"""One target in drawn pictures: by box, by class, hidden and back, among look-alikes, with a tracker that drifts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from benchmarks.tracking_scenes import texture
+from skyloop.clock import nanoseconds
+from skyloop.control.target_estimate import Traits
+from skyloop.control.target_finder import Sighting, TargetFinder
+from skyloop.control.target_view import Camera
+from skyloop.errors import UsageError
+from skyloop.vision.detection import Detection
+from skyloop.vision.tracking import Box, Image, TrackResult, overlap
+from tests.control.target_world import PERIOD_S, SIZE, Path, box_of, camera_at, walk
+
+WIDTH, HEIGHT = SIZE
+BLUE, RED = (180, 90, 40), (40, 60, 190)
+
+
+class Walker:
+    """A textured, upright thing on a way."""
+
+    def __init__(self, path: Path, colour: tuple[int, int, int], seed: int) -> None:
+        self.path = path
+        self.cloth = texture(np.random.default_rng(seed), 40, 120, colour)
+
+    def box(self, camera: Camera, at_s: float) -> Box:
+        box = box_of(camera, np.array([*self.path(at_s), 0.0]))
+        assert box is not None, "the test's thing is out of view"
+        return box
+
+    def draw(self, image: Image, box: Box) -> None:
+        x, y, width, height = (round(part) for part in box)
+        rows = np.arange(height) * len(self.cloth) // height
+        columns = np.arange(width) * self.cloth.shape[1] // width
+        part = image[y : y + height, x : x + width]
+        part[:] = self.cloth[rows][:, columns][: len(part), : part.shape[1]]
+
+
+class Film:
+    """Pictures of walkers, what a detector finds in them, and a finder that is given both.
+
+    Of two that overlap the detector finds the nearer one.
+
+    Attributes:
+        sightings: With the true box of the first walker, of each picture.
+    """
+
+    def __init__(self, finder: TargetFinder, *walkers: Walker, detects: bool = True) -> None:
+        self.finder, self.walkers, self.detects = finder, walkers, detects
+        self.steps = -1
+        self.sightings: list[tuple[Sighting, Box]] = []
+        self._background = texture(np.random.default_rng(7), WIDTH, HEIGHT)
+
+    @property
+    def at_ns(self) -> int:
+        return nanoseconds(1.0 + self.steps * PERIOD_S)
+
+    @property
+    def time_s(self) -> float:
+        return self.steps * PERIOD_S
+
+    def picture(self, hidden: Sequence[int] = ()) -> tuple[Image, list[Detection]]:
+        camera, image = camera_at(), self._background.copy()
+        boxes = [(n, each.box(camera, self.time_s)) for n, each in enumerate(self.walkers) if n not in hidden]
+        boxes.sort(key=lambda one: one[1][3])  # the farthest first
+        for n, box in boxes:
+            self.walkers[n].draw(image, box)
+        shown = [
+            box for k, (_, box) in enumerate(boxes) if all(overlap(box, nearer) < 0.2 for _, nearer in boxes[k + 1 :])
+        ]
+        return image, [Detection(box, 0.9, 0, "person") for box in shown]
+
+    def run(self, seconds: float, hidden: Sequence[int] = ()) -> None:
+        for _ in range(round(seconds / PERIOD_S)):
+            self.steps += 1
+            image, detections = self.picture(hidden)
+            found = self.finder.see(
+                image, camera_at(), self.at_ns, ground=True, detections=detections if self.detects else None
+            )
+            self.sightings.append((found, self.walkers[0].box(camera_at(), self.time_s)))
+
+    def agreement(self, last: int = 10) -> float:
+        """The worst overlap with the true box in the last pictures."""
+        return min(0.0 if one.box is None else overlap(one.box, truth) for one, truth in self.sightings[-last:])
+
+    def is_kept(self, n: int = 0) -> bool:
+        """Whether the finder's target is where a walker is."""
+        assert self.finder.estimator is not None
+        foot = self.finder.estimator.at(self.at_ns).foot
+        return math.dist(foot[:2], self.walkers[n].path(self.time_s)) < 0.6
+
+
+def start_box(walker: Walker) -> Box:
+    return walker.box(camera_at(), 0.0)
+
+
+def test_a_box_is_enough() -> None:
+    walker = Walker(walk(4.0, -1.0, 0.0, 0.8), BLUE, 1)
+    film = Film(TargetFinder(box=start_box(walker)), walker, detects=False)
+    film.run(2.0)
+    assert film.agreement(28) > 0.6
+    assert film.is_kept()
+    assert film.finder.target is None
+    assert film.finder.others(film.at_ns) == []
+    assert film.finder.class_name is None
+    first = film.sightings[0][0]
+    assert first.box == start_box(walker)
+    assert first.confidence == 1.0
+    assert all(0.0 < (one.confidence or 0.0) <= 1.0 for one, _ in film.sightings)
+
+
+def test_a_box_on_a_detection_makes_its_thing_the_target_at_once() -> None:
+    walker, other = Walker(walk(4.0, -0.8, 0.0, 0.6), BLUE, 1), Walker(walk(4.5, 1.4), RED, 2)
+    x, y, width, height = start_box(walker)
+    film = Film(TargetFinder(box=(x - 5, y - 4, width + 8, height + 6)), walker, other)
+    film.run(1 / 15)
+    assert film.finder.class_name == "person"
+    film.run(1.6)
+    assert film.finder.target is not None
+    assert film.agreement(20) == pytest.approx(1.0), "the box is the detection's"
+    assert len(film.finder.detections) == 2
+    assert film.is_kept()
+    (beside,) = film.finder.others(film.at_ns)
+    assert beside.foot[:2] == pytest.approx([4.5, 1.4], abs=0.4)
+    assert film.finder.others(film.at_ns + nanoseconds(1.5)) == []
+
+
+def test_a_box_is_enough_until_the_detector_agrees() -> None:
+    walker = Walker(walk(4.0, -0.8, 0.0, 0.6), BLUE, 1)
+    film = Film(TargetFinder(box=start_box(walker)), walker, detects=False)
+    film.run(0.5)
+    assert film.finder.target is None
+    film.detects = True
+    film.run(2 / 15)
+    assert film.finder.target is None, "a detection or two may be a chance"
+    film.run(0.3)
+    assert film.finder.target is not None
+    assert film.agreement(2) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("class_name", [None, "person"])
+@pytest.mark.parametrize("detects_s", [0.0, 0.5])
+def test_traits_that_are_given_go_before_those_of_the_class(class_name: str | None, detects_s: float) -> None:
+    walker = Walker(walk(4.0, -0.8, 0.0, 0.4), BLUE, 1)
+    small = Traits(height_m=0.86, height_share=0.02, on_ground=False)
+    film = Film(TargetFinder(box=start_box(walker), class_name=class_name, traits=small), walker, detects=False)
+    film.run(detects_s)
+    film.detects = True
+    film.run(1.0)
+    assert film.finder.target is not None
+    assert film.finder.target.estimator.traits is small
+    assert film.finder.estimator is film.finder.target.estimator
+    assert film.finder.estimator.at(film.at_ns).range_m == pytest.approx(2.0, abs=0.4), "half as high is half as far"
+    film.run(2.5, hidden=[0])
+    film.run(0.7)
+    assert film.finder.target is not None
+    assert film.finder.target.estimator.traits is small, "also after it was recognised"
+
+
+def test_of_a_class_the_largest_is_taken_once_it_is_believed() -> None:
+    near, far = Walker(walk(3.5, 0.8), BLUE, 1), Walker(walk(5.0, -1.0), RED, 2)
+    film = Film(TargetFinder(class_name="person"), near, far)
+    film.run(2 / 15)
+    assert film.finder.target is None
+    assert film.sightings[-1][0] == Sighting(None, None)
+    film.run(1.0)
+    assert film.agreement() == pytest.approx(1.0)
+    assert film.is_kept()
+    assert film.sightings[-1][0].confidence is not None
+
+
+def test_what_is_too_small_to_be_tracked_is_followed_by_its_detections() -> None:
+    finder, image = TargetFinder(class_name="person"), texture(np.random.default_rng(7), WIDTH, HEIGHT)
+    small = Detection((150.0, 115.0, 4.0, 12.0), 0.9, 0, "person")
+    for n in range(6):
+        found = finder.see(image, camera_at(), nanoseconds(1.0 + n * PERIOD_S), ground=False, detections=[small])
+    assert found == Sighting(small.box, 0.9)
+    nothing = finder.see(image, camera_at(), nanoseconds(1.5), ground=False, detections=[])
+    assert nothing == Sighting(None, None)
+
+
+def test_a_detection_that_the_tracker_does_not_agree_with_is_not_taken() -> None:
+    walker, other = Walker(walk(4.0, 0.0), BLUE, 1), Walker(walk(4.5, 1.6), RED, 2)
+    film = Film(TargetFinder(box=start_box(walker)), walker, other, detects=False)
+    film.run(0.3)
+    elsewhere = Detection(other.box(camera_at(), 0.0), 0.9, 0, "person")
+    for _ in range(6):
+        film.steps += 1
+        image, _ = film.picture()
+        found = film.finder.see(image, camera_at(), film.at_ns, ground=True, detections=[elsewhere])
+    assert film.finder.target is None
+    assert found.box is not None
+    assert overlap(found.box, start_box(walker)) > 0.7
+
+
+def test_nothing_of_another_class_is_taken() -> None:
+    film = Film(TargetFinder(class_name="dog"), Walker(walk(3.5, 0.8), BLUE, 1))
+    film.run(1.0)
+    assert film.finder.estimator is None
+    assert all(one.box is None for one, _ in film.sightings)
+
+
+def test_what_crosses_the_target_is_not_taken_for_it() -> None:
+    for colour in (BLUE, RED):
+        walker, other = Walker(walk(4.5, -0.9, 0.0, 0.6), BLUE, 1), Walker(walk(3.6, 0.9, 0.0, -0.6), colour, 1)
+        film = Film(TargetFinder(box=start_box(walker)), walker, other)
+        film.run(3.0)
+        assert film.is_kept()
+        assert film.agreement() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("detects", [True, False], ids=["detector", "tracker"])
+def test_what_was_hidden_for_three_seconds_is_recognised(detects: bool) -> None:
+    walker = Walker(walk(4.0, -1.0, 0.0, 0.4), BLUE, 1)
+    film = Film(TargetFinder(box=start_box(walker), class_name="person"), walker, detects=detects)
+    film.run(1.5)
+    film.run(3.0, hidden=[0])
+    assert all(one.box is None for one, _ in film.sightings[-40:])
+    film.run(1.6)
+    assert film.is_kept()
+    assert film.agreement(5) > 0.6
+
+
+def test_what_has_other_colours_is_not_recognised() -> None:
+    walker = Walker(walk(4.0, 0.0), BLUE, 1)
+    film = Film(TargetFinder(box=start_box(walker)), walker, Walker(walk(4.2, 0.4), RED, 2))
+    film.run(1.5, hidden=[1])
+    film.run(2.0, hidden=[0, 1])
+    film.run(1.5, hidden=[0])
+    assert all(one.box is None for one, _ in film.sightings[-45:])
+    film.run(1.0)
+    assert film.agreement(5) == pytest.approx(1.0)
+
+
+def test_of_two_newcomers_that_look_alike_neither_is_recognised() -> None:
+    walker = Walker(walk(4.0, 0.0), BLUE, 1)
+    film = Film(TargetFinder(box=start_box(walker)), walker, Walker(walk(4.2, 0.8), BLUE, 1))
+    film.run(1.5, hidden=[1])
+    film.run(2.5, hidden=[0, 1])
+    film.run(1.5)
+    assert all(one.box is None for one, _ in film.sightings[-50:])
+
+
+def jumping(t: float) -> tuple[float, float]:
+    """Stands, and later somewhere else, two metres off."""
+    return 4.0, -1.0 if t < 2.5 else 1.1
+
+
+def test_the_tracker_recognises_what_may_have_gone_there() -> None:
+    walker = Walker(jumping, BLUE, 1)
+    slow = Traits(height_m=1.72, intensity_m2_s3=0.01)
+    film = Film(TargetFinder(box=start_box(walker), traits=slow), walker, detects=False)
+    film.run(2.0)
+    film.run(2.5, hidden=[0])
+    film.run(2.0)
+    assert film.agreement(5) > 0.6
+    assert film.is_kept()
+
+
+def test_what_comes_where_the_target_can_not_be_is_not_recognised() -> None:
+    walker = Walker(walk(4.0, 1.6), BLUE, 1)
+    slow = Traits(height_m=1.72, intensity_m2_s3=0.01)
+    finder = TargetFinder(box=start_box(walker), class_name="person", traits=slow)
+    film = Film(finder, walker, Walker(walk(4.0, -1.8), BLUE, 1))
+    film.run(2.0, hidden=[1])
+    film.run(1.2, hidden=[0, 1])
+    film.run(0.8, hidden=[0])
+    assert all(one.box is None for one, _ in film.sightings[-24:])
+
+
+def test_detections_may_come_later_than_their_picture() -> None:
+    walker = Walker(walk(4.0, -0.8, 0.0, 0.6), BLUE, 1)
+    finder = TargetFinder(class_name="person")
+    film = Film(finder, walker, detects=False)
+    late: list[tuple[int, list[Detection]]] = []
+    for _ in range(24):
+        film.run(PERIOD_S)
+        late.append((film.at_ns, film.picture()[1]))
+        if len(late) > 3:
+            at_ns, detections = late[-4]
+            finder.detected(detections, at_ns, ground=True)
+    assert finder.target is not None
+    assert film.is_kept()
+    assert film.agreement(10) > 0.6, "between the detections it is tracked"
+
+
+def test_detections_of_an_unknown_picture_are_ignored() -> None:
+    walker = Walker(walk(4.0, 0.0), BLUE, 1)
+    finder = TargetFinder(class_name="person")
+    film = Film(finder, walker, detects=False)
+    film.run(1.5)
+    _, detections = film.picture()
+    for at_ns in (0, film.at_ns + 1, film.at_ns - nanoseconds(1.2)):
+        finder.detected(detections, at_ns, ground=True)
+    assert finder.detections == ()
+
+
+class Drifting:
+    """Stands for the tracker: returns a box that it is told, and counts what it is asked for."""
+
+    def __init__(self) -> None:
+        self.box: Box | None = None
+        self.refused, self.resumed = 0, 0
+
+    def update(self, image: Image) -> TrackResult:
+        return TrackResult(self.box, 0.8, 0.9)
+
+    def shift(self, right: float, down: float) -> None:
+        pass
+
+    def refuse(self) -> None:
+        self.refused += 1
+
+    def resume(self, image: Image, box: Box) -> None:
+        self.resumed += 1
+
+
+def test_a_tracker_that_drifted_away_is_refused() -> None:
+    walker = Walker(walk(4.0, 0.0), BLUE, 1)
+    finder, drifting = TargetFinder(box=start_box(walker), traits=Traits(height_m=1.72)), Drifting()
+    film = Film(finder, walker, detects=False)
+    film.run(1.0)
+    finder._tracker = drifting  # type: ignore[assignment]
+    drifting.box = (5.0, 40.0, 20.0, 60.0)
+    film.run(0.8)
+    assert drifting.refused >= 1
+    assert all(one.box is None for one, _ in film.sightings[-12:])
+    assert film.is_kept(), "its estimate is left alone"
+
+
+@pytest.mark.parametrize(("hidden_s", "taken"), [(0.5, False), (1.2, True)])
+def test_what_was_hidden_may_be_where_it_could_have_gone_in_the_meantime(hidden_s: float, taken: bool) -> None:
+    """Nobody expects it there by its motion; but a tracker recognised it."""
+    walker, there = Walker(walk(4.0, -1.9), BLUE, 1), Walker(walk(4.0, 1.9), BLUE, 1)
+    slow = Traits(height_m=1.72, intensity_m2_s3=0.001)
+    finder, drifting = TargetFinder(box=start_box(walker), traits=slow), Drifting()
+    film = Film(finder, walker, there, detects=False)
+    film.run(1.5, hidden=[1])
+    finder._tracker = drifting  # type: ignore[assignment]
+    film.run(hidden_s)
+    drifting.box = there.box(camera_at(), 0.0)
+    film.run(0.3)
+    assert (film.sightings[-1][0].box == drifting.box) is taken
+    assert film.is_kept(1 if taken else 0)
+
+
+def test_the_box_of_another_thing_is_not_the_targets() -> None:
+    walker, other = Walker(walk(4.0, 0.0), BLUE, 1), Walker(walk(4.0, 1.2), RED, 2)
+    finder, drifting = TargetFinder(box=start_box(walker)), Drifting()
+    film = Film(finder, walker, other)
+    film.run(1.0)
+    finder._tracker = drifting  # type: ignore[assignment]
+    drifting.box = other.box(camera_at(), 0.0)
+    film.run(0.2)
+    assert film.agreement(3) == pytest.approx(1.0)
+    assert drifting.resumed == 3, "the tracker is put right by the detection"
+    film.run(0.5, hidden=[0])
+    assert all(one.box is None for one, _ in film.sightings[-7:])
+
+
+def test_a_box_without_a_bearing_is_refused() -> None:
+    finder = TargetFinder(box=(140.0, 100.0, 40.0, 40.0))
+    picture = texture(np.random.default_rng(7), WIDTH, HEIGHT)
+    with pytest.raises(UsageError, match="straight above or below"):
+        finder.see(picture, camera_at(pitch=1.4), 1, ground=True, detections=None)
+
+
+def test_a_box_outside_of_the_picture_is_refused() -> None:
+    finder = TargetFinder(box=(400.0, 100.0, 40.0, 40.0))
+    with pytest.raises(UsageError, match="at least half"):
+        finder.see(texture(np.random.default_rng(7), WIDTH, HEIGHT), camera_at(), 1, ground=True, detections=None)
+
+
+def test_a_target_needs_a_box_or_a_class() -> None:
+    with pytest.raises(UsageError, match="needs a box in the image, or the name of a class"):
+        TargetFinder()
