@@ -2,7 +2,8 @@
 
 Of ``street`` and ``yard``, at places and times of seeds that no training uses, as the camera sees them and spoilt. A
 figure counts if it is at least 14 pixels high, at least half visible and, at the picture's edge, 8 pixels of it are in
-view; that one which does not count is found is neither right nor wrong. Some two minutes on one core.
+view (pixels of a picture 320 wide); that one which does not count is found is neither right nor wrong. Some two minutes
+on one core.
 """
 
 from __future__ import annotations
@@ -34,14 +35,18 @@ _LOW: Final = 0.05  # score from which detections count for the average precisio
 _HEIGHTS: Final = ((8, 14), (14, 24), (24, 48), (48, 96), (96, 1000))
 _SHARES: Final = ((0.9, 1.01), (0.5, 0.9), (0.25, 0.5))
 
-Judge = Callable[[TargetBox], bool]
+_WIDTH: Final = 320  # of the network's input
+
+Judge = Callable[[TargetBox, float], bool]
 
 
-def counts(box: TargetBox) -> bool:
-    """Whether a thing has to be found."""
-    width, height = box.box[2:]
-    in_view = not box.cut or min(width, height) >= LEAST_CUT_PX
-    return height >= LEAST_PX and box.visible >= LEAST_VISIBLE and in_view
+def counts(box: TargetBox, scale: float = 1.0) -> bool:
+    """Whether a thing has to be found; ``scale`` from the picture to one 320 pixels wide."""
+    return scale * box.box[3] >= LEAST_PX and box.visible >= LEAST_VISIBLE and _in_view(box, scale)
+
+
+def _in_view(box: TargetBox, scale: float) -> bool:
+    return not box.cut or scale * min(box.box[2:]) >= LEAST_CUT_PX
 
 
 def held_back(count: int, **how: Any) -> Iterator[Picture]:
@@ -61,7 +66,8 @@ def matches(
         own = [each for each in detections if each.class_name == class_name]
         true = [box for box in picture.boxes if box.class_name == class_name and box.visible >= _SEEN]
         scores = np.array([each.score for each in own], np.float64)
-        judged = np.array([judge(box) for box in true], np.bool_)
+        scale = _WIDTH / picture.image.shape[1]
+        judged = np.array([judge(box, scale) for box in true], np.bool_)
         made.append(match(_corners([each.box for each in own]), scores, _corners([b.box for b in true]), judged))
     return made
 
@@ -136,9 +142,8 @@ def _details(found: Sequence[Sequence[Any]], seen: Sequence[Picture]) -> list[st
 
 
 def _within(low: int, high: int, least: float, most: float) -> Judge:
-    def judge(box: TargetBox) -> bool:
-        in_view = not box.cut or min(box.box[2:]) >= LEAST_CUT_PX
-        return low <= box.box[3] < high and least <= box.visible < most and in_view
+    def judge(box: TargetBox, scale: float) -> bool:
+        return low <= scale * box.box[3] < high and least <= box.visible < most and _in_view(box, scale)
 
     return judge
 

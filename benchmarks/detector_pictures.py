@@ -24,12 +24,17 @@ from skyloop.sim.solids import Solids
 from skyloop.sim.targets import TargetTrack
 from skyloop.sim.world import (
     FIGURE_SIZES_M,
+    BoardTarget,
     Box,
     FacePose,
     FigureTarget,
     FixedYaw,
+    Gate,
     Light,
+    Marker,
+    MarkerPattern,
     Panel,
+    PlatformTarget,
     Room,
     StillPath,
     Target,
@@ -45,7 +50,9 @@ _SHIPPED: Final = ("room", "empty", "gates", "pillars", "platform", "windy")  # 
 _GROUNDS: Final = ("asphalt", "brick", "carpet", "checker", "concrete", "grass", "metal", "parquet", "tiles", "wood")
 _SIDES: Final = ("brick", "books", "checker", "concrete", "fabric", "grass", "metal", "plaster", "tiles", "wood")
 _HUNG: Final = ("door", "window", "poster_chart", "poster_landscape", "poster_pattern")
+_GAP_M: Final = 0.004  # of what hangs on a wall or lies on the floor, so that it is in front of it
 _NEAREST_M: Final = 0.8  # of a figure to the camera
+_NEAR_M, _FAR_M = 12.0, 36.0  # so far away are most, and the others; 36 m make a person 12 pixels high
 _PERSON: Final = np.array([[0.35], [0.35], [0.8]])  # what has to be free around one
 _CAR: Final = np.array([[0.75], [0.75], [0.5]])  # and around either half of a car
 
@@ -124,7 +131,7 @@ def as_jpeg(image: Image, quality: int) -> Image:
 
 
 def _world(rng: Rng) -> World:
-    kind = rng.choice(["street", "yard", "shipped", "made up"], p=[0.3, 0.25, 0.1, 0.35])
+    kind = rng.choice(["street", "yard", "shipped", "made up"], p=[0.26, 0.22, 0.2, 0.32])
     if kind == "made up":
         return _made_up(rng)
     world = load_world(str(rng.choice(_SHIPPED)) if kind == "shipped" else str(kind), int(rng.integers(1 << 30)))
@@ -158,47 +165,103 @@ def _figures(rng: Rng, people: int, cars: int) -> tuple[Target, ...]:
 
 
 def _made_up(rng: Rng) -> World:
-    """Return a room or a ground with boxes of all kinds, trees, doors, windows, crates and figures."""
-    wide, deep, high = (float(side) for side in rng.uniform((10, 8, 3.5), (36, 28, 9)))
+    """Return a room or a ground with boxes of all kinds, trees, gates, markers, crates and figures."""
+    wide, deep, high = (float(side) for side in rng.uniform((10, 8, 3.5), (50, 34, 9)))
     floor, walls, ceiling = (str(rng.choice(_GROUNDS)) for _ in range(3))
     room = Room((wide, deep, high), floor, walls, ceiling, enclosed=bool(rng.random() < 0.4))
+    boxes, panels = _blocks(rng, room)
+    boxes += _trees(rng, room)
+    for number in range(int(rng.integers(0, 7))):
+        side, (x, y) = float(rng.uniform(0.4, 1.1)), _place(rng, room)
+        boxes.append(Box(f"crate {number}", (x, y, side / 2), (side, side, side), float(rng.uniform(0, 1.5)), "crate"))
+    targets = (*_figures(rng, int(rng.integers(0, 7)), int(rng.integers(0, 4))), *_carriers(rng, room))
+    things = tuple(boxes), _gates(rng, room), (*panels, *_posters(rng, room)), _markers(rng, room), targets
+    return World("made up", room, *things, light=Light(0.4, 50.0))
 
-    def place(margin: float = 1.0) -> tuple[float, float]:
-        x, y = rng.uniform(-0.5, 0.5, 2) * (wide - 2 * margin, deep - 2 * margin)
-        return float(x), float(y)
 
+def _place(rng: Rng, room: Room) -> tuple[float, float]:
+    x, y = rng.uniform(-0.5, 0.5, 2) * (room.size_m[0] - 2.0, room.size_m[1] - 2.0)
+    return float(x), float(y)
+
+
+def _blocks(rng: Rng, room: Room) -> tuple[list[Box], list[Panel]]:
+    """Return boxes of any surface or colour, and what hangs on the large ones."""
     boxes, panels = [], []
     for number in range(int(rng.integers(2, 12))):
-        size = tuple(float(side) for side in rng.uniform((0.15, 0.15, 0.3), (5, 3, 3.3)) * rng.choice([0.3, 0.6, 1.0]))
-        x, y = place()
-        plain = rng.random() < 0.3
-        box = Box(
-            f"block {number}",
-            (x, y, size[2] / 2),
-            (size[0], size[1], size[2]),
-            float(rng.uniform(-math.pi, math.pi)),
-            str(rng.choice(_SIDES)),
-            _colour(rng) if plain else None,
+        wide, deep, high = (
+            float(side) for side in rng.uniform((0.15, 0.15, 0.3), (5, 3, 3.3)) * rng.choice([0.3, 0.6, 1.0])
         )
-        boxes.append(box)
-        if size[0] > 1.2 and size[2] > 1.0:
-            out = box.size_m[1] / 2 + 0.004
-            at = (x + out * math.sin(box.yaw_rad), y - out * math.cos(box.yaw_rad), size[2] / 2)
-            pose = FacePose(at, box.yaw_rad - math.pi / 2)
-            sides = min(1.0, 0.6 * size[0]), 0.8 * size[2]
-            panels.append(Panel(f"panel {number}", pose, sides, str(rng.choice(_HUNG))))
+        (x, y), yaw = _place(rng, room), float(rng.uniform(-math.pi, math.pi))
+        colour = _colour(rng) if rng.random() < 0.3 else None
+        boxes.append(Box(f"block {number}", (x, y, high / 2), (wide, deep, high), yaw, str(rng.choice(_SIDES)), colour))
+        if wide > 1.2 and high > 1.0:
+            out = deep / 2 + _GAP_M
+            pose = FacePose((x + out * math.sin(yaw), y - out * math.cos(yaw), high / 2), yaw - math.pi / 2)
+            size = min(1.0, 0.6 * wide), 0.8 * high
+            panels.append(Panel(f"panel {number}", pose, size, str(rng.choice(_HUNG))))
+    return boxes, panels
+
+
+def _trees(rng: Rng, room: Room) -> list[Box]:
+    boxes = []
     for number in range(int(rng.integers(0, 6))):
-        x, y = place()
-        trunk, crown = float(rng.uniform(1.2, 2.4)), float(rng.uniform(1.0, 2.2))
-        yaw = float(rng.uniform(0, 1.5))
+        (x, y), trunk, crown = _place(rng, room), float(rng.uniform(1.2, 2.4)), float(rng.uniform(1.0, 2.2))
         boxes.append(Box(f"trunk {number}", (x, y, trunk / 2), (0.28, 0.28, trunk), 0.0, "wood"))
-        boxes.append(Box(f"crown {number}", (x, y, trunk + 0.4 * crown), (crown, crown, crown), yaw, "grass"))
-    for number in range(int(rng.integers(0, 7))):
-        x, y = place()
-        side = float(rng.uniform(0.4, 1.1))
-        boxes.append(Box(f"crate {number}", (x, y, side / 2), (side, side, side), float(rng.uniform(0, 1.5)), "crate"))
-    targets = _figures(rng, int(rng.integers(2, 7)), int(rng.integers(0, 4)))
-    return World("made up", room, tuple(boxes), panels=tuple(panels), targets=targets, light=Light(0.4, 50.0))
+        yaw, middle = float(rng.uniform(0, 1.5)), trunk + 0.4 * crown
+        boxes.append(Box(f"crown {number}", (x, y, middle), (crown, crown, crown), yaw, "grass"))
+    return boxes
+
+
+def _gates(rng: Rng, room: Room) -> tuple[Gate, ...]:
+    gates = []
+    for number in range(int(rng.integers(0, 3))):
+        low, side = float(rng.uniform(0.4, 1.4)), float(rng.uniform(0.6, 1.2))
+        at = (*_place(rng, room), low + side / 2)
+        gates.append(Gate(f"gate {number}", at, (side, side), float(rng.uniform(-3, 3)), colour=_colour(rng)))
+    return tuple(gates)
+
+
+def _markers(rng: Rng, room: Room) -> tuple[Marker, ...]:
+    """Return markers on the floor."""
+    markers = []
+    for number in range(int(rng.integers(0, 4))):
+        pose = FacePose((*_place(rng, room), _GAP_M), 0.0, math.pi / 2, float(rng.uniform(-3, 3)))
+        markers.append(Marker(f"marker {number}", pose, _pattern(rng)))
+    return tuple(markers)
+
+
+def _posters(rng: Rng, room: Room) -> tuple[Panel, ...]:
+    """Return pictures and windows on the walls in the east and the west."""
+    if not room.enclosed:
+        return ()
+    panels = []
+    for name, side, heading in (("east", 0.5, math.pi), ("west", -0.5, 0.0)):
+        x = side * (room.size_m[0] - 2 * _GAP_M)
+        pose = FacePose((x, _place(rng, room)[1], float(rng.uniform(1.2, 2.2))), heading)
+        size = float(rng.uniform(0.5, 2.0)), float(rng.uniform(0.5, 1.6))
+        panels.append(Panel(name, pose, size, str(rng.choice(_HUNG[1:]))))
+    return tuple(panels)
+
+
+def _carriers(rng: Rng, room: Room) -> list[Target]:
+    """Return what carries a marker: a board, a platform."""
+    targets: list[Target] = []
+    yaw = FixedYaw(float(rng.uniform(-3, 3)))
+    if rng.random() < 0.4:
+        path = StillPath((*_place(rng, room), float(rng.uniform(0.8, 1.8))))
+        targets.append(BoardTarget("board", _pattern(rng), path, yaw))
+    if rng.random() < 0.4:
+        wide, deep, high = (float(side) for side in rng.uniform((0.6, 0.6, 0.1), (1.6, 1.6, 0.3)))
+        path = StillPath((*_place(rng, room), float(rng.uniform(0.2, 0.6))))
+        targets.append(
+            PlatformTarget("platform", _pattern(rng), path, yaw, (wide, deep, high), str(rng.choice(_SIDES)))
+        )
+    return targets
+
+
+def _pattern(rng: Rng) -> MarkerPattern:
+    side = float(rng.uniform(0.15, 0.5))
+    return MarkerPattern("DICT_4X4_50", int(rng.integers(50)), side, side / 6)
 
 
 def _camera(rng: Rng) -> CameraModel:
@@ -264,7 +327,8 @@ def _states(
             heading = float(rng.uniform(-math.pi, math.pi))
             if seen:
                 nearest = _NEAREST_M + radius
-                away = float(np.exp(rng.uniform(math.log(nearest), math.log(16.0))))
+                near = float(np.exp(rng.uniform(math.log(nearest), math.log(_NEAR_M))))
+                away = near if rng.random() < 0.65 else float(rng.uniform(_NEAR_M, _FAR_M))
                 bearing = yaw + float(rng.uniform(-0.65, 0.65))
                 x, y = float(camera[0] + away * math.cos(bearing)), float(camera[1] + away * math.sin(bearing))
             else:

@@ -86,6 +86,14 @@ def precision(matches: Sequence[Matches], score: float) -> float:
     return right / (right + wrong) if right + wrong else float("nan")
 
 
+def balanced_score(matches: Sequence[Matches]) -> float:
+    """Return the score, 0.05 to 0.9, from which detections have the best harmonic mean of recall and precision."""
+    tried = np.arange(0.05, 0.9, 0.01)
+    pairs = [(recall(matches, score), precision(matches, score)) for score in tried]
+    means = [2 * found * right / (found + right) if found + right > 0 else 0.0 for found, right in pairs]
+    return float(tried[int(np.argmax(means))])
+
+
 def false_alarms(matches: Sequence[Matches], score: float) -> int:
     """Return how many detections with at least a score found nothing."""
     return sum(int((~each.right & ~each.ignored & (each.scores >= score)).sum()) for each in matches)

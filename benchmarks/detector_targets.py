@@ -15,7 +15,7 @@ STRIDES: Final = (8, 16, 32)
 #: Of each stride: the longer sides of the things that are its own [px].
 SIZES: Final = ((0.0, 72.0), (40.0, 160.0), (104.0, np.inf))
 NOTHING, IGNORED = -1, -2
-_REACH: Final = 1.5  # strides from a thing's middle
+_REACH: Final = 1.0  # strides from a thing's middle
 _LEAST_REACH: Final = 0.75  # for a thing smaller than a stride
 
 Floats = NDArray[np.float32]

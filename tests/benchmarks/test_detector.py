@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks.detector_pictures import as_jpeg, coarse, noisy, relit, smeared, spoil, training_pictures
-from benchmarks.detector_scores import average_precision, false_alarms, match, precision, recall
+from benchmarks.detector_scores import average_precision, balanced_score, false_alarms, match, precision, recall
 from benchmarks.detector_targets import IGNORED, NOTHING, assign, places
 from skyloop.sim.labels import CLASS_NAMES
 
@@ -30,6 +30,7 @@ def test_each_true_box_is_found_once_and_one_that_does_not_count_is_neither_righ
     assert precision([result], 0.5) == pytest.approx(1 / 3)
     assert precision([result], 0.85) == 1.0
     assert false_alarms([result], 0.7) == 1
+    assert 0.8 < balanced_score([result]) <= 0.9  # below, a second detection is wrong, and no other box is found
 
 
 def test_average_precision_of_known_rankings() -> None:
@@ -64,7 +65,7 @@ def test_places_answer_for_the_things_about_them() -> None:
 
 def test_a_smaller_thing_is_before_a_larger_one_and_what_need_not_be_found_takes_none_of_its_places() -> None:
     grid = places(64, 32)
-    boxes = np.array([[20, 12, 16, 30], [20, 12, 6, 8], [24, 16, 40, 30]], np.float32)
+    boxes = np.array([[22, 14, 30, 30], [20, 12, 6, 8], [24, 16, 40, 30]], np.float32)
     answer, _ = assign(boxes, np.array([0, 2, IGNORED]), grid)
     at = int(np.flatnonzero((grid[0] == (20, 12)).all(axis=1))[0])
     assert answer[at] == 2

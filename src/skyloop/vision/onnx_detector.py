@@ -29,8 +29,8 @@ from skyloop.vision.planar import pixels_of
 from skyloop.vision.tracking import Image
 
 _GREY: Final = 114  # what YOLO's networks were trained with around a letterboxed image
-_MEAN: Final = np.array([0.485, 0.456, 0.406], np.float32)  # ImageNet's, for RF-DETR
-_DEVIATION: Final = np.array([0.229, 0.224, 0.225], np.float32)
+_MEAN: Final = np.array([0.485, 0.456, 0.406], np.float32).reshape(3, 1, 1)  # ImageNet's, for RF-DETR
+_DEVIATION: Final = np.array([0.229, 0.224, 0.225], np.float32).reshape(3, 1, 1)
 _SIDE: Final = 640  # of a network that takes any size and names none
 _MOST_SIDE: Final = 4096
 _MOST: Final = 1000  # surest boxes that are compared with one another
@@ -140,13 +140,14 @@ class OnnxDetector:
         return canvas, np.array([wide / columns, high / rows]), np.array([left, top], np.float64)
 
     def _run(self, fitted: Image) -> dict[str, Any]:
-        if self._type is np.uint8 or self.layout in RAW_BGR:
-            values: Any = fitted if self.layout in RAW_BGR else fitted[:, :, ::-1]
-        else:
-            values = fitted[:, :, ::-1].astype(np.float32) / np.float32(255)
-            if self.layout is Layout.RF_DETR:
-                values = (values - _MEAN) / _DEVIATION
-        tensor = np.ascontiguousarray(values.transpose(2, 0, 1)[None], self._type)
+        values: Any = np.stack(self._cv.split(fitted))  # colours first: several times faster than a transposed copy
+        if self.layout not in RAW_BGR:
+            values = values[::-1]
+            if self._type is not np.uint8:
+                values = np.divide(values, np.float32(255), dtype=np.float32)
+                if self.layout is Layout.RF_DETR:
+                    values = (values - _MEAN) / _DEVIATION
+        tensor = np.ascontiguousarray(values[None], self._type)
         feed: dict[str, Any] = {self._input: tensor}
         for other in self._session.get_inputs():
             if other.name != self._input:  # RT-DETR with its postprocessor: the size that its boxes are in
