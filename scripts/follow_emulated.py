@@ -37,7 +37,7 @@ from skyloop.sim.world_file import load_world
 from skyloop.vision import simulated_detector
 
 CAMERAS: Final = {"ardrone2": FRONT_2, "tello": FRONT}
-STROLLER: Final = Case(partial(walker, speed_m_s=0.7), limit_m_s=1.0)
+STROLLER: Final = Case(partial(walker, speed_m_s=0.7), speed_m_s=1.0)
 _READY_S: Final = 30.0
 _KEPT: Final = 200
 
@@ -119,7 +119,7 @@ def fly(
         log = TruthLog(host)
         judge = Judge(load_world(str(file), seed), case.target, CAMERAS[kind])
         with flown(kind, host, options) as drone, drone.on_feedback(log.note, inline=True):
-            drone.config["limits.speed"] = case.limit_m_s
+            drone.config["limits.speed"] = case.speed_m_s
             flight = JudgedFlight(drone, judge, case, simulated_detector(), state_of=log.near, later=True)
             return flight.outcome(class_name, seconds)
 

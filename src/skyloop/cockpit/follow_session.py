@@ -18,7 +18,8 @@ from skyloop.cockpit.frame_keeper import FrameKeeper
 from skyloop.cockpit.place_flight import UP
 from skyloop.cockpit.target_tracker import Follower, TargetTracker, TrackReport
 from skyloop.cockpit.values import number, vector
-from skyloop.control.chase_law import ChaseSettings, FollowMode
+from skyloop.control.chase_law import FollowMode
+from skyloop.control.chase_settings import ChaseSettings
 from skyloop.control.target_follower import TargetFollower
 from skyloop.errors import AuthorityError, LinkError, RefusedError, SkyloopError, UnknownNameError
 from skyloop.messages import CameraInfo, Hover

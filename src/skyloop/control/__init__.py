@@ -3,7 +3,8 @@
 from skyloop.control.approach import ApproachMarker, OrbitMarker, OrbitPlace
 from skyloop.control.avoid import SeeAndAvoid
 from skyloop.control.behaviour import Behaviour
-from skyloop.control.chase_law import ChaseSettings, FollowMode
+from skyloop.control.chase_law import FollowMode
+from skyloop.control.chase_settings import ChaseSettings
 from skyloop.control.controller import Controller, RunSummary
 from skyloop.control.flow_hover import FlowHover
 from skyloop.control.follow import FollowMarker

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -19,19 +19,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import nanoseconds, seconds
+from skyloop.control.chase_settings import ChaseSettings
 from skyloop.control.dead_reckoning import DRAG_PER_S
 from skyloop.control.filters import LowPass
 from skyloop.control.limiting import GRAVITY_M_S2, SetpointLimiter, SetpointLimits, clamped, shortened
 from skyloop.control.response import Predicted, ResponseSettings, VelocityResponse
 from skyloop.control.target import Motion
 from skyloop.control.target_estimate import TargetEstimator, TargetState
-from skyloop.errors import UsageError
 from skyloop.messages import Attitude, Feedback, Velocity
 from skyloop.messages.geometry import wrap_angle
 
 Array = NDArray[np.float64]
 
 _SMOOTHING_S = 0.4  # of the target's acceleration
+_SETPOINT_OVER = 1.5  # times the greatest speed: against its drag a vehicle reaches less than it is asked for
 _SETPOINT_AHEAD = 4.0  # times as fast as the vehicle a set-point may change, to make it change
 _COMING_S = 3.0  # a target that comes by sooner is made way for
 _ALONG_M_S = 0.4  # a target that is slower has no direction to be behind or beside of
@@ -59,97 +60,6 @@ class TargetPhase(StrEnum):
 
 
 LOSSES = frozenset({TargetPhase.PREDICTING, TargetPhase.HOVERING, TargetPhase.SEARCHING, TargetPhase.GIVEN_UP})
-
-
-@dataclass(frozen=True, slots=True)
-class ChaseSettings:
-    """Goal, gains and limits of :class:`ChaseLaw`.
-
-    Attributes:
-        distance_m: Horizontal, from the vehicle's centre to the target's.
-        nearest_m: It never flies nearer, and backs off from a target that comes nearer.
-        clear_m: The same for others that the detector sees.
-        bearing_rad: Where to be as seen from the target, counter-clockwise from the direction in which it moves: 0 is
-            ahead of it, π behind, π/2 on its left. None: on whichever side it is.
-        orbit_m_s: Speed round the target, counter-clockwise from above if above 0.
-        leash_m: Farthest horizontal distance from where it began; it stays there, turning. None: no leash. Needs the
-            vehicle's velocity.
-        height_m: Above the ground; None: the height at the start.
-        lowest_m: Above the ground.
-        highest_m: Above the ground.
-        steep_rad: Farthest elevation of the target's middle, up or down, at which the height is kept.
-        lead_s: From a command's decision to its taking hold: delays of commands and feedback together.
-        response_s: From a velocity's set-point to that velocity: the target's acceleration is fed forward by as much.
-        range_gain: [1/s]
-        velocity_gain: How hard it takes up a velocity [1/s].
-        yaw_gain: [1/s]
-        height_gain: [1/s]
-        round_gain: How fast to come round to the side [1/s].
-        speed_m_s: Greatest, horizontally. The proxy's ``limits.speed`` holds as well.
-        climb_m_s: Greatest, up and down.
-        turn_rad_s: Greatest.
-        acceleration_m_s2: Of the set-point, horizontally: a harder one tilts the camera off the target.
-        react_s: How late the vehicle answers, at worst: it flies no faster towards the target than it can stop.
-        brake_m_s2: How hard it brakes then.
-        tilt_rad: Greatest, of a vehicle that is flown by attitude.
-        tilt_gain: Acceleration per velocity's error of such a vehicle [1/s].
-        seen_s: Since last seen, up to which the target counts as seen.
-        predict_s: How long it flies on by the target's last motion, ever slower.
-        hover_s: How long it hovers after that, turned to where the target should be.
-        give_up_s: Since last seen, after which it gives up.
-        search_rad_s: Yaw rate of the search.
-
-    Raises:
-        UsageError: A number is out of its range, or the distance is not beyond the nearest one.
-    """
-
-    distance_m: float = 4.0
-    nearest_m: float = 2.0
-    clear_m: float = 1.5
-    bearing_rad: float | None = None
-    orbit_m_s: float = 0.8
-    leash_m: float | None = None
-    height_m: float | None = None
-    lowest_m: float = 0.8
-    highest_m: float = 4.0
-    steep_rad: float = 0.25
-    lead_s: float = 0.12
-    response_s: float = 0.4
-    range_gain: float = 1.0
-    velocity_gain: float = 3.0
-    yaw_gain: float = 2.2
-    height_gain: float = 1.0
-    round_gain: float = 0.8
-    speed_m_s: float = 4.0
-    climb_m_s: float = 0.6
-    turn_rad_s: float = 1.8
-    acceleration_m_s2: float = 3.0
-    react_s: float = 0.5
-    brake_m_s2: float = 1.5
-    tilt_rad: float = 0.33
-    tilt_gain: float = 3.0
-    seen_s: float = 0.4
-    predict_s: float = 2.0
-    hover_s: float = 4.0
-    give_up_s: float = 25.0
-    search_rad_s: float = 0.7
-
-    def __post_init__(self) -> None:
-        free = {"bearing_rad", "orbit_m_s", "leash_m", "height_m"}
-        for name in self.__dataclass_fields__:
-            value = getattr(self, name)
-            if value is None and name in free:
-                continue
-            if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-                raise UsageError(f"{name} is {value!r} and must be a finite number")
-            if value <= 0.0 and name not in {"bearing_rad", "orbit_m_s", "velocity_gain"}:
-                raise UsageError(f"{name} is {value!r} and must be above 0")
-        if self.distance_m <= self.nearest_m:
-            raise UsageError(
-                f"distance_m is {self.distance_m:g} and must be above nearest_m, which is {self.nearest_m:g}"
-            )
-        if self.lowest_m > self.highest_m:
-            raise UsageError(f"lowest_m is {self.lowest_m:g} and must be at most highest_m, {self.highest_m:g}")
 
 
 class _Now(NamedTuple):
@@ -188,7 +98,7 @@ class ChaseLaw:
         self._direction = 1.0
         self._was: tuple[int, Array] | None = None  # the target's velocity, and when
         self._acceleration: LowPass[Array] = LowPass(_SMOOTHING_S)
-        self._response = VelocityResponse(ResponseSettings(delay_s=self.settings.lead_s))
+        self._response = VelocityResponse(_response(self.settings))
         self._limiter: SetpointLimiter | None = None
         self._last_ns: int | None = None
 
@@ -441,12 +351,18 @@ class ChaseLaw:
         """Take over the limits; the first set-point, too, is limited: by the vehicle's own velocity."""
         s = self.settings
         # A set-point leads the velocity by what accelerates the vehicle: it may change faster than that does.
-        limits = SetpointLimits(s.speed_m_s, s.climb_m_s, s.turn_rad_s, _SETPOINT_AHEAD * s.acceleration_m_s2)
+        limits = SetpointLimits(
+            _SETPOINT_OVER * s.speed_m_s, s.climb_m_s, s.turn_rad_s, _SETPOINT_AHEAD * s.acceleration_m_s2
+        )
         if self._limiter is None:
             self._limiter = SetpointLimiter(limits)
             forward, left = own.to_body(own.velocity[:2])
             self._limiter.reset(Velocity(forward=forward, left=left))
         self._limiter.limits = limits
+
+
+def _response(settings: ChaseSettings) -> ResponseSettings:
+    return ResponseSettings(delay_s=settings.lead_s, tilt_rad=settings.lean_rad)
 
 
 def _stoppable(gap_m: float, settings: ChaseSettings) -> float:

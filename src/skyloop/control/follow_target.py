@@ -8,7 +8,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from skyloop.control.behaviour import Behaviour, camera_info
-from skyloop.control.chase_law import LOSSES, ChaseSettings, FollowMode, TargetPhase
+from skyloop.control.chase_law import LOSSES, FollowMode, TargetPhase
+from skyloop.control.chase_settings import ChaseSettings
 from skyloop.control.target_estimate import Traits
 from skyloop.control.target_follower import FollowStatus, TargetFollower
 from skyloop.errors import UsageError
@@ -67,7 +68,7 @@ class FollowTarget(Behaviour):
                 the ground that it stands on.
             traits: All that is known of the target, in place of ``height_m``.
             camera: Whose frames to use; None is the vehicle's first camera.
-            settings: Of the law; None are the defaults.
+            settings: Of the law; None are the defaults. They are brought within the drone's ``limits.*``.
 
         Raises:
             UnknownNameError: There is no such camera.
@@ -77,6 +78,7 @@ class FollowTarget(Behaviour):
         """
         given = {"distance_m": distance_m, "bearing_rad": bearing_rad}
         chosen = replace(settings or ChaseSettings(), **{k: v for k, v in given.items() if v is not None})
+        chosen = chosen.within({parameter.name: parameter.value for parameter in drone.config.parameters()})
         if height_m is not None:
             traits = replace(traits or Traits(), height_m=height_m, height_share=0.05)
         if mode not in list(FollowMode):

@@ -26,6 +26,7 @@ from skyloop.vision.tracking import LEAST_PX, Box, Image, TrackResult, overlap
 _SAME: Final = 0.4  # overlap of two boxes of one thing
 _POINTED_AT: Final = 0.3  # of the user's box with a detection
 _TRACKER_NOISE: Final = 0.06  # of the edges of its boxes, as a share of their height: less sharp than a detector's
+_TAKEN: Final = 0.5  # share of the tracker's box that is within another thing's detection
 _FITS: Final = 12.0  # squared Mahalanobis distance by what was measured, up to which a box can be the target's
 _DOUBT: Final = 6  # images in a row in which the tracker's box is not where the target can be
 _LATELY_S: Final = 1.0  # others are kept clear of for so long after they were seen
@@ -190,7 +191,9 @@ class TargetFinder:
                 self._resume(image, box)
             return Sighting(box, tracked.confidence if agrees else target.detection.score)
         contested = target is not None and target.contested
-        if tracked.box is None or contested or self._is_taken(tracked.box):
+        # Which of two the tracker stayed with while they were one is not known.
+        unsure = target is not None and target.contested_ns > (target.estimator.seen_ns or 0)
+        if tracked.box is None or unsure or self._is_taken(tracked.box):
             return Sighting(None, None, contested)
         return self._by_tracker(tracked, tracked.box, camera, captured_ns, estimator)
 
@@ -235,7 +238,7 @@ class TargetFinder:
             return False
         now = self._frames[-1].captured_ns
         return any(
-            each.seen and each.estimator.seen_ns == now and overlap(each.detection.box, box) >= 0.5
+            each.seen and each.estimator.seen_ns == now and _share_within(box, each.detection.box) >= _TAKEN
             for number, each in self._scene.objects.items()
             if number != self._number
         )
@@ -325,3 +328,10 @@ class TargetFinder:
         scene.kept = {thing.number}
         scene.dormant = set()
         self._doubts = 0
+
+
+def _share_within(box: Box, other: Box) -> float:
+    """Return the share of a box that is within another one."""
+    wide = min(box[0] + box[2], other[0] + other[2]) - max(box[0], other[0])
+    high = min(box[1] + box[3], other[1] + other[3]) - max(box[1], other[1])
+    return max(0.0, wide) * max(0.0, high) / (box[2] * box[3])

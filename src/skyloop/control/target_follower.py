@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.clock import seconds
-from skyloop.control.chase_law import LOSSES, ChaseLaw, ChaseSettings, FollowMode, TargetPhase
+from skyloop.control.chase_law import LOSSES, ChaseLaw, FollowMode, TargetPhase
+from skyloop.control.chase_settings import ChaseSettings
 from skyloop.control.dead_reckoning import TiltVelocity
 from skyloop.control.target import Odometry
 from skyloop.control.target_estimate import TargetEstimator, Traits
