@@ -1,10 +1,10 @@
 """Follows people behind emulated firmware, in real time: ``python scripts/follow_emulated.py [ardrone2] [tello]``.
 
-The worlds and the judgement are those of ``follow_flights.py``; ``--case hidden`` and the others choose one. The
-vehicle is that of ``skyloop sim --firmware``, in this process, which so knows the truth; its proxy is a process of its
-own. So video is encoded, sent, decoded and late as by the real vehicle. A Tello flies 1 m/s at most by the sticks, so
-what it follows walks at 0.7 m/s. The time is that of the clock: what else the machine does disturbs the flight. What
-is touched is not counted.
+A person strolls round a lawn at 1.2 m/s, or at 0.7 m/s before a Tello, which flies 1 m/s at most by the sticks;
+``--case hidden`` and the others are those of ``follow_flights.py``, and so is the judgement. The vehicle is that of
+``skyloop sim --firmware``, in this process, which so knows the truth; its proxy is a process of its own. So video is
+encoded, sent, decoded and late as by the real vehicle. The time is that of the clock: what else the machine does
+disturbs the flight. What is touched is not counted.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from follow_flights import CASES, Case, JudgedFlight, Outcome, walker
+from follow_flights import CASES, Case, JudgedFlight, Outcome, person, rotated, spawn
 from follow_judge import Judge
 
 import skyloop
@@ -37,7 +37,20 @@ from skyloop.sim.world_file import load_world
 from skyloop.vision import simulated_detector
 
 CAMERAS: Final = {"ardrone2": FRONT_2, "tello": FRONT}
-STROLLER: Final = Case(partial(walker, speed_m_s=0.7), speed_m_s=1.0)
+
+
+def stroll(rng: random.Random, speed_m_s: float = 0.7) -> str:
+    """A person who walks round a lawn before the vehicle, while another one passes behind."""
+    room = '[room]\nsize = [34, 30, 10]\nfloor = "grass"\nenclosed = false\n[light]\namplitude = 0.25\nperiod = 40\n'
+    points = rotated([(3.5, -4), (9.5, -4), (9.5, 4), (3.5, 4)], rng)
+    other = person("passer", rng.randrange(1000), [(13, -6), (13, 6), (13.5, 6), (13.5, -6)], 1.0)
+    return room + spawn(0.0, 0.0, 0) + person("walker", rng.randrange(1000), points, speed_m_s) + other
+
+
+STROLLS: Final = {
+    "ardrone2": Case(partial(stroll, speed_m_s=1.2)),
+    "tello": Case(stroll, speed_m_s=1.0),
+}
 _READY_S: Final = 30.0
 _KEPT: Final = 200
 
@@ -127,7 +140,7 @@ def fly(
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("kinds", nargs="*", metavar="vehicle", help=f"{', '.join(CAMERAS)}; default: both")
-    parser.add_argument("--case", choices=CASES, default="walker")
+    parser.add_argument("--case", choices=("stroll", *CASES), default="stroll")
     parser.add_argument("--by", choices=("class", "box"), nargs="*", default=["class", "box"])
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--gust", type=float, default=0.0, help="standard deviation of gusts [m/s]")
@@ -137,7 +150,7 @@ def main() -> None:
     for kind in given.kinds or CAMERAS:
         if kind not in CAMERAS:
             parser.error(f"no such vehicle: {kind}; there are {', '.join(CAMERAS)}")
-        case = STROLLER if kind == "tello" and given.case == "walker" else CASES[given.case]
+        case = STROLLS[kind] if given.case == "stroll" else CASES[given.case]
         name = "car" if case.target == "car" else "person"
         for by in given.by:
             for seed in range(given.seeds):

@@ -237,11 +237,11 @@ def _scenery(name: str) -> str:
     return "".join(one for one in tables if not one.startswith(("[[target]]", "[[spawn]]")))
 
 
-def _spawn(x: float, y: float, yaw_deg: float) -> str:
+def spawn(x: float, y: float, yaw_deg: float) -> str:
     return f"[[spawn]]\nposition = [{x}, {y}, 0]\nyaw_deg = {yaw_deg}\n"
 
 
-def _person(name: str, look: int, points: list[tuple[float, float]], speed: float, radius: float = 1.5) -> str:
+def person(name: str, look: int, points: list[tuple[float, float]], speed: float, radius: float = 1.5) -> str:
     points = _rounded(points, radius)
     path = ", ".join(f"[{x:g}, {y:g}, 0]" for x, y in points)
     return (
@@ -273,7 +273,7 @@ def _turned(points: list[tuple[float, float]], rng: random.Random) -> list[tuple
     return points[first:] + points[:first]
 
 
-def _rotated(points: list[tuple[float, float]], rng: random.Random) -> list[tuple[float, float]]:
+def rotated(points: list[tuple[float, float]], rng: random.Random) -> list[tuple[float, float]]:
     """The same round trip from another point on, perhaps the other way round."""
     turned = _turned(points, rng)
     return turned[::-1] if rng.random() < 0.5 else turned
@@ -281,13 +281,13 @@ def _rotated(points: list[tuple[float, float]], rng: random.Random) -> list[tupl
 
 def walker(rng: random.Random, speed_m_s: float = 1.5) -> str:
     """A person who walks up and down the street, at 1.5 m/s, while others walk along the pavements."""
-    points = _rotated([(-13, 2), (13, 2), (13, -2), (-13, -2)], rng)
+    points = rotated([(-13, 2), (13, 2), (13, -2), (-13, -2)], rng)
     others = [
-        _person(f"passer {n}", rng.randrange(1000), [(x, y), (-x, y), (-x, y + 0.4), (x, y + 0.4)], speed)
+        person(f"passer {n}", rng.randrange(1000), [(x, y), (-x, y), (-x, y + 0.4), (x, y + 0.4)], speed)
         for n, (x, y, speed) in enumerate(((13, 6.1, 1.3), (12, -6.4, 1.0)), 1)
     ]
-    start = _spawn(-17.0, rng.uniform(-0.5, 0.5), 0.0)
-    return _scenery("street") + start + _person("walker", rng.randrange(1000), points, speed_m_s) + "".join(others)
+    start = spawn(-17.0, rng.uniform(-0.5, 0.5), 0.0)
+    return _scenery("street") + start + person("walker", rng.randrange(1000), points, speed_m_s) + "".join(others)
 
 
 def car(rng: random.Random) -> str:
@@ -310,7 +310,7 @@ def car(rng: random.Random) -> str:
     )
     mine = f'[[target]]\nname = "car"\nkind = "figure"\nshape = "car"\nlook = {rng.randrange(1000)}\n'
     mine += f'path = {{ kind = "waypoints", points = [{path}], speed = 3 }}\n'
-    return room + _spawn(rng.uniform(-2, 2), rng.uniform(-0.5, 0.5), rng.choice((90, -90))) + trees + mine + parked
+    return room + spawn(rng.uniform(-2, 2), rng.uniform(-0.5, 0.5), rng.choice((90, -90))) + trees + mine + parked
 
 
 def hidden(rng: random.Random) -> str:
@@ -325,16 +325,16 @@ def hidden(rng: random.Random) -> str:
         for side, y in (("south", -4.0), ("north", 4.0))
     )
     house = '[[box]]\nname = "house"\nstands_at = [0, 10.5]\nsize = [20, 2, 4]\ntexture = "concrete"\n'
-    passer = _person("passer", rng.randrange(1000), [(-9, 8), (9, 8), (9, 8.5), (-9, 8.5)], 1.2)
-    start = _spawn(rng.uniform(-2, 2), rng.uniform(-1, 1), rng.choice((90, -90)))
-    return room + start + walls + house + _person("walker", rng.randrange(1000), points, 1.5) + passer
+    passer = person("passer", rng.randrange(1000), [(-9, 8), (9, 8), (9, 8.5), (-9, 8.5)], 1.2)
+    start = spawn(rng.uniform(-2, 2), rng.uniform(-1, 1), rng.choice((90, -90)))
+    return room + start + walls + house + person("walker", rng.randrange(1000), points, 1.5) + passer
 
 
 def twin(rng: random.Random) -> str:
     """A person whose exact twin comes towards him, past him and back, again and again, on either side."""
     look = rng.randrange(1000)
     room = '[room]\nsize = [30, 24, 10]\nfloor = "concrete"\nenclosed = false\n[light]\namplitude = 0.25\nperiod = 40\n'
-    points = _rotated([(-8.0, -3.0), (8.0, -3.0), (8.0, 3.0), (-8.0, 3.0)], rng)
+    points = rotated([(-8.0, -3.0), (8.0, -3.0), (8.0, 3.0), (-8.0, 3.0)], rng)
     aside = rng.choice((-0.7, 0.7))
     half = [(-8.0, -3 + aside), (8.0, -3 + aside), (8.0, 3 + aside), (-8.0, 3 + aside)]
     first = rng.randrange(4)
@@ -342,8 +342,8 @@ def twin(rng: random.Random) -> str:
     clockwise = points.index((8, -3)) == (points.index((-8, -3)) + 1) % 4
     if clockwise:
         others = others[::-1]
-    start = _spawn(rng.uniform(-2, 2), rng.uniform(-0.5, 0.5), rng.choice((90, -90)))
-    return room + start + _person("walker", look, points, 1.5) + _person("double", look, others, 1.2)
+    start = spawn(rng.uniform(-2, 2), rng.uniform(-0.5, 0.5), rng.choice((90, -90)))
+    return room + start + person("walker", look, points, 1.5) + person("double", look, others, 1.2)
 
 
 SMALL_CAR: Final = Traits(height_m=1.15, height_share=0.05, radius_m=1.0, intensity_m2_s3=3.0)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from skyloop.clock import nanoseconds
-from skyloop.control.dead_reckoning import DRAG_PER_S, TiltVelocity
+from skyloop.control.dead_reckoning import DRAG_PER_S, Tilting, TiltVelocity
 from skyloop.messages import Feedback, FlightState
 
 GRAVITY = 9.80665
@@ -74,3 +74,19 @@ def test_neither_gaps_nor_late_samples_are_integrated_over() -> None:
 
 def test_a_vehicle_on_its_side_is_no_rocket() -> None:
     assert np.hypot(*held(0.5, roll_rad=math.pi / 2)[:2]) < 2.0 * GRAVITY
+
+
+def test_how_fast_it_tilts_is_told_by_the_last_samples() -> None:
+    tilting = Tilting()
+    assert tilting.rate_rad_s == 0.0
+    for n in range(5):
+        tilting.add(tilted(n / 10, pitch_rad=0.1))
+    assert tilting.rate_rad_s == 0.0, "it is held"
+    tilting.add(tilted(0.5, pitch_rad=-0.1))
+    assert tilting.rate_rad_s == pytest.approx(0.2 / 0.15)
+    tilting.add(tilted(0.45, pitch_rad=1.0))
+    tilting.add(tilted(0.55, pitch_rad=None))
+    assert tilting.rate_rad_s == pytest.approx(0.2 / 0.15), "neither late nor unknown samples count"
+    for n in range(6, 12):
+        tilting.add(tilted(n / 10, pitch_rad=-0.1))
+    assert tilting.rate_rad_s == 0.0, "that was long ago"

@@ -22,7 +22,7 @@ from skyloop.control.chase_law import FollowMode
 from skyloop.control.chase_settings import ChaseSettings
 from skyloop.control.target_follower import TargetFollower
 from skyloop.errors import AuthorityError, LinkError, RefusedError, SkyloopError, UnknownNameError
-from skyloop.messages import CameraInfo, Hover
+from skyloop.messages import CameraInfo, Hover, Value
 from skyloop.vision.opencv import opencv
 from skyloop.vision.tracking import Box, checked_box
 
@@ -54,7 +54,7 @@ class FollowerFactory(Protocol):
         box: Box,
         class_name: str | None,
         mode: FollowMode,
-        settings: ChaseSettings | None,
+        settings: ChaseSettings,
     ) -> Follower: ...
 
 
@@ -87,6 +87,7 @@ class FollowSession:
         self._camera = ""
         self._mode = ""
         self._distance_m = 0.0
+        self._limits: dict[str, Value] = {}  # of the drone, when the target was marked
         self._pilot: PilotConnection | None = None  # while it flies, or is about to
         self._flying = False
         self._waits = ""  # why it hovers meanwhile
@@ -138,13 +139,14 @@ class FollowSession:
             MissingExtraError: OpenCV is not installed.
         """
         camera = self._camera_info(command.camera)
-        settings = None if command.distance_m is None else _settings(command.distance_m)
+        settings = _settings(command.distance_m)
         pilot = None
         if command.mode is not None:
             _check_mode(command.mode)
             pilot = held()
             _check_in_air(pilot)
         await asyncio.to_thread(opencv, _WHAT)
+        self._limits = await asyncio.to_thread(lambda: dict(self._drone.config.items()))
         keeper = self._keeper
         if keeper is None or keeper.camera != camera.name:
             raise RefusedError(f"no frames of {camera.name} are kept: choose the camera first (follow_select)")
@@ -153,7 +155,8 @@ class FollowSession:
         self.end("another target was marked")
         self._keeper = None  # it is the tracker's now
         self._camera, self._mode, self._pilot = camera.name, command.mode or "", pilot
-        self._distance_m = (settings or ChaseSettings()).distance_m
+        self._distance_m = settings.distance_m
+        settings = settings.within(self._limits)
         mode = FollowMode(command.mode or FollowMode.FOLLOW)
         make = partial(self._make, camera, box=box, class_name=command.class_name, mode=mode, settings=settings)
         loop = asyncio.get_running_loop()
@@ -181,7 +184,7 @@ class FollowSession:
         if not self._flying:
             _check_in_air(pilot)
         if command.distance_m is not None:
-            tracker.settings = _settings(command.distance_m)
+            tracker.settings = _settings(command.distance_m).within(self._limits)
             self._distance_m = command.distance_m
         self._mode = tracker.mode = command.mode
         self._pilot = pilot  # who sets off with the next report, at the latest when the tracker has caught up
@@ -334,8 +337,8 @@ def _check_mode(mode: str) -> None:
         raise UnknownNameError("mode of following", mode, FollowMode)
 
 
-def _settings(distance_m: float) -> ChaseSettings:
-    return ChaseSettings(distance_m=distance_m)
+def _settings(distance_m: float | None) -> ChaseSettings:
+    return ChaseSettings() if distance_m is None else ChaseSettings(distance_m=distance_m)
 
 
 def _check_in_air(pilot: PilotConnection) -> None:

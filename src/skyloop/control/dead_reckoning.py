@@ -10,6 +10,7 @@ against the wind, as an integral would: the estimate is the tilt, averaged.
 from __future__ import annotations
 
 import math
+from collections import deque
 from typing import Final
 
 import numpy as np
@@ -26,6 +27,7 @@ Array = NDArray[np.float64]
 #: Cremers, "Camera-Based Navigation of a Low-Cost Quadrocopter", IROS 2012), 0.28 for an AR.Drone 1 (``sim/vehicles``).
 DRAG_PER_S: Final = 0.45
 _LONGEST_STEP_S: Final = 0.5  # longer gaps are not integrated over
+_TILTING_S: Final = 0.3
 _STEEPEST: Final = 0.5  # cosine of the tilt, beyond which the vehicle does not keep its height
 
 
@@ -67,3 +69,28 @@ class TiltVelocity:
         c, s = math.cos(yaw), math.sin(yaw)
         x, y = self._velocity.tolist()
         return c * x + s * y, c * y - s * x, 0.0
+
+
+class Tilting:
+    """How fast a vehicle tilted lately, by differences: for one whose feedback has no gyroscope."""
+
+    def __init__(self) -> None:
+        """Initialise: it does not tilt."""
+        self._kept: deque[tuple[int, float, float]] = deque()
+
+    def add(self, feedback: Feedback) -> None:
+        """Note the next sample; one without roll and pitch, or not newer than the last, is ignored."""
+        roll, pitch = feedback.roll_rad, feedback.pitch_rad
+        if roll is None or pitch is None or (self._kept and feedback.captured_ns <= self._kept[-1][0]):
+            return
+        self._kept.append((feedback.captured_ns, roll, pitch))
+        while seconds(feedback.captured_ns - self._kept[0][0]) > _TILTING_S:
+            self._kept.popleft()
+
+    @property
+    def rate_rad_s(self) -> float:
+        """The farthest that roll and pitch are apart within the last 0.3 s, per 0.15 s [rad/s]."""
+        if not self._kept:
+            return 0.0
+        _, rolls, pitches = zip(*self._kept, strict=True)
+        return math.hypot(max(rolls) - min(rolls), max(pitches) - min(pitches)) / (_TILTING_S / 2)

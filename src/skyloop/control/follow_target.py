@@ -78,7 +78,7 @@ class FollowTarget(Behaviour):
         """
         given = {"distance_m": distance_m, "bearing_rad": bearing_rad}
         chosen = replace(settings or ChaseSettings(), **{k: v for k, v in given.items() if v is not None})
-        chosen = chosen.within({parameter.name: parameter.value for parameter in drone.config.parameters()})
+        chosen = chosen.within(dict(drone.config.items()))
         if height_m is not None:
             traits = replace(traits or Traits(), height_m=height_m, height_share=0.05)
         if mode not in list(FollowMode):

@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 
 _HISTORY_S = 3.0
 _LONGEST_STEP_S = 0.5  # longer gaps are not integrated over: the vehicle may have done anything
+_SHORTEST_STEP_S = 0.02  # between samples that came later than they were sent, yaw says little about its rate
 _EXTRAPOLATE_S = 0.3
 
 
@@ -79,7 +80,7 @@ class Odometry:
         if last is not None and feedback.captured_ns <= last.at_ns:
             return
         velocity = rotation_from_euler(0.0, 0.0, feedback.yaw_rad) @ np.asarray(feedback.velocity_m_s)
-        rate = 0.0 if feedback.angular_velocity_rad_s is None else feedback.angular_velocity_rad_s[2]
+        rate = self._yaw_rate(feedback, last)
         position = np.zeros(3)
         if last is not None:
             dt = min(seconds(feedback.captured_ns - last.at_ns), _LONGEST_STEP_S)
@@ -87,6 +88,17 @@ class Odometry:
         self._history.append(Motion(feedback.captured_ns, position, velocity, feedback.yaw_rad, rate))
         while seconds(feedback.captured_ns - self._history[0].at_ns) > _HISTORY_S:
             self._history.popleft()
+
+    def _yaw_rate(self, feedback: Feedback, last: Motion | None) -> float:
+        """Return the yaw rate that is reported, or else that since the last sample: a Tello reports none."""
+        if feedback.angular_velocity_rad_s is not None:
+            return feedback.angular_velocity_rad_s[2]
+        if last is None or feedback.yaw_rad is None:
+            return 0.0
+        dt_s = seconds(feedback.captured_ns - last.at_ns)
+        if dt_s < _SHORTEST_STEP_S:
+            return last.yaw_rate
+        return wrap_angle(feedback.yaw_rad - last.yaw) / dt_s if dt_s <= _LONGEST_STEP_S else 0.0
 
     @property
     def newest(self) -> Motion | None:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from skyloop.clock import seconds
 from skyloop.control.chase_law import LOSSES, ChaseLaw, FollowMode, TargetPhase
 from skyloop.control.chase_settings import ChaseSettings
-from skyloop.control.dead_reckoning import TiltVelocity
+from skyloop.control.dead_reckoning import Tilting, TiltVelocity
 from skyloop.control.target import Odometry
 from skyloop.control.target_estimate import TargetEstimator, Traits
 from skyloop.control.target_finder import Sighting, TargetFinder
@@ -115,6 +115,7 @@ class TargetFollower:
         self._odometry = Odometry()
         self._newest: Feedback | None = None
         self._relative = False
+        self._tilting = Tilting()
         self._reckoning = TiltVelocity()
         self._seen_ns: int | None = None  # capture of the last frame that showed the target, or may have
         self._sighting = Sighting(None, None)
@@ -163,6 +164,7 @@ class TargetFollower:
     def feedback(self, feedback: Feedback) -> None:
         """Update with the vehicle's newest state."""
         self._newest = feedback
+        self._tilting.add(feedback)
         if self._finder is None:
             self._relative = feedback.velocity_m_s is None
         if self._relative:
@@ -190,7 +192,14 @@ class TargetFollower:
         body = motion.position.copy()
         if state.altitude_m is not None:
             body[2] = state.altitude_m + _FEET_M
-        view = Camera.at(self._camera, state, body, frame.intrinsics, (frame.shape[1], frame.shape[0]))
+        rates = (0.0, 0.0)
+        if state.angular_velocity_rad_s is None and state.yaw_rad is not None:
+            # No gyroscope, so attitude comes seldom, and images bear the time of their arrival.
+            rates = motion.yaw_rate, self._tilting.rate_rad_s
+            if frame.captured_ns > state.captured_ns:
+                state = msgspec.structs.replace(state, yaw_rad=motion.yaw)
+        size = (frame.shape[1], frame.shape[0])
+        view = Camera.at(self._camera, state, body, frame.intrinsics, size, rates)
         if view is None:
             return [Text("the vehicle's attitude is not known yet", (8.0, 16.0), _LOST)]
         if self._finder is None:

@@ -27,6 +27,7 @@ _BESIDE: Final = 0.75  # of the image's size from the optical axis: a half is it
 _STEEPEST: Final = 0.15  # cosine of the elevation: what is nearly straight above or below has no azimuth
 _TILT_RAD: Final = 0.008  # error of the attitude at the capture, which moves both edges alike
 _YAW_RAD: Final = 0.006
+_UNTIMELY_S: Final = 0.06  # of images that have the time of their arrival: by encoding, the network and decoding
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,12 +39,16 @@ class Camera:
         rotation: From optical axes to odometry axes, (3, 3).
         intrinsics: Of the image.
         size: Width and height of the image [px].
+        yaw_rad: Standard deviation of its yaw at the capture.
+        tilt_rad: Standard deviation of its tilt.
     """
 
     position: Array
     rotation: Array
     intrinsics: Intrinsics
     size: tuple[int, int]
+    yaw_rad: float = _YAW_RAD
+    tilt_rad: float = _TILT_RAD
 
     @classmethod
     def at(
@@ -53,6 +58,7 @@ class Camera:
         body: Array,
         intrinsics: Intrinsics,
         size: tuple[int, int],
+        rates_rad_s: tuple[float, float] = (0.0, 0.0),
     ) -> Camera | None:
         """Place a camera.
 
@@ -62,6 +68,8 @@ class Camera:
             body: Position of the vehicle, (3,) [m]; the third is its height above the ground where that is known.
             intrinsics: In pixels of the image.
             size: Width and height of the image [px].
+            rates_rad_s: Of yaw and of tilt, of a vehicle whose images and attitude have no common clock: the faster it
+                turns, the less certain its attitude is at the capture.
 
         Returns:
             None while the attitude is not known.
@@ -72,8 +80,11 @@ class Camera:
         if feedback.roll_rad is None or feedback.pitch_rad is None or feedback.yaw_rad is None:
             return None
         to_level = feedback.rotation
+        yaw_rad = math.hypot(_YAW_RAD, _UNTIMELY_S * rates_rad_s[0])
+        tilt_rad = math.hypot(_TILT_RAD, _UNTIMELY_S * rates_rad_s[1])
         offset = np.zeros(3) if mounting.position_m is None else np.asarray(mounting.position_m)
-        return cls(body + to_level @ offset, to_level @ mounting_rotation(mounting), intrinsics, size)
+        place, rotation = body + to_level @ offset, to_level @ mounting_rotation(mounting)
+        return cls(place, rotation, intrinsics, size, yaw_rad, tilt_rad)
 
     def pixel(self, point: Array) -> tuple[float, float] | None:
         """Return where a point (3,) is in the image, or a little beside it [px]; None farther off.
@@ -150,10 +161,11 @@ class BoxView:
             azimuth=math.atan2(rays[2, 1], rays[2, 0]),
             bottom=None if cut_below else bottom,
             top=None if cut_above else top,
-            azimuth_rad=math.hypot(across, _YAW_RAD),
+            azimuth_rad=math.hypot(across, camera.yaw_rad),
             edge=edge,
             below=bottom if cut_below else None,
             above=top if cut_above else None,
+            tilt=camera.tilt_rad,
         )
 
 
