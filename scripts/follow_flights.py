@@ -31,6 +31,7 @@ JUDGED: Final = 2  # each second frame
 SWAPPED: Final = 3  # judged frames in a row that show something else in the target's box
 TILT_RAD: Final = 0.5  # against gusts the drag leaves too little of the simulated drone's usual 0.21 rad
 _WAIT_S: Final = 60.0
+_POINTED_S: Final = 1.0  # so long is the target in view when it is pointed at
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +163,8 @@ class JudgedFlight:
         self._hits += getattr(event, "kind", "") == "collision"
 
     def _first_box(self) -> tuple[float, float, float, float] | None:
-        begin = None
+        """Point at the target once it was in view for a second."""
+        begin, since = None, None
         for frame in self._drone.frames():
             begin = begin or frame.captured_ns
             if frame.captured_ns - begin > _WAIT_S * 1e9:
@@ -172,7 +174,9 @@ class JudgedFlight:
                 continue
             truth = self._judge.at(state, frame.captured_ns)
             mine = truth.box
-            if mine is not None and not mine.cut and mine.visible > 0.9 and mine.box[3] >= 24 and truth.distance_m < 8:
+            clear = mine is not None and not mine.cut and mine.visible > 0.9 and mine.box[3] >= 24
+            since = (since or frame.captured_ns) if clear and truth.distance_m < 8 else None
+            if mine is not None and since is not None and frame.captured_ns - since > _POINTED_S * 1e9:
                 x, y, width, height = mine.box
                 return float(x), float(y), float(width), float(height)
         return None
@@ -320,9 +324,9 @@ def hidden(rng: random.Random) -> str:
     oval = [(5 + 5.5 * math.cos(a), 5.5 * math.sin(a)) for a in ends]  # counter-clockwise: the inside is on his left
     points = _turned([*oval, *((-x, -y) for x, y in oval)], rng)
     walls = "".join(
-        f'[[box]]\nname = "wall {side}"\nstands_at = [{rng.uniform(-2, 2):.2f}, {y}]\nsize = [4.4, 0.3, 2.6]\n'
+        f'[[box]]\nname = "wall {side}"\nstands_at = [{rng.uniform(-2, 2):.2f}, {y}]\nsize = [4.8, 0.3, 2.6]\n'
         'texture = "brick"\n'
-        for side, y in (("south", -4.0), ("north", 4.0))
+        for side, y in (("south", -4.7), ("north", 4.7))
     )
     house = '[[box]]\nname = "house"\nstands_at = [0, 10.5]\nsize = [20, 2, 4]\ntexture = "concrete"\n'
     passer = person("passer", rng.randrange(1000), [(-9, 8), (9, 8), (9, 8.5), (-9, 8.5)], 1.2)

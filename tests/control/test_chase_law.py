@@ -180,6 +180,20 @@ def test_it_keeps_clear_of_others(side: float) -> None:
     assert math.isfinite(sum(pushed((0.0, 0.0)))), "who is where it is"
 
 
+def test_of_somebody_who_comes_straight_it_keeps_the_side_that_it_took() -> None:
+    law, estimator = still_law(away=(8.0, 0.0))
+    sides = []
+    for n in range(20):
+        at = motion(1.0 + n * PERIOD_S)
+        aside = 0.3 if n < 3 else 0.15 * (-1.0) ** n  # as noise has it
+        other = still_law(at_s=at.at_ns / 1e9, away=(3.0 - n * 0.1, 0.0))[1].at(at.at_ns)
+        other = replace(other, foot=np.array([3.0 - n * 0.1, -aside, 0.0]), velocity=np.array([-1.5, 0.0]))
+        command = law.step(at.at_ns, at, 1.2, estimator, at.at_ns, [other])
+        assert isinstance(command, Velocity)
+        sides.append(command.left)
+    assert min(sides[3:]) > 0.1
+
+
 def test_the_first_set_point_is_one_that_the_vehicle_can_fly_on_from() -> None:
     for speed in (0.0, 1.0):
         law, estimator = still_law(away=(8.0, 0.0))
@@ -303,6 +317,30 @@ def test_a_target_that_is_lost_is_waited_for_looked_for_and_given_up(relative: b
         if phase in LOSSES - {TargetPhase.PREDICTING} and isinstance(command, Attitude):
             assert math.hypot(command.roll, command.pitch) < 0.05, "no more than brings it to rest"
     assert translation(world.commands[-1]) < 0.01
+
+
+def test_while_it_hovers_it_looks_to_both_sides_of_where_the_target_should_be() -> None:
+    settings = ChaseSettings(predict_s=1.0, hover_s=6.0, search_rad_s=0.7, sweep_rad=0.6)
+    world = ChaseWorld(walk(4.0, 0.0), settings=settings, hidden=after(3.0), seed=None)
+    world.run(9.0)
+    azimuths = [-one for one, phase in zip(world.azimuths, world.phases, strict=True) if phase is TargetPhase.HOVERING]
+    assert max(map(abs, azimuths)) == pytest.approx(0.6, abs=0.12)
+    assert min(max(azimuths), -min(azimuths)) == pytest.approx(0.24, abs=0.1), "less far to the other side"
+    passed = [n for n, (a, b) in enumerate(itertools.pairwise(azimuths)) if a * b < 0.0]
+    assert len(passed) >= 3, "to and fro"
+
+
+def test_somebody_who_may_be_the_lost_target_is_looked_at() -> None:
+    law, estimator = still_law()
+    other = still_law(away=(4.0, 2.5))[1]
+    for hover_s, phase in ((10.0, TargetPhase.HOVERING), (0.1, TargetPhase.SEARCHING)):
+        law.settings = replace(law.settings, hover_s=hover_s)
+        for at_s in (4.0, 4.1):
+            at = motion(at_s)
+            seen = other.at(at.at_ns)
+            command = law.step(at.at_ns, at, 1.2, estimator, nanoseconds(1.0), candidate=seen)
+        assert law.phase is phase
+        assert turn(command) == pytest.approx(2.2 * math.atan2(2.5, 4.0), abs=0.2)
 
 
 def turn(command: object) -> float:
@@ -437,3 +475,19 @@ def test_settings_that_make_no_sense_are_refused(given: dict[str, Any], why: str
 def test_settings_that_make_sense_are_taken(given: dict[str, Any]) -> None:
     settings = ChaseSettings(**given)
     assert all(getattr(settings, name) == value for name, value in given.items())
+
+
+def test_settings_are_brought_within_the_drones_limits() -> None:
+    limits = {"limits.speed": 1.5, "limits.climb": 0.3, "limits.yaw_rate": 0.9, "limits.altitude": 0.7}
+    found = ChaseSettings().within(limits | {"limits.tilt": 0.21, "autopilot.kind": "sim"})
+    assert (found.speed_m_s, found.climb_m_s, found.turn_rad_s) == (1.5, 0.3, 0.9)
+    assert (found.lowest_m, found.highest_m) == (0.7, 0.7)
+    assert (found.tilt_rad, found.lean_rad) == (0.21, 0.21)
+    wide = dict.fromkeys(limits, 100.0) | {"limits.tilt": True, "limits.speed": "fast"}
+    assert ChaseSettings().within(wide) == ChaseSettings().within({}) == ChaseSettings()
+
+
+def test_a_vehicle_that_may_lean_less_is_not_counted_on_for_more() -> None:
+    """Else its weak answer would be taken for a trim of its loop, and it would overshoot for seconds."""
+    for lean_rad, most in ((0.5, 0.5), (0.21, 0.21)):
+        assert ChaseLaw(ChaseSettings(lean_rad=lean_rad))._response.settings.tilt_rad == most

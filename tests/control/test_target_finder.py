@@ -364,6 +364,51 @@ def test_the_box_of_another_thing_is_not_the_targets() -> None:
     assert all(one.box is None for one, _ in film.sightings[-7:])
 
 
+def test_of_a_detected_target_the_tracker_is_believed_between_the_images_that_are_searched() -> None:
+    walker = Walker(walk(4.0, 0.0), BLUE, 1)
+    finder, drifting = TargetFinder(box=start_box(walker)), Drifting()
+    film = Film(finder, walker)
+    film.run(1.0)
+    finder._tracker = drifting  # type: ignore[assignment]
+    drifting.box = walker.box(camera_at(), 0.0)
+    film.detects = False
+    film.run(0.5)
+    assert film.agreement(7) == pytest.approx(1.0)
+    film.detects = True
+    film.run(0.2, hidden=[0])
+    assert all(one.box is None for one, _ in film.sightings[-3:]), "it sees what hides the target"
+    film.run(1.2, hidden=[0])
+    film.detects = False
+    film.run(0.2)
+    assert all(one.box is None for one, _ in film.sightings[-3:]), "nor later, before it was recognised"
+
+
+def test_a_newcomer_is_looked_at_before_it_is_taken_for_the_target() -> None:
+    walker, back = Walker(walk(4.0, -1.0), BLUE, 1), Walker(walk(4.0, 1.0), BLUE, 1)
+    film = Film(TargetFinder(box=start_box(walker)), walker, back)
+    film.run(1.0, hidden=[1])
+    assert film.finder.candidate(film.at_ns) is None
+    film.run(1.5, hidden=[0, 1])
+    film.run(2 * PERIOD_S, hidden=[0])
+    candidate = film.finder.candidate(film.at_ns)
+    assert candidate is not None
+    assert candidate.foot[:2] == pytest.approx([4.0, 1.0], abs=0.5)
+    assert film.sightings[-1][0].box is None
+    film.run(5 * PERIOD_S, hidden=[0])
+    assert film.sightings[-1][0].box is not None
+    assert film.finder.candidate(film.at_ns) is None
+
+
+def test_somebody_in_other_clothes_is_not_even_looked_at() -> None:
+    walker, other = Walker(walk(4.0, -1.0), BLUE, 1), Walker(walk(4.0, 1.0), RED, 1)
+    film = Film(TargetFinder(box=start_box(walker)), walker, other)
+    film.run(1.0, hidden=[1])
+    film.run(1.5, hidden=[0, 1])
+    film.run(1.0, hidden=[0])
+    assert film.finder.candidate(film.at_ns) is None
+    assert film.sightings[-1][0].box is None
+
+
 def test_a_box_without_a_bearing_is_refused() -> None:
     finder = TargetFinder(box=(140.0, 100.0, 40.0, 40.0))
     picture = texture(np.random.default_rng(7), WIDTH, HEIGHT)

@@ -35,6 +35,9 @@ _SMOOTHING_S = 0.4  # of the target's acceleration
 _SETPOINT_OVER = 1.5  # times the greatest speed: against its drag a vehicle reaches less than it is asked for
 _SETPOINT_AHEAD = 4.0  # times as fast as the vehicle a set-point may change, to make it change
 _COMING_S = 3.0  # a target that comes by sooner is made way for
+_GIVING_WAY_S = 1.0  # who has begun to make way to one side goes on to that side
+_EITHER_SIDE = 0.6  # of the clearance: it may pass on either side of somebody who comes so near to its middle
+_SWEEP_BACK = 0.4  # of the sweep: to where the target was not going
 _ALONG_M_S = 0.4  # a target that is slower has no direction to be behind or beside of
 
 
@@ -96,11 +99,13 @@ class ChaseLaw:
         self._height: float | None = None
         self._since_ns: int | None = None  # when the search began
         self._direction = 1.0
+        self._sweep_first = 0.0  # side to look to first, 1 is left; 0: not chosen yet
         self._was: tuple[int, Array] | None = None  # the target's velocity, and when
         self._acceleration: LowPass[Array] = LowPass(_SMOOTHING_S)
         self._response = VelocityResponse(_response(self.settings))
         self._limiter: SetpointLimiter | None = None
         self._last_ns: int | None = None
+        self._made_way: tuple[int | None, Array] = (None, np.zeros(2))  # when, and to which side
 
     def step(
         self,
@@ -111,6 +116,7 @@ class ChaseLaw:
         seen_ns: int | None,
         others: Sequence[TargetState] = (),
         *,
+        candidate: TargetState | None = None,
         relative: bool = False,
     ) -> Velocity | Attitude:
         """Compute the set-point for now.
@@ -122,6 +128,7 @@ class ChaseLaw:
             target: Its filter; None before it was seen.
             seen_ns: When it was last in view for certain, or perhaps; None: never.
             others: Who else was seen lately, and is kept clear of.
+            candidate: Somebody who may be the lost target, and is looked at.
             relative: The vehicle does not report its velocity (see :mod:`.dead_reckoning`): the set-point is an
                 attitude.
         """
@@ -142,12 +149,15 @@ class ChaseLaw:
         now = _Now(own, ahead, predicted, altitude_m, dt_s, relative)
         self._limits(own)
         still = np.zeros(2)
+        if candidate is not None and self.phase in (TargetPhase.HOVERING, TargetPhase.SEARCHING):
+            return self._steer(still, self._turn(ahead, candidate), candidate, now)
         if target is None or self.phase in (TargetPhase.LOOKING, TargetPhase.SEARCHING):
             return self._steer(still, s.search_rad_s * self._direction, None, now)
         state = target.at(ahead.at_ns)
         if self.phase is TargetPhase.GIVEN_UP:
             return self._steer(still, 0.0, state, now)
-        turn = self._turn(ahead, state)
+        aside, sweeping = self._sweep(unseen_s, ahead, state)
+        turn = self._turn(ahead, state, aside, sweeping)
         if self.phase is TargetPhase.HOVERING or self.mode is FollowMode.LOOK:
             return self._steer(still, turn, state, now)
         # As fast as before for half of the time, then ever slower.
@@ -215,14 +225,39 @@ class ChaseLaw:
             FollowMode.LOOK: TargetPhase.WATCHING,
         }[self.mode]
 
-    def _turn(self, own: Motion, state: TargetState) -> float:
-        """Return the yaw rate that brings the target to the middle, and keeps it there."""
+    def _sweep(self, unseen_s: float, own: Motion, state: TargetState) -> tuple[float, float]:
+        """Return how far to the left of where the target should be to look [rad], and how fast that changes [rad/s].
+
+        To and fro while it hovers, at first and farthest to where the target was going: 0 in all other phases.
+        """
+        s = self.settings
+        if self.phase is not TargetPhase.HOVERING:
+            self._sweep_first = 0.0
+            return 0.0, 0.0
+        if self._sweep_first == 0.0:
+            x, y = state.foot[:2] - own.position[:2]
+            self._sweep_first = math.copysign(1.0, x * state.velocity[1] - y * state.velocity[0])
+        back = _SWEEP_BACK * s.sweep_rad
+        whole = s.sweep_rad + back
+        swept = (s.search_rad_s * (unseen_s - s.seen_s - s.predict_s) + back) % (2.0 * whole)
+        aside = self._sweep_first * (whole - abs(swept - whole) - back)  # a triangular wave
+        return aside, math.copysign(s.search_rad_s, self._sweep_first * (whole - swept))
+
+    def _turn(self, own: Motion, state: TargetState, aside: float = 0.0, sweeping: float = 0.0) -> float:
+        """Return the yaw rate that turns it to the target, or beside it, and keeps it there.
+
+        Args:
+            own: The vehicle's motion.
+            state: The target's.
+            aside: To the left of the target [rad].
+            sweeping: How fast that changes [rad/s].
+        """
         offset = state.foot[:2] - own.position[:2]
         across = max(0.5, float(np.hypot(*offset)))
-        error = wrap_angle(math.atan2(offset[1], offset[0]) - own.yaw)
+        error = wrap_angle(math.atan2(offset[1], offset[0]) + aside - own.yaw)
         moving = state.velocity - own.velocity[:2]
         sweep = float(offset[0] * moving[1] - offset[1] * moving[0]) / across**2
-        turn = clamped(self.settings.yaw_gain * error + 0.9 * sweep, self.settings.turn_rad_s)
+        turn = clamped(self.settings.yaw_gain * error + 0.9 * sweep + sweeping, self.settings.turn_rad_s)
         if abs(turn) > 0.05:
             self._direction = math.copysign(1.0, turn)
         return turn
@@ -288,18 +323,24 @@ class ChaseLaw:
         return left * math.copysign(min(needed, 0.7 * s.speed_m_s), aside)
 
     def _clear_of(self, other: TargetState, own: Motion, wanted: Array) -> Array:
-        """Return the velocity that keeps clear of somebody else, (2,) [m/s]."""
+        """Return the velocity that keeps clear of somebody else, (2,) [m/s].
+
+        The nearest pass counts, by the velocity that it has or that it is about to take up.
+        """
         clear_m = self.settings.clear_m
-        here, moving = own.position[:2] - other.foot[:2], wanted - other.velocity
-        square = float(moving @ moving)
-        in_s = clamped(-float(here @ moving) / square, _COMING_S) if square > 0.01 else 0.0
-        nearest = here + moving * max(0.0, in_s)
-        away = float(np.hypot(*nearest))
+        here = own.position[:2] - other.foot[:2]
+        passes = [_pass(here, velocity - other.velocity) for velocity in (wanted, own.velocity[:2])]
+        away, in_s, side = min(passes, key=lambda one: one[0])
         if in_s >= _COMING_S or away >= clear_m:
             return np.zeros(2)
-        left = np.array([-moving[1], moving[0]]) / max(0.1, math.sqrt(square))
-        direction = nearest / away if away > 0.1 else left
-        return direction * min((clear_m - away) / max(0.5, in_s), 0.7 * self.settings.speed_m_s)
+        gap = clear_m - away
+        # Of somebody who comes straight towards it, noise would make it take now one side, now the other.
+        made_way_ns, before = self._made_way
+        lately = made_way_ns is not None and seconds(own.at_ns - made_way_ns) < _GIVING_WAY_S
+        if lately and float(side @ before) < 0.0 and away < _EITHER_SIDE * clear_m:
+            side, gap = -side, clear_m + away
+        self._made_way = own.at_ns, side
+        return side * min(gap / max(0.5, in_s), 0.7 * self.settings.speed_m_s)
 
     def _kept_off(self, wanted: Array, state: TargetState, sight: Array, across: float) -> Array:
         """Take away what would bring it so near, and so fast, that it could not stop before the nearest distance."""
@@ -363,6 +404,21 @@ class ChaseLaw:
 
 def _response(settings: ChaseSettings) -> ResponseSettings:
     return ResponseSettings(delay_s=settings.lead_s, tilt_rad=settings.lean_rad)
+
+
+def _pass(here: Array, moving: Array) -> tuple[float, float, Array]:
+    """Return how near two come to each other [m], in how many seconds, and the unit vector to where one passes, (2,).
+
+    Args:
+        here: From the other to the one, (2,) [m].
+        moving: The one's velocity against the other's, (2,) [m/s].
+    """
+    square = float(moving @ moving)
+    in_s = clamped(-float(here @ moving) / square, _COMING_S) if square > 0.01 else 0.0
+    nearest = here + moving * max(0.0, in_s)
+    away = float(np.hypot(*nearest))
+    aside = np.array([-moving[1], moving[0]]) / max(0.1, math.sqrt(square))
+    return away, in_s, nearest / away if away > 0.1 else aside
 
 
 def _stoppable(gap_m: float, settings: ChaseSettings) -> float:

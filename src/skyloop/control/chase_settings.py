@@ -45,9 +45,10 @@ class ChaseSettings:
         lean_rad: Greatest lean of a vehicle that is flown by velocity: what it is counted on for.
         seen_s: Since last seen, up to which the target counts as seen.
         predict_s: How long it flies on by the target's last motion, ever slower.
-        hover_s: How long it hovers after that, turned to where the target should be.
+        hover_s: How long it hovers after that, looking to both sides of where the target should be.
         give_up_s: Since last seen, after which it gives up.
         search_rad_s: Yaw rate of the search.
+        sweep_rad: How far past where the target should be it looks while it hovers.
 
     Raises:
         UsageError: A number is out of its range, or the distance is not beyond the nearest one.
@@ -69,7 +70,7 @@ class ChaseSettings:
     velocity_gain: float = 3.0
     yaw_gain: float = 2.2
     height_gain: float = 1.0
-    round_gain: float = 0.8
+    round_gain: float = 1.2
     speed_m_s: float = 4.0
     climb_m_s: float = 0.6
     turn_rad_s: float = 1.8
@@ -84,6 +85,7 @@ class ChaseSettings:
     hover_s: float = 4.0
     give_up_s: float = 25.0
     search_rad_s: float = 0.7
+    sweep_rad: float = 0.6
 
     def __post_init__(self) -> None:
         free = {"bearing_rad", "orbit_m_s", "leash_m", "height_m"}

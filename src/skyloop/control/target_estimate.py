@@ -13,8 +13,9 @@ GPS-denied object tracking and following for unmanned aerial vehicles", SSRR 201
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +32,10 @@ _LATE_S: Final = 0.5  # a box that is later than this is of no use
 _ADAPTING: Final = 0.3  # of the surprise, by one box
 _USUAL: Final = 1.5  # surprise that is taken for noise
 _MOST_SURPRISE: Final = 4.0
-_STRAIGHT_S: Final = 3.0  # nothing unseen is thought to go straight on for longer
+_STRAIGHT_S: Final = 4.0  # nothing unseen is thought to go straight on for longer
+_GONE_S: Final = 0.2  # a thing that was not seen for longer, and for more images than one or two, is hidden
+_GONE_INTERVALS: Final = 2.5
+_BEFORE_S: Final = 0.2  # before it was seen last: what hid it had not begun to cut its box off then
 _GATE: Final = 4.0  # standard deviations, of the azimuth
 _EDGE_GATE: Final = 3.0  # of an edge: a farther one is hidden by something, or the image of something else
 _LEAST_SLOPE: Final = 0.04  # of an edge, below which its height says nothing about the range
@@ -113,6 +117,12 @@ class TargetState:
         return np.add(self.foot, (0.0, 0.0, self.height_m / 2))
 
 
+class _Estimate(NamedTuple):
+    at_ns: int
+    state: Array
+    covariance: Array
+
+
 class TargetEstimator:
     """The filter of one thing.
 
@@ -141,6 +151,8 @@ class TargetEstimator:
         self._covariance = np.eye(6)
         self._surprise = 1.0  # of late: the squared Mahalanobis distance of an azimuth and a size, about 1
         self._eye: Array = np.zeros(3)  # of the camera that saw it last
+        self._before: deque[_Estimate] = deque()  # of the boxes before, as far back as _BEFORE_S
+        self._interval_s = 0.0  # between the last two boxes
 
     def start(self, view: BoxView, camera: Camera, at_ns: int, *, ground: bool) -> None:
         """Start from the first box.
@@ -192,6 +204,8 @@ class TargetEstimator:
         self._at_ns = self.seen_ns = at_ns
         self._eye = camera.position
         self.refused, self._surprise = 0, 1.0
+        self._before.clear()
+        self._remember(at_ns)
 
     def distance(self, view: BoxView, camera: Camera, at_ns: int) -> tuple[float, float]:
         """Return how badly a box fits.
@@ -242,6 +256,7 @@ class TargetEstimator:
         keep = np.eye(6) - gain @ jacobian
         self._state = _moved(state + gain @ off, late_s)
         self._covariance = keep @ covariance @ keep.T + gain @ noise @ gain.T  # Joseph's form
+        self._remember(max(at_ns, self._at_ns))
         self._at_ns = self.seen_ns = max(at_ns, self._at_ns)
         if late_s == 0.0:
             self._eye = camera.position
@@ -249,7 +264,9 @@ class TargetEstimator:
         return True
 
     def at(self, at_ns: int) -> TargetState:
-        """Predict the target's state. It is not moved on for more than three seconds, but ever less certain.
+        """Predict the target's state. It is not moved on for more than four seconds, but ever less certain.
+
+        A thing that is hidden goes on as it went shortly before it was: what hides it cuts off its last boxes.
 
         Args:
             at_ns: The time to predict for.
@@ -283,6 +300,11 @@ class TargetEstimator:
         dt = seconds(at_ns - self._at_ns)
         if dt <= 0.0:
             return _moved(self._state, max(-_LATE_S, dt)), self._covariance
+        if dt > max(_GONE_S, _GONE_INTERVALS * self._interval_s):
+            from_ns, from_state, from_covariance = self._before[0]
+            dt = seconds(at_ns - from_ns)
+        else:
+            from_state, from_covariance = self._state, self._covariance
         move = np.eye(6)
         move[0, 2] = move[1, 3] = dt
         wander = np.zeros((6, 6))
@@ -294,7 +316,13 @@ class TargetEstimator:
             wander[axis + 2, axis + 2] = q * dt
         wander[4, 4] = 0.02**2 * dt
         wander[5, 5] = 0.01**2 * dt
-        return _moved(self._state, min(dt, _STRAIGHT_S)), move @ self._covariance @ move.T + wander
+        return _moved(from_state, min(dt, _STRAIGHT_S)), move @ from_covariance @ move.T + wander
+
+    def _remember(self, at_ns: int) -> None:
+        self._interval_s = seconds(at_ns - self._before[-1].at_ns) if self._before else 0.0
+        self._before.append(_Estimate(at_ns, self._state, self._covariance))
+        while len(self._before) > 1 and seconds(at_ns - self._before[1].at_ns) >= _BEFORE_S:
+            self._before.popleft()
 
 
 def _moved(state: Array, dt_s: float) -> Array:

@@ -31,8 +31,9 @@ _FITS: Final = 12.0  # squared Mahalanobis distance by what was measured, up to 
 _DOUBT: Final = 6  # images in a row in which the tracker's box is not where the target can be
 _LATELY_S: Final = 1.0  # others are kept clear of for so long after they were seen
 _DORMANT_S: Final = 1.0  # unseen for longer, it must be recognised
-_SIMILAR: Final = 9.0  # unlikeness of a newcomer's colours, up to which it may be the target
-_CLEARLY: Final = 4.0  # by which any other newcomer must be more unlike
+_SIMILAR: Final = 1.6  # mean unlikeness of a newcomer's colours, up to which it may be the target
+_LOOKED_AT: Final = 5  # images that are needed for that
+_CLEARLY: Final = 1.0  # by which any other newcomer must be more unlike
 _FAST_M_S: Final = 4.0  # what an unseen thing may have moved at
 _KEPT_FRAMES: Final = 12  # for detections that come later than their frames
 
@@ -100,6 +101,7 @@ class TargetFinder:
         self._frames: deque[_Seen] = deque(maxlen=_KEPT_FRAMES)
         self._middle: tuple[float, float] | None = None  # where the target should be in the newest image [px]
         self._doubts = 0
+        self._newcomers: dict[int, tuple[int, float]] = {}  # images of them, and mean unlikeness to the target
         self._agreed = 0  # images in a row in which tracker and a detection agree
 
     def see(
@@ -130,6 +132,8 @@ class TargetFinder:
             self._first_box = None
         if detections is not None:
             self._use(detections, self._frames[-1], tracked, ground=ground)
+        if not self._is_backed(tracked.box, detections):
+            tracked = TrackResult(None, 0.0)
         sighting = self._decide(image, camera, captured_ns, tracked)
         self._middle = None if self.estimator is None else camera.pixel(self.estimator.at(captured_ns).middle)
         return sighting
@@ -150,6 +154,18 @@ class TargetFinder:
     def target(self) -> SceneObject | None:
         """The target among the detected things; None where no detector knows it."""
         return None if self._scene is None or self._number is None else self._scene.objects.get(self._number)
+
+    def candidate(self, at_ns: int) -> TargetState | None:
+        """Where somebody is who was seen lately and may be the lost target: worth a closer look."""
+        scene, found = self._scene, None
+        if scene is None or self._number not in scene.dormant:
+            return None
+        for number, (_, mean) in self._newcomers.items():
+            thing = scene.objects.get(number)
+            lately = thing is not None and seconds(at_ns - thing.last_ns) < _LATELY_S
+            if thing is not None and lately and mean < 2.0 * _SIMILAR and (found is None or mean < found[0]):
+                found = mean, thing
+        return None if found is None else found[1].estimator.at(at_ns)
 
     def others(self, at_ns: int) -> list[TargetState]:
         """Where people and other things are that were detected in the last second, without the target."""
@@ -232,6 +248,19 @@ class TargetFinder:
         self.estimator = again
         return True
 
+    def _is_backed(self, box: Box | None, detections: Sequence[Detection] | None) -> bool:
+        """Whether the tracker's box may be the target's, as far as the detector says.
+
+        A tracker goes on to see what hides the target: of a target that the detector knows, it is believed between the
+        images that are searched, for a second.
+        """
+        target, scene = self.target, self._scene
+        if box is None or target is None or scene is None or target.seen:
+            return True
+        if target.number in scene.dormant:
+            return False
+        return detections is None or any(overlap(one.box, box) >= _SAME for one in detections)
+
     def _is_taken(self, box: Box) -> bool:
         """Whether the box is that of another thing, by its detection in this image."""
         if self._scene is None or self._number is None:
@@ -262,7 +291,7 @@ class TargetFinder:
         self.detections = tuple(detections)
         target = self.target
         if target is not None and target.estimator.seen_ns is not None:
-            gone = seconds(frame.captured_ns - target.estimator.seen_ns) > _DORMANT_S
+            gone = seconds(frame.captured_ns - target.last_ns) > _DORMANT_S
             scene.dormant = {target.number} if gone else set()
         looks = [colours(frame.image, one.box) for one in detections]
         scene.update(detections, looks, frame.camera, frame.captured_ns, ground=ground)
@@ -272,6 +301,8 @@ class TargetFinder:
             self._choose(scene, frame, tracked)
         elif target.number in scene.dormant:
             self._recognise(scene, target, frame)
+        else:
+            self._newcomers.clear()
 
     def _choose(self, scene: Scene, frame: _Seen, tracked: TrackResult) -> None:
         """Take the detection that the user's box, or the tracker, or else the class means."""
@@ -305,13 +336,19 @@ class TargetFinder:
             view = BoxView.of(each.detection.box, frame.camera)
             if view is None or target.estimator.distance(view, frame.camera, frame.captured_ns)[0] > _FITS:
                 continue
-            likely.append((unlikeness(target.looks, each.looks), each))
+            images, mean = self._newcomers.get(each.number, (0, 0.0))
+            mean += (unlikeness(target.looks, each.places) - mean) / (images + 1)
+            self._newcomers[each.number] = images + 1, mean
+            likely.append((mean, each))
         likely.sort(key=lambda one: one[0])
-        if not likely or likely[0][0] > _SIMILAR or not likely[0][1].confirmed:
+        if not likely or likely[0][0] > _SIMILAR or self._newcomers[likely[0][1].number][0] < _LOOKED_AT:
             return
         if len(likely) > 1 and likely[1][0] - likely[0][0] < _CLEARLY:
             return  # nothing tells them apart
-        self._adopt(scene, likely[0][1])
+        found = likely[0][1]
+        # Of what comes out of hiding the first boxes are of what it comes from behind of, too.
+        found.looks, found.hits = target.looks, target.hits + found.hits
+        self._adopt(scene, found)
         del scene.objects[target.number]
 
     def _may_be(self, each: SceneObject) -> bool:

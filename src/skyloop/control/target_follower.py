@@ -236,9 +236,16 @@ class TargetFollower:
         motion, newest = self._odometry.at(now_ns), self._newest
         if motion is None or newest is None or seconds(now_ns - newest.captured_ns) > _STALE_S:
             return Attitude() if self._relative else Velocity()
-        others = () if self._finder is None else self._finder.others(now_ns)
+        finder = self._finder
         return self._law.step(
-            now_ns, motion, newest.altitude_m, self._estimator, self._seen_ns, others, relative=self._relative
+            now_ns,
+            motion,
+            newest.altitude_m,
+            self._estimator,
+            self._seen_ns,
+            () if finder is None else finder.others(now_ns),
+            candidate=None if finder is None else finder.candidate(now_ns),
+            relative=self._relative,
         )
 
     @property

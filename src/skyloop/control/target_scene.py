@@ -26,8 +26,9 @@ from skyloop.vision.object_tracks import assignment
 Floats = NDArray[np.float32]
 
 _COLOUR_UNITS: Final = np.array([30.0, 10.0, 10.0, 30.0, 10.0, 10.0], np.float32)  # of L, a, b: light changes L most
-_OTHER: Final = 16.0  # unlikeness from which something is another thing
-_LEARNING: Final = 0.05  # of the colours, by one detection
+_OTHER: Final = 10.0  # unlikeness from which something is another thing; its own: mostly below 0.5, at times 3
+_UNLIKE: Final = 3.0  # weight of the unlikeness against that of where things are
+_LEARNING: Final = 0.05  # of the colours, by one detection; of the first ones the mean
 _GATE: Final = 9.0  # of the squared Mahalanobis distance by the number of what was measured
 _NEVER: Final = 1e6
 _AMBIGUOUS: Final = 4.0  # of the likelihood's negative logarithm, doubled: less is not clear
@@ -41,6 +42,7 @@ _TURNED: Final = 0.3  # of that difference, the other way round, from which they
 _KEEP_S: Final = 2.0  # things that are hidden are remembered for so long: what comes after that may be another one
 _YOUNG_S: Final = 0.5  # and those that were seen only once
 _CONFIRMED: Final = 3  # detections
+_WELL_KNOWN: Final = 15  # detections: its colours are known then
 _SURE: Final = 0.35  # score of a detection that may be a new thing
 
 
@@ -54,8 +56,10 @@ class SceneObject:
         estimator: Where it is.
         detection: The last one.
         looks: Its colours, (6,): see :func:`skyloop.vision.appearance.colours`.
+        places: Those of the last detection, (n, 6).
         hits: How often it was detected.
         first_ns: When it was detected first.
+        last_ns: When it was detected last.
         seen: Whether it was detected in the newest image.
         contested_ns: When it was contested last.
         velocities: Of the last half second.
@@ -67,8 +71,10 @@ class SceneObject:
     estimator: TargetEstimator
     detection: Detection
     looks: Floats
+    places: Floats
     hits: int
     first_ns: int
+    last_ns: int
     seen: bool = True
     contested_ns: int = 0
     contested: bool = False
@@ -93,7 +99,7 @@ class SceneObject:
 
     def exchange(self, other: SceneObject) -> None:
         """Exchange all but the numbers."""
-        for name in ("estimator", "detection", "hits", "seen", "contested", "velocities"):
+        for name in ("estimator", "detection", "hits", "last_ns", "seen", "contested", "velocities"):
             mine, its = getattr(self, name), getattr(other, name)
             setattr(self, name, its)
             setattr(other, name, mine)
@@ -106,8 +112,19 @@ class _Seen(NamedTuple):
 
 
 def unlikeness(one: Floats, other: Floats) -> float:
-    """Return how much two things differ in their colours: squared, in units of what light and folds change."""
-    return float(np.sum(((one - other) / _COLOUR_UNITS) ** 2))
+    """Return how much two things differ in their colours: squared, in units of what light and folds change.
+
+    Args:
+        one: Of a thing, (6,).
+        other: Of a thing (6,), or of places in a box (n, 6), of which the most similar counts.
+    """
+    return float(np.min(np.sum(((one - other) / _COLOUR_UNITS) ** 2, axis=-1)))
+
+
+def _nearest(one: Floats, places: Floats) -> Floats:
+    """Return the most similar of the colours of places in a box, (6,)."""
+    places = np.atleast_2d(places)
+    return places[int(np.argmin(np.sum(((one - places) / _COLOUR_UNITS) ** 2, axis=-1)))]
 
 
 def _is_about(thing: SceneObject, at_ns: int) -> bool:
@@ -165,7 +182,7 @@ class Scene:
 
         Args:
             detections: Of one image.
-            looks: The colours of each.
+            looks: The colours of each: (6,), or (n, 6) at n places from its left to its right.
             camera: That took it.
             at_ns: Its capture.
             ground: Whether the camera's height above the ground is known.
@@ -193,10 +210,10 @@ class Scene:
         for i, thing in enumerate(things):
             for j, one in enumerate(seen):
                 unlike = unlikeness(thing.looks, one.looks)
-                if one.detection.class_name == thing.class_name and (unlike < _OTHER or not thing.confirmed):
+                if one.detection.class_name == thing.class_name and (unlike < _OTHER or thing.hits < _WELL_KNOWN):
                     fit, cost = thing.estimator.distance(one.view, camera, at_ns)
                     if fit < _GATE:
-                        costs[i, j] = cost + unlike
+                        costs[i, j] = cost + _UNLIKE * unlike
         shift = float(costs.min())  # the assignment minimises sums: all costs must be better than no pair
         rows, columns = self._assign(np.where(costs < _NEVER, costs - shift, _NEVER))
         pairs = [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if costs[i, j] < _NEVER]
@@ -221,7 +238,10 @@ class Scene:
             thing, one = things[i], seen[j]
             if thing.estimator.update(one.view, camera, at_ns):
                 thing.seen, thing.detection, thing.hits = True, one.detection, thing.hits + 1
-                thing.looks = thing.looks + _LEARNING * (one.looks - thing.looks)
+                thing.places, thing.last_ns = one.looks, max(at_ns, thing.last_ns)
+                thing.looks = thing.looks + max(_LEARNING, 1.0 / thing.hits) * (
+                    _nearest(thing.looks, one.looks) - thing.looks
+                )
                 thing.remember(at_ns)
         return [seen[j] for j in range(len(seen)) if j not in used]
 
@@ -256,7 +276,10 @@ class Scene:
         estimator = TargetEstimator(self.traits.get(name, UNKNOWN), relative=self._relative)
         estimator.start(new.view, camera, at_ns, ground=ground)
         number = next(self._numbers)
-        self.objects[number] = SceneObject(number, name, estimator, new.detection, new.looks, 1, at_ns)
+        places = np.atleast_2d(new.looks)
+        self.objects[number] = SceneObject(
+            number, name, estimator, new.detection, places[len(places) // 2], places, 1, at_ns, at_ns
+        )
 
     def _forget(self, at_ns: int) -> None:
         for number, each in list(self.objects.items()):

@@ -12,6 +12,9 @@ from skyloop.vision.opencv import opencv
 from skyloop.vision.patches import Floats, features, patch
 from skyloop.vision.tracking import Box, Image, overlap
 
+_PLACES: Final = 5  # across a box, at which its colours are taken
+_ASIDE: Final = 0.12  # of its width, from one to the next
+_HALVES: Final = ((0.18, 0.48), (0.55, 0.85))  # from the top, as shares of its height
 _SIZE: Final = (24, 24)  # of the stored patch, whatever the target's shape
 _GRADIENTS: Final = 7  # the first channels of the features
 _COLOUR_WEIGHT: Final = 1.2
@@ -50,9 +53,10 @@ class Appearance:
 
 
 def colours(image: Image, box: Box) -> Floats:
-    """Return the colours of the upper and the lower half of what is in a box, (6,) float32: L, a, b of each (CIELAB).
+    """Return the colours of the upper and the lower half of what is in a box, (5, 6) float32: L, a, b of each (CIELAB).
 
-    The middle of its width only, where there is least of the background.
+    Five times, each of a third of its width, from left to right: with an arm or a leg stretched out, a person is not in
+    the middle of the box, and what is there is background.
 
     Args:
         image: uint8, (h, w, 3) BGR or (h, w) grey.
@@ -63,16 +67,16 @@ def colours(image: Image, box: Box) -> Floats:
     """
     cv = opencv("comparing colours")
     x, y, width, height = box
-    left, right = _within(x + 0.3 * width, x + 0.7 * width, image.shape[1])
-    halves = []
-    for low, high in ((0.18, 0.48), (0.55, 0.85)):
-        top, bottom = _within(y + low * height, y + high * height, image.shape[0])
-        part = np.ascontiguousarray(image[top:bottom, left:right])
-        if part.ndim == 2:
-            part = cv.cvtColor(part, cv.COLOR_GRAY2BGR)
-        mean = cv.resize(part, (1, 1), interpolation=cv.INTER_AREA).astype(np.float32) / 255.0
-        halves.append(cv.cvtColor(mean, cv.COLOR_BGR2LAB).reshape(3))
-    return np.asarray(np.concatenate(halves), np.float32)
+    grey = image.ndim == 2
+    means = np.empty((_PLACES, len(_HALVES), 3), np.float32)
+    for n in range(_PLACES):
+        middle = x + width * (0.5 + _ASIDE * (n - _PLACES // 2))
+        left, right = _within(middle - width / 6, middle + width / 6, image.shape[1])
+        for half, (low, high) in enumerate(_HALVES):
+            top, bottom = _within(y + low * height, y + high * height, image.shape[0])
+            part = image[top:bottom, left:right]
+            means[n, half] = part.mean() if grey else np.asarray(part).mean(axis=(0, 1))
+    return np.asarray(cv.cvtColor(means / np.float32(255.0), cv.COLOR_BGR2LAB).reshape(_PLACES, -1), np.float32)
 
 
 def _within(low: float, high: float, most: int) -> tuple[int, int]:
