@@ -31,7 +31,7 @@ JUDGED: Final = 2  # each second frame
 SWAPPED: Final = 3  # judged frames in a row that show something else in the target's box
 TILT_RAD: Final = 0.5  # against gusts the drag leaves too little of the simulated drone's usual 0.21 rad
 _WAIT_S: Final = 60.0
-_POINTED_S: Final = 1.0  # so long is the target in view when it is pointed at
+_POINTED_S: Final = 0.5  # so long is the target in view when it is pointed at
 
 
 @dataclass(frozen=True, slots=True)

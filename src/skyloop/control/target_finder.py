@@ -33,6 +33,7 @@ _LATELY_S: Final = 1.0  # others are kept clear of for so long after they were s
 _DORMANT_S: Final = 1.0  # unseen for longer, it must be recognised
 _SIMILAR: Final = 1.6  # mean unlikeness of a newcomer's colours, up to which it may be the target
 _LOOKED_AT: Final = 5  # images that are needed for that
+_OF_LATE: Final = 8  # images that the mean is mostly of
 _CLEARLY: Final = 1.0  # by which any other newcomer must be more unlike
 _FAST_M_S: Final = 4.0  # what an unseen thing may have moved at
 _KEPT_FRAMES: Final = 12  # for detections that come later than their frames
@@ -337,9 +338,12 @@ class TargetFinder:
             if view is None or target.estimator.distance(view, frame.camera, frame.captured_ns)[0] > _FITS:
                 continue
             images, mean = self._newcomers.get(each.number, (0, 0.0))
-            mean += (unlikeness(target.looks, each.places) - mean) / (images + 1)
-            self._newcomers[each.number] = images + 1, mean
-            likely.append((mean, each))
+            if each.whole:
+                images += 1
+                mean += (unlikeness(target.looks, each.places) - mean) / min(images, _OF_LATE)
+                self._newcomers[each.number] = images, mean
+            if images:
+                likely.append((mean, each))
         likely.sort(key=lambda one: one[0])
         if not likely or likely[0][0] > _SIMILAR or self._newcomers[likely[0][1].number][0] < _LOOKED_AT:
             return

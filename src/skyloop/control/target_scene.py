@@ -27,6 +27,8 @@ Floats = NDArray[np.float32]
 
 _COLOUR_UNITS: Final = np.array([30.0, 10.0, 10.0, 30.0, 10.0, 10.0], np.float32)  # of L, a, b: light changes L most
 _OTHER: Final = 10.0  # unlikeness from which something is another thing; its own: mostly below 0.5, at times 3
+_OTHER_AGAIN: Final = 3.0  # the same, of what was not seen for a moment
+_MOMENT_S: Final = 0.3
 _UNLIKE: Final = 3.0  # weight of the unlikeness against that of where things are
 _LEARNING: Final = 0.05  # of the colours, by one detection; of the first ones the mean
 _GATE: Final = 9.0  # of the squared Mahalanobis distance by the number of what was measured
@@ -39,9 +41,10 @@ _EARLIER_S: Final = 0.5  # before two met: what pulls at them as their boxes mer
 _APART_S: Final = 0.6  # after they parted: how they move on is known then
 _DIFFER_M_S: Final = 0.8  # between their velocities before: else nothing tells them apart
 _TURNED: Final = 0.3  # of that difference, the other way round, from which they were taken for each other
-_KEEP_S: Final = 2.0  # things that are hidden are remembered for so long: what comes after that may be another one
+_KEEP_S: Final = 1.0  # things that are hidden are remembered for so long: what comes after that may be another one
 _YOUNG_S: Final = 0.5  # and those that were seen only once
 _CONFIRMED: Final = 3  # detections
+_OF_A_PART: Final = 1.0  # unlikeness of what the image cuts off: its halves are others
 _WELL_KNOWN: Final = 15  # detections: its colours are known then
 _SURE: Final = 0.35  # score of a detection that may be a new thing
 
@@ -56,7 +59,8 @@ class SceneObject:
         estimator: Where it is.
         detection: The last one.
         looks: Its colours, (6,): see :func:`skyloop.vision.appearance.colours`.
-        places: Those of the last detection, (n, 6).
+        places: Those of the last detection that the image did not cut off, (n, 6).
+        whole: Whether the last detection was of the whole thing.
         hits: How often it was detected.
         first_ns: When it was detected first.
         last_ns: When it was detected last.
@@ -76,6 +80,7 @@ class SceneObject:
     first_ns: int
     last_ns: int
     seen: bool = True
+    whole: bool = True
     contested_ns: int = 0
     contested: bool = False
 
@@ -85,6 +90,11 @@ class SceneObject:
     def confirmed(self) -> bool:
         """Whether it was seen often enough to be believed."""
         return self.hits >= _CONFIRMED
+
+    def learn(self, places: Floats) -> None:
+        """Update the colours with those at places of its newest detection, (n, 6)."""
+        self.places = places
+        self.looks = self.looks + max(_LEARNING, 1.0 / self.hits) * (_nearest(self.looks, places) - self.looks)
 
     def remember(self, at_ns: int) -> None:
         """Keep the velocity of this time for :attr:`earlier`."""
@@ -109,6 +119,11 @@ class _Seen(NamedTuple):
     detection: Detection
     view: BoxView
     looks: Floats
+
+    @property
+    def whole(self) -> bool:
+        """Whether the image cuts off neither its upper nor its lower end."""
+        return self.view.bottom is not None and self.view.top is not None
 
 
 def unlikeness(one: Floats, other: Floats) -> float:
@@ -209,8 +224,9 @@ class Scene:
         costs = np.full((len(things), len(seen)), _NEVER)
         for i, thing in enumerate(things):
             for j, one in enumerate(seen):
-                unlike = unlikeness(thing.looks, one.looks)
-                if one.detection.class_name == thing.class_name and (unlike < _OTHER or thing.hits < _WELL_KNOWN):
+                unlike = unlikeness(thing.looks, one.looks) if one.whole else _OF_A_PART
+                most = _OTHER if seconds(at_ns - thing.last_ns) < _MOMENT_S else _OTHER_AGAIN
+                if one.detection.class_name == thing.class_name and (unlike < most or thing.hits < _WELL_KNOWN):
                     fit, cost = thing.estimator.distance(one.view, camera, at_ns)
                     if fit < _GATE:
                         costs[i, j] = cost + _UNLIKE * unlike
@@ -238,10 +254,9 @@ class Scene:
             thing, one = things[i], seen[j]
             if thing.estimator.update(one.view, camera, at_ns):
                 thing.seen, thing.detection, thing.hits = True, one.detection, thing.hits + 1
-                thing.places, thing.last_ns = one.looks, max(at_ns, thing.last_ns)
-                thing.looks = thing.looks + max(_LEARNING, 1.0 / thing.hits) * (
-                    _nearest(thing.looks, one.looks) - thing.looks
-                )
+                thing.whole, thing.last_ns = one.whole, max(at_ns, thing.last_ns)
+                if one.whole:
+                    thing.learn(one.looks)
                 thing.remember(at_ns)
         return [seen[j] for j in range(len(seen)) if j not in used]
 
