@@ -330,7 +330,8 @@ def hidden(rng: random.Random) -> str:
     )
     house = '[[box]]\nname = "house"\nstands_at = [0, 10.5]\nsize = [20, 2, 4]\ntexture = "concrete"\n'
     passer = person("passer", rng.randrange(1000), [(-9, 8), (9, 8), (9, 8.5), (-9, 8.5)], 1.2)
-    start = spawn(rng.uniform(-2, 2), rng.uniform(-1, 1), rng.choice((90, -90)))
+    side = rng.choice((1, -1))  # it looks to where nothing hides him
+    start = spawn(side * rng.uniform(2, 4), rng.uniform(-1, 1), 0 if side > 0 else 180)
     return room + start + walls + house + person("walker", rng.randrange(1000), points, 1.5) + passer
 
 

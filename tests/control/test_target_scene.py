@@ -177,13 +177,13 @@ def test_light_that_changes_slowly_is_learned() -> None:
     assert scene.objects[1].hits == 120
 
 
-def test_what_is_hidden_is_forgotten_after_a_second_unless_it_is_kept() -> None:
+def test_what_is_hidden_is_forgotten_after_two_seconds_unless_it_is_kept() -> None:
     for kept in (False, True):
         people = People((walk(5.0, -1.0), BLUE), (walk(5.0, 1.0), RED))
         people.run(1.0)
         number = people.who(0).number
         people.scene.kept = {number} if kept else set()
-        people.run(0.8, hidden=frozenset({0}))
+        people.run(1.8, hidden=frozenset({0}))
         assert number in people.scene.objects
         people.run(0.4, hidden=frozenset({0}))
         assert (number in people.scene.objects) is kept

@@ -34,6 +34,11 @@ _DORMANT_S: Final = 1.0  # unseen for longer, it must be recognised
 _SIMILAR: Final = 1.6  # mean unlikeness of a newcomer's colours, up to which it may be the target
 _LOOKED_AT: Final = 5  # images that are needed for that
 _OF_LATE: Final = 8  # images that the mean is mostly of
+_TWIN: Final = 0.6  # unlikeness of another thing, up to which nothing but place and motion tells it from the target
+_TWIN_S: Final = 60.0  # since a twin was seen beside the target: a newcomer may be it
+_TWIN_OFF_M: Final = 1.0  # how far a newcomer may then be from where the target should be, and how much faster
+_TWIN_OFF_M_S: Final = 0.5
+_TWIN_DIFFERS_M_S: Final = 1.2
 _CLEARLY: Final = 1.0  # by which any other newcomer must be more unlike
 _FAST_M_S: Final = 4.0  # what an unseen thing may have moved at
 _KEPT_FRAMES: Final = 12  # for detections that come later than their frames
@@ -102,6 +107,7 @@ class TargetFinder:
         self._frames: deque[_Seen] = deque(maxlen=_KEPT_FRAMES)
         self._middle: tuple[float, float] | None = None  # where the target should be in the newest image [px]
         self._doubts = 0
+        self._twin_ns: int | None = None  # when another thing that looks like the target was seen beside it
         self._newcomers: dict[int, tuple[int, float]] = {}  # images of them, and mean unlikeness to the target
         self._agreed = 0  # images in a row in which tracker and a detection agree
 
@@ -304,6 +310,7 @@ class TargetFinder:
             self._recognise(scene, target, frame)
         else:
             self._newcomers.clear()
+            self._note_twins(scene, target, frame.captured_ns)
 
     def _choose(self, scene: Scene, frame: _Seen, tracked: TrackResult) -> None:
         """Take the detection that the user's box, or the tracker, or else the class means."""
@@ -350,10 +357,34 @@ class TargetFinder:
         if len(likely) > 1 and likely[1][0] - likely[0][0] < _CLEARLY:
             return  # nothing tells them apart
         found = likely[0][1]
+        if not self._is_expected(target, found, frame.captured_ns):
+            return
         # Of what comes out of hiding the first boxes are of what it comes from behind of, too.
         found.looks, found.hits = target.looks, target.hits + found.hits
         self._adopt(scene, found)
         del scene.objects[target.number]
+
+    def _note_twins(self, scene: Scene, target: SceneObject, at_ns: int) -> None:
+        """Note whether something that looks just like the target is seen beside it."""
+        if target.seen and any(
+            each.seen and each.whole and each.confirmed and unlikeness(target.looks, each.looks) < _TWIN
+            for each in scene.objects.values()
+            if each is not target
+        ):
+            self._twin_ns = at_ns
+
+    def _is_expected(self, target: SceneObject, found: SceneObject, at_ns: int) -> bool:
+        """Whether a newcomer moves about where and as the target should, if it is known to have a twin."""
+        if self._twin_ns is None or seconds(at_ns - self._twin_ns) > _TWIN_S:
+            return True
+        assert target.estimator.seen_ns is not None
+        expected, is_at = target.estimator.at(at_ns), found.estimator.at(at_ns)
+        unseen_s = seconds(at_ns - target.estimator.seen_ns)
+        off_m, off_m_s = (
+            float(((one - other) @ (one - other)) ** 0.5)
+            for one, other in ((expected.foot[:2], is_at.foot[:2]), (expected.velocity, is_at.velocity))
+        )
+        return off_m < _TWIN_OFF_M + _TWIN_OFF_M_S * unseen_s and off_m_s < _TWIN_DIFFERS_M_S
 
     def _may_be(self, each: SceneObject) -> bool:
         return self.class_name is None or each.class_name == self.class_name

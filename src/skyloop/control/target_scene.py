@@ -41,10 +41,12 @@ _EARLIER_S: Final = 0.5  # before two met: what pulls at them as their boxes mer
 _APART_S: Final = 0.6  # after they parted: how they move on is known then
 _DIFFER_M_S: Final = 0.8  # between their velocities before: else nothing tells them apart
 _TURNED: Final = 0.3  # of that difference, the other way round, from which they were taken for each other
-_KEEP_S: Final = 1.0  # things that are hidden are remembered for so long: what comes after that may be another one
+_KEEP_S: Final = 2.0  # things that are hidden are remembered for so long: what comes after that may be another one
 _YOUNG_S: Final = 0.5  # and those that were seen only once
 _CONFIRMED: Final = 3  # detections
 _OF_A_PART: Final = 1.0  # unlikeness of what the image cuts off: its halves are others
+_SETTLED: Final = 8  # detections: what was seen less often, perhaps two as one, contests nothing of others
+_YOUNG: Final = 4.0  # by which its costs are higher
 _WELL_KNOWN: Final = 15  # detections: its colours are known then
 _SURE: Final = 0.35  # score of a detection that may be a new thing
 
@@ -229,7 +231,7 @@ class Scene:
                 if one.detection.class_name == thing.class_name and (unlike < most or thing.hits < _WELL_KNOWN):
                     fit, cost = thing.estimator.distance(one.view, camera, at_ns)
                     if fit < _GATE:
-                        costs[i, j] = cost + _UNLIKE * unlike
+                        costs[i, j] = cost + _UNLIKE * unlike + (0.0 if thing.hits >= _SETTLED else _YOUNG)
         shift = float(costs.min())  # the assignment minimises sums: all costs must be better than no pair
         rows, columns = self._assign(np.where(costs < _NEVER, costs - shift, _NEVER))
         pairs = [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if costs[i, j] < _NEVER]
@@ -241,7 +243,7 @@ class Scene:
                 k
                 for k in range(len(things))
                 if k not in matched
-                and things[k].confirmed
+                and things[k].hits >= _SETTLED
                 and _is_about(things[k], at_ns)
                 and (costs[k, j] < costs[i, j] + _AMBIGUOUS or _is_merged(things[i], things[k], seen[j], camera, at_ns))
             ]
