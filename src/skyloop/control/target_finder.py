@@ -33,6 +33,7 @@ _LATELY_S: Final = 1.0  # others are kept clear of for so long after they were s
 _DORMANT_S: Final = 1.0  # unseen for longer, it must be recognised
 _SIMILAR: Final = 1.6  # mean unlikeness of a newcomer's colours, up to which it may be the target
 _LOOKED_AT: Final = 5  # images that are needed for that
+_LOOKED_AT_LONGEST: Final = 15  # who was not taken for the target by then is not looked at any more
 _OF_LATE: Final = 8  # images that the mean is mostly of
 _TWIN: Final = 0.6  # unlikeness of another thing, up to which nothing but place and motion tells it from the target
 _TWIN_S: Final = 60.0  # since a twin was seen beside the target: a newcomer may be it
@@ -167,10 +168,11 @@ class TargetFinder:
         scene, found = self._scene, None
         if scene is None or self._number not in scene.dormant:
             return None
-        for number, (_, mean) in self._newcomers.items():
+        for number, (images, mean) in self._newcomers.items():
             thing = scene.objects.get(number)
-            lately = thing is not None and seconds(at_ns - thing.last_ns) < _LATELY_S
-            if thing is not None and lately and mean < 2.0 * _SIMILAR and (found is None or mean < found[0]):
+            if thing is None or seconds(at_ns - thing.last_ns) > _LATELY_S or images > _LOOKED_AT_LONGEST:
+                continue
+            if mean < 2.0 * _SIMILAR and (found is None or mean < found[0]):
                 found = mean, thing
         return None if found is None else found[1].estimator.at(at_ns)
 
