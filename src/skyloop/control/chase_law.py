@@ -35,6 +35,7 @@ _SMOOTHING_S = 0.4  # of the target's acceleration
 _SETPOINT_OVER = 1.5  # times the greatest speed: against its drag a vehicle reaches less than it is asked for
 _SETPOINT_AHEAD = 4.0  # times as fast as the vehicle a set-point may change, to make it change
 _COMING_S = 3.0  # a target that comes by sooner is made way for
+_UNCERTAIN_M = 1.0  # most by which it stays farther off from somebody whose place is not certain
 _GIVING_WAY_S = 1.0  # who has begun to make way to one side goes on to that side
 _EITHER_SIDE = 0.6  # of the clearance: it may pass on either side of somebody who comes so near to its middle
 _SWEEP_BACK = 0.4  # of the sweep: to where the target was not going
@@ -325,12 +326,17 @@ class ChaseLaw:
     def _clear_of(self, other: TargetState, own: Motion, wanted: Array) -> Array:
         """Return the velocity that keeps clear of somebody else, (2,) [m/s].
 
-        The nearest pass counts, by the velocity that it has or that it is about to take up.
+        The nearest pass counts, by the velocity that it has or that it is about to take up, and whether the other goes
+        on or stops; the less certain it is where the other is, the farther off it stays.
         """
-        clear_m = self.settings.clear_m
+        clear_m = self.settings.clear_m + min(_UNCERTAIN_M, other.place_m)
         here = own.position[:2] - other.foot[:2]
-        passes = [_pass(here, velocity - other.velocity) for velocity in (wanted, own.velocity[:2])]
-        away, in_s, side = min(passes, key=lambda one: one[0])
+        passes = [
+            _pass(here, velocity - theirs)
+            for velocity in (wanted, own.velocity[:2])
+            for theirs in (other.velocity, np.zeros(2))
+        ]
+        away, in_s, side = min(passes, key=lambda one: (one[1] >= _COMING_S, one[0]))
         if in_s >= _COMING_S or away >= clear_m:
             return np.zeros(2)
         gap = clear_m - away
