@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+import signal
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,8 @@ from typer.main import get_command
 import skyloop
 from skyloop.cli.app import build
 from skyloop.cli.fly_follow import SIDES
+from skyloop.clock import nanoseconds
+from skyloop.messages import Feedback
 from tests.cli.conftest import Run
 from tests.processes.conftest import Process
 
@@ -92,6 +95,51 @@ def test_it_follows_a_person_and_lands(run: Run, delta: Process) -> None:
     assert lines[-1] == "landing"
     assert any("following" in line and "m away" in line and "confidence" in line for line in lines)
     with skyloop.connect("delta", access="observe") as drone:
+        assert drone.feedback().state is skyloop.FlightState.LANDED
+
+
+WALKER = """
+[room]
+size = [30, 20, 8]
+floor = "grass"
+enclosed = false
+
+[[spawn]]
+position = [-6, 0, 0]
+
+[[target]]
+name = "anna"
+kind = "figure"
+shape = "person"
+path = { kind = "waypoints", points = [[0, -1.5, 0], [0, 1.5, 0]], speed = 0.6 }
+"""
+
+
+def away_m(feedback: Feedback) -> float:
+    """The true distance from the drone to the person."""
+    native = dict(feedback.native or {})
+    return math.dist(*([float(native[f"truth.{one}{axis}"]) for axis in "xy"] for one in ("", "anna.")))  # type: ignore[arg-type]
+
+
+@pytest.mark.process
+@pytest.mark.flight
+def test_a_processor_that_runs_finds_whom_it_follows(start: Callable[..., Process], tmp_path: Path) -> None:
+    world = tmp_path / "walker.toml"
+    world.write_text(WALKER)
+    start("proxy", f"sim://?world={world}&cameras=front&fps=15&wind=0", "--name", "epsilon").until("ready")
+    start("detect", "--on", "epsilon")
+    with skyloop.connect("epsilon", access="observe") as drone:
+        assert next(iter(drone.results("detections", timeout_s=20.0))).value["detections"]
+        assert away_m(drone.feedback()) > 5.5
+        flown = start("fly", "follow", "epsilon", "--class", "person", "--detector", "detections")
+        flown.until("following")
+        near = drone.wait(lambda feedback: abs(away_m(feedback) - 4.0) < 0.4, timeout_s=30.0)
+        later_ns = near.captured_ns + nanoseconds(1.0)
+        assert away_m(drone.wait(lambda feedback: feedback.captured_ns > later_ns)) == pytest.approx(4.0, abs=1.0)
+        flown.signal(signal.SIGINT)
+        assert flown.wait() == 0
+        flown.until("landing")
+        assert "lost" not in flown.text
         assert drone.feedback().state is skyloop.FlightState.LANDED
 
 

@@ -411,6 +411,24 @@ def test_detections_that_come_late_are_used() -> None:
     assert follower.status.range_m == pytest.approx(4.0 - 0.12, abs=0.5)
 
 
+def test_what_only_late_detections_show_is_followed() -> None:
+    follower = follower_of(box=None, class_name="person", detects=True)
+    for n in range(12):
+        at_s = 1.0 + n * PERIOD_S
+        follower.feedback(state(at_s))
+        follower.look(picture(at_s))
+        follower.detected([Detection((158.0, 112.0, 4.0, 14.0), 0.9, 0, "person")], nanoseconds(at_s))
+        follower.step(nanoseconds(at_s))
+    assert follower.status.box is None, "too small for the tracker"
+    assert follower.phase is TargetPhase.FOLLOWING
+    at_s += 1.0
+    follower.feedback(state(at_s))
+    follower.look(picture(at_s))
+    follower.detected([], nanoseconds(at_s))
+    follower.step(nanoseconds(at_s))
+    assert follower.phase is not TargetPhase.FOLLOWING
+
+
 def test_other_things_are_drawn_and_what_is_contested_is_said() -> None:
     class Both:
         def detect(self, image: Any) -> list[Detection]:

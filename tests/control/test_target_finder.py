@@ -290,6 +290,30 @@ def test_detections_may_come_later_than_their_picture() -> None:
     assert film.agreement(10) > 0.6, "between the detections it is tracked"
 
 
+def test_late_detections_agree_with_a_box_as_those_in_time_do() -> None:
+    walker = Walker(walk(4.0, -0.8, 0.0, 0.6), BLUE, 1)
+    finder = TargetFinder(box=start_box(walker))
+    film = Film(finder, walker, detects=False)
+    film.run(3 * PERIOD_S)
+    for n in range(3):
+        assert finder.target is None, "a detection or two may be a chance"
+        at_ns, detections = film.at_ns, film.picture()[1]
+        film.run(PERIOD_S)
+        assert finder.detected(detections, at_ns, ground=True) is (n == 2)
+    assert finder.target is not None
+
+
+def test_what_is_too_small_to_be_tracked_is_seen_by_late_detections() -> None:
+    finder, image = TargetFinder(class_name="person"), texture(np.random.default_rng(7), WIDTH, HEIGHT)
+    small = Detection((150.0, 115.0, 4.0, 12.0), 0.9, 0, "person")
+    seen = []
+    for at_ns in (nanoseconds(1.0 + n * PERIOD_S) for n in range(4)):
+        finder.see(image, camera_at(), at_ns, ground=False, detections=None)
+        seen.append(finder.detected([small], at_ns, ground=False))
+    assert seen == [False, False, True, True]
+    assert not finder.detected([], at_ns, ground=False)
+
+
 def test_detections_of_an_unknown_picture_are_ignored() -> None:
     walker = Walker(walk(4.0, 0.0), BLUE, 1)
     finder = TargetFinder(class_name="person")
@@ -297,7 +321,7 @@ def test_detections_of_an_unknown_picture_are_ignored() -> None:
     film.run(1.5)
     _, detections = film.picture()
     for at_ns in (0, film.at_ns + 1, film.at_ns - nanoseconds(1.2)):
-        finder.detected(detections, at_ns, ground=True)
+        assert not finder.detected(detections, at_ns, ground=True)
     assert finder.detections == ()
 
 
@@ -332,6 +356,22 @@ def test_a_tracker_that_drifted_away_is_refused() -> None:
     assert drifting.refused >= 1
     assert all(one.box is None for one, _ in film.sightings[-12:])
     assert film.is_kept(), "its estimate is left alone"
+
+
+def test_late_detections_bring_a_tracker_back_that_lost_the_target_or_went_elsewhere() -> None:
+    walker = Walker(walk(4.0, 0.0), BLUE, 1)
+    finder, drifting = TargetFinder(class_name="person"), Drifting()
+    film = Film(finder, walker, detects=False)
+    for _ in range(4):
+        film.run(PERIOD_S)
+        finder.detected(film.picture()[1], film.at_ns, ground=True)
+    finder._tracker = drifting  # type: ignore[assignment]
+    x, y, width, height = start_box(walker)
+    for box, resumed in ((None, 1), ((x + 0.7 * width, y, width, height), 2), ((x + 1.0, y, width, height), 2)):
+        drifting.box = box
+        film.run(PERIOD_S)
+        assert finder.detected(film.picture()[1], film.at_ns, ground=True)
+        assert drifting.resumed == resumed
 
 
 @pytest.mark.parametrize(("hidden_s", "taken"), [(0.5, False), (1.2, True)])

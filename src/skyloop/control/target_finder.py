@@ -59,6 +59,7 @@ class _Seen:
     image: Image
     camera: Camera
     captured_ns: int
+    box: Box | None = None  # in which the target was found
 
 
 class TargetFinder:
@@ -143,20 +144,35 @@ class TargetFinder:
         if not self._is_backed(tracked.box, detections):
             tracked = TrackResult(None, 0.0)
         sighting = self._decide(image, camera, captured_ns, tracked)
+        self._frames[-1].box = sighting.box
         self._middle = None if self.estimator is None else camera.pixel(self.estimator.at(captured_ns).middle)
         return sighting
 
-    def detected(self, detections: Sequence[Detection], captured_ns: int, *, ground: bool) -> None:
+    def detected(self, detections: Sequence[Detection], captured_ns: int, *, ground: bool) -> bool:
         """Use detections that come later than the image that they were found in.
+
+        Where the tracker did not find the target in that image, or elsewhere, it goes on from there.
 
         Args:
             detections: Of one of the last images given to :meth:`see`; of another image they are ignored.
             captured_ns: Of that image.
             ground: Whether the camera's height above the ground is known.
+
+        Returns:
+            Whether they show the target, or may show it.
         """
         frame = next((one for one in self._frames if one.captured_ns == captured_ns), None)
-        if frame is not None:
-            self._use(detections, frame, TrackResult(None, 0.0), ground=ground)
+        if frame is None:
+            return False
+        self._use(detections, frame, TrackResult(frame.box, 0.0), ground=ground)
+        target = self.target
+        if target is None or not target.seen:
+            return target is not None and target.contested
+        if frame.box is None or overlap(frame.box, target.detection.box) < _SAME:
+            self._resume(frame.image, target.detection.box)
+            # The tracker's next step begins in that image, not in the newest.
+            self._middle = frame.camera.pixel(target.estimator.at(captured_ns).middle)
+        return True
 
     @property
     def target(self) -> SceneObject | None:

@@ -226,7 +226,8 @@ class TargetFollower:
         """
         if self._finder is not None:
             ground = self._newest is not None and self._newest.altitude_m is not None
-            self._finder.detected(detections, captured_ns, ground=ground)
+            if self._finder.detected(detections, captured_ns, ground=ground):
+                self._seen_ns = max(captured_ns, self._seen_ns or 0)
 
     def step(self, now_ns: int) -> Velocity | Attitude:
         """Compute the set-point for now [ns on the proxy's clock]; it holds the vehicle while its motion is not known.
