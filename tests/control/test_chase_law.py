@@ -17,7 +17,7 @@ from skyloop.control.chase_settings import ChaseSettings
 from skyloop.control.target import Motion
 from skyloop.control.target_estimate import TargetEstimator
 from skyloop.errors import UsageError
-from skyloop.messages import Attitude, Velocity
+from skyloop.messages import Attitude, Value, Velocity
 from skyloop.messages.geometry import wrap_angle
 from tests.control.target_world import PERIOD_S, PERSON, ChaseWorld, Path, camera_at, view_of, walk
 
@@ -483,7 +483,7 @@ def test_settings_are_brought_within_the_drones_limits() -> None:
     assert (found.speed_m_s, found.climb_m_s, found.turn_rad_s) == (1.5, 0.3, 0.9)
     assert (found.lowest_m, found.highest_m) == (0.7, 0.7)
     assert (found.tilt_rad, found.lean_rad) == (0.21, 0.21)
-    wide = dict.fromkeys(limits, 100.0) | {"limits.tilt": True, "limits.speed": "fast"}
+    wide: dict[str, Value] = {**dict.fromkeys(limits, 100.0), "limits.tilt": True, "limits.speed": "fast"}
     assert ChaseSettings().within(wide) == ChaseSettings().within({}) == ChaseSettings()
 
 

@@ -141,7 +141,8 @@ def unlikeness(one: Floats, other: Floats) -> float:
 def _nearest(one: Floats, places: Floats) -> Floats:
     """Return the most similar of the colours of places in a box, (6,)."""
     places = np.atleast_2d(places)
-    return places[int(np.argmin(np.sum(((one - places) / _COLOUR_UNITS) ** 2, axis=-1)))]
+    nearest: Floats = places[int(np.argmin(np.sum(((one - places) / _COLOUR_UNITS) ** 2, axis=-1)))]
+    return nearest
 
 
 def _is_about(thing: SceneObject, at_ns: int) -> bool:
