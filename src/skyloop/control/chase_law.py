@@ -35,9 +35,10 @@ _SMOOTHING_S = 0.4  # of the target's acceleration
 _SETPOINT_OVER = 1.5  # times the greatest speed: against its drag a vehicle reaches less than it is asked for
 _SETPOINT_AHEAD = 4.0  # times as fast as the vehicle a set-point may change, to make it change
 _COMING_S = 3.0  # a target that comes by sooner is made way for
+_SURE_M = 0.35  # a deviation of a place up to which it counts as certain
 _UNCERTAIN_M = 1.0  # most by which it stays farther off from somebody whose place is not certain
 _GIVING_WAY_S = 1.0  # who has begun to make way to one side goes on to that side
-_EITHER_SIDE = 0.6  # of the clearance: it may pass on either side of somebody who comes so near to its middle
+_EITHER_SIDE = 0.2  # of the clearance: it may pass on either side of somebody who comes so near to its middle
 _SWEEP_BACK = 0.4  # of the sweep: to where the target was not going
 _ALONG_M_S = 0.4  # a target that is slower has no direction to be behind or beside of
 
@@ -326,16 +327,14 @@ class ChaseLaw:
     def _clear_of(self, other: TargetState, own: Motion, wanted: Array) -> Array:
         """Return the velocity that keeps clear of somebody else, (2,) [m/s].
 
-        The nearest pass counts, by the velocity that it has or that it is about to take up, and whether the other goes
-        on or stops; the less certain it is where the other is, the farther off it stays.
+        The nearest pass counts, by the velocity that it has or that it is about to take up. The less certain it is
+        where the other is, who is out of view perhaps, the farther off it stays, and reckons with a stop.
         """
-        clear_m = self.settings.clear_m + min(_UNCERTAIN_M, other.place_m)
+        uncertain_m = max(0.0, min(_UNCERTAIN_M, other.place_m - _SURE_M))
+        clear_m = self.settings.clear_m + uncertain_m
         here = own.position[:2] - other.foot[:2]
-        passes = [
-            _pass(here, velocity - theirs)
-            for velocity in (wanted, own.velocity[:2])
-            for theirs in (other.velocity, np.zeros(2))
-        ]
+        moves = (other.velocity, np.zeros(2)) if uncertain_m > 0.0 else (other.velocity,)
+        passes = [_pass(here, velocity - theirs) for velocity in (wanted, own.velocity[:2]) for theirs in moves]
         away, in_s, side = min(passes, key=lambda one: (one[1] >= _COMING_S, one[0]))
         if in_s >= _COMING_S or away >= clear_m:
             return np.zeros(2)

@@ -38,6 +38,7 @@ _GONE_INTERVALS: Final = 2.5
 _BEFORE_S: Final = 0.2  # before it was seen last: what hid it had not begun to cut its box off then
 _GATE: Final = 4.0  # standard deviations, of the azimuth
 _EDGE_GATE: Final = 3.0  # of an edge: a farther one is hidden by something, or the image of something else
+_OUTGROWN: Final = 3.0  # standard deviations of both edges, outwards
 _LEAST_SLOPE: Final = 0.04  # of an edge, below which its height says nothing about the range
 _SURE_OF_SIZE: Final = 0.4  # deviation of the logarithm of the height, from which on it counts as unknown
 
@@ -213,10 +214,15 @@ class TargetEstimator:
         Returns:
             The squared Mahalanobis distance divided by the number of what was measured, which is about 1 for its own
             boxes; and the negative logarithm of its likelihood, up to what all filters have in common for this box.
+            Both are infinite for a box that is too large above and below: something may hide a part of a thing, but
+            add nothing to it.
         """
         state, covariance = self._predict(at_ns)
         off, jacobian, noise = _innovation(view, camera, state, self.traits.radius_m)
         spread = jacobian @ covariance @ jacobian.T + noise
+        share = off / np.sqrt(np.diag(spread))
+        if len(share) == 3 and -share[1] > _OUTGROWN and share[2] > _OUTGROWN:
+            return math.inf, math.inf
         squared = float(off @ np.linalg.solve(spread, off))
         return squared / len(off), squared + float(np.linalg.slogdet(spread)[1] - np.linalg.slogdet(noise)[1])
 

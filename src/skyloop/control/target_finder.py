@@ -33,13 +33,15 @@ _LATELY_S: Final = 1.0  # others are kept clear of for so long after they were s
 _DORMANT_S: Final = 1.0  # unseen for longer, it must be recognised
 _SIMILAR: Final = 1.6  # mean unlikeness of a newcomer's colours, up to which it may be the target
 _LOOKED_AT: Final = 5  # images that are needed for that
-_LOOKED_AT_LONGEST: Final = 15  # who was not taken for the target by then is not looked at any more
+_LOOKED_AT_IN_DOUBT: Final = 10  # until it is known how a newcomer moves
+_LOOKED_AT_LONGEST: Final = 20  # who was not taken for the target by then is not looked at any more
 _OF_LATE: Final = 8  # images that the mean is mostly of
 _TWIN: Final = 0.6  # unlikeness of another thing, up to which nothing but place and motion tells it from the target
 _TWIN_S: Final = 60.0  # since a twin was seen beside the target: a newcomer may be it
 _TWIN_OFF_M: Final = 1.0  # how far a newcomer may then be from where the target should be, and how much faster
 _TWIN_OFF_M_S: Final = 0.5
-_TWIN_DIFFERS_M_S: Final = 1.2
+_OTHER_WAY_M_S: Final = 2.2  # between the velocities of a newcomer and of the target before it was hidden
+_GOES_ON_S: Final = 6.0  # so long is it believed to have kept its direction
 _CLEARLY: Final = 1.0  # by which any other newcomer must be more unlike
 _FAST_M_S: Final = 4.0  # what an unseen thing may have moved at
 _KEPT_FRAMES: Final = 12  # for detections that come later than their frames
@@ -363,6 +365,8 @@ class TargetFinder:
             if view is None or target.estimator.distance(view, frame.camera, frame.captured_ns)[0] > _FITS:
                 continue
             images, mean = self._newcomers.get(each.number, (0, 0.0))
+            if images and not self._is_expected(target, each, mean, frame.captured_ns):
+                images = 0  # nor by one image in which two are taken for one
             if each.whole:
                 images += 1
                 mean += (unlikeness(target.looks, each.places) - mean) / min(images, _OF_LATE)
@@ -370,12 +374,14 @@ class TargetFinder:
             if images:
                 likely.append((mean, each))
         likely.sort(key=lambda one: one[0])
-        if not likely or likely[0][0] > _SIMILAR or self._newcomers[likely[0][1].number][0] < _LOOKED_AT:
+        if not likely or likely[0][0] > _SIMILAR:
+            return
+        mean, found = likely[0]
+        if self._newcomers[found.number][0] < (_LOOKED_AT if mean < _TWIN else _LOOKED_AT_IN_DOUBT):
             return
         if len(likely) > 1 and likely[1][0] - likely[0][0] < _CLEARLY:
             return  # nothing tells them apart
-        found = likely[0][1]
-        if not self._is_expected(target, found, frame.captured_ns):
+        if not self._is_expected(target, found, mean, frame.captured_ns):
             return
         # Of what comes out of hiding the first boxes are of what it comes from behind of, too.
         found.looks, found.hits = target.looks, target.hits + found.hits
@@ -391,10 +397,11 @@ class TargetFinder:
         ):
             self._twin_ns = at_ns
 
-    def _is_expected(self, target: SceneObject, found: SceneObject, at_ns: int) -> bool:
-        """Whether a newcomer moves about where and as the target should, if it is known to have a twin."""
-        if self._twin_ns is None or seconds(at_ns - self._twin_ns) > _TWIN_S:
-            return True
+    def _is_expected(self, target: SceneObject, found: SceneObject, mean: float, at_ns: int) -> bool:
+        """Whether a newcomer moves as the target should, as far as its colours leave a doubt.
+
+        If the target is known to have a twin, it must also be about where it should be.
+        """
         assert target.estimator.seen_ns is not None
         expected, is_at = target.estimator.at(at_ns), found.estimator.at(at_ns)
         unseen_s = seconds(at_ns - target.estimator.seen_ns)
@@ -402,7 +409,9 @@ class TargetFinder:
             float(((one - other) @ (one - other)) ** 0.5)
             for one, other in ((expected.foot[:2], is_at.foot[:2]), (expected.velocity, is_at.velocity))
         )
-        return off_m < _TWIN_OFF_M + _TWIN_OFF_M_S * unseen_s and off_m_s < _TWIN_DIFFERS_M_S
+        if self._twin_ns is not None and seconds(at_ns - self._twin_ns) < _TWIN_S:
+            return off_m < _TWIN_OFF_M + _TWIN_OFF_M_S * unseen_s and off_m_s < _OTHER_WAY_M_S
+        return mean < _TWIN or unseen_s > _GOES_ON_S or off_m_s < _OTHER_WAY_M_S
 
     def _may_be(self, each: SceneObject) -> bool:
         return self.class_name is None or each.class_name == self.class_name
