@@ -34,6 +34,7 @@ Array = NDArray[np.float64]
 
 _KEPT_S = 2.0  # estimates of the past, to see how well the marker's motion was foreseen
 _MOST_REFUSED = 4  # sightings in a row that don't fit the filter: then it restarts
+_CONTRADICTED = 2  # and so many abort a touch-down
 _REACTION_S = 0.25  # for which a difference of velocity counts: the vehicle takes it out within this time
 _JUST = 0.999  # of a limit: turned into body axes, a speed may be longer by the last digit
 _MOVES_M_S = 0.1  # what is slower has no direction that could turn
@@ -224,12 +225,15 @@ class LandingLaw:
         s = self.settings
         if relative.height < s.nearly_m:
             return relative.touching_off > s.pad_m
-        return relative.touching_off > s.abort_off_m or self._unseen_s(now_ns) > s.blind_s
+        contradicted = self._target.refused >= _CONTRADICTED
+        return relative.touching_off > s.abort_off_m or self._unseen_s(now_ns) > s.blind_s or contradicted
 
     def _sure(self, relative: _Relative) -> bool:
         """Whether to touch down: over the marker, as fast as it, and it does what was foreseen."""
         s = self.settings
-        if relative.touching_off > s.commit_off_m or float(np.hypot(*relative.velocity)) > s.commit_m_s:
+        if self._target.refused or relative.touching_off > s.commit_off_m:
+            return False
+        if float(np.hypot(*relative.velocity)) > s.commit_m_s:
             return False
         newest = self._past[-1]
         if newest.turning_rad_s > s.commit_turn_rad_s and float(np.hypot(*newest.velocity[:2])) > _MOVES_M_S:
