@@ -18,15 +18,20 @@ from skyloop.messages.geometry import rotation_from_euler
 DT, FEEDBACK, FRAME, TOP_M = 0.005, 5, 13, 0.2
 GRAVITY = 9.80665
 LIMITS = {"limits.speed": 5.0, "limits.climb": 0.7, "limits.altitude": 3.0, "limits.tilt": 0.21}
+FAST = {**LIMITS, "limits.speed": 8.0, "limits.tilt": 0.5}
 
 
 class ChaseWorld:
     """A platform on a straight or a circle comes by below; what is asked for arrives 50 ms later."""
 
-    def __init__(self, speed: float, radius: float = math.inf, *, gust: float = 0.0, **settings: float) -> None:
+    def __init__(
+        self, speed: float, radius: float = math.inf, *, gust: float = 0.0, fast: bool = False, **settings: float
+    ) -> None:
         self.rng = np.random.default_rng(4)
+        limits = FAST if fast else LIMITS
+        self.most_m_s2 = GRAVITY * math.tan(limits["limits.tilt"])
         self.speed, self.radius, self.gust = speed, radius, gust
-        self.law = LandingLaw(LandingSettings(wait_s=30.0, **settings).within(LIMITS))  # type: ignore[arg-type]
+        self.law = LandingLaw(LandingSettings(wait_s=30.0, **settings).within(limits))  # type: ignore[arg-type]
         self.position, self.velocity, self.lean = np.array([0.0, 0.1, 2.5]), np.zeros(3), np.zeros(2)
         self.wind = np.zeros(2)
         self.now_ns, self.begin_ns = NS_PER_S, NS_PER_S
@@ -72,7 +77,7 @@ class ChaseWorld:
         c, s = math.cos(self.yaw), math.sin(self.yaw)
         asked = np.array([c * late.forward - s * late.left, s * late.forward + c * late.left])
         lean = 2.0 * (asked - self.velocity[:2])
-        lean *= min(1.0, GRAVITY * math.tan(0.21) / max(1e-9, float(np.hypot(*lean))))
+        lean *= min(1.0, self.most_m_s2 / max(1e-9, float(np.hypot(*lean))))
         self.lean += (lean - self.lean) * DT / 0.1
         self.wind += -self.wind * DT + self.gust * math.sqrt(2 * DT) * self.rng.normal(size=2)
         push = -0.5 * (self.velocity[:2] - self.wind)
@@ -106,9 +111,12 @@ class ChaseWorld:
             self.law.see(seen + self.rng.normal(0, 0.004, 3), state, self.now_ns)
 
 
-@pytest.mark.parametrize(("speed", "radius", "gust"), [(2.0, math.inf, 0.0), (2.0, 10.0, 0.0), (1.0, 8.0, 1.0)])
+@pytest.mark.parametrize(
+    ("speed", "radius", "gust"),
+    [(2.0, math.inf, 0.0), (2.0, 10.0, 0.0), (1.0, 8.0, 1.0), (3.0, math.inf, 0.0), (3.0, 10.0, 0.0)],
+)
 def test_lands_on_a_platform_that_comes_by(speed: float, radius: float, gust: float) -> None:
-    world = ChaseWorld(speed, radius, gust=gust)
+    world = ChaseWorld(speed, radius, gust=gust, fast=speed > 2.0)
     assert world.run(40.0) is LandingPhase.DOWN
     assert world.off < 0.12
     assert float(np.hypot(*world.velocity[:2])) == pytest.approx(speed, abs=0.3)
