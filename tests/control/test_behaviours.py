@@ -42,9 +42,9 @@ def script() -> Iterator[ModuleType]:
         ("gates", 0, 0.0),
         ("gates", 3, 1.0),
         ("landing", 0, 0.0),
-        ("landing", 5, 1.0),
-        ("landing-2-straight", 0, 0.0),
-        ("landing-2-turning", 0, 1.0),
+        ("landing", 3, 1.0),
+        ("landing-1-turning", 0, 1.0),
+        ("landing-3-straight", 0, 0.0),
         ("approach", 1, 1.0),
     ],
 )

@@ -24,11 +24,9 @@ FAST = {**LIMITS, "limits.speed": 8.0, "limits.tilt": 0.5}
 class ChaseWorld:
     """A platform on a straight or a circle comes by below; what is asked for arrives 50 ms later."""
 
-    def __init__(
-        self, speed: float, radius: float = math.inf, *, gust: float = 0.0, fast: bool = False, **settings: float
-    ) -> None:
+    def __init__(self, speed: float, radius: float = math.inf, *, gust: float = 0.0, **settings: float) -> None:
         self.rng = np.random.default_rng(4)
-        limits = FAST if fast else LIMITS
+        limits = FAST if speed > 2.0 else LIMITS
         self.most_m_s2 = GRAVITY * math.tan(limits["limits.tilt"])
         self.speed, self.radius, self.gust = speed, radius, gust
         self.law = LandingLaw(LandingSettings(wait_s=30.0, **settings).within(limits))  # type: ignore[arg-type]
@@ -116,7 +114,7 @@ class ChaseWorld:
     [(2.0, math.inf, 0.0), (2.0, 10.0, 0.0), (1.0, 8.0, 1.0), (3.0, math.inf, 0.0), (3.0, 10.0, 0.0)],
 )
 def test_lands_on_a_platform_that_comes_by(speed: float, radius: float, gust: float) -> None:
-    world = ChaseWorld(speed, radius, gust=gust, fast=speed > 2.0)
+    world = ChaseWorld(speed, radius, gust=gust)
     assert world.run(40.0) is LandingPhase.DOWN
     assert world.off < 0.12
     assert float(np.hypot(*world.velocity[:2])) == pytest.approx(speed, abs=0.3)
