@@ -150,16 +150,18 @@ def landing(speed: float, ground: str = "walk") -> Callable[[int, float], Flight
 def land(speed: float, ground: str, seed: int, gust_m_s: float) -> Flight:
     """Land on a platform: ``walk`` about a room, ``straight`` along a runway, or ``turning`` on a circle."""
     wait = ground != "walk"
+    fast = speed > 2.0
     settings = LandingSettings(give_up_s=LANDING_S[wait] - 5.0)
     if wait:  # above the road, as high as it may
-        settings = replace(settings, wait_s=60.0, search_height_m=2.8)
+        settings = replace(settings, wait_s=60.0, search_height_m=FAST_HEIGHT_M if fast else 2.8)
     places: list[Place] = []
     with TemporaryDirectory() as folder:
         world = Path(folder, "platform.toml")
         world.write_text(platform_world(speed, ground, seed))
         with flying(str(world), "bottom", seed, gust_m_s) as drone:
-            if speed > 2.0:
-                drone.config["limits.tilt"], drone.config["limits.speed"] = FAST_TILT_RAD, FAST_SPEED_M_S
+            if fast:
+                for limit, value in FAST_LIMITS.items():
+                    drone.config[f"limits.{limit}"] = value
             drone.on_feedback(lambda feedback: places.append(Place.of(feedback)))
             lander = LandOnMarker(drone, settings=settings)
             run = lander.run(seconds=LANDING_S[wait])
@@ -231,8 +233,11 @@ def platform_world(speed: float, ground: str, seed: int) -> str:
 
 
 TURN_M: Final = 10.0
-FAST_TILT_RAD: Final = 0.5  # above 2 m/s the drag of the vehicle leaves too little of the usual 0.21 rad, and
-FAST_SPEED_M_S: Final = 8.0  # its loop flies 4 m/s only by set-points of more than the usual 5 m/s
+#: Above 2 m/s the drag of the vehicle leaves too little of the usual 0.21 rad, its loop flies 4 m/s only by set-points
+#: of more than the usual 5 m/s, and from below the usual 3 m it sees what passes for too short a time to tell how it
+#: turns.
+FAST_LIMITS: Final = {"tilt": 0.5, "speed": 8.0, "altitude": 4.0}
+FAST_HEIGHT_M: Final = 3.6
 SAFE_HEIGHT_M: Final = 1.5
 LANDING_S: Final = {False: 90.0, True: 120.0}  # by whether it waits for the platform to pass
 FIELD: Final = """

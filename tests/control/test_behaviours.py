@@ -14,6 +14,7 @@ import pytest
 from skyloop.control import FlowHover, FlyThroughGates, GateKind, ImageServo, LandOnMarker, SeeAndAvoid
 from skyloop.control.gate_law import GatePhase
 from skyloop.control.landing_law import LandingPhase
+from skyloop.control.landing_settings import LandingSettings
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.messages import Annotation, FlightState, Land, LinkState, Severity, Velocity
 from skyloop.stepping.rehearsal import Radio, rehearse
@@ -37,7 +38,15 @@ def script() -> Iterator[ModuleType]:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "seed", "gust"),
-    [("gates", 0, 0.0), ("gates", 3, 1.0), ("landing", 0, 0.0), ("landing", 3, 1.0), ("approach", 1, 1.0)],
+    [
+        ("gates", 0, 0.0),
+        ("gates", 3, 1.0),
+        ("landing", 0, 0.0),
+        ("landing", 3, 1.0),
+        ("landing-1-turning", 0, 1.0),
+        ("landing-3-straight", 0, 0.0),
+        ("approach", 1, 1.0),
+    ],
 )
 def test_does_what_it_should(script: ModuleType, name: str, seed: int, gust: float) -> None:
     flight = script.GOALS[name].fly(seed, gust)
@@ -69,6 +78,36 @@ def test_summary_says_what_was_missed(script: ModuleType) -> None:
     assert "17 of 20" in text
     assert text.endswith("missed")
     assert script.summary(script.GOALS["landing"], 0.0, [good] * 18 + [bad] * 2).endswith("met")
+
+
+def test_how_a_landing_ended_is_judged_by_the_truth(script: ModuleType) -> None:
+    def end(*places: tuple[FlightState, float, float, float]) -> str:
+        return str(script.unsafe_end([script.Place(0, *place) for place in places]))
+
+    flying, landed = FlightState.FLYING, FlightState.LANDED
+    assert end((flying, 0.0, 0.1, 0.3), (landed, 0.1, 0.06, 0.26)) == ""
+    assert end((flying, 3.0, 0.3, 0.5), (landed, 3.0, -0.14, 0.06)) == "", "on the floor"
+    assert end((FlightState.HOVERING, 20.0, 2.4, 2.6)) == ""
+    assert end((flying, 0.4, 0.2, 0.4)) == "flies on at 0.4 m"
+    assert end((landed, 0.1, 0.3, 0.5), (landed, 2.0, -0.14, 0.06)) == "stopped its motors in the air"
+    assert end((landed, 0.5, 0.06, 0.26), (landed, 0.9, -0.14, 0.06)) == "fell off the platform"
+    assert end((FlightState.EMERGENCY, 0.5, 0.06, 0.26), (landed, 0.5, 0.06, 0.26)) == "crashed"
+
+
+def test_a_landing_that_finds_nothing_ends_hovering_high_and_warns(tmp_path: Path) -> None:
+    world = tmp_path / "empty.toml"
+    world.write_text("[room]\nsize = [20, 20, 6]\n[[spawn]]\nposition = [0, 0, 0]\n")
+    with rehearse(f"sim://?world={world}&cameras=bottom&fps=5") as drone:
+        drone.takeoff()
+        told: list[tuple[str, Severity]] = []
+        drone.on_event(lambda event: told.append((event.text, event.severity)))
+        landing = LandOnMarker(drone, settings=LandingSettings(give_up_s=4.0))
+        landing.run(seconds=15.0)
+        assert landing.done
+        assert not landing.landed
+        assert landing.phase is LandingPhase.GIVEN_UP
+        assert ("landing: gave up: hovering at a safe height", Severity.WARNING) in told
+        assert (drone.feedback().altitude_m or 0.0) > 2.2
 
 
 def test_a_gate_that_is_not_there_is_searched_and_not_flown_to(script: ModuleType) -> None:

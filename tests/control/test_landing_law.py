@@ -16,6 +16,7 @@ from skyloop.control.response import ResponseSettings
 from skyloop.control.spiral import SpiralSearch
 from skyloop.errors import UsageError
 from skyloop.messages import Feedback, Velocity
+from skyloop.messages.geometry import rotation_from_euler
 
 DT = 1 / 15
 TOP_M = 0.2
@@ -107,6 +108,40 @@ def test_what_turns_just_above_is_waited_for() -> None:
     for _ in range(600):
         world.step()
     assert world.phase() is LandingPhase.DOWN
+
+
+def hovering(roll_rate: float, late_s: float, sights: list[tuple[float, float, float]]) -> LandingLaw:
+    """A law that saw these places, in levelled axes, while its vehicle rolled; attitudes are from ``late_s`` before."""
+    law, rate = LandingLaw(), (roll_rate, 0.0, 0.0)
+    for k, sight in enumerate(sights):
+        now_ns = NS_PER_S + nanoseconds(k * DT)
+        state = Feedback(
+            captured_ns=now_ns,
+            roll_rad=0.0,
+            pitch_rad=0.0,
+            yaw_rad=0.0,
+            velocity_m_s=(0.0, 0.0, 0.0),
+            angular_velocity_rad_s=rate,
+        )
+        law.feedback(state)
+        seen = rotation_from_euler(roll_rate * late_s, 0.0, 0.0).T @ np.array(sight)
+        law.see(seen, state, now_ns + nanoseconds(late_s))
+    law.step(now_ns)
+    return law
+
+
+def test_an_attitude_from_before_the_frame_is_carried_on() -> None:
+    law = hovering(1.0, 0.02, [(0.0, 0.0, -2.0)] * 15)
+    assert law.off_m is not None
+    assert law.off_m < 0.01  # taken as it was, the marker were 0.04 m off
+
+
+def test_what_is_seen_while_turning_fast_counts_less() -> None:
+    sights = [(0.0, 0.0, -2.0)] * 15 + [(0.06, 0.0, -2.0)]
+    steady, turning = (hovering(rate, 0.0, sights).off_m for rate in (0.0, 2.0))
+    assert steady is not None
+    assert turning is not None
+    assert turning < 0.7 * steady
 
 
 def test_nothing_is_asked_for_before_the_vehicle_was_heard() -> None:

@@ -1,66 +1,129 @@
-"""How a vehicle answers velocity set-points, by a model of such a vehicle."""
+"""The model of a vehicle's answer, against a vehicle with delay, lean, lag and wind."""
 
 from __future__ import annotations
 
 import math
+from collections import deque
 
 import numpy as np
 import pytest
 
-from skyloop.clock import nanoseconds
+from skyloop.clock import NS_PER_S, nanoseconds
 from skyloop.control.response import ResponseSettings, VelocityResponse
 from skyloop.errors import UsageError
 from skyloop.messages import Feedback
 
-STEP_S = 0.025
+DT = 0.005
 GRAVITY = 9.80665
 
 
-def flown(push: float, wanted: float = 1.0, seconds: float = 6.0) -> tuple[list[float], VelocityResponse]:
-    """Velocities ahead of a vehicle with a velocity loop, behind a delay, that the air pushes ahead [m/s²]."""
-    settings = ResponseSettings(delay_s=0.1)
-    response, under_way = VelocityResponse(settings), [0.0] * 4
-    velocity, lean, velocities = 0.0, 0.0, []
-    for n in range(round(seconds / STEP_S)):
-        now_ns = nanoseconds(1.0 + n * STEP_S)
-        response.add(
-            Feedback(
-                captured_ns=now_ns,
-                roll_rad=0.0,
-                pitch_rad=math.atan2(lean, GRAVITY),
-                yaw_rad=0.0,
-                velocity_m_s=(velocity, 0.0, 0.0),
-            )
+class Vehicle:
+    """Leans by the velocity's error, late; one axis, forward; its lean is limited."""
+
+    def __init__(self, gain: float = 2.0, lag: float = 0.1, delay: float = 0.05, wind: float = 0.0) -> None:
+        self.gain, self.lag, self.wind = gain, lag, wind
+        self.velocity = self.position = self.lean = 0.0
+        self.now_ns = NS_PER_S
+        steps = max(1, round(delay / DT))
+        self._under_way: deque[float] = deque([0.0] * steps, maxlen=steps)
+
+    def step(self, setpoint: float, most: float) -> None:
+        late = self._under_way[0]
+        self._under_way.append(setpoint)
+        asked = max(-most, min(most, self.gain * (late - self.velocity)))
+        self.lean += (asked - self.lean) * DT / self.lag
+        self.velocity += (self.lean + self.wind) * DT
+        self.position += self.velocity * DT
+        self.now_ns += nanoseconds(DT)
+
+    def feedback(self) -> Feedback:
+        return Feedback(
+            captured_ns=self.now_ns,
+            roll_rad=0.0,
+            pitch_rad=math.atan(self.lean / GRAVITY),
+            yaw_rad=0.0,
+            velocity_m_s=(self.velocity, 0.0, 0.0),
         )
-        predicted = response.predict(now_ns)
-        assert predicted is not None
-        setpoint = response.setpoint(3.0 * (np.array([wanted, 0.0]) - predicted.velocity), predicted)
-        response.sent(setpoint, now_ns)
-        under_way.append(float(setpoint[0]))
-        lean += (STEP_S / 0.1) * (2.0 * (under_way.pop(0) - velocity) - lean)
-        velocity += (lean + push) * STEP_S
-        velocities.append(velocity)
-    return velocities, response
+
+
+def hold(vehicle: Vehicle, seconds: float = 12.0) -> list[float]:
+    """Keep a position with gains that a loop without prediction would swing by; returns the positions."""
+    response = VelocityResponse()
+    most = response.settings.most_m_s2
+    places, setpoint = [], 0.0
+    for k in range(round(seconds / DT)):
+        if k % 5 == 0:
+            response.add(vehicle.feedback())
+            motion = response.predict(vehicle.now_ns)
+            assert motion is not None
+            place = vehicle.position + motion.moved[0]
+            wanted = 12.0 * (1.0 - place) - 6.0 * motion.velocity[0]
+            setpoint = float(response.setpoint(np.array([wanted, 0.0]), motion)[0])
+            response.sent(np.array([setpoint, 0.0]), vehicle.now_ns)
+        vehicle.step(setpoint, most)
+        places.append(vehicle.position)
+    return places
+
+
+@pytest.mark.parametrize(
+    ("gain", "lag", "delay"),
+    [(2.0, 0.1, 0.05), (1.5, 0.1, 0.05), (2.6, 0.1, 0.05), (2.0, 0.16, 0.05), (2.0, 0.1, 0.1), (2.0, 0.1, 0.0)],
+)
+def test_holds_a_position_against_wind_also_by_a_model_that_is_a_little_wrong(
+    gain: float, lag: float, delay: float
+) -> None:
+    late = hold(Vehicle(gain, lag, delay, wind=0.8))[round(8.0 / DT) :]
+    assert max(late) - 1.0 < 0.02
+    assert 1.0 - min(late) < 0.02
 
 
 @pytest.mark.parametrize("push", [0.0, 0.8, -0.8])
 def test_takes_up_a_velocity_whatever_pushes(push: float) -> None:
-    velocities, response = flown(push)
+    vehicle, response = Vehicle(delay=0.1, wind=push), VelocityResponse(ResponseSettings(delay_s=0.1))
+    velocities = []
+    for k in range(round(6.0 / DT)):
+        if k % 5 == 0:
+            response.add(vehicle.feedback())
+            motion = response.predict(vehicle.now_ns)
+            assert motion is not None
+            setpoint = response.setpoint(3.0 * (np.array([1.0, 0.0]) - motion.velocity), motion)
+            response.sent(setpoint, vehicle.now_ns)
+        vehicle.step(float(setpoint[0]), 5.0)
+        velocities.append(vehicle.velocity)
     assert velocities[-1] == pytest.approx(1.0, abs=0.05)
     assert max(velocities) < 1.35
-    predicted = response.predict(nanoseconds(7.0))
-    assert predicted is not None
-    assert predicted.push[0] == pytest.approx(push, abs=0.2)
 
 
-def test_knows_nothing_before_feedback() -> None:
+def test_learns_what_the_wind_does() -> None:
+    vehicle, response = Vehicle(wind=-1.2), VelocityResponse()
+    for k in range(600):
+        vehicle.step(0.5, 3.0)
+        if k % 5 == 0:
+            response.sent(np.array([0.5, 0.0]), vehicle.now_ns)
+            response.add(vehicle.feedback())
+    motion = response.predict(vehicle.now_ns)
+    assert motion is not None
+    assert motion.push == pytest.approx([-1.2, 0.0], abs=0.1)
+    assert motion.at_ns == vehicle.now_ns + nanoseconds(0.05)
+
+
+def test_what_is_asked_for_is_within_the_lean() -> None:
+    response = VelocityResponse(ResponseSettings(tilt_rad=0.2))
+    response.add(Vehicle().feedback())
+    motion = response.predict(2 * NS_PER_S)
+    assert motion is not None
+    setpoint = response.setpoint(np.array([50.0, 0.0]), motion)
+    assert setpoint == pytest.approx([GRAVITY * math.tan(0.2) / 2.0, 0.0])
+
+
+def test_knows_nothing_before_it_has_heard() -> None:
     response = VelocityResponse()
     assert response.predict(0) is None
-    response.add(Feedback(captured_ns=1, velocity_m_s=(1.0, 0.0, 0.0)))  # without attitude
-    assert response.predict(2) is None
+    response.add(Feedback(captured_ns=1, velocity_m_s=(1.0, 0.0, 0.0), yaw_rad=0.0))
+    assert response.predict(NS_PER_S) is None, "without an attitude"
 
 
-@pytest.mark.parametrize("wrong", [{"gain_per_s": 0.0}, {"delay_s": -0.1}, {"lag_s": math.nan}, {"tilt_rad": 1.6}])
-def test_bad_settings_are_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(UsageError):
-        ResponseSettings(**wrong)
+@pytest.mark.parametrize("setting", [{"gain_per_s": 0.0}, {"lag_s": math.nan}, {"delay_s": -0.1}, {"tilt_rad": 2.0}])
+def test_settings_out_of_range_are_refused(setting: dict[str, float]) -> None:
+    with pytest.raises(UsageError, match=next(iter(setting))):
+        ResponseSettings(**setting)

@@ -27,6 +27,7 @@ from skyloop.control.spiral import SpiralSearch
 from skyloop.control.target import Motion, Odometry
 from skyloop.control.turning import TurnEstimate, TurningTargetFilter
 from skyloop.messages import Feedback, Velocity
+from skyloop.messages.geometry import rotation_from_euler
 
 __all__ = ["LandingLaw", "LandingPhase", "LandingSettings"]
 
@@ -34,6 +35,8 @@ Array = NDArray[np.float64]
 
 _KEPT_S = 2.0  # estimates of the past, to see how well the marker's motion was foreseen
 _MOST_REFUSED = 4  # sightings in a row that don't fit the filter: then it restarts
+_CONTRADICTED = 2  # and so many abort a touch-down
+_LATEST_S = 0.1  # for which a turn goes on as in the feedback next to a frame
 _REACTION_S = 0.25  # for which a difference of velocity counts: the vehicle takes it out within this time
 _JUST = 0.999  # of a limit: turned into body axes, a speed may be longer by the last digit
 _MOVES_M_S = 0.1  # what is slower has no direction that could turn
@@ -126,16 +129,19 @@ class LandingLaw:
 
         Args:
             position: The marker's centre in body axes, (3,) [m].
-            at_capture: Feedback with the attitude at the capture.
+            at_capture: Feedback with the attitude at the capture; if it is from before, its turn goes on.
             captured_ns: Capture of the frame.
         """
         motion = self._odometry.at(captured_ns)
         if motion is None or at_capture.roll_rad is None or at_capture.pitch_rad is None or at_capture.yaw_rad is None:
             return
-        place = motion.position + at_capture.rotation @ position
-        deviation = self.settings.sight_m + self.settings.sight_share * float(np.linalg.norm(position))
+        turning = np.asarray(at_capture.angular_velocity_rad_s or (0.0, 0.0, 0.0))
+        turned = turning * clamped(seconds(captured_ns - at_capture.captured_ns), _LATEST_S)
+        place = motion.position + at_capture.rotation @ rotation_from_euler(*turned.tolist()) @ position
+        s, sweep_m_s = self.settings, float(np.linalg.norm(np.cross(turning, position)))
+        deviation = s.sight_m + s.sight_share * float(np.linalg.norm(position)) + s.sight_s * sweep_m_s
         unseen_s = self._unseen_s(captured_ns)
-        if unseen_s > self.settings.recovering_s or self._target.refused >= _MOST_REFUSED:
+        if unseen_s > s.recovering_s or self._target.refused >= _MOST_REFUSED:
             self._target.start(place, deviation, captured_ns)
             self._past.clear()
         elif not self._target.update(place, deviation, captured_ns):
@@ -224,12 +230,15 @@ class LandingLaw:
         s = self.settings
         if relative.height < s.nearly_m:
             return relative.touching_off > s.pad_m
-        return relative.touching_off > s.abort_off_m or self._unseen_s(now_ns) > s.blind_s
+        contradicted = self._target.refused >= _CONTRADICTED
+        return relative.touching_off > s.abort_off_m or self._unseen_s(now_ns) > s.blind_s or contradicted
 
     def _sure(self, relative: _Relative) -> bool:
         """Whether to touch down: over the marker, as fast as it, and it does what was foreseen."""
         s = self.settings
-        if relative.touching_off > s.commit_off_m or float(np.hypot(*relative.velocity)) > s.commit_m_s:
+        if self._target.refused or relative.touching_off > s.commit_off_m:
+            return False
+        if float(np.hypot(*relative.velocity)) > s.commit_m_s:
             return False
         newest = self._past[-1]
         if newest.turning_rad_s > s.commit_turn_rad_s and float(np.hypot(*newest.velocity[:2])) > _MOVES_M_S:

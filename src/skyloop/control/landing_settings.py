@@ -10,7 +10,7 @@ from skyloop.control.response import ResponseSettings
 from skyloop.errors import UsageError
 from skyloop.messages import Value
 
-_MAY_BE_0 = frozenset({"wait_s", "climb_gain"})
+_MAY_BE_0 = frozenset({"wait_s", "climb_gain", "sight_s"})
 _MAY_BE_INFINITE = frozenset({"give_up_s", "ceiling_m"})
 _BELOW_CEILING_M = 0.2  # so far below the greatest altitude it searches: the proxy slows climbs down before it
 
@@ -29,15 +29,16 @@ class LandingSettings:
     position_gain: float = 12.0  #: acceleration by offset [1/s²]
     velocity_gain: float = 6.0  #: acceleration by error of velocity [1/s]
     climb_gain: float = 1.0  #: share of the climb's error that is asked for on top
-    speed_m_s: float = 5.0  #: greatest, horizontally
+    speed_m_s: float = 8.0  #: greatest, horizontally
     climb_m_s: float = 0.7  #: greatest, up and down
-    acceleration_m_s2: float = 5.0  #: greatest change of the set-point, horizontally: for vehicles that answer faster
+    acceleration_m_s2: float = 15.0  #: greatest change of the set-point, horizontally: for vehicles that answer faster
     climb_acceleration_m_s2: float = 2.0  #: and vertically
     closing_m_s: float = 1.5  #: greatest speed relative to the marker, on the way to it
     braking_m_s2: float = 1.0  #: by which it slows down to the marker's velocity on arrival
     known_m_s: float = 0.5  #: it follows the marker once its velocity is known so well (standard deviation)
     sight_m: float = 0.004  #: standard deviation of a sighting's position next to the camera
     sight_share: float = 0.004  #: and how much it grows with each metre of distance
+    sight_s: float = 0.01  #: by how much the attitude may be late for the frame: the more it turns, the farther off
 
     descent_m_s: float = 0.45
     cone_m: float = 0.06  #: radius of the cone at the marker: outside of it, the vehicle does not descend
