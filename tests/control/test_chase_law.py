@@ -180,6 +180,22 @@ def test_it_keeps_clear_of_others(side: float) -> None:
     assert math.isfinite(sum(pushed((0.0, 0.0)))), "who is where it is"
 
 
+def test_of_somebody_whose_place_is_not_certain_it_stays_farther_off() -> None:
+    """Who has gone out of view may have turned, or stopped."""
+    law, estimator = still_law(away=(8.0, 0.0))
+    other = replace(estimator.at(nanoseconds(1.0)), foot=np.array([2.0, 1.9, 0.0]))
+    found = []
+    for place_m in (0.2, 1.2):
+        law = ChaseLaw()
+        for n in range(20):
+            at = motion(1.0 + n * PERIOD_S)
+            gone = replace(other, velocity=np.array([1.5, 0.0]), place_m=place_m)
+            command = law.step(at.at_ns, at, 1.2, estimator, at.at_ns, [gone])
+        assert isinstance(command, Velocity)
+        found.append(command.left)
+    assert found[1] < found[0] - 0.1
+
+
 def test_of_somebody_who_comes_straight_it_keeps_the_side_that_it_took() -> None:
     law, estimator = still_law(away=(8.0, 0.0))
     sides = []

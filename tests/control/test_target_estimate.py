@@ -13,7 +13,7 @@ from skyloop.clock import nanoseconds
 from skyloop.control.target_estimate import TRAITS, UNKNOWN, TargetEstimator, TargetState, Traits
 from skyloop.control.target_view import BoxView, Camera
 from skyloop.errors import UsageError
-from tests.control.target_world import PERIOD_S, PERSON, Path, camera_at, view_of, walk
+from tests.control.target_world import PERIOD_S, PERSON, Path, box_of, camera_at, view_of, walk
 
 CASE_OF_SIZE = replace(PERSON, on_ground=False)
 CASE_OF_GROUND = replace(UNKNOWN, radius_m=0.25)
@@ -125,6 +125,25 @@ def test_what_is_hidden_goes_on_as_it_went_before_its_boxes_were_cut() -> None:
     assert off(estimator.at(nanoseconds(last_s + 0.1)), path, last_s + 0.1) > 0.1, (
         "a missed image or two change nothing"
     )
+
+
+def test_nothing_is_added_to_a_thing_but_parts_may_be_hidden() -> None:
+    path, camera = walk(6.0, 0.0), camera_at()
+    estimator = watched(PERSON, path, ground=True, seconds=2.0)
+    x, y, width, height = box_of(camera, np.array([6.0, 0.0, 0.0])) or (0.0, 0.0, 0.0, 0.0)
+    boxes = {
+        "its own": (x, y, width, height),
+        "somebody nearer": (x, y - 0.3 * height, width, 1.6 * height),
+        "its upper half": (x, y, width, 0.5 * height),
+    }
+    fits = {}
+    for name, box in boxes.items():
+        view = BoxView.of(box, camera)
+        assert view is not None
+        fits[name] = estimator.distance(view, camera, nanoseconds(2.0))[0]
+    assert fits["its own"] < 2.0
+    assert math.isinf(fits["somebody nearer"])
+    assert math.isfinite(fits["its upper half"])
 
 
 def test_seldom_boxes_are_no_hiding() -> None:
