@@ -22,7 +22,7 @@ from skyloop.vision.tracking import Box
 Array = NDArray[np.float64]
 
 _CUT_PX: Final = 2.0  # nearer to the image's edge than this, and than this share of its size, a box may be cut off
-_CUT: Final = 0.04
+_CUT: Final = 0.07
 _BESIDE: Final = 0.75  # of the image's size from the optical axis: a half is its edge
 _STEEPEST: Final = 0.15  # cosine of the elevation: what is nearly straight above or below has no azimuth
 _TILT_RAD: Final = 0.008  # error of the attitude at the capture, which moves both edges alike
