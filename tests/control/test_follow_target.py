@@ -405,6 +405,7 @@ def test_detections_that_come_late_are_used() -> None:
         drawn = follower.look(picture(at_s))
         follower.detected([Detection(the_box(), 0.9, 0, "person")], nanoseconds(at_s))
     assert [one.text for one in drawn if isinstance(one, Text)] != []
+    assert sum(isinstance(one, Polyline) and one.closed for one in drawn) == 1, "the processor draws its own"
     assert follower.status.class_name == "person"
     assert follower.finder is not None
     assert follower.finder.target is not None

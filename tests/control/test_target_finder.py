@@ -330,7 +330,7 @@ class Drifting:
 
     def __init__(self) -> None:
         self.box: Box | None = None
-        self.refused, self.resumed = 0, 0
+        self.refused, self.resumed, self.started = 0, 0, 0
 
     def update(self, image: Image) -> TrackResult:
         return TrackResult(self.box, 0.8, 0.9)
@@ -343,6 +343,9 @@ class Drifting:
 
     def resume(self, image: Image, box: Box) -> None:
         self.resumed += 1
+
+    def start(self, image: Image, box: Box) -> None:
+        self.started += 1
 
 
 def test_a_tracker_that_drifted_away_is_refused() -> None:
@@ -367,11 +370,28 @@ def test_late_detections_bring_a_tracker_back_that_lost_the_target_or_went_elsew
         finder.detected(film.picture()[1], film.at_ns, ground=True)
     finder._tracker = drifting  # type: ignore[assignment]
     x, y, width, height = start_box(walker)
-    for box, resumed in ((None, 1), ((x + 0.7 * width, y, width, height), 2), ((x + 1.0, y, width, height), 2)):
+    elsewhere, there = (x + 0.7 * width, y, width, height), (x + 1.0, y, width, height)
+    for box, counts in ((None, (1, 0)), (elsewhere, (1, 1)), (there, (1, 1)), (None, (2, 1))):
         drifting.box = box
         film.run(PERIOD_S)
         assert finder.detected(film.picture()[1], film.at_ns, ground=True)
-        assert drifting.resumed == resumed
+        assert (drifting.started, drifting.resumed) == counts, "with new looks where it was lost"
+
+
+def test_late_detections_tell_the_size_and_not_the_tracker() -> None:
+    walker = Walker(walk(4.0, 0.0), BLUE, 1)
+    finder, drifting = TargetFinder(class_name="person"), Drifting()
+    film = Film(finder, walker, detects=False)
+    x, y, width, height = start_box(walker)
+    drifting.box = (x, y + 0.1 * height, 0.8 * width, 0.85 * height)
+    for n in range(40):
+        film.run(PERIOD_S)
+        finder.detected(film.picture()[1], film.at_ns, ground=True)
+        if n == 4:
+            finder._tracker = drifting  # type: ignore[assignment]
+    assert film.sightings[-1][0].box == drifting.box
+    assert finder.estimator is not None
+    assert finder.estimator.at(film.at_ns).range_m == pytest.approx(4.0, abs=0.25)
 
 
 @pytest.mark.parametrize(("hidden_s", "taken"), [(0.5, False), (1.2, True)])

@@ -26,6 +26,7 @@ from skyloop.vision.tracking import LEAST_PX, Box, Image, TrackResult, overlap
 _SAME: Final = 0.4  # overlap of two boxes of one thing
 _POINTED_AT: Final = 0.3  # of the user's box with a detection
 _TRACKER_NOISE: Final = 0.06  # of the edges of its boxes, as a share of their height: less sharp than a detector's
+_BESIDE_LATE: Final = 0.25  # the same where late detections tell the size, which the tracker gets wrong in the long run
 _TAKEN: Final = 0.5  # share of the tracker's box that is within another thing's detection
 _FITS: Final = 12.0  # squared Mahalanobis distance by what was measured, up to which a box can be the target's
 _DOUBT: Final = 6  # images in a row in which the tracker's box is not where the target can be
@@ -106,6 +107,7 @@ class TargetFinder:
         self._relative = relative
         self._tracker = LongTermTracker()
         self._tracking = False
+        self._tracker_noise = _TRACKER_NOISE
         self._scene: Scene | None = None
         self._number: int | None = None  # of the target in the scene
         self._frames: deque[_Seen] = deque(maxlen=_KEPT_FRAMES)
@@ -168,9 +170,12 @@ class TargetFinder:
             return False
         self._use(detections, frame, TrackResult(frame.box, 0.0), ground=ground)
         target = self.target
+        self._tracker_noise = _TRACKER_NOISE if target is None else _BESIDE_LATE
         if target is None or not target.seen:
             return target is not None and target.contested
         if frame.box is None or overlap(frame.box, target.detection.box) < _SAME:
+            # Who it is is known without the tracker: looks by which it did not know the target again help nobody.
+            self._tracking = self._tracking and frame.box is not None
             self._resume(frame.image, target.detection.box)
             # The tracker's next step begins in that image, not in the newest.
             self._middle = frame.camera.pixel(target.estimator.at(captured_ns).middle)
@@ -243,7 +248,7 @@ class TargetFinder:
     def _by_tracker(
         self, tracked: TrackResult, box: Box, camera: Camera, captured_ns: int, estimator: TargetEstimator
     ) -> Sighting:
-        view = BoxView.of(box, camera, _TRACKER_NOISE)
+        view = BoxView.of(box, camera, self._tracker_noise)
         if view is None or estimator.seen_ns is None:
             return Sighting(None, None)
         if estimator.seen_ns == captured_ns:  # the box that it was started with

@@ -287,9 +287,9 @@ class TargetFollower:
         assert view is not None
         box = self._sighting.box
         colour = _SEEN if box is not None else _LOST
-        shapes: list[Shape] = [
-            Polyline(one.outline, True, _OTHER) for one in self._finder.detections[:16] if box is None or one.box != box
-        ]
+        # A processor draws what it finds itself, on the frame that it is in.
+        found = () if self._detector is None else self._finder.detections[:16]
+        shapes: list[Shape] = [Polyline(one.outline, True, _OTHER) for one in found if box is None or one.box != box]
         if estimator is None:
             return [*shapes, Text(self.phase.value, (8.0, 16.0), colour)]
         state = estimator.at(captured_ns)
