@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import time
 from typing import TYPE_CHECKING, Any
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 pytestmark = pytest.mark.process
 
 PORTRAIT, LANDSCAPE, TABLET = (390, 844), (844, 390), (1024, 768)
+NARROW = (360, 740)
 FINGER_PX = 44.0
 FELT = "window.felt = []; navigator.vibrate = (pattern) => felt.push(pattern);"
 #: What can be pressed and seen, and is smaller than a finger: name, width, height.
@@ -108,6 +110,17 @@ def check_arrangement(page: DronePage, size: tuple[int, int]) -> None:
     assert page.page.evaluate(SMALL, FINGER_PX) == []
 
 
+def check_head(page: DronePage) -> None:
+    """On a narrow telephone, too, all of the head has a place of its own, with a battery that is full."""
+    page.page.set_viewport_size({"width": NARROW[0], "height": NARROW[1]})
+    page.until(lambda: "100 %" in page.says(".battery"), "the battery is full")
+    parts = {name: box(page, name) for name in (".fly", "h2", ".pill", ".battery", ".full", ".hud", ".chip.age")}
+    for one, other in itertools.combinations(parts, 2):
+        assert apart(parts[one], parts[other]), f"{one} and {other}: {parts}"
+    assert parts[".full"]["top"] == parts[".fly"]["top"], "in the corner"
+    page.page.set_viewport_size({"width": PORTRAIT[0], "height": PORTRAIT[1]})
+
+
 def test_a_flight_on_a_telephone(deck: Deck) -> None:
     deck.proxy("phone")
     page = touched(deck, "phone", PORTRAIT)
@@ -117,6 +130,7 @@ def test_a_flight_on_a_telephone(deck: Deck) -> None:
         still = page.page.evaluate(STILL)
         take_control(page)
         check_arrangement(page, PORTRAIT)
+        check_head(page)
         tap_until(page, "Take off", "hovering")
         left, right = (page.pane.locator(".thumb").nth(place).bounding_box() for place in (0, 1))
         assert left is not None
