@@ -1,5 +1,5 @@
 """Photographs the cockpit: ``python scripts/cockpit_pictures.py``, or with ``one``, ``fleet``, ``swarm``,
-``asked``, ``phone`` or ``target`` for a part.
+``asked``, ``phone``, ``target`` or ``film`` for a part.
 
 =======================================  ===========================================================================
 ``cockpit-one-dark.png``, ``…-light``    one simulated drone that follows a marker, with what its controller draws; once
@@ -12,6 +12,7 @@
 ``cockpit-asked-dark.png``, ``…-phone``  a program asks for the drone that the page flies
 ``cockpit-target-dark.png``,             a person in a park who was detected, pressed and is followed; on a telephone
 ``cockpit-target-phone.png``             pressed with a finger, before anything flies
+``cockpit-follow.webp``                  a film: a box is drawn around a person in a park, who is followed
 =======================================  ===========================================================================
 
 Needs Chromium and ``pip install playwright pillow``.
@@ -34,23 +35,32 @@ from pathlib import Path
 from typing import Literal
 
 import browser
+from page_film import PageFilm, Shown
 from PIL import Image
 from playwright.sync_api import Browser, Page, ViewportSize, sync_playwright
 
 import skyloop
+from skyloop.cli.follow_truth import FrameTruth, TargetTruth
+from skyloop.clock import nanoseconds
 from skyloop.cockpit.child import CockpitProcess
 from skyloop.control.follow import FollowMarker
 from skyloop.control.waypoint import Waypoint, reached, velocity_to
 from skyloop.messages import Annotation, Polyline, Text
+from skyloop.sim import load_world
 
 PICTURES = Path(__file__).parents[1] / "docs" / "pictures"
 MARKER_ID = 7
 DESK: ViewportSize = {"width": 1440, "height": 900}
 WALL: ViewportSize = {"width": 1680, "height": 1020}
+CINEMA: ViewportSize = {"width": 720, "height": 540}
 PHONE: ViewportSize = {"width": 390, "height": 844}
 PHONE_ON_ITS_SIDE: ViewportSize = {"width": 844, "height": 390}
 TOUCHED = (PHONE, PHONE_ON_ITS_SIDE)
 MOST_BYTES = 300_000
+FILM_BYTES = 700_000
+SIMULATED = (320, 240)  # pixels of the simulator's camera
+MARGIN_PX = 2.0  # of a box that is drawn by hand, in those
+FIRST_PLACE, LAST_PLACE = (520.0, 440.0), (650.0, 340.0)  # of the mouse in the film, before and after
 ROUND_M = 1.1
 Scheme = Literal["dark", "light"]
 SCHEMES: tuple[Scheme, ...] = ("dark", "light")
@@ -65,7 +75,7 @@ Fly = Callable[[threading.Event], None]
 
 
 def main() -> None:
-    makers = {"one": one, "fleet": fleet, "swarm": swarm, "asked": asked, "phone": phone, "target": target}
+    makers = {each.__name__: each for each in (one, fleet, swarm, asked, phone, target, film)}
     wanted = sys.argv[1:] or list(makers)
     for name in wanted:
         if name not in makers:
@@ -189,8 +199,7 @@ def target() -> None:
         skyloop.connect("alpha", access="observe", name="pictures") as drone,
     ):
         drone.on_annotation(lambda one: found.append(one) if one.source == "detections" and one.shapes else None)
-        detecting = subprocess.Popen([sys.executable, "-m", "skyloop", "detect", "--on", "alpha", "--max-fps", "4"])
-        try:
+        with detecting():
             views: list[tuple[str, ViewportSize]] = [("phone", PHONE), ("dark", DESK)]
             for name, size in views:
                 page = open_page(chromium, f"{address}#alpha", size, "dark")
@@ -217,9 +226,87 @@ def target() -> None:
                 save(page, f"cockpit-target-{name}.png")
                 page.keyboard.press("l")
                 page.locator(".pill", has_text="landed").wait_for()
-        finally:
-            detecting.terminate()
-            detecting.wait()
+
+
+def film() -> None:
+    """A box is drawn by hand around a person in a park, who is followed, circled, and left alone again.
+
+    Where the box has to be is the simulator's truth; how far the drone was truly away is printed.
+    """
+    command = ["sim", "--name", "alpha", "--world", "park", "--seed", "4"]
+    command += [word for option in ("cameras=front", "width=320", "fps=15") for word in ("--option", option)]
+    truth = TargetTruth(load_world("park", 4))
+    away_m: list[float] = []
+    with (
+        flight(command, [lambda _: None]) as (chromium, address),
+        skyloop.connect("alpha", access="observe", name="pictures") as drone,
+        detecting(),
+    ):
+
+        def now(in_s: float = 0.0) -> FrameTruth:
+            """What is on the screen, now or soon."""
+            true = truth.at_capture(drone.feedback(), shown.captured_ns + nanoseconds(in_s))
+            assert true is not None
+            return true
+
+        page = open_page(chromium, f"{address}#alpha", CINEMA, "dark")
+        shown = Shown(page)
+        page.reload()
+        page.get_by_role("button", name="Take control").click()
+        page.locator('.pane[data-mine="true"]').wait_for()
+        page.keyboard.press("t")
+        page.locator(".pill", has_text="hovering").wait_for()
+        page.locator('[data-tool="full"]').click()
+        page.mouse.move(*FIRST_PLACE)
+        taken = PageFilm(page, lambda: away_m.append(now().distances_m["walker"]))
+        while not is_well_seen(now(in_s=1.2)):
+            page.wait_for_timeout(50)
+        taken.begin(*FIRST_PLACE)
+        taken.shoot(0.2)
+        taken.click(page.locator('[data-tool="follow"]'))
+        taken.shoot_until(page.locator(".follow-hint", has_text="Drag a box"))
+        taken.move(*corner(page, now(in_s=0.6), upper=True))
+        shown.wait_for_next()
+        pressed = now()
+        page.mouse.move(*corner(page, pressed, upper=True))
+        page.mouse.down()
+        taken.move(*corner(page, pressed, upper=False), seconds=0.8)
+        page.mouse.up()
+        taken.shoot_until(page.locator(".follow-phase", has_text="Tracked"))
+        panel = page.get_by_role("region", name="Target")
+        taken.click(panel.get_by_role("button", name="Follow"))
+        taken.move(*LAST_PLACE)
+        taken.shoot(6.5)
+        since = len(away_m)
+        taken.click(panel.get_by_role("button", name="Orbit"))
+        taken.shoot(4.5)
+        print(f"truly {min(away_m[since:]):.1f} to {max(away_m[since:]):.1f} m away, from {away_m[0]:.1f} m at first")
+        taken.click(panel.get_by_role("button", name="Stop"))
+        taken.shoot(1.0)
+    taken.save(PICTURES / "cockpit-follow.webp", FILM_BYTES)
+
+
+def is_well_seen(true: FrameTruth) -> bool:
+    """Whether the walker is wholly in the picture, near, and has a way to go until its left edge."""
+    box = true.boxes.get("walker")
+    return box is not None and not box.cut and box.visible > 0.98 and 180 < box.box[0] < 275 and box.box[3] > 60
+
+
+def corner(page: Page, true: FrameTruth, *, upper: bool) -> tuple[float, float]:
+    """Where the upper left or the lower right corner of a box around the walker is on the screen [CSS pixels]."""
+    x, y, width, height = true.boxes["walker"].box
+    if upper:
+        return on_screen(page, (x - MARGIN_PX, y - MARGIN_PX), SIMULATED)
+    return on_screen(page, (x + width + MARGIN_PX, y + height + MARGIN_PX), SIMULATED)
+
+
+def on_screen(page: Page, pixel: tuple[float, float], size: tuple[float, float]) -> tuple[float, float]:
+    """Where a pixel of the drone's picture is on the screen [CSS pixels]."""
+    picture = page.locator(".video").bounding_box()
+    assert picture is not None
+    scale = min(picture["width"] / size[0], picture["height"] / size[1])
+    x = picture["x"] + picture["width"] / 2 + (pixel[0] - size[0] / 2) * scale
+    return x, picture["y"] + picture["height"] / 2 + (pixel[1] - size[1] / 2) * scale
 
 
 def mark(page: Page, found: Annotation, *, touch: bool) -> None:
@@ -230,14 +317,11 @@ def mark(page: Page, found: Annotation, *, touch: bool) -> None:
         if isinstance(outline, Polyline) and isinstance(text, Text) and text.text.startswith("person")
         if outline.points[2][1] - outline.points[0][1] > found.height / 5  # others are too far for a picture
     ]
-    picture = page.locator(".video").bounding_box()
-    if not people or picture is None:
+    if not people:
         return
     points = max((one.points for one in people), key=lambda corners: corners[2][1] - corners[0][1])
-    scale = min(picture["width"] / found.width, picture["height"] / found.height)
-    middle = [sum(values) / 4 for values in zip(*points, strict=True)]
-    x = picture["x"] + picture["width"] / 2 + (middle[0] - found.width / 2) * scale
-    y = picture["y"] + picture["height"] / 2 + (middle[1] - found.height / 2) * scale
+    across, down = (sum(values) / 4 for values in zip(*points, strict=True))
+    x, y = on_screen(page, (across, down), (found.width, found.height))
     if touch:
         page.touchscreen.tap(x, y)
     else:
@@ -268,6 +352,15 @@ def rounds(name: str, number: int) -> Fly:
             drone.land(wait=False)
 
     return fly
+
+
+@contextmanager
+def detecting() -> Iterator[None]:
+    """A processor that finds people."""
+    command = [sys.executable, "-m", "skyloop", "detect", "--on", "alpha"]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
+        yield
+        process.terminate()
 
 
 # How it is photographed -----------------------------------------------------------------------------------------------

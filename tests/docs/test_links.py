@@ -10,6 +10,7 @@ import pytest
 from tests.docs.pages import PAGES, ROOT, prose, spans
 
 MOST_BYTES = 300_000
+LARGE = {"cockpit-follow.webp": 700_000}  # a film of the page, whose text has to be read
 _LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 
 
@@ -46,4 +47,4 @@ def test_pictures_are_small_and_all_are_shown() -> None:
     assert pictures
     for picture in pictures:
         assert picture in shown, f"{picture.name} is shown nowhere"
-        assert picture.stat().st_size < MOST_BYTES
+        assert picture.stat().st_size < LARGE.get(picture.name, MOST_BYTES), picture.name
