@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+from skyloop.control.limiting import lowered
 from skyloop.errors import UsageError
 from skyloop.messages import Value
 
@@ -111,19 +112,14 @@ class ChaseSettings:
             limits: ``limits.speed``, ``limits.climb``, ``limits.yaw_rate``, ``limits.altitude`` and ``limits.tilt``, as
                 in ``drone.config``; one that is missing limits nothing.
         """
-
-        def least(own: float, name: str) -> float:
-            limit = limits.get(name)
-            return own if isinstance(limit, bool) or not isinstance(limit, int | float) else min(own, limit)
-
-        highest = least(self.highest_m, "limits.altitude")
+        highest = lowered(self.highest_m, limits, "limits.altitude")
         return replace(
             self,
-            speed_m_s=least(self.speed_m_s, "limits.speed"),
-            climb_m_s=least(self.climb_m_s, "limits.climb"),
-            turn_rad_s=least(self.turn_rad_s, "limits.yaw_rate"),
+            speed_m_s=lowered(self.speed_m_s, limits, "limits.speed"),
+            climb_m_s=lowered(self.climb_m_s, limits, "limits.climb"),
+            turn_rad_s=lowered(self.turn_rad_s, limits, "limits.yaw_rate"),
             highest_m=highest,
             lowest_m=min(self.lowest_m, highest),
-            tilt_rad=least(self.tilt_rad, "limits.tilt"),
-            lean_rad=least(self.lean_rad, "limits.tilt"),
+            tilt_rad=lowered(self.tilt_rad, limits, "limits.tilt"),
+            lean_rad=lowered(self.lean_rad, limits, "limits.tilt"),
         )

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
+from skyloop.control.limiting import lowered
 from skyloop.control.response import ResponseSettings
 from skyloop.errors import UsageError
 from skyloop.messages import Value
@@ -104,19 +105,14 @@ class LandingSettings:
         Raises:
             UsageError: The drone may not fly high enough to search.
         """
-
-        def least(own: float, name: str, less: float = 0.0) -> float:
-            limit = limits.get(name)
-            return own if isinstance(limit, bool) or not isinstance(limit, int | float) else min(own, limit - less)
-
-        climb = least(self.climb_m_s, "limits.climb")
+        climb = lowered(self.climb_m_s, limits, "limits.climb")
         return replace(
             self,
-            response=replace(self.response, tilt_rad=least(self.response.tilt_rad, "limits.tilt")),
-            speed_m_s=least(self.speed_m_s, "limits.speed"),
+            response=replace(self.response, tilt_rad=lowered(self.response.tilt_rad, limits, "limits.tilt")),
+            speed_m_s=lowered(self.speed_m_s, limits, "limits.speed"),
             climb_m_s=climb,
             descent_m_s=min(self.descent_m_s, climb),
             final_descent_m_s=min(self.final_descent_m_s, climb),
-            ceiling_m=least(self.ceiling_m, "limits.altitude"),
-            search_height_m=least(self.search_height_m, "limits.altitude", _BELOW_CEILING_M),
+            ceiling_m=lowered(self.ceiling_m, limits, "limits.altitude"),
+            search_height_m=lowered(self.search_height_m, limits, "limits.altitude", _BELOW_CEILING_M),
         )

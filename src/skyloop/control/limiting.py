@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from skyloop.errors import UsageError
-from skyloop.messages import Velocity
+from skyloop.messages import Value, Velocity
 
 Array = NDArray[np.float64]
 GRAVITY_M_S2 = 9.80665  #: standard gravity
@@ -25,6 +26,19 @@ def shortened(vector: Array, longest: float) -> Array:
     """Return a vector (n,) of the same direction whose length is at most ``longest``."""
     length = math.sqrt(float(vector @ vector))
     return vector if length <= longest else vector * (longest / length)
+
+
+def lowered(own: float, limits: Mapping[str, Value], name: str, less: float = 0.0) -> float:
+    """Return a number, lowered to a limit of a drone if that is below it.
+
+    Args:
+        own: The number.
+        limits: As in ``drone.config``; where there is no number of this name, nothing limits.
+        name: Of the limit.
+        less: By how much to stay below the limit.
+    """
+    limit = limits.get(name)
+    return own if isinstance(limit, bool) or not isinstance(limit, int | float) else min(own, limit - less)
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,7 @@ from skyloop.errors import UsageError
 from skyloop.vision import LongTermTracker
 from skyloop.vision.appearance import colours
 from skyloop.vision.detection import Detection
-from skyloop.vision.tracking import LEAST_PX, Box, Image, TrackResult, overlap
+from skyloop.vision.tracking import LEAST_PX, Box, Image, TrackResult, overlap, overlap_area
 
 _SAME: Final = 0.4  # overlap of two boxes of one thing
 _POINTED_AT: Final = 0.3  # of the user's box with a detection
@@ -297,9 +297,9 @@ class TargetFinder:
         """Whether the box is that of another thing, by its detection in this image."""
         if self._scene is None or self._number is None:
             return False
-        now = self._frames[-1].captured_ns
+        now, taken = self._frames[-1].captured_ns, _TAKEN * box[2] * box[3]
         return any(
-            each.seen and each.estimator.seen_ns == now and _share_within(box, each.detection.box) >= _TAKEN
+            each.seen and each.estimator.seen_ns == now and overlap_area(box, each.detection.box) >= taken
             for number, each in self._scene.objects.items()
             if number != self._number
         )
@@ -432,10 +432,3 @@ class TargetFinder:
         scene.kept = {thing.number}
         scene.dormant = set()
         self._doubts = 0
-
-
-def _share_within(box: Box, other: Box) -> float:
-    """Return the share of a box that is within another one."""
-    wide = min(box[0] + box[2], other[0] + other[2]) - max(box[0], other[0])
-    high = min(box[1] + box[3], other[1] + other[3]) - max(box[1], other[1])
-    return max(0.0, wide) * max(0.0, high) / (box[2] * box[3])

@@ -135,14 +135,18 @@ def unlikeness(one: Floats, other: Floats) -> float:
         one: Of a thing, (6,).
         other: Of a thing (6,), or of places in a box (n, 6), of which the most similar counts.
     """
-    return float(np.min(np.sum(((one - other) / _COLOUR_UNITS) ** 2, axis=-1)))
+    return float(np.min(_unlike(one, other)))
 
 
 def _nearest(one: Floats, places: Floats) -> Floats:
     """Return the most similar of the colours of places in a box, (6,)."""
     places = np.atleast_2d(places)
-    nearest: Floats = places[int(np.argmin(np.sum(((one - places) / _COLOUR_UNITS) ** 2, axis=-1)))]
+    nearest: Floats = places[int(np.argmin(_unlike(one, places)))]
     return nearest
+
+
+def _unlike(one: Floats, other: Floats) -> Floats:
+    return np.asarray(np.sum(((one - other) / _COLOUR_UNITS) ** 2, axis=-1))
 
 
 def _is_about(thing: SceneObject, at_ns: int) -> bool:
