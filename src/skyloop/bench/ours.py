@@ -12,6 +12,7 @@ from skyloop.client import Drone, Frame, connect
 from skyloop.client.channels import VideoOptions
 from skyloop.messages import Feedback
 from skyloop.proxy import Proxy
+from skyloop.proxy.warm_up import keep_warm
 from skyloop.transport.base import TransportServer
 from skyloop.transport.local import LocalServer
 
@@ -32,6 +33,7 @@ class Vehicle:
         name, server = self._server(address)
         self._vehicle = BenchVehicle(received)
         self._proxy = Proxy(self._vehicle, server, name=name)
+        keep_warm(self._proxy)
         self._proxy.start()
 
     def _server(self, address: str) -> tuple[str, TransportServer]:

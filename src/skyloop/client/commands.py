@@ -552,6 +552,15 @@ def above_zero(name: str, value: object) -> float:
     return found
 
 
+def all_finite(a: object, b: object, c: object, d: object) -> bool:
+    """Return whether four values are floats that can be commanded as they are: :func:`number` need not look at each.
+
+    False is no judgement: an int, or four huge floats whose sum is none, may be fine.
+    """
+    floats = type(a) is float and type(b) is float and type(c) is float and type(d) is float
+    return floats and math.isfinite(a + b + c + d)  # type: ignore[operator]
+
+
 def number(name: str, value: object) -> float:
     """Return ``value`` as a finite float.
 

@@ -18,6 +18,7 @@ from skyloop.client.connection import Scheduler
 from skyloop.client.core import Access, DroneCore, OnExit
 from skyloop.client.drone import Drone
 from skyloop.client.swarm import OnError, Swarm, check_policy, in_parallel
+from skyloop.client.warm_up import PERIOD_S, keeper
 from skyloop.errors import Hint, LinkError, SwarmError, UnknownNameError, UsageError
 from skyloop.transport.base import ClientHandler, Dialer, TransportClient, check_name
 
@@ -67,6 +68,7 @@ class ConnectOptions(TypedDict, total=False):
     on_exit: OnExit
     authority: Authority | None
     network: NetworkChoice
+    warm_s: float
 
 
 def explains_moved_options(function: Callable[P, R]) -> Callable[P, R]:
@@ -94,6 +96,7 @@ def connect(
     on_exit: OnExit = "land",
     authority: Authority | None = None,
     network: NetworkChoice = None,
+    warm_s: float = PERIOD_S,
 ) -> Drone:
     """Connect to a drone.
 
@@ -113,6 +116,8 @@ def connect(
             ``Authority()``.
         network: True, an address, or a :class:`Network` with keys; False stays on this host. None: as the variable
             ``SKYLOOP_NETWORK`` says, without which nothing leaves this host.
+        warm_s: How often the code of commands, feedback and frames is run on a dummy while this application flies [s],
+            so that it stays in the processor's caches and delays are shorter; 0: never.
 
     Raises:
         UnknownNameError: If no proxy of this name runs; carries suggestions.
@@ -129,6 +134,7 @@ def connect(
         raise UsageError(f"authority is {authority!r:.80} and must be a skyloop.Authority, as Authority(priority=4)")
     if timeout_s is not None:
         check_seconds("timeout_s", timeout_s)
+    keep_warm = keeper(warm_s)
     app = name if name is not None else _script_name()
     deadline = time.monotonic() + (timeout_s or (START_TIMEOUT_S if "://" in target else NAME_TIMEOUT_S))
     if "://" in target:
@@ -149,6 +155,7 @@ def connect(
             scheduler=scheduler,
             on_close=end,
             reach=reach,
+            keep_warm=None if scheduler is not None and scheduler.in_step else keep_warm,
         )
     except BaseException:
         if end is not None:

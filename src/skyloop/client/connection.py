@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Final
 
 from skyloop.client.link_monitor import Thresholds
@@ -25,6 +27,7 @@ from skyloop.messages import (
 from skyloop.transport.base import FEEDBACK, Dialer
 
 _LOOK_NS: Final = nanoseconds(0.05)  #: how often the link's state is judged
+_LOOK_S: Final = 1.0  #: how often a thread that waits for samples tries again to receive them itself
 _log = logging.getLogger("skyloop")
 
 
@@ -83,7 +86,7 @@ class ProxyConnection:
     def receiving(self) -> bool:
         """Whether the calling thread is the receiving one, which must not wait for what it would itself receive."""
         session = self._session
-        return session is not None and session.receiver == threading.get_ident()
+        return session is not None and session.receiving
 
     @property
     def offset_ns(self) -> int:
@@ -106,6 +109,14 @@ class ProxyConnection:
         """Wake the supervisor, so that it attends to the connection now."""
         self.poked = True
         self.woken.notify()
+
+    def lead(self, ready: Callable[[], bool], wake: Callable[[], None], timeout_s: float) -> bool:
+        """Receive on the calling thread, where there is a session whose transport can.
+
+        See :meth:`skyloop.transport.base.TransportClient.lead`.
+        """
+        session = self._session
+        return session is not None and session.lead(ready, wake, timeout_s)
 
     def subscribe(self, topic: str, on: bool = True) -> None:
         """Subscribe to a topic or unsubscribe, in this session and all that follow.
@@ -393,6 +404,36 @@ def _nowhere(packet: bytes) -> bool:  # noqa: ARG001  (there is no connection to
     return False
 
 
+class ReceivingNotifier(Notifier):
+    """A notifier for a thread that waits for samples: it receives meanwhile, so that a sample wakes it directly."""
+
+    __slots__ = ("_connection",)
+
+    def __init__(self, connection: ProxyConnection) -> None:
+        super().__init__()
+        self._connection = connection
+
+    def wait_for(self, ready: Callable[[], bool], timeout_s: float | None = None) -> bool:
+        """Wait until ``ready()`` is true; see :meth:`Notifier.wait_for`. May take 50 ms longer than ``timeout_s``."""
+        deadline_s = math.inf if timeout_s is None else time.monotonic() + timeout_s
+        while not ready():
+            left_s = deadline_s - time.monotonic()
+            if left_s <= 0.0:
+                return ready()
+            offered: list[bool] = []
+            if not self._connection.lead(ready, partial(self._offer, offered), left_s):
+                super().wait_for(partial(_either, ready, offered), min(left_s, _LOOK_S))
+        return True
+
+    def _offer(self, offered: list[bool]) -> None:
+        offered.append(True)
+        self.notify()
+
+
+def _either(ready: Callable[[], bool], offered: list[bool]) -> bool:
+    return ready() or bool(offered)
+
+
 class Scheduler:
     """Where the time of a drone comes from, here real time: waiting is sleeping, and a slow application misses samples.
 
@@ -408,6 +449,10 @@ class Scheduler:
     def notifier(self) -> Notifier:
         """Return a notifier for an application to wait for."""
         return Notifier()
+
+    def sample_notifier(self, connection: ProxyConnection) -> Notifier:
+        """Return a notifier for a thread that waits for nothing but samples of this connection."""
+        return ReceivingNotifier(connection)
 
     def begin(self, supervisor: ConnectionSupervisor) -> None:
         """Attend to the connection from now on; called with the first session."""

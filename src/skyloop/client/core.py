@@ -14,6 +14,7 @@ from skyloop.client.commands import CommandSender
 from skyloop.client.completion import ActionWait
 from skyloop.client.connection import ConnectionSupervisor, ProxyConnection, RedialPolicy, Scheduler
 from skyloop.client.logbook import Logbook
+from skyloop.client.mailbox import Notifier
 from skyloop.client.parameters import Config, Restorer
 from skyloop.client.results import ResultChannel, checked_age, checked_name
 from skyloop.client.telemetry import ClientState, Mailboxes, Receiver
@@ -71,6 +72,7 @@ class DroneOptions(TypedDict, total=False):
     scheduler: Scheduler | None
     on_close: Callable[[], None] | None
     reach: str | None
+    keep_warm: Callable[[bool], None] | None
 
 
 class DroneCore:
@@ -92,6 +94,7 @@ class DroneCore:
         scheduler: Scheduler | None = None,
         on_close: Callable[[], None] | None = None,
         reach: str | None = None,
+        keep_warm: Callable[[bool], None] | None = None,
     ) -> None:
         """Prepare a drone without connecting; :meth:`open` connects.
 
@@ -106,6 +109,8 @@ class DroneCore:
             scheduler: Source of the time and of waiting; None: real time.
             on_close: Called at the end of :meth:`close`, on the closing thread.
             reach: Name or address under which another process reaches the same vehicle; None if none can.
+            keep_warm: Called with whether this application flies the vehicle now, some twenty times a second, on the
+                supervisor's thread; see :mod:`skyloop.warmth`.
 
         Raises:
             UsageError: If ``access``, ``on_exit``, ``app``, ``rate_hz`` or ``stall_s`` is out of range.
@@ -144,7 +149,7 @@ class DroneCore:
         )
         self.supervisor = ConnectionSupervisor(
             connection,
-            Receiver(app, state, connection, self.commands, restorer),
+            Receiver(app, state, connection, self.commands, restorer, keep_warm or _let_be),
             dial,
             Hello(app, self.role),
             policy=policy,
@@ -241,6 +246,10 @@ class DroneCore:
         finally:
             self.close()
         return problem
+
+    def sample_notifier(self) -> Notifier:
+        """Return a notifier for a thread that waits for nothing but samples of this drone."""
+        return self.state.scheduler.sample_notifier(self.connection)
 
     @contextmanager
     def closing(self, mailbox: Closable) -> Iterator[None]:
@@ -405,6 +414,7 @@ class DroneCore:
         wanted = [channels.everything] if named is None else [channels.channel(one) for one in named]
         return Mailboxes(
             self.state.scheduler,
+            self.connection,
             feedback=self.state.on_feedback if feedback else None,
             frames=self.channel(camera) if frames else None,
             results=wanted if results else [],
@@ -458,3 +468,7 @@ def _check_knows(capabilities: Capabilities, action: AnyAction) -> None:
             f"{action.name} is not possible: neither the vehicle ({capabilities.vehicle}) nor its proxy can fly to a "
             "place; a proxy of an earlier version must be updated"
         )
+
+
+def _let_be(flies: bool) -> None:
+    """Keep nothing warm."""

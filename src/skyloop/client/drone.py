@@ -24,7 +24,15 @@ from skyloop.client.authority import (
     authority_request,
 )
 from skyloop.client.channels import Channel, Listener, VideoOptions
-from skyloop.client.commands import above_zero, checked, in_world_axes, number, position_action, return_action
+from skyloop.client.commands import (
+    above_zero,
+    all_finite,
+    checked,
+    in_world_axes,
+    number,
+    position_action,
+    return_action,
+)
 from skyloop.client.completion import ReturnWatch, is_there
 from skyloop.client.core import DOWN, UP, DroneCore, DroneOptions
 from skyloop.client.frame import Arrival, Frame
@@ -332,9 +340,10 @@ class Drone:
         Returns:
             Whether it was handed to the transport now; see :class:`Drone` for this and for what is raised.
         """
-        return self._core.command(
-            Velocity(number("forward", forward), number("left", left), number("up", up), number("yaw_rate", yaw_rate))
-        )
+        if not all_finite(forward, left, up, yaw_rate):
+            forward, left = number("forward", forward), number("left", left)
+            up, yaw_rate = number("up", up), number("yaw_rate", yaw_rate)
+        return self._core.command(Velocity(forward, left, up, yaw_rate))
 
     def attitude(self, *, roll: float = 0.0, pitch: float = 0.0, climb: float = 0.0, yaw_rate: float = 0.0) -> bool:
         """Hold an attitude with a climb rate.
@@ -348,9 +357,10 @@ class Drone:
         Returns:
             Whether it was handed to the transport now; see :class:`Drone` for this and for what is raised.
         """
-        return self._core.command(
-            Attitude(number("roll", roll), number("pitch", pitch), number("climb", climb), number("yaw_rate", yaw_rate))
-        )
+        if not all_finite(roll, pitch, climb, yaw_rate):
+            roll, pitch = number("roll", roll), number("pitch", pitch)
+            climb, yaw_rate = number("climb", climb), number("yaw_rate", yaw_rate)
+        return self._core.command(Attitude(roll, pitch, climb, yaw_rate))
 
     def go_to(
         self,
@@ -621,7 +631,7 @@ class Drone:
             ClosedError: If the drone was closed before.
         """
         channel = self._core.channel(camera, **how)
-        mailbox: Mailbox[Arrival] = Mailbox(notifier=self._state.scheduler.notifier())
+        mailbox: Mailbox[Arrival] = Mailbox(notifier=self._core.sample_notifier())
         self._core.check_may_wait()
         with self._core.closing(mailbox), channel.into(mailbox):
             while not self._core.closed:

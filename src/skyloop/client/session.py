@@ -264,6 +264,16 @@ class ProxySession:
         end = self._end
         return end is not None and not self._quiet and end.send(packet)
 
+    def lead(self, ready: Callable[[], bool], wake: Callable[[], None], timeout_s: float) -> bool:
+        """Receive on the calling thread; see :meth:`skyloop.transport.base.TransportClient.lead`."""
+        end = self._end
+        return end is not None and not self._quiet and end.lead(ready, wake, timeout_s)
+
+    @property
+    def receiving(self) -> bool:
+        """Whether the calling thread is the one that receives now."""
+        return self.receiver == threading.get_ident() or (self._end is not None and self._end.receiving)
+
     def subscribe(self, topic: str, on: bool) -> None:
         """Subscribe to a topic or unsubscribe.
 

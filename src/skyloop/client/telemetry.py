@@ -64,6 +64,7 @@ class Mailboxes:
     def __init__(
         self,
         scheduler: Scheduler,
+        connection: ProxyConnection,
         *,
         feedback: Channel[Feedback] | None,
         frames: VideoChannel | None,
@@ -74,13 +75,14 @@ class Mailboxes:
 
         Args:
             scheduler: Source of the time and of waiting.
+            connection: What the samples come through.
             feedback: Channel of feedback, if it is wanted.
             frames: Channel of frames, if they are wanted.
             results: Channels of the results that are wanted.
             max_age_s: Oldest age of a result that is accepted [s]; None: any.
         """
         self.clock = scheduler.clock  #: on which a controller's time runs
-        self.notifier = scheduler.notifier()
+        self.notifier = scheduler.sample_notifier(connection)
         self.feedback: Mailbox[Feedback] = Mailbox(1, self.notifier)
         self.frames: Mailbox[Arrival] = Mailbox(1, self.notifier)
         self.results = ResultMailbox(max_age_s, self.notifier)
@@ -230,9 +232,16 @@ class Receiver:
     """
 
     def __init__(
-        self, name: str, state: ClientState, connection: ProxyConnection, commands: CommandSender, restorer: Restorer
+        self,
+        name: str,
+        state: ClientState,
+        connection: ProxyConnection,
+        commands: CommandSender,
+        restorer: Restorer,
+        keep_warm: Callable[[bool], None],
     ) -> None:
         self._name = name
+        self._keep_warm = keep_warm
         self._state = state
         self._connection = connection
         self._commands = commands
@@ -258,6 +267,7 @@ class Receiver:
         """Drop the authority and the set-point; ``reason`` is published by :meth:`link_changed`."""
         self._restorer.disconnected()
         self._commands.disconnected()
+        self._keep_warm(False)
 
     def link_changed(self, state: LinkState, reason: str) -> None:
         """Publish the state of the hop to the proxy, and an event."""
@@ -279,6 +289,8 @@ class Receiver:
         for channel in tuple(self._state.variants.values()):
             if channel.watch.stalled(flows, now_ns):
                 self._connection.resubscribe(channel.request.topic)
+        newest = self._state.newest
+        self._keep_warm(newest is not None and newest.state.airborne and self._commands.status.state == "held")
         return self._commands.tick(now_ns)
 
     def feedback(self, sample: Feedback, now_ns: int) -> None:

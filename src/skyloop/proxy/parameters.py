@@ -26,6 +26,7 @@ from skyloop.proxy.core.returning import ReturnSettings
 from skyloop.proxy.core.safety import Safety, check_written, safety_of
 from skyloop.zones import BOX, FAR_M, ROOM, ZONES, Space, space_of
 
+LEAST_WARM_S: Final = 0.001  #: a shorter warm.period_s, other than 0, counts as this
 MAX_TEXT: Final = 1024  #: characters of a text value
 MAX_PARAMETER: Final = 8192  #: bytes of one encoded parameter: a driver's larger one is left out
 PAGE_BYTES: Final = MAX_BODY - 256  #: of encoded parameters in one reply
@@ -124,6 +125,14 @@ OWN: Final[tuple[Parameter, ...]] = (
         description="Walls of the room as a box, where the vehicle knows them: a simulated one does",
     ),
     Parameter(ZONES, ParameterType.TEXT, "", default="", description="No-fly zones: boxes and cylinders"),
+    _own(
+        "warm.period_s",
+        0.005,
+        "s",
+        0.0,
+        1.0,
+        "Interval at which the code of commands is run on a dummy in a flight, which keeps it fast; 0: never",
+    ),
 )
 
 
@@ -203,6 +212,7 @@ class FlightSettings:
     max_age_ns: int  #: of a command
     authority_timeout_ns: int
     authority_ask_ns: int
+    warm_s: float  #: how often the code is run on a dummy while the vehicle is flown; 0: never
 
 
 class Parameters:
@@ -293,6 +303,7 @@ class Parameters:
             max_age_ns=nanoseconds(number("command.max_age_s")),
             authority_timeout_ns=nanoseconds(number("authority.timeout_s")),
             authority_ask_ns=nanoseconds(number("authority.ask_s")),
+            warm_s=max(number("warm.period_s"), LEAST_WARM_S) if number("warm.period_s") else 0.0,
         )
 
     def set(self, name: str, value: Value) -> Parameter:

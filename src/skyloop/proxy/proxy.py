@@ -11,6 +11,7 @@ import os
 import secrets
 import threading
 import time
+from collections.abc import Callable
 from functools import partial
 from typing import Final
 
@@ -157,6 +158,8 @@ class Proxy:
             on_failure=self.publisher.driver_failed,
         )
         self._ticker = threading.Thread(target=self._run, name="skyloop-ticker", daemon=True) if ticker else None
+        #: Called 50 times a second with how often the code is to be run on a dummy [s]; 0: not now. See ``warm_up``.
+        self.keep_warm: Callable[[float], None] = _let_be
         self._stopping = threading.Event()
         self._life_lock = threading.Lock()
         self._started = self._stopped = False
@@ -235,6 +238,7 @@ class Proxy:
         self._stopping.set()
         if self._ticker is not None and self._ticker.is_alive():
             self._ticker.join()
+        self.keep_warm(0.0)
         self.handler.leave_hovering(self.clock())
         self._requests.stop()
         try:
@@ -355,6 +359,7 @@ class Proxy:
         self.publisher.keep_alive(now_ns)
         self.workers.tick(now_ns)
         self.events.tick(now_ns)
+        self.keep_warm(self.handler.warm_s if self.handler.piloted else 0.0)
 
     def _end_silent(self, now_ns: int) -> None:
         """End connections without a Hello: they take places from others."""
@@ -400,6 +405,10 @@ class Proxy:
     def _refresh_parameters(self) -> None:
         """Read the driver's parameters again, now that its vehicle has come. On the driver's thread."""
         self._requests.call_later(self._parameter_requests.read_driver)
+
+
+def _let_be(period_s: float) -> None:
+    """Keep nothing warm."""
 
 
 def _as_reported(state: FlightState) -> FlightState:

@@ -22,6 +22,7 @@ from skyloop.messages import EventKind, LinkState, Severity
 from skyloop.proxy.audit import AuditTrail, audit_path
 from skyloop.proxy.flight_record import FlightRecord, record_path
 from skyloop.proxy.proxy import Proxy
+from skyloop.proxy.warm_up import keep_warm
 from skyloop.transport.base import TransportServer
 
 LAND_WITHIN_S: Final = 20.0  #: how long a signalled proxy waits for its vehicle to land
@@ -137,6 +138,8 @@ def run(
     ``parent_fd``) none.
     """
     shutdown = _Shutdown()
+    for proxy in proxies:
+        keep_warm(proxy)
     if audit is not None or parent_fd is None:
         for proxy in proxies:
             _keep_trail(proxy, audit)

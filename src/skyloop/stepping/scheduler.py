@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable
 from typing import Final, Protocol
 
-from skyloop.client.connection import ConnectionSupervisor, Scheduler
+from skyloop.client.connection import ConnectionSupervisor, ProxyConnection, Scheduler
 from skyloop.client.mailbox import Notifier
 from skyloop.clock import NS_PER_S, ManualClock, nanoseconds
 from skyloop.errors import UsageError
@@ -68,6 +68,10 @@ class StepScheduler(Scheduler):
         self._interrupted = False
 
     def notifier(self) -> Notifier:
+        """Return a notifier whose waits advance the time."""
+        return StepNotifier(self)
+
+    def sample_notifier(self, connection: ProxyConnection) -> Notifier:  # noqa: ARG002
         """Return a notifier whose waits advance the time."""
         return StepNotifier(self)
 

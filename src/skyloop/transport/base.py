@@ -299,6 +299,26 @@ class TransportClient(ABC):
         The handler's ``closed`` is called before this returns, unless this runs on the receiving thread.
         """
 
+    def lead(self, ready: Callable[[], bool], wake: Callable[[], None], timeout_s: float) -> bool:  # noqa: ARG002
+        """Receive on the calling thread while it waits, so that what it waits for wakes one thread and not two.
+
+        The handler is called on this thread meanwhile, still one call at a time. The default can't.
+
+        Args:
+            ready: Whether the wait is over; called on this thread after each packet, and some times a second.
+            wake: Called once, on another thread, when trying again may succeed; not if this returns True.
+            timeout_s: How long to receive [s]; may take 50 ms longer.
+
+        Returns:
+            Whether this thread did the receiving; False if another one does, and the caller waits as ever.
+        """
+        return False
+
+    @property
+    def receiving(self) -> bool:
+        """Whether the calling thread has been lent to :meth:`lead`, and must not wait for what it would receive."""
+        return False
+
     @property
     @abstractmethod
     def same_clock(self) -> bool:

@@ -29,30 +29,32 @@ class PriorityLock:
     """
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
+        self._taken = threading.Lock()  # taken while a thread has it; handed over as it is
         self._owner = 0  # identity of the thread that has it
-        self._depth = 0
+        self._depth = 0  # how often the owner acquired it besides
+        self._queues = threading.Lock()  # guards the queues
         self._urgent: deque[tuple[threading.Lock, int]] = deque()  # who waits, woken by a lock of its own
         self._others: deque[tuple[threading.Lock, int]] = deque()
         self.urgent = _Urgent(self)
 
-    def acquire(self, *, urgent: bool = False) -> None:
+    def acquire(self, urgent: bool = False) -> None:
         """Wait for the lock and acquire it; the thread that holds it may acquire it again.
 
         Args:
             urgent: Whether to go before all waiters that are not urgent.
         """
         me = threading.get_ident()
+        if self._taken.acquire(False):  # the usual case, with as few lines as possible
+            self._owner = me
+            return
         if self._owner == me:
             self._depth += 1
             return
-        with self._lock:
-            if not self._owner:
-                self._owner, self._depth = me, 1
-                return
-            woken = threading.Lock()
-            woken.acquire()
+        woken = threading.Lock()
+        woken.acquire()
+        with self._queues:
             (self._urgent if urgent else self._others).append((woken, me))
+        self._hand_over()  # should it have been released just now
         woken.acquire()  # it is ours then
 
     def release(self) -> None:
@@ -60,17 +62,21 @@ class PriorityLock:
 
         Only the thread that holds the lock may call this; that is not checked.
         """
-        self._depth -= 1
         if self._depth:
+            self._depth -= 1
             return
-        with self._lock:
+        self._owner = 0
+        self._taken.release()
+        if self._urgent or self._others:
+            self._hand_over()
+
+    def _hand_over(self) -> None:
+        """Give the lock to who waits first, if it is free."""
+        with self._queues:
             waiting = self._urgent or self._others
-            if not waiting:
-                self._owner = 0
-                return
-            woken, self._owner = waiting.popleft()
-            self._depth = 1
-        woken.release()
+            if waiting and self._taken.acquire(False):
+                woken, self._owner = waiting.popleft()
+                woken.release()
 
     @property
     def held(self) -> bool:

@@ -7,7 +7,9 @@ import logging
 import os
 import socket
 import threading
+import time
 from collections import deque
+from collections.abc import Callable
 from typing import Final
 
 from skyloop.errors import DecodeError, LinkError, UnknownNameError
@@ -22,6 +24,8 @@ from skyloop.transport.local.sockets import SEND_FLAGS, Socket, credentials, set
 _MAX_RECEIVED: Final = HEADER_SIZE + MAX_BODY + 256  # a frame's packet has a few bytes more than its header's
 _ANCILLARY: Final = socket.CMSG_SPACE(4 * array.array("i").itemsize)
 _RETRY_S: Final = 0.25  # for what did not fit into a full socket
+_LOOK_S: Final = 0.05  # how often a thread that leads looks whether its wait is over, while nothing comes
+_STAND_BY_S: Final = 0.002  # how long nobody receives after the thread that led went away with what it waited for
 _log = logging.getLogger(__name__)
 
 
@@ -56,6 +60,11 @@ class LocalClient(TransportClient):
         handler: Called on the receiving thread, which starts at once.
     """
 
+    # Whoever holds ``_turn`` receives and delivers. That is the receiving thread, or a thread of the application that
+    # waits for a sample and *leads* meanwhile: a sample wakes that thread alone, where handing it over from one to the
+    # other takes a second wake-up, which costs as much as the whole way from the proxy. While somebody leads, the
+    # receiving thread stands by, and receives again when nobody has for two milliseconds.
+
     def __init__(self, sock: Socket, name: str, handler: ClientHandler) -> None:
         self._address = f"local:{name} (pid {credentials(sock).pid})"
         sock.limit_backlog()
@@ -66,6 +75,11 @@ class LocalClient(TransportClient):
         self._leases = Leases(self._release)
         self._closing = False
         self._reason = ""
+        self._turn = threading.Lock()
+        self._receiver = 0  # identity of the thread that has the turn
+        self._ended = ""  # why receiving is over
+        self._candidate: Callable[[], None] | None = None  # wakes a thread that would lead
+        self._releases: deque[bytes] = deque()  # of frames that were dropped while a packet was delivered
         self._send_own(packets.hello())
         self._thread = threading.Thread(target=self._run, args=(sock,), name=f"skyloop-{name}-client", daemon=True)
         self._thread.start()
@@ -88,8 +102,26 @@ class LocalClient(TransportClient):
 
     def close(self) -> None:
         self._end("closed by the application")
-        if threading.current_thread() is not self._thread:
+        if not self.receiving:
             self._thread.join()
+
+    def lead(self, ready: Callable[[], bool], wake: Callable[[], None], timeout_s: float) -> bool:
+        sock = self._socket
+        if sock is None or self._ended:
+            return False
+        if not self._turn.acquire(False):
+            self._candidate = wake  # the receiving thread makes room after the next packet
+            return False
+        deadline_s = time.monotonic() + timeout_s
+        try:
+            self._take_turn(sock, lambda: ready() or time.monotonic() >= deadline_s)
+        finally:
+            self._turn.release()
+        return True
+
+    @property
+    def receiving(self) -> bool:
+        return self._receiver == threading.get_ident()
 
     @property
     def same_clock(self) -> bool:
@@ -108,7 +140,11 @@ class LocalClient(TransportClient):
             sock.hang_up(packets.bye(reason))
 
     def _release(self, slot: int) -> None:
-        self._send_own(packets.release(slot))
+        packet = packets.release(slot)
+        if self._receiver == threading.get_ident():
+            self._releases.append(packet)  # after the delivery, for which somebody waits
+        else:
+            self._send_own(packet)
 
     def _send_own(self, packet: bytes) -> None:
         """Send one of the transport's own packets, later if it does not fit now.
@@ -132,37 +168,64 @@ class LocalClient(TransportClient):
     # --- the receiving thread ---
 
     def _run(self, sock: Socket) -> None:
-        try:
-            reason = self._receive(sock)
-        except Exception as error:  # noqa: BLE001  (a handler may raise anything)
-            _log.exception("the handler of %s failed; its connection ends", self._address)
-            reason = f"the application's handler failed: {error!r}"
+        while not self._ended:
+            set_timeout(sock, socket.SO_RCVTIMEO, _RETRY_S)
+            with self._turn:
+                self._take_turn(sock, lambda: self._candidate is not None)
+            wake, self._candidate = self._candidate, None
+            if wake is not None and not self._ended:
+                set_timeout(sock, socket.SO_RCVTIMEO, _LOOK_S)
+                wake()
+                self._stand_by()
+        reason = self._ended
         self._end(reason)
         reason = self._reason
         self._socket = None
         self._unsent.clear()
+        self._releases.clear()
         self._leases.end()
         try:
             self._handler.closed(reason)
         except Exception:  # noqa: BLE001  (a handler may raise anything)
             _log.exception("the handler of %s failed in closed()", self._address)
 
-    def _receive(self, sock: Socket) -> str:
-        """Deliver until the connection ends, and return why."""
+    def _stand_by(self) -> None:
+        """Wait until nobody leads."""
+        while not self._ended:
+            time.sleep(_STAND_BY_S)
+            if not self._turn.locked():
+                return
+
+    # --- whoever has the turn ---
+
+    def _take_turn(self, sock: Socket, over: Callable[[], bool]) -> None:
+        """Deliver until it is over, or the connection has ended."""
+        self._receiver = threading.get_ident()
+        try:
+            self._ended = self._receive(sock, over)
+        except Exception as error:  # noqa: BLE001  (a handler may raise anything)
+            _log.exception("the handler of %s failed; its connection ends", self._address)
+            self._ended = f"the application's handler failed: {error!r}"
+        finally:
+            self._receiver = 0
+
+    def _receive(self, sock: Socket, over: Callable[[], bool]) -> str:
+        """Deliver until it is over, or until the connection ends: then return why."""
         receive = sock.recvmsg
         deliver, deliver_frame = self._handler.packet, self._handler.frame
         while not self._closing:
+            if self._releases or self._unsent:
+                self._send_waiting(sock)
             try:
                 packet, ancillary, _, _ = receive(_MAX_RECEIVED, _ANCILLARY, socket.MSG_CMSG_CLOEXEC)
             except BlockingIOError:
-                self._send_unsent(sock)
+                if over():
+                    return ""
                 continue
             except ConnectionResetError:
                 continue  # what was sent before it still comes, and then the end
             except OSError as error:
                 return f"receiving failed: {error}"
-            if self._unsent:
-                self._send_unsent(sock)
             kind = packet[5:6]
             if kind < OWN and packet and not ancillary:
                 deliver(packet)
@@ -181,7 +244,9 @@ class LocalClient(TransportClient):
                 del pixels  # else their slot stayed leased until the next packet
             else:
                 deliver(packet)
-        return self._reason
+            if over():
+                return ""
+        return self._reason or "closed by the application"
 
     def _control(self, packet: bytes, descriptors: list[int]) -> None:
         """Handle one of the transport's own packets that is no frame, and close the descriptors that came with it.
@@ -207,7 +272,10 @@ class LocalClient(TransportClient):
             for descriptor in descriptors:
                 os.close(descriptor)
 
-    def _send_unsent(self, sock: Socket) -> None:
+    def _send_waiting(self, sock: Socket) -> None:
+        """Send the releases of this turn, and what did not fit into the socket before."""
+        while self._releases:
+            self._unsent.append(self._releases.popleft())
         try:
             while self._unsent:
                 # It stays in the queue until it is sent, so that nothing that comes later overtakes it.

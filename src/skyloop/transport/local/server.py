@@ -257,7 +257,8 @@ class LocalServer(TransportServer):
                 return f"receiving failed: {error}"
             if packet == packets.WAKE and connection.joined:
                 continue  # at once: the command that follows it does not wait in line with it
-            with lock.urgent if is_command(packet) else lock:
+            lock.acquire(is_command(packet))
+            try:
                 if not packet or connection.ending:
                     # An empty packet cannot be distinguished from the end, so it counts as one.
                     return f"the application is gone ({peer.address})"
@@ -267,6 +268,8 @@ class LocalServer(TransportServer):
                     self._welcome(handler, connection, packet)
                 elif packet[5:6] < OWN or not (packets.is_own(packet) and self._control(handler, connection, packet)):
                     deliver(peer, packet)
+            finally:
+                lock.release()
 
     def _welcome(self, handler: ServerHandler, connection: ServerConnection, packet: bytes) -> None:
         """Handle a connection's first packet. A process that only asks who listens here sends none."""

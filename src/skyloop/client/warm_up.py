@@ -1,0 +1,204 @@
+"""An application's code kept warm while it flies: a second drone, connected to nothing, is flown meanwhile.
+
+It is made of the same classes, so that the very instructions of commands, feedback and frames run, and of nothing that
+a proxy or the application could notice. See :mod:`skyloop.warmth`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+
+from skyloop.client.connection import ConnectionSupervisor, ProxyConnection, Scheduler
+from skyloop.client.core import DroneCore
+from skyloop.client.drone import Drone
+from skyloop.client.mailbox import Notifier
+from skyloop.clock import ManualClock, nanoseconds
+from skyloop.errors import UsageError
+from skyloop.messages import (
+    ACTION_NAMES,
+    AnyReply,
+    AuthorityGranted,
+    CameraInfo,
+    Capabilities,
+    Encoding,
+    Feedback,
+    FlightState,
+    FrameHeader,
+    Hello,
+    LinkState,
+    Reply,
+    Request,
+    RequestAuthority,
+    Welcome,
+    decode,
+    encode,
+)
+from skyloop.transport.base import ClientHandler, TransportClient
+from skyloop.warmth import Warmer
+
+_CAMERA: Final = "camera"
+_SIDE: Final = 16  #: of its frames [pixels]
+_ROUND_NS: Final = nanoseconds(1 / 32)  #: by which its clock goes on from round to round
+_APP: Final = 1
+
+
+def make_round() -> Callable[[], None]:
+    """Make the second drone, and return what brings it one feedback and one frame, and sends one command.
+
+    Raises:
+        SkyloopError: It could not connect to itself: the code here is wrong.
+    """
+    clock = ManualClock()
+    scheduler = _OwnTime(clock)
+    core = DroneCore(lambda handler: _Echo(handler, clock), app="warm-up", scheduler=scheduler)
+    core.open()
+    drone = Drone(core)
+    session = core.connection.session
+    assert session is not None
+    inbox = core.inbox(frames=True)
+    inbox.__enter__()
+    pixels = np.zeros(_SIDE * _SIDE * 3, np.uint8)
+    rounds = 1
+
+    def once() -> None:
+        nonlocal rounds
+        rounds += 1
+        clock.now_ns += _ROUND_NS
+        now_ns = clock()
+        session.packet(_feedback(rounds, now_ns))
+        header = FrameHeader(_CAMERA, rounds, now_ns, now_ns, _SIDE, _SIDE, Encoding.BGR8, pixels.size)
+        session.frame(header, pixels)
+        inbox.notifier.wait_for(lambda: inbox.waiting, 0.0)
+        inbox.feedback.take()
+        inbox.frame()
+        drone.velocity(forward=0.1, yaw_rate=0.1 if rounds % 2 else -0.1)
+
+    return once
+
+
+PERIOD_S: Final = 0.005  #: how often the code is run, unless the application says otherwise
+#: That of this process: one keeps the code of all its drones warm.
+WARMER: Final = Warmer(make_round, "client")
+
+
+def keeper(period_s: float) -> Callable[[bool], None]:
+    """Return what one drone calls with whether it is flown from here.
+
+    Args:
+        period_s: How often the code is run while it is [s]; 0: never.
+
+    Raises:
+        UsageError: It is neither 0 nor from 0.001 to 1.
+    """
+    if not (period_s == 0.0 or 0.001 <= period_s <= 1.0):
+        raise UsageError(f"warm_s is {period_s!r} and must be from 0.001 to 1 s, or 0 for never")
+    who = object()
+    return lambda flies: WARMER.keep(who, period_s if flies else 0.0)
+
+
+def _feedback(seq: int, now_ns: int) -> bytes:
+    return encode(
+        Feedback(
+            captured_ns=now_ns,
+            seq=seq,
+            published_ns=now_ns,
+            state=FlightState.FLYING,
+            vehicle_link=LinkState.UP,
+            owner="warm-up",
+            owner_id=_APP,
+            lease=1,
+            battery=0.8,
+            battery_v=11.4,
+            roll_rad=0.01,
+            pitch_rad=-0.02,
+            yaw_rad=0.5,
+            altitude_m=1.2,
+            velocity_m_s=(0.1, 0.0, 0.0),
+            angular_velocity_rad_s=(0.0, 0.01, 0.0),
+            acceleration_m_s2=(0.0, 0.1, 9.8),
+            position_m=(0.5, 0.25, 1.2),
+        )
+    )
+
+
+class _OwnTime(Scheduler):
+    """Time that only the rounds make go on; whoever waits attends to the connection instead."""
+
+    def __init__(self, clock: ManualClock) -> None:
+        super().__init__(clock)
+        self._supervisor: ConnectionSupervisor | None = None
+
+    def notifier(self) -> Notifier:
+        return _Attending(self)
+
+    def sample_notifier(self, connection: ProxyConnection) -> Notifier:  # noqa: ARG002
+        return _Attending(self)
+
+    def begin(self, supervisor: ConnectionSupervisor) -> None:
+        self._supervisor = supervisor
+
+    def attend(self) -> None:
+        """Do what the connection's thread does."""
+        if self._supervisor is not None:
+            self._supervisor.attend()
+
+
+class _Attending(Notifier):
+    """Attends to the connection in place of waiting."""
+
+    __slots__ = ("_time",)
+
+    def __init__(self, time: _OwnTime) -> None:
+        super().__init__()
+        self._time = time
+
+    def wait_for(self, ready: Callable[[], bool], timeout_s: float | None = None) -> bool:  # noqa: ARG002
+        if not ready():
+            self._time.attend()
+        return ready()
+
+
+class _Echo(TransportClient):
+    """Answers what a drone asks at first, and drops everything else."""
+
+    def __init__(self, handler: ClientHandler, clock: ManualClock) -> None:
+        self._handler = handler
+        self._clock = clock
+        self._open = False
+
+    def send(self, packet: bytes) -> bool:
+        if not self._open:
+            sample = decode(packet)
+            answer = self._answer(sample.body) if isinstance(sample, Request) else None
+            if isinstance(sample, Request) and answer is not None:
+                self._handler.packet(encode(Reply(sample.id, answer)))
+        return True
+
+    def _answer(self, asked: object) -> AnyReply | None:
+        if isinstance(asked, Hello):
+            actions = frozenset(ACTION_NAMES.values())
+            cameras = (CameraInfo(_CAMERA, _SIDE, _SIDE, 30.0),)
+            return Welcome(_APP, "warm-up", 1, 1, "nothing://", self._clock(), Capabilities("", actions, cameras))
+        if isinstance(asked, RequestAuthority):
+            self._open = True
+            return AuthorityGranted(1)
+        return None
+
+    def subscribe(self, topic: str, on: bool = True) -> None:
+        """Bring the first feedback when it is subscribed to."""
+        if topic == "feedback" and on:
+            self._handler.packet(_feedback(1, self._clock()))
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+    @property
+    def same_clock(self) -> bool:
+        return True
+
+    @property
+    def address(self) -> str:
+        return "nowhere"

@@ -1,0 +1,184 @@
+"""The proxy's code kept warm while somebody flies: a second proxy, of no vehicle and for nobody, is flown meanwhile.
+
+It is made of the same classes, so that the very instructions of commands, feedback and frames run, and of nothing that
+a vehicle, an application, a file or the network could notice. See :mod:`skyloop.warmth`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+
+from skyloop.clock import ManualClock, nanoseconds
+from skyloop.drivers.base import Driver, Sink
+from skyloop.drivers.uri import VehicleUri
+from skyloop.errors import LinkError
+from skyloop.messages import (
+    ACTION_NAMES,
+    AnyAction,
+    AuthorityGranted,
+    CameraInfo,
+    Capabilities,
+    Command,
+    Feedback,
+    FlightState,
+    FrameHeader,
+    Hello,
+    LinkState,
+    Reply,
+    Request,
+    RequestAuthority,
+    Role,
+    Velocity,
+    decode,
+    encode,
+)
+from skyloop.proxy.proxy import Proxy
+from skyloop.transport.base import Peer, Pixels, ServerHandler, TransportServer
+from skyloop.transport.local.frame_exchange import FrameExchange
+from skyloop.warmth import Warmer
+
+_CAMERA: Final = "camera"
+_SIDE: Final = 16  #: of its frames [pixels]
+_ROUND_NS: Final = nanoseconds(1 / 32)  #: by which its clock goes on from round to round
+
+
+def make_round() -> Callable[[], None]:
+    """Make the second proxy, and return what flies it for one command, one feedback and one frame.
+
+    Raises:
+        LinkError: It gave itself no authority: the code here is wrong.
+    """
+    clock, server, driver = ManualClock(), _Nowhere(), _Nothing()
+    proxy = Proxy(driver, server, name="warm-up", clock=clock, ticker=False)
+    peer = Peer(1, "nobody")
+    proxy.handler.begin(clock())
+    driver.open(proxy.publisher)
+    driver.report(clock())
+    proxy.peer_joined(peer)
+    proxy.packet(peer, encode(Request(1, Hello("warm-up", Role.PILOT))))
+    proxy.packet(peer, encode(Request(2, RequestAuthority(priority=0))))
+    lease = server.lease
+    if not lease:
+        raise LinkError("the proxy that is flown for its code did not grant the authority")
+    image = np.zeros((_SIDE, _SIDE, 3), np.uint8)
+    rounds = 0
+
+    def once() -> None:
+        nonlocal rounds
+        rounds += 1
+        clock.now_ns += _ROUND_NS
+        now_ns = clock()
+        set_point = Velocity(forward=0.1, yaw_rate=0.1 if rounds % 2 else -0.1)
+        proxy.packet(peer, encode(Command(rounds, lease, rounds, now_ns, set_point)))
+        driver.report(now_ns)
+        driver.show(now_ns, image)
+
+    return once
+
+
+#: That of this process: one keeps the code of all its proxies warm.
+WARMER: Final = Warmer(make_round, "proxy")
+
+
+def keep_warm(proxy: Proxy) -> None:
+    """Keep the code of this process's proxies warm while this one's vehicle is flown by a pilot."""
+    proxy.keep_warm = lambda period_s: WARMER.keep(proxy, period_s)
+
+
+class _Nothing(Driver):
+    """A vehicle that is not there."""
+
+    shared = False
+
+    def __init__(self) -> None:
+        super().__init__(VehicleUri("nothing"))
+
+    def capabilities(self) -> Capabilities:
+        return Capabilities("nothing", frozenset(ACTION_NAMES.values()), (CameraInfo(_CAMERA, _SIDE, _SIDE, 30.0),))
+
+    def _open(self, sink: Sink) -> None:
+        sink.link(LinkState.UP)
+
+    def _close(self) -> None:
+        """Nothing is open."""
+
+    def _apply(self, action: AnyAction) -> AnyAction:
+        return action
+
+    def report(self, now_ns: int) -> None:
+        """Report as much as a real vehicle does."""
+        assert self._sink is not None
+        self._sink.feedback(
+            Feedback(
+                captured_ns=now_ns,
+                state=FlightState.FLYING,
+                battery=0.8,
+                battery_v=11.4,
+                roll_rad=0.01,
+                pitch_rad=-0.02,
+                yaw_rad=0.5,
+                altitude_m=1.2,
+                velocity_m_s=(0.1, 0.0, 0.0),
+                angular_velocity_rad_s=(0.0, 0.01, 0.0),
+                acceleration_m_s2=(0.0, 0.1, 9.8),
+                position_m=(0.5, 0.25, 1.2),
+            )
+        )
+
+    def show(self, now_ns: int, image: Pixels) -> None:
+        """Give a frame."""
+        assert self._sink is not None
+        self._sink.frame(_CAMERA, image, now_ns, width=_SIDE, height=_SIDE)
+
+
+class _Viewer:
+    """Looks at the frames, and gives each back at once."""
+
+    def transmit(self, packet: bytes) -> None:
+        """Drop a packet."""
+
+    def transmit_descriptor(self, packet: bytes, descriptor: int) -> None:
+        """Drop a packet with a descriptor."""
+
+
+class _Nowhere(TransportServer):
+    """Where nobody is connected, although the proxy believes that one application is."""
+
+    def __init__(self) -> None:
+        self.lease = 0
+        self._viewer = _Viewer()
+        self._exchange = FrameExchange()
+        self._exchange.subscribe(self._viewer, _CAMERA)
+
+    def start(self, handler: ServerHandler) -> None:
+        """Serve nobody."""
+
+    def stop(self) -> None:
+        """Nothing was started."""
+
+    def send(self, peer: Peer, packet: bytes) -> bool:  # noqa: ARG002
+        reply = decode(packet)
+        if isinstance(reply, Reply) and isinstance(reply.body, AuthorityGranted):
+            self.lease = reply.body.lease
+        return True
+
+    def publish(self, topic: str, packet: bytes) -> int:  # noqa: ARG002
+        return 0
+
+    def publish_frame(self, header: FrameHeader, pixels: Pixels) -> int:
+        missed = self._exchange.publish(header, pixels)
+        self._exchange.release(self._viewer, 1)
+        return missed
+
+    def subscribers(self, topic: str) -> int:
+        return int(topic.startswith("video"))
+
+    def disconnect(self, peer: Peer, reason: str) -> None:
+        """Nobody is connected."""
+
+    @property
+    def address(self) -> str:
+        return "nowhere"

@@ -1,0 +1,89 @@
+"""Code that somebody waits for, kept in the processor's caches: run on a dummy every few milliseconds while it matters.
+
+A command comes every 31 ms. Meanwhile others use the caches, so that the same instructions, which take 8 µs when they
+have just run, take 110 µs: most of the delay of a channel. ``docs/delays.md`` has the measurements.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+
+_log = logging.getLogger(__name__)
+
+
+class Warmer:
+    """Runs one piece of code again and again, on one thread of the process, while anybody wants it.
+
+    Args:
+        make: Returns the function to run; called on the thread when it is wanted for the first time.
+        name: For the thread and for messages.
+        sleep: Waits for some seconds.
+    """
+
+    def __init__(
+        self, make: Callable[[], Callable[[], object]], name: str, *, sleep: Callable[[float], object] = time.sleep
+    ) -> None:
+        self._make = make
+        self._name = name
+        self._sleep = sleep
+        self._wanted: dict[object, float] = {}  # by who wants it: how often [s]
+        self._period_s = 0.0  # the shortest of them; 0: nobody
+        self._run: Callable[[], object] | None = None
+        self._thread: threading.Thread | None = None
+        self._lock = threading.Lock()
+
+    def keep(self, who: object, period_s: float) -> None:
+        """Keep the code warm for somebody, or no longer. Quick where nothing changes. Any thread.
+
+        Args:
+            who: Whoever wants it.
+            period_s: How often the code is run [s]; 0: ``who`` does not want it any more.
+        """
+        if self._wanted.get(who, 0.0) == period_s:
+            return
+        with self._lock:
+            if period_s > 0.0:
+                self._wanted[who] = period_s
+            else:
+                self._wanted.pop(who, None)
+            self._period_s = min(self._wanted.values(), default=0.0)
+            if self._wanted and self._thread is None:
+                self._thread = threading.Thread(target=self._work, name=f"skyloop-warm-{self._name}", daemon=True)
+                self._thread.start()
+
+    @property
+    def active(self) -> bool:
+        """Whether anybody wants the code to be run now."""
+        return self._period_s > 0.0
+
+    def _work(self) -> None:
+        while True:
+            with self._lock:
+                period_s = self._period_s
+                if not period_s:
+                    self._thread = None  # another one is started when it is wanted again
+                    return
+            try:
+                if self._run is None:
+                    self._run = self._make()
+                self._run()
+            except Exception:  # noqa: BLE001  everything works without this, only slower
+                _log.exception("keeping the %s warm failed, and is given up", self._name)
+                with self._lock:
+                    self._wanted.clear()
+                    self._period_s, self._thread = 0.0, None
+                    self._make = _cold
+                    self._run = _nothing
+                return
+            self._sleep(period_s)
+
+
+def _nothing() -> None:
+    """Run nothing."""
+
+
+def _cold() -> Callable[[], object]:
+    return _nothing

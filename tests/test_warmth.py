@@ -1,0 +1,94 @@
+"""Code that is kept warm: on one thread, while somebody wants it, and never at the cost of anything else."""
+
+from __future__ import annotations
+
+import queue
+import threading
+
+import pytest
+
+from skyloop.transport.testing import wait_until
+from skyloop.warmth import Warmer
+
+
+class Pace:
+    """A sleep that lasts until the test lets it go on."""
+
+    def __init__(self) -> None:
+        self.slept: queue.Queue[float] = queue.Queue()
+        self._turn: queue.Queue[None] = queue.Queue()
+
+    def sleep(self, seconds: float) -> None:
+        self.slept.put(seconds)
+        self._turn.get(timeout=10.0)
+
+    def go_on(self) -> None:
+        self._turn.put(None)
+
+
+def warm_threads() -> list[str]:
+    return [thread.name for thread in threading.enumerate() if thread.name == "skyloop-warm-test"]
+
+
+def test_it_runs_while_somebody_wants_it_as_often_as_the_one_who_wants_it_most() -> None:
+    pace, runs = Pace(), list[int]()
+    warmer = Warmer(lambda: lambda: runs.append(1), "test", sleep=pace.sleep)
+    assert not warmer.active
+    assert warm_threads() == []
+    warmer.keep("one", 0.005)
+    assert pace.slept.get(timeout=10.0) == 0.005
+    assert (warmer.active, len(runs), warm_threads()) == (True, 1, ["skyloop-warm-test"])
+    warmer.keep("one", 0.005)  # nothing changes
+    warmer.keep("two", 0.002)
+    pace.go_on()
+    assert pace.slept.get(timeout=10.0) == 0.002
+    warmer.keep("two", 0.0)
+    pace.go_on()
+    assert pace.slept.get(timeout=10.0) == 0.005
+    assert len(runs) == 3
+    warmer.keep("one", 0.0)
+    assert not warmer.active
+    pace.go_on()
+    wait_until(lambda: not warm_threads(), "the thread has ended")
+    assert len(runs) == 3
+    warmer.keep("three", 0.004)
+    assert pace.slept.get(timeout=10.0) == 0.004
+    warmer.keep("three", 0.0)
+    pace.go_on()
+    wait_until(lambda: not warm_threads(), "the second thread has ended")
+
+
+def test_what_it_runs_is_made_once_and_not_before_it_is_wanted() -> None:
+    pace, made = Pace(), list[str]()
+
+    def make() -> object:
+        made.append(threading.current_thread().name)
+        return lambda: None
+
+    warmer = Warmer(make, "test", sleep=pace.sleep)  # type: ignore[arg-type]
+    assert made == []
+    for _ in range(2):
+        warmer.keep("one", 0.005)
+        pace.slept.get(timeout=10.0)
+        warmer.keep("one", 0.0)
+        pace.go_on()
+        wait_until(lambda: not warm_threads(), "the thread has ended")
+    assert made == ["skyloop-warm-test"]
+
+
+def test_code_that_fails_is_given_up_and_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    pace = Pace()
+
+    def broken() -> None:
+        raise RuntimeError("as bad as can be")
+
+    warmer = Warmer(lambda: broken, "test", sleep=pace.sleep)
+    warmer.keep("one", 0.005)
+    wait_until(lambda: "is given up" in caplog.text and not warm_threads(), "it was given up")
+    assert not warmer.active
+    warmer.keep("one", 0.005)  # its drone asks twenty times a second
+    pace.slept.get(timeout=10.0)
+    warmer.keep("one", 0.0)
+    pace.go_on()
+    wait_until(lambda: not warm_threads(), "the thread has ended")
+    assert caplog.text.count("is given up") == 1

@@ -1,0 +1,149 @@
+"""An application's own thread receives while it waits, and the receiving thread when it does not."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from skyloop.transport.base import FEEDBACK, video
+from skyloop.transport.local import LocalServer, dial
+from skyloop.transport.local.client import LocalClient
+from skyloop.transport.testing import FRONT, ClientLog, ServerLog, header, picture, wait_until
+
+_names = (f"lead-{number}" for number in itertools.count())
+
+
+class Pair:
+    """A server, and a client whose log says which thread each packet came on."""
+
+    def __init__(self) -> None:
+        name = next(_names)
+        self.server, self.there, self.here = LocalServer(name), ServerLog(), ClientLog()
+        self.threads: list[str] = []
+        self.here.on_packet = lambda _: self.threads.append(threading.current_thread().name)
+        self.server.start(self.there)
+        client = dial(name)(self.here)
+        assert isinstance(client, LocalClient)
+        self.client = client
+        client.subscribe(FEEDBACK)
+        wait_until(lambda: self.server.subscribers(FEEDBACK), "it has subscribed")
+
+    def send(self, packet: bytes) -> None:
+        assert self.server.publish(FEEDBACK, packet) == 0
+
+    def lead(self, count: int, timeout_s: float = 10.0) -> None:
+        """Wait on this thread until so many packets are there, as a notifier does."""
+        offered = threading.Event()
+        deadline = time.monotonic() + timeout_s
+        while len(self.here.packets) < count and time.monotonic() < deadline:
+            if not self.client.lead(lambda: len(self.here.packets) >= count, offered.set, 1.0):
+                offered.wait(0.01)
+                offered.clear()
+
+
+@pytest.fixture
+def pair() -> Iterator[Pair]:
+    pair = Pair()
+    try:
+        yield pair
+    finally:
+        pair.client.close()
+        pair.server.stop()
+
+
+def make_it_lead(pair: Pair) -> threading.Thread:
+    """Start a thread that leads, as soon as the first packet makes room for it, until three are there."""
+    thread = threading.Thread(target=pair.lead, args=(3,), name="waiting")
+    thread.start()
+    wait_until(lambda: pair.client._candidate, "it would lead")
+    pair.send(b"one")
+    wait_until(lambda: pair.client._receiver == thread.ident, "it leads")
+    return thread
+
+
+def test_what_a_thread_waits_for_comes_on_that_thread(pair: Pair) -> None:
+    thread = make_it_lead(pair)
+    pair.send(b"two")
+    pair.send(b"three")
+    thread.join(10.0)
+    assert pair.here.packets == [b"one", b"two", b"three"]
+    assert pair.threads[1:] == ["waiting", "waiting"]
+    assert pair.threads[0] != "waiting"
+
+
+def test_the_receiving_thread_goes_on_when_the_other_is_busy(pair: Pair) -> None:
+    make_it_lead(pair)
+    pair.send(b"two")
+    pair.send(b"three")
+    wait_until(lambda: len(pair.here.packets) == 3, "its wait is over")
+    wait_until(lambda: pair.client._receiver == pair.client._thread.ident, "the receiving thread has its turn again")
+    pair.send(b"four")
+    wait_until(lambda: len(pair.here.packets) == 4, "it came all the same")
+    assert pair.threads[3] == pair.client._thread.name
+
+
+def test_a_wait_that_is_over_without_a_packet_ends(pair: Pair) -> None:
+    thread = make_it_lead(pair)
+    pair.here.packets += [b"from elsewhere"] * 2
+    thread.join(10.0)
+    assert not thread.is_alive()
+
+
+def test_the_connection_ends_for_who_leads_as_well(pair: Pair) -> None:
+    thread = make_it_lead(pair)
+    pair.server.stop()
+    wait_until(lambda: pair.here.closings, "it is told")
+    assert pair.here.closings == ["the proxy stopped"]
+    assert not pair.client.lead(lambda: False, lambda: None, 1.0)
+    pair.here.packets += [b"nothing", b"more"]
+    thread.join(10.0)
+    assert not thread.is_alive()
+
+
+def test_who_leads_may_close_in_the_middle(pair: Pair) -> None:
+    thread = make_it_lead(pair)
+    closed = threading.Event()
+
+    def close(_: bytes) -> None:
+        assert pair.client.receiving
+        pair.client.close()
+        closed.set()
+
+    pair.here.on_packet = close
+    pair.send(b"two")
+    assert closed.wait(10.0)
+    wait_until(lambda: pair.here.closings == ["closed by the application"], "it is told")
+    pair.here.packets += [b"nothing", b"more"]
+    thread.join(10.0)
+    assert not thread.is_alive()
+
+
+def test_a_handler_that_fails_ends_the_connection_and_not_the_thread_that_leads(pair: Pair) -> None:
+    thread = make_it_lead(pair)
+
+    def fail(_: bytes) -> None:
+        raise RuntimeError("the application is broken")
+
+    pair.here.on_packet = fail
+    pair.send(b"two")
+    wait_until(lambda: pair.here.closings, "it is told")
+    assert "the application is broken" in pair.here.closings[0]
+    assert thread.is_alive()
+    pair.here.packets += [b"nothing", b"more"]
+    thread.join(10.0)
+    assert not thread.is_alive()
+
+
+def test_a_frame_that_is_dropped_during_a_delivery_is_given_back_after_it(pair: Pair) -> None:
+    pair.client.subscribe(video(FRONT))
+    wait_until(lambda: pair.server.subscribers(video(FRONT)), "it has subscribed")
+    pair.here.keep = False
+    for seq in range(1, 40):
+        head = header(seq)
+        assert pair.server.publish_frame(head, picture(head)) == 0
+        wait_until(lambda seq=seq: pair.here.saw(seq), "it came")  # type: ignore[misc]
+    assert pair.here.torn == []
