@@ -8,7 +8,7 @@ import threading
 import pytest
 
 from skyloop.transport.testing import wait_until
-from skyloop.warmth import Warmer
+from skyloop.warmth import Pieces, Warmer
 
 
 class Pace:
@@ -19,6 +19,8 @@ class Pace:
         self._turn: queue.Queue[None] = queue.Queue()
 
     def sleep(self, seconds: float) -> None:
+        if not seconds:
+            return  # between two pieces
         self.slept.put(seconds)
         self._turn.get(timeout=10.0)
 
@@ -32,7 +34,7 @@ def warm_threads() -> list[str]:
 
 def test_it_runs_while_somebody_wants_it_as_often_as_the_one_who_wants_it_most() -> None:
     pace, runs = Pace(), list[int]()
-    warmer = Warmer(lambda: lambda: runs.append(1), "test", sleep=pace.sleep)
+    warmer = Warmer(lambda: [lambda: runs.append(1)], "test", sleep=pace.sleep)
     assert not warmer.active
     assert warm_threads() == []
     warmer.keep("one", 0.005)
@@ -61,11 +63,11 @@ def test_it_runs_while_somebody_wants_it_as_often_as_the_one_who_wants_it_most()
 def test_what_it_runs_is_made_once_and_not_before_it_is_wanted() -> None:
     pace, made = Pace(), list[str]()
 
-    def make() -> object:
+    def make() -> Pieces:
         made.append(threading.current_thread().name)
-        return lambda: None
+        return (lambda: None,)
 
-    warmer = Warmer(make, "test", sleep=pace.sleep)  # type: ignore[arg-type]
+    warmer = Warmer(make, "test", sleep=pace.sleep)
     assert made == []
     for _ in range(2):
         warmer.keep("one", 0.005)
@@ -82,7 +84,7 @@ def test_code_that_fails_is_given_up_and_told_once(caplog: pytest.LogCaptureFixt
     def broken() -> None:
         raise RuntimeError("as bad as can be")
 
-    warmer = Warmer(lambda: broken, "test", sleep=pace.sleep)
+    warmer = Warmer(lambda: [broken], "test", sleep=pace.sleep)
     warmer.keep("one", 0.005)
     wait_until(lambda: "is given up" in caplog.text and not warm_threads(), "it was given up")
     assert not warmer.active

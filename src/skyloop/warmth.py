@@ -9,7 +9,10 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+
+#: Run one after the other.
+Pieces = Sequence[Callable[[], object]]
 
 _log = logging.getLogger(__name__)
 
@@ -18,20 +21,18 @@ class Warmer:
     """Runs one piece of code again and again, on one thread of the process, while anybody wants it.
 
     Args:
-        make: Returns the function to run; called on the thread when it is wanted for the first time.
+        make: Returns the pieces of code, in their order; called on the thread when it is wanted for the first time.
         name: For the thread and for messages.
         sleep: Waits for some seconds.
     """
 
-    def __init__(
-        self, make: Callable[[], Callable[[], object]], name: str, *, sleep: Callable[[float], object] = time.sleep
-    ) -> None:
+    def __init__(self, make: Callable[[], Pieces], name: str, *, sleep: Callable[[float], object] = time.sleep) -> None:
         self._make = make
         self._name = name
         self._sleep = sleep
         self._wanted: dict[object, float] = {}  # by who wants it: how often [s]
         self._period_s = 0.0  # the shortest of them; 0: nobody
-        self._run: Callable[[], object] | None = None
+        self._pieces: Pieces | None = None
         self._thread: threading.Thread | None = None
         self._lock = threading.Lock()
 
@@ -67,23 +68,16 @@ class Warmer:
                     self._thread = None  # another one is started when it is wanted again
                     return
             try:
-                if self._run is None:
-                    self._run = self._make()
-                self._run()
+                if self._pieces is None:
+                    self._pieces = self._make()
+                for piece in self._pieces:
+                    piece()
+                    self._sleep(0.0)  # who waits for the interpreter meanwhile waits for one piece and not for all
             except Exception:  # noqa: BLE001  everything works without this, only slower
                 _log.exception("keeping the %s warm failed, and is given up", self._name)
                 with self._lock:
                     self._wanted.clear()
                     self._period_s, self._thread = 0.0, None
-                    self._make = _cold
-                    self._run = _nothing
+                    self._pieces = ()
                 return
             self._sleep(period_s)
-
-
-def _nothing() -> None:
-    """Run nothing."""
-
-
-def _cold() -> Callable[[], object]:
-    return _nothing

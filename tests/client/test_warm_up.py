@@ -34,11 +34,12 @@ def test_a_round_takes_feedback_and_a_frame_and_sends_a_command(
 
     monkeypatch.setattr(warm_up, "DroneCore", Seen)
     with caplog.at_level(logging.DEBUG):
-        once = warm_up.make_round()
+        pieces = warm_up.make_pieces()
         (core,) = made
         before = core.commands.sends.count
         for _ in range(200):
-            once()
+            for piece in pieces:
+                piece()
     stats = Drone(core).stats
     assert stats["feedback"].count == 201
     assert stats["video/camera"].count == 200

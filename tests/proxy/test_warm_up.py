@@ -24,9 +24,10 @@ def test_a_round_runs_a_command_a_feedback_and_a_frame_and_nobody_learns_of_it(
 
     monkeypatch.setattr(warm_up, "Proxy", Seen)
     with caplog.at_level(logging.DEBUG):
-        once = warm_up.make_round()
+        pieces = warm_up.make_pieces()
         for _ in range(500):
-            once()
+            for piece in pieces:
+                piece()
     (proxy,) = made
     counts = proxy._counters.snapshot()
     assert counts["commands.applied"] == counts["commands.received"] == 500

@@ -37,7 +37,7 @@ from skyloop.messages import (
     encode,
 )
 from skyloop.transport.base import ClientHandler, TransportClient
-from skyloop.warmth import Warmer
+from skyloop.warmth import Pieces, Warmer
 
 _CAMERA: Final = "camera"
 _SIDE: Final = 16  #: of its frames [pixels]
@@ -45,8 +45,8 @@ _ROUND_NS: Final = nanoseconds(1 / 32)  #: by which its clock goes on from round
 _APP: Final = 1
 
 
-def make_round() -> Callable[[], None]:
-    """Make the second drone, and return what brings it one feedback and one frame, and sends one command.
+def make_pieces() -> Pieces:
+    """Make the second drone, and return what brings it one feedback, one frame, and sends one command.
 
     Raises:
         SkyloopError: It could not connect to itself: the code here is wrong.
@@ -63,25 +63,29 @@ def make_round() -> Callable[[], None]:
     pixels = np.zeros(_SIDE * _SIDE * 3, np.uint8)
     rounds = 1
 
-    def once() -> None:
+    def feedback() -> None:
         nonlocal rounds
         rounds += 1
         clock.now_ns += _ROUND_NS
+        session.packet(_feedback(rounds, clock()))
+        inbox.feedback.take()
+
+    def frame() -> None:
         now_ns = clock()
-        session.packet(_feedback(rounds, now_ns))
         header = FrameHeader(_CAMERA, rounds, now_ns, now_ns, _SIDE, _SIDE, Encoding.BGR8, pixels.size)
         session.frame(header, pixels)
         inbox.notifier.wait_for(lambda: inbox.waiting, 0.0)
-        inbox.feedback.take()
         inbox.frame()
+
+    def command() -> None:
         drone.velocity(forward=0.1, yaw_rate=0.1 if rounds % 2 else -0.1)
 
-    return once
+    return feedback, frame, command
 
 
 PERIOD_S: Final = 0.005  #: how often the code is run, unless the application says otherwise
 #: That of this process: one keeps the code of all its drones warm.
-WARMER: Final = Warmer(make_round, "client")
+WARMER: Final = Warmer(make_pieces, "client")
 
 
 def keeper(period_s: float) -> Callable[[bool], None]:

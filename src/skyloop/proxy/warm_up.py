@@ -6,7 +6,6 @@ a vehicle, an application, a file or the network could notice. See :mod:`skyloop
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Final
 
 import numpy as np
@@ -38,15 +37,15 @@ from skyloop.messages import (
 from skyloop.proxy.proxy import Proxy
 from skyloop.transport.base import Peer, Pixels, ServerHandler, TransportServer
 from skyloop.transport.local.frame_exchange import FrameExchange
-from skyloop.warmth import Warmer
+from skyloop.warmth import Pieces, Warmer
 
 _CAMERA: Final = "camera"
 _SIDE: Final = 16  #: of its frames [pixels]
 _ROUND_NS: Final = nanoseconds(1 / 32)  #: by which its clock goes on from round to round
 
 
-def make_round() -> Callable[[], None]:
-    """Make the second proxy, and return what flies it for one command, one feedback and one frame.
+def make_pieces() -> Pieces:
+    """Make the second proxy, and return what gives it one command, one feedback and one frame.
 
     Raises:
         LinkError: It gave itself no authority: the code here is wrong.
@@ -66,21 +65,18 @@ def make_round() -> Callable[[], None]:
     image = np.zeros((_SIDE, _SIDE, 3), np.uint8)
     rounds = 0
 
-    def once() -> None:
+    def command() -> None:
         nonlocal rounds
         rounds += 1
         clock.now_ns += _ROUND_NS
-        now_ns = clock()
         set_point = Velocity(forward=0.1, yaw_rate=0.1 if rounds % 2 else -0.1)
-        proxy.packet(peer, encode(Command(rounds, lease, rounds, now_ns, set_point)))
-        driver.report(now_ns)
-        driver.show(now_ns, image)
+        proxy.packet(peer, encode(Command(rounds, lease, rounds, clock(), set_point)))
 
-    return once
+    return command, lambda: driver.report(clock()), lambda: driver.show(clock(), image)
 
 
 #: That of this process: one keeps the code of all its proxies warm.
-WARMER: Final = Warmer(make_round, "proxy")
+WARMER: Final = Warmer(make_pieces, "proxy")
 
 
 def keep_warm(proxy: Proxy) -> None:
