@@ -31,12 +31,11 @@ def overlapping(low: Floats, high: Floats, movable: int) -> tuple[Indices, Indic
     before = counts.cumsum() - counts  # pairs of the boxes before each
     second = np.arange(len(first)) - (before - numbers - 1).repeat(counts)
     one, other = order.take(first), order.take(second)
+    for across in {0, 1, 2} - {axis}:
+        begins, ends = low[across], high[across]
+        overlap = (begins.take(one) <= ends.take(other)) & (begins.take(other) <= ends.take(one))
+        one, other = one.compress(overlap), other.compress(overlap)
     lesser, greater = np.minimum(one, other), np.maximum(one, other)
-    chosen = lesser < movable
-    for across in range(3):
-        if across != axis:
-            chosen &= low[across].take(lesser) <= high[across].take(greater)
-            chosen &= low[across].take(greater) <= high[across].take(lesser)
-    lesser, greater = lesser[chosen], greater[chosen]
-    sorted_ = (lesser * low.shape[1] + greater).argsort()
-    return lesser[sorted_], greater[sorted_]
+    wanted = (lesser < movable).nonzero()[0]
+    wanted = wanted.take((lesser.take(wanted) * len(order) + greater.take(wanted)).argsort())
+    return lesser.take(wanted), greater.take(wanted)

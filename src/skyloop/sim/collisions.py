@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from skyloop.sim.broad_phase import Indices, overlapping
+from skyloop.sim.columns import ARRAYS, NUMBERS, N, Operations, few
 from skyloop.sim.dynamics import STEP_S, Bodies, column
 from skyloop.sim.parameters import VehicleParameters
 from skyloop.sim.solids import Overlap, Solids
@@ -23,11 +24,11 @@ _MOST_ACCELERATION_M_S2 = 60.0  # above what thrust, gravity and drag at 10 m/s 
 _STILL_M_S = 0.3  # along the normal: slower contacts don't bounce, or things would never come to rest
 _PASSES = 6
 _TOUCH_M = 1e-9  # overlaps up to this are touching: rounding alone leaves some that no push ends
-_LOOK_STEPS = 20  # between two broad phases
-_LOOK_S = _LOOK_STEPS * STEP_S
-_SLACK_M = 0.05  # a broad phase looks so much further, for what is pushed
+#: Steps between two broad phases, which for few drones cost as much as for some, but leave less to look at.
+LOOK_STEPS, LOOK_STEPS_OF_FEW = 15, 30
+_SLACK_M = 0.03  # a broad phase looks so much further, for what is pushed
 #: Up to so many pairs are faster looked at one by one.
-_FEW_PAIRS = 6
+FEW_PAIRS = 6
 
 
 @dataclass(slots=True)
@@ -50,8 +51,7 @@ class _Near:
     """What drones can reach before the next broad phase.
 
     Attributes:
-        drones: Pairs of drones that can reach one another, the lesser number first.
-        one: The first of each of these pairs.
+        one: The first of each pair of drones that can reach one another, the lesser number.
         other: The second.
         across: The square of the sum of their radii.
         upright: The square of the sum of their half heights.
@@ -65,7 +65,6 @@ class _Near:
         room_high: Greatest coordinates.
     """
 
-    drones: list[tuple[int, int]]
     one: Indices
     other: Indices
     across: Floats
@@ -88,34 +87,39 @@ class Collisions:
         self._solids = solids
         radius = column(parameters, lambda p: p.radius_m)
         self._hull = np.array([radius, radius, column(parameters, lambda p: p.half_height_m)])
+        self._widest = float(radius.max())
         self._radii, self._half_heights = radius.tolist(), self._hull[2].tolist()
         self._low, self._high = solids.room_low + self._hull, solids.room_high - self._hull  # of centres in the room
         self._bounce = [p.restitution for p in parameters]
         self._friction = [p.friction for p in parameters]
+        self._floor_constants = np.array(self._bounce), np.array(self._friction)
         self._mass = [p.mass_kg for p in parameters]
         self._on_floor = np.zeros(len(parameters), dtype=np.bool_)
-        self._heights, self._feet = bodies.position[2], self._hull[2]
+        self._feet = self._hull[2]
+        # Rows, of which single numbers are written faster than whole columns.
+        self._x, self._y, self._z = bodies.position
+        self._vx, self._vy, self._vz = bodies.velocity
         self._free = bodies.position.copy()  # where each drone last was clear of all that doesn't move
+        self._look_steps = LOOK_STEPS_OF_FEW if few(len(parameters)) else LOOK_STEPS
         self._next = 0  # the step of the next broad phase
-        self._anchor = bodies.position.copy()  # where the last one found each drone …
-        self._reach = np.zeros(len(parameters))  # … and how far it can get until the next one
+        self._reach = np.zeros(len(parameters))  # how far each drone can get until then
+        self._strayed = [0.0 for _ in parameters]  # how much further it may get, because it was pushed or hit
         self._look_around(0)
         self._next = 0
 
     def resolve(self, step: int) -> Contacts | None:
         """Resolve the overlaps of the last step; return the contacts, or None without any."""
         contacts: Contacts | None = None
-        np.less(self._heights, self._feet, out=self._on_floor)
+        np.less(self._z, self._feet, out=self._on_floor)
         if np.count_nonzero(self._on_floor):
             contacts = Contacts()
-            for drone in self._on_floor.nonzero()[0].tolist():
-                self._meet_floor(drone, contacts)
+            self._meet_floor(self._on_floor.nonzero()[0], contacts)
         looked = step >= self._next
         if looked:
             self._look_around(step)
         elif self._near.moving:
             self._solids.move((step + 1) * STEP_S)
-        if self._near.drones or self._near.solids:
+        if len(self._near.one) or self._near.solids:
             contacts = contacts or Contacts()
             self._narrow(step, contacts)
         if looked or self._near.solids:
@@ -123,12 +127,11 @@ class Collisions:
         return contacts
 
     def _narrow(self, step: int, contacts: Contacts) -> None:
-        touched = self._meet_drones(contacts) if self._near.drones else []
-        if any(self._strays(drone, step) for drone in touched):
+        if len(self._near.one) and self._meet_drones((self._next - step) * STEP_S, contacts):
             self._look_around(step)
+        left_s = (self._next - step) * STEP_S
         for drone in self._within_solids():
-            self._meet_solids(drone, contacts)
-            if self._strays(drone, step):
+            if self._meet_solids(drone, left_s, contacts):
                 self._next = step + 1
 
     def moved(self, drone: int) -> None:
@@ -139,30 +142,31 @@ class Collisions:
     # The broad phase -------------------------------------------------------------------------------------------
 
     def _look_around(self, step: int) -> None:
-        """Find what each drone can reach in the next :data:`_LOOK_STEPS` steps."""
+        """Find what each drone can reach until the next broad phase."""
         solids, position, velocity = self._solids, self._bodies.position, self._bodies.velocity
         if solids.moving:
             solids.move((step + 1) * STEP_S)
-        self._next = step + _LOOK_STEPS
-        np.copyto(self._anchor, position)
+        self._next = step + self._look_steps
+        seconds = self._look_steps * STEP_S
+        self._strayed = [0.0] * len(self._strayed)
         np.sqrt((velocity * velocity).sum(axis=0), out=self._reach)
-        np.multiply(self._reach, _LOOK_S, out=self._reach)
-        np.add(self._reach, _span(_LOOK_STEPS) + _SLACK_M, out=self._reach)
+        np.multiply(self._reach, seconds, out=self._reach)
+        np.add(self._reach, _span(self._look_steps) + _SLACK_M, out=self._reach)
         low, high = position - self._reach, position + self._reach
         walled = ((low < self._low) | (high > self._high)).any(axis=0).nonzero()[0]
-        bounds = solids.bounds(_LOOK_S)
+        bounds = solids.bounds(seconds, self._widest)
         low, high = (np.hstack(pair) for pair in zip((low - self._hull, high + self._hull), bounds, strict=True))
         drones = len(self._reach)
         first, second = overlapping(low, high, drones)
         between = second < drones
-        one, other = first[between], second[between]
+        one, other = first.compress(between), second.compress(between)
         radius, _, half_height = self._hull.take(one, axis=1) + self._hull.take(other, axis=1)
-        who, what = first[~between], second[~between] - drones
-        near: dict[int, list[int]] = {drone: [] for drone in walled.tolist()}
+        np.logical_not(between, out=between)
+        who, what = first.compress(between), second.compress(between) - drones
+        near: dict[int, list[int]] = {drone: [] for drone in sorted({*walled.tolist(), *who.tolist()})}
         for drone, solid in zip(who.tolist(), what.tolist(), strict=True):
-            near.setdefault(drone, []).append(solid)
+            near[drone].append(solid)
         self._near = _Near(
-            drones=list(zip(one.tolist(), other.tolist(), strict=True)),
             one=one,
             other=other,
             across=radius * radius,
@@ -177,44 +181,40 @@ class Collisions:
             room_high=self._high.take(walled, axis=1),
         )
 
-    def _strays(self, drone: int, step: int) -> bool:
-        """Whether a drone that was pushed or hit can get further than the broad phase reckoned, before the next one."""
-        steps = self._next - step
-        x, y, z = self._bodies.position[:, drone].tolist()
-        was_x, was_y, was_z = self._anchor[:, drone].tolist()
-        vx, vy, vz = self._bodies.velocity[:, drone].tolist()
-        away = math.sqrt((x - was_x) ** 2 + (y - was_y) ** 2 + (z - was_z) ** 2)
-        speed = math.sqrt(vx * vx + vy * vy + vz * vz)
-        return away + speed * steps * STEP_S + _span(steps) > float(self._reach[drone])
+    def _strays(self, drone: int, metres: float) -> bool:
+        """Whether a drone that gets further by so much leaves what the last broad phase looked at."""
+        self._strayed[drone] += metres
+        return self._strayed[drone] > _SLACK_M
 
     # The floor -------------------------------------------------------------------------------------------------
 
-    def _meet_floor(self, drone: int, contacts: Contacts) -> None:
-        position, velocity = self._bodies.position, self._bodies.velocity
-        vx, vy, vz = velocity[:, drone].tolist()
-        position[2, drone] = self._half_heights[drone]
-        falling = max(-vz, 0.0)
-        bounce = falling * self._bounce[drone] if falling > _STILL_M_S else 0.0
-        sliding = math.sqrt(vx * vx + vy * vy)
-        left = max(1.0 - self._friction[drone] * (falling + bounce) / max(sliding, 1e-9), 0.0)
-        velocity[:, drone] = vx * left, vy * left, max(vz, bounce)
-        contacts.standing.add(drone)
-        if falling > _STILL_M_S:
-            contacts.impacts.append((drone, falling, "the floor"))
+    def _meet_floor(self, who: Indices, contacts: Contacts) -> None:
+        velocity = self._bodies.velocity
+        drones: list[int] = who.tolist()
+        contacts.standing.update(drones)
+        if few(len(drones)):
+            for drone in drones:
+                self._z[drone] = self._half_heights[drone]
+                before = velocity[:, drone].tolist()
+                vx, vy, vz, falling = _off_floor(NUMBERS, before, self._bounce[drone], self._friction[drone])
+                self._vx[drone], self._vy[drone], self._vz[drone] = vx, vy, vz
+                if falling > _STILL_M_S:
+                    contacts.impacts.append((drone, falling, "the floor"))
+        else:
+            self._z[who] = self._feet[who]
+            bounce, friction = (values.take(who) for values in self._floor_constants)
+            vx, vy, vz, falling = _off_floor(ARRAYS, velocity.take(who, axis=1), bounce, friction)
+            self._vx[who], self._vy[who], self._vz[who] = vx, vy, vz
+            for hard in (falling > _STILL_M_S).nonzero()[0].tolist():
+                contacts.impacts.append((drones[hard], float(falling[hard]), "the floor"))
 
     # Solids ----------------------------------------------------------------------------------------------------
 
     def _within_solids(self) -> list[int]:
-        """Return the drones that are within a solid, a wall or the ceiling, in ascending order."""
+        """Return the drones that may be within a solid, a wall or the ceiling, in ascending order."""
         near, position = self._near, self._bodies.position
-        if len(near.who) + len(near.walled) <= _FEW_PAIRS:
-            return [
-                drone
-                for drone, solids in near.solids.items()
-                if self._solids.overlap(
-                    position[:, drone].tolist(), self._radii[drone], self._half_heights[drone], solids
-                )
-            ]
+        if len(near.who) + len(near.walled) <= FEW_PAIRS:
+            return list(near.solids)
         found = set()
         if len(near.who):
             within = self._solids.within(position.take(near.who, axis=1), near.what, near.sizes)
@@ -225,15 +225,18 @@ class Collisions:
             found.update(near.walled[beyond].tolist())
         return sorted(found)
 
-    def _meet_solids(self, drone: int, contacts: Contacts) -> None:
+    def _meet_solids(self, drone: int, left_s: float, contacts: Contacts) -> bool:
+        """Push a drone out of solids; returns whether it may leave, in this time, what the broad phase looked at."""
         bodies, radius, half_height = self._bodies, self._radii[drone], self._half_heights[drone]
-        x, y, z = bodies.position[:, drone].tolist()
-        height, climb = z, float(bodies.velocity[2, drone])
+        x, y, z = start = bodies.position[:, drone].tolist()
+        height, climb = z, float(self._vz[drone])
         among: list[int] | None = self._near.solids[drone]
-        pushed = 0.0
+        pushed, carried = 0.0, 0.0
         for _ in range(_PASSES):
             overlap = self._solids.overlap((x, y, z), radius, half_height, among)
             if overlap is None or overlap.depth_m <= _TOUCH_M:
+                if not pushed:
+                    return False
                 break
             pushed += overlap.depth_m
             if pushed > _SLACK_M:
@@ -241,7 +244,8 @@ class Collisions:
             normal_x, normal_y, normal_z = overlap.normal
             x, y = x + normal_x * overlap.depth_m, y + normal_y * overlap.depth_m
             z = max(z + normal_z * overlap.depth_m, half_height)
-            impact, more_x, more_y = self._rebound(drone, overlap)
+            impact, more_x, more_y, faster = self._rebound(drone, overlap)
+            carried += faster
             # Friction acts on this step's motion too, or a drone that stands in wind would creep.
             x, y = x + more_x * STEP_S, y + more_y * STEP_S
             if normal_z > 0.5:
@@ -252,7 +256,8 @@ class Collisions:
             # (A moving platform may overlap it afterwards: it can't be clear of both.)
             if self._within_fixed(drone, (x, y, z)):
                 x, y, z = self._wedge(drone, height, climb, contacts)
-        bodies.position[:, drone] = x, y, z
+        self._x[drone], self._y[drone], self._z[drone] = x, y, z
+        return self._strays(drone, math.dist(start, (x, y, z)) + carried * left_s)
 
     def _wedge(self, drone: int, height: float, climb: float, contacts: Contacts) -> Vec3:
         """Return the position of a drone that is wedged, so that pushing it out of one thing leads into another.
@@ -262,26 +267,24 @@ class Collisions:
         ever.
         """
         free_x, free_y, free_z = self._free[:, drone].tolist()
-        self._bodies.velocity[:, drone] = 0.0, 0.0, climb
+        self._vx[drone], self._vy[drone], self._vz[drone] = 0.0, 0.0, climb
         if not self._within_fixed(drone, (free_x, free_y, height)):
             return free_x, free_y, height
         # All faces are level or upright: there is one above or below.
-        self._bodies.velocity[2, drone] = 0.0
+        self._vz[drone] = 0.0
         if height < free_z:
             contacts.standing.add(drone)
         return free_x, free_y, free_z
 
     def _within_fixed(self, drone: int, point: Vec3) -> bool:
-        overlap = self._solids.overlap(
-            point, self._radii[drone], self._half_heights[drone], range(self._solids.fixed)
-        )
+        overlap = self._solids.overlap(point, self._radii[drone], self._half_heights[drone], range(self._solids.fixed))
         return overlap is not None and overlap.depth_m > _TOUCH_M
 
-    def _rebound(self, drone: int, overlap: Overlap) -> Vec3:
+    def _rebound(self, drone: int, overlap: Overlap) -> tuple[float, float, float, float]:
         """Take the velocity into the surface back, and rub.
 
         Returns:
-            That velocity [m/s]; and the changes of the velocity east and north.
+            That velocity [m/s]; the changes of the velocity east and north; and by how much it is faster.
         """
         vx, vy, vz = self._bodies.velocity[:, drone].tolist()
         nx, ny, nz = overlap.normal
@@ -289,16 +292,19 @@ class Collisions:
         along_x, along_y, along_z = vx - surface_x, vy - surface_y, vz - surface_z
         into = -(along_x * nx + along_y * ny + along_z * nz)
         if into <= 0:
-            return 0.0, 0.0, 0.0
+            return 0.0, 0.0, 0.0, 0.0
         back = into * self._bounce[drone] if into > _STILL_M_S else 0.0
         along_x, along_y, along_z = along_x + into * nx, along_y + into * ny, along_z + into * nz
         sliding = math.sqrt(along_x * along_x + along_y * along_y + along_z * along_z)
         left = max(0.0, 1.0 - self._friction[drone] * (into + back) / sliding) if sliding > 0 else 0.0
         after_x, after_y = surface_x + along_x * left + back * nx, surface_y + along_y * left + back * ny
-        self._bodies.velocity[:, drone] = after_x, after_y, surface_z + along_z * left + back * nz
+        after_z = surface_z + along_z * left + back * nz
+        self._vx[drone], self._vy[drone], self._vz[drone] = after_x, after_y, after_z
         if nz > 0.5:
             self._turn_along(drone, overlap.spin_rad_s, into + back)
-        return into, after_x - vx, after_y - vy
+        before = math.sqrt(vx * vx + vy * vy + vz * vz)
+        faster = math.sqrt(after_x * after_x + after_y * after_y + after_z * after_z) - before
+        return into, after_x - vx, after_y - vy, max(faster, 0.0)
 
     def _turn_along(self, drone: int, spin_rad_s: float, impulse_m_s: float) -> None:
         """Let a surface that turns take a drone on it along: friction all over the foot print of a disk.
@@ -312,16 +318,16 @@ class Collisions:
 
     # Drones ----------------------------------------------------------------------------------------------------
 
-    def _meet_drones(self, contacts: Contacts) -> list[int]:
-        """Part the drones that overlap; returns those that were pushed."""
-        near, pushed = self._near, []
-        for one, other in self._close_pairs() if len(near.drones) > _FEW_PAIRS else near.drones:
-            if self._part(one, other, contacts):
-                pushed += [one, other]
-        return pushed
+    def _meet_drones(self, left_s: float, contacts: Contacts) -> bool:
+        """Part drones that overlap; returns whether one may leave, in this time, what the broad phase looked at."""
+        strayed = False
+        for one, other in self._close_pairs():
+            if self._part(one, other, left_s, contacts):
+                strayed = True
+        return strayed
 
     def _close_pairs(self) -> list[tuple[int, int]]:
-        """Return the pairs that overlap, of many."""
+        """Return the pairs of drones that overlap."""
         near, position = self._near, self._bodies.position
         apart = position.take(near.one, axis=1) - position.take(near.other, axis=1)
         np.multiply(apart, apart, out=apart)
@@ -330,10 +336,11 @@ class Collisions:
         close = (east < near.across) & (up < near.upright)
         if not np.count_nonzero(close):
             return []
-        return [near.drones[pair] for pair in close.nonzero()[0].tolist()]
+        which = close.nonzero()[0]
+        return list(zip(near.one.take(which).tolist(), near.other.take(which).tolist(), strict=True))
 
-    def _part(self, one: int, other: int, contacts: Contacts) -> bool:
-        """Part two drones if they overlap; returns whether they did."""
+    def _part(self, one: int, other: int, left_s: float, contacts: Contacts) -> bool:
+        """Part two drones; returns whether one may leave, in this time, what the broad phase looked at."""
         position, velocity = self._bodies.position, self._bodies.velocity
         one_x, one_y, one_z = position[:, one].tolist()
         other_x, other_y, other_z = position[:, other].tolist()
@@ -341,33 +348,45 @@ class Collisions:
         size = math.sqrt(away_x * away_x + away_y * away_y)
         across = size - (self._radii[one] + self._radii[other])
         upright = abs(away_z) - (self._half_heights[one] + self._half_heights[other])
-        if across >= 0.0 or upright >= 0.0:
-            return False
+        depth = -max(across, upright)
+        if depth <= 0.0:
+            return False  # a push by a third one has parted them
         if across > upright:
             nx, ny, nz = (away_x / size, away_y / size, 0.0) if size > 1e-6 else (1.0, 0.0, 0.0)
-            depth = -across
         else:
             nx, ny, nz = 0.0, 0.0, 1.0 if away_z >= 0 else -1.0
-            depth = -upright
             contacts.upon.append((one, other) if away_z >= 0 else (other, one))
-        share = self._mass[other] / (self._mass[one] + self._mass[other])
-        rest = 1.0 - share
-        one_z, other_z = one_z + nz * depth * share, other_z - nz * depth * rest
+        mine = self._mass[other] / (self._mass[one] + self._mass[other])
+        theirs = 1.0 - mine
+        one_z, other_z = one_z + nz * depth * mine, other_z - nz * depth * theirs
         # Nobody is pushed into the floor: both are lifted instead.
         up = max(self._half_heights[one] - one_z, self._half_heights[other] - other_z, 0.0)
-        position[:, one] = one_x + nx * depth * share, one_y + ny * depth * share, one_z + up
-        position[:, other] = other_x - nx * depth * rest, other_y - ny * depth * rest, other_z + up
+        self._x[one], self._y[one], self._z[one] = one_x + nx * depth * mine, one_y + ny * depth * mine, one_z + up
+        self._x[other], self._y[other] = other_x - nx * depth * theirs, other_y - ny * depth * theirs
+        self._z[other] = other_z + up
         one_vx, one_vy, one_vz = velocity[:, one].tolist()
         other_vx, other_vy, other_vz = velocity[:, other].tolist()
         into = -((one_vx - other_vx) * nx + (one_vy - other_vy) * ny + (one_vz - other_vz) * nz)
+        change = 0.0
         if into > 0:
             change = into * (1.0 + (min(self._bounce[one], self._bounce[other]) if into > _STILL_M_S else 0.0))
-            mine, theirs = change * share, change * rest
-            velocity[:, one] = one_vx + nx * mine, one_vy + ny * mine, one_vz + nz * mine
-            velocity[:, other] = other_vx - nx * theirs, other_vy - ny * theirs, other_vz - nz * theirs
+            more, less = change * mine, change * theirs
+            self._vx[one], self._vy[one], self._vz[one] = one_vx + nx * more, one_vy + ny * more, one_vz + nz * more
+            self._vx[other], self._vy[other] = other_vx - nx * less, other_vy - ny * less
+            self._vz[other] = other_vz - nz * less
             if into > _STILL_M_S:
                 contacts.impacts += [(one, into, "another drone"), (other, into, "another drone")]
-        return True
+        further = depth + change * left_s
+        return self._strays(one, further * mine + up) | self._strays(other, further * theirs + up)
+
+
+def _off_floor(do: Operations, velocity: N, bounce: N, friction: N) -> tuple[N, N, N, N]:
+    """Return the velocity after meeting the floor, and how fast that was, along the normal [m/s]."""
+    vx, vy, vz = velocity
+    falling = do.most(-vz, 0.0)
+    back = do.choose(falling > _STILL_M_S, falling * bounce, 0.0)
+    left = do.most(1.0 - friction * (falling + back) / do.most(do.root(vx * vx + vy * vy), 1e-9), 0.0)
+    return vx * left, vy * left, do.most(vz, back), falling
 
 
 def _span(steps: int) -> float:

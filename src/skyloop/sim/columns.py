@@ -18,12 +18,17 @@ import numpy as np
 from skyloop.sim.streams import Floats
 
 N: TypeAlias = Any  #: a number of one drone, or an array with one of each
-FEW: Final = 4  #: up to so many drones are computed one by one
+FEW = 3  #: up to so many drones are computed one by one
+
+
+def few(drones: int) -> bool:
+    """Whether so many drones are computed one by one."""
+    return drones <= FEW
 
 
 def columns(rows: int, drones: int) -> Floats:
     """Return zeros of shape (rows, drones), laid out for the way in which so many drones are computed."""
-    return np.zeros((drones, rows)).T if drones <= FEW else np.zeros((rows, drones))
+    return np.zeros((drones, rows)).T if few(drones) else np.zeros((rows, drones))
 
 
 class Fields:
@@ -52,7 +57,7 @@ class Operations:
         least: Of two values, the lesser.
         most: Of two values, the greater.
         root: The square root.
-        choose: The second value where the first is not zero, else the third.
+        choose: The second value where the first is true, else the third.
     """
 
     least: Callable[[N, N], N]

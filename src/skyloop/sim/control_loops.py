@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from skyloop.sim.columns import ARRAYS, FEW, NUMBERS, Fields, N, Operations, columns
+from skyloop.sim.columns import ARRAYS, NUMBERS, Fields, N, Operations, columns, few
 from skyloop.sim.dynamics import Bodies, column
 from skyloop.sim.parameters import GRAVITY_M_S2, Limits, VehicleParameters
 from skyloop.sim.sensors import Sensors
@@ -74,7 +74,7 @@ class ControlLoops:
         for drone, limit in enumerate(limits):
             self.set_limits(drone, limit)
             self.set_ceiling(drone, limit.altitude_m)
-        self._few = n <= FEW
+        self._few = few(n)
         if self._few:
             gains = self._gains
             rows = (gains.velocity, gains.integral, gains.level_brake, gains.altitude, gains.climb, gains.least_thrust)
@@ -164,7 +164,7 @@ class ControlLoops:
         ceiling, most_thrust, running, by_velocity, held, reference, east, north, behind = rest
         sin_yaw, cos_roll, cos_pitch, cos_yaw = turned
         altitude, forward, left, climbing = estimate
-        period = self._period_s
+        period, least_tilt = self._period_s, -tilt_limit
 
         # Roll and pitch that bring the horizontal velocity to the set-point.
         ahead, aside = first - forward, second - left
@@ -174,14 +174,15 @@ class ControlLoops:
         north = north + learn * do.least(do.most(sin_yaw * ahead + cos_yaw * aside, -limit), limit)
         east, north = do.most(do.least(east, most), -most), do.most(do.least(north, most), -most)
         lean = gains.velocity * ahead + cos_yaw * east + sin_yaw * north
-        pitch = do.least(do.most(lean / GRAVITY_M_S2, -tilt_limit), tilt_limit)
+        pitch = do.least(do.most(lean / GRAVITY_M_S2, least_tilt), tilt_limit)
         lean = gains.velocity * aside - sin_yaw * east + cos_yaw * north
-        roll = do.least(do.most(lean / -GRAVITY_M_S2, -tilt_limit), tilt_limit)
+        roll = do.least(do.most(lean / -GRAVITY_M_S2, least_tilt), tilt_limit)
         if self._any_level_brake:  # against the speed, of drones that fly by attitude
             brake = gains.level_brake * do.root(forward * forward + left * left)
             first = first + _brake(do, left * brake, first, tilt_limit)
             second = second + _brake(do, -forward * brake, second, tilt_limit)
-        roll, pitch = do.choose(by_velocity, roll, first), do.choose(by_velocity, pitch, second)
+        flies = by_velocity > 0.0
+        roll, pitch = do.choose(flies, roll, first), do.choose(flies, pitch, second)
 
         reference = do.least(reference + climb * period, altitude + _REFERENCE_LEAD_M)
         reference = do.least(do.most(reference, altitude - _REFERENCE_LEAD_M), ceiling)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from skyloop.sim.columns import FEW, Fields, columns
+from skyloop.sim.columns import Fields, columns, few
 from skyloop.sim.parameters import GRAVITY_M_S2, VehicleParameters
 from skyloop.sim.streams import Floats
 
@@ -57,7 +57,7 @@ class Bodies:
         np.sin(self.angles, out=self.sin)
         np.cos(self.angles, out=self.cos)
         self._set_constants(parameters)
-        self._few = n <= FEW
+        self._few = few(n)
         if self._few:
             self.commands, self.turned, self.moved = Fields(table, 9, 4), Fields(table, 15, 4), Fields(table, 25, 4)
             self._turning, self._turned = Fields(table, 0, 12), Fields(table, 0, 6)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from skyloop.sim.columns import FEW, Fields, N, columns
+from skyloop.sim.columns import Fields, N, columns, few
 from skyloop.sim.dynamics import Bodies, body_rates, column, specific_force
 from skyloop.sim.parameters import VehicleParameters
 from skyloop.sim.streams import Floats, NormalBlocks, Purpose, stream
@@ -60,7 +60,7 @@ class Sensors:
         self._estimate = columns(4, n)
         self.altitude: Floats = self._estimate[0]
         self.velocity: Floats = self._estimate[1:]
-        self._few = n <= FEW
+        self._few = few(n)
         if self._few:
             self.numbers = Fields(self._estimate, 0, 4)
             self._each = list(enumerate(self._half_height.tolist()))
@@ -81,7 +81,10 @@ class Sensors:
                 self.numbers.write(drone, z - half_height, *_levelled(velocity, sin_yaw, cos_yaw))
         else:
             np.subtract(bodies.position[2], self._half_height, out=self.altitude)
-            self.velocity[:] = _levelled(bodies.velocity, bodies.sin[2], bodies.cos[2])
+            for row, values in zip(
+                self.velocity, _levelled(bodies.velocity, bodies.sin[2], bodies.cos[2]), strict=True
+            ):
+                row[:] = values
         np.add(self._estimate, self._bias[9:], out=self._estimate)
         np.add(self._estimate, self._estimate_noise * self._normals.take(), out=self._estimate)
 

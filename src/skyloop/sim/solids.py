@@ -49,6 +49,8 @@ class Solids:
         self._motions: list[tuple[Vec3, float]] = [((0.0, 0.0, 0.0), 0.0) for _ in sizes]
         for number, box in enumerate(boxes):
             self._place(number, box.position_m, box.yaw_rad)
+        self._bounds = np.zeros((3, len(sizes))), np.zeros((3, len(sizes)))
+        self._bounded_m = math.nan  # the radius for which these are
         size_x, size_y, height = world.room.size_m
         self.room_low = np.array([[-size_x / 2], [-size_y / 2], [-np.inf]])
         self.room_high = np.array([[size_x / 2], [size_y / 2], [height]])
@@ -79,15 +81,30 @@ class Solids:
             centre = (x, y, z - half if lifts else z + half)
             self._place(number, centre, state.yaw_rad, state.velocity_m_s, state.yaw_rate_rad_s)
 
-    def bounds(self, seconds: float) -> tuple[Floats, Floats]:
-        """Return bounding boxes, low and high, each (3, boxes); of moving ones, for so long from where they are now."""
-        c, s = np.abs(self._cos), np.abs(self._sin)
-        x, y, z = self._half
-        reach = np.array([c * x + s * y, s * x + c * y, z])
-        reach[:, self._fixed :] += self.top_speed_m_s * seconds
-        low: Floats = (self._centre - reach)[:, :, 0]
-        high: Floats = (self._centre + reach)[:, :, 0]
-        return low, high
+    def bounds(self, seconds: float, radius_m: float) -> tuple[Floats, Floats]:
+        """Return bounding boxes, low and high, each (3, boxes) [m]; not to be kept.
+
+        Args:
+            seconds: For so long moving ones stay within theirs, from where they are now.
+            radius_m: Of hulls that meet a box only where their own bounding box meets this one. (A hull is as far from
+                the corner of a turned box as a square would be that is turned likewise.)
+        """
+        if radius_m != self._bounded_m:
+            self._bounded_m = radius_m
+            self._bound(slice(0, self._fixed), 0.0)
+        if self._movers:
+            self._bound(slice(self._fixed, None), self.top_speed_m_s * seconds)
+        return self._bounds
+
+    def _bound(self, which: slice, reach_m: float) -> None:
+        """Work out the bounding boxes of some solids, so much larger all round."""
+        c, s = np.abs(self._cos[which]), np.abs(self._sin[which])
+        x, y, z = self._half[:, which]
+        corner = (c + s - 1.0) * self._bounded_m + reach_m
+        around = np.array([c * x + s * y + corner, s * x + c * y + corner, z + reach_m])
+        low, high = self._bounds
+        low[:, which] = (self._centre[:, which] - around)[:, :, 0]
+        high[:, which] = (self._centre[:, which] + around)[:, :, 0]
 
     def within(self, points: Floats, numbers: Indices, sizes: Floats) -> Indices:
         """Return which points are within a solid each: indices into ``points``, ascending.
@@ -137,14 +154,18 @@ class Solids:
         """
         x, y, z = point
         wide, deep, tall = self._room
-        depth, normal = max(
-            (abs(x) + radius - wide, (-1.0 if x > 0 else 1.0, 0.0, 0.0)),
-            (abs(y) + radius - deep, (0.0, -1.0 if y > 0 else 1.0, 0.0)),
-            (z + half_height - tall, (0.0, 0.0, -1.0)),
-            key=_depth,
-        )
-        worst = Overlap(normal, depth) if depth > 0 else None
-        deepest, found = max(depth, 0.0), -1
+        deepest, worst = 0.0, None
+        beyond_x, beyond_y, beyond_z = abs(x) + radius - wide, abs(y) + radius - deep, z + half_height - tall
+        if beyond_x > 0.0 or beyond_y > 0.0 or beyond_z > 0.0:
+            deepest = max(beyond_x, beyond_y, beyond_z)
+            if deepest == beyond_x:
+                normal = (-1.0 if x > 0 else 1.0, 0.0, 0.0)
+            elif deepest == beyond_y:
+                normal = (0.0, -1.0 if y > 0 else 1.0, 0.0)
+            else:
+                normal = (0.0, 0.0, -1.0)
+            worst = Overlap(normal, deepest)
+        found = -1
         local = inside = (0.0, 0.0, 0.0)
         for number in range(len(self)) if among is None else among:
             centre_x, centre_y, centre_z, half_x, half_y, half_z, c, s = self._boxes[number]
@@ -198,7 +219,3 @@ def _top_speed(target: PlatformTarget | FigureTarget) -> float:
     """Return a speed [m/s] that no point of a target exceeds, those at its corners included."""
     turn = 0.0 if isinstance(target.yaw, FixedYaw) else target.yaw.turn_rate_rad_s
     return top_speed(target.path) + turn * math.hypot(*target.size_m[:2]) / 2
-
-
-def _depth(wall: tuple[float, Vec3]) -> float:
-    return wall[0]
