@@ -62,8 +62,8 @@ def test_a_few_drones_are_read_and_written_as_numbers() -> None:
     table = columns.columns(5, 2)
     table[:, 1] = range(5)
     fields = Fields(table, 1, 3)
-    assert fields.read(1) == (1.0, 2.0, 3.0)
-    fields.write(0, 7.0, 8.0, 9.0)
+    assert fields.read[1]() == (1.0, 2.0, 3.0)
+    fields.write[0](7.0, 8.0, 9.0)
     assert table[:, 0].tolist() == [0.0, 7.0, 8.0, 9.0, 0.0]
     assert table[:, 1].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
 

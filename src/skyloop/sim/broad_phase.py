@@ -21,6 +21,8 @@ def overlapping(low: Floats, high: Floats, movable: int) -> tuple[Indices, Indic
     Returns:
         The lesser and the greater number of each pair, in ascending order. Boxes that touch overlap.
     """
+    if low.shape[1] < 2:
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
     axis = int((low.max(axis=1) - low.min(axis=1)).argmax())
     order = low[axis].argsort(kind="stable")
     begins, ends = low[axis, order], high[axis, order]

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from struct import Struct
 from typing import Any, Final, TypeAlias
 
@@ -32,21 +33,20 @@ def columns(rows: int, drones: int) -> Floats:
 
 
 class Fields:
-    """Consecutive rows of an array made by :func:`columns` for at most :data:`FEW` drones, as plain floats."""
+    """Consecutive rows of an array made by :func:`columns` for a few drones, as plain floats.
+
+    Attributes:
+        read: Of each drone, a function that returns its numbers.
+        write: Of each drone, a function that replaces them; it takes as many numbers.
+    """
 
     def __init__(self, table: Floats, first: int, count: int) -> None:
-        self._struct = Struct(f"{count}d")
-        self._memory = memoryview(table.T).cast("B")  # type: ignore[arg-type]
-        self._first = first * table.itemsize
-        self._column = table.shape[0] * table.itemsize
-
-    def read(self, drone: int) -> tuple[float, ...]:
-        """Return a drone's numbers."""
-        return self._struct.unpack_from(self._memory, self._first + drone * self._column)
-
-    def write(self, drone: int, *values: float) -> None:
-        """Replace a drone's numbers, all of them."""
-        self._struct.pack_into(self._memory, self._first + drone * self._column, *values)
+        rows, drones = table.shape
+        memory = memoryview(table.T).cast("B")  # type: ignore[arg-type]
+        offsets = [(drone * rows + first) * table.itemsize for drone in range(drones)]
+        numbers = Struct(f"{count}d")
+        self.read: list[Callable[[], tuple[float, ...]]] = [partial(numbers.unpack_from, memory, at) for at in offsets]
+        self.write: list[Callable[..., None]] = [partial(numbers.pack_into, memory, at) for at in offsets]
 
 
 @dataclass(frozen=True, slots=True)

@@ -136,11 +136,11 @@ class ControlLoops:
         estimate: Sequence[N]
         if self._few:
             for drone, gains in self._each:
-                inputs = self._inputs.read(drone)
-                turned, estimate = bodies.turned.read(drone), sensors.numbers.read(drone)
+                inputs = self._inputs.read[drone]()
+                turned, estimate = bodies.turned.read[drone](), sensors.numbers.read[drone]()
                 commands, state = self._commands(NUMBERS, gains, inputs, turned, estimate, inputs[_LANDING] > 0.0)
-                bodies.commands.write(drone, *commands)
-                self._state.write(drone, *state)
+                bodies.commands.write[drone](*commands)
+                self._state.write[drone](*state)
         else:
             turned, estimate = (bodies.sin[2], *bodies.cos), (sensors.altitude, *sensors.velocity)
             landing = bool(self._landing.any())

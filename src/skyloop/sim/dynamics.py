@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from skyloop.sim.columns import Fields, columns, few
+from skyloop.sim.columns import Fields, N, columns, few
 from skyloop.sim.parameters import GRAVITY_M_S2, VehicleParameters
 from skyloop.sim.streams import Floats
 
@@ -146,22 +146,26 @@ class Bodies:
     def _turn_one(
         self, drone: int, damp: float, damp_yaw: float, most: float, most_yaw: float, airspeed_tilt: float
     ) -> None:
-        roll, pitch, yaw, roll_rate, pitch_rate, yaw_rate, *rest = self._turning.read(drone)
+        roll, pitch, yaw, roll_rate, pitch_rate, yaw_rate, *rest = self._turning.read[drone]()
         stiff, stiff_pitch, stiff_yaw, roll_command, pitch_command, yaw_command = rest
         more_roll, more_pitch = self._tilt_one(drone, airspeed_tilt) if airspeed_tilt else (0.0, 0.0)
+        # (Comparisons are faster than min and max.)
         change = (roll_command - roll + more_roll) * stiff - roll_rate * damp
-        roll_rate += max(min(change, most), -most)
+        roll_rate += change if -most <= change <= most else math.copysign(most, change)
         change = (pitch_command - pitch + more_pitch) * stiff_pitch - pitch_rate * damp
-        pitch_rate += max(min(change, most), -most)
+        pitch_rate += change if -most <= change <= most else math.copysign(most, change)
         change = yaw_command * stiff_yaw - yaw_rate * damp_yaw
-        yaw_rate += max(min(change, most_yaw), -most_yaw)
-        roll = max(min(roll + roll_rate * STEP_S, _MOST_TILT_RAD), -_MOST_TILT_RAD)
-        pitch = max(min(pitch + pitch_rate * STEP_S, _MOST_TILT_RAD), -_MOST_TILT_RAD)
-        self._turned.write(drone, roll, pitch, yaw + yaw_rate * STEP_S, roll_rate, pitch_rate, yaw_rate)
+        yaw_rate += change if -most_yaw <= change <= most_yaw else math.copysign(most_yaw, change)
+        roll, pitch = roll + roll_rate * STEP_S, pitch + pitch_rate * STEP_S
+        if abs(roll) > _MOST_TILT_RAD:
+            roll = math.copysign(_MOST_TILT_RAD, roll)
+        if abs(pitch) > _MOST_TILT_RAD:
+            pitch = math.copysign(_MOST_TILT_RAD, pitch)
+        self._turned.write[drone](roll, pitch, yaw + yaw_rate * STEP_S, roll_rate, pitch_rate, yaw_rate)
 
     def _tilt_one(self, drone: int, airspeed_tilt: float) -> tuple[float, float]:
         """As :meth:`_tilt_by_airspeed`, for one drone."""
-        *_, sin_yaw, _, _, cos_yaw, air_x, air_y, _, _, _, _, _, vx, vy, _ = self._moving.read(drone)
+        *_, sin_yaw, _, _, cos_yaw, air_x, air_y, _, _, _, _, _, vx, vy, _ = self._moving.read[drone]()
         east, north = vx - air_x, vy - air_y
         speed = math.sqrt(east * east + north * north)
         slowed = min(speed, _MOST_TILTING_AIRSPEED_M_S)
@@ -180,7 +184,7 @@ class Bodies:
         quadratic: float,
         quadratic_z: float,
     ) -> None:
-        thrust_command, sin_roll, sin_pitch, sin_yaw, cos_roll, cos_pitch, cos_yaw, *rest = self._moving.read(drone)
+        thrust_command, sin_roll, sin_pitch, sin_yaw, cos_roll, cos_pitch, cos_yaw, *rest = self._moving.read[drone]()
         air_x, air_y, air_z, thrust, x, y, z, vx, vy, vz = rest
         thrust += (thrust_command - thrust) * motor_share
         shortfall = ground_effect / max(z + rotor_offset, rotor_height)
@@ -194,7 +198,7 @@ class Bodies:
         az = cos_pitch * cos_roll * lift - GRAVITY_M_S2 - dz * (quadratic_z * airspeed + linear_z)
         new_vx, new_vy, new_vz = vx + ax * STEP_S, vy + ay * STEP_S, vz + az * STEP_S
         x, y, z = x + new_vx * STEP_S, y + new_vy * STEP_S, z + new_vz * STEP_S
-        self._moved.write(drone, thrust, x, y, z, new_vx, new_vy, new_vz, vx, vy, vz)
+        self._moved.write[drone](thrust, x, y, z, new_vx, new_vy, new_vz, vx, vy, vz)
 
     def _turn(self) -> None:
         change, other = self._a, self._b
@@ -282,17 +286,21 @@ def specific_force(bodies: Bodies) -> Floats:
     return force
 
 
-def body_rates(bodies: Bodies) -> Floats:
-    """Return angular velocities about the bodies' axes, shape (3, n) [rad/s], from the rates of the Euler angles."""
-    roll_rate, pitch_rate, yaw_rate = bodies.rates
-    sin_roll, sin_pitch, _ = bodies.sin
-    cos_roll, cos_pitch, _ = bodies.cos
-    return np.array(
-        [
-            roll_rate - yaw_rate * sin_pitch,
-            pitch_rate * cos_roll + yaw_rate * sin_roll * cos_pitch,
-            -pitch_rate * sin_roll + yaw_rate * cos_roll * cos_pitch,
-        ]
+def body_rates(rates: N, sin: N, cos: N) -> tuple[N, N, N]:
+    """Return angular velocities about a body's axes [rad/s], from the rates of its Euler angles.
+
+    Args:
+        rates: Of roll, pitch, yaw: three numbers, or three arrays.
+        sin: Sines of roll, pitch, yaw.
+        cos: Cosines.
+    """
+    roll_rate, pitch_rate, yaw_rate = rates
+    sin_roll, sin_pitch, _ = sin
+    cos_roll, cos_pitch, _ = cos
+    return (
+        roll_rate - yaw_rate * sin_pitch,
+        pitch_rate * cos_roll + yaw_rate * sin_roll * cos_pitch,
+        -pitch_rate * sin_roll + yaw_rate * cos_roll * cos_pitch,
     )
 
 

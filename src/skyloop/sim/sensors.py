@@ -76,9 +76,9 @@ class Sensors:
         bodies = self._bodies
         if self._few:
             for drone, half_height in self._each:
-                sin_yaw, _, _, cos_yaw = bodies.turned.read(drone)
-                z, *velocity = bodies.moved.read(drone)
-                self.numbers.write(drone, z - half_height, *_levelled(velocity, sin_yaw, cos_yaw))
+                sin_yaw, _, _, cos_yaw = bodies.turned.read[drone]()
+                z, *velocity = bodies.moved.read[drone]()
+                self.numbers.write[drone](z - half_height, *_levelled(velocity, sin_yaw, cos_yaw))
         else:
             np.subtract(bodies.position[2], self._half_height, out=self.altitude)
             for row, values in zip(
@@ -98,7 +98,8 @@ class Sensors:
             bodies = self._bodies
             # Drone after drone from one stream of the step, so that the first ones' noise isn't changed by more drones.
             normals = stream(self._seed, Purpose.INERTIAL, step).standard_normal(self._inertial_noise.shape[::-1]).T
-            truth = np.concatenate([body_rates(bodies), specific_force(bodies), bodies.angles])
+            rates = body_rates(bodies.rates, bodies.sin, bodies.cos)
+            truth = np.concatenate([rates, specific_force(bodies), bodies.angles])
             self._inertial = truth + self._bias[:9] + self._inertial_noise * normals
             self._inertial_step = step
         return self._inertial
