@@ -31,40 +31,45 @@ class Arena:
         self.centres = np.array([spawn.position_m[:2] for spawn in self.world.spawns])
         self._steps = max(1, round(period_s / STEP_S))
         self._take_off()
+        self._state: tuple[Floats, Floats, Floats] | None = None
+        self._poses: tuple[Floats, Floats] | None = None
 
     def step(self, commands: Floats) -> None:
         """Go on by one period with these velocities: forward, left, up [m/s], yaw rate [rad/s]; shape (n, 4)."""
         for drone, row in enumerate(commands.tolist()):
             self.simulation.command(drone, Velocity(*row))
         self.simulation.step(self._steps)
+        self._state = self._poses = None
 
     def put(self, drone: int, place: Floats, yaw: float) -> None:
         """Put a drone somewhere in its cell, at rest; ``place`` relative to the cell's centre on the floor [m]."""
         x, y, z = place.tolist()
         middle_x, middle_y = self.centres[drone].tolist()
         self.simulation.put(drone, (middle_x + x, middle_y + y, z), yaw)
+        self._state = self._poses = None
 
     def state(self) -> tuple[Floats, Floats, Floats]:
-        """Return where the drones are in their cells, how fast and at which angles.
+        """Return where the drones are in their cells, how fast and at which angles; not to be changed.
 
         Returns:
             Positions, shape (n, 3) [m]; velocities in the body's levelled axes, shape (n, 3) [m/s]; roll, pitch and
             yaw, shape (n, 3) [rad]. Positions and angles are the true ones, as motion capture would measure them;
             velocities are what the drones estimate.
         """
-        places = np.empty((self.count, 3))
-        velocities, angles = np.empty((self.count, 3)), np.empty((self.count, 3))
-        for drone in range(self.count):
-            truth, feedback = self.simulation.truth(drone), self.simulation.feedback(drone)
-            places[drone] = truth.position_m
-            velocities[drone] = feedback.velocity_m_s
-            angles[drone] = truth.roll_rad, truth.pitch_rad, truth.yaw_rad
-        places[:, :2] -= self.centres
-        return places, velocities, angles
+        if self._state is None:
+            self._state = self.simulation.motions()
+            self._state[0][:, :2] -= self.centres
+        return self._state
+
+    def poses(self) -> tuple[Floats, Floats]:
+        """Return the drones' poses in the world; see :meth:`Simulation.poses`. Not to be changed."""
+        if self._poses is None:
+            self._poses = self.simulation.poses()
+        return self._poses
 
     def airborne(self) -> NDArray[np.bool_]:
         """Which drones fly, shape (n,)."""
-        return np.array([self.simulation.state(drone).airborne for drone in range(self.count)])
+        return self.simulation.airborne()
 
     def _take_off(self) -> None:
         for drone in range(self.count):

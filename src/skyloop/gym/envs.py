@@ -31,20 +31,30 @@ Observe = Literal["state", "pixels", "both"]
 #: What an observation is: numbers, a picture, or a dict of picture and motion.
 Seen = Observation | NDArray[np.uint8] | dict[str, NDArray[Any]]
 
-PIXELS: Final = spaces.Box(0, 255, (ONBOARD_PX, ONBOARD_PX, 3), np.uint8)
-SPACES: Final[dict[str, spaces.Space[Any]]] = {
-    "state": OBSERVATIONS,
-    "pixels": PIXELS,
-    "both": spaces.Dict({"pixels": PIXELS, "motion": MOTIONS}),
-}
+SIZES_PX: Final = (16, 512)  #: least and greatest edge of a picture
 
 
 class _Observer:
-    """Makes the observations of all drones of a task in the form that is asked for."""
+    """Makes the observations of all drones of a task in the form that is asked for.
 
-    def __init__(self, task: Reaching, form: Observe) -> None:
+    Attributes:
+        space: Of the observations of one drone.
+    """
+
+    def __init__(self, task: Reaching, form: Observe, size_px: int) -> None:
         if form not in get_args(Observe):
             raise UsageError(f"observe is {form!r} and must be one of {', '.join(get_args(Observe))}")
+        least, most = SIZES_PX
+        if isinstance(size_px, bool) or not isinstance(size_px, int) or not least <= size_px <= most:
+            raise UsageError(f"size_px is {size_px!r} and must be a whole number from {least} to {most}")
+        pixels = spaces.Box(0, 255, (size_px, size_px, 3), np.uint8)
+        choices: dict[str, spaces.Space[Any]] = {
+            "state": OBSERVATIONS,
+            "pixels": pixels,
+            "both": spaces.Dict({"pixels": pixels, "motion": MOTIONS}),
+        }
+        self.space = choices[form]
+        self._size_px = size_px
         self._task = task
         self._form = form
         self._camera: OnBoard | None = None
@@ -56,13 +66,12 @@ class _Observer:
 
     def all(self) -> Any:
         """Return the observations of all drones, with a leading axis."""
-        state = self._task.observe()
         if self._form == "state":
-            return state
+            return self._task.observe()
         if self._camera is None:
-            self._camera = OnBoard(self._task.arena)
+            self._camera = OnBoard(self._task.arena, self._size_px)
         pixels = np.stack([self._camera.draw(drone, self._task.rings(drone)) for drone in range(self._task.drones)])
-        return pixels if self._form == "pixels" else {"pixels": pixels, "motion": state[:, MOTION]}
+        return pixels if self._form == "pixels" else {"pixels": pixels, "motion": self._task.observe()[:, MOTION]}
 
     def first(self) -> Seen:
         """Return the observation of the first drone."""
@@ -76,10 +85,10 @@ class TaskEnv(gymnasium.Env[Seen, NDArray[np.float32]]):
     Action, shape (4,), float32, from -1 to 1: velocity ahead, left, up in shares of 1 m/s, turning counter-clockwise in
     shares of 1.5 rad/s, for 40 ms. Observation with ``observe="state"``, shape (10,), float32: where the goal is,
     ahead, left, up [m]; velocity as the drone believes [m/s]; roll (right side down), pitch (nose down) [rad]; sine and
-    cosine of the turn to the wanted heading. With ``"pixels"``: what its camera ahead sees, RGB, shape (64, 64, 3),
-    uint8, the goal as a red ring. With ``"both"``: a dict of ``pixels`` and ``motion``, which is velocity, roll and
-    pitch. ``info`` has ``is_success`` and ``distance_m``, of reset too. Leaving the cell of 7 m costs 5 and ends the
-    episode. ``render_mode="rgb_array"``: a picture of the drone and its goal.
+    cosine of the turn to the wanted heading. With ``"pixels"``: what its camera ahead sees, RGB, shape (size_px,
+    size_px, 3), uint8, the goal as a red ring. With ``"both"``: a dict of ``pixels`` and ``motion``, which is velocity,
+    roll and pitch. ``info`` has ``is_success`` and ``distance_m``, of reset too. Leaving the cell of 7 m costs 5 and
+    ends the episode. ``render_mode="rgb_array"``: a picture of the drone and its goal.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / PERIOD_S)}  # noqa: RUF012
@@ -92,14 +101,15 @@ class TaskEnv(gymnasium.Env[Seen, NDArray[np.float32]]):
         seconds: float = 8.0,
         gusts_m_s: float = 0.3,
         observe: Observe = "state",
+        size_px: int = ONBOARD_PX,
         render_mode: str | None = None,
     ) -> None:
         if render_mode not in (None, "rgb_array"):
             raise UsageError(f'render_mode is {render_mode!r} and must be "rgb_array" or None')
         self.render_mode = render_mode
         self._task = self.task(1, seconds, gusts_m_s)
-        self._observer = _Observer(self._task, observe)
-        self.observation_space = SPACES[observe]
+        self._observer = _Observer(self._task, observe, size_px)
+        self.observation_space = self._observer.space
         self._picture: Picture | None = None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Seen, dict[str, Any]]:
@@ -137,16 +147,22 @@ class TaskVectorEnv(VectorEnv[Any, NDArray[np.float32], NDArray[Any]]):
     task: ClassVar[type[Reaching]]
 
     def __init__(
-        self, num_envs: int = 16, *, seconds: float = 8.0, gusts_m_s: float = 0.3, observe: Observe = "state"
+        self,
+        num_envs: int = 16,
+        *,
+        seconds: float = 8.0,
+        gusts_m_s: float = 0.3,
+        observe: Observe = "state",
+        size_px: int = ONBOARD_PX,
     ) -> None:
         if isinstance(num_envs, bool) or not isinstance(num_envs, int) or not 1 <= num_envs <= 1000:
             raise UsageError(f"num_envs is {num_envs!r} and must be a whole number from 1 to 1000")
         self.num_envs = num_envs
         self._task = self.task(num_envs, seconds, gusts_m_s)
-        self._observer = _Observer(self._task, observe)
-        self.single_action_space, self.single_observation_space = ACTIONS, SPACES[observe]
+        self._observer = _Observer(self._task, observe, size_px)
+        self.single_action_space, self.single_observation_space = ACTIONS, self._observer.space
         self.action_space = batch_space(ACTIONS, num_envs)
-        self.observation_space = batch_space(SPACES[observe], num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
         self._ended = np.zeros(num_envs, dtype=np.bool_)
 
     def reset(

@@ -32,6 +32,7 @@ _HEIGHT: Final = 2.0  #: … whose middle is this high
 _WALK_M: Final = (1.6, 1.6, 0.4)  #: how far a target walks from there
 _WALK_RAD_S: Final = 0.18  #: and how fast, at most: 0.3 m/s
 _FAILURE: Final = -5.0
+_FULL: Final = np.array([SPEED_M_S, SPEED_M_S, SPEED_M_S, TURN_RAD_S])
 #: goal ahead, left, up [m]; velocity ahead, left, up [m/s]; roll, pitch [rad]; turn to the wanted heading, sine, cosine
 _HIGHEST: Final = np.array([10, 10, 10, 5, 5, 5, math.pi, math.pi, 1, 1], np.float32)
 MOTION: Final = slice(3, 8)  #: the part of an observation that is the drone's own: velocity, roll, pitch
@@ -84,8 +85,8 @@ class Reaching:
 
     def step(self, actions: Floats) -> tuple[Floats, Bools, Bools, Infos]:
         """Rewards, which are over for good, which are at the end of their time, and what there is to know of each."""
-        bounded = np.clip(np.nan_to_num(actions), -1.0, 1.0)
-        self.arena.step(bounded * [SPEED_M_S, SPEED_M_S, SPEED_M_S, TURN_RAD_S])
+        bounded = np.minimum(np.maximum(np.where(np.isnan(actions), 0.0, actions), -1.0), 1.0)
+        self.arena.step(bounded * _FULL)
         self.age += 1
         places, _, angles = self.arena.state()
         jerk = np.abs(bounded - self._before).sum(axis=1)
@@ -103,21 +104,19 @@ class Reaching:
     def observe(self) -> Observation:
         """The observation, shape (n, 10)."""
         places, velocities, angles = self.arena.state()
-        ahead = self.goals - places
-        yaw = angles[:, 2]
+        east, north, up = (self.goals - places).T
+        roll, pitch, yaw = angles.T
         sine, cosine = np.sin(yaw), np.cos(yaw)
         turn = self._wanted_heading(places) - yaw
-        columns = [
-            cosine * ahead[:, 0] + sine * ahead[:, 1],
-            cosine * ahead[:, 1] - sine * ahead[:, 0],
-            ahead[:, 2],
-            *velocities.T,
-            angles[:, 0],
-            angles[:, 1],
-            np.sin(turn),
-            np.cos(turn),
-        ]
-        return np.clip(np.stack(columns, axis=1).astype(np.float32), -_HIGHEST, _HIGHEST)
+        seen = np.empty((self.drones, len(_HIGHEST)), np.float32)
+        seen[:, 0] = cosine * east + sine * north
+        seen[:, 1] = cosine * north - sine * east
+        seen[:, 2] = up
+        seen[:, 3:6] = velocities
+        seen[:, 6], seen[:, 7] = roll, pitch
+        seen[:, 8], seen[:, 9] = np.sin(turn), np.cos(turn)
+        np.minimum(seen, _HIGHEST, out=seen)
+        return np.maximum(seen, -_HIGHEST, out=seen)
 
     def rings(self, drone: int) -> list[tuple[Floats, Floats | None, float]]:
         """What to draw of the task: centre in the cell, normal (None: faces the camera), radius [m]."""

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+_Angle = TypeVar("_Angle", float, NDArray[np.float64])
 
 
 def rotation_from_euler(roll: float, pitch: float, yaw: float) -> NDArray[np.float64]:
@@ -65,6 +68,6 @@ def euler_from_rotation(rotation: NDArray[np.float64]) -> tuple[float, float, fl
     return roll, pitch, yaw
 
 
-def wrap_angle(angle: float) -> float:
-    """Return the same angle within [-π, π) [rad]."""
+def wrap_angle(angle: _Angle) -> _Angle:
+    """Return the same angle, or angles in an array, within [-π, π) [rad]."""
     return (angle + math.pi) % (2 * math.pi) - math.pi

@@ -112,10 +112,8 @@ class Autopilot:
             else:
                 self._advance(drone, Happening.BATTERY_LOW, Land(), time_s)
 
-    def feel(self, contacts: Contacts | None, time_s: float) -> None:
-        """React to what was touched; called once per step."""
-        if contacts is None:
-            return
+    def feel(self, contacts: Contacts, time_s: float) -> None:
+        """React to what was touched in a step."""
         for drone, speed, what in contacts.impacts:
             text = f"hit {what} at {speed:.1f} m/s"
             self._note(OccurrenceKind.COLLISION, drone, time_s, text, speed)

@@ -1,4 +1,8 @@
-"""Collisions of drones with the floor, solid things and one another: contact, bounce and friction."""
+"""Collisions of drones with the floor, solid things and one another: contact, bounce and friction.
+
+A broad phase finds, every few steps, what each drone can reach before the next time. In between only those pairs are
+looked at: all together in arrays where they are many, one by one where they are few.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +12,23 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from skyloop.sim.broad_phase import Indices, overlapping
+from skyloop.sim.columns import ARRAYS, NUMBERS, N, Operations, few
 from skyloop.sim.dynamics import STEP_S, Bodies, column
 from skyloop.sim.parameters import VehicleParameters
-from skyloop.sim.solids import Indices, Overlap, Solids
+from skyloop.sim.solids import Overlap, Solids
 from skyloop.sim.streams import Floats
+from skyloop.sim.world import Vec3
 
 _MOST_ACCELERATION_M_S2 = 60.0  # above what thrust, gravity and drag at 10 m/s of headwind give together
 _STILL_M_S = 0.3  # along the normal: slower contacts don't bounce, or things would never come to rest
 _PASSES = 6
 _TOUCH_M = 1e-9  # overlaps up to this are touching: rounding alone leaves some that no push ends
-_FAR_STEPS = 250
+#: Steps between two broad phases, which for few drones cost as much as for some, but leave less to look at.
+LOOK_STEPS, LOOK_STEPS_OF_FEW = 15, 30
+_SLACK_M = 0.03  # a broad phase looks so much further, for what is pushed
+#: Up to so many pairs are faster looked at one by one.
+FEW_PAIRS = 6
 
 
 @dataclass(slots=True)
@@ -35,6 +46,39 @@ class Contacts:
     impacts: list[tuple[int, float, str]] = field(default_factory=list)
 
 
+@dataclass(slots=True)
+class _Near:
+    """What drones can reach before the next broad phase.
+
+    Attributes:
+        one: The first of each pair of drones that can reach one another, the lesser number.
+        other: The second.
+        across: The square of the sum of their radii.
+        upright: The square of the sum of their half heights.
+        solids: The solids that a drone can reach, of those that can reach any or a wall or the ceiling.
+        who: The drone of each pair of a drone and a solid.
+        what: The solid.
+        sizes: See :meth:`Solids.sizes`.
+        moving: Whether one of these solids moves.
+        walled: Drones that can reach a wall or the ceiling.
+        room_low: Least coordinates of their centres, (3, walled).
+        room_high: Greatest coordinates.
+    """
+
+    one: Indices
+    other: Indices
+    across: Floats
+    upright: Floats
+    solids: dict[int, list[int]]
+    who: Indices
+    what: Indices
+    sizes: Floats
+    moving: bool
+    walled: Indices
+    room_low: Floats
+    room_high: Floats
+
+
 class Collisions:
     """Keeps drones out of solids and of one another; called once per step."""
 
@@ -43,195 +87,308 @@ class Collisions:
         self._solids = solids
         radius = column(parameters, lambda p: p.radius_m)
         self._hull = np.array([radius, radius, column(parameters, lambda p: p.half_height_m)])
-        self._bounce = column(parameters, lambda p: p.restitution)
-        self._friction = column(parameters, lambda p: p.friction)
-        self._mass = column(parameters, lambda p: p.mass_kg)
-        self._due = np.zeros(len(parameters), dtype=np.int64)
-        self._next = 0
+        self._widest = float(radius.max())
+        self._radii, self._half_heights = radius.tolist(), self._hull[2].tolist()
+        self._low, self._high = solids.room_low + self._hull, solids.room_high - self._hull  # of centres in the room
+        self._bounce = [p.restitution for p in parameters]
+        self._friction = [p.friction for p in parameters]
+        self._floor_constants = np.array(self._bounce), np.array(self._friction)
+        self._mass = [p.mass_kg for p in parameters]
+        self._on_floor = np.zeros(len(parameters), dtype=np.bool_)
+        self._feet = self._hull[2]
+        # Rows, of which single numbers are written faster than whole columns.
+        self._x, self._y, self._z = bodies.position
+        self._vx, self._vy, self._vz = bodies.velocity
         self._free = bodies.position.copy()  # where each drone last was clear of all that doesn't move
+        self._look_steps = LOOK_STEPS_OF_FEW if few(len(parameters)) else LOOK_STEPS
+        self._next = 0  # the step of the next broad phase
+        self._reach = np.zeros(len(parameters))  # how far each drone can get until then
+        self._strayed = [0.0 for _ in parameters]  # how much further it may get, because it was pushed or hit
+        self._look_around(0)
+        self._next = 0
 
     def resolve(self, step: int) -> Contacts | None:
         """Resolve the overlaps of the last step; return the contacts, or None without any."""
         contacts: Contacts | None = None
-        low = self._bodies.position[2] < self._hull[2]
-        if low.any():
+        np.less(self._z, self._feet, out=self._on_floor)
+        if np.count_nonzero(self._on_floor):
             contacts = Contacts()
-            self._meet_floor(np.flatnonzero(low), contacts)
-        if step >= self._next:
-            contacts = self._look_around(step, contacts or Contacts())
+            self._meet_floor(self._on_floor.nonzero()[0], contacts)
+        looked = step >= self._next
+        if looked:
+            self._look_around(step)
+        elif self._near.moving:
+            self._solids.move((step + 1) * STEP_S)
+        if len(self._near.one) or self._near.solids:
+            contacts = contacts or Contacts()
+            self._narrow(step, contacts)
+        if looked or self._near.solids:
+            np.copyto(self._free, self._bodies.position)
         return contacts
+
+    def _narrow(self, step: int, contacts: Contacts) -> None:
+        if len(self._near.one) and self._meet_drones((self._next - step) * STEP_S, contacts):
+            self._look_around(step)
+        left_s = (self._next - step) * STEP_S
+        for drone in self._within_solids():
+            if self._meet_solids(drone, left_s, contacts):
+                self._next = step + 1
+
+    def moved(self, drone: int) -> None:
+        """Take note that a drone was put somewhere else."""
+        self._free[:, drone] = self._bodies.position[:, drone]
+        self._next = 0
+
+    # The broad phase -------------------------------------------------------------------------------------------
+
+    def _look_around(self, step: int) -> None:
+        """Find what each drone can reach until the next broad phase."""
+        solids, position, velocity = self._solids, self._bodies.position, self._bodies.velocity
+        if solids.moving:
+            solids.move((step + 1) * STEP_S)
+        self._next = step + self._look_steps
+        seconds = self._look_steps * STEP_S
+        self._strayed = [0.0] * len(self._strayed)
+        np.sqrt((velocity * velocity).sum(axis=0), out=self._reach)
+        np.multiply(self._reach, seconds, out=self._reach)
+        np.add(self._reach, _span(self._look_steps) + _SLACK_M, out=self._reach)
+        low, high = position - self._reach, position + self._reach
+        walled = ((low < self._low) | (high > self._high)).any(axis=0).nonzero()[0]
+        bounds = solids.bounds(seconds, self._widest)
+        low, high = (np.hstack(pair) for pair in zip((low - self._hull, high + self._hull), bounds, strict=True))
+        drones = len(self._reach)
+        first, second = overlapping(low, high, drones)
+        between = second < drones
+        one, other = first.compress(between), second.compress(between)
+        radius, _, half_height = self._hull.take(one, axis=1) + self._hull.take(other, axis=1)
+        np.logical_not(between, out=between)
+        who, what = first.compress(between), second.compress(between) - drones
+        near: dict[int, list[int]] = {drone: [] for drone in sorted({*walled.tolist(), *who.tolist()})}
+        for drone, solid in zip(who.tolist(), what.tolist(), strict=True):
+            near[drone].append(solid)
+        self._near = _Near(
+            one=one,
+            other=other,
+            across=radius * radius,
+            upright=half_height * half_height,
+            solids=near,
+            who=who,
+            what=what,
+            sizes=solids.sizes(what, self._hull.take(who, axis=1)),
+            moving=bool((what >= solids.fixed).any()),
+            walled=walled,
+            room_low=self._low.take(walled, axis=1),
+            room_high=self._high.take(walled, axis=1),
+        )
+
+    def _strays(self, drone: int, metres: float) -> bool:
+        """Whether a drone that gets further by so much leaves what the last broad phase looked at."""
+        self._strayed[drone] += metres
+        return self._strayed[drone] > _SLACK_M
+
+    # The floor -------------------------------------------------------------------------------------------------
 
     def _meet_floor(self, who: Indices, contacts: Contacts) -> None:
-        position, velocity = self._bodies.position, self._bodies.velocity
-        position[2, who] = self._hull[2, who]
-        falling = np.maximum(-velocity[2, who], 0.0)
-        bounce = np.where(falling > _STILL_M_S, falling * self._bounce[who], 0.0)
-        velocity[2, who] = np.maximum(velocity[2, who], bounce)
-        sliding = np.hypot(velocity[0, who], velocity[1, who])
-        lost = self._friction[who] * (falling + bounce)
-        velocity[:2, who] *= np.maximum(1.0 - lost / np.maximum(sliding, 1e-9), 0.0)
-        contacts.standing.update(who.tolist())
-        if falling.max() > _STILL_M_S:
-            hard = falling > _STILL_M_S
-            contacts.impacts += [(int(i), float(v), "the floor") for i, v in zip(who[hard], falling[hard], strict=True)]
+        velocity = self._bodies.velocity
+        drones: list[int] = who.tolist()
+        contacts.standing.update(drones)
+        if few(len(drones)):
+            for drone in drones:
+                self._z[drone] = self._half_heights[drone]
+                before = velocity[:, drone].tolist()
+                vx, vy, vz, falling = _off_floor(NUMBERS, before, self._bounce[drone], self._friction[drone])
+                self._vx[drone], self._vy[drone], self._vz[drone] = vx, vy, vz
+                if falling > _STILL_M_S:
+                    contacts.impacts.append((drone, falling, "the floor"))
+        else:
+            self._z[who] = self._feet[who]
+            bounce, friction = (values.take(who) for values in self._floor_constants)
+            vx, vy, vz, falling = _off_floor(ARRAYS, velocity.take(who, axis=1), bounce, friction)
+            self._vx[who], self._vy[who], self._vz[who] = vx, vy, vz
+            for hard in (falling > _STILL_M_S).nonzero()[0].tolist():
+                contacts.impacts.append((drones[hard], float(falling[hard]), "the floor"))
 
-    def _look_around(self, step: int, contacts: Contacts) -> Contacts:
-        who = np.flatnonzero(self._due <= step)
-        if self._solids.moving:
-            self._solids.move((step + 1) * STEP_S)
-        if len(self._due) > 1:
-            pushed = self._meet_drones(who, contacts)
-            if pushed:
-                who = np.union1d(who, pushed)
-        clearance = self._solids.clearance(self._bodies.position[:, who], self._hull[:, who])
-        for drone in who[clearance < 0].tolist():
-            self._meet_solids(drone, contacts)
-        self._free[:, who] = self._bodies.position[:, who]
-        self._plan(step, who, clearance)
-        return contacts
+    # Solids ----------------------------------------------------------------------------------------------------
 
-    def _meet_solids(self, drone: int, contacts: Contacts) -> None:
-        position, hull = self._bodies.position[:, drone].copy(), self._hull[:, drone]
-        height, climb = float(position[2]), float(self._bodies.velocity[2, drone])
+    def _within_solids(self) -> list[int]:
+        """Return the drones that may be within a solid, a wall or the ceiling, in ascending order."""
+        near, position = self._near, self._bodies.position
+        if len(near.who) + len(near.walled) <= FEW_PAIRS:
+            return list(near.solids)
+        found = set()
+        if len(near.who):
+            within = self._solids.within(position.take(near.who, axis=1), near.what, near.sizes)
+            found.update(near.who.take(within).tolist())
+        if len(near.walled):
+            at = position.take(near.walled, axis=1)
+            beyond = ((at < near.room_low) | (at > near.room_high)).any(axis=0)
+            found.update(near.walled[beyond].tolist())
+        return sorted(found)
+
+    def _meet_solids(self, drone: int, left_s: float, contacts: Contacts) -> bool:
+        """Push a drone out of solids; returns whether it may leave, in this time, what the broad phase looked at."""
+        bodies, radius, half_height = self._bodies, self._radii[drone], self._half_heights[drone]
+        x, y, z = start = bodies.position[:, drone].tolist()
+        height, climb = z, float(self._vz[drone])
+        among: list[int] | None = self._near.solids[drone]
+        pushed, carried = 0.0, 0.0
         for _ in range(_PASSES):
-            overlap = self._solids.overlap(position, hull)
+            overlap = self._solids.overlap((x, y, z), radius, half_height, among)
             if overlap is None or overlap.depth_m <= _TOUCH_M:
+                if not pushed:
+                    return False
                 break
-            position += np.array(overlap.normal) * overlap.depth_m
-            position[2] = max(position[2], hull[2])
-            before = self._bodies.velocity[:2, drone].copy()
-            impact = self._rebound(drone, overlap)
+            pushed += overlap.depth_m
+            if pushed > _SLACK_M:
+                among = None
+            normal_x, normal_y, normal_z = overlap.normal
+            x, y = x + normal_x * overlap.depth_m, y + normal_y * overlap.depth_m
+            z = max(z + normal_z * overlap.depth_m, half_height)
+            impact, more_x, more_y, faster = self._rebound(drone, overlap)
+            carried += faster
             # Friction acts on this step's motion too, or a drone that stands in wind would creep.
-            position[:2] += (self._bodies.velocity[:2, drone] - before) * STEP_S
-            if overlap.normal[2] > 0.5:
+            x, y = x + more_x * STEP_S, y + more_y * STEP_S
+            if normal_z > 0.5:
                 contacts.standing.add(drone)
             if impact > _STILL_M_S:
                 contacts.impacts.append((drone, impact, "something solid"))
         else:
             # (A moving platform may overlap it afterwards: it can't be clear of both.)
-            if self._within_fixed(position, hull):
-                position = self._wedge(drone, height, climb, contacts)
-        self._bodies.position[:, drone] = position
+            if self._within_fixed(drone, (x, y, z)):
+                x, y, z = self._wedge(drone, height, climb, contacts)
+        self._x[drone], self._y[drone], self._z[drone] = x, y, z
+        return self._strays(drone, math.dist(start, (x, y, z)) + carried * left_s)
 
-    def _wedge(self, drone: int, height: float, climb: float, contacts: Contacts) -> Floats:
+    def _wedge(self, drone: int, height: float, climb: float, contacts: Contacts) -> Vec3:
         """Return the position of a drone that is wedged, so that pushing it out of one thing leads into another.
 
         It is across where it was clear, and free vertically, for nothing that it is wedged between holds it there. It
         has no friction: what presses it would grow without end in a narrow enough corner, and hold it in the air for
         ever.
         """
-        velocity, free = self._bodies.velocity[:, drone], self._free[:, drone]
-        position = np.array([free[0], free[1], height])
-        velocity[:] = 0.0, 0.0, climb
-        if self._within_fixed(position, self._hull[:, drone]):  # all faces are level or upright: one above or below
-            position[2] = free[2]
-            velocity[2] = 0.0
-            if height < free[2]:
-                contacts.standing.add(drone)
-        return position
+        free_x, free_y, free_z = self._free[:, drone].tolist()
+        self._vx[drone], self._vy[drone], self._vz[drone] = 0.0, 0.0, climb
+        if not self._within_fixed(drone, (free_x, free_y, height)):
+            return free_x, free_y, height
+        # All faces are level or upright: there is one above or below.
+        self._vz[drone] = 0.0
+        if height < free_z:
+            contacts.standing.add(drone)
+        return free_x, free_y, free_z
 
-    def _within_fixed(self, position: Floats, hull: Floats) -> bool:
-        overlap = self._solids.overlap(position, hull, moving=False)
+    def _within_fixed(self, drone: int, point: Vec3) -> bool:
+        overlap = self._solids.overlap(point, self._radii[drone], self._half_heights[drone], range(self._solids.fixed))
         return overlap is not None and overlap.depth_m > _TOUCH_M
 
-    def _rebound(self, drone: int, overlap: Overlap) -> float:
-        """Take the velocity into the surface back, and rub; returns that velocity [m/s]."""
-        direction, surface = np.array(overlap.normal), np.array(overlap.surface_m_s)
-        relative = self._bodies.velocity[:, drone] - surface
-        into = -float(relative @ direction)
+    def _rebound(self, drone: int, overlap: Overlap) -> tuple[float, float, float, float]:
+        """Take the velocity into the surface back, and rub.
+
+        Returns:
+            That velocity [m/s]; the changes of the velocity east and north; and by how much it is faster.
+        """
+        vx, vy, vz = self._bodies.velocity[:, drone].tolist()
+        nx, ny, nz = overlap.normal
+        surface_x, surface_y, surface_z = overlap.surface_m_s
+        along_x, along_y, along_z = vx - surface_x, vy - surface_y, vz - surface_z
+        into = -(along_x * nx + along_y * ny + along_z * nz)
         if into <= 0:
-            return 0.0
+            return 0.0, 0.0, 0.0, 0.0
         back = into * self._bounce[drone] if into > _STILL_M_S else 0.0
-        along = relative + into * direction
-        sliding = float(np.linalg.norm(along))
-        if sliding > 0:
-            along *= max(0.0, 1.0 - self._friction[drone] * (into + back) / sliding)
-        self._bodies.velocity[:, drone] = surface + along + back * direction
-        if overlap.normal[2] > 0.5:
+        along_x, along_y, along_z = along_x + into * nx, along_y + into * ny, along_z + into * nz
+        sliding = math.sqrt(along_x * along_x + along_y * along_y + along_z * along_z)
+        left = max(0.0, 1.0 - self._friction[drone] * (into + back) / sliding) if sliding > 0 else 0.0
+        after_x, after_y = surface_x + along_x * left + back * nx, surface_y + along_y * left + back * ny
+        after_z = surface_z + along_z * left + back * nz
+        self._vx[drone], self._vy[drone], self._vz[drone] = after_x, after_y, after_z
+        if nz > 0.5:
             self._turn_along(drone, overlap.spin_rad_s, into + back)
-        return into
+        before = math.sqrt(vx * vx + vy * vy + vz * vz)
+        faster = math.sqrt(after_x * after_x + after_y * after_y + after_z * after_z) - before
+        return into, after_x - vx, after_y - vy, max(faster, 0.0)
 
     def _turn_along(self, drone: int, spin_rad_s: float, impulse_m_s: float) -> None:
         """Let a surface that turns take a drone on it along: friction all over the foot print of a disk.
 
         With pressure p = F / πR² its torque is 2/3 μ F R, against the disk's moment of inertia m R² / 2.
         """
-        most = self._friction[drone] * impulse_m_s * (4 / 3) / self._hull[0, drone]
+        most = self._friction[drone] * impulse_m_s * (4 / 3) / self._radii[drone]
         change = max(-most, min(most, spin_rad_s - float(self._bodies.rates[2, drone])))
         self._bodies.rates[2, drone] += change
         self._bodies.angles[2, drone] += change * STEP_S
 
-    def _meet_drones(self, who: Indices, contacts: Contacts) -> list[int]:
-        """Part the drones that overlap; returns those that were pushed."""
-        across, upright = self._gaps(who)
-        close = (across < 0) & (upright < 0)
-        close[np.arange(len(who)), who] = False
-        pushed: list[int] = []
-        if close.any():
-            for row, other in zip(*np.nonzero(close), strict=True):
-                drone = int(who[row])
-                if other > drone or other not in who:
-                    self._part(drone, int(other), float(across[row, other]), float(upright[row, other]), contacts)
-                    pushed += [drone, int(other)]
-        return pushed
+    # Drones ----------------------------------------------------------------------------------------------------
 
-    def _gaps(self, who: Indices) -> tuple[Floats, Floats]:
-        """Gaps between hulls, across and upright, each (m, n), to all others (and, without sense, to itself)."""
-        position, radius, half = self._bodies.position, self._hull[0], self._hull[2]
-        east = position[0] - position[0, who, None]
-        north = position[1] - position[1, who, None]
-        across = np.sqrt(east * east + north * north) - (radius + radius[who, None])
-        upright = np.abs(position[2] - position[2, who, None]) - (half + half[who, None])
-        return across, upright
+    def _meet_drones(self, left_s: float, contacts: Contacts) -> bool:
+        """Part drones that overlap; returns whether one may leave, in this time, what the broad phase looked at."""
+        strayed = False
+        for one, other in self._close_pairs():
+            if self._part(one, other, left_s, contacts):
+                strayed = True
+        return strayed
 
-    def _part(self, one: int, other: int, across: float, upright: float, contacts: Contacts) -> None:
+    def _close_pairs(self) -> list[tuple[int, int]]:
+        """Return the pairs of drones that overlap."""
+        near, position = self._near, self._bodies.position
+        apart = position.take(near.one, axis=1) - position.take(near.other, axis=1)
+        np.multiply(apart, apart, out=apart)
+        east, north, up = apart
+        np.add(east, north, out=east)
+        close = (east < near.across) & (up < near.upright)
+        if not np.count_nonzero(close):
+            return []
+        which = close.nonzero()[0]
+        return list(zip(near.one.take(which).tolist(), near.other.take(which).tolist(), strict=True))
+
+    def _part(self, one: int, other: int, left_s: float, contacts: Contacts) -> bool:
+        """Part two drones; returns whether one may leave, in this time, what the broad phase looked at."""
         position, velocity = self._bodies.position, self._bodies.velocity
-        away = position[:, one] - position[:, other]
+        one_x, one_y, one_z = position[:, one].tolist()
+        other_x, other_y, other_z = position[:, other].tolist()
+        away_x, away_y, away_z = one_x - other_x, one_y - other_y, one_z - other_z
+        size = math.sqrt(away_x * away_x + away_y * away_y)
+        across = size - (self._radii[one] + self._radii[other])
+        upright = abs(away_z) - (self._half_heights[one] + self._half_heights[other])
+        depth = -max(across, upright)
+        if depth <= 0.0:
+            return False  # a push by a third one has parted them
         if across > upright:
-            away[2] = 0.0
-            size = math.hypot(away[0], away[1])
-            normal = away / size if size > 1e-6 else np.array([1.0, 0.0, 0.0])
-            depth = -across
+            nx, ny, nz = (away_x / size, away_y / size, 0.0) if size > 1e-6 else (1.0, 0.0, 0.0)
         else:
-            normal, depth = np.array([0.0, 0.0, 1.0 if away[2] >= 0 else -1.0]), -upright
-            contacts.upon.append((one, other) if away[2] >= 0 else (other, one))
-        share = float(self._mass[other] / (self._mass[one] + self._mass[other]))
-        position[:, one] += normal * depth * share
-        position[:, other] -= normal * depth * (1.0 - share)
-        self._keep_above_floor(one, other)
-        into = -float((velocity[:, one] - velocity[:, other]) @ normal)
+            nx, ny, nz = 0.0, 0.0, 1.0 if away_z >= 0 else -1.0
+            contacts.upon.append((one, other) if away_z >= 0 else (other, one))
+        mine = self._mass[other] / (self._mass[one] + self._mass[other])
+        theirs = 1.0 - mine
+        one_z, other_z = one_z + nz * depth * mine, other_z - nz * depth * theirs
+        # Nobody is pushed into the floor: both are lifted instead.
+        up = max(self._half_heights[one] - one_z, self._half_heights[other] - other_z, 0.0)
+        self._x[one], self._y[one], self._z[one] = one_x + nx * depth * mine, one_y + ny * depth * mine, one_z + up
+        self._x[other], self._y[other] = other_x - nx * depth * theirs, other_y - ny * depth * theirs
+        self._z[other] = other_z + up
+        one_vx, one_vy, one_vz = velocity[:, one].tolist()
+        other_vx, other_vy, other_vz = velocity[:, other].tolist()
+        into = -((one_vx - other_vx) * nx + (one_vy - other_vy) * ny + (one_vz - other_vz) * nz)
+        change = 0.0
         if into > 0:
             change = into * (1.0 + (min(self._bounce[one], self._bounce[other]) if into > _STILL_M_S else 0.0))
-            velocity[:, one] += normal * change * share
-            velocity[:, other] -= normal * change * (1.0 - share)
+            more, less = change * mine, change * theirs
+            self._vx[one], self._vy[one], self._vz[one] = one_vx + nx * more, one_vy + ny * more, one_vz + nz * more
+            self._vx[other], self._vy[other] = other_vx - nx * less, other_vy - ny * less
+            self._vz[other] = other_vz - nz * less
             if into > _STILL_M_S:
                 contacts.impacts += [(one, into, "another drone"), (other, into, "another drone")]
-
-    def _keep_above_floor(self, *drones: int) -> None:
-        """Lift a drone that another one has just pushed into the floor, and the other by as much."""
-        heights = self._bodies.position[2]
-        below = max(float(self._hull[2, drone] - heights[drone]) for drone in drones)
-        if below > 0.0:
-            heights[list(drones)] += below
-
-    def _plan(self, step: int, who: Indices, clearance: Floats) -> None:
-        """Set when each drone has to be looked at again. Two drones each may use up half of the gap between them."""
-        speed = np.sqrt((self._bodies.velocity**2).sum(axis=0))
-        self._due[who] = step + _steps_to(clearance, speed[who] + self._solids.top_speed_m_s)
-        if len(self._due) > 1:
-            across, upright = self._gaps(who)
-            gap = np.maximum(across, upright)
-            gap[np.arange(len(who)), who] = np.inf
-            nearest = gap.min(axis=0) / 2  # to any of those looked at
-            np.minimum(self._due, step + _steps_to(nearest, speed), out=self._due)
-            self._due[who] = np.minimum(self._due[who], step + _steps_to(gap.min(axis=1) / 2, speed[who]))
-        self._next = int(self._due.min())
+        further = depth + change * left_s
+        return self._strays(one, further * mine + up) | self._strays(other, further * theirs + up)
 
 
-def _steps_to(distance: Floats, speed: Floats) -> Floats:
-    """Whole steps in which ``distance`` can't be used up, at least 1: from s = v t + a t² / 2."""
-    a = _MOST_ACCELERATION_M_S2
-    reach = np.minimum(np.maximum(distance, 0.0), 1e3)
-    time = (np.sqrt(speed * speed + 2 * a * reach) - speed) / a
-    steps: Floats = np.minimum(np.maximum(np.floor(time / STEP_S), 1), _FAR_STEPS).astype(np.int64)
-    return steps
+def _off_floor(do: Operations, velocity: N, bounce: N, friction: N) -> tuple[N, N, N, N]:
+    """Return the velocity after meeting the floor, and how fast that was, along the normal [m/s]."""
+    vx, vy, vz = velocity
+    falling = do.most(-vz, 0.0)
+    back = do.choose(falling > _STILL_M_S, falling * bounce, 0.0)
+    left = do.most(1.0 - friction * (falling + back) / do.most(do.root(vx * vx + vy * vy), 1e-9), 0.0)
+    return vx * left, vy * left, do.most(vz, back), falling
+
+
+def _span(steps: int) -> float:
+    """Return how far a drone gets from rest in so many steps at most [m]."""
+    return _MOST_ACCELERATION_M_S2 * STEP_S * STEP_S * steps * (steps + 1) / 2

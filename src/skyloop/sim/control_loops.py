@@ -1,11 +1,16 @@
-"""The firmware's outer loops: from set-points and estimates to attitude and thrust, for all drones."""
+"""The firmware's outer loops: from set-points and estimates to attitude and thrust, for all drones.
+
+The formulas are written once, for the numbers of one drone and for arrays of all.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
+from skyloop.sim.columns import ARRAYS, NUMBERS, Fields, N, Operations, columns, few
 from skyloop.sim.dynamics import Bodies, column
 from skyloop.sim.parameters import GRAVITY_M_S2, Limits, VehicleParameters
 from skyloop.sim.sensors import Sensors
@@ -20,6 +25,23 @@ _INTEGRATED_ERROR_M_S = 0.25  # larger errors count as this: braking from speed 
 _MOST_INTEGRAL_M_S2 = 3.0  # a drone that is held by a wall stops learning here
 
 
+_ROWS = 15  # of the table of set-points, limits and, from this row on, the loops' state:
+_STATE = 11
+_LANDING = 10
+
+
+@dataclass(frozen=True, slots=True)
+class _Gains:
+    """Of one drone, or of all."""
+
+    velocity: N
+    integral: N
+    level_brake: N
+    altitude: N
+    climb: N
+    least_thrust: N
+
+
 class ControlLoops:
     """Set-points and state of the loops, one column per drone. Written by the flight logic between updates."""
 
@@ -29,28 +51,35 @@ class ControlLoops:
         n = len(parameters)
         self._bodies = bodies
         self._period_s = period_s
-        self._set_point = np.zeros((4, n))  # forward and left, or roll and pitch; climb; yaw rate
-        self._by_velocity = np.ones(n, dtype=np.bool_)
-        self._running = np.zeros(n)
-        self._reference = np.zeros(n)
-        self._ceiling = np.zeros(n)
-        self._integral = np.zeros((2, n))
-        self._landing = np.zeros(n, dtype=np.bool_)
-        self._behind = np.zeros(n)  # how far a landing drone is above where its descent should have brought it
-        self._velocity_gain = column(parameters, lambda p: p.velocity_gain_per_s)
-        self._integral_gain = column(parameters, lambda p: p.velocity_integral_per_s2) * period_s
-        self._level_brake = column(parameters, lambda p: p.level_brake_per_m) / GRAVITY_M_S2
-        self._any_level_brake = bool(self._level_brake.any())
-        self._altitude_gain = column(parameters, lambda p: p.altitude_gain_per_s)
-        self._climb_gain = column(parameters, lambda p: p.climb_gain_per_s)
-        self._least_thrust = column(parameters, lambda p: p.least_thrust) * GRAVITY_M_S2
+        table = columns(_ROWS, n)
+        self._set_point = table[:4]  # forward and left, or roll and pitch; climb; yaw rate
+        self._tilt_limit, self._climb_limit, self._ceiling, self.most_thrust = table[4:8]
+        self._running, self._by_velocity, self._landing = table[8:11]  # 1 or 0
+        # How far a landing drone is above where its descent should have brought it is the last one.
+        self._reference, self._integral, self._behind = table[11], table[12:14], table[14]
+        self._rows = tuple(table)
+        self._by_velocity[:] = 1.0
+        brake = column(parameters, lambda p: p.level_brake_per_m) / GRAVITY_M_S2
+        self._any_level_brake = bool(brake.any())
+        self._gains = _Gains(
+            velocity=column(parameters, lambda p: p.velocity_gain_per_s),
+            integral=column(parameters, lambda p: p.velocity_integral_per_s2) * period_s,
+            level_brake=brake,
+            altitude=column(parameters, lambda p: p.altitude_gain_per_s),
+            climb=column(parameters, lambda p: p.climb_gain_per_s),
+            least_thrust=column(parameters, lambda p: p.least_thrust) * GRAVITY_M_S2,
+        )
         self._full_thrust = column(parameters, lambda p: p.most_thrust) * GRAVITY_M_S2
-        self.most_thrust = self._full_thrust.copy()
-        self._tilt_limit = np.zeros(n)
-        self._climb_limit = np.zeros(n)
+        self.most_thrust[:] = self._full_thrust
         for drone, limit in enumerate(limits):
             self.set_limits(drone, limit)
             self.set_ceiling(drone, limit.altitude_m)
+        self._few = few(n)
+        if self._few:
+            gains = self._gains
+            rows = (gains.velocity, gains.integral, gains.level_brake, gains.altitude, gains.climb, gains.least_thrust)
+            self._each = [(drone, _Gains(*one)) for drone, one in enumerate(np.array(rows).T.tolist())]
+            self._inputs, self._state = Fields(table, 0, _ROWS), Fields(table, _STATE, _ROWS - _STATE)
 
     def set_limits(self, drone: int, limits: Limits) -> None:
         """Change a drone's limits."""
@@ -68,19 +97,19 @@ class ControlLoops:
     def follow_velocity(self, drone: int, forward: float, left: float, climb: float, yaw_rate: float) -> None:
         """Follow a velocity: levelled body axes [m/s], yaw rate [rad/s]."""
         self._set_point[:, drone] = (forward, left, climb, yaw_rate)
-        self._by_velocity[drone] = True
-        self._landing[drone] = False
+        self._by_velocity[drone] = 1.0
+        self._landing[drone] = 0.0
 
     def follow_attitude(self, drone: int, roll: float, pitch: float, climb: float, yaw_rate: float) -> None:
         """Follow an attitude: roll right side down, pitch nose down [rad], climb [m/s], yaw rate [rad/s]."""
         self._set_point[:, drone] = (roll, pitch, climb, yaw_rate)
-        self._by_velocity[drone] = False
-        self._landing[drone] = False
+        self._by_velocity[drone] = 0.0
+        self._landing[drone] = 0.0
 
     def land(self, drone: int, descent_m_s: float) -> None:
         """Descend on the spot, whatever set-point was in force."""
         self.follow_velocity(drone, 0.0, 0.0, -descent_m_s, 0.0)
-        self._landing[drone] = True
+        self._landing[drone] = 1.0
         self._behind[drone] = 0.0
 
     def start(self, drone: int, altitude_m: float) -> None:
@@ -93,7 +122,7 @@ class ControlLoops:
     def stop(self, drone: int) -> None:
         """Stop the motors."""
         self._running[drone] = 0.0
-        self._landing[drone] = False
+        self._landing[drone] = 0.0
         self._bodies.cut(drone)
 
     def rest(self, drone: int) -> None:
@@ -102,67 +131,80 @@ class ControlLoops:
 
     def update(self, sensors: Sensors) -> None:
         """Compute the commands of the attitude loops and motors for one period."""
-        command = self._bodies.attitude_command
-        roll, pitch = self._level_tilts(sensors.velocity)
-        np.copyto(command[:2], self._set_point[:2])
-        if self._any_level_brake:
-            command[:2] += self._level_brakes(sensors.velocity)
-        np.copyto(command[0], roll, where=self._by_velocity)
-        np.copyto(command[1], pitch, where=self._by_velocity)
-        np.copyto(command[2], self._set_point[3])
-        np.multiply(command, self._running, out=command)
-        self._lift(sensors)
+        bodies = self._bodies
+        turned: Sequence[N]
+        estimate: Sequence[N]
+        if self._few:
+            for drone, gains in self._each:
+                inputs = self._inputs.read[drone]()
+                turned, estimate = bodies.turned.read[drone](), sensors.numbers.read[drone]()
+                commands, state = self._commands(NUMBERS, gains, inputs, turned, estimate, inputs[_LANDING] > 0.0)
+                bodies.commands.write[drone](*commands)
+                self._state.write[drone](*state)
+        else:
+            turned, estimate = (bodies.sin[2], *bodies.cos), (sensors.altitude, *sensors.velocity)
+            landing = bool(self._landing.any())
+            commands, state = self._commands(ARRAYS, self._gains, self._rows, turned, estimate, landing)
+            for row, values in zip((*bodies.attitude_command, bodies.thrust_command), commands, strict=True):
+                row[:] = values
+            for row, values in zip(self._rows[_STATE:], state, strict=True):
+                row[:] = values
 
-    def _level_tilts(self, velocity: Floats) -> tuple[Floats, Floats]:
-        """Roll and pitch that bring the horizontal velocity to the set-point."""
-        sin_yaw, cos_yaw = self._bodies.sin[2], self._bodies.cos[2]
-        forward, left = self._set_point[:2] - velocity[:2]
-        east, north = self._integral
-        learn = self._integral_gain * self._running * self._by_velocity
-        limit = _INTEGRATED_ERROR_M_S
-        east += learn * np.minimum(np.maximum(cos_yaw * forward - sin_yaw * left, -limit), limit)
-        north += learn * np.minimum(np.maximum(sin_yaw * forward + cos_yaw * left, -limit), limit)
-        np.minimum(self._integral, _MOST_INTEGRAL_M_S2, out=self._integral)
-        np.maximum(self._integral, -_MOST_INTEGRAL_M_S2, out=self._integral)
-        ahead = self._velocity_gain * forward + cos_yaw * east + sin_yaw * north
-        aside = self._velocity_gain * left - sin_yaw * east + cos_yaw * north
-        most = self._tilt_limit
-        pitch = np.minimum(np.maximum(ahead / GRAVITY_M_S2, -most), most)
-        roll = np.minimum(np.maximum(aside / -GRAVITY_M_S2, -most), most)
-        return roll, pitch
+    def _commands(
+        self,
+        do: Operations,
+        gains: _Gains,
+        inputs: Sequence[N],
+        turned: Sequence[N],
+        estimate: Sequence[N],
+        landing: bool,
+    ) -> tuple[tuple[N, N, N, N], tuple[N, N, N, N]]:
+        """Return roll, pitch, yaw rate and thrust; and the loops' state after the period."""
+        first, second, climb, yaw_rate, tilt_limit, climb_limit, *rest = inputs
+        ceiling, most_thrust, running, by_velocity, held, reference, east, north, behind = rest
+        sin_yaw, cos_roll, cos_pitch, cos_yaw = turned
+        altitude, forward, left, climbing = estimate
+        period, least_tilt = self._period_s, -tilt_limit
 
-    def _level_brakes(self, velocity: Floats) -> Floats:
-        """Roll and pitch against the speed, to be added to the set-points of drones that fly by attitude."""
-        forward, left = velocity[:2]
-        lean = np.array([left, -forward]) * (self._level_brake * np.hypot(forward, left))
-        most = self._tilt_limit
-        share = np.maximum(1.0 - np.abs(self._set_point[:2]) / most, 0.0)
-        braked: Floats = np.minimum(np.maximum(lean, -most), most) * share
-        return braked
+        # Roll and pitch that bring the horizontal velocity to the set-point.
+        ahead, aside = first - forward, second - left
+        learn = gains.integral * running * by_velocity
+        most, limit = _MOST_INTEGRAL_M_S2, _INTEGRATED_ERROR_M_S
+        east = east + learn * do.least(do.most(cos_yaw * ahead - sin_yaw * aside, -limit), limit)
+        north = north + learn * do.least(do.most(sin_yaw * ahead + cos_yaw * aside, -limit), limit)
+        east, north = do.most(do.least(east, most), -most), do.most(do.least(north, most), -most)
+        lean = gains.velocity * ahead + cos_yaw * east + sin_yaw * north
+        pitch = do.least(do.most(lean / GRAVITY_M_S2, least_tilt), tilt_limit)
+        lean = gains.velocity * aside - sin_yaw * east + cos_yaw * north
+        roll = do.least(do.most(lean / -GRAVITY_M_S2, least_tilt), tilt_limit)
+        if self._any_level_brake:  # against the speed, of drones that fly by attitude
+            brake = gains.level_brake * do.root(forward * forward + left * left)
+            first = first + _brake(do, left * brake, first, tilt_limit)
+            second = second + _brake(do, -forward * brake, second, tilt_limit)
+        flies = by_velocity > 0.0
+        roll, pitch = do.choose(flies, roll, first), do.choose(flies, pitch, second)
 
-    def _lift(self, sensors: Sensors) -> None:
-        altitude, climbing = sensors.altitude, sensors.velocity[2]
-        climb = self._set_point[2]
-        reference = self._reference
-        reference += climb * self._period_s
-        np.minimum(reference, altitude + _REFERENCE_LEAD_M, out=reference)
-        np.maximum(reference, altitude - _REFERENCE_LEAD_M, out=reference)
-        np.minimum(reference, self._ceiling, out=reference)
-        wanted = climb * (reference < self._ceiling) + self._altitude_gain * (reference - altitude)
-        wanted = np.minimum(np.maximum(wanted, -self._climb_limit), self._climb_limit)
-        upward = GRAVITY_M_S2 + self._climb_gain * (wanted - climbing)
-        if self._landing.any():
-            upward -= self._ease(climbing)
-        thrust = upward / (self._bodies.cos[0] * self._bodies.cos[1])
-        thrust = np.minimum(np.maximum(thrust, self._least_thrust), self.most_thrust)
-        np.multiply(thrust, self._running, out=self._bodies.thrust_command)
+        reference = do.least(reference + climb * period, altitude + _REFERENCE_LEAD_M)
+        reference = do.least(do.most(reference, altitude - _REFERENCE_LEAD_M), ceiling)
+        wanted = climb * (reference < ceiling) + gains.altitude * (reference - altitude)
+        wanted = do.least(do.most(wanted, -climb_limit), climb_limit)
+        upward = GRAVITY_M_S2 + gains.climb * (wanted - climbing)
+        if landing:
+            behind = self._fall_behind(do, climbing, do.most(climb, -climb_limit), behind) * held
+            upward = upward - _HELD_EASE_PER_S2 * do.most(behind - _HELD_M, 0.0)
+        thrust = do.least(do.most(upward / (cos_roll * cos_pitch), gains.least_thrust), most_thrust)
+        commands = roll * running, pitch * running, yaw_rate * running, thrust * running
+        return commands, (reference, east, north, behind)
 
-    def _ease(self, climbing: Floats) -> Floats:
-        """How much less thrust a landing drone takes that does not get down [m/s²]."""
-        error = climbing - np.maximum(self._set_point[2], -self._climb_limit)
-        change = np.where(error > 0, error * (climbing < _HELD_CLIMB_M_S), _HELD_REGAIN * error)
+    def _fall_behind(self, do: Operations, climbing: N, descent: N, behind: N) -> N:
+        """Return how far a landing drone that does not get down is behind now [m]; it takes less thrust by that."""
+        error = climbing - descent
+        held = do.choose(error > 0, error * (climbing < _HELD_CLIMB_M_S), _HELD_REGAIN * error)
         most = _HELD_M + GRAVITY_M_S2 / _HELD_EASE_PER_S2
-        behind = np.minimum(np.maximum(self._behind + change * self._period_s, 0.0), most)
-        np.multiply(behind, self._landing, out=self._behind)
-        eased: Floats = _HELD_EASE_PER_S2 * np.maximum(self._behind - _HELD_M, 0.0)
-        return eased
+        return do.least(do.most(behind + held * self._period_s, 0.0), most)
+
+
+def _brake(do: Operations, lean: N, set_point: N, tilt_limit: N) -> N:
+    """Return by how much more to lean in an axis than its set-point says, against the speed."""
+    share = do.most(1.0 - abs(set_point) / tilt_limit, 0.0)
+    return do.least(do.most(lean, -tilt_limit), tilt_limit) * share

@@ -1,16 +1,24 @@
-"""Dynamics of quadrotors: all drones at once, one array column each, in fixed steps."""
+"""Dynamics of quadrotors in fixed steps: all drones at once, one array column each; a few of them one by one.
+
+Both ways give the same bits, to which ``tests/sim/test_columns.py`` holds them.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from skyloop.sim.columns import Fields, N, columns, few
 from skyloop.sim.parameters import GRAVITY_M_S2, VehicleParameters
 from skyloop.sim.streams import Floats
 
 STEP_S = 0.004
 
+# As arrays, with which NumPy computes faster than with numbers.
+_STEP, _GRAVITY, _ONE = np.array(STEP_S), np.array(GRAVITY_M_S2), np.array(1.0)
+_ROWS = 32  # of the table of a body's state and inputs
 _MOST_TILT_RAD = 1.2  # far from the singularity of Euler angles at π/2
 _MOST_TILTING_AIRSPEED_M_S = 3.0  # the air tilts no further beyond: no recording is faster
 
@@ -32,25 +40,37 @@ class Bodies:
         attitude_command: Input: roll, pitch [rad] and yaw rate [rad/s], (3, n).
         thrust_command: Input: per mass, (n,).
         air: Input: velocity of the air, (3, n).
+        commands: Of a few drones: the inputs attitude_command and thrust_command.
+        turned: Of a few drones: sine of yaw; cosines of roll, pitch, yaw.
+        moved: Of a few drones: height of the centre [m], velocity [m/s].
     """
 
     def __init__(self, parameters: Sequence[VehicleParameters], positions: Floats, yaws: Floats) -> None:
         n = len(parameters)
-        self.position = positions.copy()
-        self.velocity = np.zeros((3, n))
-        self.velocity_before = np.zeros((3, n))
-        self.angles = np.zeros((3, n))
+        table = columns(_ROWS, n)
+        self.angles, self.rates, self._stiff, self.attitude_command = (table[row : row + 3] for row in (0, 3, 6, 9))
+        self.thrust_command, self.thrust = table[12], table[22]
+        self.sin, self.cos, self.air = (table[row : row + 3] for row in (13, 16, 19))
+        self.position, self.velocity, self.velocity_before = (table[row : row + 3] for row in (23, 26, 29))
+        self.position[:] = positions
         self.angles[2] = yaws
-        self.rates = np.zeros((3, n))
-        self.thrust = np.zeros(n)
-        self.attitude_command = np.zeros((3, n))
-        self.thrust_command = np.zeros(n)
-        self.air = np.zeros((3, n))
-        self.sin = np.sin(self.angles)
-        self.cos = np.cos(self.angles)
+        np.sin(self.angles, out=self.sin)
+        np.cos(self.angles, out=self.cos)
         self._set_constants(parameters)
-        self._a, self._b = np.empty((3, n)), np.empty((3, n))
-        self._c, self._d = np.empty(n), np.empty(n)
+        self._few = few(n)
+        if self._few:
+            self.commands, self.turned, self.moved = Fields(table, 9, 4), Fields(table, 15, 4), Fields(table, 25, 4)
+            self._turning, self._turned = Fields(table, 0, 12), Fields(table, 0, 6)
+            self._moving, self._moved = Fields(table, 12, 17), Fields(table, 22, 10)
+            self._each = list(enumerate(self._constants()))
+        else:
+            # Views and constants that a step needs are made once: making one takes as long as computing with it.
+            self._a, self._b, self._squares = (np.empty((3, n)) for _ in range(3))
+            self._a_rows, self._b_rows, self._square_rows = tuple(self._a), tuple(self._b), tuple(self._squares)
+            self._c, self._d = np.empty(n), np.empty(n)
+            self._tilts = self.angles[:2]
+            self._most_tilt, self._least_tilt = np.full((2, n), _MOST_TILT_RAD), np.full((2, n), -_MOST_TILT_RAD)
+            self._sines_and_cosines = (*self.sin, *self.cos)
 
     def _set_constants(self, parameters: Sequence[VehicleParameters]) -> None:
         frequency = column(parameters, lambda p: p.attitude_frequency_rad_s)
@@ -60,9 +80,9 @@ class Bodies:
         # One formula for all three axes: change of rate = stiffness (command - held · angle) - damping · rate. In yaw
         # the angle isn't held, and the command is a rate.
         self._held = np.array([ones, ones, zeros])
-        self._stiff = np.array([frequency**2, frequency**2, yaw_rate]) * STEP_S
+        self._stiff_running = np.array([frequency**2, frequency**2, yaw_rate]) * STEP_S
+        self._stiff[:] = self._stiff_running
         self._damp = np.array([2 * damping * frequency, 2 * damping * frequency, yaw_rate]) * STEP_S
-        self._stiff_running = self._stiff.copy()
         self._most_change = np.tile(column(parameters, lambda p: p.most_angular_acceleration_rad_s2), (3, 1)) * STEP_S
         self._least_change = -self._most_change
         self._motor_share = 1.0 - np.exp(-STEP_S / column(parameters, lambda p: p.motor_time_constant_s))
@@ -77,6 +97,14 @@ class Bodies:
         self._rotor_height = column(parameters, lambda p: p.rotor_height_m)
         self._rotor_offset = column(parameters, lambda p: p.rotor_height_m - p.half_height_m)
         self._ground_effect = column(parameters, lambda p: p.ground_effect**0.5 * p.rotor_radius_m / 4)
+
+    def _constants(self) -> list[tuple[tuple[float, ...], tuple[float, ...]]]:
+        """Return each drone's constants as plain floats, of turning and of moving."""
+        turning = [*self._damp[1:], *self._most_change[1:], self._airspeed_tilt]
+        moving = [self._motor_share, self._rotor_offset, self._rotor_height, self._ground_effect]
+        moving += [*self._linear[1:], *self._quadratic[1:]]
+        rows = (np.array(constants).T.tolist() for constants in (turning, moving))
+        return [(tuple(one), tuple(other)) for one, other in zip(*rows, strict=True)]
 
     def cut(self, drone: int) -> None:
         """Stop the motors: nothing holds the attitude any more."""
@@ -100,13 +128,77 @@ class Bodies:
 
     def step(self) -> None:
         """Advance by :data:`STEP_S`, without collisions."""
-        self._turn()
-        acceleration = self._accelerate()
-        np.copyto(self.velocity_before, self.velocity)
-        np.multiply(acceleration, STEP_S, out=acceleration)
-        np.add(self.velocity, acceleration, out=self.velocity)
-        np.multiply(self.velocity, STEP_S, out=acceleration)
-        np.add(self.position, acceleration, out=self.position)
+        if self._few:
+            self._step_each()
+        else:
+            self._turn()
+            self._move()
+
+    def _step_each(self) -> None:
+        """As :meth:`_turn` and :meth:`_move`, one drone after the other."""
+        for drone, (constants, _) in self._each:
+            self._turn_one(drone, *constants)
+        np.sin(self.angles, out=self.sin)
+        np.cos(self.angles, out=self.cos)
+        for drone, (_, constants) in self._each:
+            self._move_one(drone, *constants)
+
+    def _turn_one(
+        self, drone: int, damp: float, damp_yaw: float, most: float, most_yaw: float, airspeed_tilt: float
+    ) -> None:
+        roll, pitch, yaw, roll_rate, pitch_rate, yaw_rate, *rest = self._turning.read[drone]()
+        stiff, stiff_pitch, stiff_yaw, roll_command, pitch_command, yaw_command = rest
+        more_roll, more_pitch = self._tilt_one(drone, airspeed_tilt) if airspeed_tilt else (0.0, 0.0)
+        # (Comparisons are faster than min and max.)
+        change = (roll_command - roll + more_roll) * stiff - roll_rate * damp
+        roll_rate += change if -most <= change <= most else math.copysign(most, change)
+        change = (pitch_command - pitch + more_pitch) * stiff_pitch - pitch_rate * damp
+        pitch_rate += change if -most <= change <= most else math.copysign(most, change)
+        change = yaw_command * stiff_yaw - yaw_rate * damp_yaw
+        yaw_rate += change if -most_yaw <= change <= most_yaw else math.copysign(most_yaw, change)
+        roll, pitch = roll + roll_rate * STEP_S, pitch + pitch_rate * STEP_S
+        if abs(roll) > _MOST_TILT_RAD:
+            roll = math.copysign(_MOST_TILT_RAD, roll)
+        if abs(pitch) > _MOST_TILT_RAD:
+            pitch = math.copysign(_MOST_TILT_RAD, pitch)
+        self._turned.write[drone](roll, pitch, yaw + yaw_rate * STEP_S, roll_rate, pitch_rate, yaw_rate)
+
+    def _tilt_one(self, drone: int, airspeed_tilt: float) -> tuple[float, float]:
+        """As :meth:`_tilt_by_airspeed`, for one drone."""
+        *_, sin_yaw, _, _, cos_yaw, air_x, air_y, _, _, _, _, _, vx, vy, _ = self._moving.read[drone]()
+        east, north = vx - air_x, vy - air_y
+        speed = math.sqrt(east * east + north * north)
+        slowed = min(speed, _MOST_TILTING_AIRSPEED_M_S)
+        tilt = airspeed_tilt * (slowed * slowed / max(speed, 1e-9))
+        return (cos_yaw * north - sin_yaw * east) * tilt, -(cos_yaw * east + sin_yaw * north) * tilt
+
+    def _move_one(
+        self,
+        drone: int,
+        motor_share: float,
+        rotor_offset: float,
+        rotor_height: float,
+        ground_effect: float,
+        linear: float,
+        linear_z: float,
+        quadratic: float,
+        quadratic_z: float,
+    ) -> None:
+        thrust_command, sin_roll, sin_pitch, sin_yaw, cos_roll, cos_pitch, cos_yaw, *rest = self._moving.read[drone]()
+        air_x, air_y, air_z, thrust, x, y, z, vx, vy, vz = rest
+        thrust += (thrust_command - thrust) * motor_share
+        shortfall = ground_effect / max(z + rotor_offset, rotor_height)
+        lift = thrust / (1.0 - shortfall * shortfall)
+        forward = sin_pitch * cos_roll
+        dx, dy, dz = vx - air_x, vy - air_y, vz - air_z
+        airspeed = math.sqrt(dx * dx + dy * dy + dz * dz)
+        drag = quadratic * airspeed + linear
+        ax = (cos_yaw * forward + sin_yaw * sin_roll) * lift - dx * drag
+        ay = (sin_yaw * forward - cos_yaw * sin_roll) * lift - dy * drag
+        az = cos_pitch * cos_roll * lift - GRAVITY_M_S2 - dz * (quadratic_z * airspeed + linear_z)
+        new_vx, new_vy, new_vz = vx + ax * STEP_S, vy + ay * STEP_S, vz + az * STEP_S
+        x, y, z = x + new_vx * STEP_S, y + new_vy * STEP_S, z + new_vz * STEP_S
+        self._moved.write[drone](thrust, x, y, z, new_vx, new_vy, new_vz, vx, vy, vz)
 
     def _turn(self) -> None:
         change, other = self._a, self._b
@@ -120,11 +212,10 @@ class Bodies:
         np.minimum(change, self._most_change, out=change)
         np.maximum(change, self._least_change, out=change)
         np.add(self.rates, change, out=self.rates)
-        np.multiply(self.rates, STEP_S, out=other)
+        np.multiply(self.rates, _STEP, out=other)
         np.add(self.angles, other, out=self.angles)
-        tilts = self.angles[:2]
-        np.minimum(tilts, _MOST_TILT_RAD, out=tilts)
-        np.maximum(tilts, -_MOST_TILT_RAD, out=tilts)
+        np.minimum(self._tilts, self._most_tilt, out=self._tilts)
+        np.maximum(self._tilts, self._least_tilt, out=self._tilts)
         np.sin(self.angles, out=self.sin)
         np.cos(self.angles, out=self.cos)
 
@@ -133,19 +224,17 @@ class Bodies:
         east, north = self.velocity[:2] - self.air[:2]
         sin_yaw, cos_yaw = self.sin[2], self.cos[2]
         forward, left = cos_yaw * east + sin_yaw * north, cos_yaw * north - sin_yaw * east
-        speed = np.hypot(east, north)
-        slowed = np.minimum(speed, _MOST_TILTING_AIRSPEED_M_S) ** 2 / np.maximum(speed, 1e-9)
-        tilt: Floats = np.array([left, -forward]) * (self._airspeed_tilt * slowed)
+        speed = np.sqrt(east * east + north * north)
+        slowed = np.minimum(speed, _MOST_TILTING_AIRSPEED_M_S)
+        tilt: Floats = np.array([left, -forward]) * (self._airspeed_tilt * (slowed * slowed / np.maximum(speed, 1e-9)))
         return tilt
 
-    def _accelerate(self) -> Floats:
+    def _move(self) -> None:
         lift = self._lift()
-        total, drag = self._a, self._b
-        sin_roll, sin_pitch, sin_yaw = self.sin
-        cos_roll, cos_pitch, cos_yaw = self.cos
-        x, y, z = total
+        total, drag, squares = self._a, self._b, self._squares
+        sin_roll, sin_pitch, sin_yaw, cos_roll, cos_pitch, cos_yaw = self._sines_and_cosines
+        (x, y, z), side, forward = self._a_rows, self._b_rows[0], self._d
         # The third column of Rz(yaw) Ry(pitch) Rx(roll).
-        forward, side = self._d, drag[0]
         np.multiply(sin_pitch, cos_roll, out=forward)
         np.multiply(cos_yaw, forward, out=x)
         np.multiply(sin_yaw, sin_roll, out=side)
@@ -155,16 +244,24 @@ class Bodies:
         np.subtract(y, side, out=y)
         np.multiply(cos_pitch, cos_roll, out=z)
         np.multiply(total, lift, out=total)
-        np.subtract(z, GRAVITY_M_S2, out=z)
+        np.subtract(z, _GRAVITY, out=z)
 
         np.subtract(self.velocity, self.air, out=drag)
-        squares = drag * drag
-        airspeed = np.sqrt(squares[0] + squares[1] + squares[2])
+        np.multiply(drag, drag, out=squares)
+        (x, y, z), airspeed = self._square_rows, self._d
+        np.add(x, y, out=airspeed)
+        np.add(airspeed, z, out=airspeed)
+        np.sqrt(airspeed, out=airspeed)
         np.multiply(self._quadratic, airspeed, out=squares)
         np.add(squares, self._linear, out=squares)
         np.multiply(drag, squares, out=drag)
         np.subtract(total, drag, out=total)
-        return total
+
+        np.copyto(self.velocity_before, self.velocity)
+        np.multiply(total, _STEP, out=total)
+        np.add(self.velocity, total, out=self.velocity)
+        np.multiply(self.velocity, _STEP, out=total)
+        np.add(self.position, total, out=self.position)
 
     def _lift(self) -> Floats:
         """Thrust with the motors' lag, raised near the floor by 1 / (1 - (R / 4h)²): Cheeseman and Bennett 1955."""
@@ -176,8 +273,9 @@ class Bodies:
         np.maximum(shortfall, self._rotor_height, out=shortfall)
         np.divide(self._ground_effect, shortfall, out=shortfall)
         np.multiply(shortfall, shortfall, out=shortfall)
-        np.subtract(1.0, shortfall, out=shortfall)
-        return np.divide(self.thrust, shortfall, out=lift)
+        np.subtract(_ONE, shortfall, out=shortfall)
+        np.divide(self.thrust, shortfall, out=lift)
+        return lift
 
 
 def specific_force(bodies: Bodies) -> Floats:
@@ -188,17 +286,21 @@ def specific_force(bodies: Bodies) -> Floats:
     return force
 
 
-def body_rates(bodies: Bodies) -> Floats:
-    """Return angular velocities about the bodies' axes, shape (3, n) [rad/s], from the rates of the Euler angles."""
-    roll_rate, pitch_rate, yaw_rate = bodies.rates
-    sin_roll, sin_pitch, _ = bodies.sin
-    cos_roll, cos_pitch, _ = bodies.cos
-    return np.array(
-        [
-            roll_rate - yaw_rate * sin_pitch,
-            pitch_rate * cos_roll + yaw_rate * sin_roll * cos_pitch,
-            -pitch_rate * sin_roll + yaw_rate * cos_roll * cos_pitch,
-        ]
+def body_rates(rates: N, sin: N, cos: N) -> tuple[N, N, N]:
+    """Return angular velocities about a body's axes [rad/s], from the rates of its Euler angles.
+
+    Args:
+        rates: Of roll, pitch, yaw: three numbers, or three arrays.
+        sin: Sines of roll, pitch, yaw.
+        cos: Cosines.
+    """
+    roll_rate, pitch_rate, yaw_rate = rates
+    sin_roll, sin_pitch, _ = sin
+    cos_roll, cos_pitch, _ = cos
+    return (
+        roll_rate - yaw_rate * sin_pitch,
+        pitch_rate * cos_roll + yaw_rate * sin_roll * cos_pitch,
+        -pitch_rate * sin_roll + yaw_rate * cos_roll * cos_pitch,
     )
 
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-import numpy as np
-
 from skyloop.errors import UsageError
 from skyloop.sim.parameters import VehicleParameters
 from skyloop.sim.solids import Solids
@@ -65,5 +63,4 @@ def _grid(world: World, spacing: float, around: Spawn | None) -> list[tuple[floa
 def _is_clear(spawn: Spawn, drone: VehicleParameters, solids: Solids, margin_m: float) -> bool:
     x, y, z = spawn.position_m
     radius = drone.radius_m + margin_m
-    point = np.array([x, y, z + drone.half_height_m + 1e-6])
-    return solids.overlap(point, np.array([radius, radius, drone.half_height_m])) is None
+    return solids.overlap((x, y, z + drone.half_height_m + 1e-6), radius, drone.half_height_m) is None

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from skyloop.sim.columns import Fields, N, columns, few
 from skyloop.sim.dynamics import Bodies, body_rates, column, specific_force
 from skyloop.sim.parameters import VehicleParameters
 from skyloop.sim.streams import Floats, NormalBlocks, Purpose, stream
@@ -36,6 +37,7 @@ class Sensors:
     Attributes:
         altitude: Of the feet above the floor, (n,) [m].
         velocity: Forward, left, up, levelled axes, (3, n) [m/s].
+        numbers: Of a few drones: altitude and velocity.
     """
 
     def __init__(
@@ -55,9 +57,13 @@ class Sensors:
         self._bias: Floats = deviation * self._bias_normals.take()
         self._inertial = np.empty((9, n))
         self._inertial_step = -1
-        self._estimate = np.empty((4, n))
+        self._estimate = columns(4, n)
         self.altitude: Floats = self._estimate[0]
         self.velocity: Floats = self._estimate[1:]
+        self._few = few(n)
+        if self._few:
+            self.numbers = Fields(self._estimate, 0, 4)
+            self._each = list(enumerate(self._half_height.tolist()))
         self.estimate()
 
     def wander(self) -> None:
@@ -67,13 +73,18 @@ class Sensors:
 
     def estimate(self) -> None:
         """Measure altitude and velocity now."""
-        vx, vy, vz = self._bodies.velocity
-        sin_yaw, cos_yaw = self._bodies.sin[2], self._bodies.cos[2]
-        altitude, forward, left, up = self._estimate
-        np.subtract(self._bodies.position[2], self._half_height, out=altitude)
-        np.add(cos_yaw * vx, sin_yaw * vy, out=forward)
-        np.subtract(cos_yaw * vy, sin_yaw * vx, out=left)
-        np.copyto(up, vz)
+        bodies = self._bodies
+        if self._few:
+            for drone, half_height in self._each:
+                sin_yaw, _, _, cos_yaw = bodies.turned.read[drone]()
+                z, *velocity = bodies.moved.read[drone]()
+                self.numbers.write[drone](z - half_height, *_levelled(velocity, sin_yaw, cos_yaw))
+        else:
+            np.subtract(bodies.position[2], self._half_height, out=self.altitude)
+            for row, values in zip(
+                self.velocity, _levelled(bodies.velocity, bodies.sin[2], bodies.cos[2]), strict=True
+            ):
+                row[:] = values
         np.add(self._estimate, self._bias[9:], out=self._estimate)
         np.add(self._estimate, self._estimate_noise * self._normals.take(), out=self._estimate)
 
@@ -87,10 +98,17 @@ class Sensors:
             bodies = self._bodies
             # Drone after drone from one stream of the step, so that the first ones' noise isn't changed by more drones.
             normals = stream(self._seed, Purpose.INERTIAL, step).standard_normal(self._inertial_noise.shape[::-1]).T
-            truth = np.concatenate([body_rates(bodies), specific_force(bodies), bodies.angles])
+            rates = body_rates(bodies.rates, bodies.sin, bodies.cos)
+            truth = np.concatenate([rates, specific_force(bodies), bodies.angles])
             self._inertial = truth + self._bias[:9] + self._inertial_noise * normals
             self._inertial_step = step
         return self._inertial
+
+
+def _levelled(velocity: N, sin_yaw: N, cos_yaw: N) -> tuple[N, N, N]:
+    """Return a velocity in world axes as forward, left, up."""
+    vx, vy, vz = velocity
+    return cos_yaw * vx + sin_yaw * vy, cos_yaw * vy - sin_yaw * vx, vz
 
 
 def _rows(parameters: Sequence[VehicleParameters], values: Sequence[_Value]) -> Floats:

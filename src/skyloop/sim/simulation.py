@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from skyloop.errors import UsageError
 from skyloop.messages import Action, AnyAction, FlightState
@@ -136,7 +137,8 @@ class Simulation:
         self._bodies.step()
         contacts = self._collisions.resolve(self._step)
         self._step += 1
-        self._autopilot.feel(contacts, self.time_s)
+        if contacts is not None:
+            self._autopilot.feel(contacts, self.time_s)
 
     # Flying ----------------------------------------------------------------------------------------------------
 
@@ -208,6 +210,7 @@ class Simulation:
             if self._autopilot.states[self._number(drone)] not in (FlightState.HOVERING, FlightState.FLYING):
                 raise UsageError(f"drone {drone} is {self._autopilot.states[drone]}: only one that flies can be put")
             self._bodies.put(drone, place, wrap_angle(yaw_rad), GRAVITY_M_S2)
+            self._collisions.moved(drone)
             altitude = position_m[2] - self.parameters[drone].half_height_m
             self._autopilot.hover_here(drone, altitude, self.time_s)
 
@@ -251,7 +254,9 @@ class Simulation:
                 pitch_rad=pitch,
                 yaw_rad=wrap_angle(yaw),
                 quaternion=quaternion_from_euler(roll, pitch, yaw),
-                angular_velocity_rad_s=_vec3(body_rates(bodies)[:, i]),
+                angular_velocity_rad_s=body_rates(
+                    *(rows[:, i].tolist() for rows in (bodies.rates, bodies.sin, bodies.cos))
+                ),
                 thrust=float(bodies.thrust[i]) / GRAVITY_M_S2,
                 wind_m_s=_vec3(bodies.air[:, i]),
                 battery=float(self._batteries.charge[i]),
@@ -265,6 +270,23 @@ class Simulation:
         """
         with self._lock:
             return self._bodies.position.T.copy(), rotations(self._bodies.sin, self._bodies.cos)
+
+    def motions(self) -> tuple[Floats, Floats, Floats]:
+        """Return how all drones move, as new arrays: what a task needs of many at once.
+
+        Returns:
+            True positions in world axes, shape (n, 3) [m]; velocities forward, left and up as the drones estimate them,
+            up to 12 ms older, shape (n, 3) [m/s]; true roll, pitch and yaw, yaw within ±π, shape (n, 3) [rad].
+        """
+        with self._lock:
+            angles = self._bodies.angles.T.copy()
+            angles[:, 2] = wrap_angle(angles[:, 2])
+            return self._bodies.position.T.copy(), self._sensors.velocity.T.copy(), angles
+
+    def airborne(self) -> NDArray[np.bool_]:
+        """Return which drones fly, shape (n,); see :attr:`FlightState.airborne`."""
+        with self._lock:
+            return np.array([state.airborne for state in self._autopilot.states])
 
     def target_states(self, time_s: float | None = None) -> tuple[TargetState, ...]:
         """Return the states of the moving targets, in the world's order.

@@ -1,20 +1,20 @@
-"""The solid things of a world as arrays, and the distances of drones from them."""
+"""The solid things of a world, and how far drones are from them or within them."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from skyloop.sim.broad_phase import Indices
 from skyloop.sim.streams import Floats
 from skyloop.sim.targets import TargetTrack, top_speed
 from skyloop.sim.world import FigureTarget, FixedYaw, PlatformTarget, Vec3, World
 
 
-@dataclass(frozen=True, slots=True)
-class Overlap:
+class Overlap(NamedTuple):
     """A drone within a solid (or outside of the room).
 
     Attributes:
@@ -43,13 +43,18 @@ class Solids:
         self._half = np.array(sizes).reshape(-1, 3).T[:, :, None] / 2  # (3, boxes, 1)
         self._centre = np.zeros((3, len(sizes), 1))
         self._cos, self._sin = np.ones((len(sizes), 1)), np.zeros((len(sizes), 1))
-        self._velocity = np.zeros((3, len(sizes)))
-        self._spin = np.zeros(len(sizes))
+        # The same as plain numbers, with which one box is looked at faster: centre, half the size, cosine and sine of
+        # yaw; and how fast each goes and turns.
+        self._boxes = [(0.0,) * 8 for _ in sizes]
+        self._motions: list[tuple[Vec3, float]] = [((0.0, 0.0, 0.0), 0.0) for _ in sizes]
         for number, box in enumerate(boxes):
-            self._place(number, np.array(box.position_m), box.yaw_rad)
+            self._place(number, box.position_m, box.yaw_rad)
+        self._bounds = np.zeros((3, len(sizes))), np.zeros((3, len(sizes)))
+        self._bounded_m = math.nan  # the radius for which these are
         size_x, size_y, height = world.room.size_m
-        self._room_low = np.array([[-size_x / 2], [-size_y / 2], [-np.inf]])
-        self._room_high = np.array([[size_x / 2], [size_y / 2], [height]])
+        self.room_low = np.array([[-size_x / 2], [-size_y / 2], [-np.inf]])
+        self.room_high = np.array([[size_x / 2], [size_y / 2], [height]])
+        self._room = size_x / 2, size_y / 2, height
         self.top_speed_m_s = max((_top_speed(target) for _, target in movers), default=0.0)
         self.move(0.0)
 
@@ -58,15 +63,67 @@ class Solids:
         """Whether any of the solids moves."""
         return bool(self._movers)
 
+    def __len__(self) -> int:
+        """Return the number of boxes, platforms and figures; they are numbered, and those that move come last."""
+        return len(self._boxes)
+
+    @property
+    def fixed(self) -> int:
+        """The number of those that don't move."""
+        return self._fixed
+
     def move(self, time_s: float) -> None:
         """Move the moving solids to where they are at a time."""
         for number, (track, lifts) in enumerate(zip(self._movers, self._lifts, strict=True), self._fixed):
             state = track.at(time_s)
-            centre = np.array(state.position_m)  # of a platform's top, of a figure's foot print
-            centre[2] += self._half[2, number, 0] * (-1.0 if lifts else 1.0)
-            self._place(number, centre, state.yaw_rad)
-            self._velocity[:, number] = state.velocity_m_s
-            self._spin[number] = state.yaw_rate_rad_s
+            x, y, z = state.position_m  # of a platform's top, of a figure's foot print
+            half = float(self._half[2, number, 0])
+            centre = (x, y, z - half if lifts else z + half)
+            self._place(number, centre, state.yaw_rad, state.velocity_m_s, state.yaw_rate_rad_s)
+
+    def bounds(self, seconds: float, radius_m: float) -> tuple[Floats, Floats]:
+        """Return bounding boxes, low and high, each (3, boxes) [m]; not to be kept.
+
+        Args:
+            seconds: For so long moving ones stay within theirs, from where they are now.
+            radius_m: Of hulls that meet a box only where their own bounding box meets this one. (A hull is as far from
+                the corner of a turned box as a square would be that is turned likewise.)
+        """
+        if radius_m != self._bounded_m:
+            self._bounded_m = radius_m
+            self._bound(slice(0, self._fixed), 0.0)
+        if self._movers:
+            self._bound(slice(self._fixed, None), self.top_speed_m_s * seconds)
+        return self._bounds
+
+    def _bound(self, which: slice, reach_m: float) -> None:
+        """Work out the bounding boxes of some solids, so much larger all round."""
+        c, s = np.abs(self._cos[which]), np.abs(self._sin[which])
+        x, y, z = self._half[:, which]
+        corner = (c + s - 1.0) * self._bounded_m + reach_m
+        around = np.array([c * x + s * y + corner, s * x + c * y + corner, z + reach_m])
+        low, high = self._bounds
+        low[:, which] = (self._centre[:, which] - around)[:, :, 0]
+        high[:, which] = (self._centre[:, which] + around)[:, :, 0]
+
+    def within(self, points: Floats, numbers: Indices, sizes: Floats) -> Indices:
+        """Return which points are within a solid each: indices into ``points``, ascending.
+
+        Args:
+            points: Shape (3, m), m at least 1.
+            numbers: The solid of each point, shape (m,).
+            sizes: What :meth:`sizes` returns for the same numbers and the points' hulls.
+        """
+        x, y, z = points - self._centre[:, :, 0].take(numbers, axis=1)
+        c, s = self._cos[:, 0].take(numbers), self._sin[:, 0].take(numbers)
+        away = np.array([c * x + s * y, c * y - s * x, z])
+        found: Indices = (np.abs(away) < sizes).all(axis=0).nonzero()[0]
+        return found
+
+    def sizes(self, numbers: Indices, hulls: Floats) -> Floats:
+        """Return half the sizes of solids with hulls (3, m) around them, shape (3, m)."""
+        grown: Floats = self._half[:, :, 0].take(numbers, axis=1) + hulls
+        return grown
 
     def clearance(self, points: Floats, hulls: Floats) -> Floats:
         """Return the distance to the nearest solid, wall or ceiling, (m,).
@@ -77,52 +134,77 @@ class Solids:
             points: Of the drones, (3, m).
             hulls: Radius, radius, half height, (3, m).
         """
-        room = np.minimum(points - self._room_low, self._room_high - points) - hulls
+        room = np.minimum(points - self.room_low, self.room_high - points) - hulls
         nearest: Floats = room.min(axis=0)
         if self._half.shape[1]:
             outside = np.abs(self._local(points)) - (self._half + hulls[:, None, :])
             nearest = np.minimum(nearest, outside.max(axis=0).min(axis=0))
         return nearest
 
-    def overlap(self, point: Floats, hull: Floats, *, moving: bool = True) -> Overlap | None:
-        """Return the deepest overlap of one drone, or None. ``point`` and ``hull`` are (3,)."""
-        low = self._room_low[:, 0] + hull - point
-        high = point - (self._room_high[:, 0] - hull)
-        axis = int(np.maximum(low, high).argmax())
-        depth = float(max(low[axis], high[axis]))
-        worst = None
-        if depth > 0:
-            normal = [0.0, 0.0, 0.0]
-            normal[axis] = 1.0 if low[axis] > high[axis] else -1.0
-            worst = Overlap((normal[0], normal[1], normal[2]), depth)
-        count = self._half.shape[1] if moving else self._fixed
-        if count:
-            local = self._local(point[:, None])[:, :count, 0]
-            inside = self._half[:, :count, 0] + hull[:, None] - np.abs(local)
-            depths = inside.min(axis=0)
-            box = int(depths.argmax())
-            if depths[box] > max(depth, 0.0):
-                worst = self._way_out(box, local[:, box], inside[:, box])
-        return worst
+    def overlap(
+        self, point: Sequence[float], radius: float, half_height: float, among: Iterable[int] | None = None
+    ) -> Overlap | None:
+        """Return the deepest overlap of one drone, or None.
 
-    def _way_out(self, box: int, local: Floats, inside: Floats) -> Overlap:
-        axis = int(inside.argmin())
-        if box >= self._fixed and self._lifts[box - self._fixed] and local[2] > 0:
+        Args:
+            point: Its centre, three numbers [m].
+            radius: Of its hull [m].
+            half_height: Of its hull [m].
+            among: The solids to look at, beside the room; None is all.
+        """
+        x, y, z = point
+        wide, deep, tall = self._room
+        deepest, worst = 0.0, None
+        beyond_x, beyond_y, beyond_z = abs(x) + radius - wide, abs(y) + radius - deep, z + half_height - tall
+        if beyond_x > 0.0 or beyond_y > 0.0 or beyond_z > 0.0:
+            deepest = max(beyond_x, beyond_y, beyond_z)
+            if deepest == beyond_x:
+                normal = (-1.0 if x > 0 else 1.0, 0.0, 0.0)
+            elif deepest == beyond_y:
+                normal = (0.0, -1.0 if y > 0 else 1.0, 0.0)
+            else:
+                normal = (0.0, 0.0, -1.0)
+            worst = Overlap(normal, deepest)
+        found = -1
+        local = inside = (0.0, 0.0, 0.0)
+        for number in range(len(self)) if among is None else among:
+            centre_x, centre_y, centre_z, half_x, half_y, half_z, c, s = self._boxes[number]
+            up = z - centre_z
+            inside_z = half_z + half_height - abs(up)
+            if inside_z <= deepest:
+                continue
+            east, north = x - centre_x, y - centre_y
+            ahead, left = c * east + s * north, c * north - s * east
+            inside_x, inside_y = half_x + radius - abs(ahead), half_y + radius - abs(left)
+            if inside_x > deepest and inside_y > deepest:
+                deepest, found = min(inside_x, inside_y, inside_z), number
+                local, inside = (ahead, left, up), (inside_x, inside_y, inside_z)
+        return worst if found < 0 else self._way_out(found, local, inside)
+
+    def _way_out(self, number: int, local: Vec3, inside: Vec3) -> Overlap:
+        axis = inside.index(min(inside))
+        if number >= self._fixed and self._lifts[number - self._fixed] and local[2] > 0:
             axis = 2  # a platform lifts what is on it, however it moves
         sign = 1.0 if local[axis] >= 0 else -1.0
-        c, s = float(self._cos[box, 0]), float(self._sin[box, 0])
+        *_, c, s = self._boxes[number]
         if axis == 2:
             normal = (0.0, 0.0, sign)
         else:
             normal = (c * sign, s * sign, 0.0) if axis == 0 else (-s * sign, c * sign, 0.0)
-        vx, vy, vz = self._velocity[:, box].tolist()
-        spin, (x, y, _) = float(self._spin[box]), local.tolist()
+        (vx, vy, vz), spin = self._motions[number]
+        x, y, _ = local
         surface = (vx - spin * (s * x + c * y), vy + spin * (c * x - s * y), vz)
-        return Overlap(normal, float(inside[axis]), surface, spin)
+        return Overlap(normal, inside[axis], surface, spin)
 
-    def _place(self, number: int, centre: Floats, yaw_rad: float) -> None:
+    def _place(
+        self, number: int, centre: Vec3, yaw_rad: float, velocity: Vec3 = (0.0, 0.0, 0.0), spin: float = 0.0
+    ) -> None:
+        c, s = math.cos(yaw_rad), math.sin(yaw_rad)
         self._centre[:, number, 0] = centre
-        self._cos[number, 0], self._sin[number, 0] = np.cos(yaw_rad), np.sin(yaw_rad)
+        self._cos[number, 0], self._sin[number, 0] = c, s
+        half_x, half_y, half_z = self._half[:, number, 0].tolist()
+        self._boxes[number] = (*centre, half_x, half_y, half_z, c, s)
+        self._motions[number] = velocity, spin
 
     def _local(self, points: Floats) -> Floats:
         """Points (3, m) in the axes of each box, (3, boxes, m)."""
@@ -137,6 +219,3 @@ def _top_speed(target: PlatformTarget | FigureTarget) -> float:
     """Return a speed [m/s] that no point of a target exceeds, those at its corners included."""
     turn = 0.0 if isinstance(target.yaw, FixedYaw) else target.yaw.turn_rate_rad_s
     return top_speed(target.path) + turn * math.hypot(*target.size_m[:2]) / 2
-
-
-Indices = NDArray[np.intp]
