@@ -21,7 +21,7 @@ from skyloop.sim.render import kernels, shading
 from skyloop.sim.render.atlas import GAP, Atlas, AtlasBuilder
 from skyloop.sim.render.base import Image
 from skyloop.sim.render.painter import Painter
-from skyloop.sim.render.quads import QuadBuilder, Quads
+from skyloop.sim.render.quads import Floats, QuadBuilder, Quads
 from skyloop.sim.render.raster import Raster
 from skyloop.sim.render.shadows import Placed
 from skyloop.sim.render.visibility import EDGE_ON_M, PRIORITY_SHARE
@@ -60,6 +60,7 @@ class CompiledPainter(Painter):
         texels = atlas.image.view(np.int32)
         self._pairs = np.ndarray((texels.size - 1,), np.int64, texels.data, 0, (4,))
         self._grid = np.array([grid.width, grid.height, grid.fx, grid.fy, grid.cx, grid.cy], dtype=np.float64)
+        self._fixed: tuple[NDArray[np.intp], Floats, Floats] | None = None
         self._rows_for, kept = _rows(raster)
         self._nearest = np.empty((kernels.BAND, grid.width), np.float32)
         self._numbers = np.empty((kernels.BAND, grid.width), np.int32)
@@ -70,19 +71,20 @@ class CompiledPainter(Painter):
     ) -> None:
         """See :meth:`Painter.paint`."""
         n, atlas = len(quads), self.atlas
+        if self._fixed is None or self._fixed[0] is not quads.texture:  # the scene's, whatever has moved
+            weight = 1.0 + PRIORITY_SHARE * quads.priority
+            origin = np.stack([atlas.x0[quads.texture], atlas.y0[quads.texture], atlas.span[quads.texture]], axis=1)
+            self._fixed = (quads.texture, weight, origin)
+        _, weight, origin = self._fixed
         scene = (
-            quads.corners,
-            quads.normals,
-            quads.u_slope,
-            quads.v_slope,
-            quads.u_start,
-            quads.v_start,
+            quads.vectors,
+            quads.starts,
             quads.two_sided,
             quads.lit,
             shown,
-            1.0 + PRIORITY_SHARE * quads.priority,
+            weight,
             quads.density,
-            np.stack([atlas.x0[quads.texture], atlas.y0[quads.texture], atlas.span[quads.texture]], axis=1),
+            origin,
             np.asarray(pose.position_m, dtype=np.float64),
             np.asarray(pose.rotation, dtype=np.float64),
         )

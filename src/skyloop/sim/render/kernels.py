@@ -30,12 +30,8 @@ _ROUND = np.float32(3 << 22)  # added and taken away, it rounds a number up to 2
 
 
 def prepare(
-    corners: Floats,
-    normals: Floats,
-    u_slope: Floats,
-    v_slope: Floats,
-    u_start: Floats,
-    v_start: Floats,
+    vectors: Floats,
+    starts: Floats,
     two_sided: NDArray[np.bool_],
     lit: NDArray[np.bool_],
     shown: NDArray[np.bool_],
@@ -55,12 +51,8 @@ def prepare(
     """Select the quads that may be seen, as ``visible_quads`` and ``sampling_table`` do.
 
     Args:
-        corners: As those after it, of ``Quads``.
-        normals: See ``Quads``.
-        u_slope: See ``Quads``.
-        v_slope: See ``Quads``.
-        u_start: See ``Quads``.
-        v_start: See ``Quads``.
+        vectors: As those after it, of ``Quads``.
+        starts: See ``Quads``.
         two_sided: See ``Quads``.
         lit: See ``Quads``.
         shown: Whether a quad is to be drawn at all, (n,).
@@ -97,14 +89,14 @@ def prepare(
     for k in range(len(shown)):
         if not shown[k]:
             continue
-        n0, n1, n2 = normals[k, 0], normals[k, 1], normals[k, 2]
-        above = n0 * (p0 - corners[k, 0, 0]) + n1 * (p1 - corners[k, 0, 1]) + n2 * (p2 - corners[k, 0, 2])
+        n0, n1, n2 = vectors[k, 4, 0], vectors[k, 4, 1], vectors[k, 4, 2]
+        above = n0 * (p0 - vectors[k, 0, 0]) + n1 * (p1 - vectors[k, 0, 1]) + n2 * (p2 - vectors[k, 0, 2])
         if not (above > edge_on or (two_sided[k] and above < -edge_on)):
             continue
         off_left = off_right = off_top = off_bottom = behind = True
         ahead = True
         for i in range(4):
-            d0, d1, d2 = corners[k, i, 0] - p0, corners[k, i, 1] - p1, corners[k, i, 2] - p2
+            d0, d1, d2 = vectors[k, i, 0] - p0, vectors[k, i, 1] - p1, vectors[k, i, 2] - p2
             x[i] = d0 * r00 + d1 * r10 + d2 * r20
             y[i] = d0 * r01 + d1 * r11 + d2 * r21
             z[i] = d0 * r02 + d1 * r12 + d2 * r22
@@ -141,10 +133,10 @@ def prepare(
         planes[count, 0], planes[count, 1] = along_x, along_y
         planes[count, 2] = start - along_x * cx - along_y * cy
         count += 1
-        u0, u1, u2 = u_slope[k, 0], u_slope[k, 1], u_slope[k, 2]
-        v0, v1, v2 = v_slope[k, 0], v_slope[k, 1], v_slope[k, 2]
-        under_u = u0 * p0 + u1 * p1 + u2 * p2 + u_start[k] - origin[k, 2]
-        under_v = v0 * p0 + v1 * p1 + v2 * p2 + v_start[k]
+        u0, u1, u2 = vectors[k, 5, 0], vectors[k, 5, 1], vectors[k, 5, 2]
+        v0, v1, v2 = vectors[k, 6, 0], vectors[k, 6, 1], vectors[k, 6, 2]
+        under_u = u0 * p0 + u1 * p1 + u2 * p2 + starts[k, 0] - origin[k, 2]
+        under_v = v0 * p0 + v1 * p1 + v2 * p2 + starts[k, 1]
         table[0, count] = u0 * r00 + u1 * r10 + u2 * r20 + under_u * c0
         table[1, count] = u0 * r01 + u1 * r11 + u2 * r21 + under_u * c1
         table[2, count] = u0 * r02 + u1 * r12 + u2 * r22 + under_u * c2
@@ -244,6 +236,7 @@ def draw(
             crossings[k, i, 0] = edges[k, i, 1] / -edges[k, i, 0]
             crossings[k, i, 1] = edges[k, i, 2] / -edges[k, i, 0]
     differs, near_by = np.empty(columns, np.int16), np.empty(columns, np.int16)
+    none, sign = np.int16(0), np.int16(~NUMBER)
     room = 5 * BLOCK  # each pixel, and four samples of it where they differ
     number, mixed = np.empty(room, np.int32), np.empty(BLOCK, np.int32)
     x_, y_, w_ = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
@@ -302,7 +295,7 @@ def draw(
                     near_by[n] = differs[n] | differs[n + 1] | base[n] ^ base[n + 1]
                 near_by[columns - 1] = differs[columns - 1]
                 for n in range(columns):
-                    near_by[n] = np.int16(near_by[n] + NUMBER) & ~NUMBER
+                    near_by[n] = sign if near_by[n] != 0 else none
                 for row in range(compared, end):
                     line = seen[row & kept]
                     for n in range(columns):
