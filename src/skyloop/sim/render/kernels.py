@@ -240,7 +240,9 @@ def draw(
     room = 5 * BLOCK  # each pixel, and four samples of it where they differ
     number, mixed = np.empty(room, np.int32), np.empty(BLOCK, np.int32)
     x_, y_, w_ = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
-    spot, detail = np.empty(room, np.int32), np.empty(room, np.int32)
+    u_, v_, size = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
+    left, top_, light = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room, np.int32)
+    part_u, part_v, spot = np.empty(room, np.int32), np.empty(room, np.int32), np.empty(room, np.int32)
     upper, lower = np.empty(room, np.int64), np.empty(room, np.int64)
     above_, below_ = upper.view(np.int32), lower.view(np.int32)
     colours = np.empty(room, np.int32)
@@ -328,63 +330,75 @@ def draw(
                     y_[total], y_[total + 1] = sample_y[row], sample_y[row]
                     y_[total + 2], y_[total + 3] = sample_y[row + 1], sample_y[row + 1]
                     total += 4
-        # Where on its texture: pixels in a row that show one quad at once, then single samples.
+        # What the texture's place is computed from: for the pixels in a row that show one quad at once, then by samples.
         start = 0
-        while start < total:
+        while start < count_:
             quad = number[start]
             end = start + 1
-            if start < count_:
-                while end < count_ and number[end] == quad:
-                    end += 1
-                # A little beyond, so that there is no rest; the next ones overwrite it.
-                stop = min(start + (end - start + 31) // 32 * 32, count_)
-                xs, ys = flat_x[begin + start : begin + stop], flat_y[begin + start : begin + stop]
-            else:
-                stop = end
-                xs, ys = x_[start:stop], y_[start:stop]
-            ws, places, details = w_[start:stop], spot[start:stop], detail[start:stop]
-            p0, p1, p2 = table[6, quad], table[7, quad], table[8, quad]
-            q0, q1, q2 = table[0, quad], table[1, quad], table[2, quad]
-            r0, r1, r2 = table[3, quad], table[4, quad], table[5, quad]
-            size, left, top_, light = table[9, quad], table[10, quad], table[11, quad], np.int32(table[12, quad]) << 10
-            for n in range(len(ws)):
-                w = p0 * xs[n] + p1 * ys[n] + p2
-                w = w if w > far else far
-                ws[n] = w
-                inverse = one / w
-                area = size * inverse * inverse * inverse
-                at, by = zero, one
-                at = at if area < np.float32(4.0) else one
-                by = by if area < np.float32(4.0) else half
-                at = at if area < np.float32(16.0) else np.float32(2.0)
-                by = by if area < np.float32(16.0) else np.float32(0.25)
-                at = at if area < np.float32(64.0) else np.float32(3.0)
-                by = by if area < np.float32(64.0) else np.float32(0.125)
-                at = at if area < np.float32(256.0) else np.float32(4.0)
-                by = by if area < np.float32(256.0) else np.float32(0.0625)
-                at = at if area < np.float32(1024.0) else np.float32(5.0)
-                by = by if area < np.float32(1024.0) else np.float32(0.03125)
-                at = at if area < np.float32(4096.0) else np.float32(6.0)
-                by = by if area < np.float32(4096.0) else np.float32(0.015625)
-                scale = inverse * by
-                u = (q0 * xs[n] + q1 * ys[n] + q2) * scale + between * at + left
-                u = u if u > zero else zero
-                u = u if u < most_u else most_u
-                v = (r0 * xs[n] + r1 * ys[n] + r2) * scale + top_
-                v = v if v > zero else zero
-                v = v if v < most_v else most_v
-                at_u, at_v = np.int32(u * parts + _ROUND - _ROUND), np.int32(v * parts + _ROUND - _ROUND)
-                details[n] = np.int32(np.int32(np.int32(at_v & 31) << 5) | np.int32(at_u & 31) | light)
-                places[n] = np.int32(np.int32(np.int32(at_v >> 5) * stride) + np.int32(at_u >> 5))
+            while end < count_ and number[end] == quad:
+                end += 1
+            # A little beyond, so that there is no rest; the next ones overwrite it.
+            stop = min(start + (end - start + 31) // 32 * 32, count_)
+            xs, ys = flat_x[begin + start : begin + stop], flat_y[begin + start : begin + stop]
+            into = w_[start:stop]
+            p, q, r = table[6, quad], table[7, quad], table[8, quad]
+            for n in range(len(into)):
+                into[n] = p * xs[n] + q * ys[n] + r
+            into = u_[start:stop]
+            p, q, r = table[0, quad], table[1, quad], table[2, quad]
+            for n in range(len(into)):
+                into[n] = p * xs[n] + q * ys[n] + r
+            into = v_[start:stop]
+            p, q, r = table[3, quad], table[4, quad], table[5, quad]
+            for n in range(len(into)):
+                into[n] = p * xs[n] + q * ys[n] + r
+            size[start:stop] = table[9, quad]
+            left[start:stop] = table[10, quad]
+            top_[start:stop] = table[11, quad]
+            light[start:stop] = np.int32(table[12, quad])
             start = end
+        for n in range(count_, total):
+            quad, x, y = number[n], x_[n], y_[n]
+            w_[n] = table[6, quad] * x + table[7, quad] * y + table[8, quad]
+            u_[n] = table[0, quad] * x + table[1, quad] * y + table[2, quad]
+            v_[n] = table[3, quad] * x + table[4, quad] * y + table[5, quad]
+            size[n], left[n], top_[n] = table[9, quad], table[10, quad], table[11, quad]
+            light[n] = np.int32(table[12, quad])
+        for n in range(total):
+            w = w_[n] if w_[n] > far else far
+            w_[n] = w
+            inverse = one / w
+            area = size[n] * inverse * inverse * inverse
+            at, by = zero, one
+            at = at if area < np.float32(4.0) else one
+            by = by if area < np.float32(4.0) else half
+            at = at if area < np.float32(16.0) else np.float32(2.0)
+            by = by if area < np.float32(16.0) else np.float32(0.25)
+            at = at if area < np.float32(64.0) else np.float32(3.0)
+            by = by if area < np.float32(64.0) else np.float32(0.125)
+            at = at if area < np.float32(256.0) else np.float32(4.0)
+            by = by if area < np.float32(256.0) else np.float32(0.0625)
+            at = at if area < np.float32(1024.0) else np.float32(5.0)
+            by = by if area < np.float32(1024.0) else np.float32(0.03125)
+            at = at if area < np.float32(4096.0) else np.float32(6.0)
+            by = by if area < np.float32(4096.0) else np.float32(0.015625)
+            scale = inverse * by
+            u = u_[n] * scale + between * at + left[n]
+            u = u if u > zero else zero
+            u = u if u < most_u else most_u
+            v = v_[n] * scale + top_[n]
+            v = v if v > zero else zero
+            v = v if v < most_v else most_v
+            at_u, at_v = np.int32(u * parts + _ROUND - _ROUND), np.int32(v * parts + _ROUND - _ROUND)
+            part_u[n], part_v[n] = np.int32(at_u & 31), np.int32(at_v & 31)
+            spot[n] = np.int32(np.int32(np.int32(at_v >> 5) * stride) + np.int32(at_u >> 5))
         for n in range(total):
             texel = np.uint64(spot[n])
             upper[n], lower[n] = pairs[texel], pairs[texel + next_row]
         # Between four texels: blue and red at once, as far as sixteen bits for each hold them.
         for n in range(total):
             a, b, c, d = above_[2 * n], above_[2 * n + 1], below_[2 * n], below_[2 * n + 1]
-            right = np.int32(detail[n] & 31)
-            down, bright = np.int32(np.int32(detail[n] >> 5) & 31), np.int32(detail[n] >> 10)
+            right, down, bright = part_u[n], part_v[n], light[n]
             a_, b_ = np.int32(a & 0xFF00FF), np.int32(b & 0xFF00FF)
             c_, d_ = np.int32(c & 0xFF00FF), np.int32(d & 0xFF00FF)
             over = np.int32(np.int32(a_ << 5) + np.int32(right * np.int32(b_ - a_)))
