@@ -85,7 +85,7 @@ class Labeller:
         view = visible_quads(posed.quads, shown, pose, raster.grid)
         buffer.draw(view, posed.quads.priority[view.index])
         numbers = np.append(-1, view.index)  # column 0 of the buffer is "nothing"
-        seen = numbers[buffer.seen.reshape(-1)[raster.lookup[0]]]
+        seen = numbers[buffer.seen.reshape(-1)[raster.lookup]]
         in_view = np.zeros(len(posed.quads), np.bool_)
         in_view[view.index] = True
         found = []
@@ -94,7 +94,7 @@ class Labeller:
                 continue
             alone = visible_quads(posed.quads, quads, pose, raster.grid)
             buffer.draw(alone, posed.quads.priority[alone.index])
-            whole = buffer.seen.reshape(-1)[raster.lookup[0]] > 0
+            whole = buffer.seen.reshape(-1)[raster.lookup] > 0
             count = int(whole.sum())
             if not count:
                 continue

@@ -20,8 +20,8 @@ from skyloop.sim.camera import BOTTOM_CAMERA, CameraModel, CameraPose
 from skyloop.sim.render import kernels, shading
 from skyloop.sim.render.atlas import GAP, Atlas, AtlasBuilder
 from skyloop.sim.render.base import Image
-from skyloop.sim.render.painter import Painter, Singles
-from skyloop.sim.render.quads import QuadBuilder, Quads
+from skyloop.sim.render.painter import Painter
+from skyloop.sim.render.quads import Floats, QuadBuilder, Quads
 from skyloop.sim.render.raster import Raster
 from skyloop.sim.render.shadows import Placed
 from skyloop.sim.render.visibility import EDGE_ON_M, PRIORITY_SHARE
@@ -37,46 +37,54 @@ class Kernels:
     """The functions of ``kernels``; by default as they are, uncompiled."""
 
     prepare: Callable[..., int] = kernels.prepare
-    fill: Callable[..., None] = kernels.fill
-    resolve: Callable[..., int] = kernels.resolve
-    shade: Callable[..., None] = kernels.shade
-    darken: Callable[..., None] = kernels.darken
+    draw: Callable[..., None] = kernels.draw
 
 
 KERNELS: Final = tuple(field.name for field in fields(Kernels))
 
 
 class CompiledPainter(Painter):
-    """Draws with kernels; see :class:`Painter`."""
+    """Draws with kernels; see :class:`Painter`.
+
+    Args:
+        raster: See :class:`Painter`.
+        model: See :class:`Painter`.
+        atlas: See :class:`Painter`.
+        functions: The kernels.
+    """
 
     def __init__(self, raster: Raster, model: CameraModel, atlas: Atlas, functions: Kernels) -> None:
         super().__init__(raster, model, atlas)
-        grid, pixels = raster.grid, raster.lookup.shape[1]
+        grid = raster.grid
         self._do = functions
-        self._texels = atlas.image.view(np.int32)[..., 0]
+        texels = atlas.image.view(np.int32)
+        self._pairs = np.ndarray((texels.size - 1,), np.int64, texels.data, 0, (4,))
         self._grid = np.array([grid.width, grid.height, grid.fx, grid.fy, grid.cx, grid.cy], dtype=np.float64)
-        self._lookup = raster.lookup.view(np.uint32)  # unsigned: no place is counted from the end
+        self._fixed: tuple[NDArray[np.intp], Floats, Floats] | None = None
+        self._rows_for, kept = _rows(raster)
         self._nearest = np.empty((kernels.BAND, grid.width), np.float32)
-        self._seen = np.empty((grid.height, grid.width), np.int32)
-        self._numbers = np.empty(pixels, np.int32)
-        self._mixed = np.empty(pixels, np.int32)
+        self._numbers = np.empty((kernels.BAND, grid.width), np.int32)
+        self._seen = np.empty((kept, grid.width), np.int16)
 
-    def find(self, quads: Quads, shown: NDArray[np.bool_], pose: CameraPose) -> tuple[NDArray[np.int32], Singles]:
-        """See :meth:`Painter.find`."""
+    def paint(
+        self, quads: Quads, shown: NDArray[np.bool_], shadows: list[Placed], pose: CameraPose, picture: Image
+    ) -> None:
+        """See :meth:`Painter.paint`."""
         n, atlas = len(quads), self.atlas
+        if self._fixed is None or self._fixed[0] is not quads.texture:  # the scene's, whatever has moved
+            weight = 1.0 + PRIORITY_SHARE * quads.priority
+            origin = np.stack([atlas.x0[quads.texture], atlas.y0[quads.texture], atlas.span[quads.texture]], axis=1)
+            self._fixed = (quads.texture, weight, origin)
+        _, weight, origin = self._fixed
         scene = (
-            quads.corners,
-            quads.normals,
-            quads.u_slope,
-            quads.v_slope,
-            quads.u_start,
-            quads.v_start,
+            quads.vectors,
+            quads.starts,
             quads.two_sided,
             quads.lit,
             shown,
-            1.0 + PRIORITY_SHARE * quads.priority,
+            weight,
             quads.density,
-            np.stack([atlas.x0[quads.texture], atlas.y0[quads.texture], atlas.span[quads.texture]], axis=1),
+            origin,
             np.asarray(pose.position_m, dtype=np.float64),
             np.asarray(pose.rotation, dtype=np.float64),
         )
@@ -85,32 +93,46 @@ class CompiledPainter(Painter):
         # In one piece each: of another layout Numba would compile the function anew.
         whole = [np.ascontiguousarray(part) for part in scene]
         count = self._do.prepare(*whole, _CONSTANTS, self._grid, self.pixel_area, edges, planes, box, table)
-        self._do.fill(count, edges, planes, box, self._nearest, self._seen)
-        return self._seen.reshape(-1), table
+        raster, pixels = self.raster, picture.shape[0] * picture.shape[1]
+        self._do.draw(
+            count,
+            edges,
+            planes,
+            box,
+            table,
+            raster.samples,
+            raster.to_grid,
+            self._rows_for,
+            raster.rays.x,
+            raster.rays.y,
+            raster.sample_x,
+            raster.sample_y,
+            self._nearest,
+            self._numbers,
+            self._seen,
+            self._pairs,
+            atlas.image.shape[:2],
+            float(GAP),
+            float(shading.FARTHEST),
+            np.array([shadow.box for shadow in shadows], dtype=np.int64).reshape(-1, 4),
+            np.ascontiguousarray(pose.rotation, dtype=np.float32),
+            np.array([shadow.numbers for shadow in shadows], dtype=np.float32).reshape(-1, 7),
+            picture,
+            np.ndarray((pixels - 1,), np.int32, picture.data, 0, (3,)),
+        )
 
-    def resolve(self, seen: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """See :meth:`Painter.resolve`."""
-        count = self._do.resolve(seen, self._lookup, self._numbers, self._mixed)
-        return self._numbers, self._mixed[:count]
 
-    def shade(
-        self,
-        table: Singles,
-        numbers: NDArray[np.int32],
-        ray_x: Singles,
-        ray_y: Singles,
-        colours: NDArray[np.uint8],
-        inverse_depth: Singles,
-    ) -> None:
-        """See :meth:`Painter.shade`."""
-        packed = colours.view(np.int32)[:, 0]
-        farthest = float(shading.FARTHEST)
-        self._do.shade(table, numbers, ray_x, ray_y, self._texels, float(GAP), farthest, packed, inverse_depth)
-
-    def darken(self, picture: Image, shadow: Placed, inverse_depth: Singles) -> None:
-        """See :meth:`Painter.darken`."""
-        rays = self.raster.rays
-        self._do.darken(picture, rays.x, rays.y, inverse_depth, shadow.box, shadow.axes, shadow.numbers)
+def _rows(raster: Raster) -> tuple[NDArray[np.int64], int]:
+    """How many rows of the grid must be known for each row of the picture, and how many of the last ones are needed."""
+    height, width = raster.rays.x.shape
+    row = raster.lookup.reshape(height, width) // raster.grid.width
+    # For the samples below, and to know whether what is below those of the row differs.
+    rows_for = np.minimum(np.maximum.accumulate(row.max(axis=1)) + 2, raster.grid.height).astype(np.int64)
+    at_once = -(-kernels.BLOCK // width) + 1  # rows of the picture
+    first = np.minimum.accumulate(row.min(axis=1)[::-1])[::-1]
+    bands = -(-rows_for // kernels.BAND) * kernels.BAND
+    needed = max(bands[min(start + at_once, height) - 1] - first[start] for start in range(height))
+    return rows_for, 1 << (int(needed) - 1).bit_length()
 
 
 class Compiler:

@@ -68,11 +68,12 @@ class SensorEffects:
         length = math.hypot(dx, dy)
         if length < _BLUR_FROM_PX:
             return
-        half = math.ceil(length / 2) + 1
-        kernel = np.zeros((2 * half + 1, 2 * half + 1), np.float32)
-        steps = np.linspace(-0.5, 0.5, 4 * half + 1)
-        for x, y in zip(half + dx * steps, half + dy * steps, strict=True):
-            kernel[round(y), round(x)] += 1.0
+        steps = np.linspace(-0.5, 0.5, 4 * math.ceil(length / 2) + 5)
+        right, down = np.rint(dx * steps).astype(np.intp), np.rint(dy * steps).astype(np.intp)
+        across, along = abs(right).max(), abs(down).max()
+        # No larger than it must be: OpenCV takes a large one's detour over frequencies, which is slow.
+        kernel = np.zeros((2 * along + 1, 2 * across + 1), np.float32)
+        np.add.at(kernel, (along + down, across + right), 1.0)
         cv2.filter2D(picture, -1, kernel / kernel.sum(), dst=picture, borderType=cv2.BORDER_REPLICATE)
 
 

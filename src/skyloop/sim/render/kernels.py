@@ -20,20 +20,18 @@ if TYPE_CHECKING:
     from skyloop.sim.render.quads import Floats
 
     Singles = NDArray[np.float32]
-    Integers = NDArray[np.int32]
+    Shorts = NDArray[np.int16]
 
-BLOCK = 512  # samples worked on at a time: few enough for the working arrays to stay in the cache
+BLOCK = 512  # pixels worked on at a time: few enough for the working arrays to stay in the cache
 BAND = 16  # rows of the grid, likewise
+FEW = 8  # of them
+NUMBER = 0x7FFF  # the bits of a sample that are a number: the sign says that another one is near
 _ROUND = np.float32(3 << 22)  # added and taken away, it rounds a number up to 2^22 to a whole one, halves to even
 
 
 def prepare(
-    corners: Floats,
-    normals: Floats,
-    u_slope: Floats,
-    v_slope: Floats,
-    u_start: Floats,
-    v_start: Floats,
+    vectors: Floats,
+    starts: Floats,
     two_sided: NDArray[np.bool_],
     lit: NDArray[np.bool_],
     shown: NDArray[np.bool_],
@@ -53,12 +51,8 @@ def prepare(
     """Select the quads that may be seen, as ``visible_quads`` and ``sampling_table`` do.
 
     Args:
-        corners: As those after it, of ``Quads``.
-        normals: See ``Quads``.
-        u_slope: See ``Quads``.
-        v_slope: See ``Quads``.
-        u_start: See ``Quads``.
-        v_start: See ``Quads``.
+        vectors: As those after it, of ``Quads``.
+        starts: See ``Quads``.
         two_sided: See ``Quads``.
         lit: See ``Quads``.
         shown: Whether a quad is to be drawn at all, (n,).
@@ -95,14 +89,14 @@ def prepare(
     for k in range(len(shown)):
         if not shown[k]:
             continue
-        n0, n1, n2 = normals[k, 0], normals[k, 1], normals[k, 2]
-        above = n0 * (p0 - corners[k, 0, 0]) + n1 * (p1 - corners[k, 0, 1]) + n2 * (p2 - corners[k, 0, 2])
+        n0, n1, n2 = vectors[k, 4, 0], vectors[k, 4, 1], vectors[k, 4, 2]
+        above = n0 * (p0 - vectors[k, 0, 0]) + n1 * (p1 - vectors[k, 0, 1]) + n2 * (p2 - vectors[k, 0, 2])
         if not (above > edge_on or (two_sided[k] and above < -edge_on)):
             continue
         off_left = off_right = off_top = off_bottom = behind = True
         ahead = True
         for i in range(4):
-            d0, d1, d2 = corners[k, i, 0] - p0, corners[k, i, 1] - p1, corners[k, i, 2] - p2
+            d0, d1, d2 = vectors[k, i, 0] - p0, vectors[k, i, 1] - p1, vectors[k, i, 2] - p2
             x[i] = d0 * r00 + d1 * r10 + d2 * r20
             y[i] = d0 * r01 + d1 * r11 + d2 * r21
             z[i] = d0 * r02 + d1 * r12 + d2 * r22
@@ -139,10 +133,10 @@ def prepare(
         planes[count, 0], planes[count, 1] = along_x, along_y
         planes[count, 2] = start - along_x * cx - along_y * cy
         count += 1
-        u0, u1, u2 = u_slope[k, 0], u_slope[k, 1], u_slope[k, 2]
-        v0, v1, v2 = v_slope[k, 0], v_slope[k, 1], v_slope[k, 2]
-        under_u = u0 * p0 + u1 * p1 + u2 * p2 + u_start[k] - origin[k, 2]
-        under_v = v0 * p0 + v1 * p1 + v2 * p2 + v_start[k]
+        u0, u1, u2 = vectors[k, 5, 0], vectors[k, 5, 1], vectors[k, 5, 2]
+        v0, v1, v2 = vectors[k, 6, 0], vectors[k, 6, 1], vectors[k, 6, 2]
+        under_u = u0 * p0 + u1 * p1 + u2 * p2 + starts[k, 0] - origin[k, 2]
+        under_v = v0 * p0 + v1 * p1 + v2 * p2 + starts[k, 1]
         table[0, count] = u0 * r00 + u1 * r10 + u2 * r20 + under_u * c0
         table[1, count] = u0 * r01 + u1 * r11 + u2 * r21 + under_u * c1
         table[2, count] = u0 * r02 + u1 * r12 + u2 * r22 + under_u * c2
@@ -160,246 +154,310 @@ def prepare(
     return count
 
 
-def fill(count: int, edges: Floats, planes: Floats, box: NDArray[np.int64], nearest: Singles, seen: Integers) -> None:
-    """Find the nearest quad at each sample, as ``DepthBuffer`` does.
+def draw(
+    count: int,
+    edges: Floats,
+    planes: Floats,
+    box: NDArray[np.int64],
+    table: Singles,
+    samples: int,
+    to_grid: Singles,
+    rows_for: NDArray[np.int64],
+    ray_x: Singles,
+    ray_y: Singles,
+    sample_x: Singles,
+    sample_y: Singles,
+    nearest: Singles,
+    numbers: NDArray[np.int32],
+    seen: Shorts,
+    pairs: NDArray[np.int64],
+    atlas_size: tuple[int, int],
+    gap: float,
+    farthest: float,
+    boxes: NDArray[np.int64],
+    axes: Singles,
+    shadows: Singles,
+    picture: NDArray[np.uint8],
+    packed: NDArray[np.int32],
+) -> None:
+    """Draw a picture as ``PlainPainter`` does with ``DepthBuffer``, ``Shader`` and ``shadows.darken``.
+
+    The nearest quad at each sample is found for a band of the grid, then the rows of the picture that need no more of
+    it are coloured, while the band is still in the cache.
 
     Args:
-        count: What :func:`prepare` returned, and it wrote the next three.
+        count: What :func:`prepare` returned, and it wrote the next four.
         edges: See :func:`prepare`.
         planes: See :func:`prepare`.
         box: See :func:`prepare`.
-        nearest: Is used: 1/z at each sample of a band, (BAND, width).
-        seen: Is written: the table's column for each sample, 0 where there is nothing, (height, width).
+        table: See :func:`prepare`.
+        samples: Of each pixel, 1 or 4.
+        to_grid: See ``Raster``.
+        rows_for: How many rows of the grid must be known for each row of the picture, (height,).
+        ray_x: x of each pixel's ray (x, y, 1), (height, width).
+        ray_y: y of it, (height, width).
+        sample_x: x of the ray of each column of the grid.
+        sample_y: y of the ray of each row of the grid.
+        nearest: Is used: 1/z at each sample of a band, (BAND, columns).
+        numbers: Is used, (BAND, columns).
+        seen: Is used: the table's column for each sample, 0 where there is nothing, and the sign bit where a sample may
+            be another one than the next ones to the right and below. Holds the last rows of the grid that were worked
+            on, as many as the picture needs at a time; a power of two. (rows, columns).
+        pairs: The atlas: each texel and the next one, BGRA each, in one number.
+        atlas_size: Its rows and columns.
+        gap: Between two levels of a texture in the atlas [texels].
+        farthest: 1/z that a ray past a quad's horizon is taken to have [1/m].
+        boxes: Of each shadow: first row, row after the last, first column, column after the last, (s, 4).
+        axes: World from optical.
+        shadows: Numbers of ``shadows.Placed``: below, away x, away y, squared radius, strength, thickness, more of it,
+            (s, 7).
+        picture: Is written: BGR, (height, width, 3).
+        packed: The picture's memory as a number for each pixel but the last, which begin three bytes apart.
     """
-    height, width = seen.shape
-    wide = float(width)
-    along = np.empty((count, width), np.float32)
+    zero, half, one, full = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(255.0)
+    three, parts = np.float32(3.0), np.float32(32.0)  # a texel has 32 parts along each side
+    most_u, most_v = np.float32(atlas_size[1] - 2), np.float32(atlas_size[0] - 2)
+    between, far = np.float32(gap), np.float32(farthest)
+    stride = np.int32(atlas_size[1])
+    next_row = np.uint64(atlas_size[1])  # unsigned: Numba counts no place from the end
+    scale_x, scale_y, start_x, start_y = to_grid[0], to_grid[1], to_grid[2], to_grid[3]
+    height, width = ray_x.shape
+    grid_rows, columns = len(sample_y), len(sample_x)
+    kept = len(seen) - 1  # the bits of a grid's row that are its row in ``seen``
+    kept_, columns_ = np.int32(kept), np.int32(columns)
+    seen_ = seen.reshape(-1)
+    wide = float(columns)
+    along = np.empty((count, columns), np.float32)
+    crossings = np.empty((count, 4, 2))
     for k in range(count):
         for column in range(box[k, 2], box[k, 3]):
             along[k, column] = planes[k, 0] * column
-    for top in range(0, height, BAND):
-        nearest[:] = 0.0
-        seen[top : top + BAND] = 0
-        for k in range(count):
-            number = np.int32(k + 1)
-            for row in range(max(top, box[k, 0]), min(top + BAND, box[k, 1])):
-                low, high = -1.0, wide
-                for i in range(4):
-                    crossing = (edges[k, i, 1] * row + edges[k, i, 2]) / -edges[k, i, 0]
-                    if edges[k, i, 0] > 0.0:
-                        low = max(low, crossing)
-                    else:
-                        high = min(high, crossing)
-                first = int(np.ceil(min(max(low, 0.0), wide)))
-                end = int(np.floor(min(max(high, -1.0), wide - 1.0))) + 1
-                if first >= end:
+        for i in range(4):
+            crossings[k, i, 0] = edges[k, i, 1] / -edges[k, i, 0]
+            crossings[k, i, 1] = edges[k, i, 2] / -edges[k, i, 0]
+    differs, near_by = np.empty(columns, np.int16), np.empty(columns, np.int16)
+    none, sign = np.int16(0), np.int16(~NUMBER)
+    room = 5 * BLOCK  # each pixel, and four samples of it where they differ
+    number, mixed = np.empty(room, np.int32), np.empty(BLOCK, np.int32)
+    x_, y_, w_ = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
+    u_, v_, size = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room, np.float32)
+    left, top_, light = np.empty(room, np.float32), np.empty(room, np.float32), np.empty(room, np.int32)
+    part_u, part_v, spot = np.empty(room, np.int32), np.empty(room, np.int32), np.empty(room, np.int32)
+    upper, lower = np.empty(room, np.int64), np.empty(room, np.int64)
+    above_, below_ = upper.view(np.int32), lower.view(np.int32)
+    colours = np.empty(room, np.int32)
+    depth, shade = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.int32)
+    flat_x, flat_y = ray_x.reshape(-1), ray_y.reshape(-1)
+    known = compared = 0  # rows of the grid
+    for begin in range(0, height * width, BLOCK):
+        count_ = min(BLOCK, height * width - begin)
+        first_row, last_row = begin // width, (begin + count_ - 1) // width
+        while known < rows_for[last_row]:
+            top, bottom = known, min(known + BAND, grid_rows)
+            nearest[:] = 0.0
+            numbers[:] = 0
+            for k in range(count):
+                own = np.int32(k + 1)
+                for row in range(max(top, box[k, 0]), min(bottom, box[k, 1])):
+                    low, high = -1.0, wide
+                    for i in range(4):
+                        crossing = crossings[k, i, 0] * row + crossings[k, i, 1]
+                        if edges[k, i, 0] > 0.0:
+                            low = max(low, crossing)
+                        else:
+                            high = min(high, crossing)
+                    first = int(np.ceil(min(max(low, 0.0), wide)))
+                    end = int(np.floor(min(max(high, -1.0), wide - 1.0))) + 1
+                    if first >= end:
+                        continue
+                    start = np.float32(planes[k, 1] * row + planes[k, 2])
+                    near, shown, across = nearest[row - top, first:end], numbers[row - top, first:end], along[k, first:end]
+                    for n in range(end - first):
+                        candidate = across[n] + start
+                        closer = candidate > near[n]
+                        near[n] = candidate if closer else near[n]
+                        shown[n] = own if closer else shown[n]
+            for row in range(top, bottom):
+                shown, line = numbers[row - top], seen[row & kept]
+                for n in range(columns):
+                    line[n] = shown[n]
+            known = bottom
+            # A few rows at a time: the bits in which the numbers of a column differ, also in the row below, then those
+            # in which they differ from the next column's.
+            last = bottom if bottom == grid_rows or samples == 1 else bottom - 1
+            while compared < last:
+                end = min(compared + FEW, last)
+                base = seen[compared & kept]
+                differs[:] = 0
+                for row in range(compared + 1, min(end + 1, grid_rows)):
+                    line = seen[row & kept]
+                    for n in range(columns):
+                        differs[n] |= line[n] ^ base[n]
+                for n in range(columns - 1):
+                    near_by[n] = differs[n] | differs[n + 1] | base[n] ^ base[n + 1]
+                near_by[columns - 1] = differs[columns - 1]
+                for n in range(columns):
+                    near_by[n] = sign if near_by[n] != 0 else none
+                for row in range(compared, end):
+                    line = seen[row & kept]
+                    for n in range(columns):
+                        line[n] |= near_by[n]
+                compared = end
+        # What each pixel shows, and those that show several quads.
+        xs, ys = flat_x[begin : begin + count_], flat_y[begin : begin + count_]
+        for n in range(count_):
+            column, row = np.int32(xs[n] * scale_x + start_x), np.int32(ys[n] * scale_y + start_y)
+            spot[n] = np.int32(np.int32(np.int32(row & kept_) * columns_) + column)
+        for n in range(count_):
+            number[n] = seen_[np.uint64(spot[n])]
+        total = count_
+        mixtures = 0
+        for n in range(count_):
+            if number[n] < 0:
+                number[n] &= NUMBER
+                if samples == 1:
                     continue
-                down = np.float32(planes[k, 1] * row + planes[k, 2])
-                near, numbers, across = nearest[row - top, first:end], seen[row, first:end], along[k, first:end]
-                for n in range(end - first):
-                    candidate = across[n] + down
-                    closer = candidate > near[n]
-                    near[n] = candidate if closer else near[n]
-                    numbers[n] = number if closer else numbers[n]
-
-
-def resolve(seen: Integers, lookup: NDArray[np.uint32], numbers: Integers, mixed: Integers) -> int:
-    """Find what each pixel shows.
-
-    Args:
-        seen: Of :func:`fill`, flat.
-        lookup: Places in it of each pixel's samples, (1 or 4, pixels).
-        numbers: Is written: the table's column for each pixel's first sample, (pixels,).
-        mixed: Is written: the pixels whose samples see different quads, as many as are returned, (pixels,).
-
-    Returns:
-        How many pixels that are.
-    """
-    first = lookup[0]
-    count = 0
-    if len(lookup) == 1:
-        for pixel in range(len(numbers)):
-            numbers[pixel] = seen[first[pixel]]
-    else:
-        second, third, fourth = lookup[1], lookup[2], lookup[3]
-        for pixel in range(len(numbers)):
-            number = seen[first[pixel]]
-            numbers[pixel] = number
-            others = seen[second[pixel]] ^ number | seen[third[pixel]] ^ number | seen[fourth[pixel]] ^ number
-            mixed[np.uint64(count)] = pixel
-            count += others != 0
-    return count
-
-
-def shade(
-    table: Singles,
-    numbers: Integers,
-    ray_x: Singles,
-    ray_y: Singles,
-    atlas: Integers,
-    gap: float,
-    farthest: float,
-    colours: Integers,
-    inverse_depth: Singles,
-) -> None:
-    """Write the colours and inverse depths of samples, as ``Shader`` does.
-
-    Args:
-        table: Of :func:`prepare`.
-        numbers: The table's column for each sample, (n,).
-        ray_x: x of the ray (x, y, 1), (n,).
-        ray_y: y of the ray, (n,).
-        atlas: Its texels, BGRA in one number each.
-        gap: Between two levels of a texture in the atlas [texels].
-        farthest: 1/z that a ray past a quad's horizon is taken to have [1/m].
-        colours: Is written: BGRA in one number, A is 0, (n,).
-        inverse_depth: Is written [1/m], (n,).
-    """
-    zero, half, one, full = np.float32(0.0), np.float32(0.5), np.float32(1.0), np.float32(255.0)
-    parts, whole = np.float32(32.0), np.float32(1.0 / 1024.0)  # a texel has 32 parts along each side
-    unit, second, third = np.float32(1.0 / 128.0), np.float32(256.0), np.float32(65536.0)
-    most_u, most_v = np.float32(atlas.shape[1] - 2), np.float32(atlas.shape[0] - 2)
-    between, far = np.float32(gap), np.float32(farthest)
-    stride = atlas.shape[1]
-    texels = atlas.reshape(-1)
-    one_on, one_down = np.uint64(1), np.uint64(stride)  # unsigned: Numba counts no place from the end
-    u_, v_, w_ = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
-    left, top, light = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
-    size, level, scale = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
-    at_u, at_v = np.empty(BLOCK, np.int32), np.empty(BLOCK, np.int32)
-    corner = np.empty((4, BLOCK), np.int32)
-    c0, c1, c2, c3 = corner[0], corner[1], corner[2], corner[3]
-    for first in range(0, len(numbers), BLOCK):
-        count = min(BLOCK, len(numbers) - first)
-        block, out, ws = (
-            numbers[first : first + count],
-            colours[first : first + count],
-            inverse_depth[first : first + count],
-        )
+                row, column = int(ys[n] * scale_y + start_y), int(xs[n] * scale_x + start_x)
+                above, below = seen[row & kept], seen[row + 1 & kept]
+                a, b = above[column] & NUMBER, above[column + 1] & NUMBER
+                c, d = below[column] & NUMBER, below[column + 1] & NUMBER
+                if a ^ b | a ^ c | a ^ d:
+                    mixed[mixtures] = n
+                    mixtures += 1
+                    number[total], number[total + 1], number[total + 2], number[total + 3] = a, b, c, d
+                    x_[total], x_[total + 1] = sample_x[column], sample_x[column + 1]
+                    x_[total + 2], x_[total + 3] = sample_x[column], sample_x[column + 1]
+                    y_[total], y_[total + 1] = sample_y[row], sample_y[row]
+                    y_[total + 2], y_[total + 3] = sample_y[row + 1], sample_y[row + 1]
+                    total += 4
+        # What the texture's place is computed from: for the pixels in a row that show one quad at once, then by samples.
         start = 0
-        while start < count:
-            number = block[start]
+        while start < count_:
+            quad = number[start]
             end = start + 1
-            while end < count and block[end] == number:
+            while end < count_ and number[end] == quad:
                 end += 1
-            # A little beyond the run, so that there is no rest; the next run overwrites it.
-            stop = min(start + (end - start + 31) // 32 * 32, count)
-            xs, ys = ray_x[first + start : first + stop], ray_y[first + start : first + stop]
+            # A little beyond, so that there is no rest; the next ones overwrite it.
+            stop = min(start + (end - start + 31) // 32 * 32, count_)
+            xs, ys = flat_x[begin + start : begin + stop], flat_y[begin + start : begin + stop]
             into = w_[start:stop]
-            p, q, r = table[6, number], table[7, number], table[8, number]
+            p, q, r = table[6, quad], table[7, quad], table[8, quad]
             for n in range(len(into)):
                 into[n] = p * xs[n] + q * ys[n] + r
             into = u_[start:stop]
-            p, q, r = table[0, number], table[1, number], table[2, number]
+            p, q, r = table[0, quad], table[1, quad], table[2, quad]
             for n in range(len(into)):
                 into[n] = p * xs[n] + q * ys[n] + r
             into = v_[start:stop]
-            p, q, r = table[3, number], table[4, number], table[5, number]
+            p, q, r = table[3, quad], table[4, quad], table[5, quad]
             for n in range(len(into)):
                 into[n] = p * xs[n] + q * ys[n] + r
-            size[start:stop] = table[9, number]
-            left[start:stop] = table[10, number]
-            top[start:stop] = table[11, number]
-            light[start:stop] = np.float32(int(table[12, number]))
+            size[start:stop] = table[9, quad]
+            left[start:stop] = table[10, quad]
+            top_[start:stop] = table[11, quad]
+            light[start:stop] = np.int32(table[12, quad])
             start = end
-        for n in range(count):
-            ws[n] = w_[n] if w_[n] > far else far
-        for n in range(count):
-            inverse = one / ws[n]
+        for n in range(count_, total):
+            quad, x, y = number[n], x_[n], y_[n]
+            w_[n] = table[6, quad] * x + table[7, quad] * y + table[8, quad]
+            u_[n] = table[0, quad] * x + table[1, quad] * y + table[2, quad]
+            v_[n] = table[3, quad] * x + table[4, quad] * y + table[5, quad]
+            size[n], left[n], top_[n] = table[9, quad], table[10, quad], table[11, quad]
+            light[n] = np.int32(table[12, quad])
+        for n in range(total):
+            w = w_[n] if w_[n] > far else far
+            w_[n] = w
+            inverse = one / w
             area = size[n] * inverse * inverse * inverse
-            at = zero
+            at, by = zero, one
             at = at if area < np.float32(4.0) else one
+            by = by if area < np.float32(4.0) else half
             at = at if area < np.float32(16.0) else np.float32(2.0)
+            by = by if area < np.float32(16.0) else np.float32(0.25)
             at = at if area < np.float32(64.0) else np.float32(3.0)
+            by = by if area < np.float32(64.0) else np.float32(0.125)
             at = at if area < np.float32(256.0) else np.float32(4.0)
+            by = by if area < np.float32(256.0) else np.float32(0.0625)
             at = at if area < np.float32(1024.0) else np.float32(5.0)
+            by = by if area < np.float32(1024.0) else np.float32(0.03125)
             at = at if area < np.float32(4096.0) else np.float32(6.0)
-            level[n] = at
-        for n in range(count):
-            at, by = level[n], one
-            by = by if at < one else half
-            by = by if at < np.float32(2.0) else np.float32(0.25)
-            by = by if at < np.float32(3.0) else np.float32(0.125)
-            by = by if at < np.float32(4.0) else np.float32(0.0625)
-            by = by if at < np.float32(5.0) else np.float32(0.03125)
-            by = by if at < np.float32(6.0) else np.float32(0.015625)
-            scale[n] = one / ws[n] * by
-        for n in range(count):
-            u = u_[n] * scale[n] + between * level[n] + left[n]
+            by = by if area < np.float32(4096.0) else np.float32(0.015625)
+            scale = inverse * by
+            u = u_[n] * scale + between * at + left[n]
             u = u if u > zero else zero
             u = u if u < most_u else most_u
-            at_u[n] = np.int32(u * parts + _ROUND - _ROUND)
-        for n in range(count):
-            v = v_[n] * scale[n] + top[n]
+            v = v_[n] * scale + top_[n]
             v = v if v > zero else zero
             v = v if v < most_v else most_v
-            at_v[n] = np.int32(v * parts + _ROUND - _ROUND)
-        for n in range(count):
-            spot = np.uint64((at_v[n] >> 5) * stride + (at_u[n] >> 5))
-            c0[n], c1[n] = texels[spot], texels[spot + one_on]
-            c2[n], c3[n] = texels[spot + one_down], texels[spot + one_down + one_on]
-        for n in range(count):
-            right, below = np.float32(np.int32(at_u[n] & 31)), np.float32(np.int32(at_v[n] & 31))
-            s0, s1 = (parts - right) * (parts - below), right * (parts - below)
-            s2, s3 = (parts - right) * below, right * below
-            # Whole numbers below 2^24, hence exact. Rounded to the nearest, halves up; with light, halves to even.
-            blue = np.float32(np.int32(c0[n] & 255)) * s0 + np.float32(np.int32(c1[n] & 255)) * s1
-            blue += np.float32(np.int32(c2[n] & 255)) * s2 + np.float32(np.int32(c3[n] & 255)) * s3
-            green = np.float32(np.int32(c0[n] >> 8 & 255)) * s0 + np.float32(np.int32(c1[n] >> 8 & 255)) * s1
-            green += np.float32(np.int32(c2[n] >> 8 & 255)) * s2 + np.float32(np.int32(c3[n] >> 8 & 255)) * s3
-            red = np.float32(np.int32(c0[n] >> 16 & 255)) * s0 + np.float32(np.int32(c1[n] >> 16 & 255)) * s1
-            red += np.float32(np.int32(c2[n] >> 16 & 255)) * s2 + np.float32(np.int32(c3[n] >> 16 & 255)) * s3
-            blue = np.float32(np.int32(blue * whole + half)) * light[n] * unit + _ROUND - _ROUND
-            green = np.float32(np.int32(green * whole + half)) * light[n] * unit + _ROUND - _ROUND
-            red = np.float32(np.int32(red * whole + half)) * light[n] * unit + _ROUND - _ROUND
-            blue = blue if blue < full else full
-            green = green if green < full else full
-            red = red if red < full else full
-            out[n] = np.int32(blue + green * second + red * third)
-
-
-def darken(
-    picture: NDArray[np.uint8],
-    ray_x: Singles,
-    ray_y: Singles,
-    inverse_depth: Singles,
-    box: tuple[int, int, int, int],
-    axes: Singles,
-    shadow: Singles,
-) -> None:
-    """Darken what shows a shadow's place, as ``shadows.darken`` does.
-
-    Args:
-        picture: BGR, (height, width, 3), changed in place.
-        ray_x: Of each pixel, (height, width).
-        ray_y: Of each pixel, (height, width).
-        inverse_depth: Of each pixel, (height, width).
-        box: First row, row after the last, first column, column after the last.
-        axes: World from optical.
-        shadow: Numbers of ``shadows.Placed``: below, away x, away y, squared radius, strength, thickness, more of it.
-    """
-    zero, one, three, full = np.float32(0.0), np.float32(1.0), np.float32(3.0), np.float32(255.0)
-    above, away_x, away_y, square = shadow[0], shadow[1], shadow[2], shadow[3]
-    strength, thickness, more = shadow[4], shadow[5], shadow[6]
-    a0, a1, a2, b0, b1, b2 = axes[0, 0], axes[0, 1], axes[0, 2], axes[1, 0], axes[1, 1], axes[1, 2]
-    c0, c1, c2 = axes[2, 0], axes[2, 1], axes[2, 2]
-    depth, light = np.empty(box[3] - box[2], np.float32), np.empty(box[3] - box[2], np.int32)
-    for row in range(box[0], box[1]):
-        xs, ys, ws = ray_x[row, box[2] : box[3]], ray_y[row, box[2] : box[3]], inverse_depth[row, box[2] : box[3]]
-        out = picture[row, box[2] : box[3]]
-        for n in range(len(light)):
-            depth[n] = one / ws[n]
-        for n in range(len(light)):
-            off = abs((c0 * xs[n] + c1 * ys[n] + c2) * depth[n] - above)
-            at_x = (a0 * xs[n] + a1 * ys[n] + a2) * depth[n] + away_x
-            at_y = (b0 * xs[n] + b1 * ys[n] + b2) * depth[n] + away_y
-            rim = one - (at_x * at_x + at_y * at_y) / square
-            rim = rim if rim > zero else zero
-            rim = rim if off < thickness * depth[n] + more else zero
-            light[n] = np.int32(full - strength * rim * rim * (three - (rim + rim)))
-        for n in range(len(light)):
-            if light[n] < 255:
-                for channel in range(3):
+            at_u, at_v = np.int32(u * parts + _ROUND - _ROUND), np.int32(v * parts + _ROUND - _ROUND)
+            part_u[n], part_v[n] = np.int32(at_u & 31), np.int32(at_v & 31)
+            spot[n] = np.int32(np.int32(np.int32(at_v >> 5) * stride) + np.int32(at_u >> 5))
+        for n in range(total):
+            texel = np.uint64(spot[n])
+            upper[n], lower[n] = pairs[texel], pairs[texel + next_row]
+        # Between four texels: blue and red at once, as far as sixteen bits for each hold them.
+        for n in range(total):
+            a, b, c, d = above_[2 * n], above_[2 * n + 1], below_[2 * n], below_[2 * n + 1]
+            right, down, bright = part_u[n], part_v[n], light[n]
+            a_, b_ = np.int32(a & 0xFF00FF), np.int32(b & 0xFF00FF)
+            c_, d_ = np.int32(c & 0xFF00FF), np.int32(d & 0xFF00FF)
+            over = np.int32(np.int32(a_ << 5) + np.int32(right * np.int32(b_ - a_)))
+            under = np.int32(np.int32(c_ << 5) + np.int32(right * np.int32(d_ - c_)))
+            blue, blue_under = np.int32(over & 0xFFFF), np.int32(under & 0xFFFF)
+            red, red_under = np.int32(over >> 16), np.int32(under >> 16)
+            a_, b_ = np.int32(np.int32(a >> 8) & 0xFF), np.int32(np.int32(b >> 8) & 0xFF)
+            c_, d_ = np.int32(np.int32(c >> 8) & 0xFF), np.int32(np.int32(d >> 8) & 0xFF)
+            green = np.int32(np.int32(a_ << 5) + np.int32(right * np.int32(b_ - a_)))
+            green_under = np.int32(np.int32(c_ << 5) + np.int32(right * np.int32(d_ - c_)))
+            # Rounded to the nearest, halves up; with light, halves to even.
+            blue = np.int32(np.int32(np.int32(blue << 5) + np.int32(down * np.int32(blue_under - blue)) + 512) >> 10)
+            green = np.int32(
+                np.int32(np.int32(green << 5) + np.int32(down * np.int32(green_under - green)) + 512) >> 10
+            )
+            red = np.int32(np.int32(np.int32(red << 5) + np.int32(down * np.int32(red_under - red)) + 512) >> 10)
+            blue, green, red = np.int32(blue * bright), np.int32(green * bright), np.int32(red * bright)
+            blue = np.int32(np.int32(blue + 63 + np.int32(np.int32(blue >> 7) & 1)) >> 7)
+            green = np.int32(np.int32(green + 63 + np.int32(np.int32(green >> 7) & 1)) >> 7)
+            red = np.int32(np.int32(red + 63 + np.int32(np.int32(red >> 7) & 1)) >> 7)
+            blue = blue if blue < 255 else np.int32(255)
+            green = green if green < 255 else np.int32(255)
+            red = red if red < 255 else np.int32(255)
+            colours[n] = np.int32(blue | np.int32(green << 8) | np.int32(red << 16))
+        for n in range(mixtures):
+            spread, green_ = 0x20002, 2  # halves up
+            for k in range(count_ + 4 * n, count_ + 4 * n + 4):
+                spread += colours[k] & 0xFF00FF
+                green_ += colours[k] >> 8 & 0xFF
+            colours[mixed[n]] = spread >> 2 & 0xFF00FF | green_ >> 2 << 8
+        for k in range(len(boxes)):
+            height_, away_x, away_y, square = shadows[k, 0], shadows[k, 1], shadows[k, 2], shadows[k, 3]
+            strength, thickness, more = shadows[k, 4], shadows[k, 5], shadows[k, 6]
+            for row in range(max(first_row, boxes[k, 0]), min(last_row + 1, boxes[k, 1])):
+                at_row = row * width - begin  # where the row begins in the block, or would
+                start = max(at_row + boxes[k, 2], 0)
+                stop = max(min(at_row + boxes[k, 3], count_), start)
+                xs, ys = flat_x[begin + start : begin + stop], flat_y[begin + start : begin + stop]
+                ws, out = w_[start:stop], colours[start:stop]
+                for n in range(len(out)):
+                    depth[n] = one / ws[n]
+                for n in range(len(out)):
+                    off = abs((axes[2, 0] * xs[n] + axes[2, 1] * ys[n] + axes[2, 2]) * depth[n] - height_)
+                    at_x = (axes[0, 0] * xs[n] + axes[0, 1] * ys[n] + axes[0, 2]) * depth[n] + away_x
+                    at_y = (axes[1, 0] * xs[n] + axes[1, 1] * ys[n] + axes[1, 2]) * depth[n] + away_y
+                    rim = one - (at_x * at_x + at_y * at_y) / square
+                    rim = rim if rim > zero else zero
+                    rim = rim if off < thickness * depth[n] + more else zero
+                    shade[n] = np.int32(full - strength * rim * rim * (three - (rim + rim)))
+                for n in range(len(out)):
                     # The nearest to a 255th, by shifts.
-                    product = light[n] * out[n, channel] + 128
-                    out[n, channel] = (product + (product >> 8)) >> 8
+                    dark = np.int32(np.int32(shade[n] * np.int32(out[n] & 0xFF00FF)) + 0x800080)
+                    green = np.int32(np.int32(shade[n] * np.int32(np.int32(out[n] >> 8) & 0xFF)) + 0x80)
+                    dark = np.int32(np.int32(np.int32(dark + np.int32(np.int32(dark >> 8) & 0xFF00FF)) >> 8) & 0xFF00FF)
+                    green = np.int32(np.int32(green + np.int32(green >> 8)) & 0xFF00)
+                    out[n] = np.int32(dark | green)
+        # Each number's fourth byte is the next pixel's first, and written after it.
+        bytes_ = packed[begin : begin + count_]
+        for n in range(len(bytes_)):
+            bytes_[n] = colours[n]
+    for k in range(3):
+        picture[height - 1, width - 1, k] = colours[count_ - 1] >> 8 * k & 0xFF

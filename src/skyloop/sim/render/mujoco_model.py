@@ -204,6 +204,8 @@ def _chosen(quads: Quads, rows: NDArray[np.bool_]) -> Quads:
 def _one_sided(quads: Quads) -> Quads:
     """Those seen from both sides as two, back to back."""
     both = _chosen(quads, quads.two_sided)
-    back = replace(both, corners=both.corners[:, ::-1], normals=-both.normals)
+    vectors = both.vectors.copy()
+    vectors[:, :4], vectors[:, 4] = both.corners[:, ::-1], -both.normals
+    back = replace(both, vectors=vectors)
     joined = concatenate([quads, back])
     return replace(joined, two_sided=np.zeros(len(joined), np.bool_))

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from skyloop.sim.camera import CameraModel, CameraPose
 from skyloop.sim.render.atlas import Atlas
 from skyloop.sim.render.base import Image
-from skyloop.sim.render.painter import Painter, Singles
+from skyloop.sim.render.opencv import cv2
+from skyloop.sim.render.painter import Painter
 from skyloop.sim.render.quads import Quads
 from skyloop.sim.render.raster import Raster
 from skyloop.sim.render.shading import Shader, sampling_table
@@ -23,34 +24,48 @@ class PlainPainter(Painter):
         super().__init__(raster, model, atlas)
         self._shader = Shader(atlas)
         self._buffer = DepthBuffer(raster.grid)
-        self._numbers = np.empty(raster.lookup.shape, np.int32)
+        self._steps = (0, 1, raster.grid.width, raster.grid.width + 1)  # from a pixel's first sample to all four
+        self._colours = np.empty((model.height, model.width, 4), np.uint8)
+        self._inverse_depth = np.empty((model.height, model.width), np.float32)
 
-    def find(self, quads: Quads, shown: NDArray[np.bool_], pose: CameraPose) -> tuple[NDArray[np.int32], Singles]:
-        """See :meth:`Painter.find`."""
+    def paint(
+        self, quads: Quads, shown: NDArray[np.bool_], shadows: list[Placed], pose: CameraPose, picture: Image
+    ) -> None:
+        """See :meth:`Painter.paint`."""
         view = visible_quads(quads, shown, pose, self.raster.grid)
         self._buffer.draw(view, quads.priority[view.index])
-        return self._buffer.seen.reshape(-1), sampling_table(quads, view, pose, self.atlas, self.pixel_area)
+        seen = self._buffer.seen.reshape(-1)
+        table = sampling_table(quads, view, pose, self.atlas, self.pixel_area)
+        numbers, mixed = self._resolve(seen)
+        rays, colours = self.raster.rays, self._colours.reshape(-1, 4)
+        flat_x, flat_y, inverse_depth = rays.x.reshape(-1), rays.y.reshape(-1), self._inverse_depth.reshape(-1)
+        self._shader.shade(table, numbers, flat_x, flat_y, colours, inverse_depth)
+        if len(mixed):
+            self._smooth(seen, table, mixed, colours)
+        cv2.cvtColor(self._colours, cv2.COLOR_BGRA2BGR, dst=picture)
+        for shadow in shadows:
+            darken(picture, shadow, rays, self._inverse_depth)
 
-    def resolve(self, seen: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """See :meth:`Painter.resolve`."""
-        numbers = self._numbers
-        for k, places in enumerate(self.raster.lookup):
-            np.take(seen, places, out=numbers[k], mode="clip")
-        mixed = np.flatnonzero((numbers[1:] != numbers[0]).any(axis=0))
-        return numbers[0], mixed.astype(np.int32)
+    def _resolve(self, seen: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.intp]]:
+        """Return the table's column of each pixel's first sample, (pixels,), and the pixels whose samples differ."""
+        raster = self.raster
+        first = seen[raster.lookup]
+        if raster.samples == 1:
+            return first, np.empty(0, np.intp)
+        differs = np.zeros(len(first), np.bool_)
+        for step in self._steps[1:]:
+            differs |= seen[raster.lookup + step] != first
+        return first, np.flatnonzero(differs)
 
-    def shade(
-        self,
-        table: Singles,
-        numbers: NDArray[np.int32],
-        ray_x: Singles,
-        ray_y: Singles,
-        colours: NDArray[np.uint8],
-        inverse_depth: Singles,
+    def _smooth(
+        self, seen: NDArray[np.int32], table: NDArray[np.float32], pixels: NDArray[np.intp], colours: NDArray[np.uint8]
     ) -> None:
-        """See :meth:`Painter.shade`."""
-        self._shader.shade(table, numbers.astype(np.intp), ray_x, ray_y, colours, inverse_depth)
-
-    def darken(self, picture: Image, shadow: Placed, inverse_depth: Singles) -> None:
-        """See :meth:`Painter.darken`."""
-        darken(picture, shadow, self.raster.rays, inverse_depth)
+        """Colour all samples of pixels whose samples see different quads, and average them."""
+        raster = self.raster
+        places = (raster.lookup[pixels] + np.array(self._steps, dtype=np.int32)[:, None]).reshape(-1)
+        row = places // raster.grid.width
+        ray_x, ray_y = raster.sample_x[places - row * raster.grid.width], raster.sample_y[row]
+        samples = np.empty((len(places), 4), np.uint8)
+        self._shader.shade(table, seen[places], ray_x, ray_y, samples, np.empty(len(places), np.float32))
+        total = samples.reshape(4, -1, 4).sum(axis=0, dtype=np.uint16)
+        colours[pixels] = total + 2 >> 2

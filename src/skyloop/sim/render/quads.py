@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from skyloop.sim.render.atlas import Texture
 
 Floats = NDArray[np.float64]
-CHANGING = ("corners", "normals", "u_slope", "v_slope", "u_start", "v_start")  #: when quads are moved
+_CORNERS = 4  # of a quad's vectors; then come the normal and the slopes of u and v
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,12 +21,8 @@ class Quads:
     the texture's top left edge.
     """
 
-    corners: Floats  #: (n, 4, 3) [m], counter-clockwise seen from the front
-    normals: Floats  #: (n, 3) unit, towards the front
-    u_slope: Floats  #: (n, 3) [texel/m]
-    v_slope: Floats  #: (n, 3) [texel/m]
-    u_start: Floats  #: (n,) [texel]
-    v_start: Floats  #: (n,) [texel]
+    vectors: Floats  #: (n, 7, 3): corners, normal, slope of u, slope of v, in one piece to be moved at once
+    starts: Floats  #: (n, 2) of u and of v [texel]
     texture: NDArray[np.intp]  #: (n,) number in the atlas
     two_sided: NDArray[np.bool_]  #: (n,) seen from behind as well
     priority: NDArray[np.intp]  #: (n,) of things in one plane the highest is seen
@@ -34,7 +30,37 @@ class Quads:
     density: Floats  #: (n,) [texel/m²]
 
     def __len__(self) -> int:
-        return len(self.corners)
+        return len(self.vectors)
+
+    @property
+    def corners(self) -> Floats:
+        """Corners [m], (n, 4, 3), counter-clockwise seen from the front."""
+        return self.vectors[:, :_CORNERS]
+
+    @property
+    def normals(self) -> Floats:
+        """Unit vectors towards the front, (n, 3)."""
+        return self.vectors[:, _CORNERS]
+
+    @property
+    def u_slope(self) -> Floats:
+        """Slope of u [texel/m], (n, 3)."""
+        return self.vectors[:, _CORNERS + 1]
+
+    @property
+    def v_slope(self) -> Floats:
+        """Slope of v [texel/m], (n, 3)."""
+        return self.vectors[:, _CORNERS + 2]
+
+    @property
+    def u_start(self) -> Floats:
+        """Start of u [texel], (n,)."""
+        return self.starts[:, 0]
+
+    @property
+    def v_start(self) -> Floats:
+        """Start of v [texel], (n,)."""
+        return self.starts[:, 1]
 
     def joined(self, other: Quads) -> Quads:
         """These quads, and then the others."""
@@ -47,23 +73,21 @@ class Quads:
 
 def moved_each(many: Quads, positions_m: Floats, rotations: Floats) -> Quads:
     """Quads of ``n`` equal bodies, one body after the other, each after a rotation (n, 3, 3) and a shift (n, 3)."""
+    vectors, starts = np.empty_like(many.vectors), np.empty_like(many.starts)
+    move_each(many, positions_m, rotations, vectors, starts)
+    return replace(many, vectors=vectors, starts=starts)
+
+
+def move_each(many: Quads, positions_m: Floats, rotations: Floats, vectors: Floats, starts: Floats) -> None:
+    """Write the vectors and starts of :func:`moved_each` into arrays of the same shape, which are in one piece."""
     bodies = len(positions_m)
-    across = rotations.transpose(0, 2, 1)
-
-    def turned(vectors: Floats) -> Floats:
-        return np.asarray(np.matmul(vectors.reshape(bodies, -1, 3), across))
-
-    corners = turned(many.corners) + positions_m[:, None]
-    u_slope, v_slope = turned(many.u_slope), turned(many.v_slope)
-    return replace(
-        many,
-        corners=corners.reshape(-1, 4, 3),
-        normals=turned(many.normals).reshape(-1, 3),
-        u_slope=u_slope.reshape(-1, 3),
-        v_slope=v_slope.reshape(-1, 3),
-        u_start=many.u_start - np.matmul(u_slope, positions_m[:, :, None]).reshape(-1),
-        v_start=many.v_start - np.matmul(v_slope, positions_m[:, :, None]).reshape(-1),
+    np.matmul(
+        many.vectors.reshape(bodies, -1, 3), rotations.transpose(0, 2, 1), out=vectors.reshape(bodies, -1, 3)
     )
+    of_bodies = vectors.reshape(bodies, -1, _CORNERS + 3, 3)
+    of_bodies[:, :, :_CORNERS] += positions_m[:, None, None]
+    under = np.matmul(of_bodies[:, :, _CORNERS + 1 :].reshape(bodies, -1, 3), positions_m[:, :, None])
+    np.subtract(many.starts, under.reshape(starts.shape), out=starts)
 
 
 def concatenate(parts: list[Quads]) -> Quads:
@@ -180,12 +204,8 @@ class QuadBuilder:
             *self._rows, strict=True
         )
         return Quads(
-            np.array(corners, dtype=np.float64),
-            np.array(normals, dtype=np.float64),
-            np.array(u_slope, dtype=np.float64),
-            np.array(v_slope, dtype=np.float64),
-            np.array(u_start, dtype=np.float64),
-            np.array(v_start, dtype=np.float64),
+            np.concatenate([np.array(corners), np.array([normals, u_slope, v_slope]).transpose(1, 0, 2)], axis=1),
+            np.array([u_start, v_start], dtype=np.float64).T.copy(),
             np.array(texture, dtype=np.intp),
             np.array(two_sided, dtype=np.bool_),
             np.array(priority, dtype=np.intp),

@@ -13,7 +13,7 @@ from skyloop.sim.render import models
 from skyloop.sim.render.atlas import AtlasBuilder
 from skyloop.sim.render.base import SceneState
 from skyloop.sim.render.figures import figure
-from skyloop.sim.render.quads import CHANGING, Quads, concatenate, moved_each
+from skyloop.sim.render.quads import Quads, concatenate, move_each
 from skyloop.sim.render.room import SIDES, static_quads
 from skyloop.sim.render.shadows import Shadow
 from skyloop.sim.world import BoardTarget, FigureTarget, PlatformTarget, World
@@ -105,28 +105,33 @@ class Scene:
             )
         if len(state.targets) != len(self._targets):
             raise UsageError(f"the world has {len(self._targets)} moving targets, the state {len(state.targets)}")
-        parts = [self._static]
+        vectors, starts = self._everything.vectors.copy(), self._everything.starts.copy()
+        done = len(self._static)
         shadows: list[Shadow] = []
         for template, figure_, target, now in zip(
             self._targets, self._figures, self.world.targets, state.targets, strict=True
         ):
             position, turn = np.array(now.position_m), _yaw(now.yaw_rad)
+            part = slice(done, done + len(template))
+            done = part.stop
             if figure_ is not None:
-                parts.append(figure_.posed(position, turn, now.walked_m))
+                posed = figure_.posed(position, turn, now.walked_m)
+                vectors[part], starts[part] = posed.vectors, posed.starts
                 shadows += figure_.shadows(position, turn)
                 continue
-            parts.append(template.moved(position, turn))
+            move_each(template, position[None], turn[None], vectors[part], starts[part])
             on_floor = np.array([position[0], position[1], 0.0])
             if isinstance(target, BoardTarget):
-                parts.append(self._stand.moved(on_floor, turn))
+                part = slice(done, done + len(self._stand))
+                done = part.stop
+                move_each(self._stand, on_floor[None], turn[None], vectors[part], starts[part])
                 shadows.append(Shadow(on_floor, 0.32, 0.45))
             elif isinstance(target, PlatformTarget):
                 shadows.append(Shadow(on_floor, 0.75 * math.hypot(*target.size_m[:2]), 0.45))
         if self._swarm is not None:
-            parts.append(moved_each(self._swarm, state.drone_positions_m, state.drone_rotations))
+            move_each(self._swarm, state.drone_positions_m, state.drone_rotations, vectors[done:], starts[done:])
             shadows += filter(None, map(self._drone_shadow, state.drone_positions_m.tolist()))
-        changing = {name: np.concatenate([getattr(part, name) for part in parts]) for name in CHANGING}
-        return Posed(replace(self._everything, **changing), self._owner, tuple(shadows))
+        return Posed(replace(self._everything, vectors=vectors, starts=starts), self._owner, tuple(shadows))
 
     def _drone_shadow(self, position_m: list[float]) -> Shadow | None:
         """The soft spot on whatever surface is below a drone; None if it is too high above it."""

@@ -70,7 +70,7 @@ class Shader:
     def shade(
         self,
         table: NDArray[np.float32],
-        seen: NDArray[np.intp],
+        seen: NDArray[np.int32],
         ray_x: NDArray[np.float32],
         ray_y: NDArray[np.float32],
         colours: NDArray[np.uint8],
@@ -88,7 +88,8 @@ class Shader:
         """
         for start in range(0, len(seen), CHUNK):
             part = slice(start, min(start + CHUNK, len(seen)))
-            self._shade_chunk(table, seen[part], ray_x[part], ray_y[part], colours[None, part], inverse_depth[part])
+            numbers = seen[part].astype(np.intp)
+            self._shade_chunk(table, numbers, ray_x[part], ray_y[part], colours[None, part], inverse_depth[part])
 
     def _shade_chunk(
         self,

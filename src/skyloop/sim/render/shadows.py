@@ -32,18 +32,41 @@ class Shadow:
 
 
 @dataclass(frozen=True, slots=True)
+class Extremes:
+    """Least and most of x/z or y/z in each column or row of a picture, (n,), and in all of it."""
+
+    least: NDArray[np.float32]
+    most: NDArray[np.float32]
+    low: float
+    high: float
+
+    @staticmethod
+    def along(values: NDArray[np.float32], axis: int) -> Extremes:
+        """Find them; axis 0: of columns."""
+        least, most = values.min(axis=axis), values.max(axis=axis)
+        return Extremes(least, most, float(least.min()), float(most.max()))
+
+    def span(self, low: float, high: float) -> tuple[int, int] | None:
+        """The first column or row that may see something between two bounds, and the one after the last, or None."""
+        if not (low <= self.high and high >= self.low):
+            return None
+        where = ((self.most >= low) & (self.least <= high)).nonzero()[0]
+        return (int(where[0]), int(where[-1]) + 1) if len(where) else None
+
+
+@dataclass(frozen=True, slots=True)
 class Rays:
     """x/z and y/z of each pixel of a lens, (height, width), and their extremes in each column and row."""
 
     x: NDArray[np.float32]
     y: NDArray[np.float32]
-    columns: tuple[NDArray[np.float32], NDArray[np.float32]]  #: least and most x, (width,)
-    rows: tuple[NDArray[np.float32], NDArray[np.float32]]  #: least and most y, (height,)
+    columns: Extremes  #: of x
+    rows: Extremes  #: of y
 
     @staticmethod
     def of(x: NDArray[np.float32], y: NDArray[np.float32]) -> Rays:
         """Find the extremes."""
-        return Rays(x, y, (x.min(axis=0), x.max(axis=0)), (y.min(axis=1), y.max(axis=1)))
+        return Rays(x, y, Extremes.along(x, 0), Extremes.along(y, 1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,8 +91,9 @@ def placed(shadow: Shadow, pose: CameraPose, rays: Rays) -> Placed | None:
     at = _seen_at((-away @ pose.rotation).tolist(), (shadow.radius_m * pose.rotation[:2]).tolist())
     if not at:
         return None
-    columns = _span(rays.columns, min(x for x, _ in at), max(x for x, _ in at))
-    rows = _span(rays.rows, min(y for _, y in at), max(y for _, y in at))
+    across, down = zip(*at, strict=True)
+    columns = rays.columns.span(min(across), max(across))
+    rows = rays.rows.span(min(down), max(down)) if columns else None
     if columns is None or rows is None:
         return None
     numbers = (-away[2], away[0], away[1], shadow.radius_m**2, 255.0 * shadow.strength, _THICKNESS, _MORE_M)
@@ -117,11 +141,3 @@ def _seen_at(centre: list[float], sides: list[list[float]]) -> list[tuple[float,
             share = (_NEAR_M - z) / (z2 - z)
             found.append(((x + share * (x2 - x)) / _NEAR_M, (y + share * (y2 - y)) / _NEAR_M))
     return found
-
-
-def _span(extremes: tuple[NDArray[np.float32], NDArray[np.float32]], low: float, high: float) -> tuple[int, int] | None:
-    """The first row or column that may see something between two bounds, and the one after the last; None if none."""
-    if not (low <= extremes[1].max() and high >= extremes[0].min()):
-        return None
-    where = np.flatnonzero((extremes[1] >= low) & (extremes[0] <= high))
-    return (int(where[0]), int(where[-1]) + 1) if len(where) else None

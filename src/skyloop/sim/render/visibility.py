@@ -108,8 +108,7 @@ def _columns(edges: Floats, grid: Grid) -> tuple[NDArray[np.int16], NDArray[np.i
     start = edges[..., 2] - slope_x * grid.cx - slope_y * grid.cy
     # An exactly level edge bounds no column; the tiny slope makes it all or nothing for a whole row.
     slope_x[slope_x == 0.0] = 1e-30
-    crossing = slope_y[..., None] * np.arange(grid.height) + start[..., None]
-    crossing /= -slope_x[..., None]
+    crossing = (slope_y / -slope_x)[..., None] * np.arange(grid.height) + (start / -slope_x)[..., None]
     rising = (slope_x > 0.0)[..., None]
     low = np.where(rising, crossing, -1.0).max(axis=1)
     high = np.where(rising, float(grid.width), crossing).min(axis=1)
