@@ -185,6 +185,8 @@ def _wanted(info: inspect.Type, place: Place) -> str:
     if isinstance(plain, inspect.ListType):
         if _tables(plain.item_type):
             return f"tables written [[{place.table}]]"
+        if isinstance(_plain(plain.item_type), inspect.StrType):
+            return "a list of texts"
         return f"a list of at least {plain.min_length} lists of {len(_plain(plain.item_type).item_types)} numbers"
     return "one of " + ", ".join(_choices(info)) if _choices(info) else f"a table [{place.table}]"
 
