@@ -19,17 +19,29 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Final
+from typing import Final, Protocol
 
 from skyloop.transport.local.connection import ServerConnection
 from skyloop.transport.local.sockets import Socket
 
-if TYPE_CHECKING:
-    from skyloop.transport.local.shared_server import SharedLocalServer
-
 CHECK_S: Final = 0.5  #: how often silent connections, and listeners that could not accept, are looked at
 _AFTER_FAILURE_S: Final = 0.01
 _log = logging.getLogger(__name__)
+
+
+class Receiver(Protocol):
+    """A transport server, as its reactor sees it. All but :attr:`reactor` is for the reactor's thread."""
+
+    reactor: Reactor  #: which receives for it now
+
+    def receive(self, reactor: Reactor, source: Source) -> bool:
+        """Take one packet or caller; return whether a packet waits for :meth:`deliver_waiting`."""
+
+    def deliver_waiting(self, reactor: Reactor, source: Source) -> None:
+        """Handle the packet that waits in a source."""
+
+    def end_silent(self, reactor: Reactor, source: Source, now_s: float) -> None:
+        """End a connection that takes too long to send its first packet."""
 
 
 class Source:
@@ -44,7 +56,7 @@ class Source:
     __slots__ = ("connection", "ended", "fileno", "muted", "packet", "server", "since_s", "sock")
 
     def __init__(
-        self, server: SharedLocalServer, sock: Socket | None = None, connection: ServerConnection | None = None
+        self, server: Receiver, sock: Socket | None = None, connection: ServerConnection | None = None
     ) -> None:
         self.server = server
         self.sock = sock
@@ -66,10 +78,10 @@ def receiving() -> bool:
 
 
 class Reactor:
-    """Receives for :class:`SharedLocalServer` ends on one thread, from its construction to :meth:`close`."""
+    """Receives for transport servers on one thread, from its construction to :meth:`close`."""
 
     def __init__(self) -> None:
-        self.inside: SharedLocalServer | None = None  #: whose handler is being called, or may be
+        self.inside: Receiver | None = None  #: whose handler is being called, or may be
         self.entries = 0  #: how often :attr:`inside` was set
         self._lock = threading.Lock()  # guards the table
         self._sources: dict[int, Source] = {}  # by file descriptor
@@ -96,7 +108,7 @@ class Reactor:
             self._epoll.unregister(source.fileno)
             return True
 
-    def split(self, stuck: SharedLocalServer) -> Reactor:
+    def split(self, stuck: Receiver) -> Reactor:
         """Leave this reactor to one server, and return a new one that receives for all others. Any thread.
 
         No packet is lost, none is delivered twice, and the packets of each connection keep their order.
@@ -179,7 +191,7 @@ class Reactor:
                 if source.server.receive(self, source):
                     waiting.append(source)
 
-    def _enter(self, server: SharedLocalServer) -> None:
+    def _enter(self, server: Receiver) -> None:
         self.inside = server
         self.entries += 1
 

@@ -112,9 +112,9 @@ class SharedLocalServer(LocalServer):
         """End a connection that takes too long to send its first packet."""
         with self._lock:
             connection = source.connection
-            if connection is not None and not source.ended and now_s - source.since_s > HELLO_S:
-                if self._is_mine(reactor, source):
-                    self._finish_connection(source, connection, f"it sent no Hello within {HELLO_S:g} s")
+            if connection is None or now_s - source.since_s <= HELLO_S or not self._is_mine(reactor, source):
+                return
+            self._finish_connection(source, connection, f"it sent no Hello within {HELLO_S:g} s")
 
     def _is_mine(self, reactor: Reactor, source: Source) -> bool:
         """Return whether this reactor still receives from it; pass it on or drop it if not."""
