@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import threading
 from collections.abc import Iterator
+from functools import partial
 
 import pytest
 
@@ -53,6 +54,9 @@ class Served:
     @property
     def packets(self) -> list[bytes]:
         return [packet for _, packet in self.log.packets]
+
+    def got(self, *packets: bytes) -> bool:
+        return self.packets == list(packets)
 
     def close(self) -> None:
         self.client.close()
@@ -110,9 +114,13 @@ def test_packets_that_wait_behind_a_blocked_handler_are_handled_after_the_split(
     servers[0].log.on_packet = hold
     assert servers[0].client.send(b"hold")
     assert first.wait(PATIENCE_S)
-    blocked = threading.Event()
-    servers[1].log.on_packet = lambda _, __: (blocked.set(), gate2.wait(PATIENCE_S))[0]
-    gate2 = threading.Event()
+    blocked, gate2 = threading.Event(), threading.Event()
+
+    def block(_: Peer, packet: bytes) -> None:
+        blocked.set()
+        gate2.wait(PATIENCE_S)
+
+    servers[1].log.on_packet = block
     for server in servers[1:]:  # all are ready in the next turn
         for number in range(3):
             assert server.client.send(bytes([number + 1]))
@@ -120,7 +128,7 @@ def test_packets_that_wait_behind_a_blocked_handler_are_handled_after_the_split(
     assert blocked.wait(PATIENCE_S)
     new = reactor.split(servers[1].server)
     for server in (servers[2], servers[3]):
-        wait_until(lambda server=server: server.packets == [b"\1", b"\2", b"\3"], "in order, and once")
+        wait_until(partial(server.got, b"\1", b"\2", b"\3"), "in order, and once")
     gate2.set()
     wait_until(lambda: servers[1].packets == [b"\1", b"\2", b"\3"], "its own too")
     for server in servers:
@@ -140,7 +148,7 @@ def test_a_reactor_that_is_split_while_packets_flow_loses_none(reactor: Reactor)
             made.append(servers[number % 5].server.reactor.split(servers[number % 5].server))
     for server in servers:
         wanted = [number.to_bytes(2, "little") for number in range(count)]
-        wait_until(lambda server=server, wanted=wanted: server.packets == wanted, "all, in order, once")
+        wait_until(partial(server.got, *wanted), "all, in order, once")
     for server in servers:
         server.close()
     for each in made:

@@ -130,7 +130,7 @@ def parse_fleet(text: str, source: str) -> Fleet:
     found = read_tables(parse_toml(text, source), source, _File)
     top = Place(source)
     _checked(top, "name", lambda: check_name(found.name))
-    settings_of(Vehicle(name="unnamed", address="sim://"), found.defaults, top.under("defaults"), Defaults())
+    settings_of(Vehicle(name="unnamed", address="sim://"), found.defaults, top.under("defaults"), found.defaults)
     seen: dict[str, Place] = {}
     vehicles: list[VehicleSettings] = []
     for number, vehicle in enumerate(found.vehicle, start=1):

@@ -197,14 +197,14 @@ class Host:
             while not (vehicle.land(LOOK_S) or hurry()) and time.monotonic() < deadline_s:
                 pass
 
-        threads = [  # of its own each: a driver that hangs keeps no other vehicle in the air
-            threading.Thread(target=land, args=(vehicle,), name="skyloop-host-land", daemon=True)
+        landing = {  # a thread of its own for each: a driver that hangs keeps no other vehicle in the air
+            vehicle: threading.Thread(target=land, args=(vehicle,), name="skyloop-host-land", daemon=True)
             for vehicle in list(self.vehicles.values())
-        ]
-        for thread in threads:
+        }
+        for thread in landing.values():
             thread.start()
-        for thread in threads:
-            while thread.is_alive() and not hurry() and time.monotonic() < deadline_s:
+        for vehicle, thread in landing.items():
+            while thread.is_alive() and vehicle.runs and not hurry() and time.monotonic() < deadline_s:
                 thread.join(LOOK_S)
 
     def close(self, reason: str = "the host was stopped") -> None:

@@ -78,7 +78,7 @@ class Watchdog:
             entries, inside = loop.entries, loop.inside
             if inside is None:
                 continue
-            before, looks = self._seen.get(loop, (entries, 0))
+            before, looks = self._seen.get(loop, (-1, 0))
             looks = looks + punctual if before == entries else 0
             seen[loop] = entries, looks
             if punctual and before == entries and looks in (STALL_LOOKS, HANG_LOOKS):
