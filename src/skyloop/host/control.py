@@ -75,6 +75,8 @@ class Answer(msgspec.Struct, frozen=True):
     code: str = ""
 
 
+_requests: Final[msgspec.json.Decoder[Request]] = msgspec.json.Decoder(Request)
+_answers: Final = msgspec.json.Decoder(Answer)
 #: Carries out a request, on a thread of its own. Raises :class:`skyloop.errors.SkyloopError`.
 Answering = Callable[[Request], Answer]
 _ERRORS: Final[dict[str, type[SkyloopError]]] = {
@@ -152,7 +154,7 @@ class ControlServer:
         if not packet:
             return None
         try:
-            request = msgspec.json.decode(packet[:MAX_REQUEST], type=Request)
+            request = _requests.decode(packet[:MAX_REQUEST])
         except (msgspec.DecodeError, RecursionError) as error:
             return Answer(error=f"the request is not understood: {error}", kind="RefusedError", code="malformed")
         try:
@@ -219,7 +221,7 @@ def ask(name: str, request: Request, *, group: str | None = None) -> Answer:
     except OSError as error:
         raise LinkError(f"the host {name!r} ended the connection: {error.strerror}") from None
     try:
-        answer = msgspec.json.decode(received, type=Answer)
+        answer = _answers.decode(received)
     except msgspec.DecodeError:
         raise LinkError(f"the host {name!r} ended before it answered") from None
     if answer.error:

@@ -22,6 +22,7 @@ LONGEST_PAUSE_S: Final = 30.0
 SILENT_LOOKS: Final = 10  #: seconds without a report after which a process hangs as a whole, and is killed
 STEADY_S: Final = 60.0  #: a process that ran for so long is started again after the first pause
 _LOOK_S: Final = 1.0
+_decoder: Final = msgspec.json.Decoder(VehicleStatus)
 _log = logging.getLogger(__name__)
 
 
@@ -96,7 +97,7 @@ class OwnProcessVehicle(HostedVehicle):
 
     def _parsed(self, line: bytes) -> VehicleStatus | None:
         try:
-            return msgspec.json.decode(line, type=VehicleStatus)
+            return _decoder.decode(line)
         except msgspec.DecodeError:  # a driver's own words
             _log.info("%s: %s", self.settings.name, line.decode(errors="replace").rstrip())
             return None
