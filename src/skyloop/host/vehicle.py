@@ -22,6 +22,7 @@ from skyloop.proxy import Proxy
 from skyloop.proxy.flight_record import FlightRecord, record_path
 from skyloop.proxy.requests import JobQueue
 from skyloop.proxy.serve import keep_trail
+from skyloop.proxy.warm_up import keep_warm
 from skyloop.transport.base import TransportServer
 from skyloop.transport.local.reactor import Reactor
 from skyloop.transport.local.shared_server import SharedLocalServer
@@ -140,6 +141,7 @@ class SharedVehicle(HostedVehicle):
         driver = self._make(settings.address)
         proxy = Proxy(driver, self._end(str(driver.uri)), name=settings.name, ticker=False, jobs=self._jobs)
         proxy.parameters.preset(settings.presets)
+        keep_warm(proxy)
         keep_trail(proxy, None)
         proxy.keep_record(FlightRecord(record_path(settings.name), str(driver.uri)))
         self.proxy = proxy
