@@ -17,7 +17,7 @@ def runtime_dir(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         monkeypatch.setenv("XDG_STATE_HOME", f"{directory}/state")
         monkeypatch.delenv("SKYLOOP_GROUP", raising=False)
         # What is kept warm stays for as long as the process, with a frame slot that tests of those would find.
-        monkeypatch.setattr("skyloop.host.vehicle.keep_warm", lambda proxy: None)
+        monkeypatch.setattr("skyloop.host.host.FEW", 0)
         yield Path(directory) / "run"
 
 

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from skyloop.transport.fabric import FabricSettings
 
 LAND_WITHIN_S: Final = 20.0
+FEW: Final = 8  #: vehicles of which one that is flown alone leaves the code of commands cold
 _AT_ONCE: Final = 8  # vehicles that start at the same time
 _STALL_S: Final = STALL_LOOKS * LOOK_S
 _HANG_S: Final = HANG_LOOKS * LOOK_S
@@ -97,7 +98,11 @@ class Host:
     def _make(self, settings: VehicleSettings, network: FabricSettings | None) -> HostedVehicle:
         if settings.own_process:
             return OwnProcessVehicle(settings, self.announce)
-        return SharedVehicle(settings, self._reactor, self._workers.lane(), network, self._make_driver)
+        lane = self._workers.lane()
+        return SharedVehicle(settings, self._reactor, lane, network, self._make_driver, self._few)
+
+    def _few(self) -> bool:
+        return len(self.vehicles) <= FEW
 
     def add_all(self, several: Sequence[VehicleSettings]) -> dict[str, str]:
         """Serve several vehicles, some at a time; return by name why some could not be served."""

@@ -22,7 +22,7 @@ from skyloop.proxy import Proxy
 from skyloop.proxy.flight_record import FlightRecord, record_path
 from skyloop.proxy.requests import JobQueue
 from skyloop.proxy.serve import keep_trail
-from skyloop.proxy.warm_up import keep_warm
+from skyloop.proxy.warm_up import WARMER
 from skyloop.transport.base import TransportServer
 from skyloop.transport.local.reactor import Reactor
 from skyloop.transport.local.shared_server import SharedLocalServer
@@ -117,6 +117,7 @@ class SharedVehicle(HostedVehicle):
         jobs: Answers its requests that may wait.
         network: How its proxy joins the network; None for this host only.
         make: Makes the driver of an address.
+        few: Whether this process has few vehicles: the code of many is warm by itself.
     """
 
     def __init__(
@@ -126,8 +127,10 @@ class SharedVehicle(HostedVehicle):
         jobs: JobQueue,
         network: FabricSettings | None,
         make: Callable[[str], Driver] = make_driver,
+        few: Callable[[], bool] = lambda: True,
     ) -> None:
         super().__init__(settings)
+        self._few = few
         self._make = make
         self.server = SharedLocalServer(settings.name, reactor, group=settings.group)
         self.proxy: Proxy | None = None
@@ -141,7 +144,7 @@ class SharedVehicle(HostedVehicle):
         driver = self._make(settings.address)
         proxy = Proxy(driver, self._end(str(driver.uri)), name=settings.name, ticker=False, jobs=self._jobs)
         proxy.parameters.preset(settings.presets)
-        keep_warm(proxy)
+        proxy.keep_warm = lambda period_s: WARMER.keep(proxy, period_s if self._few() else 0.0)
         keep_trail(proxy, None)
         proxy.keep_record(FlightRecord(record_path(settings.name), str(driver.uri)))
         self.proxy = proxy
