@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 
 import msgspec
 
-from benchmarks.scale import FRAME_PERIOD_S
+from benchmarks.scale import FRAME_PERIOD_S, loopback
 from skyloop.bench.contract import Arrivals, picture
 from skyloop.bench.machine import Machine, cpu_time_s, memory_bytes
 from skyloop.bench.ours import Listening
@@ -32,6 +32,7 @@ from skyloop.host.fleet import VehicleSettings
 from skyloop.host.host import Host
 from skyloop.host.serve import SWITCH_INTERVAL_S
 from skyloop.transport.fabric import FabricSettings
+from skyloop.transport.local.directory import DIRECTORY_VARIABLE
 
 _AHEAD_NS: Final = 200_000_000
 _ANSWERS_WITHIN_S: Final = 180.0
@@ -67,7 +68,7 @@ class CaseResult(msgspec.Struct, frozen=True):
     opened_s: float  #: that the pilot took to connect to all
 
 
-class Fleet(msgspec.Struct, frozen=True, tag_field="what", tag="fleet"):
+class HostedFleet(msgspec.Struct, frozen=True, tag_field="what", tag="fleet"):
     """A whole run, as in ``fleet.json``."""
 
     machine: Machine
@@ -75,7 +76,17 @@ class Fleet(msgspec.Struct, frozen=True, tag_field="what", tag="fleet"):
     cases: list[CaseResult]
 
 
-def measure(seconds: float, cases: Sequence[Case], progress: Progress = lambda _share, _what: None) -> Fleet:
+def cases_of(vehicles: int, observers: int, networked: int) -> list[Case]:
+    """Return the cases to measure: the vehicles alone, with observers of one, and some over the network."""
+    cases = [Case(vehicles)]
+    if observers:
+        cases.append(Case(vehicles, observers))
+    if networked:
+        cases.append(Case(networked, network=loopback(0)))
+    return cases
+
+
+def measure(seconds: float, cases: Sequence[Case], progress: Progress = lambda _share, _what: None) -> HostedFleet:
     """Measure each case.
 
     Args:
@@ -88,16 +99,17 @@ def measure(seconds: float, cases: Sequence[Case], progress: Progress = lambda _
         progress(number / len(cases), case.name)
         with Workers() as workers:
             results.append(_play(case, workers, seconds))
-    return Fleet(machine, seconds, results)
+    return HostedFleet(machine, seconds, results)
 
 
 def _play(case: Case, workers: Workers, seconds: float) -> CaseResult:
     turn = Turn(0, seconds, frame_period_s=FRAME_PERIOD_S)
     host = workers.start(serve, case)
-    vehicle_mb = host.answer(_ANSWERS_WITHIN_S)
+    host.answer(_ANSWERS_WITHIN_S)
     pilot = workers.start(fly_all, case)
     opened_s = pilot.answer(_ANSWERS_WITHIN_S)
-    shares = [OBSERVERS_AT_ONCE] * (case.observers // OBSERVERS_AT_ONCE)
+    firsts = range(0, case.observers, OBSERVERS_AT_ONCE)
+    shares = [min(OBSERVERS_AT_ONCE, case.observers - first) for first in firsts]
     watching = [workers.start(observe, case, count) for count in shares]
     for worker in watching:
         worker.answer(_ANSWERS_WITHIN_S)
@@ -109,12 +121,12 @@ def _play(case: Case, workers: Workers, seconds: float) -> CaseResult:
     before_s = _used_s(parts)
     sleep_until(begin_ns + round(seconds * 1e9))
     cores = {part: (used_s - before_s[part]) / seconds for part, used_s in _used_s(parts).items()}
-    arrivals, threads = {}, {}
-    for part, worker in (("host", host), ("pilot", pilot)):
-        arrivals[part], threads[part] = worker.answer(seconds + SETTLE_S + _ANSWERS_WITHIN_S)
+    in_time_s = seconds + SETTLE_S + _ANSWERS_WITHIN_S
+    applied, host_threads, vehicle_mb = host.answer(in_time_s)
+    received, pilot_threads = pilot.answer(in_time_s)
     delays = {
-        COMMAND: since(arrivals["host"], begin_ns).get(COMMAND, []),
-        FEEDBACK: since(arrivals["pilot"], begin_ns).get(FEEDBACK, []),
+        COMMAND: since(applied, begin_ns).get(COMMAND, []),
+        FEEDBACK: since(received, begin_ns).get(FEEDBACK, []),
     }
     sent = {COMMAND: case.vehicles * turn.count(COMMAND), FEEDBACK: case.vehicles * turn.count(FEEDBACK)}
     for worker in watching:
@@ -131,7 +143,7 @@ def _play(case: Case, workers: Workers, seconds: float) -> CaseResult:
         bool(case.network),
         {
             name: summarize(
-                [received - at for at, received in found],
+                [arrived - sent_at for sent_at, arrived in found],
                 sent=sent[name],
                 period_s=turn.period_s(name.partition(",")[0]),
             )
@@ -141,7 +153,7 @@ def _play(case: Case, workers: Workers, seconds: float) -> CaseResult:
         {name: min(1.0, len(found) / sent[name]) for name, found in delays.items()},
         cores,
         vehicle_mb,
-        threads,
+        {"host": host_threads, "pilot": pilot_threads},
         opened_s,
     )
 
@@ -185,7 +197,7 @@ def serve(pipe: Pipe, case: Case) -> None:
     one = memory_bytes(os.getpid())
     for each in settings[1:]:
         host.add(each)
-    pipe.send((memory_bytes(os.getpid()) - one) / 1e6 / max(1, case.vehicles - 1))
+    pipe.send("ready")
     try:
         asked = pipe.recv()
         if asked is None:
@@ -199,7 +211,8 @@ def serve(pipe: Pipe, case: Case) -> None:
         for thread in threads:
             thread.join()
         time.sleep(SETTLE_S)
-        pipe.send((recorder.arrivals, threading.active_count()))
+        each_mb = (memory_bytes(os.getpid()) - one) / 1e6 / max(1, case.vehicles - 1)
+        pipe.send((recorder.arrivals, threading.active_count(), each_mb))
         pipe.recv()
     finally:
         host.close()
@@ -224,6 +237,8 @@ def _show(vehicle: BenchVehicle, turn: Turn, begin_ns: int) -> None:
 def fly_all(pipe: Pipe, case: Case) -> None:
     """Run the pilot's process: one program flies all, with a command for each in the same moment."""
     recorder = _Recorder()
+    if case.network:  # elsewhere: who finds the proxies on this host does not ask the network
+        os.environ[DIRECTORY_VARIABLE] = f"/tmp/skyloop-{os.getpid()}-nobody"
     opening_s = time.monotonic()
     with ExitStack() as stack:
         drones = []
@@ -267,3 +282,9 @@ def _names(case: Case) -> list[str]:
 def _connect(case: Case, name: str, access: Access) -> Drone:
     network = FabricSettings(connect=(case.network,), multicast=False) if case.network else False
     return connect(name, access=access, name="bench", on_exit="hover", network=network, timeout_s=20.0)
+
+
+if __name__ == "__main__":
+    from benchmarks.command import main
+
+    main("fleet")
