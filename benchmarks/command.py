@@ -163,8 +163,25 @@ def scale(
     finish("scale", results, as_rich(found, str(results.machine)), output, draw)
 
 
+def fleet(
+    vehicles: Annotated[int, typer.Option(min=2, max=500, help="How many in one host")] = 100,
+    observers: Annotated[int, typer.Option(min=0, max=100, help="Of one of them, in another case; 0: none")] = 50,
+    networked: Annotated[int, typer.Option(min=0, max=500, help="How many over the network; 0: none")] = 50,
+    seconds: Seconds = None,
+    minutes: Minutes = None,
+    output: Output = None,
+) -> None:
+    """Measure many vehicles in one host, flown from one process."""
+    from benchmarks import fleet, tables
+
+    wanted_s = duration_s(seconds, minutes)
+    with measuring("fleet", output) as progress:
+        results = fleet.measure(wanted_s, fleet.cases_of(vehicles, observers, networked), progress)
+    finish("fleet", results, as_rich([tables.fleet_table(results)], str(results.machine)), output)
+
+
 BENCHMARKS: Final[Mapping[str, Callable[..., Any]]] = {
-    function.__name__: function for function in (peers, load, codecs, network, swarm, scale)
+    function.__name__: function for function in (peers, load, codecs, network, swarm, scale, fleet)
 }
 
 

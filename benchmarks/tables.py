@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from benchmarks.codecs import CodecResults
+from benchmarks.fleet import HostedFleet
 from benchmarks.load import PARTS as LOAD_PARTS
 from benchmarks.load import CaseResult as LoadCase
 from benchmarks.load import Load
@@ -156,6 +157,25 @@ def _scale_cells(case: CaseResult) -> list[str]:
         f"{sum(case.cpu.values()):.2f}",
         f"{case.opened_s:.1f} s",
     ]
+
+
+def fleet_table(results: HostedFleet) -> Table:
+    """Return what many vehicles in one host cost, and how late their samples are."""
+    rows = [
+        [
+            str(case.vehicles),
+            "network" if case.network else "local",
+            str(case.observers),
+            *(_pair(case.channels.get(name)) for name in (COMMAND, FEEDBACK, *_OBSERVED)),
+            f"{min(case.shares.values()):.2%}",
+            *(f"{case.cpu.get(part, 0.0):.2f}" for part in ("host", "pilot", "observers")),
+            f"{case.vehicle_mb:.2f}",
+        ]
+        for case in results.cases
+    ]
+    columns = ["vehicles", "way", "observers of one", "command", "feedback", *_OBSERVED, "least share"]
+    columns += ["host, cores", "pilot, cores", "observers, cores", "MB a vehicle"]
+    return Table("Many vehicles in one host; delays in ms: median (99th percentile)", columns, rows)
 
 
 def bend_text(results: Scale, many: str) -> str:

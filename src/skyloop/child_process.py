@@ -80,6 +80,10 @@ class ChildProcess:
         with suppress(OSError):
             self._process.stdin.close()
 
+    def terminate(self) -> None:
+        """Send it SIGTERM. Does not wait. Idempotent."""
+        self._process.terminate()
+
     def kill(self) -> None:
         """Kill it. Does not wait. Idempotent."""
         self._process.kill()

@@ -125,3 +125,12 @@ def eventually(condition: Callable[[], bool], what: str, timeout_s: float = 30.0
         assert time.monotonic() - begin < timeout_s, f"not within {timeout_s} s: {what}"
         time.sleep(0.002)
     return time.monotonic() - begin
+
+
+def skyloop_command(*words: str, code: int = 0) -> str:
+    """Run a command of ``skyloop`` to its end, with this exit code; what it said."""
+    ended = subprocess.run(
+        [sys.executable, "-m", "skyloop", *words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=60
+    )
+    assert ended.returncode == code, ended.stdout.decode()
+    return ended.stdout.decode()

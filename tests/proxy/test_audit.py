@@ -13,7 +13,7 @@ from skyloop.errors import NameTakenError, UsageError
 from skyloop.messages import Event, EventKind, FlightState, Land, ReleaseAuthority, RequestAuthority, Takeoff, Value
 from skyloop.proxy import Proxy
 from skyloop.proxy.audit import AuditTrail, Entry, Tenure, audit_path, entry_of, read, tenures
-from skyloop.proxy.serve import _keep_trail
+from skyloop.proxy.serve import keep_trail
 from skyloop.transport.local import LocalServer
 from tests.proxy.fake import Bench, FakeDriver
 
@@ -150,10 +150,10 @@ def test_the_usual_place_may_be_missing_and_one_that_was_asked_for_may_not(
     (tmp_path / "state").write_text("not a directory")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     bench = Bench()
-    _keep_trail(bench.proxy, None)
+    keep_trail(bench.proxy, None)
     assert "there is no audit trail" in caplog.text
     with pytest.raises(UsageError, match="can't be written"):
-        _keep_trail(bench.proxy, tmp_path / "state" / "mine.jsonl")
+        keep_trail(bench.proxy, tmp_path / "state" / "mine.jsonl")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "other"))
     assert audit_path("alpha") == tmp_path / "other" / "skyloop" / "audit" / "alpha.jsonl"
 

@@ -9,8 +9,8 @@ import pytest
 
 from skyloop.errors import FileFormatError, UnknownNameError, UsageError
 from skyloop.sim import Simulation, load_world, parse_world, shipped_worlds
-from skyloop.sim.toml_file import _explained
 from skyloop.sim.world import BoardTarget, FacePose, Gate, PlatformTarget, RingWalkPath, TargetState
+from skyloop.toml_file import _explained
 
 ROOM = "[room]\nsize = [8, 6, 3]\n"
 BOX = "[[box]]\nstands_at = [1, 1]\nsize = [1, 1, 1]\n"

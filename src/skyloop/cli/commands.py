@@ -89,6 +89,18 @@ COMMANDS: Final = {
         "detect my.onnx --on alpha",
     ),
     "proxy": Entry(Task.SHARE, "proxy", "proxy", "Serve one vehicle under a name", "proxy sim:// --name alpha"),
+    "host": Entry(
+        Task.SHARE,
+        "host",
+        "host",
+        "Serve many vehicles from one process",
+        "host fleet.toml",
+        behaviours={
+            "status": Entry(Task.SHARE, "host", "status", "The vehicles of a running host", "host status"),
+            "add": Entry(Task.SHARE, "host", "add", "Serve one more vehicle", "host add delta tello://192.168.10.1"),
+            "remove": Entry(Task.SHARE, "host", "remove", "Land a vehicle and serve it no longer", "host remove delta"),
+        },
+    ),
     "router": Entry(
         Task.SHARE,
         "router",

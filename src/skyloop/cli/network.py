@@ -78,18 +78,9 @@ def places(
     Raises:
         UsageError: An address or the folder is not valid, or no place is named.
     """
-    from skyloop.transport.fabric.environment import settings
+    from skyloop.transport.fabric.environment import serving
 
-    words = [word.strip() for word in network.split(",") if word.strip()]
-    if not words:
-        raise UsageError("--network names no place: give multicast, or addresses with commas")
-    routers = [word for word in words if word.lower() != MULTICAST]
-    return settings(
-        listen=tuple(listen or ()),
-        connect=(*routers, *(connect or ())),
-        multicast=multicast and len(routers) < len(words),
-        keys=keys,
-    )
+    return serving(network, listen=tuple(listen or ()), connect=tuple(connect or ()), multicast=multicast, keys=keys)
 
 
 def server_ends(settings: FabricSettings | None, group: str | None = None) -> MakeEnd:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -199,6 +199,28 @@ def _check_number(parameter: Parameter, number: float) -> None:
         raise ParameterError(f"{parameter.name} must be {allowed}, not {number!r}", code=Refusal.OUT_OF_RANGE)
 
 
+def check_presets(values: Mapping[str, Value]) -> dict[str, Value]:
+    """Return values of the proxy's own parameters as they may be written.
+
+    Raises :class:`UnknownNameError` for a name that is none of its own, and :class:`ParameterError` for a value that it
+    does not take.
+    """
+    own = {parameter.name: parameter for parameter in OWN}
+    checked: dict[str, Value] = {}
+
+    def number(name: str) -> float:
+        value = checked.get(name, own[name].value)
+        return float(value) if isinstance(value, int | float) else math.nan
+
+    for name, value in values.items():
+        if name not in own:
+            raise UnknownNameError("parameter of a proxy", name, own)
+        checked[name] = check(own[name], value)
+    for name, value in checked.items():
+        check_written(name, value, number)
+    return checked
+
+
 @dataclass(frozen=True, slots=True)
 class FlightSettings:
     """What the parameters ask of the flight."""
@@ -228,7 +250,31 @@ class Parameters:
         self._lock = threading.Lock()
         self._own = {parameter.name: parameter for parameter in OWN}
         self._driver: dict[str, Parameter] = {}
+        self._presets: dict[str, Value] = {}  # that the driver has not taken yet
         self.left_out: tuple[str, ...] = ()  #: driver's parameters that are too large to be sent
+
+    def preset(self, values: Mapping[str, Value]) -> None:
+        """Give the proxy's own parameters other values before it starts.
+
+        Where the vehicle has a parameter of the same name, :meth:`write_presets` writes that.
+
+        Raises :class:`UnknownNameError` and :class:`ParameterError`.
+        """
+        for name, value in check_presets(values).items():
+            self._own[name] = msgspec.structs.replace(self._own[name], value=value)
+            self._presets[name] = value
+
+    def write_presets(self) -> list[tuple[str, str]]:
+        """Write presets to the vehicle where it has such parameters. Returns which could not be written, and why."""
+        problems = []
+        for name in [name for name in self._presets if name in self._driver]:
+            try:
+                self.set(name, self._presets[name])
+            except Exception as error:  # noqa: BLE001  a driver may raise anything; it is tried at the next occasion
+                problems.append((name, str(error)))
+            else:
+                del self._presets[name]  # from here on it is the pilots' to change
+        return problems
 
     def refresh(self) -> None:
         """Read the driver's parameters again. Raises whatever the driver raises."""

@@ -61,13 +61,14 @@ from skyloop.proxy.handler import CommandHandler
 from skyloop.proxy.parameters import Parameters, described
 from skyloop.proxy.publisher import VehiclePublisher, topic_problem
 from skyloop.proxy.relay import Relay
-from skyloop.proxy.requests import ParameterRequests, RequestDispatcher
+from skyloop.proxy.requests import JobQueue, ParameterRequests, RequestDispatcher
 from skyloop.proxy.sessions import HELLO_NS, MAX_MALFORMED, Session
 from skyloop.proxy.workers import ProcessorWorkers
 from skyloop.transport.base import Peer, TransportServer
 
 MAX_NAME: Final = 64  #: characters of a proxy's name
 
+_ABANDON_S: Final = 1.0  #: how long the end of a proxy with a driver that hangs waits for what does not
 _log = logging.getLogger(__name__)
 
 
@@ -79,7 +80,9 @@ class Proxy:
         server_end: where applications connect, not yet started.
         name: what applications connect to, 1 to 64 characters.
         clock: the clock of all its samples [ns].
-        ticker: False leaves :meth:`tick` to the caller, for tests and for time that stands still.
+        ticker: False leaves :meth:`tick` to the caller, for many proxies in a process, for tests, and for
+            time that stands still.
+        jobs: Answers what may wait for the vehicle; by default a thread of its own.
 
     Raises:
         UsageError: for a name that is empty or too long.
@@ -93,6 +96,7 @@ class Proxy:
         name: str,
         clock: Clock = monotonic_ns,
         ticker: bool = True,
+        jobs: JobQueue | None = None,
     ) -> None:
         if not 1 <= len(name) <= MAX_NAME:
             raise UsageError(f"a proxy's name has 1 to {MAX_NAME} characters, and {name!r} has {len(name)}")
@@ -156,6 +160,7 @@ class Proxy:
                 GetStatistics: self._answer_statistics,
             },
             on_failure=self.publisher.driver_failed,
+            jobs=jobs,
         )
         self._ticker = threading.Thread(target=self._run, name="skyloop-ticker", daemon=True) if ticker else None
         #: Called 50 times a second with how often the code is to be run on a dummy [s]; 0: not now. See ``warm_up``.
@@ -245,9 +250,34 @@ class Proxy:
             self.driver.close()
         finally:
             self.server.stop()
-            for kept in (self._trail, self._record):
-                if kept is not None:
-                    kept.close()
+            self._close_records()
+
+    def abandon(self, reason: str) -> None:
+        """Publish that the proxy ends because its driver does not work, and give back what can be. Idempotent.
+
+        For a driver that hangs or fails: nothing waits for it, and it is not asked to land or to hover. What may hang
+        is left to daemon threads. The vehicle is on its own, as when its proxy is killed.
+        """
+        with self._life_lock:
+            if self._stopped or not self._started:
+                return
+            self._stopped = True
+        self.events.publish(EventKind.PROXY_CLOSING, f"proxy {self.name} ends: {reason}", Severity.ERROR)
+        self._stopping.set()
+        self.keep_warm(0.0)
+        parts = (self.server.stop, self.driver.close, self._requests.stop)
+        threads = [threading.Thread(target=part, name="skyloop-abandoned", daemon=True) for part in parts]
+        for thread in threads:
+            thread.start()
+        deadline_s = time.monotonic() + _ABANDON_S
+        for thread in threads:
+            thread.join(max(0.0, deadline_s - time.monotonic()))
+        self._close_records()
+
+    def _close_records(self) -> None:
+        for kept in (self._trail, self._record):
+            if kept is not None:
+                kept.close()
 
     def __enter__(self) -> Proxy:
         self.start()

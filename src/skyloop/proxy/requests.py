@@ -10,7 +10,7 @@ import logging
 import threading
 from collections.abc import Callable, Mapping
 from queue import SimpleQueue
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 from skyloop.errors import ParameterError, UnknownNameError
 from skyloop.messages import (
@@ -46,8 +46,46 @@ Answer = Callable[[Session, Any, int], AnyReply]
 _log = logging.getLogger(__name__)
 
 
+class JobQueue(Protocol):
+    """Does jobs one after the other, on a thread that may be shared with other proxies."""
+
+    def start(self) -> None:
+        """Begin to do what is put."""
+
+    def put(self, job: Callable[[], None]) -> None:
+        """Do this after what waits already. ``job`` must not raise. Any thread."""
+
+    def stop(self, timeout_s: float) -> None:
+        """End after the job in progress; one that hangs longer is left to its daemon thread."""
+
+
+class JobThread:
+    """A :class:`JobQueue` with a thread of its own."""
+
+    def __init__(self) -> None:
+        self._jobs: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name="skyloop-requests", daemon=True)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def put(self, job: Callable[[], None]) -> None:
+        """Do this after what waits already."""
+        self._jobs.put(job)
+
+    def stop(self, timeout_s: float) -> None:
+        """End after the job in progress."""
+        self._jobs.put(None)
+        self._thread.join(timeout_s)
+
+    def _run(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            job()
+
+
 class RequestDispatcher:
-    """Answers requests, on the receiving thread or on one of its own, from :meth:`start` to :meth:`stop`.
+    """Answers requests, on the receiving thread or on that of its jobs, from :meth:`start` to :meth:`stop`.
 
     Args:
         server: where answers are sent.
@@ -55,6 +93,7 @@ class RequestDispatcher:
         immediate: what answers on the receiving thread, by the type of the request's body.
         deferred: what answers on the thread of requests; may raise anything, which becomes a refusal.
         on_failure: called with the request's name and the error when ``deferred`` raises what is no refusal.
+        jobs: does what may wait for the driver; None: a thread of its own.
     """
 
     def __init__(
@@ -65,24 +104,23 @@ class RequestDispatcher:
         immediate: Mapping[type, Answer],
         deferred: Mapping[type, Answer],
         on_failure: Callable[[str, BaseException], None],
+        jobs: JobQueue | None = None,
     ) -> None:
         self._server = server
         self._counts = counters.counts
         self._immediate = immediate
         self._deferred = deferred
         self._on_failure = on_failure
-        self._jobs: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        self._jobs = jobs or JobThread()
         self._pending_lock = threading.Lock()
-        self._thread = threading.Thread(target=self._run, name="skyloop-requests", daemon=True)
 
     def start(self) -> None:
-        """Start the thread of requests."""
-        self._thread.start()
+        """Begin to answer what may wait."""
+        self._jobs.start()
 
     def stop(self, timeout_s: float = 2.0) -> None:
         """End after the job in progress; a driver that hangs longer is left to its daemon thread."""
-        self._jobs.put(None)
-        self._thread.join(timeout_s)
+        self._jobs.stop(timeout_s)
 
     def call_later(self, job: Callable[[], None]) -> None:
         """Call this on the thread of requests, after what waits there. ``job`` must not raise."""
@@ -108,10 +146,6 @@ class RequestDispatcher:
             self._reply(session, request, Refused(Refusal.BUSY, why))
             return
         self._jobs.put(lambda: self._answer_later(session, request, now_ns))
-
-    def _run(self) -> None:
-        while (job := self._jobs.get()) is not None:
-            job()
 
     def _answer_later(self, session: Session, request: Request, now_ns: int) -> None:
         kind = type(request.body)
@@ -183,6 +217,10 @@ class ParameterRequests:
             names = ", ".join(self._parameters.left_out)[:200]
             text = f"parameters too large to be sent: {names}"
             self._publisher.event(EventKind.DRIVER_ERROR, text, Severity.WARNING)
+        for name, why in self._parameters.write_presets():
+            if self._publisher.link_up:  # before, it has nobody to write to: it is tried again when the link is there
+                text = f"{name} could not be set as this proxy was asked to: {why}"
+                self._publisher.event(EventKind.DRIVER_ERROR, text, Severity.WARNING, where="preset")
         self._handler.configure(self._parameters.flight_settings())
 
     def get(self, _session: Session, request: GetParameter, _now_ns: int) -> AnyReply:

@@ -67,8 +67,8 @@ class LinkLines:
         return f"vehicle of {self._name}: {state.value}{why}{what}"
 
 
-class _Shutdown:
-    """Why the process must end, and how fast."""
+class Shutdown:
+    """Why a process with proxies must end, and how fast."""
 
     def __init__(self) -> None:
         self.requested = threading.Event()
@@ -76,6 +76,7 @@ class _Shutdown:
         self.reason = ""
 
     def request(self, reason: str, *, hurry: bool) -> None:
+        """Ask for the end. Any thread, and signal handlers."""
         if hurry or self.requested.is_set():  # a second signal means now
             self.hurry.set()
         self.reason = self.reason or reason
@@ -130,23 +131,26 @@ def run(
     land_within_s: float = LAND_WITHIN_S,
     look: Look | None = None,
     audit: Path | None = None,
+    records: bool | None = None,
 ) -> None:
     """Serve several vehicles from one process, as :func:`serve` does one: several drones of one simulated world.
 
     The proxies are started here and stopped at the end; lines are written of each, as :func:`serve` does. ``audit``:
     the file of the audit trail; by default each proxy has one in the user's directory of state, and a private one (with
-    ``parent_fd``) none.
+    ``parent_fd``) none. ``records``: whether there is an audit trail, and a note of a flight for the next run; by
+    default not for private ones, which are not started again under their name.
     """
-    shutdown = _Shutdown()
+    shutdown = Shutdown()
     for proxy in proxies:
         keep_warm(proxy)
-    if audit is not None or parent_fd is None:
+    records = parent_fd is None if records is None else records
+    if audit is not None or records:
         for proxy in proxies:
-            _keep_trail(proxy, audit)
-    if parent_fd is None:  # a private proxy is not started again under its name
+            keep_trail(proxy, audit)
+    if records:
         for proxy in proxies:
             proxy.keep_record(FlightRecord(record_path(proxy.name), str(proxy.driver.uri)))
-    with _signals(shutdown, ignore_interrupt=parent_fd is not None), ExitStack() as started:
+    with on_signals(shutdown, ignore_interrupt=parent_fd is not None), ExitStack() as started:
         for proxy in proxies:
             started.push(partial(_stop, proxy, shutdown))
         for proxy in proxies:
@@ -170,8 +174,11 @@ def _publish_keys(proxies: Sequence[Proxy], change: str) -> None:
         proxy.events.publish(EventKind.KEYS, change, Severity.WARNING)
 
 
-def _keep_trail(proxy: Proxy, path: Path | None) -> None:
-    """Raises :class:`UsageError` where the file that was asked for can't be written; the usual one may be missing."""
+def keep_trail(proxy: Proxy, path: Path | None) -> None:
+    """Give a proxy its audit trail.
+
+    Raises :class:`UsageError` where the file that was asked for can't be written; the usual one may be missing.
+    """
     chosen = path or audit_path(proxy.name)
     try:
         proxy.keep_trail(AuditTrail(chosen, proxy.name, f"{proxy.run_id:016x}"))
@@ -181,11 +188,11 @@ def _keep_trail(proxy: Proxy, path: Path | None) -> None:
         _log.warning("there is no audit trail, because %s can't be written: %s", chosen, error)
 
 
-def _stop(proxy: Proxy, shutdown: _Shutdown, *_: object) -> None:
+def _stop(proxy: Proxy, shutdown: Shutdown, *_: object) -> None:
     proxy.stop(reason=shutdown.reason or "it failed")
 
 
-def _land(proxies: Sequence[Proxy], shutdown: _Shutdown, within_s: float) -> None:
+def _land(proxies: Sequence[Proxy], shutdown: Shutdown, within_s: float) -> None:
     deadline = time.monotonic() + within_s
     flying = list(proxies)
     while flying and not shutdown.hurry.is_set() and time.monotonic() < deadline:
@@ -193,7 +200,9 @@ def _land(proxies: Sequence[Proxy], shutdown: _Shutdown, within_s: float) -> Non
 
 
 @contextmanager
-def _signals(shutdown: _Shutdown, *, ignore_interrupt: bool) -> Iterator[None]:
+def on_signals(shutdown: Shutdown, *, ignore_interrupt: bool) -> Iterator[None]:
+    """Let SIGINT (unless it is the parent's to handle) and SIGTERM ask for the end. On the main thread."""
+
     def asked(number: int, _: FrameType | None) -> None:
         shutdown.request(f"{signal.Signals(number).name} received", hurry=False)
 

@@ -15,7 +15,6 @@ from typing import TypeVar
 
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.files import read_text
-from skyloop.sim.toml_file import MAX_BYTES, Place, parse_toml, read_tables
 from skyloop.sim.world import (
     FIGURE_SIZES_M,
     MARKER_DICTIONARIES,
@@ -75,6 +74,7 @@ from skyloop.sim.world_tables import (
     WorldTable,
     YawTable,
 )
+from skyloop.toml_file import MAX_BYTES, Place, parse_toml, read_tables
 
 _NEAREST_M = 0.01  # of two way points
 _WALL_GAP_M = 0.004  # posters and markers hang this far off their wall, so that no renderer has to choose

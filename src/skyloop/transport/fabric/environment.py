@@ -59,6 +59,35 @@ def _choose(network: NetworkChoice, keys: Path | str | None) -> FabricSettings |
     return settings(connect=connect, multicast=len(connect) < len(words), keys=keys)
 
 
+def serving(
+    network: str,
+    *,
+    listen: tuple[str, ...] = (),
+    connect: tuple[str, ...] = (),
+    multicast: bool = True,
+    keys: Path | str | None = None,
+) -> FabricSettings:
+    """Return the settings of what serves on the network, or joins its parts.
+
+    Args:
+        network: ``multicast``, or addresses of routers with commas, with ``multicast`` among them for both.
+        listen: Addresses to listen at.
+        connect: More addresses to connect to.
+        multicast: Whether to be found by multicast, where ``network`` names it.
+        keys: The folder of an identity; defaults to ``SKYLOOP_KEYS``.
+
+    Raises:
+        UsageError: An address or the folder is not valid, or no place is named.
+    """
+    words = [word.strip() for word in network.split(",") if word.strip()]
+    if not words:
+        raise UsageError("the network names no place: give multicast, or addresses with commas")
+    routers = [word for word in words if word.lower() != MULTICAST]
+    return settings(
+        listen=listen, connect=(*routers, *connect), multicast=multicast and len(routers) < len(words), keys=keys
+    )
+
+
 def settings(
     *,
     listen: tuple[str, ...] = (),

@@ -47,6 +47,10 @@ class ServerConnection:
         self.reason = ""  #: why it ends, as soon as one end has given a reason
         self.topics: set[str] = set()
 
+    def fileno(self) -> int:
+        """Return the socket's descriptor, for who waits for several."""
+        return self._socket.fileno()
+
     def limit_silence(self, seconds: float) -> None:
         """Set how long :attr:`receive` waits for a packet before it raises ``BlockingIOError``.
 

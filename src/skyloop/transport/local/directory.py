@@ -35,7 +35,9 @@ GROUP_VARIABLE: Final = "SKYLOOP_GROUP"
 MAX_PATH: Final = 107  #: bytes that Linux allows in the path of a socket
 LOCK_TIMEOUT_S: Final = 2.0
 CONNECT_TIMEOUT_S: Final = 1.0
-_SUFFIX: Final = ".sock"
+PROXY: Final = "proxy"
+HOST: Final = "host"  #: of many proxies: its socket takes requests to add and remove vehicles
+_SUFFIXES: Final = {PROXY: ".sock", HOST: ".host"}
 _LOCK: Final = ".lock"
 _OPEN_TO_OTHERS: Final = 0o027  # writable by the group, or anything for others
 
@@ -54,11 +56,14 @@ class Directory:
     Args:
         path: The directory, absolute.
         gid: The group that shares it, None for this user alone.
+        kind: Whose sockets: :data:`PROXY` or :data:`HOST`. They have names of their own.
     """
 
-    def __init__(self, path: Path, gid: int | None) -> None:
+    def __init__(self, path: Path, gid: int | None, kind: str = PROXY) -> None:
         self.path = path
         self.gid = gid
+        self._kind = kind
+        self._suffix = _SUFFIXES[kind]
 
     def socket_path(self, name: str) -> Path:
         """Return the path of a proxy's socket.
@@ -67,7 +72,7 @@ class Directory:
             UsageError: The name can't be a proxy's, or the path is longer than :data:`MAX_PATH`.
         """
         check_name(name)
-        path = self.path / (name + _SUFFIX)
+        path = self.path / (name + self._suffix)
         if len(os.fsencode(path)) > MAX_PATH:
             raise UsageError(
                 f"the socket's path {path} has {len(os.fsencode(path))} bytes and may have {MAX_PATH}: "
@@ -129,8 +134,8 @@ class Directory:
         except FileNotFoundError:
             return []
         found = []
-        for path in sorted(self.path.glob("*" + _SUFFIX)):
-            name = path.name.removesuffix(_SUFFIX)
+        for path in sorted(self.path.glob("*" + self._suffix)):
+            name = path.name.removesuffix(self._suffix)
             if not NAME.fullmatch(name):
                 continue
             if is_live(path):
@@ -167,7 +172,7 @@ class Directory:
             if is_live(path):
                 pid = owner_pid(path)
                 raise NameTakenError(
-                    f"the name {name!r} is in use by a running proxy"
+                    f"the name {name!r} is in use by a running {self._kind}"
                     f"{f' (pid {pid})' if pid is not None else ''}: choose another, or stop that one"
                 )
             path.unlink(missing_ok=True)
@@ -217,11 +222,12 @@ class Directory:
             raise LinkError(f"cannot look into {path.parent}: {error.strerror}; its owner or group only may") from None
 
 
-def find_directory(group: str | None = None) -> Directory:
+def find_directory(group: str | None = None, kind: str = PROXY) -> Directory:
     """Return the directory of this user, or the one that a group shares. Touches no file.
 
     Args:
         group: The name of the group (default: the variable ``SKYLOOP_GROUP``).
+        kind: Whose sockets in it.
 
     Raises:
         UsageError: The group does not exist, or no directory is configured that its members can reach.
@@ -234,7 +240,7 @@ def find_directory(group: str | None = None) -> Directory:
             f"for example to /var/tmp/skyloop-{group}"
         )
     path = Path(configured) if configured else _default_path()
-    return Directory(path.absolute(), None if group is None else _group_id(group))
+    return Directory(path.absolute(), None if group is None else _group_id(group), kind)
 
 
 def _group_id(group: str) -> int:

@@ -89,21 +89,29 @@ class LocalServer(TransportServer):
             listener, inode = self._directory.listen(self._name)
             self._started = True
             self._listener = listener
-            self._thread = threading.Thread(
-                target=self._run, args=(handler, listener, inode), name=f"skyloop-{self._name}-server", daemon=True
-            )
-            self._thread.start()
+            self._begin(handler, listener, inode)
+
+    def _begin(self, handler: ServerHandler, listener: Socket, inode: int) -> None:
+        """Accept and receive from now on."""
+        self._thread = threading.Thread(
+            target=self._run, args=(handler, listener, inode), name=f"skyloop-{self._name}-server", daemon=True
+        )
+        self._thread.start()
 
     def stop(self) -> None:
         with self._state_lock:
-            thread, self._thread = self._thread, None
             listener, self._listener = self._listener, None
-            if thread is None or listener is None:
+            if listener is None:
                 return
             self._stopping.set()
             listener.hang_up()  # wakes who accepts
-        if threading.get_ident() not in self._receivers:  # a handler that stops its own server does not wait for itself
-            thread.join()
+        self._finish(listener)
+
+    def _finish(self, listener: Socket) -> None:  # noqa: ARG002  (who accepts has it)
+        """Wait until all has ended."""
+        thread = self._thread
+        if thread is not None and threading.get_ident() not in self._receivers:
+            thread.join()  # a handler that stops its own server does not wait for itself
 
     def send(self, peer: Peer, packet: bytes) -> bool:
         check_packet(packet)
@@ -180,7 +188,24 @@ class LocalServer(TransportServer):
                 _log.warning("%s cannot accept: %s", self.address, error)
                 self._stopping.wait(_RETRY_ACCEPT_S)
             return None
-        sock = Socket(accepted.detach())
+        connection = self._let_in(Socket(accepted.detach()))
+        if connection is None:
+            return None
+        connection.limit_silence(HELLO_S)
+        thread = threading.Thread(
+            target=self._serve, args=(handler, connection), name=f"skyloop-{self._name}-peer", daemon=True
+        )
+        try:
+            thread.start()
+        except RuntimeError as error:  # no more threads
+            connection.hang_up(f"{self.address} cannot serve it: {error}")
+            with self._lock:
+                self._connections.discard(connection)
+            return None
+        return thread
+
+    def _let_in(self, sock: Socket) -> ServerConnection | None:
+        """Return the connection of who called; None for one that may not connect, or has no place."""
         who = credentials(sock)
         if not may_connect(sock, self._directory.gid):
             sock.hang_up(packets.bye(f"{who} may not connect to {self.address}"))
@@ -191,20 +216,9 @@ class LocalServer(TransportServer):
             return None
         self._last_id += 1
         connection = ServerConnection(sock, Peer(self._last_id, str(who)), who)
-        connection.limit_silence(HELLO_S)
-        thread = threading.Thread(
-            target=self._serve, args=(handler, connection), name=f"skyloop-{self._name}-peer", daemon=True
-        )
         with self._lock:
             self._connections.add(connection)
-        try:
-            thread.start()
-        except RuntimeError as error:  # no more threads
-            connection.hang_up(f"{self.address} cannot serve it: {error}")
-            with self._lock:
-                self._connections.discard(connection)
-            return None
-        return thread
+        return connection
 
     def _make_room(self, who: Credentials) -> str:
         """Find a place for a caller; return why there is none, empty if there is.

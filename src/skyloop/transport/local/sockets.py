@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 #: reader stays small (about 200 packets of 300 bytes).
 SEND_BUFFER: Final = 131_072
 SEND_FLAGS: Final = socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL
+RECEIVE_FLAGS: Final = socket.MSG_DONTWAIT  #: for who waits by other means
 _SO_PEERGROUPS: Final = 59  # Linux 4.13; missing from Python's socket module
 _CREDENTIALS: Final = struct.Struct("3i")
 _MAX_OPTION: Final = 1024  # bytes that Python lets an option have: 256 groups

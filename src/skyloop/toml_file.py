@@ -6,6 +6,7 @@ import difflib
 import re
 import reprlib
 import sys
+import threading
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, TypeVar
@@ -21,6 +22,8 @@ MAX_BYTES: Final = 1 << 18  #: of a file; the largest world that is shipped take
 #: Parts of a key: a parser goes through all of them for each key below, which takes minutes for some ten thousand.
 MAX_DEPTH: Final = 16
 MAX_WHOLE: Final = (1 << 63) - 1  #: as TOML has it; larger ones are neither shown nor computed with
+#: msgspec looks at a struct's fields when it first converts to it, and crashes if two threads do at the same time.
+_converting = threading.Lock()
 _SHOWN: Final = 80  #: characters of a wrong value in a message
 # Nothing in it is tried twice, and it begins where a part does: it is as fast for what it does not find.
 _PART = r"""(?:[A-Za-z0-9_-]++|"[^"\n]*+"|'[^'\n]*+')"""
@@ -88,7 +91,8 @@ def read_tables(values: Mapping[str, Any], source: str, kind: type[T]) -> T:
         FileFormatError: A key is missing or unknown, or a value is of another kind or out of its range.
     """
     try:
-        return msgspec.convert(values, kind)
+        with _converting:
+            return msgspec.convert(values, kind)
     except msgspec.ValidationError as error:
         raise _explained(str(error), values, source, kind) from None
 
@@ -185,6 +189,8 @@ def _wanted(info: inspect.Type, place: Place) -> str:
     if isinstance(plain, inspect.ListType):
         if _tables(plain.item_type):
             return f"tables written [[{place.table}]]"
+        if isinstance(_plain(plain.item_type), inspect.StrType):
+            return "a list of texts"
         return f"a list of at least {plain.min_length} lists of {len(_plain(plain.item_type).item_types)} numbers"
     return "one of " + ", ".join(_choices(info)) if _choices(info) else f"a table [{place.table}]"
 

@@ -1,0 +1,161 @@
+"""``skyloop host``: many vehicles from one process, and what adds, removes and shows them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import msgspec
+import typer
+
+from skyloop.cli.text import columns
+from skyloop.errors import UsageError
+
+if TYPE_CHECKING:
+    from skyloop.host.control import Answer, Request
+    from skyloop.host.fleet import Fleet
+    from skyloop.host.vehicle import VehicleStatus
+
+FleetArgument = Annotated[Path, typer.Argument(metavar="FILE", help="The vehicles; docs/host.md shows such a file")]
+GroupOption = Annotated[
+    str | None, typer.Option(metavar="GROUP", help="A group of users whose members may do this too")
+]
+HostOption = Annotated[
+    str | None, typer.Option("--host", metavar="NAME", help="Which host, where several run [the one that runs]")
+]
+NameArgument = Annotated[str, typer.Argument(metavar="NAME", help="The vehicle's, as skyloop host status shows it")]
+
+
+def host(fleet: FleetArgument, group: GroupOption = None) -> None:
+    """Serve all vehicles of a file from one process, until Ctrl-C, which lands them first.
+
+    skyloop host status, add and remove show and change what it serves while it runs; each has its own --help.
+    """
+    from skyloop.host.fleet import read_fleet
+    from skyloop.host.serve import serve
+
+    found = read_fleet(fleet)
+    _prepare(found)
+    serve(found, group=group)
+
+
+def status(
+    json: Annotated[bool, typer.Option("--json", help="For programs: one JSON array")] = False,
+    host: HostOption = None,
+    group: GroupOption = None,
+) -> None:
+    """Show the vehicles of a running host: in which state they are, who flies them, and why one failed."""
+    from skyloop.host.control import Status
+
+    rows = _ask(Status(), host, group).vehicles
+    if json:
+        typer.echo(msgspec.json.encode(rows).decode())
+        return
+    for line in lines(rows):
+        typer.echo(line)
+
+
+def add(
+    what: Annotated[str, typer.Argument(metavar="NAME|FILE", help="A vehicle's name, or a file of several")],
+    address: Annotated[
+        str | None,
+        typer.Argument(metavar="[ADDRESS]", help="The vehicle's; without: of the host's own file", show_default=False),
+    ] = None,
+    own_process: Annotated[
+        bool | None,
+        typer.Option("--own-process/--shared", help="Whether its proxy gets a process of its own [as the host's file]"),
+    ] = None,
+    host: HostOption = None,
+    group: GroupOption = None,
+) -> None:
+    """Serve more vehicles from a running host: one by its address, those of a file, or one of the host's own file.
+
+    A vehicle by its address gets the defaults of the host's file. Of a file, those that run already are left alone.
+    """
+    from skyloop.host.control import Add, AddNamed
+    from skyloop.host.fleet import read_fleet
+
+    if address is None and (what.endswith(".toml") or "/" in what):
+        if own_process is not None:
+            raise UsageError('--own-process is for one vehicle: write process = "own" in the file')
+        answer = _ask(Add(read_fleet(Path(what)).vehicles), host, group)
+    else:
+        answer = _ask(AddNamed(what, address, own_process), host, group)
+    for line in lines(answer.vehicles):
+        typer.echo(line)
+    for name, why in answer.problems.items():
+        typer.echo(f"skyloop: {name} was not added: {why}", err=True)
+    if answer.problems:
+        raise typer.Exit(1)
+
+
+def remove(
+    name: NameArgument,
+    land: Annotated[bool, typer.Option("--land", help="Land it even if somebody has the authority")] = False,
+    host: HostOption = None,
+    group: GroupOption = None,
+) -> None:
+    """Land a vehicle of a running host, and serve it no longer.
+
+    It is refused while the vehicle flies and somebody has the authority, unless --land is given.
+    """
+    from skyloop.host.control import Remove
+
+    answer = _ask(Remove(name, land), host, group)
+    typer.echo(f"removed {name}: {answer.vehicles[0].address}")
+
+
+def lines(rows: tuple[VehicleStatus, ...]) -> list[str]:
+    """Return the rows as a table of text, the reason last because it may be long."""
+    if not rows:
+        return ["This host has no vehicle. Add one: skyloop host add NAME ADDRESS"]
+    cells = [("NAME", "ADDRESS", "PROXY", "PROCESS", "STATE", "LINK", "BATTERY", "PILOT", "UP", "WHY")]
+    cells += [
+        (
+            row.name,
+            row.address,
+            row.condition.value,
+            f"own, {row.pid}" if row.pid is not None else row.process,
+            row.state or "-",
+            row.link or "-",
+            "-" if row.battery is None else f"{row.battery:.0%}",
+            row.pilot or "-",
+            _duration(row.uptime_s),
+            "; ".join(filter(None, (row.failed, row.link_reason, row.link_remedy, _restarts(row)))),
+        )
+        for row in rows
+    ]
+    return columns(cells)
+
+
+def _restarts(row: VehicleStatus) -> str:
+    return f"started again {row.restarts} {'time' if row.restarts == 1 else 'times'}" if row.restarts else ""
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
+
+
+def _ask(request: Request, host: str | None, group: str | None) -> Answer:
+    from skyloop.host.control import ask, chosen_host
+
+    return ask(chosen_host(host, group), request, group=group)
+
+
+def _prepare(fleet: Fleet) -> None:
+    """Warn of an open network, and make room for the threads of simulators in this process."""
+    from skyloop.cli.network import warn_if_open
+    from skyloop.cli.simulating import settle
+    from skyloop.drivers.sim import options_of
+    from skyloop.drivers.uri import parse_uri
+    from skyloop.host.vehicle import network_of
+
+    opened = [vehicle.name for vehicle in fleet.vehicles if (net := network_of(vehicle)) and net.tls is None]
+    for vehicle in fleet.vehicles:
+        if opened[:1] == [vehicle.name]:
+            warn_if_open(network_of(vehicle), opened)
+        uri = parse_uri(vehicle.address)
+        if uri.scheme == "sim" and not vehicle.own_process:
+            settle(options_of(uri))

@@ -1,0 +1,97 @@
+"""The process of one vehicle of a host: ``python -m skyloop.host.child SETTINGS``, which a host starts.
+
+It ends with its host, at once and without landing, as a proxy of the host's own process does. Each line of its standard
+output is a status in JSON, for the host.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Sequence
+from typing import Final
+
+import msgspec
+
+from skyloop.drivers.registry import make_driver
+from skyloop.errors import SkyloopError
+from skyloop.host.fleet import VehicleSettings
+from skyloop.host.vehicle import Condition, VehicleStatus, network_of, of_proxy, reason_of
+from skyloop.proxy import Proxy
+from skyloop.proxy.serve import run
+from skyloop.transport.base import TransportServer
+from skyloop.transport.local import LocalServer
+
+FAILED: Final = 1
+STATUS_EVERY_S: Final = 0.25
+
+
+def serve(settings: VehicleSettings) -> None:
+    """Serve one vehicle until SIGTERM, which lands it, or the end of the host. On the main thread.
+
+    Raises:
+        SkyloopError: It can't be served.
+    """
+    network = network_of(settings)
+    driver = make_driver(settings.address)
+    end: TransportServer = LocalServer(settings.name, group=settings.group)
+    if network is not None:
+        from skyloop.transport.composite import CompositeServer
+        from skyloop.transport.fabric import FabricServer
+
+        end = CompositeServer([end, FabricServer(settings.name, network, vehicle=str(driver.uri))])
+    proxy = Proxy(driver, end, name=settings.name)
+    proxy.parameters.preset(settings.presets)
+    reporter = _Reporter(settings, proxy)
+    keys = None if network is None or network.ring is None else network.ring.poll
+
+    def look() -> Sequence[str]:
+        reporter.report()
+        return () if keys is None else keys()
+
+    run([proxy], parent_fd=0, look=look, records=True)
+
+
+class _Reporter:
+    """Writes the status of a proxy to standard output, several times a second."""
+
+    def __init__(self, settings: VehicleSettings, proxy: Proxy) -> None:
+        self._settings = settings
+        self._proxy = proxy
+        self._began_s = time.monotonic()
+        self._said_s = 0.0
+
+    def report(self) -> None:
+        now_s = time.monotonic()
+        if now_s - self._said_s < STATUS_EVERY_S:
+            return
+        self._said_s = now_s
+        row = VehicleStatus(
+            self._settings.name,
+            self._settings.address,
+            Condition.RUNNING,
+            uptime_s=now_s - self._began_s,
+            process="own",
+            pid=os.getpid(),
+        )
+        _write(msgspec.structs.replace(row, **of_proxy(self._proxy)))
+
+
+def _write(status: VehicleStatus) -> None:
+    sys.stdout.buffer.write(msgspec.json.encode(status) + b"\n")
+    sys.stdout.buffer.flush()
+
+
+def main() -> None:
+    """Serve the vehicle of the settings in the first argument, as JSON."""
+    settings = msgspec.json.decode(sys.argv[1], type=VehicleSettings)
+    try:
+        serve(settings)
+    except SkyloopError as error:
+        _write(VehicleStatus(settings.name, settings.address, Condition.FAILED, failed=reason_of(error)))
+        sys.exit(FAILED)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,225 @@
+"""The file of a host's vehicles, ``fleet.toml``. Pure, but for reading it; ``docs/host.md`` describes it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal, TypeVar
+
+import msgspec
+
+from skyloop.drivers.registry import driver_class
+from skyloop.drivers.uri import parse_uri
+from skyloop.errors import FileFormatError, ParameterError, SkyloopError, UsageError
+from skyloop.files import expand
+from skyloop.messages import Value
+from skyloop.proxy.parameters import check_presets
+from skyloop.toml_file import MAX_BYTES, Place, parse_toml, read_tables
+from skyloop.transport.base import check_name
+from skyloop.zones import ZONES
+
+HOST: Final = "host"  #: the name of a host that has none
+#: Schemes whose vehicle is made by its address: two with the same one are two vehicles.
+MADE_BY_ADDRESS: Final = frozenset({"sim", "video", "replay"})
+Text = Annotated[str, msgspec.Meta(min_length=1)]
+T = TypeVar("T")
+
+
+class FlightLimits(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):
+    """``limits``: the proxy's parameters of these names."""
+
+    tilt: float | None = None
+    climb: float | None = None
+    yaw_rate: float | None = None
+    speed: float | None = None
+    altitude: float | None = None
+
+
+class Defaults(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):
+    """``[defaults]``: what holds for each vehicle that says nothing else."""
+
+    network: Text | None = None  #: as ``--network`` of ``skyloop proxy``; ``off`` for this host only
+    listen: list[str] | None = None
+    multicast: bool | None = None  #: whether to be found by multicast, where ``network`` names it
+    keys: Text | None = None  #: folder of an identity
+    group: Text | None = None  #: of users who may connect as well
+    limits: FlightLimits | None = None
+    zones: list[str] | None = None
+    parameters: dict[str, Any] | None = None  #: of the proxy, by name
+    autostart: bool | None = None
+    process: Literal["shared", "own"] | None = None
+
+
+class Vehicle(Defaults, frozen=True, omit_defaults=True, forbid_unknown_fields=True, kw_only=True):
+    """``[[vehicle]]``."""
+
+    name: Text
+    address: Text
+
+
+class _File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    name: Text = HOST
+    defaults: Defaults = Defaults()
+    vehicle: list[Vehicle] = []
+
+
+class VehicleSettings(msgspec.Struct, frozen=True, omit_defaults=True):
+    """One vehicle of a host, with all defaults filled in."""
+
+    name: str
+    address: str
+    network: str | None = None  #: None: this host only
+    listen: tuple[str, ...] = ()
+    multicast: bool = True
+    keys: str | None = None
+    group: str | None = None
+    presets: dict[str, Value] = {}  #: the proxy's parameters
+    autostart: bool = True
+    own_process: bool = False
+
+
+class Fleet(msgspec.Struct, frozen=True):
+    """What a host serves."""
+
+    name: str
+    vehicles: tuple[VehicleSettings, ...]
+    defaults: Defaults  #: for vehicles that are added by their address
+
+
+def read_fleet(path: Path) -> Fleet:
+    """Read the file of a host's vehicles.
+
+    Folders of keys in it are relative to its own folder.
+
+    Raises:
+        UsageError: There is no such file, or it can't be read.
+        FileFormatError: It is not TOML, a key is unknown or missing, or a value is not valid; says where, and what is
+            allowed.
+    """
+    path = expand(path)
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise UsageError(f"the file of vehicles {path} can't be read: {error.strerror}") from None
+    if len(data) > MAX_BYTES:
+        raise FileFormatError(f"{path}: the file has more than {MAX_BYTES} bytes")
+    try:
+        text = data.decode()
+    except UnicodeDecodeError as error:
+        raise FileFormatError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start}") from None
+    fleet = parse_fleet(text, str(path))
+
+    def from_here(keys: str | None) -> str | None:
+        return None if keys is None else str((path.parent / expand(keys)).resolve())
+
+    replace = msgspec.structs.replace
+    return replace(
+        fleet,
+        vehicles=tuple(replace(vehicle, keys=from_here(vehicle.keys)) for vehicle in fleet.vehicles),
+        defaults=replace(fleet.defaults, keys=from_here(fleet.defaults.keys)),
+    )
+
+
+def parse_fleet(text: str, source: str) -> Fleet:
+    """Parse the text of a file of vehicles; see :func:`read_fleet`.
+
+    Args:
+        text: The file's text.
+        source: The file's name, for errors.
+    """
+    found = read_tables(parse_toml(text, source), source, _File)
+    top = Place(source)
+    _checked(top, "name", lambda: check_name(found.name))
+    settings_of(Vehicle(name="unnamed", address="sim://"), found.defaults, top.under("defaults"), found.defaults)
+    seen: dict[str, Place] = {}
+    vehicles: list[VehicleSettings] = []
+    for number, vehicle in enumerate(found.vehicle, start=1):
+        place = top.item("vehicle", number, vehicle.name)
+        settings = settings_of(vehicle, found.defaults, place, vehicle)
+        if settings.name in seen:
+            raise place.error("name", f"{settings.name!r} is the name of two vehicles, and must be one's")
+        for other in vehicles:
+            if other.address == settings.address and _scheme(settings.address) not in MADE_BY_ADDRESS:
+                raise place.error("address", f"{settings.address!r} is the address of {other.name!r} too")
+        seen[settings.name] = place
+        vehicles.append(settings)
+    return Fleet(found.name, tuple(vehicles), found.defaults)
+
+
+def settings_of(vehicle: Vehicle, defaults: Defaults, place: Place, own: Defaults) -> VehicleSettings:
+    """Return a vehicle's settings with the defaults filled in.
+
+    Args:
+        vehicle: The vehicle.
+        defaults: Of the host.
+        place: Where errors are.
+        own: What stands at that place.
+
+    Raises:
+        FileFormatError: A value is not valid.
+    """
+    _checked(place, "name", lambda: check_name(vehicle.name))
+    uri = _checked(place, "address", lambda: parse_uri(vehicle.address))
+    _checked(place, "address", lambda: driver_class(uri.scheme))
+
+    def either(key: str) -> Any:
+        value = getattr(vehicle, key)
+        return getattr(defaults, key) if value is None else value
+
+    network = either("network")
+    if network == "off":
+        network = None
+    for key in ("keys", "listen"):
+        if network is None and getattr(own, key) and own is vehicle:
+            raise place.error(key, 'it is for the network: give network = "multicast", or addresses, as well')
+    presets = {**_presets(defaults), **_presets(vehicle)}
+    own_presets = _presets(own)
+    for name in own_presets:
+        _check_preset(place, name, own_presets)
+    return VehicleSettings(
+        name=vehicle.name,
+        address=vehicle.address,
+        network=network,
+        listen=tuple(either("listen") or ()) if network is not None else (),
+        multicast=either("multicast") is not False,
+        keys=either("keys") if network is not None else None,
+        group=either("group"),
+        presets=_checked(place, "parameters", lambda: check_presets(presets)),
+        autostart=either("autostart") is not False,
+        own_process=either("process") == "own",
+    )
+
+
+def _presets(table: Defaults) -> dict[str, Value]:
+    limits = {} if table.limits is None else msgspec.structs.asdict(table.limits)
+    found: dict[str, Value] = {f"limits.{name}": value for name, value in limits.items() if value is not None}
+    if table.zones is not None:
+        found[ZONES] = "; ".join(table.zones)
+    for name, value in (table.parameters or {}).items():
+        found[name] = tuple(value) if isinstance(value, list) else value
+    return found
+
+
+def _check_preset(place: Place, name: str, presets: dict[str, Value]) -> None:
+    limit = name.removeprefix("limits.")
+    if name == ZONES:
+        at, key = place, "zones"
+    elif name.startswith("limits.") and limit in FlightLimits.__struct_fields__:
+        at, key = place.under("limits"), limit
+    else:
+        at, key = place.under("parameters"), name
+    _checked(at, key, lambda: check_presets({name: presets[name]}))
+
+
+def _checked(place: Place, key: str, check: Any) -> Any:
+    """Return what ``check`` returns; what it raises becomes an error of the file."""
+    try:
+        return check()
+    except FileFormatError:
+        raise
+    except (UsageError, ParameterError, SkyloopError) as error:
+        raise place.error(key, error.reason) from None
+
+
+def _scheme(address: str) -> str:
+    return address.partition("://")[0].lower()

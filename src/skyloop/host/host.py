@@ -1,0 +1,293 @@
+"""The host: any number of vehicles in one process, each of which can fail, come and go without the others noticing."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any, Final
+
+from skyloop.drivers.base import Driver
+from skyloop.drivers.registry import make_driver
+from skyloop.errors import NameTakenError, RefusedError, SkyloopError, UnknownNameError, UsageError
+from skyloop.host.fleet import VehicleSettings
+from skyloop.host.own_process import OwnProcessVehicle
+from skyloop.host.ticker import Ticker
+from skyloop.host.vehicle import Condition, HostedVehicle, SharedVehicle, VehicleStatus, network_of, reason_of, within
+from skyloop.host.watchdog import HANG_LOOKS, LOOK_S, STALL_LOOKS, SharedLoop, Watchdog
+from skyloop.host.workers import RequestWorkers
+from skyloop.messages import EventKind, Severity
+from skyloop.proxy import Proxy
+from skyloop.transport.local.reactor import Reactor
+from skyloop.transport.local.shared_server import SharedLocalServer
+
+if TYPE_CHECKING:
+    from skyloop.transport.fabric import FabricSettings
+
+LAND_WITHIN_S: Final = 20.0
+FEW: Final = 8  #: vehicles of which one that is flown alone leaves the code of commands cold
+_AT_ONCE: Final = 8  # vehicles that start at the same time
+_STALL_S: Final = STALL_LOOKS * LOOK_S
+_HANG_S: Final = HANG_LOOKS * LOOK_S
+_log = logging.getLogger(__name__)
+
+#: Shows a line to who runs the host.
+Announce = Callable[[str], None]
+
+
+class Host:
+    """Serves vehicles on shared threads, from its construction to :meth:`close`. Any thread.
+
+    Args:
+        announce: Called with a line for people when a vehicle comes, fails or goes.
+        make: Makes the driver of an address, for vehicles of this process.
+    """
+
+    def __init__(self, announce: Announce = _log.info, make: Callable[[str], Driver] = make_driver) -> None:
+        self.announce = announce
+        self._make_driver = make
+        self.vehicles: dict[str, HostedVehicle] = {}  #: by name, in the order in which they came
+        self.known: dict[str, VehicleSettings] = {}  #: what can be started by its name alone
+        self._lock = threading.Lock()  # guards who is there, and the loops
+        self._reactor = Reactor()  # for vehicles that come
+        self._ticker = Ticker(self._on_failing)
+        self._loops: list[SharedLoop] = [self._reactor, self._ticker]
+        self._workers = RequestWorkers()
+        self._watchdog = Watchdog(lambda: self._loops, self._on_stall, self._on_hang)
+        self._watchdog.start()
+        self._closing = False
+
+    # Coming and going --------------------------------------------------------------------------------------------
+
+    def add(self, settings: VehicleSettings) -> HostedVehicle:
+        """Serve one more vehicle.
+
+        Raises:
+            NameTakenError: This host, or another running proxy, has the name.
+            SkyloopError: The vehicle can't be served; it is listed as failed then.
+        """
+        network = network_of(settings)
+        with self._lock:
+            if self._closing:
+                raise RefusedError("this host is ending", code="busy")
+            present = self.vehicles.get(settings.name)
+            if present is not None and present.runs:
+                raise NameTakenError(
+                    f"this host has a vehicle named {settings.name!r} already, {present.settings.address}: choose "
+                    f"another name, or remove that one: skyloop host remove {settings.name}"
+                )
+            vehicle = self._make(settings, network)
+            vehicle.condition = Condition.STARTING
+            self.vehicles[settings.name] = vehicle
+            self.known[settings.name] = settings
+        try:
+            vehicle.start()
+        except Exception as error:
+            vehicle.condition, vehicle.failed = Condition.FAILED, reason_of(error)
+            self.announce(f"failed {settings.name}: {vehicle.failed}")
+            if isinstance(error, SkyloopError):
+                raise
+            raise RefusedError(f"{settings.name} can't be served: {error!r}", code="driver_failed") from error
+        if isinstance(vehicle, SharedVehicle) and vehicle.proxy is not None:
+            with self._lock:
+                self._ticker.add(vehicle.proxy)
+        return vehicle
+
+    def _make(self, settings: VehicleSettings, network: FabricSettings | None) -> HostedVehicle:
+        if settings.own_process:
+            return OwnProcessVehicle(settings, self.announce)
+        lane = self._workers.lane()
+        return SharedVehicle(settings, self._reactor, lane, network, self._make_driver, self._few)
+
+    def _few(self) -> bool:
+        return len(self.vehicles) <= FEW
+
+    def add_all(self, several: Sequence[VehicleSettings]) -> dict[str, str]:
+        """Serve several vehicles, some at a time; return by name why some could not be served."""
+        problems: dict[str, str] = {}
+
+        def add(settings: VehicleSettings) -> None:
+            try:
+                self.add(settings)
+            except SkyloopError as error:
+                problems[settings.name] = str(error)
+
+        with ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="skyloop-host-start") as pool:
+            list(pool.map(add, several))
+        return problems
+
+    def remove(self, name: str, *, land: bool = False, timeout_s: float = LAND_WITHIN_S) -> VehicleStatus:
+        """Land a vehicle, end its proxy and forget it.
+
+        Args:
+            name: The vehicle.
+            land: Land it even if it flies under somebody's lease.
+            timeout_s: How long to wait until it has landed [s].
+
+        Returns:
+            Its last status.
+
+        Raises:
+            UnknownNameError: There is none of this name.
+            RefusedError: It flies under a lease (code ``flown``), or has not landed in time (``flying``); it is not
+                removed then.
+        """
+        vehicle = self.vehicles.get(name)
+        if vehicle is None:
+            raise UnknownNameError("vehicle of this host", name, self.vehicles)
+        status = vehicle.status()
+        if status.airborne and status.pilot is not None and not land:
+            raise RefusedError(
+                f"{name} flies, and {status.pilot} has the authority: let {status.pilot} land it, or land and remove "
+                f"it all the same: skyloop host remove {name} --land",
+                code="flown",
+            )
+        landed: list[bool] = []
+        within(lambda: landed.append(vehicle.land(timeout_s)), timeout_s + 1.0)
+        if landed != [True]:
+            raise RefusedError(
+                f"{name} has not landed within {timeout_s:g} s and is not removed: it goes on to land and takes no "
+                "set-points any more; try again",
+                code="flying",
+            )
+        status = vehicle.status()
+        self._end(vehicle, "it was removed from its host")
+        with self._lock:
+            if self.vehicles.get(name) is vehicle:
+                del self.vehicles[name]
+        self.announce(f"removed {name}")
+        return status
+
+    def _end(self, vehicle: HostedVehicle, reason: str) -> None:
+        if isinstance(vehicle, SharedVehicle) and vehicle.proxy is not None:
+            self._untick(vehicle.proxy)
+        vehicle.stop(reason)
+
+    def _untick(self, proxy: Proxy) -> None:
+        for loop in list(self._loops):
+            if isinstance(loop, Ticker):
+                loop.remove(proxy)
+
+    def status(self) -> list[VehicleStatus]:
+        """Return a row for each vehicle, also for those of the file that were not started."""
+        with self._lock:
+            vehicles = dict(self.vehicles)
+            known = dict(self.known)
+        rows = [vehicle.status() for vehicle in vehicles.values()]
+        waiting = [settings for name, settings in known.items() if name not in vehicles]
+        process = {True: "own", False: "shared"}
+        rows += [VehicleStatus(s.name, s.address, Condition.STOPPED, process=process[s.own_process]) for s in waiting]
+        return rows
+
+    def publish_keys(self, change: str) -> None:
+        """Publish what is new about the keys of the network, to everybody."""
+        for vehicle in list(self.vehicles.values()):
+            if isinstance(vehicle, SharedVehicle) and vehicle.proxy is not None:
+                vehicle.proxy.events.publish(EventKind.KEYS, change, Severity.WARNING)
+
+    def land(self, within_s: float, hurry: Callable[[], bool] = lambda: False) -> None:
+        """Land everything that flies, at the same time.
+
+        Args:
+            within_s: How long to wait [s].
+            hurry: Asked several times a second whether to wait no longer.
+        """
+        with self._lock:
+            self._closing = True
+        deadline_s = time.monotonic() + within_s
+
+        def land(vehicle: HostedVehicle) -> None:
+            while not (vehicle.land(LOOK_S) or hurry()) and time.monotonic() < deadline_s:
+                pass
+
+        landing = {  # a thread of its own for each: a driver that hangs keeps no other vehicle in the air
+            vehicle: threading.Thread(target=land, args=(vehicle,), name="skyloop-host-land", daemon=True)
+            for vehicle in list(self.vehicles.values())
+        }
+        for thread in landing.values():
+            thread.start()
+        for vehicle, thread in landing.items():
+            while thread.is_alive() and vehicle.runs and not hurry() and time.monotonic() < deadline_s:
+                thread.join(LOOK_S)
+
+    def close(self, reason: str = "the host was stopped") -> None:
+        """End all proxies, which leaves what flies hovering, and all threads that are not stuck. Idempotent."""
+        with self._lock:
+            self._closing = True
+            vehicles = list(self.vehicles.values())
+        with ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="skyloop-host-stop") as pool:
+            list(pool.map(lambda vehicle: self._end(vehicle, reason), vehicles))
+        self._watchdog.close()
+        for loop in self._loops:
+            loop.close()
+        self._workers.close()
+
+    # When a driver hangs or fails --------------------------------------------------------------------------------
+
+    def _of(self, member: Any) -> SharedVehicle | None:
+        """Return the vehicle whose transport server or proxy this is."""
+        for vehicle in list(self.vehicles.values()):
+            if isinstance(vehicle, SharedVehicle) and member in (vehicle.server, vehicle.proxy):
+                return vehicle
+        return None
+
+    def _on_stall(self, loop: SharedLoop, member: Any) -> None:
+        """Give all other vehicles of a loop another one."""
+        with self._lock:
+            new: SharedLoop
+            if isinstance(loop, Reactor) and isinstance(member, SharedLocalServer):
+                new = loop.split(member)
+                self._reactor = new if loop is self._reactor else self._reactor
+            elif isinstance(loop, Ticker) and isinstance(member, Proxy):
+                new = loop.split(member)
+                self._ticker = new if loop is self._ticker else self._ticker
+            else:
+                return
+            self._loops.append(new)
+        vehicle = self._of(member)
+        if vehicle is not None:
+            self.announce(f"vehicle of {vehicle.settings.name}: its driver has blocked for {_STALL_S:g} s")
+            vehicle.report_stall(_STALL_S)
+
+    def _on_hang(self, loop: SharedLoop, member: Any) -> None:
+        """Give a vehicle up."""
+        with self._lock:
+            self._loops.remove(loop)
+        loop.close()  # if it ever comes back
+        vehicle = self._of(member)
+        if vehicle is not None:
+            self._give_up(vehicle, f"its driver hangs: a call has not returned for {_HANG_S:g} s")
+
+    def _on_failing(self, proxy: Proxy, error: BaseException) -> None:
+        vehicle = self._of(proxy)
+        if vehicle is not None:
+            self._give_up(vehicle, f"its driver fails each time that it is asked, so that nothing guards it: {error!r}")
+
+    def _give_up(self, vehicle: SharedVehicle, reason: str) -> None:
+        """End a vehicle whose driver does not work, on a thread of its own."""
+
+        def end() -> None:
+            if vehicle.proxy is not None:
+                self._untick(vehicle.proxy)
+            if vehicle.fail(reason):
+                self.announce(f"failed {vehicle.settings.name}: {reason}")
+
+        threading.Thread(target=end, name="skyloop-host-fail", daemon=True).start()
+
+
+def check_known(host: Host, name: str) -> VehicleSettings:
+    """Return the settings of a vehicle that the host's file names.
+
+    Raises:
+        UnknownNameError: It names none of this name.
+        UsageError: It runs already.
+    """
+    settings = host.known.get(name)
+    if settings is None:
+        raise UnknownNameError("vehicle of this host's file", name, host.known)
+    present = host.vehicles.get(name)
+    if present is not None and present.runs:
+        raise UsageError(f"{name} runs already: skyloop host status shows it")
+    return settings

@@ -1,0 +1,269 @@
+"""One vehicle of a host: its proxy on the shared threads of this process, or in a process of its own."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from enum import StrEnum
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+
+from skyloop.drivers.base import Driver
+from skyloop.drivers.registry import make_driver
+from skyloop.errors import DriverError, SkyloopError
+from skyloop.files import expand
+from skyloop.host.fleet import VehicleSettings
+from skyloop.messages import EventKind, Severity
+from skyloop.proxy import Proxy
+from skyloop.proxy.flight_record import FlightRecord, record_path
+from skyloop.proxy.requests import JobQueue
+from skyloop.proxy.serve import keep_trail
+from skyloop.proxy.warm_up import WARMER
+from skyloop.transport.base import TransportServer
+from skyloop.transport.local.reactor import Reactor
+from skyloop.transport.local.shared_server import SharedLocalServer
+
+if TYPE_CHECKING:
+    from skyloop.transport.fabric import FabricSettings
+
+OPEN_S: Final = 10.0  #: how long a driver may take to open or to close before its vehicle is given up
+_log = logging.getLogger(__name__)
+
+
+class Condition(StrEnum):
+    """What has become of a vehicle's proxy."""
+
+    STOPPED = "stopped"  #: not started yet, or removed
+    STARTING = "starting"
+    RUNNING = "running"
+    RESTARTING = "restarting"  #: its own process died, and is started again after a pause
+    FAILED = "failed"
+
+
+class VehicleStatus(msgspec.Struct, frozen=True):
+    """One row of ``skyloop host status``."""
+
+    name: str
+    address: str
+    condition: Condition
+    state: str = ""  #: flight state
+    link: str = ""  #: of the vehicle
+    link_reason: str = ""
+    link_remedy: str = ""
+    pilot: str | None = None
+    battery: float | None = None
+    uptime_s: float = 0.0
+    failed: str = ""  #: why it failed, or its process ended last
+    process: str = "shared"  #: or ``own``
+    pid: int | None = None
+    restarts: int = 0
+    airborne: bool = False
+
+
+class HostedVehicle(ABC):
+    """A vehicle of a host. Methods may be called from any thread.
+
+    Args:
+        settings: Its settings.
+    """
+
+    def __init__(self, settings: VehicleSettings) -> None:
+        self.settings = settings
+        self.condition = Condition.STOPPED
+        self.failed = ""  #: why, once it has
+        self.started_s = time.monotonic()
+
+    @abstractmethod
+    def start(self) -> None:
+        """Serve the vehicle. Raises what speaks against it, as :class:`skyloop.errors.SkyloopError`."""
+
+    @abstractmethod
+    def status(self) -> VehicleStatus:
+        """Return its row."""
+
+    @abstractmethod
+    def land(self, timeout_s: float) -> bool:
+        """Land it if it flies; return whether nothing of it flies any more."""
+
+    @abstractmethod
+    def stop(self, reason: str) -> None:
+        """End its proxy, which leaves what flies hovering. Idempotent."""
+
+    @property
+    def runs(self) -> bool:
+        """Whether it has a proxy, or is about to have one."""
+        return self.condition in (Condition.STARTING, Condition.RUNNING, Condition.RESTARTING)
+
+    def row(self) -> VehicleStatus:
+        """Return what is known without its proxy."""
+        settings = self.settings
+        up_s = time.monotonic() - self.started_s if self.condition is Condition.RUNNING else 0.0
+        process = "own" if settings.own_process else "shared"
+        return VehicleStatus(
+            settings.name, settings.address, self.condition, uptime_s=up_s, failed=self.failed, process=process
+        )
+
+
+class SharedVehicle(HostedVehicle):
+    """A vehicle whose proxy uses the shared threads of this process.
+
+    Args:
+        settings: Its settings.
+        reactor: Receives for it on this host.
+        jobs: Answers its requests that may wait.
+        network: How its proxy joins the network; None for this host only.
+        make: Makes the driver of an address.
+        few: Whether this process has few vehicles: the code of many is warm by itself.
+    """
+
+    def __init__(
+        self,
+        settings: VehicleSettings,
+        reactor: Reactor,
+        jobs: JobQueue,
+        network: FabricSettings | None,
+        make: Callable[[str], Driver] = make_driver,
+        few: Callable[[], bool] = lambda: True,
+    ) -> None:
+        super().__init__(settings)
+        self._few = few
+        self._make = make
+        self.server = SharedLocalServer(settings.name, reactor, group=settings.group)
+        self.proxy: Proxy | None = None
+        self._jobs = jobs
+        self._network = network
+        self._life = threading.Lock()  # guards starting, failing and stopping
+
+    def start(self) -> None:
+        settings = self.settings
+        self.condition = Condition.STARTING
+        driver = self._make(settings.address)
+        proxy = Proxy(driver, self._end(str(driver.uri)), name=settings.name, ticker=False, jobs=self._jobs)
+        proxy.parameters.preset(settings.presets)
+        proxy.keep_warm = lambda period_s: WARMER.keep(proxy, period_s if self._few() else 0.0)
+        keep_trail(proxy, None)
+        proxy.keep_record(FlightRecord(record_path(settings.name), str(driver.uri)))
+        self.proxy = proxy
+        try:
+            hung = not within(proxy.start, OPEN_S)
+        except BaseException:
+            self.proxy = None
+            raise
+        if hung:
+            proxy.abandon(f"its driver did not open within {OPEN_S:g} s")
+            raise DriverError(f"the driver of {settings.address} did not open within {OPEN_S:g} s: it hangs")
+        self.started_s = time.monotonic()
+        self.condition = Condition.RUNNING
+
+    def _end(self, address: str) -> TransportServer:
+        if self._network is None:
+            return self.server
+        from skyloop.transport.composite import CompositeServer
+        from skyloop.transport.fabric import FabricServer
+
+        return CompositeServer([self.server, FabricServer(self.settings.name, self._network, vehicle=address)])
+
+    def status(self) -> VehicleStatus:
+        proxy, row = self.proxy, self.row()
+        if proxy is None or self.condition is not Condition.RUNNING:
+            return row
+        return msgspec.structs.replace(row, **of_proxy(proxy))
+
+    def report_stall(self, seconds: float) -> None:
+        """Publish that its driver blocks, and that its threads are its own from here on."""
+        proxy = self.proxy
+        if proxy is not None:
+            text = (
+                f"the driver has blocked for {seconds:g} s: its vehicle gets threads of its own, apart from the others"
+            )
+            proxy.publisher.event(EventKind.DRIVER_ERROR, text, Severity.ERROR, where="host")
+
+    def fail(self, reason: str) -> bool:
+        """Give the vehicle up because its driver hangs or fails, with an event; return False if it was not running."""
+        with self._life:
+            proxy = self.proxy
+            if proxy is None or self.condition is not Condition.RUNNING:
+                return False
+            self.condition, self.failed = Condition.FAILED, reason
+        proxy.abandon(reason)
+        return True
+
+    def land(self, timeout_s: float) -> bool:
+        proxy = self.proxy
+        if proxy is None or self.condition is not Condition.RUNNING:
+            return True
+        return proxy.land(timeout_s)
+
+    def stop(self, reason: str) -> None:
+        with self._life:
+            proxy, self.proxy = self.proxy, None
+            running = self.condition is Condition.RUNNING
+            if self.condition is not Condition.FAILED:
+                self.condition = Condition.STOPPED
+        if proxy is not None and running and not within(lambda: proxy.stop(reason=reason), OPEN_S):
+            _log.error("the driver of %s does not close: it is left alone", self.settings.name)
+
+
+def of_proxy(proxy: Proxy) -> dict[str, object]:
+    """Return what a row shows of a running proxy."""
+    vehicle = proxy.publisher
+    feedback = vehicle.feedback_now
+    return {
+        "state": feedback.state.value if feedback is not None else "",
+        "battery": feedback.battery if feedback is not None else None,
+        "pilot": feedback.owner if feedback is not None else None,
+        "link": vehicle.link_state.value,
+        "link_reason": vehicle.link_reason,
+        "link_remedy": vehicle.link_remedy,
+        "airborne": proxy.handler.airborne,
+    }
+
+
+def network_of(settings: VehicleSettings) -> FabricSettings | None:
+    """Return how a vehicle's proxy joins the network; None for this host only.
+
+    Raises:
+        UsageError: An address or the folder of keys is not valid.
+        MissingExtraError: The extra ``network`` is not installed.
+    """
+    if settings.network is None:
+        return None
+    from skyloop.transport.fabric.environment import serving
+
+    keys = expand(settings.keys) if settings.keys is not None else None
+    return serving(settings.network, listen=settings.listen, multicast=settings.multicast, keys=keys)
+
+
+def within(call: Callable[[], object], seconds: float) -> bool:
+    """Call something that may hang, on a thread of its own, and raise what it raises.
+
+    Args:
+        call: The function.
+        seconds: How long to wait for it [s].
+
+    Returns:
+        Whether it returned in time; if not, it is left to its daemon thread.
+    """
+    raised: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            call()
+        except BaseException as error:  # noqa: BLE001  it is raised again where it was waited for
+            raised.append(error)
+
+    thread = threading.Thread(target=run, name="skyloop-host-call", daemon=True)
+    thread.start()
+    thread.join(seconds)
+    if raised:
+        raise raised[0]
+    return not thread.is_alive()
+
+
+def reason_of(error: BaseException) -> str:
+    """Return the text of an error, for people."""
+    return str(error) if isinstance(error, SkyloopError) else repr(error)

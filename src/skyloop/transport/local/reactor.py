@@ -1,0 +1,216 @@
+"""One thread that receives for any number of local transport servers, and can be split when one of them blocks it.
+
+A thread per connection (:mod:`skyloop.transport.local.server`) delivers a packet with one system call less, and is the
+better choice for one vehicle. For a hundred it is two hundred threads that wake one another: here one thread waits for
+all connections (epoll) and takes what is there in one go, commands first.
+
+What a handler does is done on this thread. While it calls one, :attr:`Reactor.inside` has its server and
+:attr:`Reactor.entries` counts the calls, so that somebody else notices a call that does not come back:
+:meth:`Reactor.split` then leaves this thread to that server alone and moves all others to a new reactor.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import select
+import threading
+import time
+from collections import deque
+from collections.abc import Iterable
+from typing import Final, Protocol
+
+from skyloop.transport.local.connection import ServerConnection
+from skyloop.transport.local.sockets import Socket
+
+CHECK_S: Final = 0.5  #: how often silent connections, and listeners that could not accept, are looked at
+_AFTER_FAILURE_S: Final = 0.01
+_log = logging.getLogger(__name__)
+
+
+class Receiver(Protocol):
+    """A transport server, as its reactor sees it. All but :attr:`reactor` is for the reactor's thread."""
+
+    reactor: Reactor  #: which receives for it now
+
+    def receive(self, reactor: Reactor, source: Source) -> bool:
+        """Take one packet or caller; return whether a packet waits for :meth:`deliver_waiting`."""
+
+    def deliver_waiting(self, reactor: Reactor, source: Source) -> None:
+        """Handle the packet that waits in a source."""
+
+    def end_silent(self, reactor: Reactor, source: Source, now_s: float) -> None:
+        """End a connection that takes too long to send its first packet."""
+
+
+class Source:
+    """A socket that a reactor waits for: a server's listener, or one of its connections.
+
+    Args:
+        server: Whose it is.
+        sock: The listener; None for a connection.
+        connection: The connection; None for a listener.
+    """
+
+    __slots__ = ("connection", "ended", "fileno", "muted", "packet", "server", "since_s", "sock")
+
+    def __init__(
+        self, server: Receiver, sock: Socket | None = None, connection: ServerConnection | None = None
+    ) -> None:
+        self.server = server
+        self.sock = sock
+        self.connection = connection
+        self.fileno = sock.fileno() if sock is not None else connection.fileno() if connection is not None else -1
+        self.since_s = time.monotonic()
+        self.packet: bytes | None = None  #: received, and waits until the commands of others were handled
+        self.ended = False
+        self.muted = False  #: not waited for until the next check
+
+
+class _Thread(threading.Thread):
+    """A reactor's thread."""
+
+
+def receiving() -> bool:
+    """Return whether the calling thread is one of a reactor."""
+    return isinstance(threading.current_thread(), _Thread)
+
+
+class Reactor:
+    """Receives for transport servers on one thread, from its construction to :meth:`close`."""
+
+    def __init__(self) -> None:
+        self.inside: Receiver | None = None  #: whose handler is being called, or may be
+        self.entries = 0  #: how often :attr:`inside` was set
+        self._lock = threading.Lock()  # guards the table
+        self._sources: dict[int, Source] = {}  # by file descriptor
+        self._epoll = select.epoll()
+        self._waker = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self._epoll.register(self._waker, select.EPOLLIN)
+        self._closing = False
+        self._waiting: deque[Source] = deque()  # have a packet that is not handled yet
+        self._thread = _Thread(target=self._run, name="skyloop-reactor", daemon=True)
+        self._thread.start()
+
+    def add(self, source: Source) -> None:
+        """Wait for a socket. Any thread."""
+        with self._lock:
+            self._sources[source.fileno] = source
+            self._epoll.register(source.fileno, select.EPOLLIN)
+
+    def remove(self, source: Source) -> bool:
+        """Wait for a socket no longer; return whether it was waited for here. Any thread."""
+        with self._lock:
+            if self._sources.get(source.fileno) is not source:
+                return False
+            del self._sources[source.fileno]
+            self._epoll.unregister(source.fileno)
+            return True
+
+    def split(self, stuck: Receiver) -> Reactor:
+        """Leave this reactor to one server, and return a new one that receives for all others. Any thread.
+
+        No packet is lost, none is delivered twice, and the packets of each connection keep their order.
+
+        Args:
+            stuck: The server whose handler the thread is in.
+        """
+        with self._lock:
+            moved = [source for source in self._sources.values() if source.server is not stuck]
+        new = Reactor()
+        for server in {source.server for source in moved}:
+            server.reactor = new  # from here on this thread handles nothing of theirs any more
+        for source in moved:
+            self.hand_over(source, new)
+        new.resume(source for source in moved if source.packet is not None)
+        return new
+
+    def hand_over(self, source: Source, other: Reactor) -> None:
+        """Let another reactor wait for a socket. Any thread."""
+        if self.remove(source):
+            other.add(source)
+
+    def resume(self, sources: Iterable[Source]) -> None:
+        """Handle packets that another reactor has received. Any thread."""
+        self._waiting.extend(sources)
+        self._wake()
+
+    def close(self) -> None:
+        """End the thread, after what it is doing. Its servers are stopped before. Idempotent."""
+        if not self._closing:
+            self._closing = True
+            self._wake()
+        if threading.current_thread() is not self._thread and self.inside is None:
+            self._thread.join()
+
+    def _wake(self) -> None:
+        with contextlib.suppress(OSError):
+            os.eventfd_write(self._waker, 1)
+
+    # --- its thread ---
+
+    def _run(self) -> None:
+        checked_s = time.monotonic()
+        while not self._closing:
+            self.inside = None
+            ready = self._epoll.poll(CHECK_S)
+            try:
+                self._turn(ready)
+                if time.monotonic() - checked_s >= CHECK_S:
+                    checked_s = time.monotonic()
+                    self._check()
+            except Exception:  # noqa: BLE001  nothing else receives for these servers: this thread must go on
+                _log.exception("a turn of the receiving thread failed; it goes on")
+                time.sleep(_AFTER_FAILURE_S)  # what failed is still there, and must not take the whole processor
+        self.inside = None
+        os.close(self._waker)
+        self._epoll.close()
+
+    def _turn(self, ready: list[tuple[int, int]]) -> None:
+        """Handle one packet of each connection that has one, commands first."""
+        waiting = self._waiting
+        self._receive(ready)
+        while waiting:
+            source = waiting.popleft()
+            self._enter(source.server)
+            source.server.deliver_waiting(self, source)
+            if waiting:  # a command that came meanwhile goes before the next of them
+                self._receive(self._epoll.poll(0))
+
+    def _receive(self, ready: list[tuple[int, int]]) -> None:
+        sources, waiting = self._sources, self._waiting
+        for fileno, _ in ready:
+            source = sources.get(fileno)
+            if source is None:
+                if fileno == self._waker:
+                    os.eventfd_read(self._waker)
+                continue
+            if source.packet is None:
+                self._enter(source.server)
+                if source.server.receive(self, source):
+                    waiting.append(source)
+
+    def _enter(self, server: Receiver) -> None:
+        self.inside = server
+        self.entries += 1
+
+    def mute(self, source: Source) -> None:
+        """Do not wait for a listener until the next check: it can't accept, and would be ready all the time."""
+        source.muted = True
+        with self._lock, contextlib.suppress(OSError):
+            self._epoll.modify(source.fileno, 0)
+
+    def _check(self) -> None:
+        """End connections that sent nothing, and try listeners again."""
+        now_s = time.monotonic()
+        with self._lock:
+            sources = list(self._sources.values())
+        for source in sources:
+            if source.muted:
+                source.muted = False
+                with self._lock, contextlib.suppress(OSError):
+                    self._epoll.modify(source.fileno, select.EPOLLIN)
+            elif source.connection is not None and not source.connection.joined:
+                self._enter(source.server)
+                source.server.end_silent(self, source, now_s)

@@ -1,0 +1,175 @@
+"""A host's control socket, and the commands that use it."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from skyloop.cli import main
+from skyloop.errors import LinkError, NameTakenError, RefusedError, UnknownNameError, UsageError
+from skyloop.host import control
+from skyloop.host.control import Add, AddNamed, Answer, ControlServer, Remove, Status, ask, chosen_host, running_hosts
+from skyloop.host.fleet import Defaults, FlightLimits
+from skyloop.host.serve import Answering
+from skyloop.transport.local.directory import HOST, connect, find_directory
+from tests.host.fleet import Hosting
+
+
+@pytest.fixture
+def served(hosting: Hosting, monkeypatch: pytest.MonkeyPatch) -> Iterator[Hosting]:
+    """A host whose control socket is named ``host``."""
+    monkeypatch.setattr("skyloop.host.fleet.driver_class", lambda scheme: scheme)  # there is no driver of fake://
+    server = ControlServer("host", Answering(hosting.host, Defaults(limits=FlightLimits(speed=0.5))))
+    server.start()
+    yield hosting
+    server.stop()
+    server.stop()
+
+
+def skyloop(*words: str) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main(list(words))
+    assert ended.value.code is None or isinstance(ended.value.code, int)
+    return ended.value.code or 0
+
+
+def test_vehicles_come_and_go(served: Hosting) -> None:
+    served.vehicle("alpha")
+    (row,) = ask("host", AddNamed("alpha", "fake://alpha")).vehicles
+    assert (row.name, row.condition, row.process) == ("alpha", "running", "shared")
+    proxy = served.shared("alpha").proxy
+    assert proxy is not None
+    assert proxy.handler.checks.limits.speed == 0.5
+    assert [row.name for row in ask("host", Status()).vehicles] == ["alpha"]
+    served.vehicle("bravo").fail = {"open"}
+    answer = ask("host", Add(tuple(map(served.settings, ("alpha", "bravo")))))
+    assert [(row.name, row.condition.value) for row in answer.vehicles] == [("alpha", "running"), ("bravo", "failed")]
+    assert "open is broken" in answer.problems["bravo"]
+    assert ask("host", Remove("alpha")).vehicles[0].name == "alpha"
+    assert ask("host", AddNamed("alpha")).vehicles[0].condition == "running"
+
+
+def test_errors_come_back_as_they_were_raised(served: Hosting) -> None:
+    served.add("alpha")
+    with pytest.raises(UsageError, match="did you mean 'alpha'"):
+        ask("host", Remove("alpa"))
+    with pytest.raises(UsageError, match="runs already"):
+        ask("host", AddNamed("alpha"))
+    with pytest.raises(NameTakenError, match="has a vehicle named 'alpha' already"):
+        ask("host", AddNamed("alpha", "fake://alpha"))
+    with pytest.raises(UsageError, match="lower-case"):
+        ask("host", AddNamed("Al Pha", "fake://alpha"))
+    served.airborne("alpha")
+    with pytest.raises(RefusedError, match="has the authority") as refused:
+        ask("host", Remove("alpha"))
+    assert refused.value.code == "flown"
+
+
+def test_garbage_and_callers_who_ask_nothing_do_no_harm(served: Hosting) -> None:
+    for packet in (b"", b"{", b"[" * 5000, b'{"type":"remove"}', b'{"type":"reboot"}', b"\0" * control.MAX_REQUEST):
+        sock = connect(find_directory(None, HOST).socket_path("host"))
+        if packet:
+            sock.send(packet)
+            answer = msgspec.json.decode(sock.recv(1 << 16), type=Answer)
+            assert "not understood" in answer.error
+        sock.hang_up()
+    assert ask("host", Status()).vehicles == ()
+
+
+def test_a_large_answer_arrives_whole(served: Hosting) -> None:
+    for number in range(600):
+        name = f"vehicle-{number:04}-of-a-very-large-fleet"
+        served.host.known[name] = served.settings(name)
+    assert len(ask("host", Status()).vehicles) == 600
+
+
+def test_others_may_not_use_it(served: Hosting, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(control, "may_connect", lambda sock, gid: False)
+    with pytest.raises(RefusedError, match=f"pid {os.getpid()}.*may not use the host"):
+        ask("host", Remove("alpha"))
+
+
+def test_a_host_that_fails_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    def answering(_: control.Request) -> Answer:
+        raise RuntimeError("on purpose")
+
+    server = ControlServer("host", answering)
+    server.start()
+    with pytest.raises(RefusedError, match="on purpose"):
+        ask("host", Status())
+    with pytest.raises(NameTakenError, match="in use by a running host"):
+        ControlServer("host", answering).start()
+    server.stop()
+    with pytest.raises(LinkError, match="can't be reached"):
+        ask("host", Status())
+
+
+def test_one_that_ends_before_it_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ControlServer, "_answer", lambda self, sock: None)
+    server = ControlServer("host", lambda _: Answer())
+    server.start()
+    with pytest.raises(LinkError, match="ended before it answered"):
+        ask("host", Status())
+    server.stop()
+
+
+def test_the_host_that_is_meant_is_found() -> None:
+    with pytest.raises(UsageError, match=r"skyloop host fleet\.toml"):
+        chosen_host()
+    servers = [ControlServer(name, lambda _: Answer()) for name in ("one", "two")]
+    servers[0].start()
+    assert chosen_host() == "one"
+    servers[1].start()
+    assert running_hosts() == ["one", "two"]
+    with pytest.raises(UsageError, match="--host one or two"):
+        chosen_host()
+    assert chosen_host("two") == "two"
+    with pytest.raises(UnknownNameError, match="three"):
+        chosen_host("three")
+    for server in servers:
+        server.stop()
+
+
+def test_the_commands_show_what_happens(served: Hosting, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert skyloop("host", "status") == 0
+    assert "Add one: skyloop host add NAME ADDRESS" in capsys.readouterr().out
+    served.vehicle("alpha")
+    assert skyloop("host", "add", "alpha", "fake://alpha") == 0
+    assert skyloop("host", "status", "--host", "host") == 0
+    out = capsys.readouterr().out
+    assert "fake://alpha" in out
+    assert "running" in out
+    assert skyloop("host", "status", "--json") == 0
+    (row,) = msgspec.json.decode(capsys.readouterr().out)
+    assert {"name", "address", "condition", "state", "link", "pilot", "uptime_s", "failed", "process"} <= row.keys()
+    served.vehicle("bravo").fail = {"open"}
+    (tmp_path / "more.toml").write_text('[[vehicle]]\nname = "bravo"\naddress = "fake://bravo"\n')
+    assert skyloop("host", "add", str(tmp_path / "more.toml")) == 1
+    assert "bravo was not added: open" not in (shown := capsys.readouterr()).out
+    assert "bravo was not added" in shown.err
+    assert skyloop("host", "add", str(tmp_path / "more.toml"), "--own-process") == 2
+    pilot = served.airborne("alpha")
+    assert skyloop("host", "remove", "alpha") == 1
+    assert "--land" in capsys.readouterr().err
+    assert skyloop("host", "remove", "alpha", "--land") == 0
+    assert capsys.readouterr().out == "removed alpha: fake://alpha\n"
+    assert pilot.closed_by.get(timeout=10.0)
+
+
+@pytest.mark.parametrize("words", [(), ("status",), ("add",), ("remove",)])
+def test_each_command_has_help_with_an_example(words: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
+    assert skyloop("host", *words, "--help") == 0
+    assert "Example: skyloop host" in capsys.readouterr().out
+
+
+def test_a_mistake_in_the_file_is_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    (tmp_path / "fleet.toml").write_text("[[vehicle]]\nname = 'a'\nadress = 'sim://'\n")
+    assert skyloop("host", str(tmp_path / "fleet.toml")) == 2
+    error = capsys.readouterr().err
+    assert "did you mean 'address'" in error
+    assert threading.active_count() >= 1

@@ -1,0 +1,271 @@
+"""A vehicle whose driver hangs or raises ends alone: the others are flown on, with no failsafe."""
+
+from __future__ import annotations
+
+import threading
+from functools import partial
+
+import pytest
+
+from skyloop.errors import NameTakenError, RefusedError, UnknownNameError
+from skyloop.host import vehicle as vehicles
+from skyloop.host.fleet import VehicleSettings
+from skyloop.messages import (
+    EventKind,
+    Failsafe,
+    FlightState,
+    Hover,
+    Land,
+    ListParameters,
+    Parameter,
+    ParameterType,
+    ParameterValue,
+    SetParameter,
+    Value,
+    Velocity,
+)
+from skyloop.proxy import Proxy
+from skyloop.transport.local import LocalServer, list_names
+from skyloop.transport.testing import wait_until
+from tests.host.fleet import Flight, Hosting, closing_reason
+from tests.proxy.fake import FakeDriver
+
+
+def test_a_driver_that_blocks_in_a_command_ends_only_its_own_vehicle(hosting: Hosting) -> None:
+    stuck = hosting.add("stuck")
+    hosting.add("good")
+    witness = hosting.app("stuck")
+    pilot = hosting.airborne("stuck")
+    with Flight(hosting, "good") as flight:
+        stuck.hangs = {"velocity"}
+        pilot.command(Velocity(0.3, 0.0, 0.0, 0.0), sync=False)
+        assert stuck.stuck.wait(10.0)
+        flight.goes_on()
+        wait_until(lambda: hosting.condition("stuck") == "failed", "it was given up")
+        assert "its driver hangs" in closing_reason(witness)
+        flight.goes_on()
+        late = hosting.app("good")  # whoever comes is served, and requests are answered
+        late.sync()
+    stalls = [event for event in witness.events if event.kind is EventKind.DRIVER_ERROR]
+    assert [event.data["where"] for event in stalls] == ["host"]
+    (row,) = [row for row in hosting.host.status() if row.name == "stuck"]
+    assert "a call has not returned" in row.failed
+    assert hosting.condition("good") == "running"
+    hosting.drivers["stuck"] = type(stuck)()
+    hosting.add("stuck")  # it can be served again under its name
+    assert hosting.condition("stuck") == "running"
+    stuck.let_go.set()
+
+
+def test_a_driver_that_blocks_for_a_moment_goes_on_beside_the_others(hosting: Hosting) -> None:
+    slow = hosting.add("slow")
+    hosting.add("good")
+    pilot = hosting.airborne("slow")
+    with Flight(hosting, "good") as flight:
+        slow.hangs = {"velocity"}
+        pilot.command(Velocity(0.3, 0.0, 0.0, 0.0), sync=False)
+        wait_until(lambda: any("has blocked" in line for line in hosting.lines), "it was noticed")
+        slow.hangs = set()
+        slow.let_go.set()
+        pilot.sync()
+        flight.goes_on()
+    assert hosting.condition("slow") == "running"
+    assert hosting.shared("slow").server.reactor is not hosting.shared("good").server.reactor
+
+
+def test_a_driver_that_blocks_in_a_failsafe_ends_only_its_own_vehicle(hosting: Hosting) -> None:
+    """It is called by the ticker that all vehicles share."""
+    stuck = hosting.add("stuck")
+    hosting.add("good")
+    hosting.airborne("stuck")
+    witness = hosting.app("stuck")
+    with Flight(hosting, "good") as flight:
+        stuck.hangs = {"hover"}  # for want of commands
+        assert stuck.stuck.wait(10.0)
+        flight.goes_on()
+        assert "its driver hangs" in closing_reason(witness)
+        assert hosting.condition("stuck") == "failed"
+        flight.goes_on()
+    silent = flight.pilot  # the failsafes of the others are there
+    wait_until(lambda: any(f.failsafe is Failsafe.HOVER for f in silent.feedback), "the good one hovers unflown")
+
+
+def test_a_driver_that_raises_in_each_tick_ends_only_its_own_vehicle(hosting: Hosting) -> None:
+    bad = hosting.add("bad")
+    hosting.add("good")
+    witness = hosting.app("bad")
+    with Flight(hosting, "good") as flight:
+        bad.fail = {"left_to"}
+        assert "left_to is broken" in closing_reason(witness)
+        wait_until(lambda: hosting.condition("bad") == "failed", "it was given up")
+        flight.goes_on()
+    first = next(event for event in witness.events if event.kind is EventKind.DRIVER_ERROR)
+    assert first.data["where"] == "tick"
+    assert bad.closed
+
+
+def test_a_tick_that_raises_now_and_then_ends_nothing(hosting: Hosting) -> None:
+    bad = hosting.add("bad")
+    witness = hosting.app("bad")
+    bad.fail = {"left_to"}
+    wait_until(lambda: any(event.kind is EventKind.DRIVER_ERROR for event in witness.events), "it raised")
+    bad.fail = set()
+    count = len(witness.feedback)
+    wait_until(lambda: len(witness.feedback) > count + 3, "it is kept alive by its ticks")
+    assert hosting.condition("bad") == "running"
+
+
+def test_a_driver_that_raises_in_a_command_is_reported_and_flown_on(hosting: Hosting) -> None:
+    bad = hosting.add("bad")
+    pilot = hosting.airborne("bad")
+    bad.fail = {"apply"}
+    pilot.command(Velocity(0.1, 0.0, 0.0, 0.0))
+    assert any("apply is broken" in event.text for event in pilot.told(EventKind.DRIVER_ERROR))
+    bad.fail = set()
+    pilot.command(Velocity(0.2, 0.0, 0.0, 0.0))
+    assert isinstance(bad.told[-1], Velocity)
+
+
+def test_one_that_does_not_open_keeps_nobody_waiting(hosting: Hosting, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(vehicles, "OPEN_S", 0.2)
+    hosting.vehicle("stuck").hangs = {"open"}
+    hosting.vehicle("broken").fail = {"open"}
+    hosting.vehicle("good")
+    problems = hosting.host.add_all([hosting.settings(name) for name in ("stuck", "broken", "good")])
+    assert "did not open within" in problems.pop("stuck")
+    assert "open is broken" in problems.pop("broken")
+    assert problems == {}
+    assert [hosting.condition(name) for name in ("stuck", "broken", "good")] == ["failed", "failed", "running"]
+    hosting.app("good").sync()
+    assert any(line.startswith("failed stuck: ") for line in hosting.lines)
+
+
+def test_one_that_does_not_close_keeps_nobody_waiting(hosting: Hosting, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(vehicles, "OPEN_S", 0.2)
+    hosting.add("stuck").hangs = {"close"}
+    hosting.add("good")
+    hosting.host.remove("stuck")
+    hosting.app("good").sync()
+    assert [row.name for row in hosting.host.status() if row.condition == "running"] == ["good"]
+
+
+def test_a_request_that_hangs_holds_up_its_own_vehicle_only(hosting: Hosting) -> None:
+    stuck = hosting.vehicle("stuck")
+    stuck.native = [Parameter("gain", ParameterType.FLOAT, 1.0)]
+    stuck.hangs = {"set_parameter"}
+    for name in ("stuck", "good"):
+        hosting.add(name)
+    pilot = hosting.airborne("stuck")
+    number = pilot.post(SetParameter("gain", 2.0, pilot.lease))
+    assert stuck.stuck.wait(10.0)
+    other = hosting.app("good")
+    for _ in range(10):
+        other.ask(ListParameters(0))
+    pilot.command(Velocity(0.1, 0.0, 0.0, 0.0))  # it is flown all the same
+    stuck.let_go.set()
+    assert isinstance(pilot.answer(number), ParameterValue)
+
+
+def test_names_that_are_taken_are_refused_and_the_others_start(hosting: Hosting) -> None:
+    lone = Proxy(FakeDriver(lambda: 0), LocalServer("taken"), name="taken")
+    with lone:
+        for name in ("taken", "good"):
+            hosting.vehicle(name)
+        problems = hosting.host.add_all([hosting.settings(name) for name in ("taken", "good")])
+        assert list(problems) == ["taken"]
+        assert "in use by a running proxy" in problems["taken"]
+        assert hosting.condition("good") == "running"
+    with pytest.raises(NameTakenError, match="skyloop host remove good"):
+        hosting.add("good")
+    hosting.add("taken")  # the name is free now
+    assert hosting.condition("taken") == "running"
+
+
+def test_one_that_flies_under_a_lease_is_not_removed_without_being_told_so(hosting: Hosting) -> None:
+    driver = hosting.add("alpha")
+    pilot = hosting.airborne("alpha")
+    pilot.command(Hover())
+    with pytest.raises(RefusedError, match=r"pilot has the authority.*host remove alpha --land") as refused:
+        hosting.host.remove("alpha")
+    assert refused.value.code == "flown"
+    assert Land() not in driver.told
+    last = hosting.host.remove("alpha", land=True)
+    assert last.state == FlightState.LANDED
+    assert driver.told[-1] == Land()
+    assert driver.closed
+    assert "removed from its host" in closing_reason(pilot)
+    assert hosting.host.vehicles == {}
+    assert list_names() == []
+    assert hosting.condition("alpha") == "stopped"  # it can be added again by its name
+
+
+def test_one_that_does_not_land_stays(hosting: Hosting) -> None:
+    driver = hosting.add("alpha")
+    hosting.airborne("alpha")
+    driver.lands = False
+    with pytest.raises(RefusedError, match="has not landed within") as refused:
+        hosting.host.remove("alpha", land=True, timeout_s=0.1)
+    assert refused.value.code == "flying"
+    assert hosting.condition("alpha") == "running"
+
+
+def test_an_unknown_vehicle_is_not_removed(hosting: Hosting) -> None:
+    hosting.add("alpha")
+    with pytest.raises(UnknownNameError, match="did you mean 'alpha'"):
+        hosting.host.remove("alpa")
+
+
+def test_all_land_at_the_end_though_one_hangs(hosting: Hosting) -> None:
+    for name in ("stuck", "one", "two"):
+        hosting.add(name)
+        hosting.airborne(name)
+    hosting.drivers["stuck"].hangs = {"land"}
+    landing = threading.Thread(target=hosting.host.land, args=(20.0,))
+    landing.start()
+    for name in ("one", "two"):
+        wait_until(partial(hosting.drivers[name].told.__contains__, Land()), "it lands")
+    landing.join(20.0)
+    assert not landing.is_alive(), "it must not wait for the one that hangs once that is given up"
+    with pytest.raises(RefusedError, match="ending"):
+        hosting.add("late")
+
+
+def test_presets_are_in_force_from_the_beginning(hosting: Hosting) -> None:
+    driver = hosting.vehicle("alpha")
+
+    def tilt(value: float) -> list[Parameter]:
+        return [Parameter("limits.tilt", ParameterType.FLOAT, value, minimum=0.05, maximum=1.0)]
+
+    driver.native = tilt(0.5)
+    driver.while_setting = lambda: driver.native.__setitem__(slice(None), tilt(0.2))
+    presets: dict[str, Value] = {"limits.speed": 0.5, "limits.tilt": 0.2}
+    hosting.host.add(VehicleSettings("alpha", "fake://alpha", presets=presets))
+    proxy = hosting.shared("alpha").proxy
+    assert proxy is not None
+    wait_until(lambda: proxy.handler.checks.limits.tilt == 0.2, "the vehicle's own parameter was written")
+    assert proxy.handler.checks.limits.speed == 0.5
+    pilot = hosting.airborne("alpha")
+    pilot.command(Velocity(2.0, 0.0, 0.0, 0.0))
+    flown = driver.told[-1]
+    assert isinstance(flown, Velocity)
+    assert flown.forward == pytest.approx(0.5)
+
+
+def test_a_vehicle_that_can_not_be_made_is_listed_as_failed(hosting: Hosting) -> None:
+    with pytest.raises(RefusedError, match="KeyError"):
+        hosting.host.add(VehicleSettings("nobody", "fake://nobody"))
+    assert hosting.condition("nobody") == "failed"
+
+
+def test_nothing_is_left_behind() -> None:
+    before = set(threading.enumerate())
+
+    def left() -> list[str]:
+        return [thread.name for thread in threading.enumerate() if thread not in before]
+
+    with Hosting() as hosting:
+        hosting.add("alpha")
+        hosting.app("alpha").sync()
+        hosting.host.remove("alpha")
+        wait_until(lambda: "skyloop-audit" not in left(), "its threads have ended")
+    wait_until(lambda: not left(), "all have ended")

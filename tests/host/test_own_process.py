@@ -1,0 +1,101 @@
+"""A vehicle in a process of its own, with processes that do as the test wants."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from skyloop.errors import RefusedError
+from skyloop.host import own_process
+from skyloop.host.fleet import VehicleSettings
+from skyloop.host.own_process import OwnProcessVehicle
+from skyloop.transport.testing import wait_until
+
+pytestmark = [pytest.mark.process, pytest.mark.skipif(sys.platform != "linux", reason="the local transport is Linux's")]
+
+SAY = """
+import json, os, sys, time
+def say(**more):
+    row = {"name": "a", "address": "sim://", "condition": "running", "process": "own", "pid": os.getpid(), **more}
+    print(json.dumps(row), flush=True)
+"""
+
+
+def vehicle(code: str, lines: list[str]) -> OwnProcessVehicle:
+    """One whose process runs this code."""
+    settings = VehicleSettings("a", "sim://", own_process=True)
+    return OwnProcessVehicle(settings, lines.append, (sys.executable, "-c", SAY + code))
+
+
+def test_one_that_can_not_serve_says_why() -> None:
+    for code, words in (
+        ("say(condition='failed', failed='no such thing'); sys.exit(1)", "no such thing"),
+        ("print('words of a driver'); sys.exit(3)", "exit code 3"),
+    ):
+        with pytest.raises(RefusedError, match=words):
+            vehicle(code, []).start()
+
+
+def test_one_that_dies_again_and_again_is_started_after_longer_and_longer_pauses(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pauses: list[int] = []
+    monkeypatch.setattr(own_process, "pause_s", lambda deaths: pauses.append(deaths) or 0.01)  # type: ignore[func-returns-value]
+    lines: list[str] = []
+    dying = vehicle("say(state='landed', airborne=False); time.sleep(0.05); sys.exit(7)", lines)
+    dying.start()
+    wait_until(lambda: len(pauses) >= 3, "it died three times")
+    assert pauses[:3] == [1, 2, 3]
+    assert "ended with exit code 7" in lines[0]
+    assert dying.status().restarts >= 1
+    assert "exit code 7" in dying.status().failed
+    dying.stop("it is enough")
+    assert dying.status().condition == "stopped"
+    count = len(pauses)
+    time.sleep(0.05)
+    assert len(pauses) == count
+
+
+def test_one_that_reports_nothing_any_more_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(own_process, "SILENT_LOOKS", 2)
+    monkeypatch.setattr(own_process, "_LOOK_S", 0.05)
+    lines: list[str] = []
+    hung = vehicle("say(); time.sleep(60)", lines)
+    hung.start()
+    wait_until(lambda: any("was killed by signal 9" in line for line in lines), "it was killed")
+    hung.stop("it is enough")
+
+
+def test_it_lands_at_sigterm_and_is_not_started_again(tmp_path: Path) -> None:
+    lines: list[str] = []
+    landing = vehicle(
+        f"""
+import signal
+def land(*_):
+    open({str(tmp_path / "landed")!r}, "w").close()
+    sys.exit(0)
+signal.signal(signal.SIGTERM, land)
+say(airborne=True, pilot="jane")
+time.sleep(60)
+""",
+        lines,
+    )
+    landing.start()
+    assert landing.status().pilot == "jane"
+    assert landing.runs
+    assert landing.land(10.0)
+    assert (tmp_path / "landed").exists()
+    landing.stop("it was removed")
+    assert lines == []
+    assert landing.land(0.0)
+
+
+def test_one_that_does_not_land_is_ended(tmp_path: Path) -> None:
+    stubborn = vehicle("import signal; signal.signal(signal.SIGTERM, lambda *_: None); say(); sys.stdin.read()", [])
+    stubborn.start()
+    assert not stubborn.land(0.05)
+    stubborn.stop("it was removed")
+    assert stubborn.status().condition == "stopped"

@@ -1,0 +1,176 @@
+"""The parts of a host by themselves: watchdog, ticker, workers."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+
+from skyloop.host.own_process import FIRST_PAUSE_S, LONGEST_PAUSE_S, pause_s
+from skyloop.host.ticker import Ticker
+from skyloop.host.watchdog import HANG_LOOKS, LOOK_S, STALL_LOOKS, SharedLoop, Watchdog
+from skyloop.host.workers import IDLE_THREADS, MAX_THREADS, RequestWorkers
+from skyloop.transport.testing import wait_until
+from tests.proxy.fake import Bench
+
+
+@dataclass(eq=False)
+class Loop:
+    inside: object = None
+    entries: int = 0
+
+    def close(self) -> None: ...
+
+
+class Watched:
+    """A watchdog that is told the time."""
+
+    def __init__(self) -> None:
+        self.loop = Loop()
+        self.loops: list[SharedLoop] = [self.loop]
+        self.stalls: list[object] = []
+        self.hangs: list[object] = []
+        self.now_s = 100.0
+        self.watchdog = Watchdog(
+            lambda: self.loops,
+            lambda _, inside: self.stalls.append(inside),
+            lambda _, inside: self.hangs.append(inside),
+        )
+        self.look(2)
+
+    def look(self, times: int = 1, apart_s: float = LOOK_S) -> None:
+        for _ in range(times):
+            self.now_s += apart_s
+            self.watchdog.look(self.now_s)
+
+
+def test_a_call_that_does_not_return_is_noticed_twice() -> None:
+    watched = Watched()
+    watched.loop.inside, watched.loop.entries = "x", 7
+    watched.look(STALL_LOOKS)
+    assert watched.stalls == []
+    watched.look()
+    assert watched.stalls == ["x"]
+    watched.look(HANG_LOOKS - STALL_LOOKS - 1)
+    assert watched.hangs == []
+    watched.look(5)
+    assert (watched.stalls, watched.hangs) == (["x"], ["x"])
+
+
+def test_calls_that_return_are_no_stall_however_many_there_are() -> None:
+    watched = Watched()
+    for number in range(3 * HANG_LOOKS):
+        watched.loop.inside, watched.loop.entries = "x", number
+        watched.look()
+    watched.loop.inside = None
+    watched.look(3 * HANG_LOOKS)
+    assert watched.stalls == watched.hangs == []
+
+
+def test_a_process_that_stood_still_has_no_stall() -> None:
+    """It looks late: the loop had no more time than the watchdog."""
+    watched = Watched()
+    watched.loop.inside, watched.loop.entries = "x", 1
+    watched.look(3 * HANG_LOOKS, apart_s=10.0)
+    assert watched.stalls == watched.hangs == []
+
+
+def test_each_call_that_stalls_is_noticed() -> None:
+    watched = Watched()
+    for number, inside in enumerate("xy"):
+        watched.loop.inside, watched.loop.entries = inside, number + 1
+        watched.look(STALL_LOOKS + 2)
+    assert watched.stalls == ["x", "y"]
+
+
+def test_what_is_done_about_a_stall_may_fail() -> None:
+    loop = Loop("x", 1)
+    hangs: list[object] = []
+
+    def fail(*_: object) -> None:
+        raise RuntimeError("on purpose")
+
+    watchdog = Watchdog(lambda: [loop], fail, lambda _, inside: hangs.append(inside))
+    for number in range(HANG_LOOKS + 5):
+        watchdog.look(1.0 + number * LOOK_S)
+    assert hangs == ["x"]
+
+
+def test_a_ticker_that_is_split_goes_on_with_its_one_proxy() -> None:
+    ticks: dict[str, list[str]] = {"one": [], "two": []}
+    with Bench() as one, Bench() as two:
+        for name, bench in (("one", one), ("two", two)):
+            bench.proxy.tick = lambda _, name=name: ticks[name].append(threading.current_thread().name)  # type: ignore[method-assign,misc]
+        ticker = Ticker(lambda *_: None, [one.proxy, two.proxy])
+        wait_until(lambda: all(map(len, ticks.values())), "both are ticked")
+        new = ticker.split(one.proxy)
+        assert not ticker.remove(two.proxy)
+        counts = {name: len(found) for name, found in ticks.items()}
+        wait_until(lambda: all(len(ticks[name]) > counts[name] + 2 for name in ticks), "both still are")
+        assert new.remove(two.proxy)
+        new.close()
+        count = len(ticks["two"])
+        wait_until(lambda: len(ticks["one"]) > counts["one"] + 10, "the other one goes on")
+        assert len(ticks["two"]) == count
+        ticker.close()
+
+
+def test_the_jobs_of_a_lane_are_done_in_order_and_one_at_a_time() -> None:
+    workers = RequestWorkers()
+    lanes = [workers.lane() for _ in range(5)]
+    done: list[tuple[int, int]] = []
+    inside = [0] * len(lanes)
+
+    def job(lane: int, number: int) -> None:
+        inside[lane] += 1
+        assert inside[lane] == 1
+        done.append((lane, number))
+        inside[lane] -= 1
+
+    for number in range(50):
+        for index, lane in enumerate(lanes):
+            lane.put(lambda index=index, number=number: job(index, number))  # type: ignore[misc]
+    wait_until(lambda: len(done) == 250, "all are done")
+    for index in range(len(lanes)):
+        assert [number for lane, number in done if lane == index] == list(range(50))
+    workers.close()
+
+
+def test_a_lane_that_hangs_holds_up_no_other_and_stops_in_time() -> None:
+    workers = RequestWorkers()
+    gate, reached = threading.Event(), threading.Event()
+    stuck, other = workers.lane(), workers.lane()
+    for lane in (stuck, other):
+        lane.start()
+    stuck.put(lambda: (reached.set(), gate.wait(30.0))[0])  # type: ignore[func-returns-value]
+    assert reached.wait(10.0)
+    stuck.put(lambda: reached.clear())
+    done = threading.Event()
+    other.put(done.set)
+    assert done.wait(10.0)
+    stuck.stop(0.01)
+    stuck.put(lambda: reached.clear())
+    gate.set()
+    other.stop(1.0)
+    workers.close()
+    assert reached.is_set(), "what waited was dropped"
+
+
+def test_there_is_an_end_to_the_threads() -> None:
+    workers = RequestWorkers()
+    gate = threading.Event()
+    others = set(threading.enumerate())
+    for _ in range(2 * MAX_THREADS):
+        workers.lane().put(lambda: (gate.wait(30.0), None)[1])
+    before = [thread for thread in threading.enumerate() if thread not in others]
+    assert len(before) <= MAX_THREADS
+    gate.set()
+    workers.close()
+    wait_until(lambda: not [t for t in before if t.is_alive()], "they end")
+    assert IDLE_THREADS < MAX_THREADS
+
+
+def test_pauses_before_a_process_is_started_again_grow_up_to_a_limit() -> None:
+    pauses = [pause_s(deaths) for deaths in range(1, 40)]
+    assert pauses[0] == FIRST_PAUSE_S
+    assert pauses == sorted(pauses)
+    assert pauses[-1] == LONGEST_PAUSE_S

@@ -1,0 +1,203 @@
+"""The local transport with one receiving thread for many servers: the contract, and what a blocked handler delays."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+from collections.abc import Iterator
+from functools import partial
+
+import pytest
+
+from skyloop.transport.base import FEEDBACK, Dialer, Peer, TransportServer
+from skyloop.transport.composite import CompositeServer
+from skyloop.transport.conformance import TransportSuite
+from skyloop.transport.local import dial
+from skyloop.transport.local.reactor import Reactor
+from skyloop.transport.local.shared_server import SharedLocalServer
+from skyloop.transport.testing import PATIENCE_S, ClientLog, ServerLog, wait_until
+
+_names = (f"shared-{number}" for number in itertools.count())
+
+
+class TestShared(TransportSuite):
+    @pytest.fixture(autouse=True)
+    def reactor(self) -> Iterator[None]:
+        self._reactor = Reactor()
+        yield
+        self._reactor.close()
+
+    def make_server(self) -> TransportServer:
+        return SharedLocalServer(next(_names), self._reactor)
+
+    def dialer(self, server: TransportServer) -> Dialer:
+        return dial(server.address.removeprefix("local:"))
+
+
+class TestSharedInAComposite(TestShared):
+    def make_server(self) -> TransportServer:
+        return CompositeServer([SharedLocalServer(next(_names), self._reactor)])
+
+
+class Served:
+    """A server of a reactor, its handler's log, and one client."""
+
+    def __init__(self, reactor: Reactor) -> None:
+        self.name = next(_names)
+        self.server = SharedLocalServer(self.name, reactor)
+        self.log = ServerLog()
+        self.server.start(self.log)
+        self.heard = ClientLog()
+        self.client = dial(self.name)(self.heard)
+        wait_until(lambda: self.log.joined, "it joined")
+
+    @property
+    def packets(self) -> list[bytes]:
+        return [packet for _, packet in self.log.packets]
+
+    def got(self, *packets: bytes) -> bool:
+        return self.packets == list(packets)
+
+    def close(self) -> None:
+        self.client.close()
+        self.server.stop()
+
+
+@pytest.fixture
+def reactor() -> Iterator[Reactor]:
+    made = Reactor()
+    yield made
+    made.close()
+
+
+def test_a_split_leaves_the_blocked_server_its_thread_and_moves_the_others(reactor: Reactor) -> None:
+    stuck, other = Served(reactor), Served(reactor)
+    gate, entered, threads = threading.Event(), threading.Event(), set[int]()
+
+    def block(_: Peer, packet: bytes) -> None:
+        threads.add(threading.get_ident())
+        if packet == b"block":
+            entered.set()
+            gate.wait(PATIENCE_S)
+
+    stuck.log.on_packet = block
+    assert stuck.client.send(b"block")
+    assert entered.wait(PATIENCE_S)
+    assert reactor.inside is stuck.server
+    assert [other.client.send(bytes([number])) for number in range(1, 100)] == [True] * 99
+    new = reactor.split(stuck.server)
+    wait_until(lambda: other.packets == [bytes([number]) for number in range(1, 100)], "all came, in order")
+    assert other.server.reactor is new
+    assert stuck.server.reactor is reactor
+    assert stuck.client.send(b"after")
+    gate.set()
+    wait_until(lambda: stuck.packets == [b"block", b"after"], "it goes on when its handler is back")
+    assert len(threads) == 1
+    late = ClientLog()
+    client = dial(other.name)(late)  # a caller of a server that has moved
+    wait_until(lambda: len(other.log.joined) == 2, "it joined")
+    client.close()
+    for each in (stuck, other):
+        each.close()
+    new.close()
+
+
+def test_packets_that_wait_behind_a_blocked_handler_are_handled_after_the_split(reactor: Reactor) -> None:
+    """The stuck thread has received one packet of each connection of its turn, and handles none of them."""
+    servers = [Served(reactor) for _ in range(4)]
+    gate, first = threading.Event(), threading.Event()
+
+    def hold(_: Peer, packet: bytes) -> None:
+        first.set()
+        gate.wait(PATIENCE_S)
+
+    servers[0].log.on_packet = hold
+    assert servers[0].client.send(b"hold")
+    assert first.wait(PATIENCE_S)
+    blocked, gate2 = threading.Event(), threading.Event()
+
+    def block(_: Peer, packet: bytes) -> None:
+        blocked.set()
+        gate2.wait(PATIENCE_S)
+
+    servers[1].log.on_packet = block
+    for server in servers[1:]:  # all are ready in the next turn
+        for number in range(3):
+            assert server.client.send(bytes([number + 1]))
+    gate.set()
+    assert blocked.wait(PATIENCE_S)
+    new = reactor.split(servers[1].server)
+    for server in (servers[2], servers[3]):
+        wait_until(partial(server.got, b"\1", b"\2", b"\3"), "in order, and once")
+    gate2.set()
+    wait_until(lambda: servers[1].packets == [b"\1", b"\2", b"\3"], "its own too")
+    for server in servers:
+        server.close()
+    new.close()
+
+
+def test_a_reactor_that_is_split_while_packets_flow_loses_none(reactor: Reactor) -> None:
+    servers = [Served(reactor) for _ in range(5)]
+    made = [reactor]
+    count = 400
+    for number in range(count):
+        for server in servers:
+            while not server.client.send(number.to_bytes(2, "little")):
+                pass
+        if number % 40 == 20:  # nobody is stuck: the thread that is left behind is in the middle of its turn
+            made.append(servers[number % 5].server.reactor.split(servers[number % 5].server))
+    for server in servers:
+        wanted = [number.to_bytes(2, "little") for number in range(count)]
+        wait_until(partial(server.got, *wanted), "all, in order, once")
+    for server in servers:
+        server.close()
+    for each in made:
+        each.close()
+
+
+def test_one_that_sends_no_hello_is_sent_away(reactor: Reactor, monkeypatch: pytest.MonkeyPatch) -> None:
+    from skyloop.transport.local import shared_server
+    from skyloop.transport.local.directory import connect, find_directory
+
+    monkeypatch.setattr(shared_server, "HELLO_S", 0.05)
+    server = Served(reactor)
+    silent = connect(find_directory().socket_path(server.name))
+    assert b"no Hello" in silent.recv(1000)
+    assert silent.recv(1000) == b""
+    assert server.client.send(b"here")
+    wait_until(lambda: server.packets == [b"here"], "others are not disturbed")
+    server.close()
+
+
+def test_without_descriptors_callers_wait_and_packets_do_not(reactor: Reactor, monkeypatch: pytest.MonkeyPatch) -> None:
+    server = Served(reactor)
+    source = server.server._listening
+    assert source is not None
+    real, failures = source.sock, []
+
+    class Full:
+        def accept(self) -> None:
+            failures.append(1)
+            raise OSError(24, "Too many open files")
+
+    source.sock = Full()  # type: ignore[assignment]
+    log = ClientLog()
+    client = dial(server.name)(log)
+    wait_until(lambda: failures, "it was tried")
+    assert server.client.send(b"x")
+    wait_until(lambda: server.packets == [b"x"], "packets are handled meanwhile")
+    source.sock = real
+    wait_until(lambda: len(server.log.joined) == 2, "the caller is let in when it is tried again")
+    assert len(failures) < 10, "it must not spin"
+    client.close()
+    server.close()
+
+
+def test_a_handler_may_stop_another_server_of_its_reactor(reactor: Reactor) -> None:
+    one, two = Served(reactor), Served(reactor)
+    one.log.on_packet = lambda _, __: two.server.stop()
+    assert one.client.send(b"x")
+    wait_until(lambda: two.log.left and two.heard.closings, "the other one ended")
+    assert one.server.publish(FEEDBACK, b"y") == 0
+    one.close()
+    two.close()
