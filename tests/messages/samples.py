@@ -126,6 +126,7 @@ SAMPLES: dict[str, Sample] = {
         others="the vehicle is in RTL, which was not chosen here",
         start_position_m=(0.5, -0.5, 0.125),
         return_phase=ReturnPhase.FLYING,
+        skipped=5,
     ),
     "feedback-minimal": Feedback(captured_ns=1),
     "frame": FrameHeader("front", 12, 3_000_000_000, 3_000_500_000, 320, 240, Encoding.BGR8, 230_400, INTRINSICS),

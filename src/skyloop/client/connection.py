@@ -22,7 +22,7 @@ from skyloop.messages import (
     Refused,
     Welcome,
 )
-from skyloop.transport.base import FEEDBACK, Dialer
+from skyloop.transport.base import Dialer
 
 _LOOK_NS: Final = nanoseconds(0.05)  #: how often the link's state is judged
 _log = logging.getLogger("skyloop")
@@ -65,7 +65,7 @@ class ProxyConnection:
         self._topics: list[str] = []
         self._lock = threading.Lock()  # guards the topics and the change of session
         self._session: ProxySession | None = None
-        self._malformed_before = 0  # in earlier sessions
+        self._malformed_before = self._missing_before = 0  # in earlier sessions
 
     @property
     def connected(self) -> bool:
@@ -78,6 +78,12 @@ class ProxyConnection:
         """Packets and frames that could not be decoded, in all sessions."""
         session = self._session
         return self._malformed_before + (0 if session is None else session.monitor.malformed_count)
+
+    @property
+    def missing(self) -> int:
+        """Samples of feedback that are missing by the gaps in their numbers, in all sessions."""
+        session = self._session
+        return self._missing_before + (0 if session is None else session.monitor.missing)
 
     @property
     def receiving(self) -> bool:
@@ -202,6 +208,7 @@ class ProxyConnection:
             self.transmit = _nowhere
         if session is not None:
             self._malformed_before += session.monitor.malformed_count
+            self._missing_before += session.monitor.missing
         return session
 
 
@@ -324,8 +331,8 @@ class ConnectionSupervisor:
             return False
         if verdict.state is LinkState.UP:
             self._failures = 0
-        elif session.feedback_stalled(now_ns):
-            self.connection.resubscribe(FEEDBACK)
+        else:
+            session.renew_feedback(now_ns)
         if verdict.state is not LinkState.CONNECTING:
             self._set_state(verdict.state, verdict.reason)
         return True

@@ -56,6 +56,7 @@ from skyloop.messages.config import (
 from skyloop.messages.encoded import EncodedFrame
 from skyloop.messages.event import Event
 from skyloop.messages.feedback import Feedback, Value, Vector
+from skyloop.messages.feedback_request import FeedbackRequest
 from skyloop.messages.frame import CameraInfo, FrameHeader, Intrinsics
 from skyloop.messages.kinds import (
     Encoding,
@@ -99,6 +100,7 @@ __all__ = [
     "EventKind",
     "Failsafe",
     "Feedback",
+    "FeedbackRequest",
     "FlightState",
     "FrameHeader",
     "GetParameter",

@@ -58,7 +58,7 @@ from skyloop.proxy.executor import ActionExecutor
 from skyloop.proxy.flight_record import FlightRecord
 from skyloop.proxy.handler import CommandHandler
 from skyloop.proxy.parameters import Parameters, described
-from skyloop.proxy.publisher import VehiclePublisher, topic_problem
+from skyloop.proxy.publisher import VehiclePublisher
 from skyloop.proxy.relay import Relay
 from skyloop.proxy.requests import ParameterRequests, RequestDispatcher
 from skyloop.proxy.sessions import HELLO_NS, MAX_MALFORMED, Session
@@ -303,7 +303,7 @@ class Proxy:
 
     def topic_problem(self, topic: str) -> str:
         """Return why nobody can subscribe to a topic; empty if it exists."""
-        return topic_problem(topic, self.publisher.cameras)
+        return self.publisher.topic_problem(topic)
 
     def malformed(self, peer: Peer, reason: str) -> None:
         """Count what an application asked of the transport in vain as malformed."""
