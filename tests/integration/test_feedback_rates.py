@@ -15,10 +15,10 @@ import pytest
 from skyloop.client import Drone
 from skyloop.client.drone import open_drone
 from skyloop.clock import monotonic_ns
-from skyloop.errors import UnknownNameError, UsageError
-from skyloop.messages import Feedback, FlightState, LinkState
+from skyloop.errors import NoAnswerError, UnknownNameError, UsageError
+from skyloop.messages import Feedback, FlightState, LinkState, Overview
 from skyloop.proxy import Proxy
-from skyloop.transport.base import FEEDBACK, Dialer, TransportServer
+from skyloop.transport.base import FEEDBACK, OVERVIEW, Dialer, TransportServer
 from skyloop.transport.fabric import FabricServer, FabricSettings
 from skyloop.transport.fabric import dial as dial_fabric
 from skyloop.transport.fabric.config import free_port
@@ -200,3 +200,22 @@ def test_another_connection_asks_for_the_same() -> None:
             count, now_ns = len(got), time.monotonic_ns()
             wait_until(lambda: len(got) > count and got[-1].published_ns > now_ns, "samples come again")
             assert server.subscribers(FEEDBACK) == 0
+
+
+def test_the_overview_comes_to_who_asks_for_it(transport: tuple[TransportServer, Dialer]) -> None:
+    server, dial = transport
+    got: list[Overview] = []
+    with Beating(server), open_drone(dial, app="eye", access="observe") as drone:
+        assert server.subscribers(OVERVIEW) == 0
+        with drone.on_overview(got.append):
+            wait_until(lambda: bool(got), "one comes at once")
+        wait_until(lambda: server.subscribers(OVERVIEW) == 0, "nobody asks for it")
+        (row,) = drone.overview(WAIT_S).vehicles
+        assert (row.name, row.battery, row.state) == ("rates", 0.9, FlightState.LANDED)
+        wait_until(lambda: server.subscribers(OVERVIEW) == 1, "it is kept")
+
+
+def test_a_proxy_that_sends_no_overview() -> None:
+    words = "a proxy of an earlier version sends none"
+    with scripted() as proxy, _observing(proxy) as drone, pytest.raises(NoAnswerError, match=words):
+        drone.overview(0.05)

@@ -30,6 +30,7 @@ from skyloop.messages import (
     EventKind,
     Feedback,
     LogEntry,
+    Overview,
     Parameter,
     Severity,
     Value,
@@ -429,6 +430,14 @@ class Drone:
                     deadline = loop.time() + timeout_s
 
     # Callbacks -------------------------------------------------------------------------------------------------
+
+    async def overview(self, timeout_s: float = 2.0) -> Overview:
+        """Return the newest overview of the vehicles of the proxy's process; see :meth:`skyloop.Drone.overview`."""
+        return await in_thread(lambda: self.sync.overview(timeout_s))
+
+    def on_overview(self, function: Callback[Overview]) -> Listener:
+        """Call ``function`` with each overview, on the event loop; see :meth:`skyloop.Drone.on_overview`."""
+        return Listener(self.sync.on_overview(on_loop(function)))
 
     def on_feedback(
         self, function: Callback[Feedback], *, max_hz: float | None = None, fields: Iterable[str] | None = None

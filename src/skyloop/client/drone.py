@@ -66,6 +66,7 @@ from skyloop.messages import (
     Land,
     LinkState,
     LogEntry,
+    Overview,
     ResetEmergency,
     Role,
     Severity,
@@ -538,6 +539,32 @@ class Drone:
         self._read = newest
         return newest if request is PLAIN else request.select(newest)
 
+    def overview(self, timeout_s: float = 2.0) -> Overview:
+        """Return the newest overview of all vehicles that the proxy's process serves, a row each.
+
+        It is sent once a second, and much smaller than feedback: for who watches many vehicles. The first call
+        subscribes to it, for good, and waits for one.
+
+        Args:
+            timeout_s: How long to wait for the first one [s].
+
+        Raises:
+            NoAnswerError: If none comes in time, as from a proxy of an earlier version.
+            ClosedError: If the drone is closed.
+            UsageError: If called from an inline callback before there is one.
+        """
+        self._core.check_open()
+        state = self._state
+        if state.overview is None:
+            self._core.check_may_wait()
+            state.on_overview.keep()
+            state.notifier.wait_for(lambda: state.overview is not None or self._core.closed, timeout_s)
+            self._core.check_open()
+        state.on_overview.keep()
+        if state.overview is None:
+            raise NoAnswerError(f"no overview came within {timeout_s:g} s: a proxy of an earlier version sends none")
+        return state.overview
+
     def age_s(self, sample: Feedback | Frame) -> float:
         """Return the time since the sample's capture [s], within ``clock_uncertainty_ns``."""
         return (self.now_ns - sample.captured_ns) / 1e9
@@ -718,6 +745,15 @@ class Drone:
         """
         channel = self._state.feedback_channel(_feedback_request(max_hz, fields))
         return self._listen(channel, function, "feedback", inline=inline)
+
+    def on_overview(self, function: Callable[[Overview], object], *, inline: bool = False) -> Listener[Overview]:
+        """Call ``function`` with each overview of all vehicles that the proxy's process serves; see :meth:`overview`.
+
+        Args:
+            function: Called on a thread of its own, once a second.
+            inline: Call it on the receiving thread instead.
+        """
+        return self._listen(self._state.on_overview, function, "overview", inline=inline)
 
     def on_event(self, function: Callable[[Event], object], *, inline: bool = False) -> Listener[Event]:
         """Call ``function`` with each event, including the client's own (number 0).

@@ -23,6 +23,7 @@ from skyloop.messages import (
     FrameHeader,
     LinkState,
     LogEntry,
+    Overview,
     Ping,
     Pong,
     ProcessorResult,
@@ -167,6 +168,7 @@ class ConnectionHandler(Protocol):
     def encoded(self, picture: EncodedFrame, now_ns: int) -> None: ...
     def result(self, result: ProcessorResult, now_ns: int) -> None: ...
     def share(self, share: ProcessorShare, now_ns: int) -> None: ...
+    def overview(self, page: Overview, now_ns: int) -> None: ...
 
 
 class ProxySession:
@@ -204,6 +206,7 @@ class ProxySession:
             EncodedFrame: handler.encoded,
             ProcessorResult: handler.result,
             ProcessorShare: handler.share,
+            Overview: handler.overview,
             Reply: self._reply,
         }
         self._take_feedback = handler.feedback

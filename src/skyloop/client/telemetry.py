@@ -33,6 +33,7 @@ from skyloop.messages import (
     FrameHeader,
     LinkState,
     LogEntry,
+    Overview,
     ProcessorResult,
     ProcessorShare,
     Severity,
@@ -40,7 +41,8 @@ from skyloop.messages import (
     Welcome,
 )
 from skyloop.messages.feedback_request import PLAIN
-from skyloop.transport.base import ANNOTATIONS, COMMANDS, LOGS, Pixels
+from skyloop.messages.overview import OverviewPages
+from skyloop.transport.base import ANNOTATIONS, COMMANDS, LOGS, OVERVIEW, Pixels
 
 RECENT_EVENTS: Final = 256
 #: What can be waited for: a flight state (or its name), one of several, or a predicate on feedback.
@@ -153,6 +155,8 @@ class ClientState:
         self.on_command: Channel[Applied] = Channel(lambda on: connection.subscribe(COMMANDS, on))
         self.on_annotation: Channel[Annotation] = Channel(lambda on: connection.subscribe(ANNOTATIONS, on))
         self.on_log: Channel[LogEntry] = Channel(lambda on: connection.subscribe(LOGS, on))
+        self.on_overview: Channel[Overview] = Channel(lambda on: connection.subscribe(OVERVIEW, on))
+        self.overview: Overview | None = None  #: the newest whole one
         self.on_share: Channel[ProcessorShare] = Channel()
         self.on_welcome: Channel[Welcome] = Channel()  #: a proxy was connected; supervisor's thread
         self.results = ResultChannels(connection, scheduler, self.history)
@@ -260,6 +264,7 @@ class Receiver:
         self._commands = commands
         self._restorer = restorer
         self._clock = state.scheduler.clock
+        self._overview_pages = OverviewPages()
 
     def connected(self, welcome: Welcome) -> None:
         """Reset the counters, and take in the vehicle's capabilities; see :class:`ConnectionHandler`."""
@@ -385,6 +390,14 @@ class Receiver:
     def share(self, share: ProcessorShare, now_ns: int) -> None:  # noqa: ARG002  (all are called alike)
         """Publish a worker's share of a processor's frames."""
         self._state.on_share.publish(share)
+
+    def overview(self, page: Overview, now_ns: int) -> None:  # noqa: ARG002  (all are called alike)
+        """Publish an overview whose pages have all come."""
+        whole = self._overview_pages.add(page)
+        if whole is not None:
+            self._state.overview = whole
+            self._state.on_overview.publish(whole)
+            self._state.notifier.notify()
 
 
 def as_predicate(wanted: Wanted) -> tuple[Callable[[Feedback], bool], str]:

@@ -71,6 +71,7 @@ from skyloop.messages.kinds import (
     Takeover,
 )
 from skyloop.messages.log import LogEntry
+from skyloop.messages.overview import Overview, VehicleOverview
 from skyloop.messages.parameter import Parameter, ParameterType
 from skyloop.messages.pose import VehiclePose
 from skyloop.messages.result import ProcessorResult, ProcessorShare
@@ -118,6 +119,7 @@ __all__ = [
     "LinkState",
     "ListParameters",
     "LogEntry",
+    "Overview",
     "Parameter",
     "ParameterPage",
     "ParameterType",
@@ -148,6 +150,7 @@ __all__ = [
     "Text",
     "Value",
     "Vector",
+    "VehicleOverview",
     "VehiclePose",
     "Velocity",
     "VideoRequest",

@@ -45,6 +45,7 @@ from skyloop.transport.base import (
     EVENTS,
     FEEDBACK,
     LOGS,
+    OVERVIEW,
     RESULTS,
     TransportServer,
     stream,
@@ -55,7 +56,7 @@ from skyloop.transport.base import (
 KEEP_ALIVE_NS: Final = NS_PER_S // 4
 
 #: The topics without a name in them.
-PLAIN: Final = frozenset({FEEDBACK, EVENTS, COMMANDS, ANNOTATIONS, LOGS, RESULTS})
+PLAIN: Final = frozenset({FEEDBACK, EVENTS, COMMANDS, ANNOTATIONS, LOGS, OVERVIEW, RESULTS})
 _VIDEO_TOPIC: Final = video("")
 _STREAM_TOPIC: Final = stream("")
 _RESULTS_TOPIC: Final = RESULTS + "/"
