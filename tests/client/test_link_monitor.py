@@ -125,3 +125,59 @@ def test_stall_watch_asks_once_per_patience() -> None:
     assert not watch.stalled(True, clock())
     clock.advance(5.0)
     assert not watch.stalled(False, clock())  # nothing else flows either: that is the link's matter
+
+
+def slow_flow(monitor: LinkMonitor, clock: ManualClock, seqs: list[int], period_s: float = 1.0) -> None:
+    """Samples of which 31 are left out before each, judged twenty times a second."""
+    for seq in seqs:
+        for _ in range(round(period_s * 20)):
+            clock.advance(0.05)
+            assert monitor.verdict(clock()).state is not LinkState.LOST
+        monitor.feedback(seq, clock(), 31)
+
+
+def test_feedback_that_was_asked_for_once_a_second_is_not_late(monitor: LinkMonitor, clock: ManualClock) -> None:
+    flow(monitor, clock, range(1, 33))
+    monitor.expect(1.0, clock())
+    for number in range(2, 30):
+        slow_flow(monitor, clock, [32 * number])
+        assert monitor.verdict(clock()).state is LinkState.UP
+    assert monitor.missing == 0
+    clock.advance(1.35)
+    assert monitor.verdict(clock()).state is LinkState.DEGRADED
+    clock.advance(0.7)
+    verdict = monitor.verdict(clock())
+    assert (verdict.state, verdict.restart) == (LinkState.LOST, True)
+
+
+def test_what_is_lost_of_slow_feedback_is_counted_in_its_own_samples(monitor: LinkMonitor, clock: ManualClock) -> None:
+    flow(monitor, clock, [1])
+    monitor.expect(0.1, clock())
+    slow_flow(monitor, clock, [32 * number for number in range(1, 25)], 0.1)
+    assert monitor.missing == 0
+    slow_flow(monitor, clock, [32 * 26, 32 * 29], 0.1)
+    assert monitor.missing == 1 + 2
+    assert monitor.verdict(clock()).state is LinkState.DEGRADED
+
+
+def test_a_change_of_the_rate_leaves_no_gap(monitor: LinkMonitor, clock: ManualClock) -> None:
+    flow(monitor, clock, [1])
+    monitor.expect(1.0, clock())
+    slow_flow(monitor, clock, [33, 65, 97])
+    monitor.expect(0.0, clock())
+    flow(monitor, clock, [97, *range(110, 160)])
+    assert monitor.missing == 0
+    assert monitor.verdict(clock()).state is LinkState.UP
+    flow(monitor, clock, [170])
+    assert monitor.missing == 10, "from then on gaps count again"
+
+
+def test_a_rate_once_in_a_quarter_of_an_hour_excuses_no_long_silence(monitor: LinkMonitor, clock: ManualClock) -> None:
+    flow(monitor, clock, [1])
+    monitor.expect(1000.0, clock())
+    for _ in range(100):
+        clock.advance(2.0)
+        monitor.received_ns = clock()  # the answer to a ping
+        assert monitor.verdict(clock()).state is LinkState.UP
+    clock.advance(3.1)
+    assert monitor.verdict(clock()).restart

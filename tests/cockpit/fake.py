@@ -95,6 +95,7 @@ class FakeDrone:
         self.processors: dict[str, list[Any]] = {"front": [], "bottom": []}
         self.event_listeners: list[Any] = []
         self.annotation_listeners: list[Any] = []
+        self.feedback_listeners: list[Any] = []
         self.command_listeners: list[Any] = []
         self.log_listeners: list[Any] = []
         self.requests: list[tuple[str, dict[str, Any]]] = []  #: cameras that were subscribed to, and how
@@ -103,10 +104,13 @@ class FakeDrone:
         self._size = width, height
         self._seq = 0
 
-    def feedback(self) -> Feedback:
+    def feedback(self, *, max_hz: float | None = None) -> Feedback:
         if self.newest is None:
             raise NoAnswerError("no feedback yet")
         return self.newest
+
+    def on_feedback(self, function: Callable[[Feedback], None], inline: bool, max_hz: float | None = None) -> Listening:
+        return Listening(self.feedback_listeners, function)
 
     def recent_events(self) -> list[Event]:
         return list(self.told)

@@ -16,7 +16,7 @@ from skyloop.cockpit.fleet import FORGET_S, Fleet, Overview
 from skyloop.cockpit.recordings import Recordings
 from skyloop.errors import LinkError, NoAnswerError
 from skyloop.messages import LinkState
-from skyloop.transport.base import ClientHandler, TransportClient
+from skyloop.transport.base import FEEDBACK, ClientHandler, TransportClient
 from skyloop.transport.local import LocalServer
 from skyloop.transport.testing import ServerLog
 from tests.cockpit.fake import FakeDrone, Node, Nodes, cockpit, open_socket, until
@@ -260,3 +260,17 @@ def test_sockets_are_found_without_being_noticed(tmp_path: Path, monkeypatch: py
         for server in servers:
             server.stop()
     assert finder() == []
+
+
+def test_a_row_needs_little_feedback_and_the_whole_drone_all_of_it() -> None:
+    node = Node()
+    server, slow = node._server, "feedback?max_hz=2"
+    try:
+        with cockpit(Fleet(Nodes(node))) as client:
+            until(lambda: server.subscribers(slow) == 1 and not server.subscribers(FEEDBACK))
+            with open_socket(client, "drones/alpha/telemetry") as socket:
+                socket.receive_json()
+                until(lambda: server.subscribers(FEEDBACK) == 1 and not server.subscribers(slow))
+            until(lambda: server.subscribers(slow) == 1 and not server.subscribers(FEEDBACK))
+    finally:
+        node.stop()

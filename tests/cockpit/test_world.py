@@ -27,7 +27,7 @@ def drone_with(**values: Value) -> Any:
     return SimpleNamespace(
         config=SimpleNamespace(parameters=lambda: found),
         capabilities=Capabilities("test"),
-        feedback=lambda: feedback,
+        feedback=lambda max_hz: feedback,
         now_ns=2,
     )
 

@@ -68,8 +68,8 @@ def test_a_camera_told_by_an_older_proxy_has_no_stream() -> None:
 @pytest.mark.parametrize("name", ["feedback", "feedback-minimal"])
 def test_feedback_of_an_older_proxy_has_no_reason_of_its_link_and_nobody_else_who_flies(name: str) -> None:
     older = decode((PACKETS / "older" / f"{name}.bin").read_bytes())
-    before = {"link_reason": "", "link_remedy": "", "others": None}
-    before |= {"start_position_m": None, "return_phase": ReturnPhase.NONE}
+    before: dict[str, object] = {"link_reason": "", "link_remedy": "", "others": None}
+    before |= {"start_position_m": None, "return_phase": ReturnPhase.NONE, "skipped": 0}
     assert older == msgspec.structs.replace(SAMPLES[name], **before)
 
 

@@ -21,7 +21,13 @@ PAGE = (Path(__file__).parents[2] / "docs" / "wire-format.md").read_text()
 SECTIONS = re.compile(r"^### (\w+)(?: — (kind|tag) (\d+))?\n(.*?)(?=^##|\Z)", re.MULTILINE | re.DOTALL)
 FOUND = {name: (word, number, body) for name, word, number, body in SECTIONS.findall(PAGE)}
 BODIES = (*typing.get_args(config.AnyRequest), *typing.get_args(config.AnyReply), *typing.get_args(annotation.Shape))
-PARTS = (messages.Intrinsics, messages.CameraInfo, messages.Capabilities, messages.Parameter)
+PARTS = (
+    messages.Intrinsics,
+    messages.CameraInfo,
+    messages.Capabilities,
+    messages.Parameter,
+    messages.VehicleOverview,
+)
 STRUCTS: list[type[msgspec.Struct]] = [*codec.KINDS, *command.ACTION_NAMES, *BODIES, *PARTS]
 VOCABULARIES = [v for v in vars(messages).values() if isinstance(v, EnumMeta) and v is not messages.Kind]
 

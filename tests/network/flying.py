@@ -156,9 +156,9 @@ def watch_numbers(here: Here, name: str) -> None:
     monitor = connection.monitor
     original = monitor.feedback
 
-    def feedback(seq: int, now_ns: int) -> bool:
+    def feedback(seq: int, now_ns: int, skipped: int = 0) -> bool:
         found.append(seq)
-        return original(seq, now_ns)
+        return original(seq, now_ns, skipped)
 
     monitor.feedback = feedback  # type: ignore[method-assign]
 

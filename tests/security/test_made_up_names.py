@@ -60,7 +60,7 @@ def test_what_exists_can_be_subscribed_to(topic: str) -> None:
         ("evnts", "did you mean 'events'"),
         (
             "x" * 200,
-            "annotations, commands, events, feedback, logs, results, stream/bottom, stream/front, video/",
+            "annotations, commands, events, feedback, logs, overview, results, stream/bottom, stream/front, video/",
         ),
     ],
 )

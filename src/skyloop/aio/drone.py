@@ -30,6 +30,7 @@ from skyloop.messages import (
     EventKind,
     Feedback,
     LogEntry,
+    Overview,
     Parameter,
     Severity,
     Value,
@@ -327,13 +328,21 @@ class Drone:
 
     # Reading ---------------------------------------------------------------------------------------------------
 
-    def feedback(self, *, max_age_s: float | None = None) -> Feedback:
+    def feedback(
+        self,
+        *,
+        max_age_s: float | None = None,
+        max_hz: float | None = None,
+        fields: Iterable[str] | None = None,
+    ) -> Feedback:
         """Return the newest feedback; see :meth:`skyloop.Drone.feedback`."""
-        return self.sync.feedback(max_age_s=max_age_s)
+        return self.sync.feedback(max_age_s=max_age_s, max_hz=max_hz, fields=fields)
 
-    async def next_feedback(self, timeout_s: float = 1.0) -> Feedback:
-        """Wait for feedback that was not read before, and return the newest."""
-        return await in_thread(lambda: self.sync.next_feedback(timeout_s))
+    async def next_feedback(
+        self, timeout_s: float = 1.0, *, max_hz: float | None = None, fields: Iterable[str] | None = None
+    ) -> Feedback:
+        """Wait for feedback that was not read before; see :meth:`skyloop.Drone.next_feedback`."""
+        return await in_thread(lambda: self.sync.next_feedback(timeout_s, max_hz=max_hz, fields=fields))
 
     def frame(self, camera: str | None = None, *, max_age_s: float | None = None) -> client.Frame | None:
         """Return the newest frame without waiting; see :meth:`skyloop.Drone.frame`.
@@ -422,9 +431,19 @@ class Drone:
 
     # Callbacks -------------------------------------------------------------------------------------------------
 
-    def on_feedback(self, function: Callback[Feedback]) -> Listener:
-        """Call ``function`` with the newest feedback, on the event loop."""
-        return Listener(self.sync.on_feedback(on_loop(function)))
+    async def overview(self, timeout_s: float = 2.0) -> Overview:
+        """Return the newest overview of the vehicles of the proxy's process; see :meth:`skyloop.Drone.overview`."""
+        return await in_thread(lambda: self.sync.overview(timeout_s))
+
+    def on_overview(self, function: Callback[Overview]) -> Listener:
+        """Call ``function`` with each overview, on the event loop; see :meth:`skyloop.Drone.on_overview`."""
+        return Listener(self.sync.on_overview(on_loop(function)))
+
+    def on_feedback(
+        self, function: Callback[Feedback], *, max_hz: float | None = None, fields: Iterable[str] | None = None
+    ) -> Listener:
+        """Call ``function`` with the newest feedback, on the event loop; see :meth:`skyloop.Drone.on_feedback`."""
+        return Listener(self.sync.on_feedback(on_loop(function), max_hz=max_hz, fields=fields))
 
     def on_event(self, function: Callback[Event]) -> Listener:
         """Call ``function`` with each event, on the event loop."""

@@ -15,6 +15,8 @@ from skyloop.cli.text import columns
 from skyloop.errors import SkyloopError
 
 if TYPE_CHECKING:
+    from skyloop.client import Drone
+    from skyloop.messages import VehicleOverview
     from skyloop.transport.fabric import FabricSettings
 
 ANSWER_WITHIN_S = 1.0
@@ -75,8 +77,47 @@ def running(settings: FabricSettings | None = None) -> list[Row]:
         found = merged(found, settings)
     if not found:
         return []
-    with ThreadPoolExecutor(max_workers=min(32, len(found))) as pool:
-        return list(pool.map(lambda row: described(row, settings), found))
+    processes = of_one_process(found)
+    with ThreadPoolExecutor(max_workers=min(32, len(processes))) as pool:
+        described_rows = [row for rows in pool.map(lambda rows: told(rows, settings), processes) for row in rows]
+    return sorted(described_rows, key=lambda row: (row.name, row.host))
+
+
+def of_one_process(rows: Iterable[Row]) -> list[list[Row]]:
+    """Return the rows of each process together: it describes all its vehicles in one overview."""
+    found: dict[tuple[object, ...], list[Row]] = {}
+    for row in rows:
+        found.setdefault((row.host, row.pid) if row.pid else (row.host, row.name), []).append(row)
+    return list(found.values())
+
+
+def told(rows: list[Row], settings: FabricSettings | None) -> list[Row]:
+    """Return what the proxies of one process report of themselves, several by one connection where that is possible."""
+    overview: dict[str, VehicleOverview] = {}
+    if len(rows) > 1:
+        try:
+            with observed(rows[0], settings) as drone:
+                overview = {vehicle.name: vehicle for vehicle in drone.overview().vehicles}
+        except SkyloopError:
+            pass  # each is asked by itself
+    return [
+        with_overview(row, overview[row.name]) if row.name in overview else described(row, settings) for row in rows
+    ]
+
+
+def with_overview(row: Row, vehicle: VehicleOverview) -> Row:
+    """Return the row with what an overview says of its vehicle."""
+    return msgspec.structs.replace(
+        row,
+        vehicle=vehicle.vehicle,
+        uri=vehicle.uri,
+        state=vehicle.state.value,
+        battery=vehicle.battery,
+        owner=vehicle.owner,
+        vehicle_link=vehicle.vehicle_link.value,
+        link_reason=vehicle.link_reason,
+        link_remedy=vehicle.link_remedy,
+    )
 
 
 def merged(near: list[Row], settings: FabricSettings) -> list[Row]:
@@ -100,17 +141,8 @@ def describe(name: str) -> Row:
 
 def described(row: Row, settings: FabricSettings | None) -> Row:
     """Return what a proxy reports of itself; for one that does not answer, the reason."""
-    from skyloop.client import connect
-
-    far = "local" not in row.transport
     try:
-        with connect(
-            row.name,
-            access="observe",
-            name="skyloop list",
-            timeout_s=ANSWER_WITHIN_S,
-            network=(settings or False) if far else False,
-        ) as drone:
+        with observed(row, settings) as drone:
             feedback = drone.feedback()
             return msgspec.structs.replace(
                 row,
@@ -125,6 +157,29 @@ def described(row: Row, settings: FabricSettings | None) -> Row:
             )
     except SkyloopError as error:
         return msgspec.structs.replace(row, problem=str(error))
+
+
+def observed(row: Row, settings: FabricSettings | None, name: str = "skyloop list") -> Drone:
+    """Connect to a proxy as an observer.
+
+    Args:
+        row: Which one, and how it can be reached.
+        settings: Of the network.
+        name: Under which name to connect.
+
+    Raises:
+        SkyloopError: It does not answer.
+    """
+    from skyloop.client import connect
+
+    far = "local" not in row.transport
+    return connect(
+        row.name,
+        access="observe",
+        name=name,
+        timeout_s=ANSWER_WITHIN_S,
+        network=(settings or False) if far else False,
+    )
 
 
 def lines(rows: Iterable[Row]) -> list[str]:

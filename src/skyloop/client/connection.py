@@ -24,7 +24,7 @@ from skyloop.messages import (
     Refused,
     Welcome,
 )
-from skyloop.transport.base import FEEDBACK, Dialer
+from skyloop.transport.base import Dialer
 
 _LOOK_NS: Final = nanoseconds(0.05)  #: how often the link's state is judged
 _LOOK_S: Final = 1.0  #: how often a thread that waits for samples tries again to receive them itself
@@ -68,7 +68,7 @@ class ProxyConnection:
         self._topics: list[str] = []
         self._lock = threading.Lock()  # guards the topics and the change of session
         self._session: ProxySession | None = None
-        self._malformed_before = 0  # in earlier sessions
+        self._malformed_before = self._missing_before = 0  # in earlier sessions
 
     @property
     def connected(self) -> bool:
@@ -81,6 +81,12 @@ class ProxyConnection:
         """Packets and frames that could not be decoded, in all sessions."""
         session = self._session
         return self._malformed_before + (0 if session is None else session.monitor.malformed_count)
+
+    @property
+    def missing(self) -> int:
+        """Samples of feedback that are missing by the gaps in their numbers, in all sessions."""
+        session = self._session
+        return self._missing_before + (0 if session is None else session.monitor.missing)
 
     @property
     def receiving(self) -> bool:
@@ -213,6 +219,7 @@ class ProxyConnection:
             self.transmit = _nowhere
         if session is not None:
             self._malformed_before += session.monitor.malformed_count
+            self._missing_before += session.monitor.missing
         return session
 
 
@@ -335,8 +342,8 @@ class ConnectionSupervisor:
             return False
         if verdict.state is LinkState.UP:
             self._failures = 0
-        elif session.feedback_stalled(now_ns):
-            self.connection.resubscribe(FEEDBACK)
+        else:
+            session.renew_feedback(now_ns)
         if verdict.state is not LinkState.CONNECTING:
             self._set_state(verdict.state, verdict.reason)
         return True

@@ -45,7 +45,7 @@ from skyloop.messages import (
 )
 from skyloop.messages.result import MAX_CODE
 from skyloop.messages.video import DEFAULT_QUALITY, VideoEncoding, VideoRequest
-from skyloop.transport.base import EVENTS, FEEDBACK, Dialer
+from skyloop.transport.base import EVENTS, Dialer
 
 Access = Literal["pilot", "observe"]
 OnExit = Literal["land", "hover"]
@@ -133,7 +133,7 @@ class DroneCore:
         # Each part uses those before it; the receiver handles what arrives in every session.
         connection = self.connection = ProxyConnection(scheduler.clock)
         authority = AuthorityTracker(app)
-        state = self.state = ClientState(app, connection, scheduler)
+        state = self.state = ClientState(app, connection, scheduler, whole_feedback=access == "pilot")
         restorer = Restorer(connection, state.emit)
         self.config = Config(connection, authority, restorer)
         self.log = Logbook(connection, app)
@@ -156,8 +156,7 @@ class DroneCore:
             clock=scheduler.clock,
             begin=scheduler.begin,
         )
-        for topic in (EVENTS, FEEDBACK):
-            connection.subscribe(topic)
+        connection.subscribe(EVENTS)
 
     # Beginning and end -------------------------------------------------------------------------------------------
 

@@ -67,12 +67,14 @@ from skyloop.messages import (
     Event,
     EventKind,
     Feedback,
+    FeedbackRequest,
     GetStatistics,
     Hover,
     Idle,
     Land,
     LinkState,
     LogEntry,
+    Overview,
     ResetEmergency,
     Role,
     Severity,
@@ -84,11 +86,13 @@ from skyloop.messages import (
     encode,
 )
 from skyloop.messages.annotation import Shape
+from skyloop.messages.feedback_request import PLAIN
 from skyloop.messages.pose import check_pose
 from skyloop.transport.base import Dialer
 
 T = TypeVar("T")
 EVENT_DEPTH: Final = 256  #: how many events, log entries and the like wait for a slow callback
+WHOLE_S: Final = 1.0  #: for every field of feedback to come, where less had been asked for
 _log = logging.getLogger("skyloop")
 
 
@@ -509,17 +513,32 @@ class Drone:
 
     # Reading ---------------------------------------------------------------------------------------------------
 
-    def feedback(self, *, max_age_s: float | None = None) -> Feedback:
+    def feedback(
+        self,
+        *,
+        max_age_s: float | None = None,
+        max_hz: float | None = None,
+        fields: Iterable[str] | None = None,
+    ) -> Feedback:
         """Return the newest feedback.
+
+        An observer is sent the least that gives each of its consumers what it asks for, and every sample whole while
+        nobody asks for less; the first call of this method counts as a consumer, for good. A pilot is always sent all.
 
         Args:
             max_age_s: Oldest age since capture that is accepted [s]; None: any.
+            max_hz: So many new samples a second are enough, 0.001 to 1000; None: all are wanted.
+            fields: Names of the vehicle's fields that are wanted, from ``battery`` to ``native``; the others are None.
+                None: all. Time, flight state, links, authority and failsafe always come.
 
         Raises:
             NoAnswerError: If no feedback has come yet, or the newest is older than ``max_age_s``.
             ClosedError: If the drone was closed.
+            UsageError: If ``max_hz`` is out of range, or ``fields`` are no names of fields.
         """
         self._core.check_open()
+        request = _feedback_request(max_hz, fields)
+        self._state.demand.keep(request)
         newest = self._state.newest
         if newest is None:
             raise NoAnswerError("no feedback has come yet")
@@ -528,30 +547,61 @@ class Drone:
             if age_s > max_age_s:
                 raise NoAnswerError(f"the newest feedback is {age_s:.3f} s old, {max_age_s:g} s were allowed")
         self._read = newest
-        return newest
+        return newest if request is PLAIN else request.select(newest)
+
+    def overview(self, timeout_s: float = 2.0) -> Overview:
+        """Return the newest overview of all vehicles that the proxy's process serves, a row each.
+
+        It is sent once a second, and much smaller than feedback: for who watches many vehicles. The first call
+        subscribes to it, for good, and waits for one.
+
+        Args:
+            timeout_s: How long to wait for the first one [s].
+
+        Raises:
+            NoAnswerError: If none comes in time, as from a proxy of an earlier version.
+            ClosedError: If the drone is closed.
+            UsageError: If called from an inline callback before there is one.
+        """
+        self._core.check_open()
+        state = self._state
+        if state.overview is None:
+            self._core.check_may_wait()
+            state.on_overview.keep()
+            state.notifier.wait_for(lambda: state.overview is not None or self._core.closed, timeout_s)
+            self._core.check_open()
+        state.on_overview.keep()
+        if state.overview is None:
+            raise NoAnswerError(f"no overview came within {timeout_s:g} s: a proxy of an earlier version sends none")
+        return state.overview
 
     def age_s(self, sample: Feedback | Frame) -> float:
         """Return the time since the sample's capture [s], within ``clock_uncertainty_ns``."""
         return (self.now_ns - sample.captured_ns) / 1e9
 
-    def next_feedback(self, timeout_s: float = 1.0) -> Feedback:
+    def next_feedback(
+        self, timeout_s: float = 1.0, *, max_hz: float | None = None, fields: Iterable[str] | None = None
+    ) -> Feedback:
         """Wait for feedback that was not read before, and return the newest.
 
         Args:
             timeout_s: How long to wait [s].
+            max_hz: As for :meth:`feedback`; samples that other consumers ask for are returned, too.
+            fields: As for :meth:`feedback`.
 
         Raises:
             NoAnswerError: If none comes in time.
             ClosedError: If the drone is closed.
-            UsageError: If called from an inline callback.
+            UsageError: If called from an inline callback, or an option is out of range.
         """
         self._core.check_open()
         self._core.check_may_wait()
         state = self._state
+        state.demand.keep(_feedback_request(max_hz, fields))
         if not state.notifier.wait_for(lambda: state.newest is not self._read or self._core.closed, timeout_s):
             link = self._core.connection.state.value
             raise NoAnswerError(f"no feedback came within {timeout_s:g} s: the link is {link}")
-        return self.feedback()
+        return self.feedback(max_hz=max_hz, fields=fields)
 
     def frame(self, camera: str | None = None, *, max_age_s: float | None = None) -> Frame | None:
         """Return the newest frame without waiting.
@@ -671,7 +721,9 @@ class Drone:
                 met.append(newest)
             return bool(met) or self._core.closed
 
-        if not self._state.notifier.wait_for(look, timeout_s):
+        with self._state.demand.wanted(PLAIN):
+            in_time = self._state.notifier.wait_for(look, timeout_s)
+        if not in_time:
             newest = self._state.newest
             now = "nothing is known of it" if newest is None else f"it is {newest.state.value}"
             raise NoAnswerError(f"the vehicle was not {what} within {timeout_s:g} s: {now}")
@@ -681,7 +733,14 @@ class Drone:
 
     # Callbacks -------------------------------------------------------------------------------------------------
 
-    def on_feedback(self, function: Callable[[Feedback], object], *, inline: bool = False) -> Listener[Feedback]:
+    def on_feedback(
+        self,
+        function: Callable[[Feedback], object],
+        *,
+        inline: bool = False,
+        max_hz: float | None = None,
+        fields: Iterable[str] | None = None,
+    ) -> Listener[Feedback]:
         """Call ``function`` with the newest feedback.
 
         Like every ``on_...`` method it returns a :class:`Listener`, whose ``cancel()`` ends it, and raises
@@ -690,8 +749,21 @@ class Drone:
         Args:
             function: Called on a thread of its own; feedback that newer feedback overtakes is dropped and counted.
             inline: Call it on the receiving thread instead, with every sample. It must be quick and must not wait.
+            max_hz: At most so many samples a second, 0.001 to 1000; None: all. An observer is sent no more, unless
+                another consumer asks for it.
+            fields: As for :meth:`feedback`.
         """
-        return self._listen(self._state.on_feedback, function, "feedback", inline=inline)
+        channel = self._state.feedback_channel(_feedback_request(max_hz, fields))
+        return self._listen(channel, function, "feedback", inline=inline)
+
+    def on_overview(self, function: Callable[[Overview], object], *, inline: bool = False) -> Listener[Overview]:
+        """Call ``function`` with each overview of all vehicles that the proxy's process serves; see :meth:`overview`.
+
+        Args:
+            function: Called on a thread of its own, once a second.
+            inline: Call it on the receiving thread instead.
+        """
+        return self._listen(self._state.on_overview, function, "overview", inline=inline)
 
     def on_event(self, function: Callable[[Event], object], *, inline: bool = False) -> Listener[Event]:
         """Call ``function`` with each event, including the client's own (number 0).
@@ -921,7 +993,12 @@ class Drone:
         """
         self._core.check_open()
         self._core.check_may_wait()
-        return inspect(self, self._state.newest, video_s, folder)
+        state = self._state
+        before = None if state.demand.request.is_plain else state.newest
+        with state.demand.wanted(PLAIN):
+            if before is not None:  # less was asked for: let a whole sample come
+                state.notifier.wait_for(lambda: state.newest is not before, WHOLE_S)
+            return inspect(self, state.newest, video_s, folder)
 
     def close(self) -> None:
         """Release the authority, then end the connection, all threads and a private proxy.
@@ -999,6 +1076,10 @@ def open_drone(
     core = DroneCore(dial, app=app, **options)
     core.open(timeout_s=timeout_s, authority=authority)
     return Drone(core)
+
+
+def _feedback_request(max_hz: float | None, fields: Iterable[str] | None) -> FeedbackRequest:
+    return PLAIN if max_hz is None and fields is None else FeedbackRequest.of(max_hz, fields)
 
 
 def _from_numpy(value: Any) -> Any:

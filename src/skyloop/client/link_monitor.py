@@ -34,40 +34,77 @@ class Verdict:
     restart: bool = False  #: the connection should be closed and made again
 
 
-_Counts = tuple[int, int, int, int]  #: at_ns, received, missing, malformed: totals at some time
+_Counts = tuple[int, int, int]  #: at_ns, received, missing: totals at some time
+
+#: Silence that a slow rate of feedback excuses, at most [s]: a link that is asked less often is checked by pings.
+MAX_PATIENCE_S: Final = 2.0
+WINDOW_PERIODS: Final = 10.0  #: samples over which the share of missing ones is taken, at least
 
 
 class LinkMonitor:
     """Watches one connection. Its other methods cost a few attribute writes; :meth:`verdict` does the work.
 
-    Samples of a connection carry numbers that grow by one: a gap is what was lost.
+    Samples of a connection carry numbers that grow by one: a gap is what was lost, less what the proxy left out because
+    fewer samples were asked for.
     """
 
     def __init__(self, thresholds: Thresholds, now_ns: int) -> None:
         self._limits = thresholds
-        self._late_ns = nanoseconds(thresholds.late_s)
+        self.late_ns = self._feedback_late_ns = nanoseconds(thresholds.late_s)  #: silence after which to ask
         self._silent_ns = nanoseconds(thresholds.silent_s)
-        self._window_ns = nanoseconds(thresholds.window_s)
+        self._window_ns = self._malformed_window_ns = nanoseconds(thresholds.window_s)
+        self._no_gaps_ns = 0  # until then a gap may come from a change of what was asked for
         self.received_ns = now_ns  #: when anything valid came last
         self.feedback_ns = 0  #: when feedback came last; 0 for never
         self.received = 0  #: samples of feedback
         self.missing = 0  #: samples missing by the gaps in their numbers
         self.malformed_count = 0
         self._last_seq: int | None = None
-        self._past: deque[_Counts] = deque([(now_ns, 0, 0, 0)])
+        self._past: deque[_Counts] = deque([(now_ns, 0, 0)])
+        self._past_malformed: deque[tuple[int, int]] = deque([(now_ns, 0)])
 
-    def feedback(self, seq: int, now_ns: int) -> bool:
-        """Note a sample of feedback; return False if it is repeated or was overtaken by a newer one."""
+    def expect(self, period_s: float, now_ns: int) -> None:
+        """Judge from now on by the time that may pass between two samples of feedback.
+
+        Args:
+            period_s: As it was asked for [s]; 0: every sample.
+            now_ns: When it was.
+        """
+        limits, patience_s = self._limits, min(period_s, MAX_PATIENCE_S)
+        # A switch loses no sample, but leaves a gap in the numbers, and time passes before the first one comes.
+        self._no_gaps_ns = now_ns + nanoseconds(limits.window_s)
+        self.received_ns = max(self.received_ns, now_ns)
+        if self.feedback_ns:
+            self.feedback_ns = max(self.feedback_ns, now_ns)
+        self._feedback_late_ns = nanoseconds(limits.late_s + period_s)
+        self.late_ns = nanoseconds(limits.late_s + patience_s)
+        self._silent_ns = nanoseconds(limits.silent_s + patience_s)
+        self._window_ns = nanoseconds(max(limits.window_s, WINDOW_PERIODS * patience_s))
+
+    def feedback(self, seq: int, now_ns: int, skipped: int = 0) -> bool:
+        """Note a sample of feedback; return False if it is repeated or was overtaken by a newer one.
+
+        Args:
+            seq: Its number.
+            now_ns: When it came.
+            skipped: How many samples the proxy left out before it.
+        """
         self.received_ns = now_ns
         last = self._last_seq
         if last is not None:
             if seq <= last:
                 return False
-            self.missing += seq - last - 1
+            if seq != last + 1:
+                self._gap(seq - last - 1, skipped, now_ns)
         self._last_seq = seq
         self.feedback_ns = now_ns
         self.received += 1
         return True
+
+    def _gap(self, gap: int, skipped: int, now_ns: int) -> None:
+        """Count the samples that are missing between two, where ``skipped`` are left out before each."""
+        if gap > skipped and now_ns >= self._no_gaps_ns:
+            self.missing += -((skipped - gap) // (skipped + 1))
 
     def malformed(self) -> None:
         """Note a packet that could not be decoded."""
@@ -84,7 +121,7 @@ class LinkMonitor:
         if not self.feedback_ns:
             return Verdict(LinkState.CONNECTING, "no feedback yet")
         late_ns = now_ns - self.feedback_ns
-        if late_ns > self._late_ns:
+        if late_ns > self._feedback_late_ns:
             return Verdict(LinkState.DEGRADED, f"no feedback for {late_ns / 1e9:.1f} s")
         bad = missing + malformed
         if bad > self._limits.missing_share * (received + bad):
@@ -93,12 +130,15 @@ class LinkMonitor:
 
     def _window(self, now_ns: int) -> tuple[int, int, int]:
         """How many samples were received, missing and malformed within the window."""
-        past = self._past
-        past.append((now_ns, self.received, self.missing, self.malformed_count))
+        past, past_malformed = self._past, self._past_malformed
+        past.append((now_ns, self.received, self.missing))
         while len(past) > 2 and past[1][0] <= now_ns - self._window_ns:
             past.popleft()
-        first = past[0]
-        return self.received - first[1], self.missing - first[2], self.malformed_count - first[3]
+        past_malformed.append((now_ns, self.malformed_count))
+        while len(past_malformed) > 2 and past_malformed[1][0] <= now_ns - self._malformed_window_ns:
+            past_malformed.popleft()
+        _, received, missing = past[0]
+        return self.received - received, self.missing - missing, self.malformed_count - past_malformed[0][1]
 
 
 class StallWatch:

@@ -19,9 +19,11 @@ from skyloop.messages import (
     EncodedFrame,
     Event,
     Feedback,
+    FeedbackRequest,
     FrameHeader,
     LinkState,
     LogEntry,
+    Overview,
     Ping,
     Pong,
     ProcessorResult,
@@ -34,7 +36,8 @@ from skyloop.messages import (
     decode,
     encode,
 )
-from skyloop.transport.base import Dialer, Pixels, TransportClient, video
+from skyloop.messages.feedback_request import PLAIN
+from skyloop.transport.base import FEEDBACK, Dialer, Pixels, TransportClient, video
 
 RETRY_S = 0.3  #: time after which an unanswered request is repeated; all requests are idempotent
 
@@ -124,6 +127,7 @@ class Requests:
             one.done(error)
 
 
+FEEDBACK_STALL_S: Final = 1.0  #: without feedback from a proxy that answers: it is subscribed to again
 _VIDEO: Final = video("")
 _PING_CLOCK_NS: Final = nanoseconds(1.0)  #: how often a proxy on another clock is asked for its time
 _PING_FIRST_NS: Final = nanoseconds(0.1)  #: the same until there are a few round trips
@@ -164,6 +168,7 @@ class ConnectionHandler(Protocol):
     def encoded(self, picture: EncodedFrame, now_ns: int) -> None: ...
     def result(self, result: ProcessorResult, now_ns: int) -> None: ...
     def share(self, share: ProcessorShare, now_ns: int) -> None: ...
+    def overview(self, page: Overview, now_ns: int) -> None: ...
 
 
 class ProxySession:
@@ -187,7 +192,6 @@ class ProxySession:
         self._poke = poke
         self._clock = clock
         self._end: TransportClient | None = None
-        self._late_ns = nanoseconds(thresholds.late_s)  # a proxy that is silent for so long is pinged
         self._same_clock = False
         self._quiet = False  # closed by this end: ignore what still arrives
         self._up = False
@@ -202,10 +206,13 @@ class ProxySession:
             EncodedFrame: handler.encoded,
             ProcessorResult: handler.result,
             ProcessorShare: handler.share,
+            Overview: handler.overview,
             Reply: self._reply,
         }
         self._take_feedback = handler.feedback
-        self._feedback_watch = StallWatch(1.0, clock())
+        self._feedback = PLAIN  # how feedback comes in this session
+        self._only_plain = False  # the proxy sends no other form
+        self._feedback_watch = StallWatch(FEEDBACK_STALL_S, clock())
         self.monitor = LinkMonitor(thresholds, clock())
         self.requests = Requests(self.send)
         self.offset_ns = 0  #: the proxy's clock minus ours
@@ -295,6 +302,11 @@ class ProxySession:
             topic, on = plain, bool(users)
             if on == had_users:
                 return
+        if topic.startswith(FEEDBACK):
+            if self._only_plain:
+                return
+            if on:
+                self._expect(FeedbackRequest.parse(topic))
         end.subscribe(topic, on)
 
     def tick(self, now_ns: int) -> None:
@@ -303,16 +315,36 @@ class ProxySession:
         end = self._end
         if end is None:
             return
-        silent = now_ns - self.monitor.received_ns > self._late_ns
+        late_ns = self.monitor.late_ns  # a proxy that is silent for so long is pinged
+        silent = now_ns - self.monitor.received_ns > late_ns
         usual_ns = _PING_CLOCK_NS if len(self._trips) >= _FIRST else _PING_FIRST_NS
-        if (silent or not self._same_clock) and now_ns - self._pinged_ns > (self._late_ns if silent else usual_ns):
+        if (silent or not self._same_clock) and now_ns - self._pinged_ns > (late_ns if silent else usual_ns):
             self._pinged_ns = now_ns
             self.requests.ask(Ping(now_ns), self._ponged, 1.0, now_ns)
 
-    def feedback_stalled(self, now_ns: int) -> bool:
-        """Return whether feedback has stalled although the proxy answers, and should be subscribed to again."""
+    def renew_feedback(self, now_ns: int) -> None:
+        """Subscribe to feedback again if it has stalled although the proxy answers.
+
+        Feedback in another form gives way to plain feedback, in this session: the proxy may be of an earlier version,
+        or send as many forms as it can already. Consumers select what they want in any case.
+        """
         self._feedback_watch.received_ns = self.monitor.feedback_ns
-        return self._feedback_watch.stalled(now_ns - self.monitor.received_ns < 2 * self._late_ns, now_ns)
+        end = self._end
+        answers = now_ns - self.monitor.received_ns < 2 * self.monitor.late_ns
+        if end is None or not self._feedback_watch.stalled(answers, now_ns):
+            return
+        end.subscribe(self._feedback.topic, False)
+        self._only_plain = self._only_plain or not self._feedback.is_plain
+        self._expect(PLAIN)
+        end.subscribe(FEEDBACK)
+
+    def _expect(self, request: FeedbackRequest) -> None:
+        """Judge by the rate at which feedback comes from now on."""
+        if request == self._feedback:
+            return
+        now_ns, self._feedback = self._clock(), request
+        self.monitor.expect(request.period_s, now_ns)
+        self._feedback_watch = StallWatch(FEEDBACK_STALL_S + request.period_s, now_ns)
 
     def _ponged(self, answer: AnyReply | LinkError) -> None:
         if isinstance(answer, Pong) and not self._same_clock:
@@ -342,7 +374,7 @@ class ProxySession:
         if self._quiet:
             return
         if type(sample) is Feedback:
-            if self.monitor.feedback(sample.seq, now_ns):
+            if self.monitor.feedback(sample.seq, now_ns, sample.skipped):
                 self._take_feedback(sample, now_ns)
                 if not self._up:  # the first one: wakes the supervisor, which reports that the link is up
                     self._up = True

@@ -103,11 +103,14 @@ class ChannelCounter:
             self.lost += seq - last - 1
         self.last_seq = seq
 
-    def stats(self, now_ns: int, *, dropped: int = 0, malformed: int = 0, ages: bool = True) -> ChannelStats:
+    def stats(
+        self, now_ns: int, *, lost: int = 0, dropped: int = 0, malformed: int = 0, ages: bool = True
+    ) -> ChannelStats:
         """Return the statistics at ``now_ns``.
 
         Args:
             now_ns: On this process's clock.
+            lost: Added to what was counted here.
             dropped: Added to what was counted here.
             malformed: Added to what was counted here.
             ages: Whether ``age_s`` is meaningful for this channel.
@@ -118,7 +121,7 @@ class ChannelCounter:
         return ChannelStats(
             count=self.count,
             rate_hz=_rate(arrivals, now_ns),
-            lost=self.lost,
+            lost=self.lost + lost,
             dropped=self.dropped + dropped,
             malformed=self.malformed + malformed,
             delay_s=distribution(delays),

@@ -12,6 +12,7 @@ from typing import Final, Self
 from skyloop.client.channels import Channel, VideoChannel, usual
 from skyloop.client.commands import CommandSender
 from skyloop.client.connection import ProxyConnection, Scheduler
+from skyloop.client.feedback_demand import FeedbackChannel, FeedbackDemand
 from skyloop.client.feedback_history import FeedbackHistory
 from skyloop.client.frame import Arrival, Frame
 from skyloop.client.mailbox import Mailbox
@@ -27,17 +28,21 @@ from skyloop.messages import (
     Event,
     EventKind,
     Feedback,
+    FeedbackRequest,
     FlightState,
     FrameHeader,
     LinkState,
     LogEntry,
+    Overview,
     ProcessorResult,
     ProcessorShare,
     Severity,
     VideoRequest,
     Welcome,
 )
-from skyloop.transport.base import ANNOTATIONS, COMMANDS, LOGS, Pixels
+from skyloop.messages.feedback_request import PLAIN
+from skyloop.messages.overview import OverviewPages
+from skyloop.transport.base import ANNOTATIONS, COMMANDS, LOGS, OVERVIEW, Pixels
 
 RECENT_EVENTS: Final = 256
 #: What can be waited for: a flight state (or its name), one of several, or a predicate on feedback.
@@ -119,13 +124,16 @@ class Mailboxes:
 class ClientState:
     """The newest state of a connected vehicle, and the channels that publish changes of it."""
 
-    def __init__(self, name: str, connection: ProxyConnection, scheduler: Scheduler) -> None:
+    def __init__(
+        self, name: str, connection: ProxyConnection, scheduler: Scheduler, *, whole_feedback: bool = True
+    ) -> None:
         """Make the state of a drone that has not connected yet.
 
         Args:
             name: Name of the application.
             connection: Where topics are subscribed to.
             scheduler: Source of the time and of waiting.
+            whole_feedback: Whether all feedback is received, even if all consumers ask for less.
         """
         self.scheduler = scheduler
         self.welcome: Welcome | None = None
@@ -141,12 +149,16 @@ class ClientState:
         self.variants: dict[str, VideoChannel] = {}  #: all channels, by the topic of their request
         self.counter = ChannelCounter()  #: of feedback
         self.echoes = ChannelCounter()
-        self.on_feedback: Channel[Feedback] = Channel()
+        self.demand = FeedbackDemand(connection, whole=whole_feedback)
+        self.on_feedback: Channel[Feedback] = Channel(lambda on: self.demand.want(PLAIN, on))
+        self.selected: tuple[FeedbackChannel, ...] = ()  #: of consumers that ask for less
         self.on_event: Channel[Event] = Channel()
         self.on_link: Channel[LinkStatus] = Channel()
         self.on_command: Channel[Applied] = Channel(lambda on: connection.subscribe(COMMANDS, on))
         self.on_annotation: Channel[Annotation] = Channel(lambda on: connection.subscribe(ANNOTATIONS, on))
         self.on_log: Channel[LogEntry] = Channel(lambda on: connection.subscribe(LOGS, on))
+        self.on_overview: Channel[Overview] = Channel(lambda on: connection.subscribe(OVERVIEW, on))
+        self.overview: Overview | None = None  #: the newest whole one
         self.on_share: Channel[ProcessorShare] = Channel()
         self.on_welcome: Channel[Welcome] = Channel()  #: a proxy was connected; supervisor's thread
         self.results = ResultChannels(connection, scheduler, self.history)
@@ -166,6 +178,17 @@ class ClientState:
         if channel is None:
             channel = VideoChannel(camera, self._connection, self.scheduler, self.history, request)
             self.variants[topic] = channel
+        return channel
+
+    def feedback_channel(self, request: FeedbackRequest) -> Channel[Feedback]:
+        """Return the channel of feedback as requested, made on the first call."""
+        if request.is_plain:
+            return self.on_feedback
+        for channel in self.selected:
+            if channel.request == request:
+                return channel
+        channel = FeedbackChannel(request, self.demand)
+        self.selected = (*self.selected, channel)
         return channel
 
     def emit(self, kind: EventKind, text: str, severity: Severity = Severity.WARNING, **data: str) -> None:
@@ -193,7 +216,10 @@ class ClientState:
         found = {
             "command": replace(sends.stats(now_ns, ages=False), delay_s=echoes.delay_s),
             "feedback": self.counter.stats(
-                now_ns, dropped=self.on_feedback.dropped, malformed=self._connection.malformed
+                now_ns,
+                lost=self._connection.missing,
+                dropped=sum(channel.dropped for channel in (self.on_feedback, *self.selected)),
+                malformed=self._connection.malformed,
             ),
         }
         for channel in tuple(self.variants.values()):
@@ -247,13 +273,13 @@ class Receiver:
         self._commands = commands
         self._restorer = restorer
         self._clock = state.scheduler.clock
+        self._overview_pages = OverviewPages()
 
     def connected(self, welcome: Welcome) -> None:
         """Reset the counters, and take in the vehicle's capabilities; see :class:`ConnectionHandler`."""
         state = self._state
         state.welcome = welcome
         now_ns = self._clock()
-        state.counter.last_seq = None
         for channel in state.variants.values():
             channel.restart(now_ns)
         for camera in welcome.capabilities.cameras:
@@ -305,10 +331,11 @@ class Receiver:
         if changed:
             self._commands.feedback(sample, now_ns)
         state.on_feedback.publish(sample)  # consumers first, then the statistics
+        for channel in state.selected:
+            channel.receive(sample)
         state.notifier.notify()
         offset_ns = self._connection.offset_ns
         counter = state.counter
-        counter.follow(sample.seq)
         counter.add(now_ns + offset_ns - sample.published_ns, sample.captured_ns - offset_ns, now_ns)
         if not changed:
             self._commands.feedback(sample, now_ns)
@@ -375,6 +402,14 @@ class Receiver:
     def share(self, share: ProcessorShare, now_ns: int) -> None:  # noqa: ARG002  (all are called alike)
         """Publish a worker's share of a processor's frames."""
         self._state.on_share.publish(share)
+
+    def overview(self, page: Overview, now_ns: int) -> None:  # noqa: ARG002  (all are called alike)
+        """Publish an overview whose pages have all come."""
+        whole = self._overview_pages.add(page)
+        if whole is not None:
+            self._state.overview = whole
+            self._state.on_overview.publish(whole)
+            self._state.notifier.notify()
 
 
 def as_predicate(wanted: Wanted) -> tuple[Callable[[Feedback], bool], str]:

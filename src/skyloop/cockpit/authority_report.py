@@ -48,7 +48,7 @@ class AuthorityReport:
         drone = self._station.drone
         state = "none" if pilot is None else pilot.authority.state
         try:
-            feedback = drone.feedback()
+            feedback = self._station.feedback()
             holder, priority = self._station.view.holder(feedback), feedback.owner_priority
         except LinkError:
             holder, priority = None, None
@@ -81,7 +81,7 @@ class AuthorityReport:
     def busy(self, priority: int) -> str:
         """Return why control can't be taken with a priority, in words."""
         try:
-            feedback = self._station.drone.feedback()
+            feedback = self._station.feedback()
         except LinkError:
             return "another application has control"
         held = "" if feedback.owner_priority is None else f" with priority {feedback.owner_priority}"

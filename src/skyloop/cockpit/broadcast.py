@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
+ROW_HZ: Final = 2.0  #: of a drone's feedback while pages show it only as a row among others
 Wake = Callable[[], None]
 
 

@@ -91,7 +91,7 @@ class FleetSession:
         if station.drone.link.application in (LinkState.LOST, LinkState.CLOSED):
             raise LinkError("the link to the proxy is lost")
         with suppress(LinkError):
-            if station.drone.feedback(max_age_s=1.0).state is FlightState.LANDED:
+            if (await asyncio.to_thread(station.fresh_feedback)).state is FlightState.LANDED:
                 self._send({"type": "each", **subject, "state": "done", "why": "landed already"})
                 return
         begun_ns = monotonic_ns()

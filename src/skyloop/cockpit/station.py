@@ -7,7 +7,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
 from skyloop.clock import monotonic_ns, seconds
-from skyloop.cockpit.broadcast import PeriodicBroadcast
+from skyloop.cockpit.broadcast import ROW_HZ, Cancellable, PeriodicBroadcast
 from skyloop.cockpit.camera_feed import CameraFeed
 from skyloop.cockpit.discovery import Found
 from skyloop.cockpit.feeds import EventFeed, LogFeed
@@ -21,8 +21,10 @@ from skyloop.errors import LinkError, SkyloopError
 if TYPE_CHECKING:
     from skyloop.client import Drone
     from skyloop.cockpit.pilot_connection import PilotConnection
+    from skyloop.messages import Feedback
 
 TELEMETRY_HZ: Final = 18.0
+FRESH_S: Final = 0.2  #: for feedback of a vehicle's present state to come
 PILOT_S: Final = 2.0  #: for a pilot's connection to be made
 RECORDINGS: Final = ("replay:", "video:")  #: how addresses of what was recorded begin
 RETRY_S: Final = 0.05  #: between two tries to send an emergency stop
@@ -48,7 +50,9 @@ class Station:
         self.pilots: set[PilotConnection] = set()  #: pilots' connections of pages
         self.thresholds = ThresholdReader(drone)
         self.view = TelemetryView(self)
-        self.broadcast = PeriodicBroadcast(1.0 / TELEMETRY_HZ, self.view.state, self.log_feed.want)
+        self.broadcast = PeriodicBroadcast(1.0 / TELEMETRY_HZ, self.view.state, self._on_shown)
+        drone.on_feedback(_nothing, inline=True, max_hz=ROW_HZ)  # until the drone is closed
+        self._whole: Cancellable | None = None  # a consumer of all feedback, while a page shows it
         self._stopper: asyncio.Task[PilotConnection] | None = None
         self._may_stop = 0
 
@@ -79,6 +83,37 @@ class Station:
         if (name, width) not in self.small and camera is not None:
             self.small[name, width] = SmallFeed(self.drone, camera, width)
         return self.small.get((name, width))
+
+    def feedback(self) -> Feedback:
+        """Return the newest feedback, which is sent slowly while no page shows more of the drone than its row.
+
+        Raises:
+            LinkError: There is none, or the drone was closed.
+        """
+        return self.drone.feedback(max_hz=ROW_HZ)
+
+    def fresh_feedback(self) -> Feedback:
+        """Wait for a state of the vehicle from now on: the newest may be from before a take-off.
+
+        Raises:
+            LinkError: None comes within :data:`FRESH_S`.
+        """
+        now_ns = self.drone.now_ns
+        return self.drone.wait(lambda feedback: feedback.captured_ns >= now_ns, FRESH_S)
+
+    @property
+    def feedback_period_s(self) -> float:
+        """Time between two samples of feedback as it was asked for [s]; 0 while all come."""
+        return 1.0 / ROW_HZ if self._whole is None else 0.0
+
+    def _on_shown(self, shown: bool) -> None:
+        """A page shows the whole drone, or none does any more."""
+        self.log_feed.want(shown)
+        if shown and self._whole is None:
+            self._whole = self.drone.on_feedback(_nothing, inline=True)
+        elif not shown and self._whole is not None:
+            self._whole.cancel()
+            self._whole = None
 
     # Pilots ----------------------------------------------------------------------------------------------------
 
@@ -176,6 +211,10 @@ class Station:
         await asyncio.gather(stopper, return_exceptions=True)
         if not stopper.cancelled() and stopper.exception() is None:
             await self.close_pilot(stopper.result())
+
+
+def _nothing(_: Feedback) -> None:
+    """Take feedback in, so that all of it comes; what is shown is the newest."""
 
 
 def _ignore_error(task: asyncio.Task[PilotConnection]) -> None:

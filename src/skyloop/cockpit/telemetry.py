@@ -97,7 +97,8 @@ class TelemetryView:
     def alarms(self, feedback: Feedback | None) -> list[Alarm]:
         """Return what a person must know at once, the most severe first."""
         drone = self._station.drone
-        age_s = None if feedback is None else self._age_s(feedback.captured_ns)
+        # An age that comes from being sent less is nothing to worry about.
+        age_s = None if feedback is None else self._age_s(feedback.captured_ns) - self._station.feedback_period_s
         ages: dict[str, float] = {}  # by camera, the youngest of what is shown of it
         for feed in self._station.feeds:
             if (feed_s := feed.age_s) is not None:
@@ -157,7 +158,7 @@ class TelemetryView:
 
     def _feedback(self) -> Feedback | None:
         try:
-            return self._station.drone.feedback()
+            return self._station.feedback()
         except LinkError:
             return None  # none yet, or closed
 

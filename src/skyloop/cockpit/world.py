@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from skyloop.cockpit.broadcast import ROW_HZ
 from skyloop.cockpit.values import Json, number, vector
 from skyloop.errors import NoAnswerError, ParameterError
 from skyloop.messages import Position
@@ -119,7 +120,7 @@ def view_values(camera: CameraInfo) -> Json:
 
 def _newest(drone: Drone) -> Feedback | None:
     try:
-        return drone.feedback()
+        return drone.feedback(max_hz=ROW_HZ)
     except NoAnswerError:
         return None
 

@@ -56,6 +56,7 @@ from skyloop.messages.config import (
 from skyloop.messages.encoded import EncodedFrame
 from skyloop.messages.event import Event
 from skyloop.messages.feedback import Feedback, Value, Vector
+from skyloop.messages.feedback_request import FeedbackRequest
 from skyloop.messages.frame import CameraInfo, FrameHeader, Intrinsics
 from skyloop.messages.kinds import (
     Encoding,
@@ -70,6 +71,7 @@ from skyloop.messages.kinds import (
     Takeover,
 )
 from skyloop.messages.log import LogEntry
+from skyloop.messages.overview import Overview, VehicleOverview
 from skyloop.messages.parameter import Parameter, ParameterType
 from skyloop.messages.pose import VehiclePose
 from skyloop.messages.result import ProcessorResult, ProcessorShare
@@ -99,6 +101,7 @@ __all__ = [
     "EventKind",
     "Failsafe",
     "Feedback",
+    "FeedbackRequest",
     "FlightState",
     "FrameHeader",
     "GetParameter",
@@ -116,6 +119,7 @@ __all__ = [
     "LinkState",
     "ListParameters",
     "LogEntry",
+    "Overview",
     "Parameter",
     "ParameterPage",
     "ParameterType",
@@ -146,6 +150,7 @@ __all__ = [
     "Text",
     "Value",
     "Vector",
+    "VehicleOverview",
     "VehiclePose",
     "Velocity",
     "VideoRequest",

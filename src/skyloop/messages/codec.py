@@ -22,6 +22,7 @@ from skyloop.messages.event import Event
 from skyloop.messages.feedback import Feedback
 from skyloop.messages.frame import FrameHeader
 from skyloop.messages.log import LogEntry
+from skyloop.messages.overview import Overview
 from skyloop.messages.pose import VehiclePose
 from skyloop.messages.result import ProcessorResult, ProcessorShare
 
@@ -45,6 +46,7 @@ Sample = (
     | ProcessorResult
     | ProcessorShare
     | VehiclePose
+    | Overview
 )
 
 
@@ -64,6 +66,7 @@ class Kind(IntEnum):
     RESULT = 11
     SHARE = 12
     POSE = 13
+    OVERVIEW = 14
 
 
 KINDS: Final[dict[type[Sample], Kind]] = {
@@ -80,6 +83,7 @@ KINDS: Final[dict[type[Sample], Kind]] = {
     ProcessorResult: Kind.RESULT,
     ProcessorShare: Kind.SHARE,
     VehiclePose: Kind.POSE,
+    Overview: Kind.OVERVIEW,
 }
 
 _encode_body = msgspec.msgpack.Encoder().encode

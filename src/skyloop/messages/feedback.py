@@ -66,6 +66,7 @@ class Feedback(msgspec.Struct, frozen=True, array_like=True, kw_only=True):
     others: LinkText | None = None  #: why the proxy leaves the vehicle alone: another controller flies it
     start_position_m: Vector | None = None  #: where it took off last, in world axes [m]; None: that is not known
     return_phase: ReturnPhase = ReturnPhase.NONE  #: how far it is on its way back there
+    skipped: Count = 0  #: samples before this one that the proxy left out, as the subscriber asked for fewer
 
     @property
     def origin(self) -> EarthOrigin | None:

@@ -8,13 +8,13 @@ from typing import Final, Literal
 from urllib.parse import parse_qsl, quote, unquote
 
 from skyloop.errors import UsageError
+from skyloop.messages.rate import RateLimiter
 from skyloop.messages.result import MAX_PARTS
 
 VideoEncoding = Literal["raw", "jpeg"]
 DEFAULT_QUALITY: Final = 80
 MIN_FPS: Final = 0.001  #: a frame in a quarter of an hour; the time between two of much less has no end
 _PREFIX: Final = "video/"
-_TOLERANCE: Final = 0.1  # of a period: a frame that comes so much too early is in time
 _FIELDS: Final = ("encoding", "max_fps", "part", "quality", "scale")
 
 
@@ -108,8 +108,7 @@ class FrameFilter:
 
     def __init__(self, request: VideoRequest) -> None:
         self._part = request.part
-        self._period_ns = 0 if request.max_fps is None else round(1e9 / request.max_fps)
-        self._due_ns: int | None = None
+        self._rate = RateLimiter(request.max_fps)
 
     def wants(self, seq: int, captured_ns: int) -> bool:
         """Return whether a frame is wanted. Call it once for each frame, in order.
@@ -120,18 +119,7 @@ class FrameFilter:
         """
         if self._part is not None and seq % self._part[1] != self._part[0]:
             return False
-        return not self._period_ns or self._in_time(captured_ns)
-
-    def _in_time(self, captured_ns: int) -> bool:
-        period_ns, due_ns = self._period_ns, self._due_ns
-        # A time long before the last one is of another run of the camera, and restarts the count.
-        if due_ns is None or captured_ns < due_ns - 2 * period_ns or captured_ns >= due_ns + period_ns:
-            self._due_ns = captured_ns + period_ns
-            return True
-        if captured_ns < due_ns - _TOLERANCE * period_ns:
-            return False
-        self._due_ns = due_ns + period_ns
-        return True
+        return self._rate.in_time(captured_ns)
 
 
 def _with(request: VideoRequest, field: str, text: str) -> VideoRequest:

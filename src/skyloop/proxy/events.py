@@ -53,6 +53,7 @@ class EventPublisher:
         self._repeats = RepeatedEvents()
         self._missed = 0
         self.listener: Callable[[Event], None] | None = None  #: called with each event; must be quick and never raise
+        self.last: Event | None = None  #: the newest that is not about the coming and going of an application
 
     def publish(
         self,
@@ -102,6 +103,8 @@ class EventPublisher:
             packet = encode(Event(kind, event.text, event.at_ns, severity, self._seq, app))
         if self.listener is not None:
             self.listener(event)
+        if kind is not EventKind.APPLICATION_LINK:
+            self.last = event
         missed = self._publish(EVENTS, packet)
         self._counts["events.published"] += 1
         if missed:

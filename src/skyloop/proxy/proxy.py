@@ -26,6 +26,7 @@ from skyloop.messages import (
     AnyReply,
     Command,
     EventKind,
+    Feedback,
     FlightState,
     GetParameter,
     GetStatistics,
@@ -47,10 +48,12 @@ from skyloop.messages import (
     Severity,
     Statistics,
     Value,
+    VehicleOverview,
     VehiclePose,
     Welcome,
     decode,
 )
+from skyloop.messages.overview import MAX_ADDRESS, MAX_EVENT_TEXT
 from skyloop.proxy.audit import AuditTrail
 from skyloop.proxy.core.autopilot import PERIOD_S, Autopilot, software_actions
 from skyloop.proxy.core.events import EventDraft
@@ -58,8 +61,9 @@ from skyloop.proxy.events import Counters, EventPublisher
 from skyloop.proxy.executor import ActionExecutor
 from skyloop.proxy.flight_record import FlightRecord
 from skyloop.proxy.handler import CommandHandler
+from skyloop.proxy.overview import OverviewPublisher
 from skyloop.proxy.parameters import Parameters, described
-from skyloop.proxy.publisher import VehiclePublisher, topic_problem
+from skyloop.proxy.publisher import VehiclePublisher
 from skyloop.proxy.relay import Relay
 from skyloop.proxy.requests import JobQueue, ParameterRequests, RequestDispatcher
 from skyloop.proxy.sessions import HELLO_NS, MAX_MALFORMED, Session
@@ -162,6 +166,7 @@ class Proxy:
             on_failure=self.publisher.driver_failed,
             jobs=jobs,
         )
+        self.overview = OverviewPublisher(server_end, self._overview_row)
         self._ticker = threading.Thread(target=self._run, name="skyloop-ticker", daemon=True) if ticker else None
         #: Called 50 times a second with how often the code is to be run on a dummy [s]; 0: not now. See ``warm_up``.
         self.keep_warm: Callable[[float], None] = _let_be
@@ -207,6 +212,7 @@ class Proxy:
                 self.handler.ownership.began_before()
             self._record.start()
         self._requests.start()
+        self.overview.begin()
         try:
             self.driver.open(self.publisher)
         except BaseException:
@@ -241,6 +247,7 @@ class Proxy:
             self._stopped = True
         self.events.publish(EventKind.PROXY_CLOSING, f"proxy {self.name} ends: {reason}", Severity.WARNING)
         self._stopping.set()
+        self.overview.end()
         if self._ticker is not None and self._ticker.is_alive():
             self._ticker.join()
         self.keep_warm(0.0)
@@ -337,7 +344,7 @@ class Proxy:
 
     def topic_problem(self, topic: str) -> str:
         """Return why nobody can subscribe to a topic; empty if it exists."""
-        return topic_problem(topic, self.publisher.cameras)
+        return self.publisher.topic_problem(topic)
 
     def malformed(self, peer: Peer, reason: str) -> None:
         """Count what an application asked of the transport in vain as malformed."""
@@ -390,6 +397,7 @@ class Proxy:
         self.workers.tick(now_ns)
         self.events.tick(now_ns)
         self.keep_warm(self.handler.warm_s if self.handler.piloted else 0.0)
+        self.overview.tick(now_ns)
 
     def _end_silent(self, now_ns: int) -> None:
         """End connections without a Hello: they take places from others."""
@@ -429,8 +437,40 @@ class Proxy:
         return Pong(ping.sent_ns, self.clock())
 
     def _answer_statistics(self, _session: Session, _request: GetStatistics, _now_ns: int) -> AnyReply:
-        applications = sum(session.role is not None for session in list(self._sessions.values()))
-        return Statistics(self._counters.snapshot(applications=applications, **self.server.counters))
+        return Statistics(self._counters.snapshot(applications=self.applications, **self.server.counters))
+
+    @property
+    def applications(self) -> int:
+        """How many applications are connected. Any thread."""
+        return sum(session.role is not None for session in list(self._sessions.values()))
+
+    def _overview_row(self) -> VehicleOverview:
+        known = self.publisher.feedback_now or Feedback(captured_ns=0, vehicle_link=self.publisher.link_state)
+        event = self.events.last
+        if event is not None:
+            event = msgspec.structs.replace(event, text=event.text[:MAX_EVENT_TEXT], data={})
+        return VehicleOverview(
+            name=self.name,
+            uri=self._welcome.uri[:MAX_ADDRESS],
+            vehicle=self.capabilities.vehicle[:64],
+            can_fly=bool(self.capabilities.actions),
+            captured_ns=known.captured_ns,
+            state=known.state,
+            battery=known.battery,
+            position_m=known.position_m,
+            altitude_m=known.altitude_m,
+            yaw_rad=known.yaw_rad,
+            vehicle_link=self.publisher.link_state,
+            link_reason=self.publisher.link_reason,
+            link_remedy=self.publisher.link_remedy,
+            owner=known.owner,
+            owner_priority=known.owner_priority,
+            failsafe=known.failsafe,
+            others=known.others,
+            return_phase=known.return_phase,
+            applications=self.applications,
+            event=event,
+        )
 
     def _refresh_parameters(self) -> None:
         """Read the driver's parameters again, now that its vehicle has come. On the driver's thread."""

@@ -38,12 +38,14 @@ from skyloop.messages.feedback import MAX_LINK_TEXT
 from skyloop.messages.result import PROCESSOR_NAME
 from skyloop.proxy.core.events import EventDraft
 from skyloop.proxy.events import Counters, EventPublisher
+from skyloop.proxy.feedback_variants import PREFIX, FeedbackVariants
 from skyloop.transport.base import (
     ANNOTATIONS,
     COMMANDS,
     EVENTS,
     FEEDBACK,
     LOGS,
+    OVERVIEW,
     RESULTS,
     TransportServer,
     stream,
@@ -54,7 +56,7 @@ from skyloop.transport.base import (
 KEEP_ALIVE_NS: Final = NS_PER_S // 4
 
 #: The topics without a name in them.
-PLAIN: Final = frozenset({FEEDBACK, EVENTS, COMMANDS, ANNOTATIONS, LOGS, RESULTS})
+PLAIN: Final = frozenset({FEEDBACK, EVENTS, COMMANDS, ANNOTATIONS, LOGS, OVERVIEW, RESULTS})
 _VIDEO_TOPIC: Final = video("")
 _STREAM_TOPIC: Final = stream("")
 _RESULTS_TOPIC: Final = RESULTS + "/"
@@ -101,6 +103,7 @@ class VehiclePublisher:
         self.link_up = False
         self.link_breaks = 0  #: how often the link went from up to not, or came back
         self.state_of = state_of
+        self.variants = FeedbackVariants(server, counters, clock)
         self._on_link_up = on_link_up
         self._owner: dict[str, Any] = {}
         self._publish = server.publish
@@ -191,6 +194,8 @@ class VehiclePublisher:
         self._counts["feedback.published"] += 1
         if missed:
             self._counts["feedback.missed"] += missed
+        if self.variants.known:
+            self.variants.publish(sample, now_ns)
         before = self._state
         if state is not before:
             self._state = state
@@ -247,6 +252,10 @@ class VehiclePublisher:
     def cameras(self) -> Collection[str]:
         """The names of those that the vehicle has, and of any that gave a frame all the same. Any thread."""
         return {*self._cameras, *self._frame_seq.copy()}
+
+    def topic_problem(self, topic: str) -> str:
+        """Return why nobody can subscribe to a topic; empty if it exists. Any thread."""
+        return self.variants.problem(topic) if topic.startswith(PREFIX) else topic_problem(topic, self.cameras)
 
     def wants(self, camera: str) -> bool:
         """Whether anybody looks at this camera now."""

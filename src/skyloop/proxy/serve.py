@@ -21,6 +21,7 @@ from skyloop.errors import UsageError
 from skyloop.messages import EventKind, LinkState, Severity
 from skyloop.proxy.audit import AuditTrail, audit_path
 from skyloop.proxy.flight_record import FlightRecord, record_path
+from skyloop.proxy.overview import OverviewRegistry
 from skyloop.proxy.proxy import Proxy
 from skyloop.proxy.warm_up import keep_warm
 from skyloop.transport.base import TransportServer
@@ -150,6 +151,9 @@ def run(
     if records:
         for proxy in proxies:
             proxy.keep_record(FlightRecord(record_path(proxy.name), str(proxy.driver.uri)))
+    overview = OverviewRegistry()
+    for proxy in proxies:
+        proxy.overview.share(overview)
     with on_signals(shutdown, ignore_interrupt=parent_fd is not None), ExitStack() as started:
         for proxy in proxies:
             started.push(partial(_stop, proxy, shutdown))

@@ -34,6 +34,7 @@ EVENTS = "events"
 COMMANDS = "commands"  #: echoes (Applied) of all commands that the proxy received
 ANNOTATIONS = "annotations"
 LOGS = "logs"  #: what applications log (LogEntry)
+OVERVIEW = "overview"  #: a row of each vehicle of the proxy's process, once a second (Overview)
 MAX_TOPIC = 200  #: characters
 MAX_SUBSCRIPTIONS = 64  #: topics of one connection at a time
 RESULTS = "results"  #: what all processors find (ProcessorResult)
@@ -229,6 +230,11 @@ class TransportServer(ABC):
     def counters(self) -> dict[str, float]:
         """What this end has counted since it started, by dotted name, for the proxy's statistics. Any thread."""
         return {}
+
+    @property
+    def restricted(self) -> bool:
+        """Whether an application that may connect here may be kept from other proxies, as by keys that name drones."""
+        return False
 
     @property
     @abstractmethod

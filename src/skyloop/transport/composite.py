@@ -100,6 +100,10 @@ class CompositeServer(TransportServer):
         return {name: count for end in self._ends for name, count in end.counters.items()}
 
     @property
+    def restricted(self) -> bool:
+        return any(end.restricted for end in self._ends)
+
+    @property
     def address(self) -> str:
         return ", ".join(end.address for end in self._ends)
 

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 _VIDEO: Final = video("")
 _RESULTS: Final = results("")
+#: How topics begin that applications name: nothing is kept for them once they have no subscriber.
+_NAMED: Final = (_RESULTS, f"{FEEDBACK}?")
 
 
 class Publisher:
@@ -148,12 +150,13 @@ class Publisher:
             self._subscribed[topic] = remaining
         else:
             self._subscribed.pop(topic, None)
-            if topic.startswith(_RESULTS):
+            if topic.startswith(_NAMED):
                 self._numbers.pop(topic, None)
+                self._publishers.pop(topic, None)  # ends with whoever is using it
 
     def _declare(self, session: Session, topic: str) -> zenoh.Publisher:
         z = load()
-        newest_wins = topic == FEEDBACK
+        newest_wins = topic.partition("?")[0] == FEEDBACK  # in whichever form
         return session.zenoh.declare_publisher(
             layout.topic(self._name, topic),
             congestion_control=z.CongestionControl.DROP,

@@ -169,6 +169,10 @@ class FabricServer(TransportServer):
         }
 
     @property
+    def restricted(self) -> bool:
+        return self._settings.ring is not None
+
+    @property
     def strays(self) -> int:
         """Samples and queries that came from nobody that is connected."""
         return self._registry.strays

@@ -1,0 +1,221 @@
+"""Observers that ask for less feedback, over each transport: what comes, and how the link is judged."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pytest
+
+from skyloop.client import Drone
+from skyloop.client.drone import open_drone
+from skyloop.clock import monotonic_ns
+from skyloop.errors import NoAnswerError, UnknownNameError, UsageError
+from skyloop.messages import Feedback, FlightState, LinkState, Overview
+from skyloop.proxy import Proxy
+from skyloop.transport.base import FEEDBACK, OVERVIEW, Dialer, TransportServer
+from skyloop.transport.fabric import FabricServer, FabricSettings
+from skyloop.transport.fabric import dial as dial_fabric
+from skyloop.transport.fabric.config import free_port
+from skyloop.transport.local import LocalServer
+from skyloop.transport.local import dial as dial_local
+from skyloop.transport.memory import MemoryServer
+from skyloop.transport.testing import wait_until
+from tests.client.scripted import QUICK, WAIT_S, ScriptedProxy, scripted
+from tests.proxy.fake import FakeDriver
+
+
+def _memory() -> tuple[TransportServer, Dialer]:
+    server = MemoryServer("rates")
+    return server, server.dial
+
+
+def _local() -> tuple[TransportServer, Dialer]:
+    return LocalServer("rates"), dial_local("rates")
+
+
+def _fabric() -> tuple[TransportServer, Dialer]:
+    place = (f"127.0.0.1:{free_port('127.0.0.1')}",)
+    server = FabricServer("rates", FabricSettings(listen=place, multicast=False))
+    return server, dial_fabric("rates", FabricSettings(connect=place, multicast=False))
+
+
+class Beating:
+    """A proxy whose vehicle reports 100 times a second."""
+
+    def __init__(self, server: TransportServer) -> None:
+        self.server = server
+        self.driver = FakeDriver(monotonic_ns)
+        self.proxy = Proxy(self.driver, server, name="rates")
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._beat)
+
+    def __enter__(self) -> Beating:
+        self.proxy.start()
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join()
+        self.proxy.stop()
+
+    def _beat(self) -> None:
+        while not self._ended.wait(0.01):
+            self.driver.report()
+
+
+@pytest.fixture(params=[_memory, _local, _fabric], ids=["memory", "local", "fabric"])
+def transport(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[tuple[TransportServer, Dialer]]:
+    with TemporaryDirectory(prefix="skyloop-") as directory:
+        monkeypatch.setenv("SKYLOOP_RUNTIME_DIR", str(Path(directory) / "run"))
+        yield request.param()
+
+
+def test_an_observer_is_sent_what_its_consumers_ask_for_and_its_link_is_up(
+    transport: tuple[TransportServer, Dialer],
+) -> None:
+    server, dial = transport
+    got: list[Feedback] = []
+    fast: list[Feedback] = []
+    with Beating(server), open_drone(dial, app="eye", access="observe") as drone:
+        assert server.subscribers(FEEDBACK) == 1
+        with drone.on_feedback(got.append, inline=True, max_hz=10, fields=("battery", "native")):
+            topic = "feedback?fields=battery,native&max_hz=10"
+            wait_until(lambda: server.subscribers(topic) == 1 and not server.subscribers(FEEDBACK), "it is narrowed")
+            wait_until(lambda: len(got) >= 5, "samples come")
+            before = drone.stats["feedback"].count
+            wait_until(lambda: len(got) >= 10, "samples come")
+            assert drone.stats["feedback"].count - before <= 7, "no more were sent than were asked for"
+            wait_until(lambda: drone.link.application is LinkState.UP, "the link is up")
+            with drone.on_feedback(fast.append, max_hz=50, fields=["altitude_m"]):
+                both = "feedback?fields=battery,altitude_m,native&max_hz=50"
+                wait_until(lambda: server.subscribers(both) == 1 and not server.subscribers(topic), "for both")
+                wait_until(lambda: len(fast) >= 10, "samples come")
+            wait_until(lambda: server.subscribers(topic) == 1, "narrowed again")
+        wait_until(lambda: server.subscribers(FEEDBACK) == 1, "all again, as nobody asks for less")
+        wait_until(lambda: drone.feedback().skipped == 0, "whole")
+        assert drone.stats["feedback"].lost == 0 or isinstance(server, FabricServer)  # there it travels as datagrams
+    assert {(sample.battery, sample.altitude_m) for sample in got} == {(0.9, None)}
+    assert {(sample.battery, sample.altitude_m) for sample in fast} == {(None, 1.0)}
+    for one, other in itertools.pairwise(got):
+        assert other.published_ns - one.published_ns > 0.05e9
+
+
+def test_reading_is_a_consumer_too_and_waiting_needs_all() -> None:
+    server, dial = _memory()
+    with Beating(server) as beating, open_drone(dial, app="eye", access="observe") as drone:
+        assert drone.feedback(max_hz=2, fields=["battery"]).altitude_m is None
+        slow = "feedback?fields=battery&max_hz=2"
+        wait_until(lambda: server.subscribers(slow) == 1 and not server.subscribers(FEEDBACK), "it is narrowed")
+        assert drone.next_feedback(WAIT_S, max_hz=2, fields=["battery"]).battery == 0.9
+        waiting = threading.Thread(target=drone.wait, args=("flying", WAIT_S))
+        waiting.start()
+        wait_until(lambda: server.subscribers(FEEDBACK) == 1, "all while it waits")
+        beating.driver.report(state=FlightState.FLYING)
+        waiting.join(WAIT_S)
+        wait_until(lambda: server.subscribers(slow) == 1 and not server.subscribers(FEEDBACK), "it is narrowed again")
+        findings = drone.preflight(video_s=0.0)
+        assert findings
+        assert drone.next_feedback(WAIT_S).battery == 0.9
+        wait_until(lambda: server.subscribers(FEEDBACK) == 1 and not server.subscribers(slow), "all, for good")
+
+
+def test_a_pilot_is_sent_all_and_its_consumers_get_what_they_ask_for() -> None:
+    server, dial = _memory()
+    got: list[Feedback] = []
+    with (
+        Beating(server),
+        open_drone(dial, app="pilot") as drone,
+        drone.on_feedback(got.append, max_hz=20, fields=()),
+    ):
+        wait_until(lambda: len(got) >= 5, "samples come")
+        assert server.subscribers(FEEDBACK) == 1
+        assert drone.feedback(fields=["battery"]).altitude_m is None
+        assert drone.feedback().altitude_m == 1.0
+    assert {sample.battery for sample in got} == {None}
+    assert {sample.owner for sample in got} <= {None, "pilot"}
+    for one, other in itertools.pairwise(got):
+        assert other.published_ns - one.published_ns > 0.02e9
+
+
+def test_what_makes_no_sense_is_refused() -> None:
+    server, dial = _memory()
+    with Beating(server), open_drone(dial, app="eye", access="observe") as drone:
+        calls: list[Callable[[], object]] = [
+            lambda: drone.feedback(max_hz=0),
+            lambda: drone.next_feedback(max_hz=float("nan")),
+            lambda: drone.on_feedback(print, max_hz=-1),
+        ]
+        for call in calls:
+            with pytest.raises(UsageError, match="max_hz is"):
+                call()
+        with pytest.raises(UnknownNameError, match="did you mean 'position_m'"):
+            drone.on_feedback(print, fields=["position"])
+        assert server.subscribers(FEEDBACK) == 1
+
+
+@contextmanager
+def _observing(proxy: ScriptedProxy) -> Iterator[Drone]:
+    with open_drone(proxy.server.dial, app="eye", access="observe", policy=QUICK) as drone:
+        yield drone
+
+
+def test_a_proxy_of_an_earlier_version_sends_all_and_the_rest_is_left_out_here() -> None:
+    got: list[Feedback] = []
+    with scripted() as proxy, _observing(proxy) as drone:
+        # It publishes nothing on the topic that was asked for, and answers pings all the same.
+        with drone.on_feedback(got.append, max_hz=4):
+            wait_until(lambda: proxy.server.subscribers("feedback?max_hz=4") == 1, "it is asked for")
+            wait_until(lambda: proxy.server.subscribers(FEEDBACK) == 1, "plain feedback instead")
+            wait_until(lambda: len(got) >= 3, "samples come")
+            wait_until(lambda: drone.link.application is LinkState.UP, "the link is up")
+            with drone.on_feedback(got.append, max_hz=8):
+                assert proxy.server.subscribers("feedback?max_hz=8") == 0, "it is not asked for again"
+        assert proxy.server.subscribers(FEEDBACK) == 1
+        newest = drone.feedback()
+        wait_until(lambda: drone.feedback().seq > newest.seq + 3, "all come")
+    assert got[1].published_ns - got[0].published_ns > 0.15e9
+
+
+def test_another_connection_asks_for_the_same() -> None:
+    server, dial = _memory()
+    with Beating(server), open_drone(dial, app="eye", access="observe", policy=QUICK) as drone:
+        got: list[Feedback] = []
+        with drone.on_feedback(got.append, max_hz=20):
+            wait_until(lambda: server.subscribers("feedback?max_hz=20") == 1, "it is narrowed")
+            session = drone._core.connection.session
+            assert session is not None
+            assert session._end is not None
+            session._end.close()
+            wait_until(lambda: drone._core.connection.session not in (None, session), "another session")
+            wait_until(lambda: server.subscribers("feedback?max_hz=20") == 1, "asked for in it")
+            count, now_ns = len(got), time.monotonic_ns()
+            wait_until(lambda: len(got) > count and got[-1].published_ns > now_ns, "samples come again")
+            assert server.subscribers(FEEDBACK) == 0
+
+
+def test_the_overview_comes_to_who_asks_for_it(transport: tuple[TransportServer, Dialer]) -> None:
+    server, dial = transport
+    got: list[Overview] = []
+    with Beating(server), open_drone(dial, app="eye", access="observe") as drone:
+        assert server.subscribers(OVERVIEW) == 0
+        with drone.on_overview(got.append):
+            wait_until(lambda: bool(got), "one comes at once")
+        wait_until(lambda: server.subscribers(OVERVIEW) == 0, "nobody asks for it")
+        (row,) = drone.overview(WAIT_S).vehicles
+        assert (row.name, row.battery, row.state) == ("rates", 0.9, FlightState.LANDED)
+        wait_until(lambda: server.subscribers(OVERVIEW) == 1, "it is kept")
+
+
+def test_a_proxy_that_sends_no_overview() -> None:
+    words = "a proxy of an earlier version sends none"
+    with scripted() as proxy, _observing(proxy) as drone, pytest.raises(NoAnswerError, match=words):
+        drone.overview(0.05)
