@@ -271,7 +271,11 @@ def draw(
                     if first >= end:
                         continue
                     start = np.float32(planes[k, 1] * row + planes[k, 2])
-                    near, shown, across = nearest[row - top, first:end], numbers[row - top, first:end], along[k, first:end]
+                    near, shown, across = (
+                        nearest[row - top, first:end],
+                        numbers[row - top, first:end],
+                        along[k, first:end],
+                    )
                     for n in range(end - first):
                         candidate = across[n] + start
                         closer = candidate > near[n]

@@ -81,9 +81,7 @@ def moved_each(many: Quads, positions_m: Floats, rotations: Floats) -> Quads:
 def move_each(many: Quads, positions_m: Floats, rotations: Floats, vectors: Floats, starts: Floats) -> None:
     """Write the vectors and starts of :func:`moved_each` into arrays of the same shape, which are in one piece."""
     bodies = len(positions_m)
-    np.matmul(
-        many.vectors.reshape(bodies, -1, 3), rotations.transpose(0, 2, 1), out=vectors.reshape(bodies, -1, 3)
-    )
+    np.matmul(many.vectors.reshape(bodies, -1, 3), rotations.transpose(0, 2, 1), out=vectors.reshape(bodies, -1, 3))
     of_bodies = vectors.reshape(bodies, -1, _CORNERS + 3, 3)
     of_bodies[:, :, :_CORNERS] += positions_m[:, None, None]
     under = np.matmul(of_bodies[:, :, _CORNERS + 1 :].reshape(bodies, -1, 3), positions_m[:, :, None])
