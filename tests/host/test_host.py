@@ -17,6 +17,7 @@ from skyloop.messages import (
     Hover,
     Land,
     ListParameters,
+    Overview,
     Parameter,
     ParameterType,
     ParameterValue,
@@ -25,6 +26,7 @@ from skyloop.messages import (
     Velocity,
 )
 from skyloop.proxy import Proxy
+from skyloop.transport.base import OVERVIEW
 from skyloop.transport.local import LocalServer, list_names
 from skyloop.transport.testing import wait_until
 from tests.host.fleet import Flight, Hosting, closing_reason
@@ -269,3 +271,23 @@ def test_nothing_is_left_behind() -> None:
         hosting.host.remove("alpha")
         wait_until(lambda: "skyloop-audit" not in left(), "its threads have ended")
     wait_until(lambda: not left(), "all have ended")
+
+
+def test_one_overview_shows_all_vehicles_of_the_host_and_no_more_who_has_failed(hosting: Hosting) -> None:
+    for name in ("one", "two", "three"):
+        hosting.add(name)
+    witness = hosting.app("one")
+    witness.end.subscribe(OVERVIEW)
+
+    def names() -> list[str]:
+        pages = [sample for sample in witness.others if isinstance(sample, Overview)]
+        return [row.name for row in pages[-1].vehicles] if pages else []
+
+    wait_until(lambda: names() == ["one", "three", "two"], "all are shown")
+    stuck = hosting.drivers["two"]
+    pilot = hosting.airborne("two")
+    stuck.hangs = {"velocity"}
+    pilot.command(Velocity(0.3, 0.0, 0.0, 0.0), sync=False)
+    wait_until(lambda: hosting.condition("two") == "failed", "it was given up")
+    wait_until(lambda: names() == ["one", "three"], "it is shown no longer")
+    stuck.let_go.set()

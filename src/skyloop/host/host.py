@@ -20,6 +20,7 @@ from skyloop.host.watchdog import HANG_LOOKS, LOOK_S, STALL_LOOKS, SharedLoop, W
 from skyloop.host.workers import RequestWorkers
 from skyloop.messages import EventKind, Severity
 from skyloop.proxy import Proxy
+from skyloop.proxy.overview import OverviewRegistry
 from skyloop.transport.local.reactor import Reactor
 from skyloop.transport.local.shared_server import SharedLocalServer
 
@@ -48,6 +49,7 @@ class Host:
     def __init__(self, announce: Announce = _log.info, make: Callable[[str], Driver] = make_driver) -> None:
         self.announce = announce
         self._make_driver = make
+        self._overview = OverviewRegistry()
         self.vehicles: dict[str, HostedVehicle] = {}  #: by name, in the order in which they came
         self.known: dict[str, VehicleSettings] = {}  #: what can be started by its name alone
         self._lock = threading.Lock()  # guards who is there, and the loops
@@ -99,7 +101,7 @@ class Host:
         if settings.own_process:
             return OwnProcessVehicle(settings, self.announce)
         lane = self._workers.lane()
-        return SharedVehicle(settings, self._reactor, lane, network, self._make_driver, self._few)
+        return SharedVehicle(settings, self._reactor, lane, network, self._make_driver, self._few, self._overview)
 
     def _few(self) -> bool:
         return len(self.vehicles) <= FEW

@@ -20,6 +20,7 @@ from skyloop.host.fleet import VehicleSettings
 from skyloop.messages import EventKind, Severity
 from skyloop.proxy import Proxy
 from skyloop.proxy.flight_record import FlightRecord, record_path
+from skyloop.proxy.overview import OverviewRegistry
 from skyloop.proxy.requests import JobQueue
 from skyloop.proxy.serve import keep_trail
 from skyloop.proxy.warm_up import WARMER
@@ -118,6 +119,7 @@ class SharedVehicle(HostedVehicle):
         network: How its proxy joins the network; None for this host only.
         make: Makes the driver of an address.
         few: Whether this process has few vehicles: the code of many is warm by itself.
+        overview: The rows of all vehicles of this process; None: each shows its own alone.
     """
 
     def __init__(
@@ -128,8 +130,10 @@ class SharedVehicle(HostedVehicle):
         network: FabricSettings | None,
         make: Callable[[str], Driver] = make_driver,
         few: Callable[[], bool] = lambda: True,
+        overview: OverviewRegistry | None = None,
     ) -> None:
         super().__init__(settings)
+        self._overview = overview
         self._few = few
         self._make = make
         self.server = SharedLocalServer(settings.name, reactor, group=settings.group)
@@ -145,6 +149,8 @@ class SharedVehicle(HostedVehicle):
         proxy = Proxy(driver, self._end(str(driver.uri)), name=settings.name, ticker=False, jobs=self._jobs)
         proxy.parameters.preset(settings.presets)
         proxy.keep_warm = lambda period_s: WARMER.keep(proxy, period_s if self._few() else 0.0)
+        if self._overview is not None:
+            proxy.overview.share(self._overview)
         keep_trail(proxy, None)
         proxy.keep_record(FlightRecord(record_path(settings.name), str(driver.uri)))
         self.proxy = proxy

@@ -271,6 +271,7 @@ class Proxy:
             self._stopped = True
         self.events.publish(EventKind.PROXY_CLOSING, f"proxy {self.name} ends: {reason}", Severity.ERROR)
         self._stopping.set()
+        self.overview.end()
         self.keep_warm(0.0)
         parts = (self.server.stop, self.driver.close, self._requests.stop)
         threads = [threading.Thread(target=part, name="skyloop-abandoned", daemon=True) for part in parts]
