@@ -10,11 +10,13 @@ from skyloop.bench.schedule import COMMAND, FEEDBACK, LARGE, SMALL, VIDEO, Size
 from skyloop.bench.statistics import Summary
 
 #: Medians, Skyloop's to the floor's, at most; by size of the frames and channel.
-FLOOR_MEDIAN: Final = {(SMALL, COMMAND): 1.3, (SMALL, FEEDBACK): 1.3, (SMALL, VIDEO): 1.5, (LARGE, VIDEO): 1.5}
+FLOOR_MEDIAN: Final = {(SMALL, COMMAND): 1.4, (SMALL, FEEDBACK): 1.4, (SMALL, VIDEO): 1.4, (LARGE, VIDEO): 1.1}
 #: 99th percentiles, Skyloop's to the floor's, at most.
-FLOOR_P99: Final = {(SMALL, COMMAND): 2.0, (SMALL, FEEDBACK): 2.0}
+FLOOR_P99: Final = {(SMALL, COMMAND): 2.0, (SMALL, FEEDBACK): 2.0, (SMALL, VIDEO): 2.0, (LARGE, VIDEO): 2.0}
 #: Medians, rclpy's to Skyloop's, at least.
 ROS_MEDIAN: Final = {(SMALL, COMMAND): 5.0, (SMALL, FEEDBACK): 5.0, (SMALL, VIDEO): 8.0, (LARGE, VIDEO): 30.0}
+#: Medians, ZeroMQ's to Skyloop's, at least.
+ZEROMQ_MEDIAN: Final = {(SMALL, COMMAND): 1.0}
 
 
 class Verdict(NamedTuple):
@@ -48,10 +50,14 @@ def judge_delays(results: Delays) -> list[Verdict]:
         if found := pair(size, channel, FLOOR.name):
             figure = found[0].p99_us / found[1].p99_us
             verdicts.append(Verdict(f"{_name(size, channel)}: 99th percentile to the floor's", figure, limit))
-    for (size, channel), limit in ROS_MEDIAN.items():
-        if found := pair(size, channel, "ros2"):
-            figure = found[1].median_us / found[0].median_us
-            verdicts.append(Verdict(f"{_name(size, channel)}: rclpy's median to ours", figure, limit, at_least=True))
+    for peer, title, limits in (("ros2", "rclpy", ROS_MEDIAN), ("zeromq", "ZeroMQ", ZEROMQ_MEDIAN)):
+        for (size, channel), limit in limits.items():
+            if found := pair(size, channel, peer):
+                figure, what = (
+                    found[1].median_us / found[0].median_us,
+                    f"{_name(size, channel)}: {title}'s median to ours",
+                )
+                verdicts.append(Verdict(what, figure, limit, at_least=True))
     return verdicts
 
 

@@ -1,0 +1,180 @@
+"""Compares a run with the last one on the pages, so that a loss shows.
+
+``python -m benchmarks.compare results`` reads what ``skyloop bench … --output results`` and ``python -m benchmarks.…
+--output results`` wrote, and compares it with ``docs/measured``; with a second folder, with that. Delays are compared
+as multiples of the bare hand-over's in their own run, so that a faster or busier machine changes nothing; the
+simulator, which has no such floor, as it was measured, which says something on one machine only.
+
+What is more than :data:`WORSE` times as slow as before is marked, and the exit status is 1 then.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Final, NamedTuple
+
+import typer
+
+from benchmarks.pages.delays import MEASURED
+from skyloop.bench import delays, loop
+from skyloop.bench.contenders import FLOOR, OURS
+from skyloop.bench.loop import TOTAL
+from skyloop.bench.schedule import CHANNELS, COMMAND, VIDEO
+from skyloop.bench.sim import SimResults
+from skyloop.bench.tables import Table
+from skyloop.cli.app import run
+from skyloop.cli.bench import as_rich
+from skyloop.cli.text import console
+from skyloop.errors import UsageError
+from skyloop.files import MAX_RESULTS, read_json
+
+WORSE: Final = 1.15  #: medians of one machine vary by less from run to run, as a multiple of the floor's
+
+
+class Change(NamedTuple):
+    """One figure in both runs: the smaller the better."""
+
+    what: str
+    unit: str
+    before: float
+    now: float
+    judged: bool = True  #: whether it counts as a loss when it is much larger; 99th percentiles vary too much
+
+    @property
+    def ratio(self) -> float:
+        """Now to before."""
+        return self.now / self.before
+
+    @property
+    def worse(self) -> bool:
+        """Whether it is a loss."""
+        return self.judged and self.ratio > WORSE
+
+
+def compare(now: Path, before: Path) -> list[Change]:
+    """Return all figures that both folders have.
+
+    Args:
+        now: With the results of the new run.
+        before: With those to compare with.
+
+    Raises:
+        UsageError: They have none in common.
+        FileFormatError: A file holds anything else.
+    """
+    found = [*_delays(now, before), *_loop(now, before), *_sim(now, before)]
+    if not found:
+        raise UsageError(f"{now} and {before} have no delays.json, loop.json or sim.json in common: nothing to compare")
+    return found
+
+
+def _delays(now: Path, before: Path) -> Iterator[Change]:
+    if not _both(now, before, "delays.json"):
+        return
+    new, old = delays.load(now / "delays.json"), delays.load(before / "delays.json")
+    for size in new.sizes:
+        for channel in CHANNELS:
+            figures = [_to_floor(run, size, channel) for run in (old, new)]
+            if figures[0] is not None and figures[1] is not None:
+                (median_before, p99_before), (median_now, p99_now) = figures  # type: ignore[misc]
+                yield Change(f"{channel}, frames of {size}: median", "× floor", median_before, median_now)
+                yield Change(f"{channel}, frames of {size}: 99th percentile", "× floor", p99_before, p99_now, False)
+
+
+def _to_floor(results: delays.Delays, size: str, channel: str) -> tuple[float, float] | None:
+    """The median and the 99th percentile as multiples of the floor's."""
+    ours, floor = (results.summary(name, size, channel) for name in (OURS.name, FLOOR.name))
+    if ours is None or floor is None:
+        return None
+    return ours.median_us / floor.median_us, ours.p99_us / floor.p99_us
+
+
+def _loop(now: Path, before: Path) -> Iterator[Change]:
+    """The loop, as a multiple of what the bare hand-over takes for its frame and its command."""
+    if not (_both(now, before, "loop.json") and _both(now, before, "delays.json")):
+        return
+    new, old = loop.load(now / "loop.json"), loop.load(before / "loop.json")
+    floors = [delays.load(folder / "delays.json") for folder in (before, now)]
+    for result in new.sizes:
+        same = [other for other in old.sizes if other.size == result.size]
+        below = [_floor_us(run, result.size) for run in floors]
+        if same and below[0] is not None and below[1] is not None:
+            was, is_now = same[0].stages[TOTAL].median_us / below[0], result.stages[TOTAL].median_us / below[1]
+            yield Change(f"loop, frames of {result.size}: median", "× floor", was, is_now)
+
+
+def _floor_us(results: delays.Delays, size: str) -> float | None:
+    parts = [results.summary(FLOOR.name, size, channel) for channel in (VIDEO, COMMAND)]
+    return None if None in parts else sum(part.median_us for part in parts if part is not None)
+
+
+def _sim(now: Path, before: Path) -> Iterator[Change]:
+    if not _both(now, before, "sim.json"):
+        return
+    new, old = (
+        read_json(folder / "sim.json", SimResults, "the results of bench sim", MAX_RESULTS) for folder in (now, before)
+    )
+    steps = {(row.world, row.drones): row.step.median_us for row in old.physics}
+    for step in new.physics:
+        if (step.world, step.drones) in steps:
+            what = f"simulator, {step.drones} drones in {step.world}: a step"
+            yield Change(what, "µs", steps[step.world, step.drones], step.step.median_us)
+    pictures = {(row.cameras, row.width): 1e6 / row.frames_per_s for row in old.drawing}
+    for row in new.drawing:
+        if (row.cameras, row.width) in pictures:
+            what = f"simulator, {row.cameras} at {row.width}×{row.height}: a picture"
+            yield Change(what, "µs", pictures[row.cameras, row.width], 1e6 / row.frames_per_s)
+
+
+def _both(now: Path, before: Path, name: str) -> bool:
+    return (now / name).exists() and (before / name).exists()
+
+
+def table(changes: list[Change]) -> Table:
+    """Return the changes as a table."""
+    rows = [
+        [
+            change.what,
+            f"{change.before:.3g} {change.unit}",
+            f"{change.now:.3g} {change.unit}",
+            f"{change.ratio:.2f}",
+            "slower" if change.worse else "",
+        ]
+        for change in changes
+    ]
+    return Table("A run and the last one on the pages", ["what", "before", "now", "now to before", ""], rows)
+
+
+def command(
+    folder: Annotated[
+        Path, typer.Argument(help="With the JSON files of a run (--output)", exists=True, file_okay=False)
+    ],
+    before: Annotated[Path, typer.Argument(help="With those of another run", exists=True, file_okay=False)] = MEASURED,
+) -> None:
+    """Compare a run with the last one in docs/measured.
+
+    Exits with 1 where something has become slower. Example: python -m benchmarks.compare results
+    """
+    changes = compare(folder, before)
+    for shown in as_rich([table(changes)], f"{folder} beside {before}"):
+        console().print(shown)
+    if any(change.worse for change in changes):
+        raise typer.Exit(1)
+
+
+def build() -> typer.Typer:
+    """Return the command line."""
+    app = typer.Typer(
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode=None,
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
+    app.command()(command)
+    return app
+
+
+if __name__ == "__main__":
+    run(build(), sys.argv[1:], "benchmarks.compare")
