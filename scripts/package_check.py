@@ -24,7 +24,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 TOOLS = ("build>=1.2", "twine>=6.1", "check-wheel-contents>=0.6")
 #: What `make demo` installs, too.
-EXTRAS = "sim,vision,cockpit"
+EXTRAS = "sim,fast,vision,cockpit"
 #: In the wheel beside the modules, and missed only when it is used.
 NEEDED = (
     "skyloop/py.typed",

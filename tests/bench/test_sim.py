@@ -50,7 +50,7 @@ def test_drawing_is_measured_for_each_camera_and_size(measured: tuple[sim.SimRes
         ("front and bottom", 640, 480, 2),
         ("10 × front", 320, 240, 10),
     ]
-    assert [row.target for row in rows if row.target is not None] == [60.0]
+    assert [row.target for row in rows if row.target is not None] == [312.0, 91.0, 250.0]
     for row in rows:
         assert_plausible(row.round)
         assert row.frames_per_s > 0
@@ -76,7 +76,7 @@ def test_opencv_gets_its_threads_back() -> None:
 def test_tables_name_the_targets(measured: tuple[sim.SimResults, list[float]]) -> None:
     physics, drawing = physics_table(measured[0]), drawing_table(measured[0])
     assert list(physics.columns[4].cells) == ["≥ 25 ×", "", "≥ 15 ×", "≥ 15 ×"]
-    assert [cell for cell in drawing.columns[4].cells if cell] == ["≥ 60"]
+    assert [cell for cell in drawing.columns[4].cells if cell] == ["≥ 312", "≥ 91", "≥ 250"]
     assert physics.row_count == 4
     assert drawing.row_count == 7
 

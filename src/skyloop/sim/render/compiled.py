@@ -72,10 +72,11 @@ class CompiledPainter(Painter):
         """See :meth:`Painter.paint`."""
         n, atlas = len(quads), self.atlas
         if self._fixed is None or self._fixed[0] is not quads.texture:  # the scene's, whatever has moved
-            weight = 1.0 + PRIORITY_SHARE * quads.priority
+            weight: Floats = np.asarray(1.0 + PRIORITY_SHARE * quads.priority, dtype=np.float64)
             origin = np.stack([atlas.x0[quads.texture], atlas.y0[quads.texture], atlas.span[quads.texture]], axis=1)
-            self._fixed = (quads.texture, weight, origin)
-        _, weight, origin = self._fixed
+            self._fixed = quads.texture, weight, origin
+        else:
+            _, weight, origin = self._fixed
         scene = (
             quads.vectors,
             quads.starts,

@@ -270,14 +270,14 @@ def draw(
                     end = int(np.floor(min(max(high, -1.0), wide - 1.0))) + 1
                     if first >= end:
                         continue
-                    start = np.float32(planes[k, 1] * row + planes[k, 2])
+                    along_row = np.float32(planes[k, 1] * row + planes[k, 2])
                     near, shown, across = (
                         nearest[row - top, first:end],
                         numbers[row - top, first:end],
                         along[k, first:end],
                     )
                     for n in range(end - first):
-                        candidate = across[n] + start
+                        candidate = across[n] + along_row
                         closer = candidate > near[n]
                         near[n] = candidate if closer else near[n]
                         shown[n] = own if closer else shown[n]
@@ -310,8 +310,8 @@ def draw(
         # What each pixel shows, and those that show several quads.
         xs, ys = flat_x[begin : begin + count_], flat_y[begin : begin + count_]
         for n in range(count_):
-            column, row = np.int32(xs[n] * scale_x + start_x), np.int32(ys[n] * scale_y + start_y)
-            spot[n] = np.int32(np.int32(np.int32(row & kept_) * columns_) + column)
+            at_x, at_y = np.int32(xs[n] * scale_x + start_x), np.int32(ys[n] * scale_y + start_y)
+            spot[n] = np.int32(np.int32(np.int32(at_y & kept_) * columns_) + at_x)
         for n in range(count_):
             number[n] = seen_[np.uint64(spot[n])]
         total = count_
@@ -334,7 +334,7 @@ def draw(
                     y_[total], y_[total + 1] = sample_y[row], sample_y[row]
                     y_[total + 2], y_[total + 3] = sample_y[row + 1], sample_y[row + 1]
                     total += 4
-        # What the texture's place is computed from: for the pixels in a row that show one quad at once, then by samples.
+        # What a texture's place is computed from: for pixels in a row that show one quad at once, then by samples.
         start = 0
         while start < count_:
             quad = number[start]
@@ -446,9 +446,9 @@ def draw(
                     depth[n] = one / ws[n]
                 for n in range(len(out)):
                     off = abs((axes[2, 0] * xs[n] + axes[2, 1] * ys[n] + axes[2, 2]) * depth[n] - height_)
-                    at_x = (axes[0, 0] * xs[n] + axes[0, 1] * ys[n] + axes[0, 2]) * depth[n] + away_x
-                    at_y = (axes[1, 0] * xs[n] + axes[1, 1] * ys[n] + axes[1, 2]) * depth[n] + away_y
-                    rim = one - (at_x * at_x + at_y * at_y) / square
+                    east = (axes[0, 0] * xs[n] + axes[0, 1] * ys[n] + axes[0, 2]) * depth[n] + away_x
+                    north = (axes[1, 0] * xs[n] + axes[1, 1] * ys[n] + axes[1, 2]) * depth[n] + away_y
+                    rim = one - (east * east + north * north) / square
                     rim = rim if rim > zero else zero
                     rim = rim if off < thickness * depth[n] + more else zero
                     shade[n] = np.int32(full - strength * rim * rim * (three - (rim + rim)))

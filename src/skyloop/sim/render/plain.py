@@ -24,7 +24,9 @@ class PlainPainter(Painter):
         super().__init__(raster, model, atlas)
         self._shader = Shader(atlas)
         self._buffer = DepthBuffer(raster.grid)
-        self._steps = (0, 1, raster.grid.width, raster.grid.width + 1)  # from a pixel's first sample to all four
+        # From a pixel's first sample to all of them.
+        self._steps = (0, 1, raster.grid.width, raster.grid.width + 1)[: raster.samples]
+        self._numbers = np.empty((raster.samples, len(raster.lookup)), np.int32)
         self._colours = np.empty((model.height, model.width, 4), np.uint8)
         self._inverse_depth = np.empty((model.height, model.width), np.float32)
 
@@ -48,14 +50,10 @@ class PlainPainter(Painter):
 
     def _resolve(self, seen: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.intp]]:
         """Return the table's column of each pixel's first sample, (pixels,), and the pixels whose samples differ."""
-        raster = self.raster
-        first = seen[raster.lookup]
-        if raster.samples == 1:
-            return first, np.empty(0, np.intp)
-        differs = np.zeros(len(first), np.bool_)
-        for step in self._steps[1:]:
-            differs |= seen[raster.lookup + step] != first
-        return first, np.flatnonzero(differs)
+        raster, numbers = self.raster, self._numbers
+        for k, step in enumerate(self._steps):
+            np.take(seen[step:], raster.lookup, out=numbers[k], mode="clip")
+        return numbers[0], np.flatnonzero((numbers[1:] != numbers[0]).any(axis=0))
 
     def _smooth(
         self, seen: NDArray[np.int32], table: NDArray[np.float32], pixels: NDArray[np.intp], colours: NDArray[np.uint8]

@@ -135,7 +135,7 @@ class PlanarRenderer:
 
 
 def prepare(model: CameraModel, quality: Quality = Quality.SMOOTH) -> None:
-    """Compute what the first picture through a lens would wait for: a second for 960×720 pixels with distortion.
+    """Compute what the first picture through a lens would wait for: 0.2 s for 960×720 pixels with distortion.
 
     It is kept for all renderers of the process.
     """
