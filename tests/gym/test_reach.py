@@ -25,7 +25,7 @@ from skyloop.gym import (
     ReachVectorEnv,
     register,
 )
-from skyloop.gym.picture import look_at
+from skyloop.gym.picture import OnBoard, _circle, look_at
 from skyloop.gym.tasks import FOLLOWED_M, GATES, NEAR_M
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "learn_to_reach.py"
@@ -74,6 +74,44 @@ def test_observations_are_numbers_pictures_or_both() -> None:
     assert told["is_success"].tolist() == [False, False]
     with pytest.raises(UsageError, match="observe is 'video' and must be one of state, pixels, both"):
         FollowEnv(observe="video")  # type: ignore[arg-type]
+
+
+def test_pictures_have_the_size_asked_for_and_show_no_other_drone() -> None:
+    envs = ReachVectorEnv(4, observe="pixels", size_px=84)
+    many, _ = envs.reset(seed=1)
+    assert many.shape == (4, 84, 84, 3)
+    assert envs.observation_space.contains(many)
+    arena = envs._task.arena
+    for drone in range(4):  # each looks across its cell's middle at where its neighbours are
+        arena.put(drone, np.array([0.0, 0.0, 2.0]), [0.0, math.pi / 2, -math.pi / 2, math.pi][drone])
+    camera, none = OnBoard(arena, 84), []
+    before = camera.draw(0, none)
+    arena.put(1, np.array([-3.0, 0.0, 2.0]), 0.0)
+    assert np.array_equal(camera.draw(0, none), before)
+    arena.put(0, np.array([0.0, 0.0, 2.5]), 0.0)
+    assert not np.array_equal(camera.draw(0, none), before), "its own place is seen"
+    for wrong in (15, 513, 84.0, True):
+        with pytest.raises(UsageError, match="size_px is .* and must be a whole number from 16 to 512"):
+            ReachEnv(observe="pixels", size_px=wrong)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("normal", [[0.0, 0.0, 1.0], [0.6, -0.8, 0.0], [0.1, -0.2, -0.97]])
+def test_a_ring_is_round_and_square_to_its_normal(normal: list[float]) -> None:
+    axis, centre = np.array(normal) / np.linalg.norm(normal), np.array([1.0, 2.0, 3.0])
+    spokes = _circle(centre, axis, 0.5) - centre
+    assert np.linalg.norm(spokes, axis=1) == pytest.approx(0.5)
+    assert spokes @ axis == pytest.approx(0.0, abs=1e-12)
+    assert np.linalg.norm(np.diff(spokes, axis=0), axis=1) == pytest.approx(math.sin(math.pi / 24))
+
+
+@pytest.mark.filterwarnings("error")
+def test_actions_that_are_no_numbers_count_as_none() -> None:
+    first, second = ReachEnv(), ReachEnv()
+    for env in (first, second):
+        env.reset(seed=1)
+    one = first.step(np.array([np.nan, np.inf, -np.inf, 0.5], np.float32))
+    other = second.step(np.array([0.0, 1.0, -1.0, 0.5], np.float32))
+    assert np.array_equal(one[0], other[0])
 
 
 def test_a_plain_controller_hovers_follows_and_flies_the_gates() -> None:

@@ -379,6 +379,24 @@ def test_poses_are_those_of_the_truth() -> None:
         assert Rotation.from_quat(truth.quaternion).as_matrix() == pytest.approx(rotations[drone])
 
 
+@pytest.mark.parametrize("drones", [2, 6])
+def test_motions_are_those_of_truth_and_feedback(drones: int) -> None:
+    simulation = Simulation(HALL, drones, seed=1)
+    simulation.command(1, Takeoff())
+    simulation.step(steps(4))
+    simulation.command(1, Velocity(0.5, 0.2, 0.0, 1.7))
+    simulation.step(steps(3))
+    positions, velocities, angles = simulation.motions()
+    for drone in range(drones):
+        truth = simulation.truth(drone)
+        assert positions[drone].tolist() == list(truth.position_m)
+        assert velocities[drone].tolist() == list(simulation.feedback(drone).velocity_m_s)
+        assert angles[drone].tolist() == [truth.roll_rad, truth.pitch_rad, truth.yaw_rad]
+    assert simulation.airborne().tolist() == [drone == 1 for drone in range(drones)]
+    positions[:] = 0.0
+    assert simulation.motions()[0].any(), "they are copies"
+
+
 def test_a_flying_drone_can_be_put_elsewhere_and_holds_that_place() -> None:
     simulation = Simulation(load_world("empty"), 2, seed=1)
     with pytest.raises(UsageError, match="only one that flies"):
