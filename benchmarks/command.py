@@ -180,8 +180,18 @@ def fleet(
     finish("fleet", results, as_rich([tables.fleet_table(results)], str(results.machine)), output)
 
 
+def learning(seconds: Seconds = None, minutes: Minutes = None, output: Output = None) -> None:
+    """Measure how fast Gymnasium environments step, with pictures and without."""
+    from benchmarks import learning
+
+    wanted_s = duration_s(seconds, minutes)
+    with measuring("learning", output) as progress:
+        results = learning.measure(wanted_s, progress=lambda share: progress(share, "environments"))
+    finish("learning", results, as_rich([learning.table(results)], str(results.machine)), output)
+
+
 BENCHMARKS: Final[Mapping[str, Callable[..., Any]]] = {
-    function.__name__: function for function in (peers, load, codecs, network, swarm, scale, fleet)
+    function.__name__: function for function in (peers, load, codecs, network, swarm, scale, fleet, learning)
 }
 
 
