@@ -6,6 +6,7 @@ import asyncio
 import builtins
 import json
 import os
+import re
 import shutil
 import socket
 import ssl
@@ -203,6 +204,14 @@ def test_programs_of_this_user_are_let_in_without_a_word() -> None:
         with urllib.request.urlopen(request, timeout=5) as answer:
             assert json.load(answer)["role"] == "pilot", "who is there is asked of the kernel, not of a header"
     assert os.nice(0) == before
+
+
+def test_its_metrics(capfd: pytest.CaptureFixture[str]) -> None:
+    with served(metrics="0"):
+        found = re.search(r"metrics: (http://\S+)", capfd.readouterr().err)
+        assert found is not None
+        with urllib.request.urlopen(found[1], timeout=5) as answer:
+            assert b"skyloop_cockpit_unreachable 0.0" in answer.read()
 
 
 @pytest.fixture(scope="module")

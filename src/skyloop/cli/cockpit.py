@@ -9,6 +9,7 @@ import typer
 
 from skyloop.cli.completion import drone_names
 from skyloop.cli.naming import DronesOption, KeysOption, NetworkOption, drones, join_network
+from skyloop.cli.network import MetricsOption
 from skyloop.messages import Role
 
 
@@ -57,6 +58,7 @@ def cockpit(
     ] = None,
     network: NetworkOption = None,
     keys: KeysOption = None,
+    metrics: MetricsOption = None,
 ) -> None:
     """Serve a page to watch and fly drones: video, instruments, map, plots, parameters, recordings. Until Ctrl-C.
 
@@ -74,4 +76,5 @@ def cockpit(
         recordings=recordings,
         network=network_settings(),
         world=world,
+        metrics=metrics,
     )

@@ -35,6 +35,7 @@ EXTRAS: Final = (
     ("record", "recordings", ("mcap", "foxglove_schemas_protobuf", "google.protobuf", "cv2")),
     ("parquet", "tables as Parquet", ("pyarrow",)),
     ("network", "network and its keys", ("zenoh", "cryptography", "cv2")),
+    ("metrics", "metrics for Prometheus", ("prometheus_client",)),
     ("mocap", "motion capture", ("motioncapture", "scipy")),
     ("gym", "reinforcement learning", ("gymnasium", "cv2")),
     ("bench", "figures and diagrams", ("matplotlib",)),

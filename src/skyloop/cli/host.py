@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import msgspec
 import typer
 
+from skyloop.cli.network import MetricsOption
 from skyloop.cli.text import columns
 from skyloop.errors import UsageError
 
@@ -26,7 +27,7 @@ HostOption = Annotated[
 NameArgument = Annotated[str, typer.Argument(metavar="NAME", help="The vehicle's, as skyloop host status shows it")]
 
 
-def host(fleet: FleetArgument, group: GroupOption = None) -> None:
+def host(fleet: FleetArgument, group: GroupOption = None, metrics: MetricsOption = None) -> None:
     """Serve all vehicles of a file from one process, until Ctrl-C, which lands them first.
 
     skyloop host status, add and remove show and change what it serves while it runs; each has its own --help.
@@ -36,7 +37,7 @@ def host(fleet: FleetArgument, group: GroupOption = None) -> None:
 
     found = read_fleet(fleet)
     _prepare(found)
-    serve(found, group=group)
+    serve(found, group=group, metrics=metrics)
 
 
 def status(

@@ -13,9 +13,18 @@ from skyloop.cli.naming import MULTICAST
 from skyloop.errors import UsageError
 
 if TYPE_CHECKING:
+    from skyloop.proxy.serve import Beside
     from skyloop.transport.base import TransportServer
     from skyloop.transport.fabric import FabricSettings
 
+MetricsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--metrics",
+        metavar="[HOST:]PORT",
+        help="Serve metrics for Prometheus there; on loopback without HOST, on a free port with 0",
+    ),
+]
 ServeOption = Annotated[
     str | None,
     typer.Option(
@@ -105,6 +114,26 @@ def server_ends(settings: FabricSettings | None, group: str | None = None) -> Ma
 def key_changes(settings: FabricSettings | None) -> Callable[[], list[str]] | None:
     """Return what reports on the keys, for :func:`skyloop.proxy.serve.serve`; None without keys."""
     return None if settings is None or settings.ring is None else settings.ring.poll
+
+
+def metrics_beside(where: str | None) -> Beside | None:
+    """Return what serves metrics beside the proxies of a process; None without ``--metrics``.
+
+    Raises:
+        UsageError: ``where`` is no address.
+    """
+    if where is None:
+        return None
+    from skyloop.metrics import serving_beside
+    from skyloop.metrics.endpoint import parse_where
+
+    parse_where(where)
+    return serving_beside(where, announce)
+
+
+def announce(line: str) -> None:
+    """Print a line about metrics; on standard error, as programs read the lines of proxies on standard output."""
+    typer.echo(line, err=True)
 
 
 def warn_if_open(settings: FabricSettings | None, names: list[str]) -> None:

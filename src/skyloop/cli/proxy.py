@@ -11,9 +11,11 @@ from skyloop.cli.network import (
     ConnectOption,
     KeysOption,
     ListenOption,
+    MetricsOption,
     MulticastOption,
     ServeOption,
     key_changes,
+    metrics_beside,
     server_ends,
     settings_of,
     warn_if_open,
@@ -34,6 +36,7 @@ def proxy(
     audit: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Where who flew when is written [the user's directory of state]")
     ] = None,
+    metrics: MetricsOption = None,
     parent_fd: Annotated[int | None, typer.Option(hidden=True)] = None,
 ) -> None:
     """Serve one vehicle to applications, until Ctrl-C, which lands it first.
@@ -51,5 +54,12 @@ def proxy(
 
         settle(options_of(vehicle))
     warn_if_open(settings, [name])
-    make_end = server_ends(settings, group)
-    serve(uri, name, make_end=make_end, parent_fd=parent_fd, look=key_changes(settings), audit=audit)
+    serve(
+        uri,
+        name,
+        make_end=server_ends(settings, group),
+        parent_fd=parent_fd,
+        look=key_changes(settings),
+        audit=audit,
+        beside=metrics_beside(metrics),
+    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
+from contextlib import ExitStack
 from types import FrameType
 from typing import Annotated
 
@@ -11,7 +12,15 @@ import typer
 
 from skyloop.cli.completion import network_places
 from skyloop.cli.naming import MULTICAST
-from skyloop.cli.network import ConnectOption, KeysOption, ListenOption, MulticastOption, places
+from skyloop.cli.network import (
+    ConnectOption,
+    KeysOption,
+    ListenOption,
+    MetricsOption,
+    MulticastOption,
+    announce,
+    places,
+)
 
 PORT = 7447
 _POLL_S = 0.2
@@ -31,6 +40,7 @@ def router(
     connect: ConnectOption = None,
     multicast: MulticastOption = True,
     keys: KeysOption = None,
+    metrics: MetricsOption = None,
     print_config: Annotated[
         bool,
         typer.Option("--print-config", help="Only print the configuration, for Zenoh's own router: zenohd -c FILE"),
@@ -63,15 +73,20 @@ def router(
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, end)
     session: Session = acquire(chosen, Part.ROUTER)
-    typer.echo(f"ready: a router at {', '.join(session.listens)}")
-    while not ended.wait(_POLL_S):  # looks up now and then: the kernel may hand a signal to any thread
-        if chosen.ring is None:
-            continue
-        for change in chosen.ring.poll():
-            typer.echo(f"skyloop: {change}", err=True)
-        out = session.shut_out()
-        if out:
-            typer.echo(f"skyloop: reconnecting without {', '.join(sorted(out))}", err=True)
-            session = renewed(session)
-            chosen = session.settings
+    with ExitStack() as beside:
+        if metrics is not None:
+            from skyloop.metrics import router_readings, serve
+
+            announce(beside.enter_context(serve(lambda: [router_readings(lambda: session)], metrics)).announcement)
+        typer.echo(f"ready: a router at {', '.join(session.listens)}")
+        while not ended.wait(_POLL_S):  # looks up now and then: the kernel may hand a signal to any thread
+            if chosen.ring is None:
+                continue
+            for change in chosen.ring.poll():
+                typer.echo(f"skyloop: {change}", err=True)
+            out = session.shut_out()
+            if out:
+                typer.echo(f"skyloop: reconnecting without {', '.join(sorted(out))}", err=True)
+                session = renewed(session)
+                chosen = session.settings
     release(session, linger=False)

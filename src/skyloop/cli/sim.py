@@ -16,9 +16,11 @@ from skyloop.cli.network import (
     KeysOption,
     ListenOption,
     MakeEnd,
+    MetricsOption,
     MulticastOption,
     ServeOption,
     key_changes,
+    metrics_beside,
     server_ends,
     settings_of,
     warn_if_open,
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from skyloop.drivers.uri import VehicleUri
+    from skyloop.proxy.serve import Beside
     from skyloop.sim.options import SimOptions
 
 MOST_DRONES = 100
@@ -56,6 +59,7 @@ def sim(
     connect: ConnectOption = None,
     multicast: MulticastOption = True,
     keys: KeysOption = None,
+    metrics: MetricsOption = None,
     firmware: Annotated[
         Firmware | None,
         typer.Option(
@@ -122,8 +126,11 @@ def sim(
         settle(options)
         names = [name] if drones == 1 else [f"{name}{number}" for number in range(1, drones + 1)]
         warn_if_open(network_settings, names)
-        _serve_proxies(uri, options, names, server_ends(network_settings), key_changes(network_settings))
+        look, beside = key_changes(network_settings), metrics_beside(metrics)
+        _serve_proxies(uri, options, names, server_ends(network_settings), look, beside)
         return
+    if metrics is not None:
+        raise UsageError("--metrics is of proxies, and with --firmware there is none: leave it out")
     if network is not None:
         raise UsageError("--network is for proxies, and with --firmware there is none: give --bind ADDRESS instead")
     _refuse_for_firmware(name, uri)
@@ -143,7 +150,12 @@ def _refuse_for_firmware(name: str, uri: VehicleUri) -> None:
 
 
 def _serve_proxies(
-    uri: VehicleUri, options: SimOptions, names: list[str], make_end: MakeEnd, look: Callable[[], list[str]] | None
+    uri: VehicleUri,
+    options: SimOptions,
+    names: list[str],
+    make_end: MakeEnd,
+    look: Callable[[], list[str]] | None,
+    beside: Beside | None,
 ) -> None:
     from skyloop.drivers.sim import SimDriver
     from skyloop.proxy import Proxy
@@ -153,7 +165,7 @@ def _serve_proxies(
     host = SimHost(options, len(names))
     drivers = [SimDriver(uri, host=host, drone=index) for index in range(len(names))]
     proxies = [Proxy(driver, make_end(each, str(uri)), name=each) for driver, each in zip(drivers, names, strict=True)]
-    run(proxies, look=look)
+    run(proxies, look=look, beside=beside)
 
 
 def address(world: str, seed: int, speed: float, others: list[str]) -> str:

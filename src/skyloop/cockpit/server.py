@@ -10,7 +10,7 @@ import ssl
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -89,6 +89,7 @@ def serve_cockpit(
     stop: threading.Event | None = None,
     network: FabricSettings | None = None,
     world: str | Path | None = None,
+    metrics: str | None = None,
 ) -> None:
     """Serve the page until ``stop`` is set or a signal (Ctrl-C, SIGTERM) comes.
 
@@ -105,11 +106,12 @@ def serve_cockpit(
         stop: Ends the server when it is set, from any thread.
         network: Shows drones that can be reached over it, too.
         world: File (or the name of a shipped one) of what stands around drones that don't know it themselves.
+        metrics: ``[HOST:]PORT`` of an endpoint for Prometheus, which is printed; None: none.
 
     Raises:
         UsageError: An address, port or file can't be used.
         UnknownNameError: There is no proxy of a name in ``names``.
-        MissingExtraError: The extra ``cockpit`` is not installed.
+        MissingExtraError: The extra ``cockpit``, or with ``metrics`` the extra ``metrics``, is not installed.
     """
     try:
         import cv2  # noqa: F401
@@ -139,7 +141,7 @@ def serve_cockpit(
         try:
             _check_names(names, finder)
             announcer = Announcer(gate.pairing if isinstance(gate, TokenGate) else None, loopback)
-            _serve(finder, names, access, gate, tls, recordings, listening, on_ready or announcer, stop, given)
+            _serve(finder, names, access, gate, tls, recordings, listening, on_ready or announcer, stop, given, metrics)
         finally:
             finder.close()
     finally:
@@ -235,6 +237,7 @@ def _serve(
     on_ready: Callable[[str], None],
     stop: threading.Event | None,
     world: WorldGeometry | None,
+    metrics: str | None,
 ) -> None:
     from skyloop.cockpit.app import create_app
     from skyloop.cockpit.fleet import Fleet
@@ -245,13 +248,21 @@ def _serve(
     own_name = () if bind_address(address)[1] else host_names()
     hosts = own_names(address, port, (*access.hostnames, *own_name), access.scheme)
     admission = Admission(places_here())
-    app = create_app(Fleet(finder, kept=names), Recordings(recordings), hosts, gate, admission=admission, world=world)
+    fleet = Fleet(finder, kept=names)
+    app = create_app(fleet, Recordings(recordings), hosts, gate, admission=admission, world=world)
     server = quiet_server(app)
     seen_at = reachable(address)[0]
     page = f"{access.scheme}://{f'[{seen_at}]' if ':' in seen_at else seen_at}:{port}/"
     os.nice(NICENESS)
     listener = Listener(listening, admission, http_protocol(server, admission), tls)
-    asyncio.run(_run(server, listener, lambda: on_ready(page), stop))
+    with ExitStack() as beside:
+        if metrics is not None:
+            from skyloop.cockpit.metrics import fleet_sources
+            from skyloop.metrics import serve
+
+            endpoint = beside.enter_context(serve(lambda: fleet_sources(fleet), metrics))
+            print(endpoint.announcement, file=sys.stderr, flush=True)
+        asyncio.run(_run(server, listener, lambda: on_ready(page), stop))
 
 
 def http_protocol(server: uvicorn.Server, admission: Admission, clock: Clock = monotonic_ns) -> ProtocolFactory:

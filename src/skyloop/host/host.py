@@ -61,6 +61,11 @@ class Host:
         self._watchdog.start()
         self._closing = False
 
+    def proxies(self) -> list[Proxy]:
+        """Return the proxies of this process that serve now. Any thread."""
+        present = (vehicle.proxy for vehicle in list(self.vehicles.values()) if isinstance(vehicle, SharedVehicle))
+        return [proxy for proxy in present if proxy is not None]
+
     # Coming and going --------------------------------------------------------------------------------------------
 
     def add(self, settings: VehicleSettings) -> HostedVehicle:

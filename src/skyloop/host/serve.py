@@ -16,6 +16,7 @@ from skyloop.host.fleet import Defaults, Fleet, Vehicle, settings_of
 from skyloop.host.host import Host, check_known
 from skyloop.host.vehicle import HostedVehicle, SharedVehicle, VehicleStatus, network_of
 from skyloop.messages import LinkState
+from skyloop.metrics import serve_proxies
 from skyloop.proxy.serve import LAND_WITHIN_S, LinkLines, Shutdown, on_signals
 from skyloop.toml_file import Place
 
@@ -25,7 +26,9 @@ SWITCH_INTERVAL_S: Final = 0.001
 _POLL_S: Final = 0.2
 
 
-def serve(fleet: Fleet, *, group: str | None = None, land_within_s: float = LAND_WITHIN_S) -> None:
+def serve(
+    fleet: Fleet, *, group: str | None = None, land_within_s: float = LAND_WITHIN_S, metrics: str | None = None
+) -> None:
     """Serve all vehicles of a fleet that start by themselves; blocks. On the main thread.
 
     Writes a line for each vehicle to standard output as ``skyloop proxy`` does, ``failed NAME: …`` for one that can't
@@ -36,8 +39,11 @@ def serve(fleet: Fleet, *, group: str | None = None, land_within_s: float = LAND
         fleet: The vehicles.
         group: Of users who may add and remove vehicles as well.
         land_within_s: How long to wait for vehicles to land [s].
+        metrics: ``[HOST:]PORT`` of an endpoint for Prometheus, which is announced; None: none.
 
     Raises:
+        UsageError: ``metrics`` is no address, or can't be listened on.
+        MissingExtraError: The extra ``metrics`` is needed and not installed.
         NameTakenError: A running host has the name.
         LinkError: The directory of sockets is not safe.
     """
@@ -47,6 +53,8 @@ def serve(fleet: Fleet, *, group: str | None = None, land_within_s: float = LAND
         stack.enter_context(on_signals(shutdown, ignore_interrupt=False))
         host = Host(announce)
         stack.callback(lambda: host.close(shutdown.reason or "its host failed"))
+        if metrics is not None:
+            announce(stack.enter_context(serve_proxies(host.proxies, metrics)).announcement)
         control = ControlServer(fleet.name, Answering(host, fleet.defaults), group=group)
         control.start()
         stack.callback(control.stop)

@@ -107,6 +107,7 @@ class EventPublisher:
             self.last = event
         missed = self._publish(EVENTS, packet)
         self._counts["events.published"] += 1
+        self._counts[f"events.of.{kind.value}"] += 1
         if missed:
             self._missed += missed
             self._counts["events.missed"] += missed

@@ -438,7 +438,11 @@ class Proxy:
         return Pong(ping.sent_ns, self.clock())
 
     def _answer_statistics(self, _session: Session, _request: GetStatistics, _now_ns: int) -> AnyReply:
-        return Statistics(self._counters.snapshot(applications=self.applications, **self.server.counters))
+        return Statistics(self.statistics())
+
+    def statistics(self) -> dict[str, float]:
+        """Return all counters by dotted name, as applications get them by ``GetStatistics``. Any thread."""
+        return self._counters.snapshot(applications=self.applications, **self.server.counters)
 
     @property
     def applications(self) -> int:

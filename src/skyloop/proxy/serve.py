@@ -8,7 +8,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -34,6 +34,8 @@ _log = logging.getLogger(__name__)
 
 #: Says what is new about the keys of the network, a sentence each.
 Look = Callable[[], Sequence[str]]
+#: What runs beside the proxies of a process, such as an endpoint for metrics.
+Beside = Callable[[Sequence[Proxy]], AbstractContextManager[object]]
 
 
 class LinkLines:
@@ -94,6 +96,7 @@ def serve(
     land_within_s: float = LAND_WITHIN_S,
     look: Look | None = None,
     audit: Path | None = None,
+    beside: Beside | None = None,
 ) -> None:
     """Serve a vehicle to this host's applications under a name; blocks. On the main thread.
 
@@ -122,6 +125,7 @@ def serve(
         land_within_s=land_within_s,
         look=look,
         audit=audit,
+        beside=beside,
     )
 
 
@@ -133,13 +137,15 @@ def run(
     look: Look | None = None,
     audit: Path | None = None,
     records: bool | None = None,
+    beside: Beside | None = None,
 ) -> None:
     """Serve several vehicles from one process, as :func:`serve` does one: several drones of one simulated world.
 
     The proxies are started here and stopped at the end; lines are written of each, as :func:`serve` does. ``audit``:
     the file of the audit trail; by default each proxy has one in the user's directory of state, and a private one (with
     ``parent_fd``) none. ``records``: whether there is an audit trail, and a note of a flight for the next run; by
-    default not for private ones, which are not started again under their name.
+    default not for private ones, which are not started again under their name. ``beside``: entered with the proxies
+    before they start, and left when they have ended.
     """
     shutdown = Shutdown()
     for proxy in proxies:
@@ -155,6 +161,8 @@ def run(
     for proxy in proxies:
         proxy.overview.share(overview)
     with on_signals(shutdown, ignore_interrupt=parent_fd is not None), ExitStack() as started:
+        if beside is not None:
+            started.enter_context(beside(proxies))
         for proxy in proxies:
             started.push(partial(_stop, proxy, shutdown))
         for proxy in proxies:

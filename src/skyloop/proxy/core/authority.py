@@ -144,6 +144,11 @@ class Authority:
         """Those in the queue, the next one first."""
         return tuple(self._waiting)
 
+    @property
+    def granted(self) -> int:
+        """How often the authority was granted in this run."""
+        return self._last_lease
+
     def position(self, app_id: int) -> int:
         """Return the position in the queue from 1; 0 for an application that does not wait."""
         return next((position for position, entry in enumerate(self._waiting, 1) if entry.app_id == app_id), 0)

@@ -1,0 +1,252 @@
+"""An HTTP endpoint for Prometheus, on threads of its own: who reads it, or stops reading, delays nothing else."""
+
+from __future__ import annotations
+
+import ipaddress
+import logging
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Final, Self
+from urllib.parse import urlsplit
+
+from skyloop.errors import MissingExtraError, UsageError
+from skyloop.metrics.catalogue import FAMILIES, Reading
+
+if TYPE_CHECKING:
+    from prometheus_client import CollectorRegistry
+    from prometheus_client.metrics_core import Metric
+
+LOOPBACK: Final = "127.0.0.1"
+PATH: Final = "/metrics"
+MAX_SCRAPES: Final = 8  #: at a time; a further connection is closed at once
+DEADLINE_S: Final = 10.0  #: for one connection, from its first byte to its last
+_POLL_S: Final = 0.1
+_log = logging.getLogger(__name__)
+
+#: Reads the values of one thing now.
+Source = Callable[[], Iterable[Reading]]
+
+
+def serve(sources: Callable[[], Iterable[Source]], where: str, *, deadline_s: float = DEADLINE_S) -> Endpoint:
+    """Serve metrics over HTTP until the endpoint is closed.
+
+    Args:
+        sources: Returns what there is to read; called for each scrape, and each of them too, on the endpoint's threads.
+        where: ``[HOST:]PORT``; the host is 127.0.0.1 if it is left out, and port 0 takes a free one.
+        deadline_s: How long one connection may take, at most :data:`MAX_SCRAPES` at a time [s].
+
+    Raises:
+        UsageError: ``where`` is no address, or can't be listened on.
+        MissingExtraError: The extra ``metrics`` is not installed.
+    """
+    return Endpoint(sources, parse_where(where), deadline_s)
+
+
+def parse_where(where: str) -> tuple[str, int]:
+    """Return host and port of ``[HOST:]PORT``; IPv6 addresses are in brackets.
+
+    Raises:
+        UsageError: It is not of that form.
+    """
+    host, colon, port = where.rpartition(":")
+    if not (port.isascii() and port.isdigit() and int(port) <= 65535) or (colon and not host):
+        raise UsageError(f"{where!r:.80} is no place for metrics: give a port, 0 to 65535, or HOST:PORT")
+    return (host.removeprefix("[").removesuffix("]") if colon else LOOPBACK), int(port)
+
+
+class Endpoint:
+    """Metrics over HTTP, made by :func:`serve`; a context manager that ends it."""
+
+    def __init__(self, sources: Callable[[], Iterable[Source]], where: tuple[str, int], deadline_s: float) -> None:
+        """Listen, and answer from now on; see :func:`serve`."""
+        self._server = _Server(where, _registry(sources), deadline_s)
+        self._thread = threading.Thread(
+            target=self._server.serve_forever, args=(_POLL_S,), name="skyloop-metrics", daemon=True
+        )
+        self._thread.start()
+
+    @property
+    def port(self) -> int:
+        """The TCP port."""
+        return int(self._server.server_address[1])
+
+    @property
+    def url(self) -> str:
+        """Where Prometheus finds the metrics."""
+        host = str(self._server.server_address[0])
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.port}{PATH}"
+
+    @property
+    def announcement(self) -> str:
+        """A line for people: where the metrics are, and who can read them."""
+        open_to = "" if self._server.own else " (WARNING: whoever reaches this address can read them)"
+        return f"metrics: {self.url}{open_to}"
+
+    def close(self) -> None:
+        """Answer no more. Idempotent."""
+        self._server.shutdown()
+        self._thread.join()
+        self._server.server_close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class Collector:
+    """Reads all sources when it is asked, in the form of ``prometheus_client``.
+
+    A source that fails is left out, counted and logged; the others are served all the same.
+    """
+
+    def __init__(self, sources: Callable[[], Iterable[Source]]) -> None:
+        self._sources = sources
+        self._errors = 0
+        self._lock = threading.Lock()
+
+    def collect(self) -> Iterator[Metric]:
+        """Yield all metrics that have a value now."""
+        from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
+
+        made: dict[str, Any] = {}
+        for reading in self._read():
+            metric = made.get(reading.name)
+            if metric is None:
+                family = FAMILIES[reading.name]
+                kinds = {"gauge": GaugeMetricFamily, "counter": CounterMetricFamily, "info": InfoMetricFamily}
+                name = family.name.removesuffix("_info") if family.kind == "info" else family.name
+                labels = family.labels[:1] if family.kind == "info" else family.labels
+                metric = made[reading.name] = kinds[family.kind](name, family.meaning, labels=labels)
+            if FAMILIES[reading.name].kind == "info":
+                names = FAMILIES[reading.name].labels
+                metric.add_metric(reading.labels[:1], dict(zip(names[1:], reading.labels[1:], strict=True)))
+            else:
+                metric.add_metric(reading.labels, reading.value)
+        yield from made.values()
+
+    def _read(self) -> Iterator[Reading]:
+        for source in self._sources():
+            try:
+                yield from list(source())
+            except Exception:  # noqa: BLE001  (the others are to be seen all the same)
+                with self._lock:
+                    self._errors += 1
+                _log.exception("metrics can't be read")
+            time.sleep(0)  # lets a thread go first that carries a command
+        yield Reading("skyloop_scrape_errors_total", float(self._errors))
+
+
+def _registry(sources: Callable[[], Iterable[Source]]) -> CollectorRegistry:
+    try:
+        from prometheus_client import CollectorRegistry, PlatformCollector, ProcessCollector
+    except ImportError as error:
+        raise MissingExtraError("metrics", "metrics", cause=str(error)) from None
+    registry = CollectorRegistry()
+    registry.register(Collector(sources))
+    ProcessCollector(registry=registry)
+    PlatformCollector(registry=registry)
+    return registry
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+    allow_reuse_address = True
+
+    def __init__(self, where: tuple[str, int], registry: CollectorRegistry, deadline_s: float) -> None:
+        host, port = where
+        try:
+            family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+            self.address_family = family
+            super().__init__(address[:2], _Handler)  # type: ignore[arg-type]
+        except OSError as error:
+            raise UsageError(
+                f"metrics can't be served at {host}, port {port}: {error.strerror or error}; choose another port, or 0"
+            ) from None
+        self.registry = registry
+        self.own = ipaddress.ip_address(str(self.server_address[0])).is_loopback
+        self._deadline_s = deadline_s
+        self._places = threading.BoundedSemaphore(MAX_SCRAPES)
+
+    def server_bind(self) -> None:
+        # Not HTTPServer's, which looks up this machine's name in the network.
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        self.socket.bind(self.server_address)
+        self.server_address = self.socket.getsockname()
+        self.server_name, self.server_port = str(self.server_address[0]), int(self.server_address[1])
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        if self._places.acquire(blocking=False):
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        # A limit for the whole connection, as one for each read would let a byte now and then hold it for ever.
+        guard = threading.Timer(self._deadline_s, _hang_up, (request,))
+        guard.daemon = True
+        guard.start()
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            guard.cancel()
+            self._places.release()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:  # noqa: ARG002  (as it is called)
+        _log.debug("a scrape by %s ended early", client_address, exc_info=True)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: _Server
+    server_version = "skyloop"
+    sys_version = ""
+
+    def do_GET(self) -> None:
+        if self.server.own and not _names_loopback(self.headers.get("Host", "")):
+            # A page of another site whose name leads here: its script could read the answer.
+            self._answer(HTTPStatus.FORBIDDEN, "text/plain", b"ask for this by its address\n")
+        elif self.path.partition("?")[0] != PATH:
+            self._answer(HTTPStatus.NOT_FOUND, "text/plain", f"the metrics are at {PATH}\n".encode())
+        else:
+            from prometheus_client.exposition import choose_encoder
+
+            encode, content_type = choose_encoder(self.headers.get("Accept", ""))
+            self._answer(HTTPStatus.OK, content_type, encode(self.server.registry))
+
+    def _answer(self, status: HTTPStatus, content_type: str, body: bytes) -> None:
+        self.send_response(status)
+        self.send_header("Content-Type", content_type)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, format: str, *arguments: object) -> None:  # noqa: A002  (as it is called)
+        _log.debug(format, *arguments)
+
+
+def _names_loopback(host: str) -> bool:
+    """Return whether a Host header names this machine's loopback, with any port."""
+    try:
+        name = urlsplit(f"//{host}").hostname or ""
+    except ValueError:
+        return False
+    if name == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(name).is_loopback
+    except ValueError:
+        return False
+
+
+def _hang_up(request: socket.socket) -> None:
+    with suppress(OSError):  # it is gone already
+        request.shutdown(socket.SHUT_RDWR)
