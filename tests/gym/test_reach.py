@@ -84,14 +84,15 @@ def test_pictures_have_the_size_asked_for_and_show_no_other_drone() -> None:
     arena = envs._task.arena
     for drone in range(4):  # each looks across its cell's middle at where its neighbours are
         arena.put(drone, np.array([0.0, 0.0, 2.0]), [0.0, math.pi / 2, -math.pi / 2, math.pi][drone])
-    camera, none = OnBoard(arena, 84), []
+    camera = OnBoard(arena, 84)
+    none: list[Any] = []
     before = camera.draw(0, none)
     arena.put(1, np.array([-3.0, 0.0, 2.0]), 0.0)
     assert np.array_equal(camera.draw(0, none), before)
     arena.put(0, np.array([0.0, 0.0, 2.5]), 0.0)
     assert not np.array_equal(camera.draw(0, none), before), "its own place is seen"
     for wrong in (15, 513, 84.0, True):
-        with pytest.raises(UsageError, match="size_px is .* and must be a whole number from 16 to 512"):
+        with pytest.raises(UsageError, match=r"size_px is .* and must be a whole number from 16 to 512"):
             ReachEnv(observe="pixels", size_px=wrong)  # type: ignore[arg-type]
 
 
@@ -111,7 +112,7 @@ def test_actions_that_are_no_numbers_count_as_none() -> None:
         env.reset(seed=1)
     one = first.step(np.array([np.nan, np.inf, -np.inf, 0.5], np.float32))
     other = second.step(np.array([0.0, 1.0, -1.0, 0.5], np.float32))
-    assert np.array_equal(one[0], other[0])
+    assert np.array_equal(np.asarray(one[0]), np.asarray(other[0]))
 
 
 def test_a_plain_controller_hovers_follows_and_flies_the_gates() -> None:
