@@ -34,7 +34,7 @@ def warm_threads() -> list[str]:
 
 def test_it_runs_while_somebody_wants_it_as_often_as_the_one_who_wants_it_most() -> None:
     pace, runs = Pace(), list[int]()
-    warmer = Warmer(lambda: [lambda: runs.append(1)], "test", sleep=pace.sleep)
+    warmer = Warmer(lambda: [lambda: runs.append(1)], "test", sleep=pace.sleep, clock=lambda: 0.0)
     assert not warmer.active
     assert warm_threads() == []
     warmer.keep("one", 0.005)
@@ -67,7 +67,7 @@ def test_what_it_runs_is_made_once_and_not_before_it_is_wanted() -> None:
         made.append(threading.current_thread().name)
         return (lambda: None,)
 
-    warmer = Warmer(make, "test", sleep=pace.sleep)
+    warmer = Warmer(make, "test", sleep=pace.sleep, clock=lambda: 0.0)
     assert made == []
     for _ in range(2):
         warmer.keep("one", 0.005)
@@ -84,7 +84,7 @@ def test_code_that_fails_is_given_up_and_told_once(caplog: pytest.LogCaptureFixt
     def broken() -> None:
         raise RuntimeError("as bad as can be")
 
-    warmer = Warmer(lambda: [broken], "test", sleep=pace.sleep)
+    warmer = Warmer(lambda: [broken], "test", sleep=pace.sleep, clock=lambda: 0.0)
     warmer.keep("one", 0.005)
     wait_until(lambda: "is given up" in caplog.text and not warm_threads(), "it was given up")
     assert not warmer.active
@@ -94,3 +94,28 @@ def test_code_that_fails_is_given_up_and_told_once(caplog: pytest.LogCaptureFixt
     pace.go_on()
     wait_until(lambda: not warm_threads(), "the thread has ended")
     assert caplog.text.count("is given up") == 1
+
+
+def test_where_the_processor_is_busy_it_runs_ever_more_rarely_and_comes_back() -> None:
+    now_s, late_s = 0.0, 0.0
+    slept: list[float] = []
+    ended = threading.Event()
+
+    def sleep(seconds: float) -> None:
+        nonlocal now_s, late_s
+        if not seconds:
+            return
+        slept.append(seconds)
+        late_s = 0.01 if len(slept) <= 10 else 0.0
+        now_s += seconds + late_s
+        if len(slept) == 30:
+            warmer.keep("one", 0.0)
+            ended.set()
+
+    warmer = Warmer(lambda: [lambda: None], "test", sleep=sleep, clock=lambda: now_s)
+    warmer.keep("one", 0.005)
+    assert ended.wait(10.0)
+    assert slept[:5] == pytest.approx([0.005, 0.01, 0.02, 0.04, 0.08])
+    assert slept[9] == slept[10] == 1.0
+    assert slept[11:14] == pytest.approx([0.5, 0.25, 0.125])
+    assert slept[-1] == pytest.approx(0.005)

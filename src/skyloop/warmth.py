@@ -10,10 +10,13 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
+from typing import Final
 
 #: Run one after the other.
 Pieces = Sequence[Callable[[], object]]
 
+_LATE_S: Final = 0.002  #: a thread that wakes so late found no processor free
+_RAREST_S: Final = 1.0
 _log = logging.getLogger(__name__)
 
 
@@ -24,12 +27,21 @@ class Warmer:
         make: Returns the pieces of code, in their order; called on the thread when it is wanted for the first time.
         name: For the thread and for messages.
         sleep: Waits for some seconds.
+        clock: Returns the time [s].
     """
 
-    def __init__(self, make: Callable[[], Pieces], name: str, *, sleep: Callable[[float], object] = time.sleep) -> None:
+    def __init__(
+        self,
+        make: Callable[[], Pieces],
+        name: str,
+        *,
+        sleep: Callable[[float], object] = time.sleep,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._make = make
         self._name = name
         self._sleep = sleep
+        self._clock = clock
         self._wanted: dict[object, float] = {}  # by who wants it: how often [s]
         self._period_s = 0.0  # the shortest of them; 0: nobody
         self._pieces: Pieces | None = None
@@ -61,6 +73,7 @@ class Warmer:
         return self._period_s > 0.0
 
     def _work(self) -> None:
+        pause_s = 0.0
         while True:
             with self._lock:
                 period_s = self._period_s
@@ -80,4 +93,11 @@ class Warmer:
                     self._period_s, self._thread = 0.0, None
                     self._pieces = ()
                 return
-            self._sleep(period_s)
+            # Who wakes late has no processor to spare: rarer then, by and by, so that it takes none from others.
+            pause_s = min(max(pause_s, period_s), max(period_s, _RAREST_S))
+            due_s = self._clock() + pause_s
+            self._sleep(pause_s)
+            if self._clock() > due_s + _LATE_S:
+                pause_s *= 2.0
+            else:
+                pause_s = pause_s / 2.0 if pause_s > 2.0 * period_s else 0.0

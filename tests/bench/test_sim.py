@@ -32,7 +32,7 @@ def assert_plausible(spread: Spread) -> None:
 def test_physics_is_measured_for_each_fleet(measured: tuple[sim.SimResults, list[float]]) -> None:
     rows = measured[0].physics
     assert [(row.world, row.drones) for row in rows] == [("empty", 1), ("empty", 10), ("empty", 100), ("gates", 100)]
-    assert [row.target for row in rows] == [25.0, None, 15.0, 15.0]
+    assert [row.target for row in rows] == [100.0, None, 20.0, 20.0]
     for row in rows:
         assert_plausible(row.step)
         # Half of the batches took the median or longer, so all together took at least half of that each.
@@ -75,7 +75,7 @@ def test_opencv_gets_its_threads_back() -> None:
 
 def test_tables_name_the_targets(measured: tuple[sim.SimResults, list[float]]) -> None:
     physics, drawing = physics_table(measured[0]), drawing_table(measured[0])
-    assert list(physics.columns[4].cells) == ["≥ 25 ×", "", "≥ 15 ×", "≥ 15 ×"]
+    assert list(physics.columns[4].cells) == ["≥ 100 ×", "", "≥ 20 ×", "≥ 20 ×"]
     assert [cell for cell in drawing.columns[4].cells if cell] == ["≥ 312", "≥ 91", "≥ 250"]
     assert physics.row_count == 4
     assert drawing.row_count == 7

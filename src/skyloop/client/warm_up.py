@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from skyloop.client.connection import ConnectionSupervisor, ProxyConnection, Scheduler
+from skyloop.client.connection import ConnectionSupervisor, Scheduler
 from skyloop.client.core import DroneCore
 from skyloop.client.drone import Drone
 from skyloop.client.mailbox import Notifier
@@ -53,8 +53,15 @@ def make_pieces() -> Pieces:
     """
     clock = ManualClock()
     scheduler = _OwnTime(clock)
-    core = DroneCore(lambda handler: _Echo(handler, clock), app="warm-up", scheduler=scheduler)
+    ends: list[_Echo] = []
+
+    def dial(handler: ClientHandler) -> _Echo:
+        ends.append(_Echo(handler, clock))
+        return ends[-1]
+
+    core = DroneCore(dial, app="warm-up", scheduler=scheduler)
     core.open()
+    (end,) = ends
     drone = Drone(core)
     session = core.connection.session
     assert session is not None
@@ -73,8 +80,8 @@ def make_pieces() -> Pieces:
     def frame() -> None:
         now_ns = clock()
         header = FrameHeader(_CAMERA, rounds, now_ns, now_ns, _SIDE, _SIDE, Encoding.BGR8, pixels.size)
-        session.frame(header, pixels)
-        inbox.notifier.wait_for(lambda: inbox.waiting, 0.0)
+        end.coming = lambda: session.frame(header, pixels)
+        inbox.notifier.wait_for(lambda: inbox.waiting, 1.0)
         inbox.frame()
 
     def command() -> None:
@@ -138,9 +145,6 @@ class _OwnTime(Scheduler):
     def notifier(self) -> Notifier:
         return _Attending(self)
 
-    def sample_notifier(self, connection: ProxyConnection) -> Notifier:  # noqa: ARG002
-        return _Attending(self)
-
     def begin(self, supervisor: ConnectionSupervisor) -> None:
         self._supervisor = supervisor
 
@@ -172,6 +176,7 @@ class _Echo(TransportClient):
         self._handler = handler
         self._clock = clock
         self._open = False
+        self.coming: Callable[[], None] = _nothing  #: what comes when somebody waits
 
     def send(self, packet: bytes) -> bool:
         if not self._open:
@@ -196,6 +201,10 @@ class _Echo(TransportClient):
         if topic == "feedback" and on:
             self._handler.packet(_feedback(1, self._clock()))
 
+    def lead(self, ready: Callable[[], bool], wake: Callable[[], None], timeout_s: float) -> bool:  # noqa: ARG002
+        self.coming()
+        return ready()
+
     def close(self) -> None:
         """Nothing is open."""
 
@@ -206,3 +215,7 @@ class _Echo(TransportClient):
     @property
     def address(self) -> str:
         return "nowhere"
+
+
+def _nothing() -> None:
+    """Nothing comes."""
