@@ -15,7 +15,7 @@ from typing import Final
 #: Run one after the other.
 Pieces = Sequence[Callable[[], object]]
 
-_LATE_S: Final = 0.002  #: a thread that wakes so late found no processor free
+_LATE_S: Final = 0.004  #: a thread that wakes so late found no processor free
 _RAREST_S: Final = 1.0
 _log = logging.getLogger(__name__)
 

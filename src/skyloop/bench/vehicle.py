@@ -14,11 +14,11 @@ from skyloop.messages import (
     AnyAction,
     CameraInfo,
     Capabilities,
-    Feedback,
     FlightState,
     LinkState,
     Velocity,
 )
+from skyloop.messages.typical import typical_feedback
 
 CAMERA: Final = "bench"
 _WRAPS_NS: Final = 1 << 40  # 18 minutes
@@ -83,19 +83,4 @@ class BenchVehicle(Driver):
         sink = self._sink
         if sink is None:
             return
-        sink.feedback(
-            Feedback(
-                captured_ns=captured_ns,
-                state=FlightState.HOVERING,
-                battery=0.8,
-                battery_v=11.4,
-                roll_rad=0.01,
-                pitch_rad=-0.02,
-                yaw_rad=0.5,
-                altitude_m=1.2,
-                velocity_m_s=(0.1, 0.0, 0.0),
-                angular_velocity_rad_s=(0.0, 0.01, 0.0),
-                acceleration_m_s2=(0.0, 0.1, 9.8),
-                position_m=(0.5, 0.25, 1.2),
-            )
-        )
+        sink.feedback(typical_feedback(captured_ns, FlightState.HOVERING))

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
+import msgspec
 import numpy as np
 
 from skyloop.client.connection import ConnectionSupervisor, Scheduler
@@ -24,8 +25,6 @@ from skyloop.messages import (
     CameraInfo,
     Capabilities,
     Encoding,
-    Feedback,
-    FlightState,
     FrameHeader,
     Hello,
     LinkState,
@@ -36,6 +35,7 @@ from skyloop.messages import (
     decode,
     encode,
 )
+from skyloop.messages.typical import typical_feedback
 from skyloop.transport.base import ClientHandler, TransportClient
 from skyloop.warmth import Pieces, Warmer
 
@@ -111,28 +111,9 @@ def keeper(period_s: float) -> Callable[[bool], None]:
 
 
 def _feedback(seq: int, now_ns: int) -> bytes:
-    return encode(
-        Feedback(
-            captured_ns=now_ns,
-            seq=seq,
-            published_ns=now_ns,
-            state=FlightState.FLYING,
-            vehicle_link=LinkState.UP,
-            owner="warm-up",
-            owner_id=_APP,
-            lease=1,
-            battery=0.8,
-            battery_v=11.4,
-            roll_rad=0.01,
-            pitch_rad=-0.02,
-            yaw_rad=0.5,
-            altitude_m=1.2,
-            velocity_m_s=(0.1, 0.0, 0.0),
-            angular_velocity_rad_s=(0.0, 0.01, 0.0),
-            acceleration_m_s2=(0.0, 0.1, 9.8),
-            position_m=(0.5, 0.25, 1.2),
-        )
-    )
+    state = typical_feedback(now_ns)
+    ours = {"vehicle_link": LinkState.UP, "owner": "warm-up", "owner_id": _APP, "lease": 1}
+    return encode(msgspec.structs.replace(state, seq=seq, published_ns=now_ns, **ours))
 
 
 class _OwnTime(Scheduler):

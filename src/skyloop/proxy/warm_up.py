@@ -21,8 +21,6 @@ from skyloop.messages import (
     CameraInfo,
     Capabilities,
     Command,
-    Feedback,
-    FlightState,
     FrameHeader,
     Hello,
     LinkState,
@@ -34,6 +32,7 @@ from skyloop.messages import (
     decode,
     encode,
 )
+from skyloop.messages.typical import typical_feedback
 from skyloop.proxy.proxy import Proxy
 from skyloop.transport.base import Peer, Pixels, ServerHandler, TransportServer
 from skyloop.transport.local.frame_exchange import FrameExchange
@@ -107,22 +106,7 @@ class _Nothing(Driver):
     def report(self, now_ns: int) -> None:
         """Report as much as a real vehicle does."""
         assert self._sink is not None
-        self._sink.feedback(
-            Feedback(
-                captured_ns=now_ns,
-                state=FlightState.FLYING,
-                battery=0.8,
-                battery_v=11.4,
-                roll_rad=0.01,
-                pitch_rad=-0.02,
-                yaw_rad=0.5,
-                altitude_m=1.2,
-                velocity_m_s=(0.1, 0.0, 0.0),
-                angular_velocity_rad_s=(0.0, 0.01, 0.0),
-                acceleration_m_s2=(0.0, 0.1, 9.8),
-                position_m=(0.5, 0.25, 1.2),
-            )
-        )
+        self._sink.feedback(typical_feedback(now_ns))
 
     def show(self, now_ns: int, image: Pixels) -> None:
         """Give a frame."""
