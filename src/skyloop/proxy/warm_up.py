@@ -6,7 +6,8 @@ a vehicle, an application, a file or the network could notice. See :mod:`skyloop
 
 from __future__ import annotations
 
-from typing import Final
+import sys
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -35,8 +36,10 @@ from skyloop.messages import (
 from skyloop.messages.typical import typical_feedback
 from skyloop.proxy.proxy import Proxy
 from skyloop.transport.base import Peer, Pixels, ServerHandler, TransportServer
-from skyloop.transport.local.frame_exchange import FrameExchange
 from skyloop.warmth import Pieces, Warmer
+
+if TYPE_CHECKING:
+    from skyloop.transport.local.frame_exchange import FrameExchange
 
 _CAMERA: Final = "camera"
 _SIDE: Final = 16  #: of its frames [pixels]
@@ -130,8 +133,12 @@ class _Nowhere(TransportServer):
     def __init__(self) -> None:
         self.lease = 0
         self._viewer = _Viewer()
-        self._exchange = FrameExchange()
-        self._exchange.subscribe(self._viewer, _CAMERA)
+        self._exchange: FrameExchange | None = None
+        if sys.platform == "linux":  # elsewhere there is no local transport, and no code of it to keep warm
+            from skyloop.transport.local.frame_exchange import FrameExchange
+
+            self._exchange = FrameExchange()
+            self._exchange.subscribe(self._viewer, _CAMERA)
 
     def start(self, handler: ServerHandler) -> None:
         """Serve nobody."""
@@ -149,6 +156,8 @@ class _Nowhere(TransportServer):
         return 0
 
     def publish_frame(self, header: FrameHeader, pixels: Pixels) -> int:
+        if self._exchange is None:
+            return 0
         missed = self._exchange.publish(header, pixels)
         self._exchange.release(self._viewer, 1)
         return missed
