@@ -15,6 +15,8 @@ from typing import Final
 #: Run one after the other.
 Pieces = Sequence[Callable[[], object]]
 
+PERIOD_S: Final = 0.005  #: how often the code is run, unless somebody says otherwise
+SHORTEST_S: Final = 0.001  #: the least that makes sense
 _LATE_S: Final = 0.004  #: a thread that wakes so late found no processor free
 _RAREST_S: Final = 1.0
 _log = logging.getLogger(__name__)

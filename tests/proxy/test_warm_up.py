@@ -66,3 +66,14 @@ def test_it_is_kept_warm_while_a_pilot_flies_and_never_on_the_ground(bench: Benc
 def test_a_parameter_says_how_often(bench: Bench, given: float, kept: float) -> None:
     bench.proxy.parameters.set("warm.period_s", given)
     assert bench.proxy.parameters.flight_settings().warm_s == kept
+
+
+def test_a_tick_that_comes_back_after_the_end_keeps_nothing_warm(bench: Bench) -> None:
+    asked: list[float] = []
+    bench.proxy.keep_warm = asked.append
+    bench.airborne()
+    bench.tick()
+    assert asked[-1] > 0.0
+    bench.proxy.abandon("its driver hangs")
+    bench.tick()
+    assert asked[-1] == 0.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import signal
 import threading
 import time
 from collections.abc import Iterator
@@ -147,3 +148,34 @@ def test_a_frame_that_is_dropped_during_a_delivery_is_given_back_after_it(pair: 
         assert pair.server.publish_frame(head, picture(head)) == 0
         wait_until(lambda seq=seq: pair.here.saw(seq), "it came")  # type: ignore[misc]
     assert pair.here.torn == []
+
+
+@pytest.mark.skipif(threading.current_thread() is not threading.main_thread(), reason="signals come on the main thread")
+@pytest.mark.parametrize("error", [TimeoutError, KeyboardInterrupt, ValueError])
+def test_what_a_handler_of_a_signal_raises_reaches_who_waits_and_the_connection_goes_on(
+    pair: Pair, error: type[BaseException]
+) -> None:
+    def raise_it(*_: object) -> None:
+        raise error("time is up")
+
+    main = threading.main_thread()
+    assert main.ident is not None
+
+    def interrupt() -> None:
+        wait_until(lambda: pair.client._candidate, "it would lead")
+        pair.send(b"one")
+        wait_until(lambda: pair.client._receiver == main.ident, "it leads")
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGUSR1)
+
+    before = signal.signal(signal.SIGUSR1, raise_it)
+    helper = threading.Thread(target=interrupt)
+    try:
+        helper.start()
+        with pytest.raises(error, match="time is up"):
+            pair.lead(3)
+    finally:
+        helper.join(10.0)
+        signal.signal(signal.SIGUSR1, before)
+    pair.send(b"two")
+    wait_until(lambda: pair.here.packets == [b"one", b"two"], "the receiving thread goes on")
+    assert pair.here.closings == []

@@ -16,7 +16,7 @@ from skyloop.errors import SkyloopError
 
 if TYPE_CHECKING:
     from skyloop.client import Drone
-    from skyloop.messages import VehicleOverview
+    from skyloop.messages import Feedback, VehicleOverview
     from skyloop.transport.fabric import FabricSettings
 
 ANSWER_WITHIN_S = 1.0
@@ -101,22 +101,23 @@ def told(rows: list[Row], settings: FabricSettings | None) -> list[Row]:
         except SkyloopError:
             pass  # each is asked by itself
     return [
-        with_overview(row, overview[row.name]) if row.name in overview else described(row, settings) for row in rows
+        with_state(row, seen.vehicle, seen.uri, seen) if (seen := overview.get(row.name)) else described(row, settings)
+        for row in rows
     ]
 
 
-def with_overview(row: Row, vehicle: VehicleOverview) -> Row:
-    """Return the row with what an overview says of its vehicle."""
+def with_state(row: Row, vehicle: str, uri: str, seen: Feedback | VehicleOverview) -> Row:
+    """Return the row with what its proxy reports of the vehicle."""
     return msgspec.structs.replace(
         row,
-        vehicle=vehicle.vehicle,
-        uri=vehicle.uri,
-        state=vehicle.state.value,
-        battery=vehicle.battery,
-        owner=vehicle.owner,
-        vehicle_link=vehicle.vehicle_link.value,
-        link_reason=vehicle.link_reason,
-        link_remedy=vehicle.link_remedy,
+        vehicle=vehicle,
+        uri=uri,
+        state=seen.state.value,
+        battery=seen.battery,
+        owner=seen.owner,
+        vehicle_link=seen.vehicle_link.value,
+        link_reason=seen.link_reason,
+        link_remedy=seen.link_remedy,
     )
 
 
@@ -143,18 +144,7 @@ def described(row: Row, settings: FabricSettings | None) -> Row:
     """Return what a proxy reports of itself; for one that does not answer, the reason."""
     try:
         with observed(row, settings) as drone:
-            feedback = drone.feedback()
-            return msgspec.structs.replace(
-                row,
-                vehicle=drone.capabilities.vehicle,
-                uri=drone.uri,
-                state=feedback.state.value,
-                battery=feedback.battery,
-                owner=feedback.owner,
-                vehicle_link=feedback.vehicle_link.value,
-                link_reason=feedback.link_reason,
-                link_remedy=feedback.link_remedy,
-            )
+            return with_state(row, drone.capabilities.vehicle, drone.uri, drone.feedback())
     except SkyloopError as error:
         return msgspec.structs.replace(row, problem=str(error))
 

@@ -18,9 +18,10 @@ from skyloop.client.connection import Scheduler
 from skyloop.client.core import Access, DroneCore, OnExit
 from skyloop.client.drone import Drone
 from skyloop.client.swarm import OnError, Swarm, check_policy, in_parallel
-from skyloop.client.warm_up import PERIOD_S, keeper
+from skyloop.client.warm_up import keeper
 from skyloop.errors import Hint, LinkError, SwarmError, UnknownNameError, UsageError
 from skyloop.transport.base import ClientHandler, Dialer, TransportClient, check_name
+from skyloop.warmth import PERIOD_S
 
 if TYPE_CHECKING:
     from skyloop.transport.fabric.settings import FabricSettings

@@ -27,7 +27,7 @@ from skyloop.messages import (
 from skyloop.transport.base import Dialer
 
 _LOOK_NS: Final = nanoseconds(0.05)  #: how often the link's state is judged
-_LOOK_S: Final = 1.0  #: how often a thread that waits for samples tries again to receive them itself
+_AGAIN_S: Final = 1.0  #: how often a thread that waits for samples tries again to receive them itself
 _log = logging.getLogger("skyloop")
 
 
@@ -429,7 +429,7 @@ class ReceivingNotifier(Notifier):
                 return ready()
             offered: list[bool] = []
             if not self._connection.lead(ready, partial(self._offer, offered), left_s):
-                super().wait_for(partial(_either, ready, offered), min(left_s, _LOOK_S))
+                super().wait_for(partial(_either, ready, offered), min(left_s, _AGAIN_S))
         return True
 
     def _offer(self, offered: list[bool]) -> None:

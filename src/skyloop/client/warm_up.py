@@ -37,7 +37,7 @@ from skyloop.messages import (
 )
 from skyloop.messages.typical import typical_feedback
 from skyloop.transport.base import ClientHandler, TransportClient
-from skyloop.warmth import Pieces, Warmer
+from skyloop.warmth import SHORTEST_S, Pieces, Warmer
 
 _CAMERA: Final = "camera"
 _SIDE: Final = 16  #: of its frames [pixels]
@@ -90,7 +90,6 @@ def make_pieces() -> Pieces:
     return feedback, frame, command
 
 
-PERIOD_S: Final = 0.005  #: how often the code is run, unless the application says otherwise
 #: That of this process: one keeps the code of all its drones warm.
 WARMER: Final = Warmer(make_pieces, "client")
 
@@ -104,8 +103,8 @@ def keeper(period_s: float) -> Callable[[bool], None]:
     Raises:
         UsageError: It is neither 0 nor from 0.001 to 1.
     """
-    if not (period_s == 0.0 or 0.001 <= period_s <= 1.0):
-        raise UsageError(f"warm_s is {period_s!r} and must be from 0.001 to 1 s, or 0 for never")
+    if not (period_s == 0.0 or SHORTEST_S <= period_s <= 1.0):
+        raise UsageError(f"warm_s is {period_s!r} and must be from {SHORTEST_S:g} to 1 s, or 0 for never")
     who = object()
     return lambda flies: WARMER.keep(who, period_s if flies else 0.0)
 

@@ -171,7 +171,6 @@ class _Run:
         self._feedback = 0
         self._results = 0
         self._overruns = 0
-        self._drops = 0  # when last looked at, after a callback: nothing is dropped while none runs
         self._lost = False  # another client took over, and on_authority was called
 
     def go(self, seconds: float | None, until: Callable[[], bool] | None) -> RunSummary:
@@ -228,6 +227,7 @@ class _Run:
             self._call(self._controller.on_result, result)
 
     def _call(self, callback: Callable[[Any], None], sample: Any) -> None:
+        dropped = self._dropped()
         try:
             if self._lost and self._drone.authority.state == "held":
                 self._lost = False
@@ -236,9 +236,7 @@ class _Run:
         except BaseException:
             self._hover()
             raise
-        dropped = self._dropped()
-        if dropped > self._drops:
-            self._drops = dropped
+        if self._dropped() > dropped:
             self._overruns += 1
 
     def _dropped(self) -> int:

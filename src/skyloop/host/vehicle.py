@@ -23,7 +23,7 @@ from skyloop.proxy.flight_record import FlightRecord, record_path
 from skyloop.proxy.overview import OverviewRegistry
 from skyloop.proxy.requests import JobQueue
 from skyloop.proxy.serve import keep_trail
-from skyloop.proxy.warm_up import WARMER
+from skyloop.proxy.warm_up import keep_warm
 from skyloop.transport.base import TransportServer
 from skyloop.transport.local.reactor import Reactor
 from skyloop.transport.local.shared_server import SharedLocalServer
@@ -148,7 +148,7 @@ class SharedVehicle(HostedVehicle):
         driver = self._make(settings.address)
         proxy = Proxy(driver, self._end(str(driver.uri)), name=settings.name, ticker=False, jobs=self._jobs)
         proxy.parameters.preset(settings.presets)
-        proxy.keep_warm = lambda period_s: WARMER.keep(proxy, period_s if self._few() else 0.0)
+        keep_warm(proxy, unless=lambda: not self._few())
         if self._overview is not None:
             proxy.overview.share(self._overview)
         keep_trail(proxy, None)

@@ -24,9 +24,9 @@ from skyloop.proxy.core.failsafe import FailsafeSettings
 from skyloop.proxy.core.limits import Limits
 from skyloop.proxy.core.returning import ReturnSettings
 from skyloop.proxy.core.safety import Safety, check_written, safety_of
+from skyloop.warmth import PERIOD_S, SHORTEST_S
 from skyloop.zones import BOX, FAR_M, ROOM, ZONES, Space, space_of
 
-LEAST_WARM_S: Final = 0.001  #: a shorter warm.period_s, other than 0, counts as this
 MAX_TEXT: Final = 1024  #: characters of a text value
 MAX_PARAMETER: Final = 8192  #: bytes of one encoded parameter: a driver's larger one is left out
 PAGE_BYTES: Final = MAX_BODY - 256  #: of encoded parameters in one reply
@@ -127,7 +127,7 @@ OWN: Final[tuple[Parameter, ...]] = (
     Parameter(ZONES, ParameterType.TEXT, "", default="", description="No-fly zones: boxes and cylinders"),
     _own(
         "warm.period_s",
-        0.005,
+        PERIOD_S,
         "s",
         0.0,
         1.0,
@@ -349,7 +349,7 @@ class Parameters:
             max_age_ns=nanoseconds(number("command.max_age_s")),
             authority_timeout_ns=nanoseconds(number("authority.timeout_s")),
             authority_ask_ns=nanoseconds(number("authority.ask_s")),
-            warm_s=max(number("warm.period_s"), LEAST_WARM_S) if number("warm.period_s") else 0.0,
+            warm_s=0.0 if not (warm_s := number("warm.period_s")) else max(warm_s, SHORTEST_S),
         )
 
     def set(self, name: str, value: Value) -> Parameter:

@@ -397,7 +397,8 @@ class Proxy:
         self.publisher.keep_alive(now_ns)
         self.workers.tick(now_ns)
         self.events.tick(now_ns)
-        self.keep_warm(self.handler.warm_s if self.handler.piloted else 0.0)
+        flown = self.handler.piloted and not self._stopping.is_set()  # a tick may come back after the end, from a hang
+        self.keep_warm(self.handler.warm_s if flown else 0.0)
         self.overview.tick(now_ns)
 
     def _end_silent(self, now_ns: int) -> None:

@@ -7,6 +7,7 @@ a vehicle, an application, a file or the network could notice. See :mod:`skyloop
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -81,9 +82,14 @@ def make_pieces() -> Pieces:
 WARMER: Final = Warmer(make_pieces, "proxy")
 
 
-def keep_warm(proxy: Proxy) -> None:
-    """Keep the code of this process's proxies warm while this one's vehicle is flown by a pilot."""
-    proxy.keep_warm = lambda period_s: WARMER.keep(proxy, period_s)
+def keep_warm(proxy: Proxy, unless: Callable[[], bool] = lambda: False) -> None:
+    """Keep the code of this process's proxies warm while this one's vehicle is flown by a pilot.
+
+    Args:
+        proxy: Whose vehicle.
+        unless: Whether to do without now.
+    """
+    proxy.keep_warm = lambda period_s: WARMER.keep(proxy, 0.0 if unless() else period_s)
 
 
 class _Nothing(Driver):

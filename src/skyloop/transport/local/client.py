@@ -199,13 +199,13 @@ class LocalClient(TransportClient):
     # --- whoever has the turn ---
 
     def _take_turn(self, sock: Socket, over: Callable[[], bool]) -> None:
-        """Deliver until it is over, or the connection has ended."""
+        """Deliver until it is over, or the connection has ended.
+
+        On the application's main thread, what a handler of a signal raises while nothing comes is raised from here.
+        """
         self._receiver = threading.get_ident()
         try:
             self._ended = self._receive(sock, over)
-        except Exception as error:  # noqa: BLE001  (a handler may raise anything)
-            _log.exception("the handler of %s failed; its connection ends", self._address)
-            self._ended = f"the application's handler failed: {error!r}"
         finally:
             self._receiver = 0
 
@@ -225,25 +225,31 @@ class LocalClient(TransportClient):
             except ConnectionResetError:
                 continue  # what was sent before it still comes, and then the end
             except OSError as error:
+                if error.errno is None:
+                    raise  # not the kernel's: a handler of a signal raised it, such as a TimeoutError
                 return f"receiving failed: {error}"
             kind = packet[5:6]
-            if kind < OWN and packet and not ancillary:
-                deliver(packet)
-            elif not packet:
-                return self._reason or "the proxy is gone"
-            elif ancillary or packets.is_own(packet):
-                try:
-                    if kind != packets.FRAME or ancillary:
-                        self._control(packet, _descriptors(ancillary))
-                        continue
-                    number, header = packets.parse_frame(packet)
-                    pixels = self._leases.pixels(number, header.size)
-                except (DecodeError, LinkError, OSError) as error:
-                    return f"the proxy does not keep to the protocol: {error}"
-                deliver_frame(header, pixels)
-                del pixels  # else their slot stayed leased until the next packet
-            else:
-                deliver(packet)
+            try:
+                if kind < OWN and packet and not ancillary:
+                    deliver(packet)
+                elif not packet:
+                    return self._reason or "the proxy is gone"
+                elif ancillary or packets.is_own(packet):
+                    try:
+                        if kind != packets.FRAME or ancillary:
+                            self._control(packet, _descriptors(ancillary))
+                            continue
+                        number, header = packets.parse_frame(packet)
+                        pixels = self._leases.pixels(number, header.size)
+                    except (DecodeError, LinkError, OSError) as error:
+                        return f"the proxy does not keep to the protocol: {error}"
+                    deliver_frame(header, pixels)
+                    del pixels  # else their slot stayed leased until the next packet
+                else:
+                    deliver(packet)
+            except Exception as error:  # noqa: BLE001  (a handler may raise anything)
+                _log.exception("the handler of %s failed; its connection ends", self._address)
+                return f"the application's handler failed: {error!r}"
             if over():
                 return ""
         return self._reason or "closed by the application"

@@ -259,7 +259,7 @@ class LocalServer(TransportServer):
 
     def _receive(self, handler: ServerHandler, connection: ServerConnection) -> str:
         """Hand packets on, and return why it ended. Raises what the handler raises."""
-        receive, lock, peer, deliver = connection.receive, self._lock, connection.peer, handler.packet
+        receive, lock = connection.receive, self._lock
         while True:
             try:
                 packet = receive(MAX_PACKET + 1)
@@ -273,17 +273,24 @@ class LocalServer(TransportServer):
                 continue  # at once: the command that follows it does not wait in line with it
             lock.acquire(is_command(packet))
             try:
-                if not packet or connection.ending:
-                    # An empty packet cannot be distinguished from the end, so it counts as one.
-                    return f"the application is gone ({peer.address})"
-                if len(packet) > MAX_PACKET:
-                    return f"it sent a packet of more than {MAX_PACKET} bytes"
-                if not connection.joined:
-                    self._welcome(handler, connection, packet)
-                elif packet[5:6] < OWN or not (packets.is_own(packet) and self._control(handler, connection, packet)):
-                    deliver(peer, packet)
+                reason = self._take(handler, connection, packet)
             finally:
                 lock.release()
+            if reason:
+                return reason
+
+    def _take(self, handler: ServerHandler, connection: ServerConnection, packet: bytes) -> str:
+        """Handle one packet; return why the connection ends with it, empty if it goes on. The lock is held."""
+        if not packet or connection.ending:
+            # An empty packet cannot be distinguished from the end, so it counts as one.
+            return f"the application is gone ({connection.peer.address})"
+        if len(packet) > MAX_PACKET:
+            return f"it sent a packet of more than {MAX_PACKET} bytes"
+        if not connection.joined:
+            self._welcome(handler, connection, packet)
+        elif packet[5:6] < OWN or not (packets.is_own(packet) and self._control(handler, connection, packet)):
+            handler.packet(connection.peer, packet)
+        return ""
 
     def _welcome(self, handler: ServerHandler, connection: ServerConnection, packet: bytes) -> None:
         """Handle a connection's first packet. A process that only asks who listens here sends none."""

@@ -8,7 +8,6 @@ import threading
 from skyloop.transport.base import MAX_PACKET, ServerHandler
 from skyloop.transport.local import packets
 from skyloop.transport.local.connection import ServerConnection
-from skyloop.transport.local.packets import OWN
 from skyloop.transport.local.reactor import Reactor, Source, receiving
 from skyloop.transport.local.server import HELLO_S, LocalServer
 from skyloop.transport.local.sockets import RECEIVE_FLAGS, Socket
@@ -148,19 +147,11 @@ class SharedLocalServer(LocalServer):
                 connection.hang_up("the proxy stopped")
 
     def _handle(self, source: Source, connection: ServerConnection, packet: bytes) -> None:
-        """Handle one packet as :meth:`LocalServer._receive` does."""
+        """Handle one packet, whatever the handler raises."""
         handler = self._handler
         assert handler is not None
-        reason = ""
         try:
-            if not packet or connection.ending:
-                reason = f"the application is gone ({connection.peer.address})"
-            elif len(packet) > MAX_PACKET:
-                reason = f"it sent a packet of more than {MAX_PACKET} bytes"
-            elif not connection.joined:
-                self._welcome(handler, connection, packet)
-            elif packet[5:6] < OWN or not (packets.is_own(packet) and self._control(handler, connection, packet)):
-                handler.packet(connection.peer, packet)
+            reason = self._take(handler, connection, packet)
         except Exception as error:  # noqa: BLE001  (a handler may raise anything)
             _log.exception("the handler of %s failed; %s is disconnected", self.address, connection.peer.address)
             reason = f"the proxy's handler failed: {error!r}"
