@@ -1,8 +1,12 @@
-"""Decoders of PyAV, made in one place: PyAV is optional, and imported when the first one is made."""
+"""Decoders and encoders of PyAV, made in one place: PyAV is optional, and imported when the first one is made."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from fractions import Fraction
+from typing import TYPE_CHECKING, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
 
 from skyloop.errors import MissingExtraError
 from skyloop.messages.image_header import MAX_PIXELS
@@ -57,3 +61,86 @@ def new_decoder(codec: Literal["h264", "mpeg4"], purpose: str, *, patch: bool = 
 def limit_memory(context: CodecContext) -> None:
     """A damaged header must not make the decoder ask for gigabytes."""
     context.options = {**context.options, "max_pixels": str(MAX_PIXELS)}
+
+
+_TICK: Final = Fraction(1, 1_000_000)  # of the stamps that the encoder's rate control goes by [s]
+#: How much of a second at its rate a stream may send at once: what a key picture takes. A slow link has to carry it
+#: before the next picture.
+_BURST_S: Final = 0.25
+_KEY_EVERY_S: Final = 10.0  #: who comes later asks for one
+#: The colours of PAL television, with 16 to 235 from black to white: what FFmpeg converts to, and decoders expect.
+_COLOURS: Final = "colorprim=smpte170m:transfer=smpte170m:colormatrix=smpte170m:range=tv"
+
+
+class H264Encoder:
+    """Encodes one stream so that each picture comes out at once. Used by one thread at a time.
+
+    H.264, Main profile, Annex B, without pictures that build on later ones; parameter sets before each key picture.
+
+    Args:
+        width: Of the pictures [px], even.
+        height: Of the pictures [px], even.
+        fps: About how many there will be in a second.
+        kbit_s: On average [kbit/s].
+
+    Raises:
+        MissingExtraError: PyAV is not installed, or without x264.
+    """
+
+    def __init__(self, width: int, height: int, fps: float, kbit_s: int) -> None:
+        purpose = "encoding H.264"
+        require_pyav(purpose)
+        import av
+
+        self.width, self.height, self.kbit_s = width, height, kbit_s
+        try:
+            context: VideoCodecContext = av.CodecContext.create("libx264", "w")
+        except ValueError as error:
+            raise MissingExtraError(purpose, "video", cause="this PyAV comes without x264") from error
+        context.width, context.height, context.pix_fmt = width, height, "yuv420p"
+        context.time_base = _TICK
+        context.framerate = Fraction(max(fps, 1.0)).limit_denominator(1000)
+        context.bit_rate = kbit_s * 1000
+        context.gop_size = round(max(fps, 1.0) * _KEY_EVERY_S)
+        context.max_b_frames = 0
+        context.thread_count = 1
+        context.options = {
+            "preset": "superfast",
+            "tune": "zerolatency",
+            "profile": "main",
+            "forced-idr": "1",
+            "maxrate": str(kbit_s * 1000),
+            "bufsize": str(round(kbit_s * 1000 * _BURST_S)),
+            "x264-params": f"repeat-headers=1:scenecut=0:sliced-threads=0:{_COLOURS}",
+        }
+        self._context = context
+        self._fresh = True
+
+    def set_rate(self, kbit_s: int) -> None:
+        """Change the average rate from the next picture on [kbit/s], at no cost."""
+        self.kbit_s = kbit_s
+        self._context.bit_rate = kbit_s * 1000
+
+    def encode(
+        self, pixels: NDArray[np.uint8], form: str, captured_ns: int, *, key: bool = False
+    ) -> tuple[bytes, bool]:
+        """Encode one picture; other threads run meanwhile.
+
+        Args:
+            pixels: Shape (height, width, 3) or (height, width), dtype uint8, of any size: it is scaled.
+            form: FFmpeg's name of the pixels' format: ``bgr24``, ``rgb24`` or ``gray``.
+            captured_ns: When it was captured [ns], later than the one before.
+            key: Make it a key picture.
+
+        Returns:
+            The access unit, and whether it is a key picture. Empty if the encoder gave none.
+        """
+        import av
+
+        picture = av.VideoFrame.from_ndarray(pixels, format=form)
+        picture = picture.reformat(self.width, self.height, "yuv420p", interpolation="AREA")
+        picture.pts, picture.time_base = captured_ns // 1000, _TICK
+        first, self._fresh = self._fresh, False
+        picture.pict_type = av.video.frame.PictureType.I if key or first else av.video.frame.PictureType.NONE
+        units = self._context.encode(picture)
+        return b"".join(bytes(unit) for unit in units), any(unit.is_keyframe for unit in units)

@@ -5,7 +5,8 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyloop.messages.encoded import Chain
+from skyloop.messages import EncodedFrame, decode, encode
+from skyloop.messages.encoded import MAX_PIECE, Chain, Pieces, split
 
 
 def test_a_chain_begins_at_a_key_and_breaks_at_a_gap() -> None:
@@ -30,3 +31,33 @@ def test_whatever_is_lost_each_picture_that_follows_has_all_since_its_key(sent: 
             since -= 1
             assert since in kept
     assert {number for number, (key, lost) in enumerate(sent) if key and not lost} <= kept
+
+
+def picture(seq: int, size: int) -> EncodedFrame:
+    return EncodedFrame("front", seq, 1, 2, 64, 48, "h264", True, bytes([seq % 256]) * size)
+
+
+@given(
+    st.lists(st.integers(1, 3 * MAX_PIECE + 1), min_size=1, max_size=4),
+    st.sets(st.integers(0, 15)),
+    st.booleans(),
+)
+def test_a_picture_in_pieces_comes_whole_or_not_at_all(sizes: list[int], lost: set[int], twice: bool) -> None:
+    pictures = [picture(seq, size) for seq, size in enumerate(sizes)]
+    pieces, number, came = Pieces(), 0, []
+    whole = set()
+    for one in pictures:
+        complete = True
+        for part in split(one):
+            assert len(part.data) <= MAX_PIECE
+            if number in lost:
+                complete = False
+            else:
+                for _ in range(1 + (twice and part.piece == 0)):
+                    joined = pieces.add(decode(encode(part)))  # type: ignore[arg-type]
+                    came += [] if joined is None else [joined]
+            number += 1
+        if complete:
+            whole.add(one.seq)
+    assert {one.seq for one in came} == whole
+    assert all(one == pictures[one.seq] for one in came)

@@ -60,7 +60,7 @@ def test_sizes_on_the_page() -> None:
     assert f"at most {codec.MAX_BODY:,}".replace(",", " ") in PAGE
     assert codec.SIGNATURE.hex(" ").upper() in PAGE
     assert codec.HEADER_SIZE == 12
-    assert f"| `data` | bin, ≤ {encoded.MAX_ENCODED:_} |".replace("_", " ") in PAGE
+    assert f"| `data` | bin, ≤ {encoded.MAX_PIECE:_} |".replace("_", " ") in PAGE
 
 
 LOCAL, _, FABRIC = PAGE.partition("\n## The local transport\n")[2].partition("\n## The fabric transport\n")

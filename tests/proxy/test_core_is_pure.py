@@ -13,6 +13,7 @@ import skyloop.zones
 ALLOWED = {
     "__future__",
     "bisect",
+    "collections",
     "collections.abc",
     "dataclasses",
     "enum",

@@ -8,7 +8,6 @@ import re
 import skyloop
 from skyloop.cli.app import build
 from skyloop.logfile import layout
-from skyloop.messages.encoded import MAX_ENCODED
 from skyloop.recording.backlog import RESERVE
 from skyloop.recording.options import CHOICES, MB
 from skyloop.recording.status import RecorderState
@@ -55,10 +54,6 @@ def test_the_topics_are_those_of_the_layout() -> None:
         layout.TF,
         layout.LOG,
     ]
-
-
-def test_the_largest_picture_of_h264_is_that_of_the_wire() -> None:
-    assert f"more than {MAX_ENCODED:,} bytes".replace(",", " ") in section(PAGE, "### H.264 passthrough")
 
 
 def test_the_metadata_are_those_of_the_layout() -> None:

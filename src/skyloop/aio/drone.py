@@ -25,6 +25,7 @@ from skyloop.messages import (
     AnyAction,
     Applied,
     Capabilities,
+    EncodedFrame,
     Encoding,
     Event,
     EventKind,
@@ -497,6 +498,37 @@ class Drone:
                 "on_frame takes a plain function, which runs on a thread of its own; else iterate over frames()"
             )
         return self.sync.on_frame(function, camera, depth=depth, inline=inline, **how)
+
+    def on_encoded(
+        self,
+        function: Callable[[EncodedFrame], object],
+        camera: str | None = None,
+        *,
+        kbit_s: int | None = None,
+        max_fps: float | None = None,
+        scale: float = 1.0,
+        depth: int = 30,
+        inline: bool = False,
+    ) -> client.Listener[EncodedFrame]:
+        """Call ``function`` with pictures as they are encoded, on a thread of its own.
+
+        Args:
+            function: A plain function.
+            camera: Name of the camera; None: the vehicle's first.
+            kbit_s: As for :meth:`skyloop.Drone.on_encoded`.
+            max_fps: As for :meth:`skyloop.Drone.on_encoded`.
+            scale: As for :meth:`skyloop.Drone.on_encoded`.
+            depth: As for :meth:`skyloop.Drone.on_encoded`.
+            inline: As for :meth:`skyloop.Drone.on_encoded`.
+
+        Raises:
+            UsageError: If it is a coroutine function.
+        """
+        if inspect.iscoroutinefunction(function):
+            raise UsageError("on_encoded takes a plain function, which runs on a thread of its own")
+        return self.sync.on_encoded(
+            function, camera, kbit_s=kbit_s, max_fps=max_fps, scale=scale, depth=depth, inline=inline
+        )
 
     def annotate(self, frame: client.Frame, shapes: Iterable[Shape], source: str | None = None) -> bool:
         """Publish shapes drawn over a frame; see :meth:`skyloop.Drone.annotate`."""

@@ -17,9 +17,9 @@ from skyloop.client.link_monitor import StallWatch
 from skyloop.client.mailbox import Holder, Mailbox
 from skyloop.client.statistics import ChannelCounter, ChannelStats
 from skyloop.errors import DecodeError
-from skyloop.messages import CameraInfo, EncodedFrame, EventKind, FrameHeader, Severity, VideoRequest
+from skyloop.messages import CameraInfo, EventKind, FrameHeader, Severity, VideoRequest
 from skyloop.messages.video import FrameFilter, VideoEncoding
-from skyloop.transport.base import Pixels, stream, video
+from skyloop.transport.base import Pixels, video
 
 T = TypeVar("T")
 
@@ -149,8 +149,6 @@ class VideoChannel(Channel[Arrival]):
         self.counter = ChannelCounter()
         self.undecodable = 0
         self.watch = StallWatch(max(1.0, 5.0 * self._period_s(camera.fps)), scheduler.clock())
-        #: Images as the vehicle encoded them; published on the receiving thread.
-        self.stream: Channel[EncodedFrame] = Channel(lambda on: connection.subscribe(stream(camera.name), on))
         self.filter = FrameFilter(self.request)  #: chooses the plain frames that this request asks for
         self._read: Arrival | None = None  # what next_frame() gave last
         self._connection = connection
@@ -228,6 +226,7 @@ class VideoOptions(TypedDict, total=False):
     max_fps: float
     scale: float
     part: tuple[int, int]
+    kbit_s: int
 
 
 def usual(camera: str) -> VideoRequest:

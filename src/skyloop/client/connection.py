@@ -95,6 +95,12 @@ class ProxyConnection:
         return session is not None and session.receiving
 
     @property
+    def variants(self) -> bool:
+        """Whether frames come in the form that was asked for; on one host they come as they are."""
+        session = self._session
+        return session is not None and session.variants
+
+    @property
     def offset_ns(self) -> int:
         """Estimate of the proxy's clock minus this process's clock [ns]."""
         session = self._session

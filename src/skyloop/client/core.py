@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -17,6 +18,7 @@ from skyloop.client.logbook import Logbook
 from skyloop.client.mailbox import Notifier
 from skyloop.client.parameters import Config, Restorer
 from skyloop.client.results import ResultChannel, checked_age, checked_name
+from skyloop.client.streams import StreamChannel
 from skyloop.client.telemetry import ClientState, Mailboxes, Receiver
 from skyloop.client.worker import Membership
 from skyloop.errors import (
@@ -45,6 +47,7 @@ from skyloop.messages import (
 )
 from skyloop.messages.result import MAX_CODE
 from skyloop.messages.video import DEFAULT_QUALITY, VideoEncoding, VideoRequest
+from skyloop.pyav import require_pyav
 from skyloop.transport.base import EVENTS, Dialer
 
 Access = Literal["pilot", "observe"]
@@ -127,6 +130,7 @@ class DroneCore:
         self.closed = False
         self.reach = reach
         self.listeners: list[Listener[Any]] = []
+        self._subscriber = secrets.token_hex(8)  # names the streams whose rate follows the path to here
         self._on_exit = on_exit
         self._on_close = on_close
         self._to_close: list[Closable] = []  # what ends with the drone
@@ -335,21 +339,24 @@ class DroneCore:
         max_fps: float | None = None,
         scale: float = 1.0,
         part: tuple[int, int] | None = None,
+        kbit_s: int | None = None,
     ) -> VideoChannel:
         """Return the channel of a camera whose frames come as requested; see :meth:`Drone.frames` for the options.
 
         Args:
             camera: Name of the camera; None: the vehicle's first.
-            encoding: ``"jpeg"`` or ``"raw"``; None: ``"jpeg"``.
+            encoding: ``"jpeg"``, ``"h264"`` or ``"raw"``; None: ``"jpeg"``.
             quality: Of JPEG, 1 to 100; None: 80.
             max_fps: Most frames a second; None: all.
             scale: Factor for width and height, above 0 and up to 1.
             part: (k, n): only every n-th frame, from k; None: all.
+            kbit_s: Of H.264 [kbit/s]; None: what the path carries.
 
         Raises:
             UnknownNameError: If the vehicle has no camera of this name.
             UnsupportedError: If the vehicle has no camera.
-            UsageError: If an option is out of range, or ``quality`` is given for raw frames.
+            UsageError: If an option is out of range, or ``quality`` is given for other frames than JPEG.
+            MissingExtraError: If H.264 is asked for and PyAV is not installed.
             ClosedError: If the drone was closed.
         """
         self.check_open()
@@ -359,8 +366,10 @@ class DroneCore:
         channel = next(iter(channels.values())) if camera is None else channels.get(camera)
         if channel is None:
             raise UnknownNameError("camera", str(camera), channels)
-        if encoding == "raw" and quality is not None:
-            raise UsageError(f'quality={quality!r} is of encoding="jpeg", and the encoding is "raw"')
+        if encoding in ("raw", "h264") and quality is not None:
+            raise UsageError(f'quality={quality!r} is of encoding="jpeg", and the encoding is {encoding!r}')
+        if encoding == "h264":
+            require_pyav("reading H.264")
         request = VideoRequest(
             channel.camera.name,
             encoding="jpeg" if encoding is None else encoding,
@@ -368,8 +377,39 @@ class DroneCore:
             max_fps=max_fps,
             scale=scale,
             part=part,
+            kbit_s=kbit_s,
+            subscriber=self._subscriber if encoding == "h264" and kbit_s is None else "",
         )
         return channel if request == channel.request else self.state.video(channel.camera, request)
+
+    def stream(
+        self,
+        camera: str | None = None,
+        *,
+        kbit_s: int | None = None,
+        max_fps: float | None = None,
+        scale: float = 1.0,
+        subscriber: str = "",
+    ) -> StreamChannel:
+        """Return the channel of a camera's H.264: with no other argument, as the vehicle itself encoded it.
+
+        Args:
+            camera: Name of the camera; None: the vehicle's first.
+            kbit_s: Encoded by the proxy with this rate [kbit/s], once for all who ask for the same.
+            max_fps: Most pictures a second; None: all.
+            scale: Factor for width and height, above 0 and up to 1.
+            subscriber: Encoded by the proxy for this subscriber alone, with the rate that the path to it carries.
+
+        Raises:
+            UnknownNameError: If the vehicle has no camera of this name.
+            UnsupportedError: If the vehicle has no camera.
+            UsageError: If an option is out of range.
+            ClosedError: If the drone was closed.
+        """
+        name = self.channel(camera).camera.name
+        return self.state.stream(
+            VideoRequest(name, encoding="h264", kbit_s=kbit_s, max_fps=max_fps, scale=scale, subscriber=subscriber)
+        )
 
     def result_channel(self, processor: str) -> ResultChannel:
         """Return the channel of a processor's results, whether or not such a processor runs.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import secrets
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
@@ -64,6 +65,7 @@ from skyloop.messages import (
     Attitude,
     Capabilities,
     EmergencyStop,
+    EncodedFrame,
     Event,
     EventKind,
     Feedback,
@@ -86,6 +88,7 @@ from skyloop.messages import (
     encode,
 )
 from skyloop.messages.annotation import Shape
+from skyloop.messages.encoded import Chain
 from skyloop.messages.feedback_request import PLAIN
 from skyloop.messages.pose import check_pose
 from skyloop.transport.base import Dialer
@@ -670,8 +673,9 @@ class Drone:
             timeout_s: How long to wait for each frame [s].
             **how: ``max_fps``: at most so many frames a second. ``scale``: factor for width and height, above 0 and up
                 to 1. ``part``: (k, n), only every n-th frame, for n workers with k from 0 that share them.
-                ``encoding``: how frames travel over a network, ``"jpeg"`` (of ``quality`` 1 to 100, default 80) or
-                ``"raw"``; on one host all travel raw.
+                ``encoding``: how frames travel over a network, ``"jpeg"`` (of ``quality`` 1 to 100, default 80),
+                ``"h264"`` (of ``kbit_s`` kilobits a second; by default as much as the path carries, with smaller and
+                fewer pictures where that is little) or ``"raw"``; on one host all travel raw.
 
         Raises:
             NoAnswerError: If no frame comes within ``timeout_s``.
@@ -844,6 +848,59 @@ class Drone:
                 function(frame)
 
         return self._listen(channel, call, f"frames of {channel.camera.name}", depth=depth, inline=inline)
+
+    def on_encoded(
+        self,
+        function: Callable[[EncodedFrame], object],
+        camera: str | None = None,
+        *,
+        kbit_s: int | None = None,
+        max_fps: float | None = None,
+        scale: float = 1.0,
+        depth: int = 30,
+        inline: bool = False,
+    ) -> Listener[EncodedFrame]:
+        """Call ``function`` with a camera's pictures as they are encoded, to store them or to send them on.
+
+        Each is an access unit of H.264 in Annex B form that can be decoded after those before it; the first one is a
+        key picture. After a missing one nothing is given up to the next key picture, which the proxy is asked for.
+        Where ``kbit_s``, ``max_fps`` and ``scale`` are left out, pictures come as the vehicle encoded them; from a
+        vehicle that sends no H.264, encoded by the proxy at the rate that the path carries.
+
+        Args:
+            function: Called on a thread of its own.
+            camera: Name of the camera; None: the vehicle's first.
+            kbit_s: Encoded by the proxy at this rate, once for all who ask for the same [kbit/s].
+            max_fps: Most pictures a second; None: all.
+            scale: Factor for width and height, above 0 and up to 1.
+            depth: How many pictures may wait, at least 1; if more come, some are missing.
+            inline: Call it on the receiving thread instead. It must be quick and must not wait.
+
+        Returns:
+            The listener; ``cancel()`` ends it.
+
+        Raises:
+            UsageError: If ``function`` can't be called or an option is out of range.
+            UnknownNameError: If the vehicle has no camera of this name.
+            UnsupportedError: If the vehicle has no camera.
+            ClosedError: If the drone was closed.
+        """
+        if depth < 1:
+            raise UsageError(f"depth is {depth!r} and must be at least 1 picture")
+        self._check_listener(function)
+        info = self._core.channel(camera).camera
+        as_it_came = bool(info.stream) and kbit_s is None and max_fps is None and scale == 1.0
+        subscriber = "" if as_it_came or kbit_s is not None else secrets.token_hex(8)
+        stream = self._core.stream(info.name, kbit_s=kbit_s, max_fps=max_fps, scale=scale, subscriber=subscriber)
+        chain = Chain()
+
+        def call(picture: EncodedFrame) -> None:
+            follows = chain.follows(picture.seq, key=picture.key)
+            stream.report(picture.seq, wants_key=not follows)
+            if follows:
+                function(picture)
+
+        return self._listen(stream, call, f"pictures of {info.name}", depth=depth, inline=inline)
 
     def annotate(self, frame: Frame, shapes: Iterable[Shape], source: str | None = None) -> bool:
         """Publish shapes drawn over a frame, for the cockpit and for recordings.

@@ -37,7 +37,7 @@ from skyloop.messages import (
     encode,
 )
 from skyloop.messages.feedback_request import PLAIN
-from skyloop.transport.base import FEEDBACK, Dialer, Pixels, TransportClient, video
+from skyloop.transport.base import FEEDBACK, Dialer, Pixels, TransportClient, stream, video
 
 RETRY_S = 0.3  #: time after which an unanswered request is repeated; all requests are idempotent
 
@@ -128,7 +128,7 @@ class Requests:
 
 
 FEEDBACK_STALL_S: Final = 1.0  #: without feedback from a proxy that answers: it is subscribed to again
-_VIDEO: Final = video("")
+_VIDEOS: Final = (video(""), stream(""))
 _PING_CLOCK_NS: Final = nanoseconds(1.0)  #: how often a proxy on another clock is asked for its time
 _PING_FIRST_NS: Final = nanoseconds(0.1)  #: the same until there are a few round trips
 _FIRST: Final = 5
@@ -197,7 +197,7 @@ class ProxySession:
         self._up = False
         self._pinged_ns = 0
         self._trips = OffsetEstimator()
-        self._video_users: dict[str, set[str]] = {}  # plain topic: topics of the requests that it serves
+        self._video_users: dict[str, set[str]] = {}  # topic of the transport: the topics that it serves
         self._handlers: dict[type, Callable[..., None]] = {
             Event: handler.event,
             Applied: handler.applied,
@@ -254,6 +254,11 @@ class ProxySession:
         return self.closed_reason is None and not self._quiet
 
     @property
+    def variants(self) -> bool:
+        """Whether frames come in the form that was asked for; see :class:`skyloop.transport.base.TransportClient`."""
+        return self._end is not None and self._end.variants
+
+    @property
     def address(self) -> str:
         """Address of the proxy, for people."""
         return self._end.address if self._end is not None else "nowhere"
@@ -282,9 +287,7 @@ class ProxySession:
         return self.receiver == threading.get_ident() or (self._end is not None and self._end.receiving)
 
     def subscribe(self, topic: str, on: bool) -> None:
-        """Subscribe to a topic or unsubscribe.
-
-        A transport that makes no variants of video carries each camera's plain frames once for all requests.
+        """Subscribe to a topic or unsubscribe. Video that several requests share is subscribed to once.
 
         Args:
             topic: Name of the topic.
@@ -293,13 +296,12 @@ class ProxySession:
         end = self._end
         if end is None:
             return
-        if not end.variants and topic.startswith(_VIDEO):
-            # This transport delivers all frames as they are; each channel then filters and scales them itself.
-            plain = VideoRequest.parse(topic).plain.topic
-            users = self._video_users.setdefault(plain, set())
+        if topic.startswith(_VIDEOS):
+            carrier = _carrier(topic, variants=end.variants)
+            users = self._video_users.setdefault(carrier, set())
             had_users = bool(users)
             (users.add if on else users.discard)(topic)
-            topic, on = plain, bool(users)
+            topic, on = carrier, bool(users)
             if on == had_users:
                 return
         if topic.startswith(FEEDBACK):
@@ -417,3 +419,19 @@ class ProxySession:
     def _malformed(self) -> None:
         self.monitor.malformed()
         self._poke()
+
+
+def _carrier(topic: str, *, variants: bool) -> str:
+    """Return the topic of the transport on which video comes.
+
+    Args:
+        topic: As it was asked for.
+        variants: Whether the transport carries frames in the form asked for, or all as they are: each channel then
+            filters and scales them itself.
+    """
+    request = VideoRequest.parse(topic)
+    if topic.startswith(stream("")):
+        return topic
+    if not variants:
+        return request.plain.topic
+    return request.stream_topic if request.encoding == "h264" else topic

@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from types import TracebackType
 from typing import Final, Self
 
@@ -19,6 +20,7 @@ from skyloop.client.mailbox import Mailbox
 from skyloop.client.parameters import Restorer
 from skyloop.client.results import Result, ResultChannels, ResultMailbox
 from skyloop.client.statistics import ChannelCounter, ChannelStats
+from skyloop.client.streams import StreamChannel, StreamDecoder
 from skyloop.errors import UnknownNameError
 from skyloop.messages import (
     Annotation,
@@ -42,7 +44,7 @@ from skyloop.messages import (
 )
 from skyloop.messages.feedback_request import PLAIN
 from skyloop.messages.overview import OverviewPages
-from skyloop.transport.base import ANNOTATIONS, COMMANDS, LOGS, OVERVIEW, Pixels
+from skyloop.transport.base import ANNOTATIONS, COMMANDS, LOGS, OVERVIEW, Pixels, stream
 
 RECENT_EVENTS: Final = 256
 #: What can be waited for: a flight state (or its name), one of several, or a predicate on feedback.
@@ -147,6 +149,7 @@ class ClientState:
         self.status = LinkStatus(LinkState.CONNECTING, LinkState.CONNECTING)
         self.channels: dict[str, VideoChannel] = {}  #: by camera, with the usual request
         self.variants: dict[str, VideoChannel] = {}  #: all channels, by the topic of their request
+        self.streams: dict[str, StreamChannel] = {}  #: by topic
         self.counter = ChannelCounter()  #: of feedback
         self.echoes = ChannelCounter()
         self.demand = FeedbackDemand(connection, whole=whole_feedback)
@@ -178,6 +181,21 @@ class ClientState:
         if channel is None:
             channel = VideoChannel(camera, self._connection, self.scheduler, self.history, request)
             self.variants[topic] = channel
+            if channel.request.encoding == "h264":
+                encoded, deliver = self.stream(channel.request), partial(channel.receive, as_asked=True)
+                encoded.decoder = StreamDecoder(encoded, deliver, self._clock, f"skyloop-decode-{camera.name}")
+        return channel
+
+    def stream(self, request: VideoRequest) -> StreamChannel:
+        """Return the channel of an encoded stream, made on the first call.
+
+        Args:
+            request: With ``encoding="h264"``.
+        """
+        topic = request.stream_topic
+        channel = self.streams.get(topic)
+        if channel is None:
+            channel = self.streams[topic] = StreamChannel(topic, self._connection, self._clock)
         return channel
 
     def feedback_channel(self, request: FeedbackRequest) -> Channel[Feedback]:
@@ -390,10 +408,10 @@ class Receiver:
         self._state.on_log.publish(entry)
 
     def encoded(self, picture: EncodedFrame, now_ns: int) -> None:  # noqa: ARG002  (all are called alike)
-        """Publish a picture as the vehicle encoded it."""
-        channel = self._state.channels.get(picture.camera)
+        """Publish a picture of an encoded stream."""
+        channel = self._state.streams.get(picture.topic or stream(picture.camera))
         if channel is not None:
-            channel.stream.publish(picture)
+            channel.receive(picture)
 
     def result(self, result: ProcessorResult, now_ns: int) -> None:
         """Publish the result of a processor."""

@@ -53,7 +53,7 @@ from skyloop.messages.config import (
     Statistics,
     Welcome,
 )
-from skyloop.messages.encoded import EncodedFrame
+from skyloop.messages.encoded import EncodedFrame, StreamReport
 from skyloop.messages.event import Event
 from skyloop.messages.feedback import Feedback, Value, Vector
 from skyloop.messages.feedback_request import FeedbackRequest
@@ -145,6 +145,7 @@ __all__ = [
     "SetParameter",
     "Severity",
     "Statistics",
+    "StreamReport",
     "Takeoff",
     "Takeover",
     "Text",

@@ -17,7 +17,7 @@ from skyloop.errors import DecodeError
 from skyloop.messages.annotation import Annotation
 from skyloop.messages.command import Applied, Command
 from skyloop.messages.config import Reply, Request
-from skyloop.messages.encoded import EncodedFrame
+from skyloop.messages.encoded import EncodedFrame, StreamReport
 from skyloop.messages.event import Event
 from skyloop.messages.feedback import Feedback
 from skyloop.messages.frame import FrameHeader
@@ -47,6 +47,7 @@ Sample = (
     | ProcessorShare
     | VehiclePose
     | Overview
+    | StreamReport
 )
 
 
@@ -67,6 +68,7 @@ class Kind(IntEnum):
     SHARE = 12
     POSE = 13
     OVERVIEW = 14
+    STREAM_REPORT = 15
 
 
 KINDS: Final[dict[type[Sample], Kind]] = {
@@ -84,6 +86,7 @@ KINDS: Final[dict[type[Sample], Kind]] = {
     ProcessorShare: Kind.SHARE,
     VehiclePose: Kind.POSE,
     Overview: Kind.OVERVIEW,
+    StreamReport: Kind.STREAM_REPORT,
 }
 
 _encode_body = msgspec.msgpack.Encoder().encode

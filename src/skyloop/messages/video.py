@@ -3,24 +3,32 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, replace
-from typing import Final, Literal
+from typing import Final, Literal, get_args
 from urllib.parse import parse_qsl, quote, unquote
 
 from skyloop.errors import UsageError
 from skyloop.messages.rate import RateLimiter
 from skyloop.messages.result import MAX_PARTS
 
-VideoEncoding = Literal["raw", "jpeg"]
+VideoEncoding = Literal["raw", "jpeg", "h264"]
 DEFAULT_QUALITY: Final = 80
+MIN_KBIT_S: Final = 30  #: of an encoded stream
+MAX_KBIT_S: Final = 50_000
+MAX_SUBSCRIBER: Final = 32  #: characters
 MIN_FPS: Final = 0.001  #: a frame in a quarter of an hour; the time between two of much less has no end
+_ENCODINGS: Final = get_args(VideoEncoding)
 _PREFIX: Final = "video/"
-_FIELDS: Final = ("encoding", "max_fps", "part", "quality", "scale")
+_STREAM_PREFIX: Final = "stream/"
+_FIELDS: Final = ("encoding", "kbit_s", "max_fps", "part", "quality", "scale", "subscriber")
 
 
 @dataclass(frozen=True, slots=True)
 class VideoRequest:
     """Frames of one camera, as one consumer wants them.
+
+    H.264 comes on a topic of its own, :attr:`stream_topic`.
 
     Two requests that give the same frames are equal and have the same :attr:`topic`.
 
@@ -29,17 +37,19 @@ class VideoRequest:
     """
 
     camera: str
-    encoding: VideoEncoding = "raw"  #: how the pixels travel where they must be sent: as they are, or as JPEG
+    encoding: VideoEncoding = "raw"  #: how the pixels travel where they must be sent: as they are, as JPEG or H.264
     quality: int = DEFAULT_QUALITY  #: of a JPEG, 1 to 100
     max_fps: float | None = None  #: at most so many frames in a second
     scale: float = 1.0  #: width and height times this, above 0 and up to 1
     part: tuple[int, int] | None = None  #: (k, n): only frames whose number leaves k when divided by n
+    kbit_s: int | None = None  #: of H.264, on average; None: as the vehicle sent it, or what the path carries
+    subscriber: str = ""  #: of H.264 whose rate follows the path to one subscriber: a name that no other has
 
     def __post_init__(self) -> None:
         if not self.camera:
             raise UsageError("a request for video needs the name of a camera")
-        if self.encoding not in ("raw", "jpeg"):
-            raise UsageError(f'encoding is {self.encoding!r} and must be "raw" or "jpeg"')
+        if self.encoding not in _ENCODINGS:
+            raise UsageError(f'encoding is {self.encoding!r} and must be "raw", "jpeg" or "h264"')
         if not _is_whole(self.quality) or not 1 <= self.quality <= 100:
             raise UsageError(f"quality is {self.quality!r} and must be a whole number from 1 to 100")
         if self.max_fps is not None and not (_is_number(self.max_fps) and MIN_FPS <= self.max_fps < math.inf):
@@ -50,20 +60,43 @@ class VideoRequest:
             raise UsageError(f"scale is {self.scale!r} and must be above 0 and at most 1")
         if self.part is not None and not _is_part(self.part):
             raise UsageError(f"part is {self.part!r} and must be (k, n) with 0 <= k < n <= {MAX_PARTS}")
-        if self.encoding == "raw" and self.quality != DEFAULT_QUALITY:
+        self._check_stream()
+        if self.encoding != "jpeg" and self.quality != DEFAULT_QUALITY:
             object.__setattr__(self, "quality", DEFAULT_QUALITY)  # it means nothing: equal requests stay equal
         if self.part == (0, 1):
             object.__setattr__(self, "part", None)
 
+    def _check_stream(self) -> None:
+        if self.encoding != "h264":
+            if self.kbit_s is not None or self.subscriber:
+                raise UsageError(f'kbit_s and subscriber are of encoding="h264", and the encoding is {self.encoding!r}')
+            return
+        if self.part is not None:
+            raise UsageError('part is not possible with encoding="h264": each of its frames builds on the one before')
+        if self.kbit_s is not None and not (_is_whole(self.kbit_s) and MIN_KBIT_S <= self.kbit_s <= MAX_KBIT_S):
+            raise UsageError(
+                f"kbit_s is {self.kbit_s!r} and must be a whole number of kilobits a second "
+                f"from {MIN_KBIT_S} to {MAX_KBIT_S}"
+            )
+        if self.subscriber and not re.fullmatch(rf"[A-Za-z0-9_-]{{1,{MAX_SUBSCRIBER}}}", self.subscriber):
+            raise UsageError(
+                f"subscriber is {self.subscriber[:64]!r} and must have 1 to {MAX_SUBSCRIBER} letters, digits, _ and -"
+            )
+
     @property
     def variant(self) -> str:
         """What follows the ``?`` of the topic; empty if the frames are to come as they are."""
+        return self._variant("" if self.encoding == "raw" else self.encoding)
+
+    def _variant(self, encoding: str) -> str:
         values = {
-            "encoding": "" if self.encoding == "raw" else self.encoding,
+            "encoding": encoding,
+            "kbit_s": "" if self.kbit_s is None else str(self.kbit_s),
             "max_fps": "" if self.max_fps is None else f"{self.max_fps:g}",
             "part": "" if self.part is None else f"{self.part[0]}/{self.part[1]}",
-            "quality": "" if self.encoding == "raw" else str(self.quality),
+            "quality": str(self.quality) if self.encoding == "jpeg" else "",
             "scale": "" if self.scale == 1.0 else f"{self.scale:g}",
+            "subscriber": self.subscriber,
         }
         return "&".join(f"{field}={quote(values[field], safe='')}" for field in _FIELDS if values[field])
 
@@ -72,6 +105,15 @@ class VideoRequest:
         """The topic to subscribe to, e.g. ``video/front?encoding=jpeg&quality=80``."""
         variant = self.variant
         return f"{_PREFIX}{self.camera}" + (f"?{variant}" if variant else "")
+
+    @property
+    def stream_topic(self) -> str:
+        """The topic on which such H.264 comes as it is encoded, e.g. ``stream/front?kbit_s=500``.
+
+        Without options it is what the vehicle itself encoded.
+        """
+        variant = self._variant("")
+        return f"{_STREAM_PREFIX}{self.camera}" + (f"?{variant}" if variant else "")
 
     @property
     def plain(self) -> VideoRequest:
@@ -85,10 +127,11 @@ class VideoRequest:
         Raises:
             UsageError: It is not a topic of a camera's frames.
         """
-        camera, _, variant = topic.removeprefix(_PREFIX).partition("?")
-        if not topic.startswith(_PREFIX) or not camera:
+        prefix = _STREAM_PREFIX if topic.startswith(_STREAM_PREFIX) else _PREFIX
+        camera, _, variant = topic.removeprefix(prefix).partition("?")
+        if not topic.startswith(prefix) or not camera:
             raise UsageError(f"{topic[:100]!r} is no topic of a camera's frames: it looks like video/front")
-        request = cls(camera)
+        request = cls(camera, encoding="h264") if prefix == _STREAM_PREFIX else cls(camera)
         try:
             for field, text in parse_qsl(variant, keep_blank_values=True, strict_parsing=bool(variant)):
                 request = _with(request, field, unquote(text))
@@ -124,10 +167,12 @@ class FrameFilter:
 
 def _with(request: VideoRequest, field: str, text: str) -> VideoRequest:
     """The request with one more field, given as text. Raises ``ValueError``."""
-    if field == "encoding" and text in ("raw", "jpeg"):
-        return replace(request, encoding="raw" if text == "raw" else "jpeg")
-    if field == "quality":
-        return replace(request, quality=int(text))
+    if field == "encoding" and text in _ENCODINGS and request.encoding != "h264":
+        return replace(request, encoding=text)  # type: ignore[arg-type]
+    if field in ("quality", "kbit_s"):
+        return replace(request, **{field: int(text)})  # type: ignore[arg-type]
+    if field == "subscriber":
+        return replace(request, subscriber=text)
     if field in ("max_fps", "scale"):
         return replace(request, **{field: float(text)})  # type: ignore[arg-type]
     if field == "part":

@@ -2,31 +2,29 @@
 
 from __future__ import annotations
 
-import threading
 from typing import Final
 
 import msgspec
 
-from skyloop.clock import Clock, nanoseconds
+from skyloop.clock import Clock
 from skyloop.errors import UsageError
 from skyloop.messages import Feedback, FeedbackRequest, encode
 from skyloop.messages.feedback_request import TOPIC
 from skyloop.messages.rate import RateLimiter
 from skyloop.proxy.events import Counters
+from skyloop.proxy.forms import Forms
 from skyloop.transport.base import TransportServer
 
 MAX_VARIANTS: Final = 16  #: forms at a time, however many subscribers each has
-#: A form that was asked for and has no subscriber keeps its place for so long: its subscription may be under way.
-KEEP_NS: Final = nanoseconds(5.0)
 PREFIX: Final = f"{TOPIC}?"  #: how the topic of each form begins
 
 
 class _Variant:
     """One form of feedback."""
 
-    def __init__(self, request: FeedbackRequest) -> None:
+    def __init__(self, topic: str, request: FeedbackRequest) -> None:
         self.request = request
-        self.topic = request.topic
+        self.topic = topic
         self.rate = RateLimiter(request.max_hz)
         self.asked_ns = 0
         self.last_seq = 0
@@ -39,9 +37,12 @@ class FeedbackVariants:
         self._publish = server.publish
         self._subscribers = server.subscribers
         self._counts = counters.counts
-        self._clock = clock
-        self._lock = threading.Lock()  # guards changes of what follows
-        self.known: tuple[_Variant, ...] = ()
+        self._forms: Forms[_Variant] = Forms(MAX_VARIANTS, server.subscribers, clock)
+
+    @property
+    def known(self) -> tuple[_Variant, ...]:
+        """The forms."""
+        return self._forms.known
 
     def problem(self, topic: str) -> str:
         """Return why a form can't be subscribed to; empty if it can, and then it has a place here. Any thread.
@@ -53,22 +54,12 @@ class FeedbackVariants:
             request = FeedbackRequest.parse(topic)
         except UsageError as error:
             return str(error)
-        now_ns = self._clock()
-        with self._lock:
-            for variant in self.known:
-                if variant.topic == topic:
-                    variant.asked_ns = now_ns
-                    return ""
-            kept = [one for one in self.known if now_ns - one.asked_ns < KEEP_NS or self._subscribers(one.topic)]
-            if len(kept) >= MAX_VARIANTS:
-                return (
-                    f"this proxy sends feedback in {MAX_VARIANTS} forms at most at a time, and all are in use: "
-                    f"subscribe to {TOPIC}, or to one of {', '.join(one.topic for one in kept[:4])} …"
-                )
-            variant = _Variant(request)
-            variant.asked_ns = now_ns
-            self.known = (*kept, variant)
-        return ""
+        if self._forms.claim(topic, lambda: _Variant(topic, request)):
+            return ""
+        return (
+            f"this proxy sends feedback in {MAX_VARIANTS} forms at most at a time, and all are in use: "
+            f"subscribe to {TOPIC}, or to one of {', '.join(one.topic for one in self.known[:4])} …"
+        )
 
     def publish(self, sample: Feedback, now_ns: int) -> None:
         """Publish a sample in each form in which it is due. One thread at a time.
@@ -77,7 +68,7 @@ class FeedbackVariants:
             sample: As it is published to those who get all.
             now_ns: The present time; not that of capture, which stands still while the vehicle is silent.
         """
-        for variant in self.known:
+        for variant in self._forms.known:
             if not self._subscribers(variant.topic) or not variant.rate.in_time(now_ns):
                 continue
             skipped = sample.seq - variant.last_seq - 1 if variant.last_seq else 0

@@ -47,6 +47,7 @@ from skyloop.messages import (
     SetParameter,
     Severity,
     Statistics,
+    StreamReport,
     Value,
     VehicleOverview,
     VehiclePose,
@@ -256,6 +257,7 @@ class Proxy:
         try:
             self.driver.close()
         finally:
+            self.publisher.streams.end()
             self.server.stop()
             self._close_records()
 
@@ -324,6 +326,8 @@ class Proxy:
             self._refuse_malformed(session, self.workers.relay(session, sample, now_ns), now_ns)
         elif isinstance(sample, VehiclePose):
             self._relay.pose(session, sample)
+        elif isinstance(sample, StreamReport):
+            self._refuse_malformed(session, self.publisher.streams.report(sample), now_ns)
         else:
             self._malformed(session, f"{kind.__name__} is for the proxy to send", now_ns)
 

@@ -39,6 +39,7 @@ from skyloop.messages.result import PROCESSOR_NAME
 from skyloop.proxy.core.events import EventDraft
 from skyloop.proxy.events import Counters, EventPublisher
 from skyloop.proxy.feedback_variants import PREFIX, FeedbackVariants
+from skyloop.proxy.streams import Streams
 from skyloop.transport.base import (
     ANNOTATIONS,
     COMMANDS,
@@ -104,6 +105,7 @@ class VehiclePublisher:
         self.link_breaks = 0  #: how often the link went from up to not, or came back
         self.state_of = state_of
         self.variants = FeedbackVariants(server, counters, clock)
+        self.streams = Streams(server, counters, clock, lambda why: self._fail("stream", why))
         self._on_link_up = on_link_up
         self._owner: dict[str, Any] = {}
         self._publish = server.publish
@@ -248,6 +250,8 @@ class VehiclePublisher:
         self._counts[f"frames.{camera}.published"] += 1
         if missed:
             self._counts[f"frames.{camera}.missed"] += missed
+        if self.streams.known:
+            self.streams.frame(header, pixels)
 
     def cameras(self) -> Collection[str]:
         """The names of those that the vehicle has, and of any that gave a frame all the same. Any thread."""
@@ -255,14 +259,21 @@ class VehiclePublisher:
 
     def topic_problem(self, topic: str) -> str:
         """Return why nobody can subscribe to a topic; empty if it exists. Any thread."""
-        return self.variants.problem(topic) if topic.startswith(PREFIX) else topic_problem(topic, self.cameras)
+        if topic.startswith(PREFIX):
+            return self.variants.problem(topic)
+        problem = topic_problem(topic, self.cameras)
+        if problem or not topic.startswith(_STREAM_TOPIC) or "?" not in topic:
+            return problem
+        request = VideoRequest.parse(topic)
+        info = self._cameras.get(request.camera) or CameraInfo(request.camera, 640, 480, 0.0)
+        return self.streams.problem(topic, request, info)
 
     def wants(self, camera: str) -> bool:
         """Whether anybody looks at this camera now."""
         topic = self._topics.get(camera)
         if topic is None:
             topic = self._topics[camera] = video(camera)
-        return self._subscribers(topic) > 0
+        return self._subscribers(topic) > 0 or (bool(self.streams.known) and self.streams.wanted(camera))
 
     def stream(
         self,
@@ -286,17 +297,11 @@ class VehiclePublisher:
             return
         if intrinsics is None:
             intrinsics = self._nominal_intrinsics(camera, width, height)
-        now_ns = self._clock()
-        sample = EncodedFrame(camera, seq, captured_ns, now_ns, width, height, H264, key, data, intrinsics)
+        sample = EncodedFrame(camera, seq, captured_ns, self._clock(), width, height, H264, key, data, intrinsics)
         try:
-            packet = encode(sample)
+            self.streams.publish(sample)
         except (ValueError, TypeError, OverflowError) as error:
             self._fail("stream", f"an encoded frame of {camera} can't be published: {error}")
-            return
-        missed = self._publish(stream(camera), packet)
-        self._counts[f"streams.{camera}.published"] += 1
-        if missed:
-            self._counts[f"streams.{camera}.missed"] += missed
 
     def wants_stream(self, camera: str) -> bool:
         """Whether anybody takes this camera's pictures as they come."""
@@ -370,9 +375,7 @@ def topic_problem(topic: str, cameras: Callable[[], Collection[str]]) -> str:
         name = topic.removeprefix(_RESULTS_TOPIC)
         known = re.fullmatch(PROCESSOR_NAME, name)
         return "" if known else f"{name[:64]!r} is no name of a processor: it has 1 to 64 letters, digits and _ . -"
-    if topic.startswith(_STREAM_TOPIC):
-        return camera_problem(topic.removeprefix(_STREAM_TOPIC), cameras)
-    if topic.startswith(_VIDEO_TOPIC):
+    if topic.startswith((_STREAM_TOPIC, _VIDEO_TOPIC)):
         try:
             return camera_problem(VideoRequest.parse(topic).camera, cameras)
         except UsageError as error:

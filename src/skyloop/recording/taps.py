@@ -193,7 +193,7 @@ class Stream:
         self.newest_ns = 0  #: arrival of the newest decodable frame, or the start
         self._put = put
         self._channel = f"{VIDEO}.{camera}"
-        self._topic = drone._core.channel(camera).stream
+        self._topic = drone._core.stream(camera)
         self._chain = Chain()
         self._begun = False
         self._sink = self._arrived

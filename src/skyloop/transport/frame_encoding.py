@@ -59,7 +59,20 @@ def scaled_header(header: FrameHeader, scale: float) -> FrameHeader:
     Returns:
         The header; ``size`` is that of plain pixels.
     """
-    width, height = max(1, round(header.width * scale)), max(1, round(header.height * scale))
+    return resized_header(header, max(1, round(header.width * scale)), max(1, round(header.height * scale)))
+
+
+def resized_header(header: FrameHeader, width: int, height: int) -> FrameHeader:
+    """Return the header of a frame that is made smaller, with intrinsics that fit.
+
+    Args:
+        header: The frame's header.
+        width: The new one [px].
+        height: The new one [px].
+
+    Returns:
+        The header; ``size`` is that of plain pixels.
+    """
     x, y = width / header.width, height / header.height
     lens = header.intrinsics
     if lens is not None:

@@ -194,6 +194,8 @@ class FramePublisher:
             request = VideoRequest.parse(topic)
         except UsageError as error:
             return str(error)
+        if request.encoding == "h264":
+            return f"H.264 comes on a topic of its own: subscribe to {request.stream_topic}"
         usual = (request.plain, VideoRequest(request.camera, encoding="jpeg"))
         variants = self._variants.get(request.camera, {})
         if request in usual or (topic in variants and key in variants[topic].readers):

@@ -7,7 +7,7 @@ from collections.abc import Callable, Hashable
 from typing import TYPE_CHECKING, Final
 
 from skyloop.messages import FrameHeader, encode
-from skyloop.transport.base import FEEDBACK, MAX_SUBSCRIPTIONS, Pixels, results, too_many_topics, video
+from skyloop.transport.base import FEEDBACK, MAX_SUBSCRIPTIONS, Pixels, results, stream, too_many_topics, video
 from skyloop.transport.fabric import layout, packets
 from skyloop.transport.fabric.connection import ServerConnection
 from skyloop.transport.fabric.frames import FramePublisher, Variant
@@ -18,9 +18,10 @@ if TYPE_CHECKING:
     import zenoh
 
 _VIDEO: Final = video("")
+_STREAMS: Final = stream("")
 _RESULTS: Final = results("")
 #: How topics begin that applications name: nothing is kept for them once they have no subscriber.
-_NAMED: Final = (_RESULTS, f"{FEEDBACK}?")
+_NAMED: Final = (_RESULTS, _STREAMS, f"{FEEDBACK}?")
 
 
 class Publisher:
@@ -157,10 +158,11 @@ class Publisher:
     def _declare(self, session: Session, topic: str) -> zenoh.Publisher:
         z = load()
         newest_wins = topic.partition("?")[0] == FEEDBACK  # in whichever form
+        usual = z.Priority.DATA_LOW if topic.startswith(_STREAMS) else z.Priority.DATA  # as for frames
         return session.zenoh.declare_publisher(
             layout.topic(self._name, topic),
             congestion_control=z.CongestionControl.DROP,
-            priority=z.Priority.REAL_TIME if newest_wins else z.Priority.DATA,
+            priority=z.Priority.REAL_TIME if newest_wins else usual,
             reliability=z.Reliability.BEST_EFFORT if newest_wins else z.Reliability.RELIABLE,
             express=True,
         )

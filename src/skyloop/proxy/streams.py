@@ -1,0 +1,314 @@
+"""H.264 of cameras as subscribers asked for it: each form is encoded once, on a thread of its own, however many watch.
+
+A form of a rate is one for all who ask for it. A form with a subscriber's name is for that one alone, and its rate and
+size follow what the path to it carries, by what it acknowledges (:mod:`skyloop.proxy.core.stream_rate`).
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from skyloop.clock import Clock, nanoseconds
+from skyloop.errors import MissingExtraError, UsageError
+from skyloop.messages import CameraInfo, EncodedFrame, Encoding, FrameHeader, StreamReport, VideoRequest, encode
+from skyloop.messages.encoded import H264, MAX_ENCODED, split
+from skyloop.messages.image_header import why_not_decoded
+from skyloop.messages.rate import RateLimiter
+from skyloop.messages.video import MAX_KBIT_S
+from skyloop.proxy.core.stream_rate import StreamRate, picture_form
+from skyloop.proxy.events import Counters
+from skyloop.proxy.forms import Forms
+from skyloop.pyav import H264Encoder, require_pyav
+from skyloop.transport.base import TransportServer
+from skyloop.transport.frame_encoding import resized_header
+
+MAX_FORMS: Final = 16  #: at a time, of all cameras: each costs its own encoding
+KEY_NS: Final = nanoseconds(0.3)  #: key pictures that are asked for have at least so much time between them
+IDLE_S: Final = 1.0  #: a form without a subscriber for so long ends its thread
+GOOD_BITS: Final = 0.2  #: for a pixel of a picture: more is not worth its bytes
+_FORMATS: Final = {Encoding.BGR8: "bgr24", Encoding.RGB8: "rgb24", Encoding.MONO8: "gray"}
+_CHANNELS: Final = {Encoding.BGR8: 3, Encoding.RGB8: 3, Encoding.MONO8: 1}
+_FPS: Final = 30.0  # of a camera that doesn't say
+_BETTER_NS: Final = nanoseconds(3.0)  # a larger picture only after so long: each change costs a key picture
+
+
+@dataclass(frozen=True, slots=True)
+class _Picture:
+    header: FrameHeader
+    pixels: NDArray[np.uint8]
+
+
+class StreamForm:
+    """One form of one camera's H.264.
+
+    Args:
+        topic: That it is published on.
+        request: What was asked for.
+        camera: The camera.
+        publish: Publishes a picture; called on the form's thread.
+        fail: Called with the reason when nothing can be encoded.
+        clock: The proxy's clock [ns].
+    """
+
+    def __init__(
+        self,
+        topic: str,
+        request: VideoRequest,
+        camera: CameraInfo,
+        publish: Callable[[EncodedFrame], None],
+        fail: Callable[[str], None],
+        clock: Clock,
+    ) -> None:
+        self.topic = topic
+        self.request = request
+        self.asked_ns = 0
+        self.skipped = 0  #: pictures that were not encoded: the path, or the encoder, had no room
+        self._fps = camera.fps if camera.fps > 0.0 else _FPS
+        if request.max_fps is not None:
+            self._fps = min(self._fps, request.max_fps)
+        self._publish = publish
+        self._fail = fail
+        self._clock = clock
+        good = round(camera.width * camera.height * request.scale**2 * self._fps * GOOD_BITS / 1000)
+        self._kbit_s = request.kbit_s or min(max(good, 100), MAX_KBIT_S)
+        self._rate = StreamRate(self._kbit_s, clock()) if request.subscriber else None
+        self._limiter = RateLimiter(request.max_fps)
+        self._scale, self._better_ns = request.scale, clock()
+        self._changed = threading.Condition()  # guards all of the following, and the rate
+        self._newest: _Picture | None = None
+        self._subscribers = 0
+        self._wants_key = True
+        self._key_ns = -KEY_NS
+        self._thread: threading.Thread | None = None
+        self._ended = False
+        self._encoder: H264Encoder | None = None
+        self._seq = clock() // 1_000_000  # a form that is made anew goes on with higher numbers
+
+    def wants(self, header: FrameHeader, subscribers: int) -> bool:
+        """Return whether a frame is to be encoded. On the thread that publishes it; call it once for each.
+
+        Args:
+            header: The frame's.
+            subscribers: How many the form has now.
+        """
+        with self._changed:
+            self._wants_key = self._wants_key or subscribers > self._subscribers
+            self._subscribers = subscribers
+            if not subscribers:
+                return False
+            if self._rate is not None and not self._rate.may_send(self._clock()):
+                self.skipped += 1
+                return False
+            return self._limiter.in_time(header.captured_ns)
+
+    def put(self, header: FrameHeader, pixels: NDArray[np.uint8]) -> None:
+        """Have a frame encoded, in place of one that still waits.
+
+        Args:
+            header: The frame's.
+            pixels: Its bytes, which stay as they are.
+        """
+        with self._changed:
+            if self._ended:
+                return
+            self.skipped += self._newest is not None
+            self._newest = _Picture(header, pixels)
+            if self._thread is None:
+                name = f"skyloop-h264-{self.request.camera}"
+                self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+                self._thread.start()
+            self._changed.notify()
+
+    def report(self, report: StreamReport, now_ns: int) -> None:
+        """Take in what a subscriber says: what it has, and whether it needs a key picture."""
+        with self._changed:
+            self._wants_key = self._wants_key or report.wants_key
+            if self._rate is not None and report.seq <= self._seq:
+                self._rate.acknowledged(report.seq, now_ns)
+
+    def end(self) -> None:
+        """End the thread, and wait for the picture that it is at."""
+        with self._changed:
+            self._ended = True
+            self._changed.notify()
+            thread = self._thread
+        if thread is not None:
+            thread.join()
+
+    def _run(self) -> None:
+        while (picture := self._next()) is not None:
+            try:
+                self._encode(picture)
+            except Exception as error:  # noqa: BLE001  (one picture less; the next may be better)
+                self._encoder = None
+                self._fail(f"{self.topic}: a picture of {self.request.camera} can't be encoded: {error}")
+            del picture
+
+    def _next(self) -> _Picture | None:
+        with self._changed:
+            if not self._changed.wait_for(lambda: self._newest is not None or self._ended, IDLE_S) or self._ended:
+                self._thread = None
+                self._encoder = None
+                self._wants_key = True
+                return None
+            picture, self._newest = self._newest, None
+            return picture
+
+    def _encode(self, picture: _Picture) -> None:
+        kbit_s = self._follow_path(picture.header)
+        header = resized_header(picture.header, *_even(picture.header, self._scale))
+        encoder = self._encoder
+        if encoder is None or (encoder.width, encoder.height) != (header.width, header.height):
+            encoder = self._encoder = H264Encoder(header.width, header.height, self._fps, kbit_s)
+        elif abs(kbit_s - encoder.kbit_s) > 0.02 * encoder.kbit_s:
+            encoder.set_rate(kbit_s)
+        now_ns = self._clock()
+        with self._changed:
+            key = self._wants_key and now_ns - self._key_ns >= KEY_NS
+        data, is_key = encoder.encode(*_image(picture), header.captured_ns, key=key)
+        if not data:
+            return
+        if len(data) > MAX_ENCODED:
+            raise UsageError(f"it has {len(data)} bytes, at most {MAX_ENCODED} are sent")
+        with self._changed:
+            self._seq += 1
+            if is_key:
+                self._wants_key, self._key_ns = False, now_ns
+            if self._rate is not None:
+                self._rate.sent(self._seq, len(data), self._clock())
+        size = (header.width, header.height)
+        times = (header.captured_ns, header.published_ns)
+        self._publish(
+            EncodedFrame(header.camera, self._seq, *times, *size, H264, is_key, data, header.intrinsics, self.topic)
+        )
+
+    def _follow_path(self, header: FrameHeader) -> int:
+        """Choose the rate, and by it the size and how many pictures a second; return the rate [kbit/s]."""
+        if self._rate is None:
+            return self._kbit_s
+        now_ns = self._clock()
+        with self._changed:
+            kbit_s = round(self._rate.kbit_s)
+            pixels_1_s = header.width * header.height * self._fps * self.request.scale**2
+            scale, share = picture_form(kbit_s, pixels_1_s)
+            scale *= self.request.scale
+            if scale < self._scale or now_ns - self._better_ns > _BETTER_NS:
+                self._scale, self._better_ns = scale, now_ns
+            elif scale == self._scale:
+                self._better_ns = now_ns
+            if share < 1.0 or self.request.max_fps is not None:
+                self._limiter.period_ns = nanoseconds(1.0 / (self._fps * share))
+            else:
+                self._limiter.period_ns = 0
+        return kbit_s
+
+
+class Streams:
+    """All forms of a vehicle's cameras.
+
+    Args:
+        server: Where they are published.
+        counters: The proxy's.
+        clock: The proxy's clock [ns].
+        fail: Called with what went wrong, for people.
+    """
+
+    def __init__(self, server: TransportServer, counters: Counters, clock: Clock, fail: Callable[[str], None]) -> None:
+        self._publish_packet = server.publish
+        self._subscribers = server.subscribers
+        self._counts = counters.counts
+        self._clock = clock
+        self._fail = fail
+        self._forms: Forms[StreamForm] = Forms(MAX_FORMS, server.subscribers, clock)
+
+    @property
+    def known(self) -> tuple[StreamForm, ...]:
+        """The forms that have, or may soon have, subscribers."""
+        return self._forms.known
+
+    def problem(self, topic: str, request: VideoRequest, camera: CameraInfo) -> str:
+        """Return why a form can't be subscribed to; empty if it can, and then it has a place here. Any thread."""
+        if request.kbit_s is None and not request.subscriber:
+            return (
+                f"{topic[:100]!r} says nothing of a rate: add kbit_s=…, or subscriber=NAME for what the path to one "
+                "subscriber carries"
+            )
+        try:
+            require_pyav("encoding H.264")
+        except MissingExtraError as error:
+            return str(error)
+        if self._forms.claim(topic, lambda: StreamForm(topic, request, camera, self.publish, self._fail, self._clock)):
+            return ""
+        return (
+            f"this proxy encodes video in {MAX_FORMS} forms at most at a time, and all are in use: subscribe to one of "
+            f"{', '.join(form.topic for form in self.known if not form.request.subscriber) or 'its frames as JPEG'}"
+        )
+
+    def wanted(self, camera: str) -> bool:
+        """Whether anybody watches an encoded form of this camera."""
+        return any(form.request.camera == camera and self._subscribers(form.topic) for form in self._forms.known)
+
+    def frame(self, header: FrameHeader, pixels: NDArray[np.uint8]) -> None:
+        """Have a frame encoded in the forms that want it. It is copied once if any does."""
+        camera = header.camera
+        wanted = [
+            form
+            for form in self._forms.known
+            if form.request.camera == camera and form.wants(header, self._subscribers(form.topic))
+        ]
+        if not wanted:
+            return
+        copy = np.frombuffer(pixels.tobytes(), np.uint8)
+        for form in wanted:
+            form.put(header, copy)
+
+    def report(self, report: StreamReport) -> str:
+        """Take in a subscriber's report; return why it makes no sense, empty if it does."""
+        form = self._forms.find(report.topic)
+        if form is not None:
+            form.report(report, self._clock())
+            return ""
+        return "" if report.topic.startswith("stream/") else f"a report of {report.topic[:64]!r}, which is no stream"
+
+    def publish(self, picture: EncodedFrame) -> None:
+        """Publish a picture in as many packets as it needs. Any thread."""
+        camera, missed = picture.camera, 0
+        for piece in split(picture):
+            missed = max(missed, self._publish_packet(picture.topic or f"stream/{camera}", encode(piece)))
+        self._counts[f"streams.{camera}.published"] += 1
+        if missed:
+            self._counts[f"streams.{camera}.missed"] += missed
+
+    def end(self) -> None:
+        """End all threads."""
+        for form in self._forms.known:
+            form.end()
+
+
+def _even(header: FrameHeader, scale: float) -> tuple[int, int]:
+    """Return the size of the encoded picture [px]: colours have half the resolution, so both are even."""
+    return max(2, round(header.width * scale / 2) * 2), max(2, round(header.height * scale / 2) * 2)
+
+
+def _image(picture: _Picture) -> tuple[NDArray[np.uint8], str]:
+    """Return a frame's image and FFmpeg's name of its format."""
+    header, pixels = picture.header, picture.pixels
+    channels = _CHANNELS.get(header.encoding)
+    if channels is not None:
+        shape = (header.height, header.width, 3) if channels == 3 else (header.height, header.width)
+        return pixels.reshape(shape), _FORMATS[header.encoding]
+    why_not = why_not_decoded(pixels.data)
+    if why_not:
+        raise UsageError(why_not)
+    import cv2
+
+    image: Any = cv2.imdecode(pixels, cv2.IMREAD_COLOR)
+    if image is None:
+        raise UsageError("it is a damaged JPEG")
+    return image, "bgr24"

@@ -1,0 +1,133 @@
+"""The rate of a stream that follows its path, on paths that are simulated."""
+
+from __future__ import annotations
+
+import random
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from skyloop.proxy.core.stream_rate import LEAST_KBIT_S, LOST_S, StreamRate, picture_form
+
+MS = 1_000_000
+PERIOD_MS = 33
+
+
+@dataclass
+class Run:
+    """A stream over a path whose capacity changes, a millisecond a step."""
+
+    capacity_kbit_s: Callable[[int], float]  #: at a time [ms]
+    loss: float = 0.0
+    most_kbit_s: int = 3000
+    one_way_ms: int = 20
+    ages_ms: list[tuple[int, int]] = field(default_factory=list)  #: when captured, and how old on arrival
+    rates: list[float] = field(default_factory=list)  #: each 100 ms
+
+    def go(self, length_ms: int, seed: int = 0) -> Run:
+        rng, rate = random.Random(seed), StreamRate(self.most_kbit_s, 0)
+        queue: deque[list[float]] = deque()  # bytes left, number, captured
+        arriving: deque[tuple[int, int]] = deque()
+        seq, budget = 0, 0.0
+        for ms in range(length_ms):
+            while arriving and arriving[0][0] <= ms:
+                rate.acknowledged(arriving.popleft()[1], ms * MS)
+            if ms % PERIOD_MS == 0 and rate.may_send(ms * MS):
+                seq += 1
+                size = int(rate.kbit_s * 125 * PERIOD_MS / 1000 * rng.lognormvariate(0.0, 0.3)) + 40
+                rate.sent(seq, size, ms * MS)
+                queue.append([size, seq, ms])
+            budget = min(budget + self.capacity_kbit_s(ms) / 8, 3000.0)
+            while queue and budget > 0:
+                used = min(budget, queue[0][0])
+                budget -= used
+                queue[0][0] -= used
+                if queue[0][0] <= 0:
+                    _, number, captured = queue.popleft()
+                    if rng.random() >= self.loss:
+                        self.ages_ms.append((int(captured), ms + self.one_way_ms - int(captured)))
+                        arriving.append((ms + 2 * self.one_way_ms, int(number)))
+            if ms % 100 == 0:
+                self.rates.append(rate.kbit_s)
+        return self
+
+    def age_ms(self, share: float, since_ms: int = 0) -> int:
+        ages = sorted(age for captured, age in self.ages_ms if captured >= since_ms)
+        return ages[int(share * (len(ages) - 1))]
+
+
+@pytest.mark.parametrize("kbit_s", [300, 1000, 2500])
+def test_a_steady_path_is_used_and_not_filled(kbit_s: int) -> None:
+    run = Run(lambda _: kbit_s).go(30_000)
+    later = run.rates[150:]
+    assert 0.5 * kbit_s <= sum(later) / len(later) <= kbit_s
+    assert run.age_ms(0.95, since_ms=5000) <= 150
+    assert len(run.ages_ms) > 0.7 * 30_000 / PERIOD_MS
+
+
+def test_a_wide_path_takes_the_most() -> None:
+    assert Run(lambda _: 50_000).go(15_000).rates[-1] == 3000
+
+
+def test_after_a_fall_of_the_capacity_delay_comes_first_and_the_rate_comes_back() -> None:
+    run = Run(lambda ms: 400 if 10_000 <= ms < 20_000 else 2500).go(40_000)
+    ages = [age for captured, age in run.ages_ms if captured >= 10_000]
+    assert max(ages) < 1000  # two pictures of before the fall
+    assert sum(age > 250 for age in ages) <= 4
+    assert run.rates[199] < 450
+    assert run.rates[-1] > 1200
+
+
+def test_while_nothing_passes_little_is_sent_and_soon_after_it_goes_on() -> None:
+    run = Run(lambda ms: 0 if 10_000 <= ms < 15_000 else 1500).go(20_000)
+    stuck = [captured for captured, _ in run.ages_ms if 10_000 <= captured < 15_000]
+    assert len(stuck) <= 25
+    assert any(15_000 <= captured < 15_300 for captured, _ in run.ages_ms)
+    assert run.age_ms(1.0, since_ms=15_500) < 200
+
+
+@pytest.mark.parametrize("loss", [0.02, 0.1])
+def test_loss_does_not_end_the_stream(loss: float) -> None:
+    run = Run(lambda _: 1000, loss=loss).go(20_000)
+    assert len(run.ages_ms) > 0.5 * 20_000 / PERIOD_MS
+    assert min(run.rates) >= LEAST_KBIT_S
+
+
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(("send", "ack", "wait")), st.integers(0, 60), st.integers(0, 5000)), max_size=200
+    )
+)
+def test_whatever_is_acknowledged_the_rate_stays_in_its_range_and_sending_goes_on(
+    events: list[tuple[str, int, int]],
+) -> None:
+    rate, now_ns, seq = StreamRate(2000, 0), 0, 0
+    for what, number, size in events:
+        now_ns += number * MS
+        if what == "send" and rate.may_send(now_ns):
+            seq += 1
+            rate.sent(seq, size, now_ns)
+        elif what == "ack":
+            rate.acknowledged(max(0, seq - number), now_ns)
+        assert LEAST_KBIT_S <= rate.kbit_s <= 2000
+    assert rate.may_send(now_ns + round(2 * LOST_S * 1e9))
+
+
+def test_what_was_never_sent_changes_nothing() -> None:
+    rate = StreamRate(2000, 0)
+    rate.acknowledged(7, MS)
+    rate.sent(1, 1000, 2 * MS)
+    rate.acknowledged(0, 3 * MS)
+    assert (rate.kbit_s, rate.lost, rate.wait_s) == (300, 0, 0.0)
+
+
+def test_the_size_of_pictures_follows_the_rate() -> None:
+    vga = 640 * 480 * 30
+    assert picture_form(2000, vga) == (1.0, 1.0)
+    scales = [picture_form(kbit_s, vga) for kbit_s in (2000, 400, 200, 70, 60)]
+    assert scales == sorted(scales, reverse=True)
+    assert picture_form(1, vga) == (0.25, 0.5)
