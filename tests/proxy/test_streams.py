@@ -1,0 +1,308 @@
+"""The proxy's encoded video, with a vehicle and a clock that a test moves."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from skyloop.errors import MissingExtraError, UsageError
+from skyloop.messages import (
+    CameraInfo,
+    EncodedFrame,
+    Encoding,
+    EventKind,
+    FrameHeader,
+    Intrinsics,
+    Role,
+    StreamReport,
+    VideoRequest,
+    encode,
+)
+from skyloop.proxy import streams
+from skyloop.proxy.streams import KEY_NS, StreamForm
+from skyloop.pyav import H264Encoder
+from tests.proxy.fake import WAIT_S, App, Bench
+
+av = pytest.importorskip("av", reason="H.264 needs the extra 'video'")
+TOPIC = "stream/front?kbit_s=300"
+MINE = "stream/front?subscriber=me"
+CAMERA = CameraInfo("front", 64, 48, 30.0)
+LENS = Intrinsics(60.0, 60.0, 31.5, 23.5)
+
+
+def shoot(bench: Bench, value: int = 90, size: tuple[int, int] = (64, 48), **fields: Any) -> None:
+    """Let the vehicle give a picture, a thirtieth of a second after the last."""
+    bench.clock.advance(0.033)
+    width, height = size
+    pixels = np.full((height, width, 3), value, np.uint8)
+    assert bench.driver.sink is not None
+    bench.driver.sink.frame("front", pixels, bench.clock(), width=width, height=height, **fields)
+
+
+def watcher(bench: Bench, topic: str = TOPIC, name: str = "watcher") -> App:
+    app = bench.join(name, Role.OBSERVER)
+    app.end.subscribe(topic)
+    app.sync()
+    return app
+
+
+def pictures(app: App) -> list[EncodedFrame]:
+    return [one for one in app.others if isinstance(one, EncodedFrame)]
+
+
+def wait_for(app: App, count: int) -> list[EncodedFrame]:
+    deadline = time.monotonic() + WAIT_S
+    while len(pictures(app)) < count:
+        assert time.monotonic() < deadline, f"{len(pictures(app))} of {count} pictures came"
+        time.sleep(0.002)
+    return pictures(app)
+
+
+def shown(bench: Bench, app: App, count: int, **fields: Any) -> list[EncodedFrame]:
+    """Take so many pictures, each encoded before the next."""
+    for _ in range(count):
+        before = len(pictures(app))
+        shoot(bench, **fields)
+        wait_for(app, before + 1)
+    return pictures(app)[-count:]
+
+
+def image(picture: EncodedFrame) -> np.ndarray:
+    (decoded,) = av.CodecContext.create("h264", "r").decode(av.Packet(picture.data)) or [None]
+    found: np.ndarray = decoded.to_ndarray(format="bgr24")
+    return found
+
+
+def test_a_picture_has_the_stamps_of_its_frame(bench: Bench) -> None:
+    app = watcher(bench)
+    (first, second) = shown(bench, app, 2, intrinsics=LENS)
+    assert (first.key, second.key) == (True, False)
+    assert second.captured_ns == bench.clock()
+    assert second.intrinsics == LENS
+    assert np.allclose(image(first), 90, atol=4)
+
+
+def test_nothing_is_encoded_for_nobody(bench: Bench) -> None:
+    app = watcher(bench)
+    assert bench.proxy.publisher.wants("front")
+    shown(bench, app, 1)
+    app.end.subscribe(TOPIC, False)
+    app.sync()
+    assert not bench.proxy.publisher.wants("front")
+    shoot(bench)
+    app.sync()
+    assert len(pictures(app)) == 1
+
+
+@pytest.mark.parametrize(("encoding", "channels"), [(Encoding.RGB8, 3), (Encoding.MONO8, 1)])
+def test_other_formats_of_pixels(bench: Bench, encoding: Encoding, channels: int) -> None:
+    app = watcher(bench)
+    pixels = np.full((48, 64, channels), 30, np.uint8)
+    pixels[..., 0] = 200  # red, where there are colours
+    assert bench.driver.sink is not None
+    bench.driver.sink.frame("front", pixels, bench.clock(), width=64, height=48, encoding=encoding)
+    (picture,) = wait_for(app, 1)
+    expected = (30, 30, 200) if channels == 3 else (200, 200, 200)
+    assert np.allclose(image(picture).mean(axis=(0, 1)), expected, atol=12)
+
+
+def test_frames_that_come_as_jpeg_are_encoded_and_damaged_ones_reported(bench: Bench) -> None:
+    cv2 = pytest.importorskip("cv2", reason="JPEG needs OpenCV")
+    app = watcher(bench)
+    _, jpeg = cv2.imencode(".jpg", np.full((48, 64, 3), 120, np.uint8))
+    header = {"width": 64, "height": 48, "encoding": Encoding.JPEG}
+    sink = bench.driver.sink
+    assert sink is not None
+    sink.frame("front", jpeg.reshape(-1), bench.clock(), **header)
+    assert np.allclose(image(wait_for(app, 1)[0]), 120, atol=6)
+    sink.frame("front", jpeg.reshape(-1)[:20].copy(), bench.clock(), **header)
+    deadline = time.monotonic() + WAIT_S
+    while not bench.published(EventKind.DRIVER_ERROR):
+        assert time.monotonic() < deadline
+        time.sleep(0.002)
+    assert "can't be encoded" in bench.published(EventKind.DRIVER_ERROR)[0].text
+    assert shown(bench, app, 1)[0].key, "it begins anew"
+
+
+def test_a_camera_that_changes_its_size(bench: Bench) -> None:
+    app = watcher(bench)
+    shown(bench, app, 2)
+    (larger,) = shown(bench, app, 1, size=(80, 61))
+    assert larger.key
+    assert image(larger).shape == (60, 80, 3), "both are even"
+
+
+def test_key_pictures_are_made_when_asked_for_and_not_too_often(bench: Bench) -> None:
+    app = watcher(bench)
+    shown(bench, app, 2)
+    bench.clock.advance(KEY_NS / 1e9)
+
+    def ask(seq: int) -> None:
+        assert app.end.send(encode(StreamReport(TOPIC, seq, wants_key=True)))
+        app.sync()
+
+    ask(1)
+    assert [one.key for one in shown(bench, app, 2)] == [True, False]
+    ask(2)
+    assert not shown(bench, app, 1)[0].key
+    bench.clock.advance(KEY_NS / 1e9)
+    assert shown(bench, app, 1)[0].key
+
+
+def test_reports_of_what_is_no_stream_are_malformed(bench: Bench) -> None:
+    app = watcher(bench)
+    for topic in ("feedback", "stream/front?kbit_s=77"):
+        assert app.end.send(encode(StreamReport(topic, 1)))
+    (event,) = app.told(EventKind.PACKET_MALFORMED)
+    assert "a report of 'feedback'" in event.text
+
+
+def test_a_form_for_one_follows_what_it_acknowledges(bench: Bench) -> None:
+    app = watcher(bench, MINE)
+    (form,) = bench.proxy.publisher.streams.known
+    for _ in range(60):
+        (picture,) = shown(bench, app, 1)
+        assert app.end.send(encode(StreamReport(MINE, picture.seq)))
+        app.sync()
+    assert form._kbit_s >= form._rate.kbit_s > 90  # type: ignore[union-attr]
+    before = len(pictures(app))
+    for _ in range(20):  # nothing is acknowledged
+        shoot(bench)
+        time.sleep(0.002)
+    assert len(pictures(app)) <= before + 8
+    assert form.skipped >= 12
+
+
+def test_a_slow_path_gets_smaller_pictures_and_larger_ones_only_after_a_while(bench: Bench) -> None:
+    app = watcher(bench, MINE)
+    (form,) = bench.proxy.publisher.streams.known
+    rate = form._rate
+    assert rate is not None
+    rate.acknowledged = lambda *_: None  # type: ignore[method-assign]
+    rate.may_send = lambda _: True  # type: ignore[method-assign]
+
+    def sizes(kbit_s: float, count: int = 2) -> list[int]:
+        rate.kbit_s = kbit_s
+        return [one.width for one in shown(bench, app, count, size=(640, 480))]
+
+    assert sizes(3000) == [640, 640]
+    assert sizes(100)[-1] == 320
+    assert sizes(3000)[-1] == 320
+    bench.clock.advance(4.0)
+    assert sizes(3000)[-1] == 640
+
+
+@pytest.fixture
+def form() -> Iterator[tuple[StreamForm, list[EncodedFrame], list[str]]]:
+    came: list[EncodedFrame] = []
+    failed: list[str] = []
+    request = VideoRequest.parse(TOPIC)
+    made = StreamForm(TOPIC, request, CAMERA, came.append, failed.append, time.monotonic_ns)
+    yield made, came, failed
+    made.end()
+
+
+def header(seq: int) -> FrameHeader:
+    return FrameHeader("front", seq, seq * 33_000_000, 0, 64, 48, Encoding.BGR8, 64 * 48 * 3)
+
+
+def test_the_newest_frame_takes_the_place_of_one_that_waits(
+    form: tuple[StreamForm, list[EncodedFrame], list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, came, _ = form
+    busy, begun = threading.Event(), threading.Event()
+    encoding = H264Encoder.encode
+
+    def slowly(self: H264Encoder, *args: Any, **named: Any) -> tuple[bytes, bool]:
+        begun.set()
+        assert busy.wait(WAIT_S)
+        return encoding(self, *args, **named)
+
+    monkeypatch.setattr(H264Encoder, "encode", slowly)
+    pixels = np.zeros(64 * 48 * 3, np.uint8)
+    made.put(header(1), pixels)
+    assert begun.wait(WAIT_S)
+    for seq in (2, 3, 4):
+        made.put(header(seq), pixels)
+    busy.set()
+    deadline = time.monotonic() + WAIT_S
+    while len(came) < 2:
+        assert time.monotonic() < deadline
+        time.sleep(0.002)
+    assert [one.captured_ns // 33_000_000 for one in came] == [1, 4]
+    assert made.skipped == 2
+
+
+def test_an_encoder_that_fails_is_reported_and_made_anew(
+    form: tuple[StreamForm, list[EncodedFrame], list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, came, failed = form
+    told = threading.Event()
+    made._fail = lambda why: (failed.append(why), told.set())  # type: ignore[assignment, func-returns-value]
+    with monkeypatch.context() as broken:
+        broken.setattr(streams, "H264Encoder", lambda *_: (_ for _ in ()).throw(ValueError("no encoder today")))
+        made.put(header(1), np.zeros(64 * 48 * 3, np.uint8))
+        assert told.wait(WAIT_S)
+    assert "no encoder today" in failed[0]
+    made.put(header(2), np.zeros(64 * 48 * 3, np.uint8))
+    deadline = time.monotonic() + WAIT_S
+    while not came:
+        assert time.monotonic() < deadline
+        time.sleep(0.002)
+    assert came[0].key
+
+
+def test_without_pyav_a_form_is_refused_with_what_to_install(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(purpose: str) -> None:
+        raise MissingExtraError(purpose, "video")
+
+    monkeypatch.setattr(streams, "require_pyav", missing)
+    app = watcher(bench)
+    (event,) = app.told(EventKind.PACKET_MALFORMED)
+    assert "pip install" in event.text
+
+
+def test_the_vehicles_own_pictures_come_in_pieces_if_they_are_large(bench: Bench) -> None:
+    app = watcher(bench, "stream/front")
+    sink = bench.driver.sink
+    assert sink is not None
+    data = bytes(range(256)) * 600
+    assert sink.wants_stream("front")
+    sink.stream("front", data, 5, width=4, height=3, key=True)
+    app.sync()
+    parts = pictures(app)
+    assert [(one.piece, one.pieces) for one in parts] == [(0, 3), (1, 3), (2, 3)]
+    assert b"".join(one.data for one in parts) == data
+    assert msgspec.structs.asdict(parts[0]) | {"data": b"", "piece": 0} == msgspec.structs.asdict(parts[2]) | {
+        "data": b"",
+        "piece": 0,
+    }
+
+
+@pytest.mark.parametrize(
+    "topic",
+    [
+        "stream/front?kbit_s=nan",
+        "stream/front?kbit_s=1",
+        "stream/front?subscriber=a/b",
+        "stream/front?encoding=jpeg",
+        "stream/nose?kbit_s=300",
+        "stream/front?part=0/2&kbit_s=300",
+        "video/front?encoding=h264&kbit_s=3000000",
+    ],
+)
+def test_topics_that_make_no_sense_are_malformed(bench: Bench, topic: str) -> None:
+    app = watcher(bench, topic)
+    assert len(app.told(EventKind.PACKET_MALFORMED)) == 1
+    assert bench.proxy.publisher.streams.known == ()
+
+
+def test_a_request_says_what_is_wrong_with_it() -> None:
+    with pytest.raises(UsageError, match="1 to 32 letters"):
+        VideoRequest("front", encoding="h264", subscriber="x" * 33)
