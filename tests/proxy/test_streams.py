@@ -116,7 +116,7 @@ def test_frames_that_come_as_jpeg_are_encoded_and_damaged_ones_reported(bench: B
     cv2 = pytest.importorskip("cv2", reason="JPEG needs OpenCV")
     app = watcher(bench)
     _, jpeg = cv2.imencode(".jpg", np.full((48, 64, 3), 120, np.uint8))
-    header = {"width": 64, "height": 48, "encoding": Encoding.JPEG}
+    header: dict[str, Any] = {"width": 64, "height": 48, "encoding": Encoding.JPEG}
     sink = bench.driver.sink
     assert sink is not None
     sink.frame("front", jpeg.reshape(-1), bench.clock(), **header)
@@ -185,7 +185,7 @@ def test_a_slow_path_gets_smaller_pictures_and_larger_ones_only_after_a_while(be
     rate = form._rate
     assert rate is not None
     rate.acknowledged = lambda *_: None  # type: ignore[method-assign]
-    rate.may_send = lambda _: True  # type: ignore[method-assign]
+    rate.may_send = lambda now_ns: True  # type: ignore[method-assign]  # noqa: ARG005
 
     def sizes(kbit_s: float, count: int = 2) -> list[int]:
         rate.kbit_s = kbit_s
