@@ -185,7 +185,7 @@ def test_a_slow_path_gets_smaller_pictures_and_larger_ones_only_after_a_while(be
     rate = form._rate
     assert rate is not None
     rate.acknowledged = lambda *_: None  # type: ignore[method-assign]
-    rate.may_send = lambda now_ns: True  # type: ignore[method-assign]  # noqa: ARG005
+    rate.may_send = lambda now_ns: True  # type: ignore[method-assign]
 
     def sizes(kbit_s: float, count: int = 2) -> list[int]:
         rate.kbit_s = kbit_s
