@@ -127,7 +127,7 @@ class H264Encoder:
         """Encode one picture; other threads run meanwhile.
 
         Args:
-            pixels: Shape (height, width, 3) or (height, width), dtype uint8, of any size: it is scaled.
+            pixels: Shape (height, width, 3) or (height, width), dtype uint8, C-contiguous, of any size: it is scaled.
             form: FFmpeg's name of the pixels' format: ``bgr24``, ``rgb24`` or ``gray``.
             captured_ns: When it was captured [ns], later than the one before.
             key: Make it a key picture.
@@ -137,7 +137,7 @@ class H264Encoder:
         """
         import av
 
-        picture = av.VideoFrame.from_ndarray(pixels, format=form)
+        picture = av.VideoFrame.from_numpy_buffer(pixels, format=form)  # copies nothing
         picture = picture.reformat(self.width, self.height, "yuv420p", interpolation="AREA")
         picture.pts, picture.time_base = captured_ns // 1000, _TICK
         first, self._fresh = self._fresh, False

@@ -264,7 +264,7 @@ class Streams:
         ]
         if not wanted:
             return
-        copy = np.frombuffer(pixels.tobytes(), np.uint8)
+        copy = pixels.reshape(-1).copy()  # other threads run meanwhile, as they would not with tobytes()
         for form in wanted:
             form.put(header, copy)
 
