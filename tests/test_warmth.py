@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import queue
 import threading
 
 import pytest
 
+from skyloop.spare import LOOK_S
 from skyloop.transport.testing import wait_until
 from skyloop.warmth import Pieces, Warmer
 
@@ -28,13 +30,17 @@ class Pace:
         self._turn.put(None)
 
 
+def always(_now_s: float) -> bool:
+    return True
+
+
 def warm_threads() -> list[str]:
     return [thread.name for thread in threading.enumerate() if thread.name == "skyloop-warm-test"]
 
 
 def test_it_runs_while_somebody_wants_it_as_often_as_the_one_who_wants_it_most() -> None:
     pace, runs = Pace(), list[int]()
-    warmer = Warmer(lambda: [lambda: runs.append(1)], "test", sleep=pace.sleep, clock=lambda: 0.0)
+    warmer = Warmer(lambda: [lambda: runs.append(1)], "test", sleep=pace.sleep, clock=lambda: 0.0, spare=always)
     assert not warmer.active
     assert warm_threads() == []
     warmer.keep("one", 0.005)
@@ -67,7 +73,7 @@ def test_what_it_runs_is_made_once_and_not_before_it_is_wanted() -> None:
         made.append(threading.current_thread().name)
         return (lambda: None,)
 
-    warmer = Warmer(make, "test", sleep=pace.sleep, clock=lambda: 0.0)
+    warmer = Warmer(make, "test", sleep=pace.sleep, clock=lambda: 0.0, spare=always)
     assert made == []
     for _ in range(2):
         warmer.keep("one", 0.005)
@@ -84,15 +90,13 @@ def test_code_that_fails_is_given_up_and_told_once(caplog: pytest.LogCaptureFixt
     def broken() -> None:
         raise RuntimeError("as bad as can be")
 
-    warmer = Warmer(lambda: [broken], "test", sleep=pace.sleep, clock=lambda: 0.0)
+    warmer = Warmer(lambda: [broken], "test", sleep=pace.sleep, clock=lambda: 0.0, spare=always)
     warmer.keep("one", 0.005)
     wait_until(lambda: "is given up" in caplog.text and not warm_threads(), "it was given up")
     assert not warmer.active
     warmer.keep("one", 0.005)  # its drone asks twenty times a second
-    pace.slept.get(timeout=10.0)
-    warmer.keep("one", 0.0)
-    pace.go_on()
-    wait_until(lambda: not warm_threads(), "the thread has ended")
+    assert not warmer.active
+    assert warm_threads() == []
     assert caplog.text.count("is given up") == 1
 
 
@@ -112,10 +116,39 @@ def test_where_the_processor_is_busy_it_runs_ever_more_rarely_and_comes_back() -
             warmer.keep("one", 0.0)
             ended.set()
 
-    warmer = Warmer(lambda: [lambda: None], "test", sleep=sleep, clock=lambda: now_s)
+    warmer = Warmer(lambda: [lambda: None], "test", sleep=sleep, clock=lambda: now_s, spare=always)
     warmer.keep("one", 0.005)
     assert ended.wait(10.0)
     assert slept[:5] == pytest.approx([0.005, 0.01, 0.02, 0.04, 0.08])
     assert slept[9] == slept[10] == 1.0
     assert slept[11:14] == pytest.approx([0.5, 0.25, 0.125])
     assert slept[-1] == pytest.approx(0.005)
+
+
+def test_it_pauses_while_the_computer_has_no_processor_to_spare_and_goes_on_by_itself() -> None:
+    now_s, runs = 0.0, list[float]()
+    slept: list[float] = []
+    ended = threading.Event()
+
+    def sleep(seconds: float) -> None:
+        nonlocal now_s
+        slept.append(seconds)
+        now_s += seconds
+        if now_s > 5.0 and seconds:
+            warmer.keep("one", 0.0)
+            ended.set()
+
+    asked: list[float] = []
+
+    def spare(at_s: float) -> bool:
+        asked.append(at_s)
+        return not 1.0 <= at_s < 3.0
+
+    warmer = Warmer(lambda: [lambda: runs.append(now_s)], "test", sleep=sleep, clock=lambda: now_s, spare=spare)
+    warmer.keep("one", 0.1)
+    assert ended.wait(10.0)
+    assert not [at_s for at_s in runs if 1.1 < at_s < 3.0]
+    assert len([at_s for at_s in runs if at_s < 1.1]) >= 9
+    assert len([at_s for at_s in runs if at_s > 3.0]) >= 15
+    assert min(later - before for before, later in itertools.pairwise(asked)) > LOOK_S - 0.001
+    assert len(asked) <= 11

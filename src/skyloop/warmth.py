@@ -12,6 +12,8 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Final
 
+from skyloop.spare import LOOK_S, Spare
+
 #: Run one after the other.
 Pieces = Sequence[Callable[[], object]]
 
@@ -25,11 +27,14 @@ _log = logging.getLogger(__name__)
 class Warmer:
     """Runs one piece of code again and again, on one thread of the process, while anybody wants it.
 
+    It pauses while the computer has no processor to spare. Code that has failed is never run again.
+
     Args:
         make: Returns the pieces of code, in their order; called on the thread when it is wanted for the first time.
         name: For the thread and for messages.
         sleep: Waits for some seconds.
         clock: Returns the time [s].
+        spare: Returns whether the computer has a processor to spare at a time on the clock [s].
     """
 
     def __init__(
@@ -39,11 +44,14 @@ class Warmer:
         *,
         sleep: Callable[[float], object] = time.sleep,
         clock: Callable[[], float] = time.monotonic,
+        spare: Callable[[float], bool] | None = None,
     ) -> None:
         self._make = make
         self._name = name
         self._sleep = sleep
         self._clock = clock
+        self._spare = Spare() if spare is None else spare
+        self._failed = False
         self._wanted: dict[object, float] = {}  # by who wants it: how often [s]
         self._period_s = 0.0  # the shortest of them; 0: nobody
         self._pieces: Pieces | None = None
@@ -60,6 +68,8 @@ class Warmer:
         if self._wanted.get(who, 0.0) == period_s:
             return
         with self._lock:
+            if self._failed:
+                return
             if period_s > 0.0:
                 self._wanted[who] = period_s
             else:
@@ -75,25 +85,21 @@ class Warmer:
         return self._period_s > 0.0
 
     def _work(self) -> None:
-        pause_s = 0.0
+        pause_s = look_s = 0.0
+        spare = False
         while True:
             with self._lock:
                 period_s = self._period_s
                 if not period_s:
                     self._thread = None  # another one is started when it is wanted again
                     return
-            try:
-                if self._pieces is None:
-                    self._pieces = self._make()
-                for piece in self._pieces:
-                    piece()
-                    self._sleep(0.0)  # who waits for the interpreter meanwhile waits for one piece and not for all
-            except Exception:  # noqa: BLE001  everything works without this, only slower
-                _log.exception("keeping the %s warm failed, and is given up", self._name)
-                with self._lock:
-                    self._wanted.clear()
-                    self._period_s, self._thread = 0.0, None
-                    self._pieces = ()
+            now_s = self._clock()
+            if now_s >= look_s:
+                spare, look_s = self._spare(now_s), now_s + LOOK_S
+            if not spare:
+                self._sleep(LOOK_S)
+                continue
+            if not self._run():
                 return
             # Who wakes late has no processor to spare: rarer then, by and by, so that it takes none from others.
             pause_s = min(max(pause_s, period_s), max(period_s, _RAREST_S))
@@ -103,3 +109,20 @@ class Warmer:
                 pause_s *= 2.0
             else:
                 pause_s = pause_s / 2.0 if pause_s > 2.0 * period_s else 0.0
+
+    def _run(self) -> bool:
+        """Run the code once; return False if it failed."""
+        try:
+            if self._pieces is None:
+                self._pieces = self._make()
+            for piece in self._pieces:
+                piece()
+                self._sleep(0.0)  # who waits for the interpreter meanwhile waits for one piece and not for all
+        except Exception:  # noqa: BLE001  everything works without this, only slower
+            _log.exception("keeping the %s warm failed, and is given up", self._name)
+            with self._lock:
+                self._failed = True
+                self._wanted.clear()
+                self._period_s, self._thread, self._pieces = 0.0, None, None
+            return False
+        return True

@@ -88,6 +88,7 @@ class ScriptedProxy:
             why_not="" if can_fly else "it has no motors",
         )
         self.run_id = 0
+        self.forgets = True  #: whether who leaves loses the authority at once
         self._peers: dict[int, tuple[Peer, str]] = {}
         self._lock = threading.Lock()
         self._leases = 0
@@ -180,6 +181,11 @@ class ScriptedProxy:
         lease = self.grant(app_id, name)
         self.event(EventKind.AUTHORITY_GRANTED, "", name, app_id=app_id, priority=16, lease=lease)
 
+    def hang_up(self) -> None:
+        """End all connections."""
+        for peer, _ in list(self._peers.values()):
+            self.server.disconnect(peer, "hung up")
+
     def garbage(self) -> None:
         for peer, _ in list(self._peers.values()):
             self.server.send(peer, b"garbage")
@@ -198,7 +204,7 @@ class ScriptedProxy:
 
     def peer_left(self, peer: Peer, reason: str) -> None:
         self._peers.pop(peer.id, None)
-        if self.owner is not None and self.owner[0] == peer.id:
+        if self.forgets and self.owner is not None and self.owner[0] == peer.id:
             self.owner = None
         self.notifier.notify()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from skyloop.client.authority import AuthorityTracker
+from skyloop.client.authority import AuthorityTracker, EndedSessions
 from skyloop.messages import Event, EventKind, Feedback, RequestAuthority, Value
 
 NOW = 10_000_000_000
@@ -152,3 +152,48 @@ def test_a_new_connection_begins_anew(held: AuthorityTracker) -> None:
     assert (held.status.state, held.wanted, held.status.priority) == ("none", True, 16)
     held.connected(1)
     assert held.granted(1, LATER), "a restarted proxy counts its leases from 1"
+
+
+def test_a_lost_link_is_no_answer(authority: AuthorityTracker) -> None:
+    assert not authority.answered
+    authority.disconnected()
+    assert not authority.answered
+    authority.connected(4)
+    authority.asked(RequestAuthority(16))
+    assert authority.granted(6, NOW)
+    assert authority.answered
+
+
+def test_an_earlier_session_is_known_by_its_number_in_the_same_run() -> None:
+    ended = EndedSessions()
+    earlier, authority = AuthorityTracker("me", ended), AuthorityTracker("me", ended)
+    earlier.connected(3, run_id=70)
+    earlier.disconnected()
+    authority.connected(4, run_id=70)
+    authority.asked(RequestAuthority(16))
+    authority.queued(1, "me")
+    assert not authority.settled  # nobody knows yet whose it is
+    assert not authority.behind_itself
+    assert authority.feedback(owned(3, 5, "me"), NOW)
+    assert authority.behind_itself
+    assert not authority.settled
+    assert authority.feedback(owned(9, 6, "me"), NOW), "another application of the same name"
+    assert not authority.behind_itself
+    assert authority.settled
+    authority.disconnected()
+    authority.connected(1, run_id=71)  # the proxy was restarted, and numbers begin again
+    authority.asked(RequestAuthority(16))
+    authority.queued(1, "other")
+    authority.feedback(owned(3, 1, "other"), NOW)
+    assert not authority.behind_itself
+    assert authority.settled
+
+
+def test_the_oldest_ended_session_is_forgotten() -> None:
+    ended = EndedSessions()
+    for app_id in range(EndedSessions.MOST + 1):
+        ended.add(7, app_id)
+    assert (7, 0) not in ended
+    assert (7, 1) in ended
+    assert (7, EndedSessions.MOST) in ended
+    assert (8, 1) not in ended

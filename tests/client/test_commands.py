@@ -13,11 +13,13 @@ import numpy as np
 import pytest
 
 from skyloop.client import Authority, AuthorityStatus, Drone
+from skyloop.client.core import DroneCore
 from skyloop.client.drone import open_drone
 from skyloop.errors import AuthorityError, ClosedError, NoAnswerError, RefusedError, UnsupportedError, UsageError
 from skyloop.messages import (
     Attitude,
     Command,
+    Done,
     EmergencyStop,
     Event,
     EventKind,
@@ -468,6 +470,88 @@ def test_refused_and_not_answered(proxy: ScriptedProxy, monkeypatch: pytest.Monk
     proxy.answers[RequestAuthority] = None
     with pytest.raises(NoAnswerError, match="did not answer the request for the authority"):
         open_drone(proxy.server.dial, app="me", policy=QUICK, timeout_s=WAIT_S)
+
+
+def asked(proxy: ScriptedProxy) -> int:
+    """How often the authority was asked for."""
+    return sum(isinstance(request, RequestAuthority) for request in list(proxy.requests))
+
+
+def test_a_link_that_is_lost_before_the_answer_is_no_answer(proxy: ScriptedProxy) -> None:
+    proxy.answers[RequestAuthority] = None
+    lost = background(
+        lambda: proxy.until(lambda: asked(proxy) > 0, "the request"),
+        proxy.answers.clear,
+        proxy.hang_up,
+    )
+    with flown(proxy) as drone:
+        assert drone.authority.state == "held"
+    lost.join(WAIT_S)
+    assert asked(proxy) > 1
+
+
+def test_a_person_whose_link_is_lost_before_the_answer_is_told_so(proxy: ScriptedProxy) -> None:
+    core = DroneCore(proxy.server.dial, app="me", policy=QUICK)
+    core.open(timeout_s=WAIT_S, acquire=False)
+    try:
+        core.commands.flown_by_person()
+        core.commands.present_until(time.monotonic_ns() + 60_000_000_000)
+        proxy.answers[RequestAuthority] = None
+        lost = background(lambda: proxy.until(lambda: asked(proxy) > 0, "the request"), proxy.hang_up)
+        with pytest.raises(NoAnswerError, match="the link was lost, or the authority given back"):
+            core.commands.request(RequestAuthority(), 0.0)
+        lost.join(WAIT_S)
+    finally:
+        core.close()
+
+
+def test_who_reconnects_waits_until_the_earlier_session_is_forgotten(proxy: ScriptedProxy, drone: Drone) -> None:
+    old = drone.authority.lease
+    proxy.forgets = False
+    before = asked(proxy)
+    proxy.hang_up()
+    proxy.until(lambda: asked(proxy) > before, "the request of the next session")
+    drone.wait(lambda _: drone.authority.state == "queued", WAIT_S)
+    assert drone.authority.holder == "me"
+    assert drone.velocity(forward=0.1) is False  # and raises nothing: it is only a matter of time
+    assert drone.authority.lease != old
+    proxy.give_back(2, "me")
+    drone.wait(lambda _: drone.authority.state == "held", WAIT_S)
+    assert drone.velocity(forward=0.1)
+
+
+def test_another_who_came_meanwhile_is_no_earlier_session(proxy: ScriptedProxy, drone: Drone) -> None:
+    proxy.forgets = False
+    proxy.hang_up()
+    drone.wait(lambda _: drone.authority.state == "queued", WAIT_S)
+    proxy.grant(99, "ada")
+    drone.wait(lambda sample: sample.owner_id == 99 and drone.authority.holder == "ada", WAIT_S)
+    with pytest.raises(AuthorityError, match="ada holds the authority"):
+        drone.hover()
+
+
+def test_who_connects_anew_waits_until_the_earlier_drone_is_forgotten(proxy: ScriptedProxy) -> None:
+    proxy.forgets = False
+    with flown(proxy):
+        proxy.answers[ReleaseAuthority] = Done()  # it is said, and not done
+    before = asked(proxy)
+    free = background(
+        lambda: proxy.until(lambda: asked(proxy) > before, "the request"), lambda: proxy.give_back(2, "me")
+    )
+    with flown(proxy) as drone:
+        assert drone.authority.state == "held"
+    free.join(WAIT_S)
+
+
+def test_an_earlier_session_that_is_not_forgotten_is_named(
+    proxy: ScriptedProxy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("skyloop.client.commands.OWN_S", 0.1)
+    proxy.forgets = False
+    with flown(proxy):
+        proxy.answers[ReleaseAuthority] = Done()
+    with pytest.raises(AuthorityError, match="holds the authority"), flown(proxy):
+        pass
 
 
 def test_an_observer_only_looks_on(proxy: ScriptedProxy) -> None:

@@ -7,6 +7,7 @@ the newer.
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -90,14 +91,45 @@ class AuthorityStatus:
     until_ns: int | None = None
 
 
+class EndedSessions:
+    """Sessions of this process that have ended, by run of the proxy and number of the application. Any thread.
+
+    A proxy may hear of the end later than of the next session, and until then the old one has the authority.
+    """
+
+    MOST = 256  #: those that are remembered
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[int, int], None] = {}
+        self._lock = threading.Lock()
+
+    def add(self, run_id: int, app_id: int) -> None:
+        """Remember one; the oldest is forgotten."""
+        with self._lock:
+            self._known[run_id, app_id] = None
+            if len(self._known) > self.MOST:
+                del self._known[next(iter(self._known))]
+
+    def __contains__(self, session: tuple[int, int]) -> bool:
+        return session in self._known
+
+
 class AuthorityTracker:
-    """Follows the authority of one application. Methods that return a bool return whether the status changed."""
+    """Follows the authority of one application. Methods that return a bool return whether the status changed.
+
+    Args:
+        name: Of the application.
+        ended: Sessions of the same process that have ended; None: only those of this tracker.
+    """
 
     #: Feedback that names no owner may be older than the grant for this long.
     SETTLE_NS = nanoseconds(0.5)
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, ended: EndedSessions | None = None) -> None:
         self._name = name
+        self._ended = EndedSessions() if ended is None else ended
+        self._run_id = 0
+        self._owner_id = 0  # who had it by the last feedback; 0: nobody
         self.app_id = 0
         self.wanted = False  #: the application asked for it and has not given it back
         self.pending = False  #: asked for on this connection, and not answered yet
@@ -114,13 +146,36 @@ class AuthorityTracker:
         """Whether this application may command."""
         return self.status.state == "held"
 
-    def connected(self, app_id: int) -> None:
-        """Reset on a new connection, on which older leases mean nothing."""
-        self.app_id = app_id
+    @property
+    def answered(self) -> bool:
+        """Whether what was asked for is held, waited for, or not wanted any more. A lost link is no answer."""
+        return not self.pending and (self.status.state != "none" or not self.wanted)
+
+    @property
+    def behind_itself(self) -> bool:
+        """Whether it waits only until the proxy notices that an earlier session of this process has ended."""
+        return self.status.state == "queued" and (self._run_id, self._owner_id) in self._ended
+
+    @property
+    def settled(self) -> bool:
+        """Whether it is held, not wanted, or known from feedback to be another application's."""
+        return self.status.state != "queued" or (self._owner_id != 0 and not self.behind_itself)
+
+    def connected(self, app_id: int, run_id: int = 0) -> None:
+        """Reset on a new connection, on which older leases mean nothing.
+
+        Args:
+            app_id: Number of this application there.
+            run_id: Number of the proxy's run; in another one the numbers of applications mean nothing.
+        """
+        if run_id != self._run_id:
+            self._owner_id = 0
+        self.app_id, self._run_id = app_id, run_id
         self._lease = 0
 
     def disconnected(self) -> bool:
         """The connection is lost, and the authority with it; it stays wanted if it is to be renewed."""
+        self._ended.add(self._run_id, self.app_id)
         self.pending = False
         self.wanted = self.wanted and self.renews
         return self._set(AuthorityStatus("none", priority=self.status.priority))
@@ -193,6 +248,7 @@ class AuthorityTracker:
 
     def feedback(self, feedback: Feedback, now_ns: int) -> bool:
         """Update from the owner and the lease in feedback, in case events were lost."""
+        before_id, self._owner_id = self._owner_id, feedback.owner_id
         if feedback.owner_id == self.app_id and feedback.lease:
             return (
                 self.wanted
@@ -203,8 +259,8 @@ class AuthorityTracker:
             newer = feedback.lease > self.status.lease
             nobody = not feedback.lease and now_ns - self._granted_ns > self.SETTLE_NS
             return (newer or nobody) and self._lost(feedback.owner if feedback.lease else None)
-        if self.status.state in ("queued", "preempted") and feedback.owner != self.status.holder:
-            return self._set(replace(self.status, holder=feedback.owner))
+        if self.status.state in ("queued", "preempted"):
+            return self._set(replace(self.status, holder=feedback.owner)) or feedback.owner_id != before_id
         return False
 
     def _lost(self, holder: str | None) -> bool:

@@ -41,6 +41,9 @@ from skyloop.messages.earth import is_on_earth
 
 _OLD_PLACE_S: Final = 2.0  #: older, a place on the earth is not converted by it
 ANSWER_S: Final = 2.0  #: how long the proxy may take to answer a request for the authority
+#: How long to wait at most for the proxy to notice that an earlier session of this process has ended: more than the
+#: time after which a silent one loses the authority.
+OWN_S: Final = 5.0
 _LATER_NS: Final = 1_000_000_000
 _ACTIONS: Final = frozenset(ACTION_NAMES)
 
@@ -176,7 +179,7 @@ class CommandSender:
             if (
                 not may_send
                 and self._connection.connected
-                and not (authority.wanted and authority.status.state == "none")
+                and not (authority.wanted and (authority.status.state == "none" or not authority.settled))
             ):
                 raise self._not_ours(action)
             if stop and self._role is Role.OBSERVER:
@@ -221,25 +224,29 @@ class CommandSender:
 
         Raises:
             AuthorityError: If it is not held after ``wait_s``, if it is refused, or if this application only observes.
-            NoAnswerError: If the proxy does not answer the request.
+            NoAnswerError: If the proxy does not answer the request, or the link is lost and not back in time.
         """
         if self._role is Role.OBSERVER:
             raise AuthorityError("this application observes", code="observer").with_hint(Hint.FLY)
+        authority = self._authority
         with self._lock:
-            self._authority.asked(request)
+            authority.asked(request)
             self._refusal = None
             self._ask_now = True
         self._connection.poke()
-        if not self.notifier.wait_for(lambda: not self._authority.pending, ANSWER_S + max(0.0, wait_s)):
+        if not self.notifier.wait_for(lambda: authority.answered, ANSWER_S + max(0.0, wait_s)):
             self.release(wait=False)
             raise NoAnswerError(f"the proxy did not answer the request for the authority within {ANSWER_S:g} s")
-        self.notifier.wait_for(lambda: self._authority.held or not self._authority.wanted, max(0.0, wait_s))
+        self.notifier.wait_for(lambda: authority.held or not authority.wanted, max(0.0, wait_s))
+        self.notifier.wait_for(lambda: authority.settled, OWN_S)
         status, refusal = self.status, self._refusal
         if status.state == "held" or (stay and status.state in ("queued", "preempted")):
             return status
         self.release(wait=False)
         if refusal is not None:
             raise AuthorityError(f"the authority was refused: {refusal.message}", code=refusal.code.value)
+        if status.state == "none":
+            raise NoAnswerError("the link was lost, or the authority given back, while the proxy was asked for it")
         raise AuthorityError(_busy(status, wait_s, self._authority.declined), code="busy").with_hint(Hint.OBSERVE)
 
     def answer(self, lease: int, app_id: int, grant: bool, reason: str) -> None:
@@ -276,10 +283,15 @@ class CommandSender:
 
     # For the connection ----------------------------------------------------------------------------------------
 
-    def connected(self, app_id: int) -> None:
-        """Reset on a new connection: :meth:`tick` requests the authority again if it is wanted."""
+    def connected(self, app_id: int, run_id: int = 0) -> None:
+        """Reset on a new connection: :meth:`tick` requests the authority again if it is wanted.
+
+        Args:
+            app_id: Number of this application there.
+            run_id: Number of the proxy's run.
+        """
         with self._lock:
-            self._authority.connected(app_id)
+            self._authority.connected(app_id, run_id)
             self._seq = 0
 
     def disconnected(self) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, Final, Literal, Protocol, TypedDict
 
-from skyloop.client.authority import Authority, AuthorityTracker, authority_request
+from skyloop.client.authority import Authority, AuthorityTracker, EndedSessions, authority_request
 from skyloop.client.channels import Listener, VideoChannel
 from skyloop.client.command_schedule import CommandSchedule
 from skyloop.client.commands import CommandSender
@@ -55,6 +55,7 @@ OnExit = Literal["land", "hover"]
 LATER_ACTIONS: Final = (Position, ReturnToStart)  #: that not every proxy knows
 UP: Final = frozenset({FlightState.HOVERING, FlightState.FLYING})
 DOWN: Final = frozenset({FlightState.LANDED})
+_ENDED: Final = EndedSessions()  #: of all drones of this process
 LANDING_S: Final = 20.0  #: how long a landing is waited for
 
 
@@ -136,7 +137,7 @@ class DroneCore:
         self._to_close: list[Closable] = []  # what ends with the drone
         # Each part uses those before it; the receiver handles what arrives in every session.
         connection = self.connection = ProxyConnection(scheduler.clock)
-        authority = AuthorityTracker(app)
+        authority = AuthorityTracker(app, _ENDED)
         state = self.state = ClientState(app, connection, scheduler, whole_feedback=access == "pilot")
         restorer = Restorer(connection, state.emit)
         self.config = Config(connection, authority, restorer)

@@ -304,7 +304,7 @@ class Receiver:
             if camera.name not in state.channels:
                 state.channels[camera.name] = state.video(camera)
         state.results.restart()
-        self._commands.connected(welcome.app_id)
+        self._commands.connected(welcome.app_id, welcome.run_id)
         state.on_welcome.publish(welcome)
 
     def disconnected(self, reason: str) -> None:  # noqa: ARG002  (link_changed publishes it)
