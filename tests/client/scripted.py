@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -87,7 +88,7 @@ class ScriptedProxy:
             CAMERAS,
             why_not="" if can_fly else "it has no motors",
         )
-        self.run_id = 0
+        self.run_id = random.getrandbits(40)  # sessions of another test's proxy are not taken for this one's
         self.forgets = True  #: whether who leaves loses the authority at once
         self._peers: dict[int, tuple[Peer, str]] = {}
         self._lock = threading.Lock()

@@ -175,7 +175,8 @@ class AuthorityTracker:
 
     def disconnected(self) -> bool:
         """The connection is lost, and the authority with it; it stays wanted if it is to be renewed."""
-        self._ended.add(self._run_id, self.app_id)
+        if self.app_id:
+            self._ended.add(self._run_id, self.app_id)
         self.pending = False
         self.wanted = self.wanted and self.renews
         return self._set(AuthorityStatus("none", priority=self.status.priority))
