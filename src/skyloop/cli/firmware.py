@@ -97,7 +97,7 @@ def _autopilots(options: SimOptions, drones: int, firmware: Firmware, serving: S
 
     kind, video = Kind(firmware.value), serving.video_port
     host = SimHost(with_multirotors(options), drones)
-    all_ports = [Ports.counted(kind, serving.port_base, drone) for drone in range(drones)]
+    all_ports = Ports.several(kind, serving.port_base, drones)
     return [
         MavlinkFirmware(
             host,

@@ -70,6 +70,7 @@ class VehicleLink(ABC, Generic[S]):
         self._selector = selectors.DefaultSelector()
         self._awake, self._waker = socket.socketpair()
         self._lookup = NameLookup(family)
+        self._awake_ns = 0  # when its thread looks again at the latest
         self._opened_ns: int | None = None  # when sockets were opened last, or tried to
         self._close_s = close_s
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
@@ -107,10 +108,10 @@ class VehicleLink(ABC, Generic[S]):
         with self.lock:
             now_ns = self._clock()
             applied = decide(now_ns)
-            due_ns = self.session.due_ns
-            if due_ns <= now_ns:
+            if self.session.due_ns <= now_ns:
                 self._send_due(now_ns)
-        if now_ns < due_ns:
+            sooner = self.session.due_ns < self._awake_ns
+        if sooner:
             self._wake()
         return applied
 
@@ -217,7 +218,8 @@ class VehicleLink(ABC, Generic[S]):
     def _step(self) -> None:
         self._renew()  # before the wait, so that no socket is closed between being ready and being read
         with self.lock:
-            wait_ns = self.session.due_ns - self._clock()
+            self._awake_ns = self.session.due_ns
+            wait_ns = self._awake_ns - self._clock()
         for key, _ in self._selector.select(max(0.0, seconds(wait_ns))):
             key.data()
         with self.lock:

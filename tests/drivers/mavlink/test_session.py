@@ -10,10 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyloop.drivers.mavlink.protocol import LOST_NS, MavlinkSession
+from skyloop.drivers.mavlink.protocol import LOST_NS, REST_NS, TICK_NS, MavlinkSession
+from skyloop.drivers.mavlink.setpoints import Goal
 from skyloop.drivers.recording_sink import RecordingSink, implausible
 from skyloop.errors import DriverError
-from skyloop.messages import FlightState, Hover, LinkState, Severity, Takeoff, Velocity
+from skyloop.messages import FlightState, Hover, Land, LinkState, Severity, Takeoff, Velocity
 from skyloop.wire.mavlink.codec import Codec
 from skyloop.wire.mavlink.codec import dialect as m
 from skyloop.wire.mavlink.texts import chunks_of
@@ -404,3 +405,27 @@ def test_places_of_different_times_are_not_taken_together() -> None:
     origin = bench.newest.origin
     assert before is None
     assert origin is None or origin.latitude_deg < 1e-3, "only what came together before"
+
+
+def test_a_vehicle_is_asked_after_as_often_as_something_is_under_way() -> None:
+    bench = Bench(Vehicle(ARDUPILOT)).found()
+
+    def next_ns() -> int:
+        bench.tick()
+        return bench.session.due_ns - bench.clock()
+
+    assert next_ns() == REST_NS, "on the ground with nothing to do"
+    bench.session.parameters.request_all(bench.clock())
+    assert next_ns() == TICK_NS, "while parameters are read"
+    bench.session.parameters.complete = True
+    bench.flying("GUIDED")
+    bench.session.command(Velocity(0.5), bench.clock())
+    assert bench.session.due_ns == bench.clock(), "a command goes at once"
+    assert next_ns() == 2 * TICK_NS, "and is repeated 25 times a second"
+    bench.clock.advance(0.01)
+    assert next_ns() == 2 * TICK_NS - 10_000_000, "also where it is polled in between"
+    bench.session.command(Takeoff(), bench.clock())
+    bench.session.command(Land(), bench.clock())
+    assert bench.session.setpoints is not None
+    assert bench.session.setpoints.goal is Goal.LAND
+    assert next_ns() == TICK_NS, "a landing is followed step by step"

@@ -118,3 +118,25 @@ def test_set_points_of_any_numbers_harm_nothing(kind: Kind, numbers: list[float]
     it.say(m.MAVLink_set_attitude_target_message(0, 1, 1, mask & 0xFF, numbers[:4], *numbers[4:8]))
     it.go_on(0.3)
     assert all(abs(each) < 50 for each in it.speed)
+
+
+@KINDS
+def test_drones_on_free_ports_share_none(kind: Kind, monkeypatch: pytest.MonkeyPatch) -> None:
+    bound: list[socket.socket] = []
+
+    class Reused(socket.socket):
+        """Gets the lowest port again that no open socket has, as a busy system does sooner or later."""
+
+        def bind(self, address: object) -> None:
+            taken = {sock.number for sock in bound if sock.fileno() >= 0}  # type: ignore[attr-defined]
+            self.number = next(number for number in range(1000, 2000) if number not in taken)
+            bound.append(self)
+
+        def getsockname(self) -> tuple[str, int]:
+            return "127.0.0.1", self.number
+
+    monkeypatch.setattr("skyloop.emulators.mavlink.settings.socket.socket", Reused)
+    several = Ports.several(kind, 0, 5)
+    numbers = [port for ports in several for port in (ports.udp, ports.remote, ports.tcp) if port is not None]
+    assert len(several) == 5
+    assert len(set(numbers)) == len(numbers)

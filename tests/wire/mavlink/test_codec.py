@@ -133,3 +133,25 @@ def test_a_damaged_recording_never_raises(data: st.DataObject) -> None:
     for _ in range(data.draw(st.integers(1, 30))):
         flight[data.draw(st.integers(0, len(flight) - 1))] = data.draw(st.integers(0, 255))
     Codec(255, 190).decode(bytes(flight))
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_datagram_is_taken_as_the_same_bytes_of_a_stream_are(version: int) -> None:
+    sender = Codec(1, 1)
+    one, two = (sender.encode(attitude(n), version=version) for n in range(2))
+    damaged = one[:-1] + bytes([one[-1] ^ 1])
+    for data, numbers, wrong in ((one, [0], 0), (one + two, [0, 1], 0), (b"\0" + one, [0], 1), (damaged, [], 1)):
+        for whole in (True, False):
+            receiver = Codec(255, 190)
+            assert [each.time_boot_ms for each in receiver.decode(data, whole=whole)] == numbers
+            assert (receiver.frames, receiver.damaged) == (len(numbers), wrong)
+
+
+def test_a_signed_datagram_is_checked_as_a_stream_is() -> None:
+    sender, receiver, keyless = Codec(1, 1, key=KEY), Codec(255, 190, key=KEY), Codec(255, 190)
+    frame = sender.encode(attitude())
+    assert len(receiver.decode(frame, whole=True)) == 1
+    assert receiver.decode(frame, whole=True) == [], "a frame that was taken is not taken twice"
+    assert receiver.decode(Codec(1, 1).encode(attitude()), whole=True) == [], "not signed"
+    assert keyless.decode(frame, whole=True) == []
+    assert (keyless.signed, keyless.damaged) == (1, 0)

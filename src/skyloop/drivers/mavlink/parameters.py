@@ -88,6 +88,11 @@ class ParameterExchange:
         """The values by the autopilot's own names."""
         return {name: held.value for name, held in self.reported.items()}
 
+    @property
+    def busy(self) -> bool:
+        """Whether parameters are being read or written."""
+        return bool(self._writes) or (self._wanted and not self.complete and not self.given_up)
+
     def on_value(self, message: Message, now_ns: int) -> None:
         """Handle a ``PARAM_VALUE``."""
         name, kind = message.param_id, message.param_type

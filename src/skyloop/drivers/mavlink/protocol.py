@@ -29,6 +29,7 @@ from skyloop.wire.mavlink.codec import dialect as m
 from skyloop.wire.mavlink.parameter_values import BYTEWISE
 
 TICK_NS: Final = nanoseconds(0.02)
+REST_NS: Final = nanoseconds(0.1)  #: the same while nothing is under way: for silence, heartbeats and requests
 HEARTBEAT_NS: Final = nanoseconds(1.0)
 DEGRADED_NS: Final = nanoseconds(1.2)  #: of silence
 LOST_NS: Final = nanoseconds(2.5)
@@ -231,7 +232,6 @@ class MavlinkSession(VehicleSession):
 
     def poll(self, now_ns: int) -> list[Packet]:
         """Return the packets to send now."""
-        self.due_ns = now_ns + TICK_NS
         self._check_silence(now_ns)
         identity = self.identity
         peer = identity.peer if identity is not None else self.options.peer
@@ -239,13 +239,23 @@ class MavlinkSession(VehicleSession):
         out, self._out = self._out, []
         if self._received_ns is not None:
             out += self.clock.poll(now_ns)
-            out += self._fly(now_ns)
-            self._check_health(now_ns)
+            vehicle = self.vehicle_state(now_ns)
+            out += self._fly(vehicle, now_ns)
+            self._check_health(vehicle, now_ns)
         packets += [(self._encoded(message), peer) for message in out]
+        self.due_ns = self._next_ns(now_ns)
         return packets
 
-    def _fly(self, now_ns: int) -> list[Message]:
-        vehicle = self.vehicle_state(now_ns)
+    def _next_ns(self, now_ns: int) -> int:
+        """Return when to be polled again: with nothing under way seldom, which is what a fleet on the ground costs."""
+        if self.parameters.busy:
+            return now_ns + TICK_NS
+        due_ns = self.setpoints.due_ns(now_ns) if self.setpoints is not None else None
+        if due_ns is None or self._received_ns is None:
+            return now_ns + REST_NS
+        return min(max(due_ns, now_ns + TICK_NS), now_ns + REST_NS)
+
+    def _fly(self, vehicle: VehicleState | None, now_ns: int) -> list[Message]:
         if self.version is None:
             self.commands.request(_ASK_VERSION, now_ns, VERSION_PACE_S)
         self._intervals.request_missing(self.telemetry, self.commands, now_ns)
@@ -268,8 +278,7 @@ class MavlinkSession(VehicleSession):
     def _encoded(self, message: Message) -> bytes:
         return self.codec.encode(message, version=1 if self._old and message.id < 256 else 2)
 
-    def _check_health(self, now_ns: int) -> None:
-        vehicle = self.vehicle_state(now_ns)
+    def _check_health(self, vehicle: VehicleState | None, now_ns: int) -> None:
         for event in self._health.update(self.telemetry, vehicle, now_ns):
             self._publish_event(event)
         exchange = self.parameters

@@ -323,6 +323,14 @@ class SetpointController:
             self._step_land(vehicle, now_ns)
         return []
 
+    def due_ns(self, now_ns: int) -> int | None:
+        """Return when :meth:`messages` has something to do next; None: nothing by the time alone."""
+        if self.stopped or self.goal in (Goal.TAKE_OFF, Goal.HOLD, Goal.LAND):
+            return now_ns
+        if self.goal is Goal.FOLLOW and self._setpoint is not None:
+            return self._sent_ns + self._setpoint.period_ns
+        return None
+
     def _flight_is_over(self) -> None:
         """Forget the flight: the next to fly the vehicle starts over."""
         self._end()

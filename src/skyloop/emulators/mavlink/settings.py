@@ -70,10 +70,24 @@ class Ports:
     @classmethod
     def free(cls, kind: Kind) -> Ports:
         """Return ports that are free now."""
-        with ExitStack() as held:
-            udp, remote = (_free(held, socket.SOCK_DGRAM) for _ in range(2))
-            tcp = _free(held, socket.SOCK_STREAM) if kind is Kind.ARDUCOPTER else None
-        return cls(udp, remote, tcp)
+        return cls.several(kind, 0, 1)[0]
+
+    @classmethod
+    def several(cls, kind: Kind, base: int | None, drones: int) -> list[Ports]:
+        """Return the ports of several drones; none of them twice. See :meth:`counted`.
+
+        Raises:
+            UsageError: They don't fit below 65536.
+        """
+        if base != 0:
+            return [cls.counted(kind, base, drone) for drone in range(drones)]
+        with ExitStack() as held:  # of all of them: the system soon gives a port that was closed to the next who asks
+            return [cls._held(kind, held) for _ in range(drones)]
+
+    @classmethod
+    def _held(cls, kind: Kind, held: ExitStack) -> Ports:
+        udp, remote = (_free(held, socket.SOCK_DGRAM) for _ in range(2))
+        return cls(udp, remote, _free(held, socket.SOCK_STREAM) if kind is Kind.ARDUCOPTER else None)
 
 
 def _free(held: ExitStack, kind: socket.SocketKind) -> int:
