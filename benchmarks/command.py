@@ -164,9 +164,12 @@ def scale(
 
 
 def fleet(
-    vehicles: Annotated[int, typer.Option(min=2, max=500, help="How many in one host")] = 100,
+    vehicles: Annotated[int, typer.Option(min=0, max=500, help="How many in one host; 0: none")] = 100,
     observers: Annotated[int, typer.Option(min=0, max=100, help="Of one of them, in another case; 0: none")] = 50,
     networked: Annotated[int, typer.Option(min=0, max=500, help="How many over the network; 0: none")] = 50,
+    mavlink: Annotated[
+        int, typer.Option(min=0, max=500, help="Emulated MAVLink vehicles, half of them in formation; 0: none")
+    ] = 40,
     seconds: Seconds = None,
     minutes: Minutes = None,
     output: Output = None,
@@ -176,8 +179,12 @@ def fleet(
 
     wanted_s = duration_s(seconds, minutes)
     with measuring("fleet", output) as progress:
-        results = fleet.measure(wanted_s, fleet.cases_of(vehicles, observers, networked), progress)
-    finish("fleet", results, as_rich([tables.fleet_table(results)], str(results.machine)), output)
+        cases = fleet.cases_of(vehicles, observers, networked)
+        results = fleet.measure(wanted_s, cases, progress, mavlink=mavlink)
+    shown = [tables.fleet_table(results)] if results.cases else []
+    if results.mavlink is not None:
+        shown.append(tables.mavlink_table(results.mavlink))
+    finish("fleet", results, as_rich(shown, str(results.machine)), output)
 
 
 def learning(seconds: Seconds = None, minutes: Minutes = None, output: Output = None) -> None:

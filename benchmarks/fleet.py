@@ -15,6 +15,8 @@ from typing import Final, NamedTuple
 
 import msgspec
 
+from benchmarks import mavlink_fleet
+from benchmarks.mavlink_fleet import MavlinkResult
 from benchmarks.scale import FRAME_PERIOD_S, loopback
 from skyloop.bench.contract import Arrivals, picture
 from skyloop.bench.machine import Machine, cpu_time_s, memory_bytes
@@ -74,32 +76,41 @@ class HostedFleet(msgspec.Struct, frozen=True, tag_field="what", tag="fleet"):
     machine: Machine
     seconds: float
     cases: list[CaseResult]
+    mavlink: MavlinkResult | None = None
 
 
 def cases_of(vehicles: int, observers: int, networked: int) -> list[Case]:
     """Return the cases to measure: the vehicles alone, with observers of one, and some over the network."""
-    cases = [Case(vehicles)]
-    if observers:
+    cases = [Case(vehicles)] if vehicles else []
+    if vehicles and observers:
         cases.append(Case(vehicles, observers))
     if networked:
         cases.append(Case(networked, network=loopback(0)))
     return cases
 
 
-def measure(seconds: float, cases: Sequence[Case], progress: Progress = lambda _share, _what: None) -> HostedFleet:
+def measure(
+    seconds: float, cases: Sequence[Case], progress: Progress = lambda _share, _what: None, *, mavlink: int = 0
+) -> HostedFleet:
     """Measure each case.
 
     Args:
         seconds: How long each case is measured [s].
         cases: The cases.
         progress: Called with the share that is done, 0 to 1, and what comes next.
+        mavlink: How many emulated MAVLink vehicles are flown in another case; 0: none.
     """
     machine, results = Machine.here(), []
+    count = len(cases) + bool(mavlink)
     for number, case in enumerate(cases):
-        progress(number / len(cases), case.name)
+        progress(number / count, case.name)
         with Workers() as workers:
             results.append(_play(case, workers, seconds))
-    return HostedFleet(machine, seconds, results)
+    flown = None
+    if mavlink:
+        progress(len(cases) / count, f"{mavlink} emulated MAVLink vehicles")
+        flown = mavlink_fleet.measure(mavlink, seconds)
+    return HostedFleet(machine, seconds, results, flown)
 
 
 def _play(case: Case, workers: Workers, seconds: float) -> CaseResult:

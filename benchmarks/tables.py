@@ -10,6 +10,7 @@ from benchmarks.fleet import HostedFleet
 from benchmarks.load import PARTS as LOAD_PARTS
 from benchmarks.load import CaseResult as LoadCase
 from benchmarks.load import Load
+from benchmarks.mavlink_fleet import MavlinkResult
 from benchmarks.network import Channel, Network
 from benchmarks.scale import PARTS, CaseResult, Scale, bends
 from benchmarks.swarm import Swarm
@@ -176,6 +177,27 @@ def fleet_table(results: HostedFleet) -> Table:
     columns = ["vehicles", "way", "observers of one", "command", "feedback", *_OBSERVED, "least share"]
     columns += ["host, cores", "pilot, cores", "observers, cores", "MB a vehicle"]
     return Table("Many vehicles in one host; delays in ms: median (99th percentile)", columns, rows)
+
+
+def mavlink_table(case: MavlinkResult) -> Table:
+    """Return how emulated MAVLink vehicles fared in one host."""
+    row = [
+        str(case.vehicles),
+        str(case.flown),
+        f"{case.lost + case.vehicles - case.up}",
+        f"{case.share:.2%}",
+        f"{case.age_median_ms:.1f} ({case.age_p99_ms:.1f})",
+        "–" if case.error_p99_m is None else f"{case.error_p99_m:.2f} ({case.error_most_m:.2f})",
+        str(len(case.failed)),
+        *(f"{case.cpu[part]:.2f}" for part in ("host", "pilot", "emulators")),
+    ]
+    columns = ["vehicles", "in formation", "links lost", "states received", "age, ms", "off its place, m", "failed"]
+    columns += ["host, cores", "pilot, cores", "emulators, cores"]
+    return Table(
+        "Emulated MAVLink vehicles in one host; ages: median (99th percentile); places: 99th percentile (most)",
+        columns,
+        [row],
+    )
 
 
 def bend_text(results: Scale, many: str) -> str:

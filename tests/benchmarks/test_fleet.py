@@ -25,8 +25,8 @@ def test_cases_that_are_not_wanted_are_left_out() -> None:
 def test_the_command_measures_prints_and_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("zenoh")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
-    words = ["--seconds", "0.5", "--vehicles", "3", "--observers", "2", "--networked", "2", "--output"]
-    ended = CliRunner().invoke(build("fleet"), [*words, str(tmp_path)], env={"COLUMNS": "200"})
+    words = ["--seconds", "0.5", "--vehicles", "3", "--observers", "2", "--networked", "2", "--mavlink", "0"]
+    ended = CliRunner().invoke(build("fleet"), [*words, "--output", str(tmp_path)], env={"COLUMNS": "200"})
     assert ended.exit_code == 0, ended.output
     assert "Many vehicles in one host" in ended.output
     results = json.loads((tmp_path / "fleet.json").read_bytes())
@@ -41,3 +41,20 @@ def test_the_command_measures_prints_and_writes(tmp_path: Path, monkeypatch: pyt
         assert set(case["channels"]) == wanted
         assert case["cpu"].keys() >= {"host", "pilot"}
         assert all(summary["minimum_us"] > 0 for summary in case["channels"].values())
+
+
+@pytest.mark.process
+def test_emulated_vehicles_fly_in_formation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("pymavlink")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    words = ["--seconds", "1", "--vehicles", "0", "--networked", "0", "--mavlink", "4", "--output"]
+    ended = CliRunner().invoke(build("fleet"), [*words, str(tmp_path)], env={"COLUMNS": "200"})
+    assert ended.exit_code == 0, ended.output
+    assert "Emulated MAVLink vehicles in one host" in ended.output
+    results = json.loads((tmp_path / "fleet.json").read_bytes())
+    assert results["cases"] == []
+    found = results["mavlink"]
+    assert (found["vehicles"], found["up"], found["flown"], found["failed"]) == (4, 4, 2, {})
+    assert 0.0 < found["share"] <= 1.2
+    assert found["error_most_m"] >= found["error_p99_m"] >= 0.0
+    assert found["cpu"].keys() == {"host", "pilot", "emulators"}

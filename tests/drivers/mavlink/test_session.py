@@ -14,7 +14,7 @@ from skyloop.drivers.mavlink.protocol import LOST_NS, REST_NS, TICK_NS, MavlinkS
 from skyloop.drivers.mavlink.setpoints import Goal
 from skyloop.drivers.recording_sink import RecordingSink, implausible
 from skyloop.errors import DriverError
-from skyloop.messages import FlightState, Hover, Land, LinkState, Severity, Takeoff, Velocity
+from skyloop.messages import FlightState, Hover, Idle, Land, LinkState, Severity, Takeoff, Velocity
 from skyloop.wire.mavlink.codec import Codec
 from skyloop.wire.mavlink.codec import dialect as m
 from skyloop.wire.mavlink.texts import chunks_of
@@ -424,7 +424,12 @@ def test_a_vehicle_is_asked_after_as_often_as_something_is_under_way() -> None:
     assert next_ns() == 2 * TICK_NS, "and is repeated 25 times a second"
     bench.clock.advance(0.01)
     assert next_ns() == 2 * TICK_NS - 10_000_000, "also where it is polled in between"
-    bench.session.command(Takeoff(), bench.clock())
+    bench.session.command(Hover(), bench.clock())
+    bench.tick()
+    due_ns = bench.session.due_ns
+    bench.session.command(Idle(), bench.clock())
+    bench.session.command(Hover(), bench.clock())
+    assert bench.session.due_ns == due_ns, "what is under way already is not hurried"
     bench.session.command(Land(), bench.clock())
     assert bench.session.setpoints is not None
     assert bench.session.setpoints.goal is Goal.LAND

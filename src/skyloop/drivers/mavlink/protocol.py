@@ -23,7 +23,7 @@ from skyloop.drivers.mavlink.setpoints import SetpointController
 from skyloop.drivers.mavlink.telemetry import HealthMonitor, Telemetry, VehicleState, feedback_of
 from skyloop.drivers.vehicle_session import LinkTimeouts, VehicleEvent, VehicleSession
 from skyloop.errors import DriverError
-from skyloop.messages import AnyAction, EventKind, FlightState, LinkState, Severity, Value
+from skyloop.messages import AnyAction, EventKind, FlightState, Idle, LinkState, Severity, Value
 from skyloop.wire.mavlink.codec import Codec, Message
 from skyloop.wire.mavlink.codec import dialect as m
 from skyloop.wire.mavlink.parameter_values import BYTEWISE
@@ -116,8 +116,11 @@ class MavlinkSession(VehicleSession):
         """
         if self.setpoints is None:
             raise DriverError(f"the vehicle can't be flown: {self._unsupported_reason}")
+        if isinstance(action, Idle):
+            return action  # nothing comes of it; pilots on the ground send it all the time
         applied = self.setpoints.apply(action, self.vehicle_state(now_ns), now_ns, alone=alone, new=new)
-        self.due_ns = now_ns
+        due_ns = self.setpoints.due_ns(now_ns)
+        self.due_ns = min(self.due_ns, now_ns if due_ns is None else max(now_ns, due_ns))
         return applied
 
     def send(self, message: Message) -> None:
