@@ -156,6 +156,17 @@ class VehicleSession(ABC):
         elif silent_ns >= patience.degraded_ns and self.link_state is LinkState.UP:
             self._set_link_state(LinkState.DEGRADED, self._silence_text(silent_ns))
 
+    def _silence_seen_ns(self, latest_ns: int) -> int:
+        """Return when :meth:`_check_silence` is to be called next, not after ``latest_ns``, so that it is in time.
+
+        Args:
+            latest_ns: The time of the next poll if the vehicle were not silent.
+        """
+        if self._received_ns is None:
+            return latest_ns
+        patience = self.TIMEOUTS.degraded_ns if self.link_state is LinkState.UP else self.TIMEOUTS.lost_ns
+        return min(latest_ns, self._received_ns + patience)
+
     def _silence_text(self, silent_ns: int | None = None) -> str:
         since = f" for {seconds(silent_ns):.2g} s" if silent_ns is not None else ""
         return self._describe_silence(since, f" ({self._unreachable})" if self._unreachable else "")

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyloop.drivers.mavlink.protocol import LOST_NS, REST_NS, TICK_NS, MavlinkSession
+from skyloop.drivers.mavlink.protocol import DEGRADED_NS, LOST_NS, REST_NS, TICK_NS, MavlinkSession
 from skyloop.drivers.mavlink.setpoints import Goal
 from skyloop.drivers.recording_sink import RecordingSink, implausible
 from skyloop.errors import DriverError
@@ -216,6 +216,7 @@ def test_its_questions_about_time_are_answered() -> None:
     bench = Bench(Vehicle(PX4)).found()
     bench.said.clear()
     bench.hear(m.MAVLink_timesync_message(0, 987_654_321))
+    assert bench.session.due_ns <= bench.clock(), "at once: it takes the delay for the way"
     bench.tick()
     answers = [each for each in bench.heard_of("TIMESYNC") if each.ts1 == 987_654_321]
     assert answers[0].tc1 == bench.clock()
@@ -434,3 +435,19 @@ def test_a_vehicle_is_asked_after_as_often_as_something_is_under_way() -> None:
     assert bench.session.setpoints is not None
     assert bench.session.setpoints.goal is Goal.LAND
     assert next_ns() == TICK_NS, "a landing is followed step by step"
+
+
+@AUTOPILOTS
+def test_a_vehicle_at_rest_is_missed_in_time_and_its_mode_seen_at_once(autopilot: int) -> None:
+    bench = Bench(Vehicle(autopilot)).found()
+    heard_ns = bench.clock()
+    for wanted, after_ns in ((LinkState.DEGRADED, DEGRADED_NS), (LinkState.LOST, LOST_NS)):
+        while bench.link() is not wanted:
+            bench.clock.advance((bench.session.due_ns - bench.clock()) / 1e9)
+            bench.tick()
+        assert bench.clock() - heard_ns == pytest.approx(after_ns, abs=1000)
+    bench.found()
+    for message in (bench.vehicle.heartbeat(), m.MAVLink_current_mode_message(0, 1, 1)):
+        bench.tick()
+        bench.hear(message)
+        assert bench.session.due_ns <= bench.clock()

@@ -39,6 +39,7 @@ QUIET_ATTITUDE_S: Final = 0.5  #: without it, other messages make feedback
 VERSION_PACE_S: Final = 1.0
 OWN_COMPONENT: Final = 190  #: MAV_COMP_ID_MISSIONPLANNER, a ground station
 _ANSWERS: Final = ("COMMAND_ACK", "PARAM_VALUE", "TIMESYNC")
+_MODES: Final = ("HEARTBEAT", "CURRENT_MODE")  #: messages that say it
 
 Packet: TypeAlias = tuple[bytes, Peer]
 _ASK_VERSION: Final = VehicleCommand(m.MAV_CMD_REQUEST_MESSAGE, (float(m.MAVLINK_MSG_ID_AUTOPILOT_VERSION),))
@@ -198,7 +199,10 @@ class MavlinkSession(VehicleSession):
         elif kind == "PARAM_VALUE":
             self.parameters.on_value(message, now_ns)
         elif kind == "TIMESYNC":
-            self._out += self.clock.on_timesync(message, now_ns)
+            answers = self.clock.on_timesync(message, now_ns)
+            if answers:
+                self._out += answers
+                self.due_ns = 0  # a late answer would be a wrong time, by which the vehicle dates poses from outside
         elif kind == "STATUSTEXT":
             for event in self._health.on_text(message):
                 self._publish_event(event)
@@ -211,8 +215,8 @@ class MavlinkSession(VehicleSession):
             age_s = self.telemetry.age_s("ATTITUDE", now_ns)
             if age_s is None or age_s > QUIET_ATTITUDE_S:
                 self._publish(self.clock.now(now_ns), now_ns)
-            if kind == "HEARTBEAT":
-                self.due_ns = 0  # a caller that waits for a mode can go on
+        if kind in _MODES:
+            self.due_ns = 0  # a caller that waits for a mode can go on
 
     def _publish(self, captured_ns: int, now_ns: int) -> None:
         vehicle = self.vehicle_state(now_ns)
@@ -251,12 +255,13 @@ class MavlinkSession(VehicleSession):
 
     def _next_ns(self, now_ns: int) -> int:
         """Return when to be polled again: with nothing under way seldom, which is what a fleet on the ground costs."""
+        tick_ns, next_ns = now_ns + TICK_NS, self._silence_seen_ns(now_ns + REST_NS)
         if self.parameters.busy:
-            return now_ns + TICK_NS
+            return min(tick_ns, next_ns)
         due_ns = self.setpoints.due_ns(now_ns) if self.setpoints is not None else None
         if due_ns is None or self._received_ns is None:
-            return now_ns + REST_NS
-        return min(max(due_ns, now_ns + TICK_NS), now_ns + REST_NS)
+            return next_ns
+        return min(max(due_ns, tick_ns), next_ns)
 
     def _fly(self, vehicle: VehicleState | None, now_ns: int) -> list[Message]:
         if self.version is None:
