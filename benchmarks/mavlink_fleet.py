@@ -22,6 +22,7 @@ from skyloop.bench.workers import Pipe, Worker, Workers
 from skyloop.client import Drone, connect
 from skyloop.client.core import Access
 from skyloop.client.swarm import Swarm
+from skyloop.emulators.loop import Loop
 from skyloop.emulators.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
 from skyloop.errors import SkyloopError
 from skyloop.host.fleet import VehicleSettings
@@ -32,8 +33,9 @@ from skyloop.messages import Feedback, LinkState, Position
 from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 
-RATE_HZ: Final = 10.0  #: of the vehicles' feedback
-WORLD: Final = 20  #: vehicles of one emulating process, which share a world
+RATE_HZ: Final = 10.0  #: of the vehicles' feedback, and of the repeats of commands
+EMULATED_HZ: Final = 25.0  #: how often an emulated autopilot flies and sends
+WORLD: Final = 200  #: vehicles of one emulating process, which share a world
 LEG_M: Final = 1.0  #: the formation goes so far to each side of where it began
 PERIOD_S: Final = 12.0  #: there and back
 TICKS_HZ: Final = 10.0  #: of the formation's set-points
@@ -118,11 +120,17 @@ def _used_s(parts: Mapping[str, Sequence[Worker]]) -> dict[str, float]:
 
 def emulate(pipe: Pipe, ports: Sequence[Ports]) -> None:
     """Run an emulated ArduCopter on each of some ports, all in one world."""
-    world = SimHost(with_multirotors(SimOptions(world="empty")), len(ports))
+    world = SimHost(with_multirotors(SimOptions(world="empty"), rate_hz=EMULATED_HZ), len(ports))
+    loop = Loop("emulators")
     with ExitStack() as stack:
-        made = [MavlinkFirmware(world, drone, kind=Kind.ARDUCOPTER, ports=each) for drone, each in enumerate(ports)]
+        made = [
+            MavlinkFirmware(world, drone, kind=Kind.ARDUCOPTER, ports=each, loop=loop)
+            for drone, each in enumerate(ports)
+        ]
         for firmware in made:
             stack.enter_context(firmware)
+        loop.start()
+        stack.callback(loop.stop)
         pipe.send([firmware.address for firmware in made])
         pipe.recv()
 
@@ -232,7 +240,7 @@ def fly(pipe: Pipe, count: int, seconds: float) -> None:
         drones: dict[str, Drone] = {}
         for number in range(count):
             access: Access = "observe" if number % 2 else "pilot"
-            drone = connect(_name(number), access=access, name="bench", network=False, timeout_s=20.0)
+            drone = connect(_name(number), access=access, name="bench", network=False, timeout_s=20.0, rate_hz=RATE_HZ)
             listening.append(_Ages())
             drone.on_feedback(listening[-1].received, inline=True)
             if access == "pilot":

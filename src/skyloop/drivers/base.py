@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import threading
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -130,6 +131,23 @@ class Sink(Protocol):
         """
 
 
+class ServedLink(Protocol):
+    """A link to a vehicle that a host serves on a thread of its own, together with those of other vehicles."""
+
+    def fileno(self) -> int:
+        """Return what becomes readable when :meth:`serve` is to be called."""
+
+    def serve(self) -> int | None:
+        """Do what there is to do, without waiting. What it raises is reported already; it is tried again after a pause.
+
+        Returns:
+            When to call it again at the latest, on the monotonic clock [ns]; None: never, but :meth:`end` once.
+        """
+
+    def end(self) -> None:
+        """Release its resources."""
+
+
 @dataclass(frozen=True, slots=True)
 class ExternalPose:
     """Where something outside of the vehicle, such as motion capture, saw it.
@@ -172,6 +190,8 @@ class Driver(ABC):
     shared = True
     #: Parameters that any pilot may write, whoever holds the authority: those that move nothing that flies.
     parameters_without_authority: frozenset[str] = frozenset()
+    #: Set by a host before :meth:`open`: serves a link that never waits on a thread with those of other vehicles.
+    serve_link: Callable[[ServedLink], None] | None = None
 
     def __init__(self, uri: VehicleUri) -> None:
         """Store the address. A subclass reads its options here, and does no I/O."""

@@ -15,7 +15,7 @@ from functools import partial
 from typing import Final, Generic, Protocol, TypeVar
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds, seconds
-from skyloop.drivers.base import Sink
+from skyloop.drivers.base import ServedLink, Sink
 from skyloop.drivers.name_lookup import NameLookup
 from skyloop.drivers.vehicle_session import SinkCallback, VehicleSession
 from skyloop.messages import AnyAction, EventKind, Severity
@@ -50,6 +50,7 @@ class VehicleLink(ABC, Generic[S]):
         clock: Monotonic, ns.
         family: Of the addresses that the host's name is looked up for.
         close_s: How long :meth:`stop` waits for the thread.
+        serve: Takes the link to a thread that serves several; None: it has one of its own.
     """
 
     def __init__(
@@ -61,6 +62,7 @@ class VehicleLink(ABC, Generic[S]):
         *,
         family: socket.AddressFamily = socket.AF_INET,
         close_s: float = 2.0,
+        serve: Callable[[ServedLink], None] | None = None,
     ) -> None:
         self.session = session
         self.lock = threading.Lock()
@@ -73,21 +75,27 @@ class VehicleLink(ABC, Generic[S]):
         self._awake_ns = 0  # when its thread looks again at the latest
         self._opened_ns: int | None = None  # when sockets were opened last, or tried to
         self._close_s = close_s
+        self._within: int | None = None  # the thread that serves it just now
+        self._ended = threading.Event()
+        self._serve_elsewhere = serve
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
 
     def start(self) -> None:
-        """Start the thread."""
+        """Start the thread, or have a shared one serve the link."""
         self._awake.setblocking(False)
         self._waker.setblocking(False)
         self._watch(self._awake, self._drain_wakeups)
-        self._thread.start()
+        if self._serve_elsewhere is not None:
+            self._serve_elsewhere(self)
+        else:
+            self._thread.start()
 
     def stop(self) -> None:
         """Stop the thread, close the sockets and end the session: every caller that waits for an answer gets none."""
         self._stopping.set()
         self._wake()
-        if self._thread is not threading.current_thread():
-            self._thread.join(self._close_s)
+        if self._within != threading.get_ident():
+            self._ended.wait(self._close_s)
         with self.lock:
             self.session.close()
 
@@ -215,11 +223,11 @@ class VehicleLink(ABC, Generic[S]):
             with self.lock:
                 self.session.failed(error)
 
-    def _step(self) -> None:
+    def _step(self, *, wait: bool = True) -> None:
         self._renew()  # before the wait, so that no socket is closed between being ready and being read
         with self.lock:
             self._awake_ns = self.session.due_ns
-            wait_ns = self._awake_ns - self._clock()
+            wait_ns = self._awake_ns - self._clock() if wait else 0
         for key, _ in self._selector.select(max(0.0, seconds(wait_ns))):
             key.data()
         with self.lock:
@@ -232,6 +240,7 @@ class VehicleLink(ABC, Generic[S]):
             self._deliver(pending)
 
     def _run(self) -> None:
+        self._within = threading.get_ident()
         try:
             while not self._stopping.is_set():
                 try:
@@ -240,11 +249,38 @@ class VehicleLink(ABC, Generic[S]):
                     self._deliver([partial(_report_failure, error)])
                     self._stopping.wait(PAUSE_S)
         finally:
-            with self.lock:
-                self._close_sockets()
-            self._selector.close()
-            self._awake.close()
-            self._waker.close()
+            self.end()
+
+    def end(self) -> None:
+        """Close everything, on the thread that serves it: nothing is delivered any more."""
+        with self.lock:
+            self._close_sockets()
+        self._selector.close()
+        self._awake.close()
+        self._waker.close()
+        self._ended.set()
+
+    # On a thread that serves several -----------------------------------------------------------------------------
+
+    def fileno(self) -> int:
+        """Return what is readable when there is something to read."""
+        return self._selector.fileno()
+
+    def serve(self) -> int | None:
+        """Do what there is to do; see :class:`skyloop.drivers.base.ServedLink`."""
+        if self._stopping.is_set():
+            return None
+        self._within = threading.get_ident()
+        try:
+            self._step(wait=False)
+        except Exception as error:
+            self._deliver([partial(_report_failure, error)])
+            raise
+        finally:
+            self._within = None
+        with self.lock:
+            self._awake_ns = self.session.due_ns
+            return self._awake_ns
 
     def _wake(self) -> None:
         """End the wait of the link's thread. From any thread."""

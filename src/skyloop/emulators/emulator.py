@@ -35,12 +35,14 @@ class RunningEmulator(ABC):
     Args:
         host: The simulated world.
         drone: Its number in it.
-        loop: Name of the loop's thread.
+        loop: Name of the loop's thread; or a loop that several share, which whoever made it starts after them and stops
+            before them.
     """
 
-    def __init__(self, host: SimHost, drone: int, loop: str) -> None:
+    def __init__(self, host: SimHost, drone: int, loop: str | Loop) -> None:
         self._host, self._drone = host, drone
-        self._loop = Loop(loop)
+        self._own_loop = isinstance(loop, str)
+        self._loop = Loop(loop) if isinstance(loop, str) else loop
         self._video: VideoEncoding[Any] | None = None
         self._open: list[Closable] = []
         self._report: Report | None = None  #: the newest
@@ -51,7 +53,8 @@ class RunningEmulator(ABC):
         self._host.detach(self._drone, self)
         if self._video is not None:
             self._video.stop()
-        self._loop.stop()
+        if self._own_loop:
+            self._loop.stop()
         for port in self._open:
             port.close()
 

@@ -9,10 +9,11 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Final
 
-from skyloop.drivers.base import Driver
+from skyloop.drivers.base import Driver, ServedLink
 from skyloop.drivers.registry import make_driver
 from skyloop.errors import NameTakenError, RefusedError, SkyloopError, UnknownNameError, UsageError
 from skyloop.host.fleet import VehicleSettings
+from skyloop.host.links import LinkThread
 from skyloop.host.own_process import OwnProcessVehicle
 from skyloop.host.ticker import Ticker
 from skyloop.host.vehicle import Condition, HostedVehicle, SharedVehicle, VehicleStatus, network_of, reason_of, within
@@ -55,7 +56,8 @@ class Host:
         self._lock = threading.Lock()  # guards who is there, and the loops
         self._reactor = Reactor()  # for vehicles that come
         self._ticker = Ticker(self._on_failing)
-        self._loops: list[SharedLoop] = [self._reactor, self._ticker]
+        self._links = LinkThread()
+        self._loops: list[SharedLoop] = [self._reactor, self._ticker, self._links]
         self._workers = RequestWorkers()
         self._watchdog = Watchdog(lambda: self._loops, self._on_stall, self._on_hang)
         self._watchdog.start()
@@ -106,7 +108,13 @@ class Host:
         if settings.own_process:
             return OwnProcessVehicle(settings, self.announce)
         lane = self._workers.lane()
-        return SharedVehicle(settings, self._reactor, lane, network, self._make_driver, self._few, self._overview)
+        return SharedVehicle(
+            settings, self._reactor, lane, network, self._make_driver, self._few, self._overview, self._serve_link
+        )
+
+    def _serve_link(self, vehicle: SharedVehicle, link: ServedLink) -> None:
+        with self._lock:
+            self._links.add(link, vehicle)
 
     def _few(self) -> bool:
         return len(self.vehicles) <= FEW
@@ -234,9 +242,9 @@ class Host:
     # When a driver hangs or fails --------------------------------------------------------------------------------
 
     def _of(self, member: Any) -> SharedVehicle | None:
-        """Return the vehicle whose transport server or proxy this is."""
+        """Return the vehicle that this is, or whose transport server or proxy."""
         for vehicle in list(self.vehicles.values()):
-            if isinstance(vehicle, SharedVehicle) and member in (vehicle.server, vehicle.proxy):
+            if isinstance(vehicle, SharedVehicle) and member in (vehicle, vehicle.server, vehicle.proxy):
                 return vehicle
         return None
 
@@ -250,6 +258,9 @@ class Host:
             elif isinstance(loop, Ticker) and isinstance(member, Proxy):
                 new = loop.split(member)
                 self._ticker = new if loop is self._ticker else self._ticker
+            elif isinstance(loop, LinkThread):
+                new = loop.split(member)
+                self._links = new if loop is self._links else self._links
             else:
                 return
             self._loops.append(new)

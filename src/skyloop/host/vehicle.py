@@ -8,11 +8,12 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from enum import StrEnum
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import msgspec
 
-from skyloop.drivers.base import Driver
+from skyloop.drivers.base import Driver, ServedLink
 from skyloop.drivers.registry import make_driver
 from skyloop.errors import DriverError, SkyloopError
 from skyloop.files import expand
@@ -120,6 +121,7 @@ class SharedVehicle(HostedVehicle):
         make: Makes the driver of an address.
         few: Whether this process has few vehicles: the code of many is warm by itself.
         overview: The rows of all vehicles of this process; None: each shows its own alone.
+        serve_link: Takes a link of its driver to a thread that serves those of several; None: it has its own thread.
     """
 
     def __init__(
@@ -131,8 +133,10 @@ class SharedVehicle(HostedVehicle):
         make: Callable[[str], Driver] = make_driver,
         few: Callable[[], bool] = lambda: True,
         overview: OverviewRegistry | None = None,
+        serve_link: Callable[[SharedVehicle, ServedLink], None] | None = None,
     ) -> None:
         super().__init__(settings)
+        self._serve_link = serve_link
         self._overview = overview
         self._few = few
         self._make = make
@@ -146,6 +150,8 @@ class SharedVehicle(HostedVehicle):
         settings = self.settings
         self.condition = Condition.STARTING
         driver = self._make(settings.address)
+        if self._serve_link is not None:
+            driver.serve_link = partial(self._serve_link, self)
         proxy = Proxy(driver, self._end(str(driver.uri)), name=settings.name, ticker=False, jobs=self._jobs)
         proxy.parameters.preset(settings.presets)
         keep_warm(proxy, unless=lambda: not self._few())

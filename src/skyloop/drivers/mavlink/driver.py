@@ -71,7 +71,7 @@ class MavlinkDriver(Driver):
             self._camera.start()
         session = MavlinkSession(self.options, monotonic_ns(), extra=self._camera_telemetry)
         session.limit(self._limits)
-        self._link = MavlinkLink(session, lambda pending: _deliver(sink, pending))
+        self._link = MavlinkLink(session, lambda pending: _deliver(sink, pending), serve=self.serve_link)
         self._link.start()
 
     def _close(self) -> None:

@@ -11,6 +11,7 @@ from functools import partial
 from typing import Final, Protocol
 
 from skyloop.clock import Clock, monotonic_ns, nanoseconds
+from skyloop.drivers.base import ServedLink
 from skyloop.drivers.mavlink.options import Address, ConnectionKind, Peer
 from skyloop.drivers.mavlink.protocol import MavlinkSession
 from skyloop.drivers.vehicle_link import VehicleLink
@@ -241,12 +242,27 @@ class MavlinkLink(VehicleLink[MavlinkSession]):
         session: The vehicle's protocol.
         deliver: Called on the link's thread with what the session has for the sink.
         clock: Monotonic, ns.
+        serve: Takes the link to a thread that serves several, if it is one over UDP: to open another may take a while.
     """
 
     def __init__(
-        self, session: MavlinkSession, deliver: Callable[[list[SinkCallback]], None], clock: Clock = monotonic_ns
+        self,
+        session: MavlinkSession,
+        deliver: Callable[[list[SinkCallback]], None],
+        clock: Clock = monotonic_ns,
+        *,
+        serve: Callable[[ServedLink], None] | None = None,
     ) -> None:
-        super().__init__("skyloop-mavlink", session, deliver, clock, family=socket.AF_UNSPEC, close_s=_CLOSE_S)
+        udp = session.options.address.kind in (ConnectionKind.UDP_IN, ConnectionKind.UDP_OUT)
+        super().__init__(
+            "skyloop-mavlink",
+            session,
+            deliver,
+            clock,
+            family=socket.AF_UNSPEC,
+            close_s=_CLOSE_S,
+            serve=serve if udp else None,
+        )
         self._connection: MavlinkConnection | None = None
         self._broken = False  # nothing can be sent any more
 

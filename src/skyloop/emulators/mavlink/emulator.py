@@ -8,6 +8,7 @@ from typing import Final
 
 from skyloop.clock import monotonic_ns
 from skyloop.emulators.emulator import NO_FAULTS, Emulator, RunningEmulator, checked_delay
+from skyloop.emulators.loop import Loop
 from skyloop.emulators.mavlink.arducopter import ArduCopter
 from skyloop.emulators.mavlink.autopilot import Autopilot
 from skyloop.emulators.mavlink.links import Port, TcpPort, UdpPort
@@ -27,8 +28,8 @@ _KINDS: dict[Kind, type[Autopilot]] = {Kind.ARDUCOPTER: ArduCopter, Kind.PX4: Px
 class RunningFirmware(RunningEmulator):
     """An autopilot that is switched on. It belongs to the loop's thread."""
 
-    def __init__(self, host: SimHost, drone: int, settings: Settings) -> None:
-        super().__init__(host, drone, f"skyloop-{settings.kind.value}")
+    def __init__(self, host: SimHost, drone: int, settings: Settings, loop: Loop | None) -> None:
+        super().__init__(host, drone, loop or f"skyloop-{settings.kind.value}")
         kind = _KINDS[settings.kind]
         self.autopilot = kind(SimulatedVehicle(host.simulation, drone), settings.system, settings.boot_s, settings.gps)
         try:
@@ -40,7 +41,8 @@ class RunningFirmware(RunningEmulator):
                 self._open.append(tcp)
             self.ports = Ports(udp.port, settings.ports.remote, tcp.port if tcp is not None else None)
             self.autopilot.ports = (udp,) if tcp is None else (udp, tcp)
-            self._loop.start()
+            if self._own_loop:
+                self._loop.start()
             if settings.video is not None:
                 stream = TransportStream(*settings.video)
                 self._open.append(stream)
@@ -88,6 +90,8 @@ class MavlinkFirmware(Emulator[RunningFirmware]):
         version: 1: it speaks the old MAVLink, and answers in nothing else.
         key: 32 bytes that sign everything; None: nothing is signed.
         video: Host and port to which the front camera's pictures are sent over UDP; None: no camera.
+        loop: The thread of a whole fleet, started after all of it was started, and stopped before any of it; None: a
+            thread of its own.
 
     Raises:
         UsageError: An argument is out of range.
@@ -110,6 +114,7 @@ class MavlinkFirmware(Emulator[RunningFirmware]):
         version: int = 2,
         key: bytes | None = None,
         video: tuple[str, int] | None = None,
+        loop: Loop | None = None,
     ) -> None:
         number = drone + 1 if system is None else system
         if not 1 <= number <= 255:
@@ -117,12 +122,13 @@ class MavlinkFirmware(Emulator[RunningFirmware]):
         if version not in (1, 2):
             raise UsageError(f"there is MAVLink 1 and MAVLink 2, not {version!r}")
         super().__init__(host, drone)
+        self._loop = loop
         delay_s = checked_delay(delay_s)
         ports = ports or Ports.standard(kind, drone)
         self.settings = Settings(kind, bind, ports, number, faults, delay_s, boot_s, gps, version, key, video)
 
     def _switched_on(self) -> RunningFirmware:
-        running = RunningFirmware(self.host, self.drone, self.settings)
+        running = RunningFirmware(self.host, self.drone, self.settings, self._loop)
         self.settings = replace(self.settings, ports=running.ports)  # found again after a restart
         return running
 

@@ -96,9 +96,15 @@ def _free(held: ExitStack, kind: socket.SocketKind) -> int:
     return int(made.getsockname()[1])
 
 
-def with_multirotors(options: SimOptions | None = None) -> SimOptions:
-    """Return options of a world for emulated autopilots: reports as often as possible, and no cameras."""
-    return replace(options or SimOptions(), rate_hz=REPORTS_HZ, cameras=())
+def with_multirotors(options: SimOptions | None = None, *, rate_hz: float = REPORTS_HZ) -> SimOptions:
+    """Return options of a world for emulated autopilots: without cameras.
+
+    Args:
+        options: Of the world and its drones.
+        rate_hz: How often an autopilot flies and sends [1/s], by default as often as possible. A fleet that is to cost
+            little takes less: no message is sent more often than that.
+    """
+    return replace(options or SimOptions(), rate_hz=rate_hz, cameras=())
 
 
 @dataclass(frozen=True, slots=True)

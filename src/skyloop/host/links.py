@@ -1,0 +1,132 @@
+"""One thread for the links of many vehicles: where each has its own, most of the time goes to changing between them."""
+
+from __future__ import annotations
+
+import selectors
+import socket
+import threading
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from typing import Any, Final
+
+from skyloop.clock import nanoseconds, seconds
+from skyloop.drivers.base import ServedLink
+from skyloop.drivers.vehicle_link import PAUSE_S
+
+_LONGEST_WAIT_NS: Final = 1_000_000_000
+
+
+class LinkThread:
+    """Serves links on one thread, from its construction to :meth:`close`, each when it has something to read or to do.
+
+    Like a :class:`skyloop.transport.local.reactor.Reactor` it shows whose code it is in, and can be split.
+
+    Args:
+        links: Those that it serves from the beginning, each with the vehicle that it belongs to.
+    """
+
+    def __init__(self, links: Mapping[ServedLink, Any] | None = None) -> None:
+        self.inside: Any = None  #: the vehicle whose link is being served
+        self.entries = 0  #: how often :attr:`inside` was set
+        self._selector = selectors.DefaultSelector()
+        self._waker, self._awake = socket.socketpair()
+        self._waker.setblocking(False)
+        self._awake.setblocking(False)
+        self._lock = threading.Lock()  # guards who is in there
+        self._members: dict[ServedLink, Any] = {}
+        self._due_ns: dict[ServedLink, int] = {}
+        self._paused: set[ServedLink] = set()  # after an error: not waited for
+        self._closing = False
+        self._selector.register(self._awake, selectors.EVENT_READ)
+        for link, vehicle in (links or {}).items():
+            self.add(link, vehicle)
+        self._thread = threading.Thread(target=self._run, name="skyloop-links", daemon=True)
+        self._thread.start()
+
+    def add(self, link: ServedLink, vehicle: Any) -> None:
+        """Serve a link from now on, until it ends. Any thread.
+
+        Args:
+            link: The link.
+            vehicle: What :attr:`inside` shows while it is served.
+        """
+        with self._lock:
+            self._members[link], self._due_ns[link] = vehicle, 0
+            self._selector.register(link, selectors.EVENT_READ, link)
+        self._wake()
+
+    def split(self, stuck: Any) -> LinkThread:
+        """Leave this thread to the links of one vehicle, and return a new one that serves all others. Any thread."""
+        with self._lock:
+            others = {link: vehicle for link, vehicle in self._members.items() if vehicle is not stuck}
+            for link in others:
+                self._forget(link)
+        return LinkThread(others)
+
+    def close(self) -> None:
+        """End the thread, unless it is stuck. Idempotent."""
+        self._closing = True
+        self._wake()
+        if threading.current_thread() is not self._thread and self.inside is None:
+            self._thread.join()
+
+    def _forget(self, link: ServedLink) -> None:
+        del self._members[link], self._due_ns[link]
+        self._paused.discard(link)
+        self._unwatch(link)
+
+    def _unwatch(self, link: ServedLink) -> None:
+        with suppress(KeyError, ValueError, OSError):
+            self._selector.unregister(link)
+
+    def _run(self) -> None:
+        while not self._closing:
+            with self._lock:
+                next_ns = min(self._due_ns.values(), default=time.monotonic_ns() + _LONGEST_WAIT_NS)
+            wait_s = seconds(max(0, min(next_ns - time.monotonic_ns(), _LONGEST_WAIT_NS)))
+            ready = {key.data for key, _ in self._selector.select(wait_s)}
+            if None in ready:
+                with suppress(OSError):
+                    self._awake.recv(4096)
+            now_ns = time.monotonic_ns()
+            with self._lock:
+                turns = [link for link, due_ns in self._due_ns.items() if link in ready or due_ns <= now_ns]
+            for link in turns:
+                self._serve(link)
+            self.inside = None
+        self._selector.close()
+        self._awake.close()
+        self._waker.close()
+
+    def _serve(self, link: ServedLink) -> None:
+        with self._lock:
+            vehicle = self._members.get(link)
+            if vehicle is None:
+                return  # it is another thread's meanwhile
+            if link in self._paused:
+                self._paused.remove(link)
+                self._selector.register(link, selectors.EVENT_READ, link)
+        self.inside = vehicle
+        self.entries += 1
+        failed = False
+        due_ns: int | None
+        try:
+            due_ns = link.serve()
+        except Exception:  # noqa: BLE001  it has told; the links of all others go on
+            failed, due_ns = True, time.monotonic_ns() + nanoseconds(PAUSE_S)
+        with self._lock:
+            if due_ns is not None:
+                if link in self._members:
+                    self._due_ns[link] = due_ns
+                    if failed:
+                        self._unwatch(link)
+                        self._paused.add(link)
+                return
+            if link in self._members:
+                self._forget(link)
+        link.end()
+
+    def _wake(self) -> None:
+        with suppress(OSError):  # it is awake, or it ended
+            self._waker.send(b"\0")

@@ -1,0 +1,123 @@
+"""Links that share a thread: each is served when it can read or is due, and one that fails harms no other."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+
+from skyloop.host.links import LinkThread
+from skyloop.transport.testing import wait_until
+
+FAR_NS = 3600 * 10**9
+
+
+class Link:
+    """Counts how often it is served; it is woken by :meth:`wake`."""
+
+    def __init__(self) -> None:
+        self.far, self.near = socket.socketpair()
+        self.near.setblocking(False)
+        self.served = 0
+        self.ended = threading.Event()
+        self.stopping = False
+        self.period_ns = FAR_NS
+        self.raises = False
+        self.hangs = threading.Event()
+        self.hangs.set()
+
+    def fileno(self) -> int:
+        return self.near.fileno()
+
+    def serve(self) -> int | None:
+        if self.stopping:
+            return None
+        self.served += 1
+        self.hangs.wait(10.0)
+        if self.raises:
+            raise ValueError("broken")
+        with suppress(BlockingIOError):
+            self.near.recv(100)
+        return time.monotonic_ns() + self.period_ns
+
+    def end(self) -> None:
+        self.near.close()
+        self.far.close()
+        self.ended.set()
+
+    def wake(self) -> None:
+        self.far.send(b"x")
+
+
+@contextmanager
+def threads(*links: Link) -> Iterator[LinkThread]:
+    thread = LinkThread({link: link for link in links})
+    try:
+        wait_until(lambda: all(link.served for link in links), "each was served once")
+        yield thread
+    finally:
+        for link in links:
+            link.raises, link.stopping = False, True
+            link.hangs.set()
+            if not link.ended.is_set():
+                link.wake()
+        wait_until(lambda: all(link.ended.is_set() for link in links), "all have ended")
+        thread.close()
+
+
+def test_a_link_is_served_when_it_can_read_and_when_it_is_due() -> None:
+    one, two = Link(), Link()
+    two.period_ns = 1_000_000
+    with threads(one, two):
+        wait_until(lambda: two.served > 5, "that which is due soon is served again")
+        assert one.served == 1
+        one.wake()
+        wait_until(lambda: one.served == 2, "that which can read is served")
+
+
+def test_a_link_that_ends_is_served_no_more() -> None:
+    one, two = Link(), Link()
+    with threads(one, two):
+        one.stopping = True
+        one.wake()
+        assert one.ended.wait(5.0)
+        two.wake()
+        wait_until(lambda: two.served == 2, "the other goes on")
+
+
+def test_one_that_raises_is_tried_again_after_pauses_beside_the_others() -> None:
+    one, two = Link(), Link()
+    with threads(one, two):
+        one.raises = True
+        begun = time.monotonic()
+        one.wake()  # and nobody reads it
+        wait_until(lambda: one.served >= 5, "it is tried again")
+        assert time.monotonic() - begun > 0.05, "not all the time"
+        two.wake()
+        wait_until(lambda: two.served == 2, "the other is served")
+        one.raises = False
+        count = one.served
+        wait_until(lambda: one.served > count, "it is served again")
+
+
+def test_one_that_hangs_keeps_its_thread_and_the_others_get_another() -> None:
+    one, two = Link(), Link()
+    with threads(one, two) as thread:
+        one.hangs.clear()
+        one.wake()
+        wait_until(lambda: one.served == 2, "it hangs")
+        assert thread.inside is one
+        new = thread.split(one)
+        two.wake()
+        wait_until(lambda: two.served >= 2, "the other is served by the new thread")
+        count = two.served
+        one.hangs.set()
+        wait_until(lambda: thread.inside is None, "it comes back")
+        two.wake()
+        wait_until(lambda: two.served > count, "the other is still the new thread's")
+        two.stopping = True
+        two.wake()
+        assert two.ended.wait(5.0)
+        new.close()
