@@ -8,8 +8,10 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
+from skyloop.drivers.base import Sink
 from skyloop.host.links import LinkThread
 from skyloop.transport.testing import wait_until
+from tests.host.fleet import Hosting, Vehicle, closing_reason
 
 FAR_NS = 3600 * 10**9
 
@@ -121,3 +123,36 @@ def test_one_that_hangs_keeps_its_thread_and_the_others_get_another() -> None:
         two.wake()
         assert two.ended.wait(5.0)
         new.close()
+
+
+class Linked(Vehicle):
+    """A vehicle whose link the host serves."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.link = Link()
+
+    def _open(self, sink: Sink) -> None:
+        super()._open(sink)
+        assert self.serve_link is not None
+        self.serve_link(self.link)
+
+
+def test_a_vehicle_whose_link_hangs_ends_alone(hosting: Hosting) -> None:
+    stuck, good = Linked(), Linked()
+    hosting.drivers.update(stuck=stuck, good=good)
+    hosting.add("stuck")
+    hosting.add("good")
+    witness = hosting.app("stuck")
+    stuck.link.hangs.clear()
+    stuck.link.wake()
+    wait_until(lambda: hosting.condition("stuck") == "failed", "it was given up")
+    assert "its driver hangs" in closing_reason(witness)
+    count = good.link.served
+    good.link.wake()
+    wait_until(lambda: good.link.served > count, "the other's link is served")
+    assert hosting.condition("good") == "running"
+    stuck.link.hangs.set()
+    assert stuck.link.ended.wait(5.0), "its thread ends with it"
+    hosting.host.close()
+    assert good.link.ended.wait(5.0)

@@ -65,7 +65,7 @@ class LinkThread:
         return LinkThread(others)
 
     def close(self) -> None:
-        """End the thread, unless it is stuck. Idempotent."""
+        """End the thread, unless it is stuck, and the links that it has left. Idempotent."""
         self._closing = True
         self._wake()
         if threading.current_thread() is not self._thread and self.inside is None:
@@ -95,6 +95,10 @@ class LinkThread:
             for link in turns:
                 self._serve(link)
             self.inside = None
+        with self._lock:
+            left = list(self._members)
+        for link in left:  # of a vehicle that was given up
+            link.end()
         self._selector.close()
         self._awake.close()
         self._waker.close()

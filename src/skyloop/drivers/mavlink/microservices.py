@@ -197,6 +197,9 @@ PATIENT_RETRY_S: Final = 20.0  #: the same after :data:`TRIES`, as the vehicle m
 TRIES: Final = 4
 
 
+LOOK_NS: Final = nanoseconds(0.2)  #: between two looks at what flows, once all was asked for
+
+
 class MessageIntervals:
     """Asks for messages at the rates that feedback needs, and again while they do not flow.
 
@@ -207,10 +210,12 @@ class MessageIntervals:
     def __init__(self, rates: Mapping[str, float]) -> None:
         self._rates = dict(rates)
         self._asked: dict[str, tuple[int, int]] = {}  # when last, and how often
-        self._slow: set[str] = set()
+        self._look_ns = 0
 
     def request_missing(self, telemetry: Telemetry, commands: CommandSender, now_ns: int) -> None:
         """Ask for messages that do not flow, at most :data:`AT_ONCE` of them."""
+        if now_ns < self._look_ns:
+            return
         left = AT_ONCE
         for name, rate_hz in self._rates.items():
             if not left:
@@ -227,6 +232,7 @@ class MessageIntervals:
             number = getattr(m, f"MAVLINK_MSG_ID_{name}")
             commands.request(VehicleCommand(m.MAV_CMD_SET_MESSAGE_INTERVAL, (number, 1e6 / rate_hz)), now_ns, 0.0)
             left -= 1
+        self._look_ns = now_ns + LOOK_NS
 
 
 ASK_NS: Final = nanoseconds(1.0)

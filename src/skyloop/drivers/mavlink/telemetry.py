@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from skyloop.clock import nanoseconds, seconds
+from skyloop.clock import NS_PER_S, seconds
 from skyloop.drivers.vehicle_session import VehicleEvent
 from skyloop.messages import EventKind, Feedback, FlightState, Severity, Value
 from skyloop.messages.earth import EarthOrigin
@@ -88,7 +88,7 @@ class Telemetry:
             max_age_s: None is returned for an older one [s].
         """
         found = self._newest.get(kind)
-        if found is None or now_ns - found[1] > nanoseconds(min(max_age_s, 1e9)):
+        if found is None or now_ns - found[1] > max_age_s * NS_PER_S:
             return None
         return found[0]
 
