@@ -34,7 +34,7 @@ from skyloop.sim.host import SimHost
 from skyloop.sim.options import SimOptions
 
 RATE_HZ: Final = 10.0  #: of the vehicles' feedback, and of the repeats of commands
-EMULATED_HZ: Final = 25.0  #: how often an emulated autopilot flies and sends
+EMULATED_HZ: Final = 20.0  #: how often an emulated autopilot flies and sends
 WORLD: Final = 200  #: vehicles of one emulating process, which share a world
 LEG_M: Final = 1.0  #: the formation goes so far to each side of where it began
 PERIOD_S: Final = 12.0  #: there and back

@@ -323,3 +323,15 @@ def test_ports_that_are_taken_are_refused_and_nothing_is_left_behind(drone: Ardr
             another.start()
         with pytest.raises(UsageError, match="taken already"):
             ArdroneFirmware(host, ports=Ports.free()).start()
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_drones_on_free_ports_share_none(version: int) -> None:
+    world = SimHost(with_ardrones(SimOptions(world="empty", seed=1)), 3)
+    with ExitStack() as stack:
+        made = [ArdroneFirmware(world, drone, version=version, ports=Ports.free()) for drone in range(3)]
+        several = [astuple(stack.enter_context(firmware).ports) for firmware in made]
+        for kind in zip(*several, strict=True):
+            assert len({*kind}) == 3
+        datagrams = [port for navdata, video, at, _ in several for port in (navdata, at, video)[: 4 - version]]
+        assert len({*datagrams}) == len(datagrams)
