@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import socket
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from skyloop.emulators.loop import Loop
 from skyloop.emulators.mavlink import Kind, MavlinkFirmware, Ports, with_multirotors
 from skyloop.emulators.mavlink.streams import Streams
 from skyloop.errors import LinkError, UsageError
@@ -54,6 +55,20 @@ def test_it_sends_to_its_remote_port_and_then_to_who_speaks(kind: Kind) -> None:
             program = Codec(255, 190)
             other.sendto(program.encode(m.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)), ("127.0.0.1", ports.udp))
             assert heard(other, "HEARTBEAT").get_srcSystem() == 1
+
+
+def test_a_fleet_shares_a_world_and_a_thread_and_is_rarer_at_work() -> None:
+    options = with_multirotors(SimOptions(world="empty", seed=1, speed=3.0), rate_hz=20.0)
+    assert options.rate_hz == 20.0
+    world, loop = SimHost(options, 2), Loop("fleet")
+    several = Ports.several(Kind.ARDUCOPTER, 0, 2)
+    with ExitStack() as stack:
+        socks = [stack.enter_context(listening(ports.remote)) for ports in several]
+        for drone, ports in enumerate(several):
+            stack.enter_context(MavlinkFirmware(world, drone, kind=Kind.ARDUCOPTER, ports=ports, loop=loop))
+        loop.start()
+        stack.callback(loop.stop)
+        assert [heard(sock, "HEARTBEAT").get_srcSystem() for sock in socks] == [1, 2]
 
 
 def test_ports_that_are_taken_and_settings_that_can_not_be() -> None:
