@@ -130,12 +130,12 @@ class Linked(Vehicle):
 
     def __init__(self) -> None:
         super().__init__()
-        self.link = Link()
+        self.own_link = Link()
 
     def _open(self, sink: Sink) -> None:
         super()._open(sink)
         assert self.serve_link is not None
-        self.serve_link(self.link)
+        self.serve_link(self.own_link)
 
 
 def test_a_vehicle_whose_link_hangs_ends_alone(hosting: Hosting) -> None:
@@ -144,15 +144,15 @@ def test_a_vehicle_whose_link_hangs_ends_alone(hosting: Hosting) -> None:
     hosting.add("stuck")
     hosting.add("good")
     witness = hosting.app("stuck")
-    stuck.link.hangs.clear()
-    stuck.link.wake()
+    stuck.own_link.hangs.clear()
+    stuck.own_link.wake()
     wait_until(lambda: hosting.condition("stuck") == "failed", "it was given up")
     assert "its driver hangs" in closing_reason(witness)
-    count = good.link.served
-    good.link.wake()
-    wait_until(lambda: good.link.served > count, "the other's link is served")
+    count = good.own_link.served
+    good.own_link.wake()
+    wait_until(lambda: good.own_link.served > count, "the other's link is served")
     assert hosting.condition("good") == "running"
-    stuck.link.hangs.set()
-    assert stuck.link.ended.wait(5.0), "its thread ends with it"
+    stuck.own_link.hangs.set()
+    assert stuck.own_link.ended.wait(5.0), "its thread ends with it"
     hosting.host.close()
-    assert good.link.ended.wait(5.0)
+    assert good.own_link.ended.wait(5.0)
