@@ -1,7 +1,6 @@
 """One thread for the links of many vehicles: where each has its own, most of the time goes to changing between them.
 
-Commands do not come here: they are sent on the thread that receives them. What vehicles report, and what goes by time
-alone, is up to 2 ms later where there are many links.
+Commands do not come here: they are sent on the thread that receives them.
 """
 
 from __future__ import annotations
@@ -18,8 +17,6 @@ from skyloop.clock import nanoseconds, seconds
 from skyloop.drivers.base import ServedLink
 from skyloop.drivers.vehicle_link import PAUSE_S
 
-GATHER_S: Final = 0.002  #: between two rounds where there are many links, so that each finds more to read at once
-MANY: Final = 8  #: more links than that are many
 _LONGEST_WAIT_NS: Final = 1_000_000_000
 
 
@@ -101,8 +98,6 @@ class LinkThread:
             for link in turns:
                 self._serve(link)
             self.inside = None
-            if len(self._members) > MANY:
-                time.sleep(GATHER_S)
         with self._lock:
             left = list(self._members)
         for link in left:  # of a vehicle that was given up
