@@ -94,8 +94,8 @@ def test_a_damaged_command_supersedes_nothing_and_is_left_to_the_handler() -> No
 def test_the_lane_is_that_of_the_commands_in_front() -> None:
     backlog = Backlog()
     lanes = []
-    for seq, action in enumerate((FLY, LAND), 1):
-        backlog.put(command(seq, action))
+    for packet in (command(1, FLY), command(2, LAND)):
+        backlog.put(packet)
         lanes.append(backlog.lane)
     assert lanes == [Lane.STEERING, Lane.URGENT]
     late = Backlog()

@@ -17,6 +17,7 @@ from skyloop.transport.local import LocalServer, dial
 from skyloop.transport.local.reactor import Reactor
 from skyloop.transport.local.shared_server import SharedLocalServer
 from skyloop.transport.testing import PATIENCE_S, ClientLog, ServerLog, wait_until
+from tests.proxy.fake import Bench
 
 FLY, LAND = Velocity(forward=1.0), Land()
 BLOCK = encode(Request(1, Ping(1)))
@@ -119,6 +120,38 @@ def test_a_landing_that_does_not_fit_any_more_follows_and_is_handed_on(
     wait_until(lambda: landing in late.packets, "it came")
     assert len(late.packets) <= 4, "set-points were taken in at most a few times, not one by one"
     late.close()
+
+
+@pytest.mark.parametrize("kind", ["a thread for each", "one for all"])
+def test_a_stalled_proxy_lands_and_refuses_nothing_for_its_age(
+    kind: str, reactor: Reactor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The vehicle's driver stands still for eight seconds, in which its pilot goes on to fly, and lands."""
+    name = next(_names)
+    server = LocalServer(name) if kind == "a thread for each" else SharedLocalServer(name, reactor)
+    gate, entered = threading.Event(), threading.Event()
+    with Bench(transport=(server, dial(name))) as bench:
+        pilot, driver = bench.airborne(), bench.driver
+        apply = driver._apply
+
+        def stall(action: AnyAction) -> AnyAction:
+            entered.set()
+            assert gate.wait(PATIENCE_S)
+            return apply(action)
+
+        monkeypatch.setattr(driver, "_apply", stall)
+        pilot.command(Velocity(forward=0.0), sync=False)
+        assert entered.wait(PATIENCE_S)
+        for number in range(1, 101):
+            bench.clock.advance(0.08)
+            pilot.command(LAND if number == 99 else Velocity(forward=number / 1000), sync=False)
+        gate.set()
+        pilot.sync()
+        assert driver.told == [Velocity(forward=0.0), LAND]  # the set-point after it does not break the landing off
+        counters = bench.proxy.statistics()
+        assert "commands.refused" not in counters
+        assert counters[SUPERSEDED] == 98
+        assert counters["commands.applied"] == 4  # the take-off, and three
 
 
 def test_over_the_network_too() -> None:
