@@ -22,7 +22,6 @@ class ServerConnection:
     """
 
     __slots__ = (
-        "_poll",
         "_send",
         "_socket",
         "admitted",
@@ -31,6 +30,7 @@ class ServerConnection:
         "joined",
         "peer",
         "pilot",
+        "poll",
         "reason",
         "receive",
         "topics",
@@ -45,7 +45,7 @@ class ServerConnection:
         self.receive = sock.recv
         poll = select.poll()
         poll.register(sock, select.POLLIN)
-        self._poll = poll.poll
+        self.poll = poll.poll  #: whether a packet, or the end, waits in the socket; for the receiving thread
         self.backlog = Backlog()  #: taken out of the socket, and not handled yet
         self.peer = peer
         self.joined = False  #: it sent Hello, and the handler knows of it
@@ -61,7 +61,7 @@ class ServerConnection:
 
     def more(self) -> bool:
         """Return whether a packet of a pilot, or the end, waits in the socket; others' commands are refused anyway."""
-        return self.pilot and bool(self._poll(0))
+        return self.pilot and bool(self.poll(0))
 
     def take_in(self) -> int:
         """Take what waits in the socket into the backlog; return how many commands that superseded."""

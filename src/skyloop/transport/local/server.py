@@ -265,7 +265,7 @@ class LocalServer(TransportServer):
 
     def _receive(self, handler: ServerHandler, connection: ServerConnection) -> str:
         """Hand packets on, and return why it ended. Raises what the handler raises."""
-        receive, lock, backlog = connection.receive, self._lock, connection.backlog
+        receive, poll, lock, backlog = connection.receive, connection.poll, self._lock, connection.backlog
         while True:
             try:
                 packet = receive(MAX_PACKET + 1)
@@ -279,7 +279,7 @@ class LocalServer(TransportServer):
                 continue  # at once: the command that follows it does not wait in line with it
             lock.acquire(is_command(packet))
             try:
-                if connection.more():  # it waited: what came meanwhile may supersede it
+                if connection.pilot and poll(0):  # it waited: what came meanwhile may supersede it
                     backlog.put(packet)
                     packet = self._next(connection)
                 reason = self._take(handler, connection, packet)
