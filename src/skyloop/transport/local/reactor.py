@@ -28,6 +28,7 @@ from skyloop.transport.local.sockets import Socket
 
 CHECK_S: Final = 0.5  #: how often silent connections, and listeners that could not accept, are looked at
 _AFTER_FAILURE_S: Final = 0.01
+_IN_A_ROW: Final = 8  # packets that are handled before it is looked for new ones
 _FIRST_COME: Final = tuple(Lane)
 #: Which lane has the next turn: where there is always something urgent, the others have one in four each.
 _ORDERS: Final = (
@@ -171,7 +172,8 @@ class Reactor:
             ready = self._epoll.poll(0 if busy else CHECK_S)
             try:
                 self._receive(ready, at_once=not busy and len(ready) == 1)
-                self._deliver()
+                for _ in range(_IN_A_ROW):
+                    self._deliver()
                 if time.monotonic() - checked_s >= CHECK_S:
                     checked_s = time.monotonic()
                     self._check()
