@@ -173,6 +173,8 @@ class Reactor:
             try:
                 self._receive(ready, at_once=not busy and len(ready) == 1)
                 for _ in range(_IN_A_ROW):
+                    if not any(self._lanes):
+                        break
                     self._deliver()
                 if time.monotonic() - checked_s >= CHECK_S:
                     checked_s = time.monotonic()
