@@ -22,12 +22,13 @@ from collections import deque
 from collections.abc import Iterable
 from typing import Final, Protocol
 
-from skyloop.transport.backlog import Lane
+from skyloop.transport.backlog import MOST_PACKETS, Lane
 from skyloop.transport.local.connection import ServerConnection
 from skyloop.transport.local.sockets import Socket
 
 CHECK_S: Final = 0.5  #: how often silent connections, and listeners that could not accept, are looked at
 _AFTER_FAILURE_S: Final = 0.01
+_PAUSE_S: Final = 100e-6  # waiting for so long shows that nothing was waiting
 _IN_A_ROW: Final = 8  # packets that are handled before it is looked for new ones
 _FIRST_COME: Final = tuple(Lane)
 #: Which lane has the next turn: where there is always something urgent, the others have one in four each.
@@ -45,8 +46,8 @@ class Receiver(Protocol):
 
     reactor: Reactor  #: which receives for it now
 
-    def receive(self, reactor: Reactor, source: Source, at_once: bool) -> Lane | None:
-        """Take in what waits in a socket; return the lane in which the source then waits for :meth:`deliver`."""
+    def receive(self, reactor: Reactor, source: Source, at_once: bool) -> bool:
+        """Take one packet; return whether it now waits for :meth:`deliver`, and more may follow in the socket."""
 
     def deliver(self, reactor: Reactor, source: Source, lane: Lane) -> Lane | None:
         """Handle one packet of a source that waited in a lane; return the lane in which it waits again."""
@@ -169,9 +170,16 @@ class Reactor:
             busy = any(self._lanes)
             if not busy:
                 self.inside = None
+            begun_s = time.monotonic()
             ready = self._epoll.poll(0 if busy else CHECK_S)
+            # After a pause, a single packet is not one of many. Looking for more behind each of many would cost a
+            # system call each: all sockets are asked together, again and again until there is nothing new.
+            waited = time.monotonic() - begun_s > _PAUSE_S
             try:
-                self._receive(ready, at_once=not busy and len(ready) == 1)
+                if self._receive(ready, at_once=waited and len(ready) == 1):
+                    for _ in range(MOST_PACKETS):
+                        if not self._receive(self._epoll.poll(0), at_once=False):
+                            break
                 for _ in range(_IN_A_ROW):
                     if not any(self._lanes):
                         break
@@ -186,21 +194,27 @@ class Reactor:
         os.close(self._waker)
         self._epoll.close()
 
-    def _receive(self, ready: list[tuple[int, int]], at_once: bool) -> None:
-        """Take in what waits in all sockets, so that what is urgent is found, and what is superseded."""
-        sources = self._sources
+    def _receive(self, ready: list[tuple[int, int]], *, at_once: bool) -> bool:
+        """Take a packet of each socket, so that what is urgent is found, and what is superseded.
+
+        Returns:
+            Whether more may wait behind one of them.
+        """
+        sources, more = self._sources, False
         for fileno, _ in ready:
             source = sources.get(fileno)
             if source is not None:
                 self._enter(source.server)
-                self._line_up(source, source.server.receive(self, source, at_once))
+                more = source.server.receive(self, source, at_once) or more
             elif fileno == self._waker:
                 os.eventfd_read(self._waker)
                 while self._resumed:
                     source = self._resumed.popleft()
-                    self._line_up(source, source.lane)
+                    self.line_up(source, source.lane)
+        return more
 
-    def _line_up(self, source: Source, lane: Lane | None) -> None:
+    def line_up(self, source: Source, lane: Lane | None) -> None:
+        """Give a source a turn in a lane; None: in none. On the reactor's thread."""
         if lane is not None:
             self._lanes[lane].append(source)
 
@@ -212,7 +226,7 @@ class Reactor:
             if waiting:
                 source = waiting.popleft()
                 self._enter(source.server)
-                self._line_up(source, source.server.deliver(self, source, lane))
+                self.line_up(source, source.server.deliver(self, source, lane))
                 return
 
     def _enter(self, server: Receiver) -> None:

@@ -66,8 +66,8 @@ class SharedLocalServer(LocalServer):
 
     # --- the reactor's thread ---
 
-    def receive(self, reactor: Reactor, source: Source, at_once: bool) -> Lane | None:
-        """Take in a caller, or all packets that wait in a connection.
+    def receive(self, reactor: Reactor, source: Source, at_once: bool) -> bool:
+        """Take in a caller, or a packet of a connection.
 
         Args:
             reactor: Whose thread it is.
@@ -75,32 +75,33 @@ class SharedLocalServer(LocalServer):
             at_once: Whether nothing else waits for the thread, so that a command is handled here.
 
         Returns:
-            The lane that the source is to be put in, to wait for :meth:`deliver`; None: in none, or in no other one.
+            Whether the packet waits for :meth:`deliver`, and more may wait behind it.
         """
         with self._lock:  # from receiving to handling, so that after a split nothing overtakes what this thread has
             if not self._is_mine(reactor, source):
-                return None
+                return False
             connection = source.connection
             if connection is None:
                 self._accept_shared(reactor, source)
-                return None
+                return False
             backlog = connection.backlog
             if backlog.full or (backlog and not connection.pilot):
-                return None
+                return False
             try:
                 packet = connection.receive(MAX_PACKET + 1, RECEIVE_FLAGS)
             except (BlockingIOError, ConnectionResetError):
-                return None  # after a reset, what was sent before it still comes, and then the end
+                return False  # after a reset, what was sent before it still comes, and then the end
             except OSError as error:
                 self._finish_connection(source, connection, f"receiving failed: {error}")
-                return None
+                return False
             if packet == packets.WAKE and connection.joined:
-                return None
+                return False
             if at_once and not backlog and is_command(packet) and not connection.more():
                 self._handle(source, connection, packet)
-                return None
-            self._superseded += backlog.put(packet) + connection.take_in()
-            return self._line_up(source, connection)
+                return False
+            self._superseded += backlog.put(packet)
+            reactor.line_up(source, self._lane(source, connection))
+            return connection.pilot and bool(packet)
 
     def deliver(self, reactor: Reactor, source: Source, lane: Lane) -> Lane | None:
         """Handle the first packet that waits in a source.
@@ -121,9 +122,9 @@ class SharedLocalServer(LocalServer):
             if connection is None or not connection.backlog:
                 return None
             self._handle(source, connection, connection.backlog.get())
-            return None if source.ended else self._line_up(source, connection)
+            return None if source.ended else self._lane(source, connection)
 
-    def _line_up(self, source: Source, connection: ServerConnection) -> Lane | None:
+    def _lane(self, source: Source, connection: ServerConnection) -> Lane | None:
         """Return the lane that a source is to be put in; None: nothing waits, or it is in that lane already."""
         lane = connection.backlog.lane
         if lane is Lane.URGENT and not connection.pilot:
