@@ -167,6 +167,9 @@ def fleet(
     vehicles: Annotated[int, typer.Option(min=2, max=500, help="How many in one host")] = 100,
     observers: Annotated[int, typer.Option(min=0, max=100, help="Of one of them, in another case; 0: none")] = 50,
     networked: Annotated[int, typer.Option(min=0, max=500, help="How many over the network; 0: none")] = 50,
+    busy_ms: Annotated[
+        float, typer.Option(min=0.0, max=100.0, help="Processor time that each driver takes for a command, to overload")
+    ] = 0.0,
     seconds: Seconds = None,
     minutes: Minutes = None,
     output: Output = None,
@@ -176,7 +179,7 @@ def fleet(
 
     wanted_s = duration_s(seconds, minutes)
     with measuring("fleet", output) as progress:
-        results = fleet.measure(wanted_s, fleet.cases_of(vehicles, observers, networked), progress)
+        results = fleet.measure(wanted_s, fleet.cases_of(vehicles, observers, networked, busy_ms / 1e3), progress)
     finish("fleet", results, as_rich([tables.fleet_table(results)], str(results.machine)), output)
 
 
