@@ -170,6 +170,9 @@ def fleet(
     mavlink: Annotated[
         int, typer.Option(min=0, max=500, help="Emulated MAVLink vehicles, half of them in formation; 0: none")
     ] = 40,
+    busy_ms: Annotated[
+        float, typer.Option(min=0.0, max=100.0, help="Processor time that each driver takes for a command, to overload")
+    ] = 0.0,
     seconds: Seconds = None,
     minutes: Minutes = None,
     output: Output = None,
@@ -179,7 +182,7 @@ def fleet(
 
     wanted_s = duration_s(seconds, minutes)
     with measuring("fleet", output) as progress:
-        cases = fleet.cases_of(vehicles, observers, networked)
+        cases = fleet.cases_of(vehicles, observers, networked, busy_ms / 1e3)
         results = fleet.measure(wanted_s, cases, progress, mavlink=mavlink)
     shown = [tables.fleet_table(results)] if results.cases else []
     if results.mavlink is not None:

@@ -18,7 +18,7 @@ import msgspec
 from benchmarks import mavlink_fleet
 from benchmarks.mavlink_fleet import MavlinkResult
 from benchmarks.scale import FRAME_PERIOD_S, loopback
-from skyloop.bench.contract import Arrivals, picture
+from skyloop.bench.contract import Arrivals, Received, picture
 from skyloop.bench.machine import Machine, cpu_time_s, memory_bytes
 from skyloop.bench.ours import Listening
 from skyloop.bench.pair import since
@@ -33,6 +33,7 @@ from skyloop.errors import SkyloopError
 from skyloop.host.fleet import VehicleSettings
 from skyloop.host.host import Host
 from skyloop.host.serve import SWITCH_INTERVAL_S
+from skyloop.messages import AnyAction
 from skyloop.transport.fabric import FabricSettings
 from skyloop.transport.local.directory import DIRECTORY_VARIABLE
 
@@ -49,11 +50,13 @@ class Case(NamedTuple):
     vehicles: int
     observers: int = 0  #: of the feedback and video of the first vehicle
     network: str = ""  #: over the fabric: where the host listens; empty: over the local transport
+    busy_s: float = 0.0  #: processor time that each vehicle's driver takes for a command [s]
 
     @property
     def name(self) -> str:
         watched = f", {self.observers} observers of one" if self.observers else ""
-        return f"{self.vehicles} vehicles{watched}, {'fabric' if self.network else 'local'}"
+        busy = f", {1e3 * self.busy_s:g} ms a command" if self.busy_s else ""
+        return f"{self.vehicles} vehicles{watched}{busy}, {'fabric' if self.network else 'local'}"
 
 
 class CaseResult(msgspec.Struct, frozen=True):
@@ -68,6 +71,7 @@ class CaseResult(msgspec.Struct, frozen=True):
     vehicle_mb: float  #: memory of the host for each vehicle, beyond that of a host with one
     threads: dict[str, int]
     opened_s: float  #: that the pilot took to connect to all
+    busy_s: float = 0.0  #: processor time that each vehicle's driver took for a command [s]
 
 
 class HostedFleet(msgspec.Struct, frozen=True, tag_field="what", tag="fleet"):
@@ -79,13 +83,13 @@ class HostedFleet(msgspec.Struct, frozen=True, tag_field="what", tag="fleet"):
     mavlink: MavlinkResult | None = None
 
 
-def cases_of(vehicles: int, observers: int, networked: int) -> list[Case]:
+def cases_of(vehicles: int, observers: int, networked: int, busy_s: float = 0.0) -> list[Case]:
     """Return the cases to measure: the vehicles alone, with observers of one, and some over the network."""
-    cases = [Case(vehicles)] if vehicles else []
+    cases = [Case(vehicles, busy_s=busy_s)] if vehicles else []
     if vehicles and observers:
-        cases.append(Case(vehicles, observers))
+        cases.append(Case(vehicles, observers, busy_s=busy_s))
     if networked:
-        cases.append(Case(networked, network=loopback(0)))
+        cases.append(Case(networked, network=loopback(0), busy_s=busy_s))
     return cases
 
 
@@ -166,7 +170,22 @@ def _play(case: Case, workers: Workers, seconds: float) -> CaseResult:
         vehicle_mb,
         {"host": host_threads, "pilot": pilot_threads},
         opened_s,
+        case.busy_s,
     )
+
+
+class _BusyVehicle(BenchVehicle):
+    """A vehicle whose driver computes for a while with each command."""
+
+    def __init__(self, received: Received, busy_s: float) -> None:
+        super().__init__(received)
+        self._busy_s = busy_s
+
+    def _apply(self, action: AnyAction) -> AnyAction:
+        until_s = time.thread_time() + self._busy_s
+        while time.thread_time() < until_s:
+            pass
+        return super()._apply(action)
 
 
 class _Recorder:
@@ -196,7 +215,10 @@ def serve(pipe: Pipe, case: Case) -> None:
     vehicles: list[BenchVehicle] = []
 
     def make(_: str) -> BenchVehicle:
-        vehicles.append(BenchVehicle(recorder.received))
+        if case.busy_s:
+            vehicles.append(_BusyVehicle(recorder.received, case.busy_s))
+        else:
+            vehicles.append(BenchVehicle(recorder.received))
         return vehicles[-1]
 
     host = Host(lambda _: None, make)

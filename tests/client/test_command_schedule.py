@@ -133,6 +133,56 @@ def test_a_take_off_is_never_replaced_before_it_went_out() -> None:
     assert bench.actions == [FORWARD, Takeoff(), FORWARD]
 
 
+def not_sent(bench: Bench, action: AnyAction) -> None:
+    bench.commander.ask(action, bench.clock())
+    bench.step(0.0)
+    assert bench.actions[-1] == action
+    bench.commander.not_sent(action, bench.clock())
+
+
+def owed(bench: Bench, action: AnyAction = FORWARD) -> AnyAction | None:
+    """What goes out before an action that is asked for now."""
+    bench.commander.ask(action, bench.clock())
+    first = bench.commander.first(action, bench.clock())
+    return None if first is None else first.action
+
+
+def test_a_landing_for_which_there_was_no_room_goes_before_the_set_points_after_it() -> None:
+    bench = Bench()
+    not_sent(bench, Land())
+    assert bench.commander.first(Land(), bench.clock()) is None, "its repeat is the same"
+    assert owed(bench) == Land()
+    bench.clock.advance(0.6)
+    assert owed(bench) is None, "as late as that nobody expects it"
+
+
+@pytest.mark.parametrize(
+    ("unsent", "then", "first"),
+    [
+        (FORWARD, FORWARD, None),
+        (Idle(), FORWARD, None),
+        (Land(), Hover(), None),  # revoked
+        (EmergencyStop(), FORWARD, EmergencyStop()),
+        (EmergencyStop(), Takeoff(), EmergencyStop()),
+    ],
+)
+def test_what_there_was_no_room_for(unsent: AnyAction, then: AnyAction, first: AnyAction | None) -> None:
+    bench = Bench()
+    not_sent(bench, unsent)
+    assert owed(bench, then) == first
+
+
+def test_nothing_takes_the_place_of_an_emergency_stop_and_nothing_else_outlives_the_authority() -> None:
+    bench = Bench()
+    not_sent(bench, Land())
+    bench.commander.clear()
+    assert owed(bench) is None
+    not_sent(bench, EmergencyStop())
+    not_sent(bench, Hover())
+    bench.commander.clear()
+    assert owed(bench) == EmergencyStop()
+
+
 def test_a_hover_goes_out_at_once_but_not_a_stream_of_them() -> None:
     bench = Bench()
     bench.ask(FORWARD)

@@ -136,6 +136,25 @@ def test_take_off_and_land(proxy: ScriptedProxy, drone: Drone) -> None:
     proxy.until(lambda: Idle() in proxy.actions()[after:], "a landed vehicle is told to land for ever")
 
 
+def test_a_landing_that_finds_no_room_is_sent_before_the_next_set_point(proxy: ScriptedProxy, drone: Drone) -> None:
+    connection = drone._core.connection
+    transmit, full = connection.transmit, threading.Event()
+
+    def through_a_full_socket(packet: bytes) -> bool:
+        return not full.is_set() and transmit(packet)
+
+    connection.transmit = through_a_full_socket
+    drone.velocity(forward=0.1)
+    proxy.until_commanded(Velocity(forward=0.1))
+    full.set()
+    assert not drone.command(Land())
+    drone.velocity(forward=0.2)
+    full.clear()
+    proxy.until_commanded(Velocity(forward=0.2))
+    actions = proxy.actions()
+    assert actions[actions.index(Velocity(forward=0.2)) - 1] == Land()
+
+
 def failsafe(proxy: ScriptedProxy, _: Command) -> None:
     proxy.more["failsafe"] = Failsafe.HOVER
 

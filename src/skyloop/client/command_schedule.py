@@ -7,7 +7,7 @@ the vehicle as it is. A set-point from before a lost link, a lost authority or a
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 from skyloop.clock import nanoseconds
 from skyloop.errors import UsageError
@@ -27,6 +27,7 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
+from skyloop.messages.command import SET_POINTS
 
 _IDLE: Final = Idle()
 _HOVER: Final = Hover()
@@ -52,6 +53,14 @@ _AT_MOST_NS: Final[dict[type[AnyAction], int]] = {
     EmergencyStop: nanoseconds(2.0),
     ResetEmergency: nanoseconds(2.0),
 }
+
+
+class Unsent(NamedTuple):
+    """What was asked for once, and found no room on the way to the proxy."""
+
+    action: AnyAction
+    intent: int
+    since_ns: int
 
 
 class CommandSchedule:
@@ -83,6 +92,7 @@ class CommandSchedule:
         self.action: AnyAction = _IDLE
         self.asked: AnyAction = _IDLE  #: what the application commanded last, whether or not it is over
         self.intent = 0
+        self.owed: Unsent | None = None  #: what was asked for once, and not sent
         self._asked_ns = 0
         # Repeats must not delay an application that commands at about the same rate: the first repeat waits a quarter
         # period longer, and only commands of the application delay the next one.
@@ -132,6 +142,19 @@ class CommandSchedule:
             self._due_ns = now_ns + self._period_ns
         return self.action
 
+    def not_sent(self, action: AnyAction, now_ns: int) -> None:
+        """Note that there was no room for what :meth:`next` returned: set-points follow anyway, a landing may not."""
+        stops = self.owed is not None and type(self.owed.action) is EmergencyStop
+        if not _is_periodic(action) and not stops:
+            self.owed = Unsent(action, self.intent, now_ns)
+
+    def first(self, action: AnyAction, now_ns: int) -> Unsent | None:
+        """Return :attr:`owed` if it is to be sent before ``action``, which neither repeats nor revokes it."""
+        owed = self.owed
+        if owed is None or owed.intent == self.intent or now_ns - owed.since_ns > self._keep_ns:
+            return None
+        return owed if _is_periodic(action) or type(owed.action) is EmergencyStop else None
+
     def decayed(self, before: AnyAction) -> bool:
         """Return whether the set-point ``before`` has decayed to hover because the application made no call."""
         return self.action is _HOVER and before is not _HOVER
@@ -155,6 +178,8 @@ class CommandSchedule:
         """Drop the set-point, after a lost authority or a failsafe. An emergency stop stays."""
         if not isinstance(self.action, EmergencyStop):
             self.action = _IDLE
+        if self.owed is not None and type(self.owed.action) is not EmergencyStop:
+            self.owed = None
 
     def resume(self, now_ns: int) -> None:
         """Start to send (again): drop a set-point that is too old."""
@@ -176,3 +201,7 @@ class CommandSchedule:
     def _expired(self, now_ns: int) -> bool:
         longest_ns = _AT_MOST_NS.get(type(self.action))
         return longest_ns is not None and now_ns - self._asked_ns > longest_ns
+
+
+def _is_periodic(action: AnyAction) -> bool:
+    return type(action) is Idle or isinstance(action, SET_POINTS)

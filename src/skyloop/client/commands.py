@@ -356,17 +356,25 @@ class CommandSender:
         return self._schedule.decayed(before)
 
     def _send_next(self, now_ns: int) -> bool:
-        action = self._schedule.next(now_ns)
+        schedule = self._schedule
+        action = schedule.next(now_ns)
         if action is None:
             return False
-        self._seq += 1
-        connection, lease, intent = self._connection, self._authority.status.lease, self._schedule.intent
-        sent_ns = self._clock() + connection.offset_ns
-        if connection.transmit(encode(Command(self._seq, lease, intent, sent_ns, action))):
-            self.sends.add(0, now_ns, now_ns)
-            return True
+        first = None if schedule.owed is None else schedule.first(action, now_ns)
+        if first is None or self._transmit(first.action, first.intent):
+            schedule.owed = None
+            if self._transmit(action, schedule.intent):
+                self.sends.add(0, now_ns, now_ns)
+                return True
         self.sends.dropped += 1
+        schedule.not_sent(action, now_ns)
         return False
+
+    def _transmit(self, action: AnyAction, intent: int) -> bool:
+        self._seq += 1
+        connection = self._connection
+        sent_ns = self._clock() + connection.offset_ns
+        return connection.transmit(encode(Command(self._seq, self._authority.status.lease, intent, sent_ns, action)))
 
     def _answered(self, answer: AnyReply | LinkError) -> None:
         """Handle the answer to a request for the authority, on the receiving thread."""

@@ -161,6 +161,9 @@ AnyAction = (
     Idle | Takeoff | Hover | Land | EmergencyStop | ResetEmergency | Attitude | Velocity | Position | ReturnToStart
 )
 
+#: Actions that set where or how fast to fly: each replaces the one before, and a program sends them periodically.
+SET_POINTS: Final = (Velocity, Attitude, Position, ReturnToStart)
+
 ACTION_NAMES: dict[type[Action], str] = {
     Idle: "idle",
     Takeoff: "takeoff",

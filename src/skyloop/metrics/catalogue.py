@@ -51,6 +51,12 @@ FAMILIES: Final[dict[str, Family]] = {
         Family("skyloop_commands_received_total", "counter", _VEHICLE, "commands that came"),
         Family("skyloop_commands_applied_total", "counter", _VEHICLE, "commands handed to the vehicle"),
         Family("skyloop_commands_clamped_total", "counter", _VEHICLE, "commands lowered to a limit"),
+        Family(
+            "skyloop_commands_superseded_total",
+            "counter",
+            _VEHICLE,
+            "commands that waited, and made way for newer ones",
+        ),
         Family("skyloop_commands_refused_total", "counter", ("vehicle", "reason"), "commands refused, by reason"),
         Family(
             "skyloop_command_delay_seconds",

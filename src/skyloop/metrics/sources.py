@@ -26,6 +26,7 @@ _COUNTERS: Final = {
     "skyloop_commands_received_total": "commands.received",
     "skyloop_commands_applied_total": "commands.applied",
     "skyloop_commands_clamped_total": "commands.clamped",
+    "skyloop_commands_superseded_total": "commands.superseded",
     "skyloop_requests_total": "requests.received",
     "skyloop_requests_refused_total": "requests.refused",
     "skyloop_packets_malformed_total": "packets.malformed",

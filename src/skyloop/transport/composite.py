@@ -97,7 +97,11 @@ class CompositeServer(TransportServer):
 
     @property
     def counters(self) -> dict[str, float]:
-        return {name: count for end in self._ends for name, count in end.counters.items()}
+        total: dict[str, float] = {}
+        for end in self._ends:
+            for name, count in end.counters.items():
+                total[name] = total.get(name, 0) + count
+        return total
 
     @property
     def restricted(self) -> bool:

@@ -31,6 +31,7 @@ from skyloop.messages import (
     Takeoff,
     Velocity,
 )
+from skyloop.messages.command import SET_POINTS
 from skyloop.proxy.core.authority import Authority
 from skyloop.proxy.core.failsafe import REASONS, FailsafeLadder
 from skyloop.proxy.core.limits import Ceiling, Clamp, Limits
@@ -43,7 +44,6 @@ from skyloop.zones import Space
 MAX_AHEAD_S: Final = 0.05  #: how far in the future a command's time may lie: the error of the clocks' offset
 _MAX_AHEAD_NS: Final = nanoseconds(MAX_AHEAD_S)
 _HOVER_ACTION: Final = Hover()
-_SET_POINTS: Final = (Velocity, Attitude, Position, ReturnToStart)
 _ON_THE_GROUND: Final = (FlightState.LANDED, FlightState.UNKNOWN)
 _TAKING: Final = (Takeoff, Hover, Land)  #: newly asked for, they take a vehicle that others fly
 
@@ -215,7 +215,7 @@ class CommandChecks:
         problem = self._problem(command, sequence, state, link, new)
         if problem is not None:
             return Decision(None, *problem, new)
-        is_set_point = kind in _SET_POINTS
+        is_set_point = kind in SET_POINTS
         if policy is StatePolicy.HOLD and is_set_point and self._ladder.step is Failsafe.LAND:
             policy = StatePolicy.HOVER  # the ladder's landing, not a pilot's: a pilot who is back breaks it off
         if policy is StatePolicy.REFUSE:
@@ -290,13 +290,13 @@ class CommandChecks:
             return Refusal.UNSUPPORTED, f"{command.action.name} is not possible: {why}"
         if self._ownership.whose is Whose.OTHERS:
             others = self._ownership.others
-            if kind in _SET_POINTS:
+            if kind in SET_POINTS:
                 return Refusal.WRONG_STATE, f"{others}: hover, take off or land first to take it over"
             if not new and kind in _TAKING:
                 return Refusal.WRONG_STATE, f"{others}, and a repeated command does not take it back: send a new one"
         if self._ladder.barred and kind is not Land:
             return Refusal.WRONG_STATE, f"only landing is possible: {REASONS[self._ladder.barred]}"
-        if self._ladder.lands_for_battery and kind in _SET_POINTS:
+        if self._ladder.lands_for_battery and kind in SET_POINTS:
             what = "returns to its start" if self._ladder.returning else "lands"
             return Refusal.WRONG_STATE, f"it {what}, because the battery is low: hover or land first to take it over"
         if self._ladder.battery_low and kind is Takeoff and state in _ON_THE_GROUND:

@@ -13,11 +13,15 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final
 
+from skyloop.transport.backlog import Backlog
 from skyloop.transport.base import Peer
 from skyloop.transport.fabric import packets
 from skyloop.transport.fabric.admission import Admission
 from skyloop.transport.fabric.delivery import DEPTH, MAX_BYTES, Outgoing, Receiver
 
+#: Packets of one application that wait for the handler, and as many commands. Further packets are not acknowledged, so
+#: that they are sent again; further commands are dropped, as newer ones follow. Set-points count once.
+MAX_WAITING: Final = 64
 POLL_S: Final = 0.05  #: how often to check whether something has to be sent again
 _OWN_AT_MOST: Final = 8  # of the transport's own packets that wait; they may be lost, and are asked for again
 _log = logging.getLogger(__name__)
@@ -39,6 +43,7 @@ class ServerConnection:
         "_taken",
         "admission",
         "announced",
+        "commands",
         "confirmed",
         "ended",
         "id",
@@ -59,6 +64,7 @@ class ServerConnection:
         self.id = connection
         self.admission = admission
         self.joined_s = joined_s  #: when it asked to be let in
+        self.commands = Backlog(MAX_WAITING)  #: that wait for the handler; the server guards it
         self.announced = False  #: the handler knows of it
         self.confirmed = False  #: its token was seen, so that Zenoh will report its end
         self.ended = False  #: what still comes is not wanted any more

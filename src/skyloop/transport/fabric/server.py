@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING, Any, Final
 
 from skyloop.errors import DecodeError, NameTakenError, UsageError
 from skyloop.messages import FrameHeader
+from skyloop.transport.backlog import SUPERSEDED
 from skyloop.transport.base import Peer, Pixels, ServerHandler, TransportServer, check_frame, check_name, check_packet
 from skyloop.transport.fabric import discovery, layout, packets
 from skyloop.transport.fabric.config import Part
-from skyloop.transport.fabric.connection import Sender, ServerConnection
+from skyloop.transport.fabric.connection import MAX_WAITING, Sender, ServerConnection
 from skyloop.transport.fabric.handler_queue import HandlerQueue
 from skyloop.transport.fabric.publishing import Publisher
 from skyloop.transport.fabric.registry import ConnectionRegistry, Item
@@ -31,12 +32,10 @@ from skyloop.transport.priority_lock import is_command
 if TYPE_CHECKING:
     import zenoh
 
-#: Packets of one application that wait for the handler, and as many commands. Further packets are not acknowledged, so
-#: that they are sent again; further commands are dropped, as newer ones follow.
-MAX_WAITING: Final = 64
 FAREWELL_S: Final = 0.5  #: how long a transport server that stops waits for its applications to receive the reason
 _POLL_S: Final = 0.5
 _REFUSED: Final = b""  # in place of a packet that was
+_COMMAND: Final = b"c"  # in place of a command: the one that waits first in the connection's backlog
 _UPWARD: Final = (layout.ASK, layout.ORDER, layout.COMMAND)
 _log = logging.getLogger(__name__)
 
@@ -68,6 +67,8 @@ class FabricServer(TransportServer):
         self._run = layout.new_id()
         ring = self._settings.ring
         topic_keys = None if ring is None else TopicSeal()
+        self._commands_lock = threading.Lock()  # guards the connections' backlogs of commands
+        self._superseded = 0  # of them, by newer ones that waited behind them
         self._queue: HandlerQueue[Item] = HandlerQueue()
         self._sender = Sender(self._put_to, name)
         self._publisher = Publisher(name, self._run, topic_keys or PLAIN)
@@ -162,6 +163,7 @@ class FabricServer(TransportServer):
     @property
     def counters(self) -> dict[str, float]:
         return {
+            SUPERSEDED: self._superseded,
             "network.dropped": self._registry.dropped,
             "network.refused": self.refused,
             "network.strays": self.strays,
@@ -250,8 +252,16 @@ class FabricServer(TransportServer):
             connection.receiver.receive(packet, control=control, deliver=partial(self._enqueue, connection))
 
     def _enqueue(self, connection: ServerConnection, packet: bytes) -> None:
-        urgent = is_command(packet) and connection.announced
-        self._queue.put(connection, (connection, packet), urgent=urgent, at_most=MAX_WAITING)
+        if not (is_command(packet) and connection.announced):
+            self._queue.put(connection, (connection, packet), at_most=MAX_WAITING)
+            return
+        with self._commands_lock:
+            if connection.commands.full:
+                return
+            superseded = connection.commands.put(packet)
+            self._superseded += superseded
+        if not superseded:  # else it has the turn of the one before it
+            self._queue.put(connection, (connection, _COMMAND), urgent=True)
 
     def _control(self, connection: ServerConnection, message: packets.Message) -> bool:
         """Handle one of the transport's own packets; return False for one that is left to the handler (garbage)."""
@@ -294,6 +304,11 @@ class FabricServer(TransportServer):
                     connection.ended = True
                     handler.peer_left(connection.peer, connection.reason)
                 elif not connection.ended:
+                    if what is _COMMAND:
+                        with self._commands_lock:
+                            if not connection.commands:
+                                continue  # one command superseded two
+                            what = connection.commands.get()
                     self._handle(handler, connection, what)
             except Exception as error:  # noqa: BLE001  (a handler may raise anything)
                 _log.exception("the handler of %s failed; %s is disconnected", self.address, connection.peer.address)

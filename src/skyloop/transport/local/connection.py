@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import array
+import select
 import socket
 
-from skyloop.transport.base import Peer
+from skyloop.transport.backlog import MOST_PACKETS, Backlog
+from skyloop.transport.base import MAX_PACKET, Peer
 from skyloop.transport.local import packets
-from skyloop.transport.local.sockets import SEND_FLAGS, Credentials, Socket, set_timeout
+from skyloop.transport.local.sockets import RECEIVE_FLAGS, SEND_FLAGS, Credentials, Socket, set_timeout
 
 
 class ServerConnection:
@@ -23,10 +25,12 @@ class ServerConnection:
         "_send",
         "_socket",
         "admitted",
+        "backlog",
         "ending",
         "joined",
         "peer",
         "pilot",
+        "poll",
         "reason",
         "receive",
         "topics",
@@ -39,6 +43,10 @@ class ServerConnection:
         self._socket = sock
         self._send = sock.send
         self.receive = sock.recv
+        poll = select.poll()
+        poll.register(sock, select.POLLIN)
+        self.poll = poll.poll  #: whether a packet, or the end, waits in the socket; for the receiving thread
+        self.backlog = Backlog()  #: taken out of the socket, and not handled yet
         self.peer = peer
         self.joined = False  #: it sent Hello, and the handler knows of it
         self.admitted = False  #: it sent who it is, and the handler let it stay
@@ -50,6 +58,28 @@ class ServerConnection:
     def fileno(self) -> int:
         """Return the socket's descriptor, for who waits for several."""
         return self._socket.fileno()
+
+    def more(self) -> bool:
+        """Return whether a packet of a pilot, or the end, waits in the socket; others' commands are refused anyway."""
+        return self.pilot and bool(self.poll(0))
+
+    def take_in(self) -> int:
+        """Take what waits in the socket into the backlog; return how many commands that superseded."""
+        superseded = 0
+        backlog = self.backlog
+        for _ in range(MOST_PACKETS):
+            if backlog.full or not self.more():
+                break
+            try:
+                packet = self.receive(MAX_PACKET + 1, RECEIVE_FLAGS)
+            except OSError:
+                break  # who waits for the next packet gets it, too
+            if packet == packets.WAKE:
+                continue
+            superseded += backlog.put(packet)
+            if not packet:
+                break  # the end
+        return superseded
 
     def limit_silence(self, seconds: float) -> None:
         """Set how long :attr:`receive` waits for a packet before it raises ``BlockingIOError``.

@@ -2,7 +2,8 @@
 
 A thread per connection (:mod:`skyloop.transport.local.server`) delivers a packet with one system call less, and is the
 better choice for one vehicle. For a hundred it is two hundred threads that wake one another: here one thread waits for
-all connections (epoll) and takes what is there in one go, commands first.
+all connections (epoll), takes in all that is there, and handles one packet of each connection in turn: landings and
+stops first, then set-points, then the rest, with some turns for each of them, however much of the others there is.
 
 What a handler does is done on this thread. While it calls one, :attr:`Reactor.inside` has its server and
 :attr:`Reactor.entries` counts the calls, so that somebody else notices a call that does not come back:
@@ -21,11 +22,22 @@ from collections import deque
 from collections.abc import Iterable
 from typing import Final, Protocol
 
+from skyloop.transport.backlog import MOST_PACKETS, Lane
 from skyloop.transport.local.connection import ServerConnection
 from skyloop.transport.local.sockets import Socket
 
 CHECK_S: Final = 0.5  #: how often silent connections, and listeners that could not accept, are looked at
 _AFTER_FAILURE_S: Final = 0.01
+_PAUSE_S: Final = 100e-6  # waiting for so long shows that nothing was waiting
+_IN_A_ROW: Final = 8  # packets that are handled before it is looked for new ones
+_FIRST_COME: Final = tuple(Lane)
+#: Which lane has the next turn: where there is always something urgent, the others have one in four each.
+_ORDERS: Final = (
+    _FIRST_COME,
+    (Lane.STEERING, Lane.URGENT, Lane.OTHERS),
+    _FIRST_COME,
+    (Lane.OTHERS, Lane.URGENT, Lane.STEERING),
+)
 _log = logging.getLogger(__name__)
 
 
@@ -34,11 +46,11 @@ class Receiver(Protocol):
 
     reactor: Reactor  #: which receives for it now
 
-    def receive(self, reactor: Reactor, source: Source) -> bool:
-        """Take one packet or caller; return whether a packet waits for :meth:`deliver_waiting`."""
+    def receive(self, reactor: Reactor, source: Source, at_once: bool) -> bool:
+        """Take one packet; return whether it now waits for :meth:`deliver`, and more may follow in the socket."""
 
-    def deliver_waiting(self, reactor: Reactor, source: Source) -> None:
-        """Handle the packet that waits in a source."""
+    def deliver(self, reactor: Reactor, source: Source, lane: Lane) -> Lane | None:
+        """Handle one packet of a source that waited in a lane; return the lane in which it waits again."""
 
     def end_silent(self, reactor: Reactor, source: Source, now_s: float) -> None:
         """End a connection that takes too long to send its first packet."""
@@ -53,7 +65,7 @@ class Source:
         connection: The connection; None for a listener.
     """
 
-    __slots__ = ("connection", "ended", "fileno", "muted", "packet", "server", "since_s", "sock")
+    __slots__ = ("connection", "ended", "fileno", "lane", "muted", "server", "since_s", "sock")
 
     def __init__(
         self, server: Receiver, sock: Socket | None = None, connection: ServerConnection | None = None
@@ -63,7 +75,7 @@ class Source:
         self.connection = connection
         self.fileno = sock.fileno() if sock is not None else connection.fileno() if connection is not None else -1
         self.since_s = time.monotonic()
-        self.packet: bytes | None = None  #: received, and waits until the commands of others were handled
+        self.lane: Lane | None = None  #: in which it waits for its turn
         self.ended = False
         self.muted = False  #: not waited for until the next check
 
@@ -89,7 +101,9 @@ class Reactor:
         self._waker = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._epoll.register(self._waker, select.EPOLLIN)
         self._closing = False
-        self._waiting: deque[Source] = deque()  # have a packet that is not handled yet
+        self._lanes: tuple[deque[Source], ...] = tuple(deque() for _ in Lane)  # have packets that are not handled yet
+        self._resumed: deque[Source] = deque()
+        self._turns = 0
         self._thread = _Thread(target=self._run, name="skyloop-reactor", daemon=True)
         self._thread.start()
 
@@ -123,7 +137,7 @@ class Reactor:
             server.reactor = new  # from here on this thread handles nothing of theirs any more
         for source in moved:
             self.hand_over(source, new)
-        new.resume(source for source in moved if source.packet is not None)
+        new.resume(source for source in moved if source.lane is not None)
         return new
 
     def hand_over(self, source: Source, other: Reactor) -> None:
@@ -133,7 +147,7 @@ class Reactor:
 
     def resume(self, sources: Iterable[Source]) -> None:
         """Handle packets that another reactor has received. Any thread."""
-        self._waiting.extend(sources)
+        self._resumed.extend(sources)
         self._wake()
 
     def close(self) -> None:
@@ -153,10 +167,23 @@ class Reactor:
     def _run(self) -> None:
         checked_s = time.monotonic()
         while not self._closing:
-            self.inside = None
-            ready = self._epoll.poll(CHECK_S)
+            busy = any(self._lanes)
+            if not busy:
+                self.inside = None
+            begun_s = time.monotonic()
+            ready = self._epoll.poll(0 if busy else CHECK_S)
+            # After a pause, a single packet is not one of many. Looking for more behind each of many would cost a
+            # system call each: all sockets are asked together, again and again until there is nothing new.
+            waited = time.monotonic() - begun_s > _PAUSE_S
             try:
-                self._turn(ready)
+                if self._receive(ready, at_once=waited and len(ready) == 1):
+                    for _ in range(MOST_PACKETS):
+                        if not self._receive(self._epoll.poll(0), at_once=False):
+                            break
+                for _ in range(_IN_A_ROW):
+                    if not any(self._lanes):
+                        break
+                    self._deliver()
                 if time.monotonic() - checked_s >= CHECK_S:
                     checked_s = time.monotonic()
                     self._check()
@@ -167,29 +194,40 @@ class Reactor:
         os.close(self._waker)
         self._epoll.close()
 
-    def _turn(self, ready: list[tuple[int, int]]) -> None:
-        """Handle one packet of each connection that has one, commands first."""
-        waiting = self._waiting
-        self._receive(ready)
-        while waiting:
-            source = waiting.popleft()
-            self._enter(source.server)
-            source.server.deliver_waiting(self, source)
-            if waiting:  # a command that came meanwhile goes before the next of them
-                self._receive(self._epoll.poll(0))
+    def _receive(self, ready: list[tuple[int, int]], *, at_once: bool) -> bool:
+        """Take a packet of each socket, so that what is urgent is found, and what is superseded.
 
-    def _receive(self, ready: list[tuple[int, int]]) -> None:
-        sources, waiting = self._sources, self._waiting
+        Returns:
+            Whether more may wait behind one of them.
+        """
+        sources, more = self._sources, False
         for fileno, _ in ready:
             source = sources.get(fileno)
-            if source is None:
-                if fileno == self._waker:
-                    os.eventfd_read(self._waker)
-                continue
-            if source.packet is None:
+            if source is not None:
                 self._enter(source.server)
-                if source.server.receive(self, source):
-                    waiting.append(source)
+                more = source.server.receive(self, source, at_once) or more
+            elif fileno == self._waker:
+                os.eventfd_read(self._waker)
+                while self._resumed:
+                    source = self._resumed.popleft()
+                    self.line_up(source, source.lane)
+        return more
+
+    def line_up(self, source: Source, lane: Lane | None) -> None:
+        """Give a source a turn in a lane; None: in none. On the reactor's thread."""
+        if lane is not None:
+            self._lanes[lane].append(source)
+
+    def _deliver(self) -> None:
+        """Handle one packet of the source whose turn it is."""
+        self._turns += 1
+        for lane in _ORDERS[self._turns % len(_ORDERS)]:
+            waiting = self._lanes[lane]
+            if waiting:
+                source = waiting.popleft()
+                self._enter(source.server)
+                self.line_up(source, source.server.deliver(self, source, lane))
+                return
 
     def _enter(self, server: Receiver) -> None:
         self.inside = server

@@ -3,7 +3,7 @@
 A thread of its own that waits in ``recv`` delivers a packet with one system call; waiting for all connections at once
 (epoll) needs two, which made the delay of a command a third longer on an idle machine. The threads take turns at the
 handler, so that it gets one call at a time as the contract says: those that bring a command first, the others in the
-order of their arrival.
+order of their arrival. A thread that comes late takes all that waits for it, and of the set-points hands on the newest.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Final
 
 from skyloop.errors import DecodeError, UsageError
 from skyloop.messages import FrameHeader
+from skyloop.transport.backlog import SUPERSEDED, Lane
 from skyloop.transport.base import (
     MAX_PACKET,
     MAX_SUBSCRIPTIONS,
@@ -74,6 +75,7 @@ class LocalServer(TransportServer):
         self._topics: dict[str, tuple[ServerConnection, ...]] = {}
         self._lock = PriorityLock()  # its holder may call the handler
         self._receivers: set[int] = set()  # identities of the receiving threads
+        self._superseded = 0  # commands, by newer ones that waited behind them
         self._last_id = 0
         self._started = False
         self._state_lock = threading.Lock()  # guards starting and stopping
@@ -157,6 +159,10 @@ class LocalServer(TransportServer):
         connection = self._peers.get(peer.id)
         if connection is not None:
             connection.hang_up(reason)
+
+    @property
+    def counters(self) -> dict[str, float]:
+        return {SUPERSEDED: self._superseded}
 
     @property
     def address(self) -> str:
@@ -259,7 +265,7 @@ class LocalServer(TransportServer):
 
     def _receive(self, handler: ServerHandler, connection: ServerConnection) -> str:
         """Hand packets on, and return why it ended. Raises what the handler raises."""
-        receive, lock = connection.receive, self._lock
+        receive, poll, lock, backlog = connection.receive, connection.poll, self._lock, connection.backlog
         while True:
             try:
                 packet = receive(MAX_PACKET + 1)
@@ -273,11 +279,25 @@ class LocalServer(TransportServer):
                 continue  # at once: the command that follows it does not wait in line with it
             lock.acquire(is_command(packet))
             try:
+                if connection.pilot and poll(0):  # it waited: what came meanwhile may supersede it
+                    backlog.put(packet)
+                    packet = self._next(connection)
                 reason = self._take(handler, connection, packet)
             finally:
                 lock.release()
+            while backlog and not reason:
+                lock.acquire(backlog.lane is not Lane.OTHERS)
+                try:
+                    reason = self._take(handler, connection, self._next(connection))
+                finally:
+                    lock.release()
             if reason:
                 return reason
+
+    def _next(self, connection: ServerConnection) -> bytes:
+        """Take in all that waits, and return what is to be handled first. The lock is held."""
+        self._superseded += connection.take_in()
+        return connection.backlog.get()
 
     def _take(self, handler: ServerHandler, connection: ServerConnection, packet: bytes) -> str:
         """Handle one packet; return why the connection ends with it, empty if it goes on. The lock is held."""

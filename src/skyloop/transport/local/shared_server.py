@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 
+from skyloop.transport.backlog import Lane
 from skyloop.transport.base import MAX_PACKET, ServerHandler
 from skyloop.transport.local import packets
 from skyloop.transport.local.connection import ServerConnection
@@ -65,15 +66,16 @@ class SharedLocalServer(LocalServer):
 
     # --- the reactor's thread ---
 
-    def receive(self, reactor: Reactor, source: Source) -> bool:
-        """Take one packet or caller; a command is handled at once.
+    def receive(self, reactor: Reactor, source: Source, at_once: bool) -> bool:
+        """Take in a caller, or a packet of a connection.
 
         Args:
             reactor: Whose thread it is.
             source: Is readable.
+            at_once: Whether nothing else waits for the thread, so that a command is handled here.
 
         Returns:
-            Whether a packet waits in the source, for :meth:`deliver_waiting`.
+            Whether the packet waits for :meth:`deliver`, and more may wait behind it.
         """
         with self._lock:  # from receiving to handling, so that after a split nothing overtakes what this thread has
             if not self._is_mine(reactor, source):
@@ -81,6 +83,9 @@ class SharedLocalServer(LocalServer):
             connection = source.connection
             if connection is None:
                 self._accept_shared(reactor, source)
+                return False
+            backlog = connection.backlog
+            if backlog.full or (backlog and not connection.pilot):
                 return False
             try:
                 packet = connection.receive(MAX_PACKET + 1, RECEIVE_FLAGS)
@@ -91,21 +96,43 @@ class SharedLocalServer(LocalServer):
                 return False
             if packet == packets.WAKE and connection.joined:
                 return False
-            if not is_command(packet):
-                source.packet = packet
-                return True
-            self._handle(source, connection, packet)
-            return False
-
-    def deliver_waiting(self, reactor: Reactor, source: Source) -> None:
-        """Handle the packet that waits in a source."""
-        with self._lock:
-            if not self._is_mine(reactor, source):
-                return
-            packet, source.packet = source.packet, None
-            connection = source.connection
-            if packet is not None and connection is not None:
+            if at_once and not backlog and is_command(packet) and not connection.more():
                 self._handle(source, connection, packet)
+                return False
+            self._superseded += backlog.put(packet)
+            reactor.line_up(source, self._lane(source, connection))
+            return connection.pilot and bool(packet)
+
+    def deliver(self, reactor: Reactor, source: Source, lane: Lane) -> Lane | None:
+        """Handle the first packet that waits in a source.
+
+        Args:
+            reactor: Whose thread it is.
+            source: Was in this lane.
+            lane: The lane.
+
+        Returns:
+            The lane that the source is to be put in again; None: in none.
+        """
+        with self._lock:
+            if not self._is_mine(reactor, source) or source.lane is not lane:
+                return None  # else it has become more urgent, and was in that lane
+            source.lane = None
+            connection = source.connection
+            if connection is None or not connection.backlog:
+                return None
+            self._handle(source, connection, connection.backlog.get())
+            return None if source.ended else self._lane(source, connection)
+
+    def _lane(self, source: Source, connection: ServerConnection) -> Lane | None:
+        """Return the lane that a source is to be put in; None: nothing waits, or it is in that lane already."""
+        lane = connection.backlog.lane
+        if lane is Lane.URGENT and not connection.pilot:
+            lane = Lane.STEERING  # it will be refused
+        if lane is None or (source.lane is not None and source.lane <= lane):
+            return None
+        source.lane = lane
+        return lane
 
     def end_silent(self, reactor: Reactor, source: Source, now_s: float) -> None:
         """End a connection that takes too long to send its first packet."""
@@ -122,7 +149,7 @@ class SharedLocalServer(LocalServer):
             return False
         if self.reactor is not reactor:
             reactor.hand_over(source, self.reactor)
-            if source.packet is not None:
+            if source.lane is not None:
                 self.reactor.resume((source,))
             return False
         return True
