@@ -26,7 +26,20 @@ def test_cases_that_are_not_wanted_are_left_out() -> None:
 def test_the_command_measures_prints_and_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("zenoh")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
-    words = "--seconds 0.5 --vehicles 3 --observers 2 --networked 2 --mavlink 0 --busy-ms 0.1".split()
+    words = [
+        "--seconds",
+        "0.5",
+        "--vehicles",
+        "3",
+        "--observers",
+        "2",
+        "--networked",
+        "2",
+        "--mavlink",
+        "0",
+        "--busy-ms",
+        "0.1",
+    ]
     ended = CliRunner().invoke(build("fleet"), [*words, "--output", str(tmp_path)], env={"COLUMNS": "200"})
     assert ended.exit_code == 0, ended.output
     assert "Many vehicles in one host" in ended.output
