@@ -210,8 +210,24 @@ def warmth(seconds: Seconds = None, minutes: Minutes = None, output: Output = No
     finish("warmth", results, as_rich([warmth.table(results)], str(results.machine)), output)
 
 
+def recordings(
+    flight: Annotated[float, typer.Option(min=1.0, help="How long the recorded flight is [s]")] = 600.0,
+    encode: Annotated[
+        bool, typer.Option("--encode/--no-encode", help="Also the export that encodes each picture")
+    ] = True,
+    output: Output = None,
+) -> None:
+    """Measure how long it takes to open, look at, seek in and export a recording."""
+    from benchmarks import recordings
+
+    with measuring("recordings", output) as progress:
+        results = recordings.measure(flight, encode=encode, progress=lambda share: progress(share, "a recording"))
+    finish("recordings", results, as_rich([recordings.table(results)], str(results.machine)), output)
+
+
 BENCHMARKS: Final[Mapping[str, Callable[..., Any]]] = {
-    function.__name__: function for function in (peers, load, codecs, network, swarm, scale, fleet, learning, warmth)
+    function.__name__: function
+    for function in (peers, load, codecs, network, swarm, scale, fleet, learning, warmth, recordings)
 }
 
 
