@@ -47,9 +47,9 @@ class Rig:
     def send(self, *units: Unit, codec: str = "h264") -> None:
         for unit in units:
             assert self.sink is not None
-            sizes = {"width": unit.width, "height": unit.height}
-            times = {"captured_ns": unit.captured_ns, "published_ns": unit.captured_ns}
-            self.sink(EncodedFrame("front", unit.number, **times, **sizes, codec=codec, key=unit.key, data=unit.data))
+            at_ns = unit.captured_ns
+            size = (unit.width, unit.height)
+            self.sink(EncodedFrame("front", unit.number, at_ns, at_ns, *size, codec, unit.key, unit.data))
 
     @property
     def numbers(self) -> list[int]:
