@@ -30,7 +30,7 @@ class Rig:
         self.items: list[Item] = []
         self.sink: Callable[[EncodedFrame], None] | None = None
         topic = SimpleNamespace(add=self._add, remove=self._remove)
-        drone = SimpleNamespace(_core=SimpleNamespace(channel=lambda name: SimpleNamespace(stream=topic)))
+        drone = SimpleNamespace(_core=SimpleNamespace(stream=lambda name: topic))
         self.stream = Stream(self._put, cast(Any, drone), "front")
         self.stream.start()
 
