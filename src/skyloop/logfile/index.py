@@ -95,7 +95,7 @@ def _read(found: Scan, file: IO[bytes]) -> bool:
     found.attachments.sort()
     for index in sorted(metadata, key=lambda index: index.offset):
         _keep_metadata(found, file, index)
-    return True
+    return not found.damaged  # what is left out of a file that holds too much depends on the order: a scan decides
 
 
 def _header_end(file: IO[bytes]) -> int:
