@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +21,6 @@ from skyloop.logfile.reader import Progress, Recording
 from skyloop.pyav import require_pyav
 from skyloop.recording.review.stream_copy import StreamCopy, TooManyChangesError, Video
 from skyloop.recording.review.tables import begin_ns
-
-T = TypeVar("T")
 
 _TIME_BASE: Final = Fraction(1, 60_000)  #: each picture keeps its own time; MPEG-4 takes no more than 65535
 _CODECS: Final = ("libx264", "libopenh264", "mpeg4")  #: the first that this PyAV has
@@ -114,7 +111,7 @@ def _encoded(
     with replacing(path) as part:
         with part.open("wb") as file, av.open(file, "w", format="mp4") as container:
             encoder = _Encoder(container, begin)
-            for captured_ns, image in _ahead(_images(recording.pictures(drone, camera, progress=progress))):
+            for captured_ns, image in _images(recording.pictures(drone, camera, progress=progress)):
                 left_out += image is None or not encoder.add(image, captured_ns)
             video = encoder.close(path)
         if video is None:
@@ -130,15 +127,6 @@ def _images(pictures: Iterator[Picture]) -> Iterator[tuple[int, NDArray[np.uint8
         except FileFormatError:
             image = None  # a damaged frame is left out; the others keep their times
         yield picture.header.captured_ns, image
-
-
-def _ahead(items: Iterator[T]) -> Iterator[T]:
-    """Yield the same, with the next one computed on a thread meanwhile."""
-    with ThreadPoolExecutor(1, "skyloop-export") as thread:
-        coming = thread.submit(next, items, None)
-        while (item := coming.result()) is not None:
-            coming = thread.submit(next, items, None)
-            yield item
 
 
 class _Encoder:
