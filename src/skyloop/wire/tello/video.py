@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from typing import Final
 
 from skyloop.errors import DecodeError
-from skyloop.wire.tello.h264 import IDR, PPS, SLICE, SPS, START, Sequence, Slice, parse_sequence, parse_slice
-from skyloop.wire.tello.h264 import unit_type as type_of
-from skyloop.wire.tello.h264 import units as units_of
+from skyloop.wire.h264 import IDR, PPS, SLICE, SPS, START, Sequence, Slice, missing_between, parse_sequence, parse_slice
+from skyloop.wire.h264 import unit_type as type_of
+from skyloop.wire.h264 import units as units_of
 
 PIECE: Final = 1460  #: bytes of every datagram of a picture but its last
 MAX_PICTURE: Final = 1 << 19  #: bytes; real ones have a fiftieth of that
@@ -116,7 +116,6 @@ class Assembly:
         before, self._before = self._before, now
         if now.is_key or before is None:
             return False
-        turns = 1 << self._sequence.frame_number_bits
-        skipped = (now.frame_number - before.frame_number - before.is_reference) % turns
-        self.missing += min(skipped, turns // 2)
+        skipped = missing_between(before, now, self._sequence)
+        self.missing += min(skipped, 1 << self._sequence.frame_number_bits - 1)
         return skipped != 0 or not now.is_first
