@@ -158,8 +158,8 @@ class V4l2Device:
             Why it could not be set, in words; empty if it was.
         """
         if exposure_ms is None:
-            tried = [self._set(AUTO_EXPOSURE, mode) for mode in (_APERTURE_FIRST, _AUTO)]
-            return "" if "" in tried else f"the camera has no automatic exposure: {tried[-1]}"
+            problem = self._set(AUTO_EXPOSURE, _APERTURE_FIRST) and self._set(AUTO_EXPOSURE, _AUTO)
+            return f"the camera has no automatic exposure: {problem}" if problem else ""
         known = self.control(EXPOSURE)
         if known is None:
             return "the camera's exposure can't be set"
@@ -242,18 +242,19 @@ class V4l2Device:
 
 
 @contextmanager
-def opened(path: str) -> Iterator[V4l2Device]:
+def opened(path: str, ioctl: Ioctl | None = None) -> Iterator[V4l2Device]:
     """Open a device for its settings.
 
     Args:
         path: Such as ``/dev/video0``.
+        ioctl: As for :class:`V4l2Device`.
 
     Raises:
         OSError: It can't be opened.
     """
     descriptor = os.open(path, os.O_RDWR | os.O_NONBLOCK)
     try:
-        yield V4l2Device(descriptor)
+        yield V4l2Device(descriptor, ioctl)
     finally:
         os.close(descriptor)
 
