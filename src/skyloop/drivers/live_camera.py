@@ -82,7 +82,7 @@ class LiveCamera:
             show=self._show,
             on_event=on_event or self._publish_event,
             wants=lambda: sink.wants(settings.name),
-            wants_checked=lambda: self._relay.wanted and self._checks,
+            wants_checked=lambda: self._checks and sink.wants_stream(settings.name),
             came=self._came,
             name="skyloop-camera",
         )

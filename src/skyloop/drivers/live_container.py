@@ -34,7 +34,7 @@ STRICT_S: Final = 15.0  #: how long nothing of H.264 is without fault before dam
 #: in the same way once more.
 _HELD_BACK: Final = {"rtsp": 1, "sdp": 1, "h264": 1, "hevc": 1, "mpegts": 2}
 _REORDERED_NS: Final = 1_000_000_000  # a step back of the stamps up to this is one of B pictures, not a clock set back
-_STAMPS: Final = 64  # pictures whose capture times are kept: more than any decoder holds back
+_STAMPS: Final = 128  # capture times that are kept: two a picture, more than any decoder holds back
 _NO_STAMPS: Final[Any] = av.format.Flags.no_timestamps.value
 
 
@@ -118,6 +118,7 @@ class ContainerStream:
         self._live_clock = LiveClock()
         self._newest_ns: int | None = None  # stamp
         self._offset_ns = 0
+        self._captured_newest_ns = 0
 
     def read(self) -> list[Coded]:
         """Return the next picture, as a list of one.
@@ -137,6 +138,8 @@ class ContainerStream:
         self._came.append(now_ns)
         unit = self._units.of(packet)
         captured_ns = min(self._captured_ns(packet), now_ns)
+        if self._units.in_order:  # a stamp that was learned meanwhile does not set the time back
+            captured_ns = self._captured_newest_ns = max(captured_ns, self._captured_newest_ns)
         units = self._units
         piece = Piece(packet, self._context, self._number, unit, units.reason, not units.in_order)
         self._number += 1
@@ -242,8 +245,11 @@ class LiveDecoder:
         self._failing_ns: int | None = None  # since when no piece could be decoded
         self._barren_ns: int | None = None  # since when no picture of H.264 came out
         self._strict: VideoCodecContext | None = None  # None: H.264 waits for a key
+        self._shown_ns = 0  # capture time of the newest picture: a later one is not captured earlier
+        self._reorders = False  # it holds pictures back that build on later ones
         self._forgiving: VideoCodecContext | None = None
-        self._captured: dict[int, int] = {}  # capture time by stamp, of what was given to the decoder
+        # Capture times of what was given to a decoder, by whether that is the strict one and the stamp it was given.
+        self._captured: dict[tuple[bool, int | None], int] = {}
 
     def decode(self, coded: Coded, *, show: bool) -> Decoded | None:
         """See :class:`skyloop.drivers.live_video.Decoder`.
@@ -265,7 +271,10 @@ class LiveDecoder:
             return None
         self._shown += 1
         pixels = np.ascontiguousarray(image.to_ndarray(format="bgr24"), dtype=np.uint8)
-        return Decoded(self._shown, pixels, None if image.pts is None else self._captured.get(image.pts))
+        strictly = self._forgiving is None and piece.is_h264
+        captured_ns = self._captured.get((strictly, image.pts), coded.captured_ns)
+        self._shown_ns = max(self._shown_ns, captured_ns)
+        return Decoded(self._shown, pixels, self._shown_ns)
 
     def _of_other(self, piece: Piece, coded: Coded, follows: bool) -> av.VideoFrame | None:
         if not follows:
@@ -277,7 +286,8 @@ class LiveDecoder:
         if unit is None:  # parameters alone, or noise
             self._note_failure(coded)
             return None
-        if not follows or unit.after_gap:
+        surprised = piece.reordered and not self._reorders  # what it builds on would be shown before it
+        if not follows or unit.after_gap or surprised:
             self._strict = None
             if self._forgiving is not None:
                 self._forgiving.flush_buffers()
@@ -298,10 +308,10 @@ class LiveDecoder:
             if not unit.is_key:
                 self.waited += 1
                 return None
-            reordered = piece.reordered or piece.context.has_b_frames
-            self._strict = new_decoder(H264, "a camera", low_delay=not reordered)
+            self._reorders = piece.reordered or bool(piece.context.has_b_frames)
+            self._strict = new_decoder(H264, "a camera", low_delay=not self._reorders)
         packet = av.Packet(unit.data)
-        packet.pts, packet.time_base = piece.packet.pts, piece.packet.time_base
+        packet.pts = piece.number  # which comes out with the picture; not each packet of a stream has a stamp
         try:
             images = self._strict.decode(packet)
         except (av.error.FFmpegError, ValueError):
@@ -333,10 +343,9 @@ class LiveDecoder:
         return good[-1] if good else None
 
     def _note_stamp(self, piece: Piece, coded: Coded) -> None:
-        if piece.packet.pts is not None:
-            self._captured[piece.packet.pts] = coded.captured_ns
-            while len(self._captured) > _STAMPS:
-                del self._captured[next(iter(self._captured))]
+        self._captured[True, piece.number] = self._captured[False, piece.packet.pts] = coded.captured_ns
+        while len(self._captured) > _STAMPS:
+            del self._captured[next(iter(self._captured))]
 
     def _note_failure(self, coded: Coded) -> None:
         now_ns = coded.arrived_ns

@@ -28,6 +28,9 @@ class AccessUnit:
     arrived_ns: int  #: when its first piece came
     after_gap: bool  #: a picture before it is known to be missing or damaged
     whole: bool  #: nothing shows that a piece of its own is missing
+    number: int = 0  #: counts the pictures that came
+    width: int = 0  #: by the newest parameters [px]; 0 before the first
+    height: int = 0
 
 
 def pieces(picture: bytes) -> list[bytes]:
@@ -51,6 +54,7 @@ class Assembly:
         self._sequence: Sequence | None = None
         self._before: Slice | None = None
         self._gap = True  # since the last picture that was given out
+        self._count = 0
 
     def feed(self, piece: bytes, now_ns: int) -> list[AccessUnit]:
         """A datagram that came now; the pictures that are complete with it, at most two."""
@@ -97,8 +101,10 @@ class Assembly:
         data = b"".join(self._pieces)
         self._pieces, self._size = [], 0
         is_key = IDR in kinds and {SPS, PPS} <= kinds
-        made = AccessUnit(data, is_key, self._arrived_ns, self._gap or gap, whole)
+        size = (0, 0) if self._sequence is None else (self._sequence.width, self._sequence.height)
+        made = AccessUnit(data, is_key, self._arrived_ns, self._gap or gap, whole, self._count, *size)
         self._gap = False
+        self._count += 1
         return [made]
 
     def _is_gap(self, head: list[bytes]) -> bool:
