@@ -22,6 +22,7 @@ from skyloop.drivers.registry import make_driver
 from skyloop.drivers.video.devices import cameras, described
 from skyloop.errors import FileFormatError, MissingExtraError, UnknownNameError, UsageError
 from skyloop.messages import Hover, LinkState
+from skyloop.pyav import new_decoder
 from skyloop.wire.ardrone.pave import PaveParser
 from tests.recordings import recorded
 
@@ -100,8 +101,44 @@ def test_who_comes_late_gets_pictures_from_the_next_key_on() -> None:
     assert sink.pictures[0].key
 
 
-def test_a_clip_has_no_stream(clip: Path) -> None:
+def test_a_clip_of_another_codec_has_no_stream(clip: Path) -> None:
     assert [camera.stream for camera in make_driver(f"video://{clip}").capabilities().cameras] == [""]
+
+
+def h264_clip(path: Path, b_frames: int) -> Path:
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        stream.codec_context.max_b_frames = b_frames
+        stream.options = {"x264-params": "keyint=8:scenecut=0:b-adapt=0"}
+        for n in range(FRAMES):
+            picture = np.full((48, 64, 3), 40 + 8 * n, np.uint8)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="bgr24")))
+        container.mux(stream.encode(None))
+    return path
+
+
+def test_h264_in_a_file_is_handed_on_with_the_times_of_its_frames(tmp_path: Path) -> None:
+    path = h264_clip(tmp_path / "clip.mp4", 0)
+    assert [camera.stream for camera in make_driver(f"video://{path}").capabilities().cameras] == ["h264"]
+    sink = RecordingSink(record=True)
+    with playing(f"video://{path}?speed=20&loop=1", sink):
+        assert sink.wait(lambda: len(sink.pictures) >= 2 * FRAMES, 20.0)
+    pictures = list(sink.pictures)[: 2 * FRAMES]
+    context = new_decoder("h264", "a test")
+    decoded = [image for picture in pictures for image in context.decode(av.Packet(picture.data))]
+    assert len(decoded) == len(pictures)
+    assert [n for n, picture in enumerate(pictures) if picture.key][:4] == [0, 8, 16, 24]
+    assert {(picture.width, picture.height) for picture in pictures} == {(64, 48)}
+    frames = [frame.captured_ns for frame in sink.frames]
+    assert [picture.captured_ns for picture in pictures[:FRAMES]] == frames[:FRAMES]
+
+
+def test_h264_with_b_frames_has_no_stream_and_plays(tmp_path: Path) -> None:
+    path = h264_clip(tmp_path / "clip.mp4", 2)
+    assert [camera.stream for camera in make_driver(f"video://{path}").capabilities().cameras] == [""]
+    sink = play(f"video://{path}?{FAST}")
+    assert sink.frame_counts == {"front": FRAMES}
 
 
 def test_a_torn_start_is_waited_out() -> None:
@@ -398,7 +435,8 @@ def test_a_device_that_comes_and_goes_is_opened_again_and_asked_for_exposure_and
 @pytest.mark.parametrize(
     ("uri", "message"),
     [
-        ("video:///dev/video0?loop=1", "a live camera has no loop"),
+        ("video:///dev/video0?loop=1", "a live camera has no loop and no speed"),
+        ("video:///dev/video0?speed=2", "a live camera has no loop and no speed"),
         ("video:///tmp/x.mp4?gain=3", "only a device has gain"),
         ("video://rtp://:5600?format=mjpeg", "only a device has format"),
         ("video:///dev/video0?format=png", "format of video:// named 'png'"),

@@ -108,7 +108,7 @@ class ContainerStream:
             raise _os_error(error) from error
         try:
             self._context, self._packets = self._chosen()
-            self._units = _Units(self._container.streams.video[0], self._context)
+            self._units = Units(self._container.streams.video[0], self._context)
         except BaseException:
             self._container.close()
             raise
@@ -177,8 +177,15 @@ class ContainerStream:
         return stamp_ns + self._offset_ns
 
 
-class _Units:
-    """The H.264 of a connection in Annex B form, whatever it comes in."""
+class Units:
+    """The H.264 of a stream in Annex B form, whatever it comes in.
+
+    ``reason`` says why its pictures can't be handed on as they came; empty as long as they can.
+
+    Args:
+        stream: Of an open container.
+        context: Of the stream.
+    """
 
     def __init__(self, stream: av.VideoStream, context: VideoCodecContext) -> None:
         self._is_h264 = context.name == H264
@@ -318,7 +325,7 @@ class LiveDecoder:
             images = None
         if images is None or any(image.is_corrupt for image in images):
             self._strict = None
-            self._note_failure(coded)
+            self.damaged += 1
             return None
         self._on_whole(coded)
         if not images:

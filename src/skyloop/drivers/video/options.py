@@ -19,10 +19,9 @@ from skyloop.drivers.video.v4l2 import FORMATS, V4l2Device, opened
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.files import expand
 
-_RECORDING: Final = ("loop", "speed", "wait")
 _LIVE: Final = ("width", "height", "fps")
 _DEVICE: Final = ("format", "exposure", "gain")
-KNOWN: Final = {"camera", *_RECORDING, *_LIVE, *_DEVICE, *INTRINSICS_OPTIONS}
+KNOWN: Final = {"camera", "loop", "speed", "wait", *_LIVE, *_DEVICE, *INTRINSICS_OPTIONS}
 _AUTO: Final = "auto"
 
 
@@ -120,8 +119,9 @@ def _check_kind(uri: VehicleUri, source: CameraSource | None) -> None:
     Raises:
         UsageError: They don't.
     """
+    if source is not None and (uri.flag("loop") or uri.number("speed", 1.0) != 1.0):
+        raise UsageError(f"{uri}: a live camera has no loop and no speed")
     unfit = {
-        "a live camera has no": _RECORDING[:2] if source is not None else (),
         "only a device or a stream has": _LIVE if source is None else (),
         "only a device has": _DEVICE if source is None or source.scheme else (),
     }

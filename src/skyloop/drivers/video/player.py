@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from skyloop.clock import monotonic_ns, nanoseconds, seconds
 from skyloop.drivers.base import Sink
+from skyloop.drivers.stream_relay import CheckedRelay, StreamRelay
 from skyloop.drivers.video.sources import DecodedImage, Source
 from skyloop.errors import SkyloopError
 from skyloop.messages import EventKind, Feedback, Intrinsics, LinkState, Severity, Value
-from skyloop.wire.ardrone.pave import PaveFrame
 
 FEEDBACK_NS: Final = 50_000_000
 POLL_S: Final = 0.02
@@ -75,7 +75,8 @@ class CameraPublisher:
         self.stop = stop
         self._position_s = 0.0
         self._feedback_ns = 0
-        self._streaming = False  # pictures are handed on as they came
+        relay = StreamRelay(sink, lambda _camera, width, height: intrinsics(width, height))
+        self._relay = CheckedRelay(relay, sink, camera, "recording")
 
     @property
     def wanted(self) -> bool:
@@ -85,7 +86,7 @@ class CameraPublisher:
     @property
     def wanted_encoded(self) -> bool:
         """Whether somebody wants the images as they were encoded."""
-        return self.sink.wants_stream(self._camera)
+        return self._relay.wanted
 
     def wait_until(self, due_ns: int) -> bool:
         """Wait, and publish feedback meanwhile. Return False if the driver is being closed."""
@@ -126,7 +127,7 @@ class CameraPublisher:
         self.shown += 1
         self._position_s = image.stamp_s
         if image.coded is not None:
-            self._publish_encoded(image.coded, due_ns)
+            self._relay.take(image.coded, image.reason, due_ns, number=image.number, connection=self.loops)
         if pixels is not None:
             height, width = pixels.shape[:2]
             self.sink.frame(
@@ -138,20 +139,6 @@ class CameraPublisher:
                 intrinsics=self._intrinsics(width, height),
             )
         return not self.stop.is_set()
-
-    def _publish_encoded(self, coded: PaveFrame, captured_ns: int) -> None:
-        """Publish an image as it was encoded. Each builds on the one decoded before it, or is a key."""
-        self._streaming = self.wanted_encoded and (self._streaming or coded.is_key)
-        if self._streaming:
-            self.sink.stream(
-                self._camera,
-                coded.payload,
-                captured_ns,
-                width=coded.width,
-                height=coded.height,
-                key=coded.is_key,
-                intrinsics=self._intrinsics(coded.width, coded.height),
-            )
 
 
 class FilePlayer:

@@ -11,10 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
+from skyloop.drivers.live_container import Units
 from skyloop.drivers.pave_decoder import PaveDecoder, av, limit_memory
 from skyloop.errors import FileFormatError, UsageError
 from skyloop.messages.encoded import H264
 from skyloop.wire.ardrone.pave import Codec, PaveFrame, PaveParser
+from skyloop.wire.h264 import Unit
 
 if TYPE_CHECKING:
     from av.container import InputContainer
@@ -32,7 +34,9 @@ class DecodedImage:
 
     stamp_s: float
     frame: av.VideoFrame
-    coded: PaveFrame | None = None  #: what it was decoded from, if that is handed on as it came
+    coded: Unit | None = None  #: what it was decoded from, if that is handed on as it came
+    number: int = 0  #: of what it was decoded from, in the stream
+    reason: str = ""  #: why what it was decoded from is not handed on, of a stream that is
 
 
 class Source(Protocol):
@@ -106,11 +110,17 @@ class ContainerSource:
         if not (self.width and self.height):
             self._container.close()
             raise FileFormatError(f"{name}: its frame size is missing: it is damaged or cut off")
+        self._units = Units(self._stream, self._stream.codec_context)
+        if not self._units.reason and not self._stream.codec_context.has_b_frames:
+            self.stream = H264
 
     def images(self) -> Iterator[DecodedImage]:
         """See :meth:`Source.images`."""
         stamp_s = -1.0 / self.fps
-        for packet in self._packets():
+        coded: dict[int | None, tuple[int, Unit | None]] = {}  # by the stamp: decoders hold pictures back
+        for number, packet in enumerate(self._packets()):
+            if self.stream and packet.size:
+                coded[packet.pts] = number, self._units.of(packet)
             try:
                 images = packet.decode()
             except (FFmpegError, ValueError):  # a damaged packet; the decoder goes on with the next one
@@ -121,7 +131,8 @@ class ContainerSource:
                     self.damaged += 1
                     continue
                 stamp_s = image.time if image.time is not None else stamp_s + 1.0 / self.fps
-                yield DecodedImage(stamp_s, image)
+                at, unit = coded.pop(image.pts, (0, None))
+                yield DecodedImage(stamp_s, image, unit, at, self._units.reason if self.stream else "")
 
     def _packets(self) -> Iterator[av.Packet[av.VideoStream]]:
         try:
@@ -169,9 +180,10 @@ class PaveSource:
             image = decoder.decode(frame)
             self.damaged = decoder.damaged + self._parser.broken_frames
             if image is not None:
-                yield DecodedImage(
-                    frame.timestamp_ms / 1000.0, image, frame if frame.codec == Codec.MPEG4_AVC else None
-                )
+                unit = None
+                if frame.codec == Codec.MPEG4_AVC:
+                    unit = Unit(frame.payload, frame.is_key, frame.after_damage, frame.width, frame.height)
+                yield DecodedImage(frame.timestamp_ms / 1000.0, image, unit, frame.number)
 
     def close(self) -> None:
         """Close the file."""
