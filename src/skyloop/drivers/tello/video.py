@@ -272,4 +272,6 @@ class TelloVideo:
             images = context.decode(av.Packet(data))
         except (av.error.FFmpegError, ValueError):
             return None
-        return images[-1] if images else None
+        # CABAC may end a damaged picture early without an error: FFmpeg fills the rest then, and says so.
+        concealed = images and images[-1].is_corrupt and context is not self._patching
+        return images[-1] if images and not concealed else None
