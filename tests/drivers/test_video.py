@@ -457,6 +457,7 @@ def test_what_sends_h264_announces_a_stream() -> None:
         "video://rtp://:5600": "h264",
         "video:///dev/video0?format=h264": "h264",
         "video:///dev/video0?format=mjpeg": "",
+        "video://rtp://:5600?stream=0": "",
     }.items():
         capabilities = make_driver(uri).capabilities()
         assert [camera.stream for camera in capabilities.cameras] == [stream]

@@ -39,6 +39,7 @@ class LiveCameraSettings:
     width: int  #: [px]
     height: int
     fps: float
+    stream: bool = True  #: whether its H.264 is handed on as it comes
     device_options: dict[str, str] = field(default_factory=dict)  #: FFmpeg's, besides those of size and rate
     purpose: str = "a camera"  #: what PyAV is needed for, as the error says it
 
@@ -82,7 +83,7 @@ class LiveCamera:
             show=self._show,
             on_event=on_event or self._publish_event,
             wants=lambda: sink.wants(settings.name),
-            wants_checked=lambda: self._checks and sink.wants_stream(settings.name),
+            wants_checked=lambda: settings.stream and self._checks and sink.wants_stream(settings.name),
             came=self._came,
             name="skyloop-camera",
         )
@@ -142,7 +143,7 @@ class LiveCamera:
         return stream
 
     def _came(self, coded: Coded) -> None:
-        if not self._checks:
+        if self._settings.stream and not self._checks:
             self._hand_on(coded)
 
     # On the decoding thread --------------------------------------------------------------------------------------
@@ -156,7 +157,7 @@ class LiveCamera:
         return LiveDecoder(self._decoded, self._report)
 
     def _decoded(self, coded: Coded) -> None:
-        if self._checks:
+        if self._settings.stream and self._checks:
             self._hand_on(coded)
 
     def _show(self, picture: Picture) -> None:

@@ -23,7 +23,7 @@ def camera_info(uri: VehicleUri, options: CameraOptions) -> CameraInfo:
         options.fps,
         intrinsics=intrinsics_of(uri, options.width, options.height),
         rotation=FACINGS[options.facing],
-        stream=H264 if source(uri, options).scheme else "",
+        stream=H264 if options.stream and source(uri, options).scheme else "",
     )
 
 
@@ -50,6 +50,7 @@ def camera_receiver(uri: VehicleUri, options: CameraOptions, sink: Sink) -> Live
         options.width,
         options.height,
         options.fps,
+        stream=options.stream,
         purpose="a camera beside the autopilot",
     )
     return LiveCamera(settings, sink, partial(intrinsics_of, uri))

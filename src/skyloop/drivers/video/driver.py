@@ -97,7 +97,14 @@ class VideoDriver(Driver):
         options = self.options
         wanted = {"input_format": FORMATS[options.device.format]} if options.device.format else {}
         return LiveCameraSettings(
-            source, options.camera, options.width, options.height, options.fps, wanted, purpose="video://"
+            source,
+            options.camera,
+            options.width,
+            options.height,
+            options.fps,
+            options.stream,
+            wanted,
+            purpose="video://",
         )
 
     def _publish_event(self, sink: Sink, event: VideoEvent, text: str) -> None:
@@ -130,15 +137,13 @@ class VideoDriver(Driver):
         if self._info is not None:
             return self._info
         width, height = options.width, options.height
-        # From the network most send H.264; a device does if it is asked for it.
-        streams = options.source is not None and (bool(options.source.scheme) or options.device.format == H264)
         return CameraInfo(
             options.camera,
             width,
             height,
             options.fps,
             intrinsics=self._intrinsics(width, height),
-            stream=H264 if streams else "",
+            stream=H264 if options.stream else "",
         )
 
     def _describe(self, source: Source) -> CameraInfo:

@@ -18,8 +18,9 @@ from skyloop.drivers.video.sources import DEFAULT_FPS, is_device
 from skyloop.drivers.video.v4l2 import FORMATS, V4l2Device, opened
 from skyloop.errors import UnknownNameError, UsageError
 from skyloop.files import expand
+from skyloop.messages.encoded import H264
 
-_LIVE: Final = ("width", "height", "fps")
+_LIVE: Final = ("width", "height", "fps", "stream")
 _DEVICE: Final = ("format", "exposure", "gain")
 KNOWN: Final = {"camera", "loop", "speed", "wait", *_LIVE, *_DEVICE, *INTRINSICS_OPTIONS}
 _AUTO: Final = "auto"
@@ -68,6 +69,7 @@ class VideoOptions:
     width: int  #: to ask of a device, and announced of a stream [px]
     height: int
     fps: float
+    stream: bool  #: whether H.264 is announced, to be handed on as it comes
     device: DeviceOptions
 
 
@@ -100,6 +102,7 @@ def options_of(uri: VehicleUri) -> VideoOptions:
         width=uri.whole("width", 640, minimum=1, maximum=16384),
         height=uri.whole("height", 480, minimum=1, maximum=16384),
         fps=uri.number("fps", DEFAULT_FPS, minimum=0.1, maximum=1000.0),
+        stream=uri.flag("stream", default=_streams(uri, source)),
         device=_device(uri),
     )
     check_intrinsics(uri)
@@ -128,6 +131,11 @@ def _check_kind(uri: VehicleUri, source: CameraSource | None) -> None:
     for what, names in unfit.items():
         if given := [name for name in names if name in uri.options]:
             raise UsageError(f"{uri}: {what} {' and '.join(given)}")
+
+
+def _streams(uri: VehicleUri, source: CameraSource | None) -> bool:
+    """Return whether a camera is likely to send H.264: one on the network, or a device that is asked for it."""
+    return source is not None and (bool(source.scheme) or uri.options.get("format") == H264)
 
 
 def _device(uri: VehicleUri) -> DeviceOptions:
