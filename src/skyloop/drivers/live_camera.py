@@ -73,6 +73,7 @@ class LiveCamera:
         self._configure = configure
         self._absent = absent
         self._checks = settings.source.loses  # whether pictures are decoded before they are handed on
+        self._stopped = False
         self._reported: list[str] = []
         relay = StreamRelay(sink, lambda _camera, width, height: intrinsics(width, height))
         self._relay = CheckedRelay(relay, sink, settings.name, _WHERE)
@@ -98,6 +99,7 @@ class LiveCamera:
 
     def stop(self) -> None:
         """Stop receiving. Idempotent; takes up to 4 s. The sink is not called after it."""
+        self._stopped = True
         self._video.stop()
 
     def telemetry(self) -> dict[str, Value]:
@@ -143,7 +145,7 @@ class LiveCamera:
         return stream
 
     def _came(self, coded: Coded) -> None:
-        if self._settings.stream and not self._checks:
+        if not self._checks:
             self._hand_on(coded)
 
     # On the decoding thread --------------------------------------------------------------------------------------
@@ -157,7 +159,7 @@ class LiveCamera:
         return LiveDecoder(self._decoded, self._report)
 
     def _decoded(self, coded: Coded) -> None:
-        if self._settings.stream and self._checks:
+        if self._checks:
             self._hand_on(coded)
 
     def _show(self, picture: Picture) -> None:
@@ -168,12 +170,15 @@ class LiveCamera:
     def _hand_on(self, coded: Coded) -> None:
         from skyloop.drivers.live_container import Piece
 
+        if self._stopped or not self._settings.stream:
+            return
         piece = coded.data
         assert isinstance(piece, Piece)
         self._relay.take(piece.unit, piece.reason, coded.captured_ns, number=piece.number, connection=coded.connection)
 
     def _report(self, what: str) -> None:
-        self._sink.event(EventKind.VEHICLE_MESSAGE, f"{_WHERE}: {what}", Severity.WARNING, where=_WHERE)
+        if not self._stopped:
+            self._sink.event(EventKind.VEHICLE_MESSAGE, f"{_WHERE}: {what}", Severity.WARNING, where=_WHERE)
 
     def _publish_event(self, event: VideoEvent, text: str) -> None:
         event.publish(self._sink, _WHERE, text)

@@ -309,7 +309,7 @@ class LiveVideo:
                         self._received += len(frames)
                         self._wanted, self._shows = wanted, shows
                         self._came.notify()
-                if self._frame_came is not None:
+                if self._frame_came is not None and not self._stop.is_set():
                     for frame in frames:
                         self._frame_came(frame)
         finally:
