@@ -1,12 +1,12 @@
 """``python -m benchmarks.damaged_video``: what is shown of video that loses datagrams, and how much of that is right.
 
-The film of a real AR.Drone 2 (``ardrone2/video-8s.pave`` of the recordings, see ``tests/recordings.py``) is sent three
-ways: as it is, in pieces of the stream that its drone sends; encoded anew as the emulated Tello does, at the bit rate
-that it would choose, in that drone's datagrams; and as it is once more, in pieces of an RTP packet's size, to the decoder
-of cameras on the network. Of each, a share of the pieces is lost, by a seed. FFmpeg's own decoder (PyAV's, as it comes,
-with its concealment of errors) gets what is left of the same pictures, cut where they begin, which no FFmpeg would
-know as surely. A picture counts as right if its PSNR beside that of the undamaged stream is 40 dB or
-more.
+The film of a real AR.Drone 2 (``ardrone2/video-8s.pave`` of the recordings, see ``tests/recordings.py``) is sent
+three ways: as it is, in pieces of the stream that its drone sends; encoded anew as the emulated Tello does, at the
+bit rate that it would choose, in that drone's datagrams; and as it is once more, in pieces of an RTP packet's size,
+to the decoder of cameras on the network. Of each, a share of the pieces is lost, by a seed. FFmpeg's own decoder
+(PyAV's, as it comes, with its concealment of errors) gets what is left of the same pictures, cut where they begin,
+which no FFmpeg would know as surely. A picture counts as right if its PSNR beside that of the undamaged stream is 40
+dB or more.
 """
 
 from __future__ import annotations
