@@ -250,6 +250,7 @@ def test_h264_in_a_container_becomes_a_stream(tmp_path: Path) -> None:
     sink = RecordingSink(record=True)
     with camera(film.address, sink):
         came(sink, 30)
+        assert sink.wait(lambda: sink.frame_counts["front"] > 0, PATIENCE_S), told(sink)
     film.close()
     numbers = decoded(list(sink.pictures)[:30])
     assert numbers == list(range(30))
