@@ -31,13 +31,16 @@ def require_pyav(purpose: str) -> None:
         raise MissingExtraError(purpose, "video", cause=str(error)) from error
 
 
-def new_decoder(codec: Literal["h264", "mpeg4"], purpose: str, *, patch: bool = False) -> VideoCodecContext:
+def new_decoder(
+    codec: Literal["h264", "mpeg4"], purpose: str, *, patch: bool = False, low_delay: bool = True
+) -> VideoCodecContext:
     """Make a decoder that gives each picture at once.
 
     Args:
         codec: FFmpeg's name of it.
         purpose: As for :func:`require_pyav`.
         patch: Fill what is damaged with what stood there before; otherwise a damaged picture is an error.
+        low_delay: False for a stream whose pictures build on later ones: they are held back for those.
 
     Raises:
         MissingExtraError: PyAV is not installed.
@@ -53,7 +56,8 @@ def new_decoder(codec: Literal["h264", "mpeg4"], purpose: str, *, patch: bool = 
         # MPEG-4 sequence.
         context.options = {"err_detect": "explode+aggressive" if codec == "h264" else "explode"}
     limit_memory(context)
-    context.flags |= av.codec.context.Flags.low_delay
+    if low_delay:
+        context.flags |= av.codec.context.Flags.low_delay
     context.thread_count = 1  # frame threads would hold pictures back
     return context
 

@@ -20,7 +20,7 @@ from skyloop.logfile.reader import Recording
 from skyloop.recording.review import stream_copy
 from skyloop.recording.review.stream_copy import contents, numbered
 from skyloop.recording.review.video import Videos, export_mp4
-from skyloop.wire.tello.h264 import START, unit_type, units
+from skyloop.wire.h264 import START, unit_type, units
 from tests.cli.conftest import Ended
 from tests.recording.streams import GROUP, STEP_NS, Unit, film, write_film
 
