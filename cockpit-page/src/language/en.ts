@@ -70,7 +70,20 @@ export const en = {
     age: (age: string) => `${age} old`,
     milliseconds: (count: string) => `${count} ms`,
     noNew: "No new picture",
-    rate: (camera: string, width: number, height: number, fps: string) => `${camera} · ${width} × ${height} · ${fps} fps`,
+    rate: (camera: string, width: number, height: number, fps: string, how: string, kB_s: string) => `${camera} · ${width} × ${height} · ${fps} fps · ${how} ${kB_s} kB/s`,
+    encoded: (kind: "vehicle" | "shared" | "own", kbit_s: number | null) =>
+      ({
+        vehicle: "H.264 as the vehicle encodes it",
+        shared: `H.264 at ${kbit_s ?? 0} kbit/s, encoded once for all who watch`,
+        own: "H.264 for this page alone, which is slow: as much as its connection carries",
+      })[kind],
+    jpeg: (why: "" | "insecure" | "browser" | "failed") =>
+      ({
+        "": "JPEG: no H.264 comes from this drone",
+        insecure: "JPEG: browsers decode H.264 only over https, or on the cockpit's own machine. Settings tell how.",
+        browser: "JPEG: this browser decodes no H.264",
+        failed: "JPEG: this browser could not decode the H.264 of this drone",
+      })[why],
     cameras: "Cameras",
     overlay: "Overlay",
     noCamera: "No camera",

@@ -126,7 +126,7 @@ class Cockpit:
         if feed is None:
             await socket.close(UNKNOWN, "no such camera")
             return
-        await VideoSender(socket, feed, station.event_feed, self.counts).run()
+        await VideoSender(socket, station, feed, self.counts).run()
 
     async def control(self, socket: WebSocket) -> None:
         """Accept a pilot's commands to one drone."""
