@@ -250,7 +250,7 @@ def test_what_gives_nothing_is_left_and_tried_again(drone: FakeDrone) -> None:
         page.take()
         (stream,) = drone.streams
         assert (len(stream.consumers), page.stream.shows) == (1, False)
-        for feed in page.station.feeds:
+        for feed in page.station.streams.values():
             feed._clock = page.clock
             feed._came_ns = 0
         page.clock.pass_s(SILENT_S + 0.1)

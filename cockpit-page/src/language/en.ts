@@ -21,6 +21,15 @@ export const en = {
     and: (one: string, other: string) => `${one}, ${other}`,
     photo: "Photos",
     photos: { shown: "With the overlay, if it is shown", plain: "Without overlay" },
+    video: "Video",
+    videoNote: (why: "" | "insecure" | "browser") =>
+      ({
+        "": "As H.264 where the drone gives it, otherwise as JPEG.",
+        insecure: "As JPEG: browsers decode H.264, which is sharper and needs less of the network, only over https or on the cockpit's own machine. Start the cockpit with skyloop cockpit --https, and open its https address.",
+        browser: "As JPEG: this browser decodes no H.264.",
+      })[why],
+    trust: "Certificate of this cockpit's authority",
+    trustNote: "The browser warns of this address until it trusts the certificate: download it, and import it as an authority in the settings of the browser, or of the phone (Security, CA certificate). It can vouch for nothing but private networks.",
     language: "Language",
     languageNote: "Used when the page is loaded again.",
   },

@@ -159,6 +159,7 @@ def create_app(
     admission: Admission | None = None,
     world: WorldGeometry | None = None,
     follower: FollowerFactory = TargetFollower,
+    page_authority: bytes | None = None,
 ) -> Starlette:
     """Make the cockpit's application.
 
@@ -171,9 +172,10 @@ def create_app(
         admission: Counts the connections.
         world: What stands around drones that don't know it themselves.
         follower: Makes what tracks a target that a page marks, and flies after it.
+        page_authority: Certificate of the authority that certified this server, PEM, for browsers that are to trust it.
     """
     cockpit = Cockpit(fleet, recordings, static, follower)
-    api = Api(fleet, gate, cockpit.counts, names.scheme, admission or Admission())
+    api = Api(fleet, gate, cockpit.counts, names.scheme, admission or Admission(), page_authority)
     return Starlette(
         routes=[
             Route("/", cockpit.page),
