@@ -16,6 +16,7 @@ import msgspec
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from skyloop.clock import monotonic_ns, seconds
+from skyloop.cockpit.broadcast import Wake
 from skyloop.cockpit.camera_feed import pack
 from skyloop.cockpit.page_stream import PageStream
 from skyloop.cockpit.small_feed import FPS, SmallFeed, SmallFrame, rounded_width
@@ -27,7 +28,8 @@ if TYPE_CHECKING:
     from skyloop.cockpit.station import Station
     from skyloop.cockpit.stream import PageCounts
 
-SEND_HZ: Final = 25.0  #: messages in a second, at most: what a picture waits for the others is seen
+SEND_HZ: Final = 25.0  #: messages in a second, at most
+GATHER_S: Final = 0.005  #: a picture waits so long for those of other cameras, which often come together
 MAX_SHOWN: Final = 64  #: cameras that one page can show at a time
 _BAD_MESSAGE: Final = 1008
 
@@ -65,7 +67,7 @@ class _Shown:
     feed: SmallFeed | None = None
     sent: int = 0  #: serial of the last JPEG sent
 
-    def connect(self, station: Station | None, camera: str) -> None:
+    def connect(self, station: Station | None, camera: str, wake: Wake) -> None:
         """Subscribe to the camera, and again after the drone came back or was replaced.
 
         To JPEGs only while the page is shown nothing else.
@@ -78,7 +80,7 @@ class _Shown:
         if self.h264 and self.stream is None:
             info = next((info for info in station.drone.capabilities.cameras if info.name == camera), None)
             if info is not None:
-                self.stream = PageStream(station, info, self.width, FPS, None)
+                self.stream = PageStream(station, info, self.width, FPS, wake)
         if self.stream is not None and self.stream.shows:
             self.release_feed()
         elif self.feed is None:
@@ -122,15 +124,20 @@ class SmallVideoSender:
         self._number = 0  # of the last message
         self._waiting = 0  # for the acknowledgement of so many frames
         self._problem = ""
+        self._wake = asyncio.Event()
 
     async def run(self) -> None:
         """Send until the page is gone."""
         receiver = asyncio.create_task(self._receive())
+        receiver.add_done_callback(lambda _: self._wake.set())
+        due_s = time.monotonic()
         try:
-            due_s = time.monotonic()
             while not receiver.done():
-                due_s = max(due_s + 1.0 / SEND_HZ, time.monotonic())
-                await asyncio.wait([receiver], timeout=due_s - time.monotonic())
+                with suppress(TimeoutError):  # JPEGs wake nobody
+                    await asyncio.wait_for(self._wake.wait(), 1.0 / SEND_HZ)
+                self._wake.clear()
+                await asyncio.sleep(max(due_s - time.monotonic(), GATHER_S))
+                due_s = time.monotonic() + 1.0 / SEND_HZ
                 if not receiver.done() and not self._waiting:
                     await self._send()
             if self._problem:
@@ -147,7 +154,7 @@ class SmallVideoSender:
         heads: list[dict[str, Any]] = []
         datas: list[bytes] = []
         for place, shown in self._shown.items():
-            shown.connect(self._stations.get(place.drone), place.camera)
+            shown.connect(self._stations.get(place.drone), place.camera, self._wake.set)
             for values, data in self._pictures(shown):
                 heads.append({"drone": place.drone, "camera": place.camera, **values, "bytes": len(data)})
                 datas.append(data)
@@ -197,6 +204,7 @@ class SmallVideoSender:
         if message.ack is not None and message.ack == self._number and self._waiting:
             self._counts.frames_acknowledged += self._waiting
             self._waiting = 0
+            self._wake.set()
             for shown in self._shown.values():
                 if shown.stream is not None:
                     shown.stream.acknowledged(message.ack)
