@@ -388,6 +388,9 @@ def test_the_age_of_the_video_is_known_to_alarms(drone: FakeDrone) -> None:
         drone.streams[0].encode(key=True, captured_ns=1)
         page.take()
         assert (page.station.feeds[0].age_s or 0.0) > 1.0
+        await page.station.view._read_channels()
+        shown = page.station.view._channels["video/front"]
+        assert (shown["count"], shown["lost"]) == (1, 0)
         found = TelemetryView(page.station).alarms(None)
         assert "video_age.front" in {alarm.id for alarm in found}
 

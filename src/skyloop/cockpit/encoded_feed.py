@@ -12,6 +12,7 @@ from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from skyloop.client.statistics import ChannelCounter, ChannelStats
 from skyloop.clock import Clock, monotonic_ns, seconds
 from skyloop.cockpit.broadcast import Wake, call_soon
 from skyloop.messages import CameraInfo, EncodedFrame
@@ -90,7 +91,7 @@ class EncodedFeed:
     def __init__(self, drone: Drone, camera: str, form: Form, clock: Clock = monotonic_ns) -> None:
         self.camera = camera
         self.form = form
-        self.received = 0  #: pictures that came
+        self._counter = ChannelCounter()
         self._drone = drone
         self._clock = clock
         self._came_ns = 0  # when the newest picture came
@@ -125,6 +126,10 @@ class EncodedFeed:
         with self._lock:
             silent = self.wanted and not (self._pictures and self.form.subscriber)
             return seconds(self._clock() - self._came_ns) if silent else 0.0
+
+    def stats(self) -> ChannelStats:
+        """Return how its pictures come, as for a channel of the drone."""
+        return self._counter.stats(self._clock())
 
     def subscribe(self, page: object, wake: Wake | None) -> None:
         """Show it on one more page; the first subscribes to the stream, whose first picture is a key.
@@ -207,7 +212,11 @@ class EncodedFeed:
             self._pictures.append(NumberedPicture(self._serial, picture))
             self._came_ns = self._clock()
             wakes = [wake for wake in self._wakes.values() if wake is not None]
-        self.received += 1
+        captured_ns = picture.captured_ns - self._drone.clock_offset_ns
+        self._counter.follow(self._serial)
+        self._counter.add(
+            self._clock() - (picture.published_ns - self._drone.clock_offset_ns), captured_ns, self._clock()
+        )
         if self._loop is not None:
             for wake in wakes:
                 call_soon(self._loop, wake)
