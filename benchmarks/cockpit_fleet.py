@@ -120,7 +120,7 @@ def clock_offset_s(page: Page) -> float:
     readings = []
     for _ in range(_TRIES):
         before_s = time.monotonic()
-        there_ms = page.evaluate("performance.now()")
+        there_ms = float(page.evaluate("performance.now()"))
         after_s = time.monotonic()
         readings.append((after_s - before_s, (before_s + after_s) / 2 - there_ms / 1e3))
     return min(readings)[1]

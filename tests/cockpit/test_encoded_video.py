@@ -261,6 +261,17 @@ def test_what_gives_nothing_is_left_and_tried_again(drone: FakeDrone) -> None:
         assert stream.consumers == []
         page.clock.pass_s(1.1)
         page.take()
+        assert len(stream.consumers) == 1
+        for feed in page.station.streams.values():
+            feed._clock = page.clock
+            feed._came_ns = page.clock.now_ns
+        page.clock.pass_s(SILENT_S + 0.1)
+        page.take()
+        page.clock.pass_s(RETRY_S + 1.0)
+        page.take()
+        assert stream.consumers == [], "the second time later"
+        page.clock.pass_s(RETRY_S)
+        page.take()
         stream.encode(key=True)
         assert page.take() == [101]
         assert page.stream.shows

@@ -24,8 +24,9 @@ LATE_S: Final = 0.25  #: a picture that takes longer to be acknowledged is late
 FALLS_BEHIND_S: Final = 1.0  #: a page of which all have been late for so long gets a stream of its own
 QUIET_S: Final = 10.0  #: with nothing late for so long it shares one again; twice as long after each relapse
 MOST_QUIET_S: Final = 160.0
-SILENT_S: Final = 2.0  #: a form of which nothing comes for so long is not to be had
-RETRY_S: Final = 30.0  #: after so long it is tried again
+SILENT_S: Final = 3.0  #: a form of which nothing comes for so long is not to be had
+RETRY_S: Final = 10.0  #: after so long it is tried again, the next time after twice as long …
+MOST_RETRY_S: Final = 300.0  #: … up to this: a proxy that refuses it says so each time
 MOST_UNDER_WAY: Final = 8  #: pictures that were sent and not acknowledged
 MOST_BYTES: Final = 1_000_000  #: of these, unless one alone has more
 
@@ -134,6 +135,7 @@ class PageStream:
         self._late_s = 0.0  # of the newest picture when it came here
         self._missed = 0  # pictures before those that are ready
         self._refused_ns: int | None = None
+        self._retry_s = RETRY_S
 
     @property
     def shows(self) -> bool:
@@ -150,6 +152,7 @@ class PageStream:
         if self._next is not None and self._ready(self._next, 0):
             self._release(self._feed)
             self._feed, self._next, self._serial = self._next, None, 0
+            self._refused_ns, self._retry_s = None, RETRY_S
         feed = self._feed
         if feed is None or not self.path.free:
             return []
@@ -211,10 +214,9 @@ class PageStream:
                 self._refuse(feed)
                 return
         present = self._next or self._feed
-        refused = self._refused_ns is not None and self._clock() - self._refused_ns < nanoseconds(RETRY_S)
+        refused = self._refused_ns is not None and self._clock() - self._refused_ns < nanoseconds(self._retry_s)
         if refused or (present is not None and present.form == form):
             return
-        self._refused_ns = None
         self._release(self._next)
         self._next = None
         if self._feed is not None and self._feed.form == form:
@@ -225,6 +227,8 @@ class PageStream:
             self._next = feed
 
     def _refuse(self, feed: EncodedFeed) -> None:
+        if self._refused_ns is not None:
+            self._retry_s = min(2.0 * self._retry_s, MOST_RETRY_S)
         self._refused_ns = self._clock()
         self._release(feed)
         if feed is self._next:
