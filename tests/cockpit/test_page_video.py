@@ -41,7 +41,9 @@ window.WebSocket = class extends WebSocket {
   }
 };
 """
-PIXELS: Final = "canvas => [...canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data].filter((_, at) => at % 37 === 0)"
+#: Some of them: all would take long to get here.
+PIXELS: Final = """canvas => [...canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data]
+  .filter((_, at) => at % 37 === 0)"""
 MOST_S: Final = 40.0  # on a machine that is busy pictures come late, and it is tried again
 FAR: Final = 12.0  # of 255, on average: two encodings of one picture are nearer than that
 
