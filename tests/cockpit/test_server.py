@@ -292,7 +292,9 @@ def test_tokens_over_tls(certificates: Path, tokens: Path) -> None:
             assert "Secure" in answer.headers["Set-Cookie"]
 
 
-def test_https_with_a_certificate_of_its_own(tmp_path: Path, tokens: Path) -> None:
+def test_https_with_a_certificate_of_its_own(
+    tmp_path: Path, tokens: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     access = with_certificate(Access(token_file=tokens), tmp_path / "keys" / "pages")
     assert access.page_authority is not None
     trusting = ssl.create_default_context(cafile=str(access.page_authority))
@@ -304,6 +306,9 @@ def test_https_with_a_certificate_of_its_own(tmp_path: Path, tokens: Path) -> No
             assert "attachment" in answer.headers["content-disposition"]
         with pytest.raises(OSError, match="certificate"):
             ask(address, "/api/session", tls=ssl.create_default_context())
+    monkeypatch.setattr("skyloop.cockpit.server.own_addresses", lambda: ["8.8.8.8"])
+    with_certificate(Access("0.0.0.0", token_file=tokens), tmp_path / "keys" / "pages")
+    assert "8.8.8.8" in capsys.readouterr().err
     with pytest.raises(UsageError, match="give one of them"):
         with_certificate(access, tmp_path / "keys" / "pages")
 

@@ -175,6 +175,12 @@ def with_certificate(access: Access, directory: Path) -> Access:
         ["localhost", "127.0.0.1"] if loopback else [*reachable(address), *own_addresses(), *host_names(), "127.0.0.1"]
     )
     made = page_certificate(directory, own, access.hostnames)
+    if made.left_out:
+        print(
+            f"cockpit: its certificate is not for {', '.join(made.left_out)}, which is not private: for browsers that "
+            "use it give --tls-cert and --tls-key",
+            file=sys.stderr,
+        )
     return replace(access, tls_cert=made.certificate, tls_key=made.key, page_authority=made.authority)
 
 
