@@ -131,7 +131,7 @@ class DroneCore:
         self.closed = False
         self.reach = reach
         self.listeners: list[Listener[Any]] = []
-        self._subscriber = secrets.token_hex(8)  # names the streams whose rate follows the path to here
+        self.subscriber = secrets.token_hex(8)  #: names the streams whose rate follows the path to here
         self._on_exit = on_exit
         self._on_close = on_close
         self._to_close: list[Closable] = []  # what ends with the drone
@@ -379,7 +379,7 @@ class DroneCore:
             scale=scale,
             part=part,
             kbit_s=kbit_s,
-            subscriber=self._subscriber if encoding == "h264" and kbit_s is None else "",
+            subscriber=self.subscriber if encoding == "h264" and kbit_s is None else "",
         )
         return channel if request == channel.request else self.state.video(channel.camera, request)
 

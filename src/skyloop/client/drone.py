@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import secrets
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
@@ -890,7 +889,7 @@ class Drone:
         self._check_listener(function)
         info = self._core.channel(camera).camera
         as_it_came = bool(info.stream) and kbit_s is None and max_fps is None and scale == 1.0
-        subscriber = "" if as_it_came or kbit_s is not None else secrets.token_hex(8)
+        subscriber = "" if as_it_came or kbit_s is not None else f"{self._core.subscriber}-encoded"
         stream = self._core.stream(info.name, kbit_s=kbit_s, max_fps=max_fps, scale=scale, subscriber=subscriber)
         chain = Chain()
 
