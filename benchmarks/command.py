@@ -237,13 +237,14 @@ def video_path(
     """Measure video over the uplinks of mobile networks, replayed, beside WebRTC. Needs root."""
     from benchmarks import video_path
     from benchmarks.hosts.traces import find
+    from benchmarks.video_path_figure import draw
 
     wanted_s, found = duration_s(seconds, minutes), find(parse_words(traces))
     chosen = parse_beginnings(contenders, video_path.CONTENDERS)
     with measuring("video_path", output) as progress:
         results = video_path.measure(wanted_s, found, chosen, progress)
     print_skipped(results.skipped)
-    finish("video_path", results, as_rich([video_path.table(results)], str(results.machine)), output)
+    finish("video_path", results, as_rich([video_path.table(results)], str(results.machine)), output, draw)
 
 
 BENCHMARKS: Final[Mapping[str, Callable[..., Any]]] = {

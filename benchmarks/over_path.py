@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Final
 
@@ -15,16 +16,22 @@ from skyloop.bench.vehicle import CAMERA
 from skyloop.client import Drone, Frame
 from skyloop.client.channels import VideoOptions
 from skyloop.messages import CameraInfo
+from skyloop.transport.base import TransportServer
+from skyloop.transport.fabric import FabricServer
+from skyloop.transport.fabric.settings import LEASE_S as DEFAULT_LEASE_S
 
 FPS: Final = 30.0
 NO_VIDEO: Final = "no video"
 FIXED_KBIT_S: Final = 1000
+LEASE_S: Final = 3.0
+PATIENT: Final = f"H.264, adaptive, lease {LEASE_S:g} s"  #: the pilot waits longer for a drone of which nothing comes
 FORMS: Final[Mapping[str, VideoOptions | None]] = MappingProxyType(
     {
         NO_VIDEO: None,
         "JPEG": VideoOptions(),
         f"H.264, {FIXED_KBIT_S} kbit/s": VideoOptions(encoding="h264", kbit_s=FIXED_KBIT_S),
         "H.264, adaptive": VideoOptions(encoding="h264"),
+        PATIENT: VideoOptions(encoding="h264"),
     }
 )
 
@@ -40,8 +47,14 @@ class Vehicle(over_network.Vehicle):
     camera = CameraInfo(CAMERA, SIZE.width, SIZE.height, FPS)
 
     def __init__(self, address: str, received: Received) -> None:
-        super().__init__(address.partition("|")[2], received)
+        form, _, place = address.partition("|")
+        self._lease_s = LEASE_S if form == PATIENT else DEFAULT_LEASE_S
+        super().__init__(place, received)
         self._scene = MovingScene(SIZE)
+
+    def _server(self, address: str) -> tuple[str, TransportServer]:
+        name, settings = over_network.settings_of(address, serves=True)
+        return name, FabricServer(name, replace(settings, lease_s=self._lease_s))
 
     def frame(self, sent_ns: int, image: Image) -> None:  # noqa: ARG002  (a moving scene instead)
         """Send what the camera sees."""

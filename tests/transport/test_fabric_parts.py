@@ -261,6 +261,22 @@ def test_the_environment_may_ask(monkeypatch: pytest.MonkeyPatch) -> None:
         environment.choose("10.0.0.5:port")
 
 
+def test_others_wait_for_an_end_as_long_as_it_asks_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    def lease_ms() -> object:
+        settings = environment.choose(network=True)
+        assert settings is not None
+        return config.make(settings, Part.PROXY)["transport"]["link"]["tx"]["lease"]
+
+    monkeypatch.delenv("SKYLOOP_LEASE_S", raising=False)
+    assert lease_ms() == 700
+    monkeypatch.setenv("SKYLOOP_LEASE_S", "3")
+    assert lease_ms() == 3000
+    for wrong in ("long", "nan", "0.1", "60"):
+        monkeypatch.setenv("SKYLOOP_LEASE_S", wrong)
+        with pytest.raises(UsageError, match=r"must be 0\.7 to 10 seconds"):
+            lease_ms()
+
+
 def test_where_is_looked_is_told_in_words() -> None:
     assert FabricSettings().reach == "multicast"
     assert FabricSettings(connect=("10.0.0.5",), multicast=False).reach == "10.0.0.5"
@@ -373,6 +389,23 @@ def test_a_router_passes_on_between_proxies_and_applications() -> None:
     assert len(set(regions)) == 2
 
 
+def test_a_session_that_is_linked_and_learns_of_nothing_is_retired(monkeypatch: pytest.MonkeyPatch) -> None:
+    retired: list[object] = []
+    linked: list[str] = []
+    monkeypatch.setattr(discovery, "retire", retired.append)
+    info = SimpleNamespace(peers_zid=lambda: linked, routers_zid=list)
+    settings = FabricSettings(connect=("10.0.0.5",), multicast=False)
+    session: Any = SimpleNamespace(
+        settings=settings, opened=time.monotonic() - 2 * discovery.STALE_S, zenoh=SimpleNamespace(info=info)
+    )
+    assert not discovery.renew(session), "there is nobody at that address"
+    linked.append("somebody")
+    assert discovery.renew(session)
+    assert retired == [session]
+    session.opened = time.monotonic() - 1.5 * discovery.YOUNG_S
+    assert not discovery.renew(session), "it may still be told"
+
+
 def test_a_session_that_does_not_know_a_node_is_retired_once_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
     retired: list[object] = []
     answered = {"known", "new"}
@@ -380,7 +413,7 @@ def test_a_session_that_does_not_know_a_node_is_retired_once_for_it(monkeypatch:
     monkeypatch.setattr(discovery, "_search", lambda _: answered)
     info = SimpleNamespace(peers_zid=lambda: ["known"], routers_zid=list)
     session: Any = SimpleNamespace(
-        settings=SimpleNamespace(multicast=True), opened=time.monotonic() - 60.0, zenoh=SimpleNamespace(info=info)
+        settings=SimpleNamespace(multicast=True, connect=()), opened=time.monotonic() - 60.0, zenoh=SimpleNamespace(info=info)
     )
     discovery.proxy_reached()
     try:
