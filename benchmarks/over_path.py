@@ -41,6 +41,10 @@ def address(form: str, place: str) -> str:
     return f"{form}|{over_network.address('alpha', place)}"
 
 
+def _lease_s(form: str) -> float:
+    return LEASE_S if form == PATIENT else DEFAULT_LEASE_S
+
+
 class Vehicle(over_network.Vehicle):
     """The drone."""
 
@@ -48,7 +52,7 @@ class Vehicle(over_network.Vehicle):
 
     def __init__(self, address: str, received: Received) -> None:
         form, _, place = address.partition("|")
-        self._lease_s = LEASE_S if form == PATIENT else DEFAULT_LEASE_S
+        self._lease_s = _lease_s(form)
         super().__init__(place, received)
         self._scene = MovingScene(SIZE)
 
@@ -68,10 +72,14 @@ class Application(over_network.Application):
         form, _, place = address.partition("|")
         options = FORMS[form]
         self.looks = False
+        self._lease_s = _lease_s(form)
         self._judge = Judge(received)
         super().__init__(place, received)
         if options is not None:
             self._watch(self._drone, options, received)
+
+    def _connect(self, address: str) -> Drone:
+        return over_network.connect(address, lease_s=self._lease_s)
 
     def _watch(self, drone: Drone, options: VideoOptions, received: Received) -> None:
         def show(frame: Frame) -> None:

@@ -389,23 +389,6 @@ def test_a_router_passes_on_between_proxies_and_applications() -> None:
     assert len(set(regions)) == 2
 
 
-def test_a_session_that_is_linked_and_learns_of_nothing_is_retired(monkeypatch: pytest.MonkeyPatch) -> None:
-    retired: list[object] = []
-    linked: list[str] = []
-    monkeypatch.setattr(discovery, "retire", retired.append)
-    info = SimpleNamespace(peers_zid=lambda: linked, routers_zid=list)
-    settings = FabricSettings(connect=("10.0.0.5",), multicast=False)
-    session: Any = SimpleNamespace(
-        settings=settings, opened=time.monotonic() - 2 * discovery.STALE_S, zenoh=SimpleNamespace(info=info)
-    )
-    assert not discovery.renew(session), "there is nobody at that address"
-    linked.append("somebody")
-    assert discovery.renew(session)
-    assert retired == [session]
-    session.opened = time.monotonic() - 1.5 * discovery.YOUNG_S
-    assert not discovery.renew(session), "it may still be told"
-
-
 def test_a_session_that_does_not_know_a_node_is_retired_once_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
     retired: list[object] = []
     answered = {"known", "new"}
@@ -413,7 +396,7 @@ def test_a_session_that_does_not_know_a_node_is_retired_once_for_it(monkeypatch:
     monkeypatch.setattr(discovery, "_search", lambda _: answered)
     info = SimpleNamespace(peers_zid=lambda: ["known"], routers_zid=list)
     session: Any = SimpleNamespace(
-        settings=SimpleNamespace(multicast=True, connect=()), opened=time.monotonic() - 60.0, zenoh=SimpleNamespace(info=info)
+        settings=SimpleNamespace(multicast=True), opened=time.monotonic() - 60.0, zenoh=SimpleNamespace(info=info)
     )
     discovery.proxy_reached()
     try:

@@ -27,7 +27,7 @@ from skyloop.transport.fabric.discovery import proxy_reached, renew
 from skyloop.transport.fabric.joining import ProxyWatch, join
 from skyloop.transport.fabric.sealing import contents
 from skyloop.transport.fabric.session import Session, acquire, load, release, retire, undeclare
-from skyloop.transport.fabric.settings import FabricSettings
+from skyloop.transport.fabric.settings import LEASE_S, FabricSettings
 from skyloop.transport.fabric.subscription import Subscription
 
 if TYPE_CHECKING:
@@ -239,6 +239,10 @@ class FabricClient(TransportClient):
     @property
     def variants(self) -> bool:
         return True
+
+    @property
+    def excused_s(self) -> float:
+        return self._session.settings.lease_s - LEASE_S
 
     @property
     def address(self) -> str:

@@ -30,7 +30,6 @@ SYNC_S: Final = 5.0
 RUNS_PER_NAME: Final = 8  #: proxies of one name that are listed: one, and two or three where a network was cut in two
 SEARCH_S: Final = 0.25  #: how long to wait for answers to a search
 YOUNG_S: Final = 1.0  #: for so long a new session searches well by itself
-STALE_S: Final = 3.0  #: a session that is linked to an address for so long, and knows of no proxy there, is given up
 FORGET_S: Final = 10.0  #: a peer that a new session could not reach either is not tried again for so long
 _POLL_S: Final = 0.05
 
@@ -167,24 +166,15 @@ def proxy_reached() -> None:
 
 
 def renew(session: Session) -> bool:
-    """Search for nodes that a session does not know, after it has not found a proxy.
-
-    One that calls an address is also retired where it is linked and still learns of nothing: it may be known there as
-    it was before its link broke, and Zenoh does not detect that.
+    """Search for nodes that a session does not know.
 
     Returns:
         True if there is one: the session is then retired, and another one has to be acquired.
     """
-    age_s = time.monotonic() - session.opened
-    if age_s < YOUNG_S:
-        return False
-    known = {str(zid) for zid in (*session.zenoh.info.peers_zid(), *session.zenoh.info.routers_zid())}
-    if session.settings.connect and known and age_s > STALE_S:
-        retire(session)
-        return True
-    if not session.settings.multicast:
+    if not session.settings.multicast or time.monotonic() - session.opened < YOUNG_S:
         return False
     answered = _search(session)
+    known = {str(zid) for zid in (*session.zenoh.info.peers_zid(), *session.zenoh.info.routers_zid())}
     with _lock:
         found = _UNREACHABLE.any_new(answered, known, time.monotonic())
     if found:

@@ -41,8 +41,8 @@ class FabricSettings:
     connect: tuple[str, ...] = ()
     multicast: bool = True  #: search, and be found, by UDP multicast on the network segments of this host
     tls: TlsFiles | None = None
-    #: Others take this process for gone when nothing came from it for so long [s]. A mobile network is silent for
-    #: seconds, and a connection that ended takes another second to come back.
+    #: A link counts as lost when nothing came by it for so long [s], by the others as they are told, and by an
+    #: application 0.3 s later. A mobile network is silent for seconds, and what was lost takes another to come back.
     lease_s: float = LEASE_S
     who: str = ANYONE  #: the identity: the common name of the certificate
     #: Zenoh's ``access_control`` section (https://zenoh.io/docs/manual/access-control/), None for none.
