@@ -109,7 +109,7 @@ class H264Encoder:
         context.width, context.height, context.pix_fmt = width, height, "yuv420p"
         context.time_base = _TICK
         context.framerate = Fraction(max(fps, 1.0)).limit_denominator(1000)
-        context.bit_rate = kbit_s * 1000
+        context.bit_rate = self._most_kbit_s * 1000
         context.gop_size = round(max(fps, 1.0) * _KEY_EVERY_S)
         context.max_b_frames = 0
         context.thread_count = 1
@@ -122,6 +122,9 @@ class H264Encoder:
             "bufsize": str(round(kbit_s * 1000 * _BURST_S)),
             "x264-params": f"repeat-headers=1:scenecut=0:sliced-threads=0:{_COLOURS}",
         }
+        context.open()
+        # x264 takes another rate later only if it began with the most that it may send, and then none above that.
+        context.bit_rate = kbit_s * 1000
         self._context = context
         self._fresh = True
 
