@@ -119,7 +119,7 @@ def jpeg_us() -> float:
 
     picture = scenery()
     header = FrameHeader("bench", 1, 0, 0, SMALL.width, SMALL.height, Encoding.BGR8, picture.nbytes)
-    pixels, request = picture.reshape(-1), VideoRequest("bench", **JPEG)
+    pixels, request = picture.reshape(-1), VideoRequest("bench", encoding="jpeg", quality=JPEG["quality"])
     encode_frame(header, pixels, request)
     begin_ns = time.process_time_ns()
     for _ in range(_JPEGS):

@@ -11,6 +11,7 @@ from benchmarks.hosts import traces
 from benchmarks.hosts.impairments import Impairments, Way
 from benchmarks.hosts.traces import Modem, Trace
 from benchmarks.over_path import NO_VIDEO
+from skyloop.bench.machine import Machine
 from skyloop.bench.schedule import COMMAND, FEEDBACK, SMALL, VIDEO, Size
 from skyloop.errors import UsageError
 
@@ -105,8 +106,8 @@ def test_only_the_time_in_which_the_path_carries_enough_counts() -> None:
     assert "50, 50, 50" in video_path.table(video_path.VideoPath(_machine(), 3.0, [case])).markdown()
 
 
-def _machine() -> video_path.Machine:
-    return video_path.Machine("cpu", 2, "system", "kernel", "3.11")
+def _machine() -> Machine:
+    return Machine("cpu", 2, "system", "kernel", "3.11")
 
 
 @pytest.mark.usefixtures("_possible")

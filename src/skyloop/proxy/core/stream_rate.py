@@ -22,9 +22,7 @@ LONG_WAIT_S: Final = 0.06  #: … and above which it falls
 MOST_WAIT_S: Final = 0.08  #: as much is under way, beside what the shortest round trip holds
 GROWTH_1_S: Final = 0.5  #: of the rate, each second …
 SEARCH_1_S: Final = 2.0  #: … and from the start, or an outage, up to the first long wait
-STANDING_S: Final = (
-    0.1  #: the shortest wait of so long is judged: paths are uneven, and only a queue that stays is ours
-)
+STANDING_S: Final = 0.1  #: the shortest wait within so long is judged: only a queue that stays is ours
 LOST_S: Final = 1.0  #: what is not acknowledged for so long is taken for lost
 SHORTEST_S: Final = 10.0  #: how long a shortest round trip counts
 _MEAN_S: Final = 0.5  # time over which the delivery is averaged
