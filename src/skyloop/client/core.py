@@ -341,6 +341,7 @@ class DroneCore:
         scale: float = 1.0,
         part: tuple[int, int] | None = None,
         kbit_s: int | None = None,
+        max_age_s: float | None = None,
     ) -> VideoChannel:
         """Return the channel of a camera whose frames come as requested; see :meth:`Drone.frames` for the options.
 
@@ -352,6 +353,7 @@ class DroneCore:
             scale: Factor for width and height, above 0 and up to 1.
             part: (k, n): only every n-th frame, from k; None: all.
             kbit_s: Of H.264 [kbit/s]; None: what the path carries.
+            max_age_s: Only checked here: the consumer passes it to :meth:`VideoChannel.picture`.
 
         Raises:
             UnknownNameError: If the vehicle has no camera of this name.
@@ -361,6 +363,7 @@ class DroneCore:
             ClosedError: If the drone was closed.
         """
         self.check_open()
+        checked_age(max_age_s)
         channels = self.state.channels
         if not channels:
             raise UnsupportedError("this vehicle has no camera")

@@ -222,8 +222,10 @@ class StreamForm:
         with self._changed:
             encoder = None if self._anew else self._encoder
             self._anew = False
-        if encoder is None or (encoder.width, encoder.height) != (header.width, header.height):
-            encoder = self._encoder = H264Encoder(header.width, header.height, self._fps, kbit_s)
+        size = (header.width, header.height)
+        if encoder is None or (encoder.width, encoder.height) != size or not encoder.carries(kbit_s):
+            varies = self._rate is not None
+            encoder = self._encoder = H264Encoder(*size, self._fps, kbit_s, varies=varies)
         elif abs(kbit_s - encoder.kbit_s) > 0.02 * encoder.kbit_s:
             encoder.set_rate(kbit_s)
         now_ns = self._clock()
@@ -242,7 +244,6 @@ class StreamForm:
                 self._wants_key, self._key_ns = False, now_ns
             if self._rate is not None:
                 self._rate.sent(self._seq, len(data), self._clock())
-        size = (header.width, header.height)
         times = (header.captured_ns, header.published_ns)
         self._publish(
             EncodedFrame(header.camera, self._seq, *times, *size, H264, is_key, data, header.intrinsics, self.topic)
