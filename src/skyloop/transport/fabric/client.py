@@ -23,7 +23,7 @@ from skyloop.transport.fabric import layout, packets
 from skyloop.transport.fabric.admission import Admission
 from skyloop.transport.fabric.config import Part
 from skyloop.transport.fabric.delivery import DEPTH, Outgoing, Receiver
-from skyloop.transport.fabric.discovery import proxy_reached, renew
+from skyloop.transport.fabric.discovery import SYNC_S, proxy_reached, renew
 from skyloop.transport.fabric.joining import ProxyWatch, join
 from skyloop.transport.fabric.sealing import contents
 from skyloop.transport.fabric.session import Session, acquire, load, release, retire, undeclare
@@ -34,6 +34,10 @@ if TYPE_CHECKING:
     import zenoh
 
 GLANCE_S: Final = 0.25  #: how long one session is given to find a proxy, before there is a search for others
+#: After a loss, a linked node that takes longer to list the proxies that it knows has probably not noticed that the
+#: links ended before they were made again. It takes the new ones for more of the old, and tells nothing by them.
+#: Each time twice as long, up to :data:`SYNC_S`: it may be busy after all.
+LIST_S: Final = 1.0
 POLL_S: Final = 0.05  #: how often to check whether something has to be sent again
 STALLED_S: Final = 5.0  #: a proxy that acknowledges nothing for so long counts as gone
 KEYS_S: Final = 0.5  #: how often to check for a newer roster
@@ -63,9 +67,10 @@ def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1
         chosen.identity.require_application()
 
     before: FabricClient | None = None  # the connection that was made last
+    list_s = SYNC_S
 
     def attempt(handler: ClientHandler, within_s: float) -> FabricClient:
-        nonlocal before, chosen
+        nonlocal before, chosen, list_s
         chosen = chosen.current()
         if before is not None and not before.parted:
             # One end may have forgotten the other while the other has not: such a session finds nobody, or gets no
@@ -74,12 +79,13 @@ def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1
             before = None
         session = acquire(chosen, Part.APP)
         try:
-            found = FabricClient(session, name, handler, within_s)
+            found = FabricClient(session, name, handler, within_s, list_s)
         except UnknownNameError:
             renew(session)
             release(session)
             raise
-        except NoAnswerError:
+        except NoAnswerError:  # as above: the links may have been lost and made again since the session was opened
+            list_s = min(2.0 * list_s, SYNC_S)
             retire(session)
             release(session)
             raise
@@ -87,7 +93,7 @@ def dial(name: str, settings: FabricSettings | None = None, *, find_s: float = 1
             release(session)
             raise
         proxy_reached()
-        before = found
+        before, list_s = found, LIST_S
         return found
 
     def dialer(handler: ClientHandler) -> FabricClient:
@@ -115,13 +121,14 @@ class FabricClient(TransportClient):
         name: The proxy's name.
         handler: Called on the receiving thread.
         find_s: How long to search for the proxy [s].
+        list_s: How long the linked nodes may take after that to list the proxies that they know [s].
 
     Raises:
         UnknownNameError: No such proxy can be reached.
         LinkError: The proxy does not let this application in, or does not answer (:class:`NoAnswerError`).
     """
 
-    def __init__(self, session: Session, name: str, handler: ClientHandler, find_s: float) -> None:
+    def __init__(self, session: Session, name: str, handler: ClientHandler, find_s: float, list_s: float) -> None:
         self._session = session
         self.parted = False  #: the proxy has announced that it ends this connection, or let it end
         self._name = name
@@ -151,7 +158,7 @@ class FabricClient(TransportClient):
         self._reason = ""
         self._held: list[Any] = []
         try:
-            about = self._enter(find_s)
+            about = self._enter(find_s, list_s)
         except BaseException:
             self._undeclare()
             raise
@@ -159,7 +166,7 @@ class FabricClient(TransportClient):
         self._thread = threading.Thread(target=self._receive, name=f"skyloop-{name}-fabric-client", daemon=True)
         self._thread.start()
 
-    def _enter(self, find_s: float) -> packets.ProxyInfo | None:
+    def _enter(self, find_s: float, list_s: float) -> packets.ProxyInfo | None:
         """Find the proxy and be let in.
 
         Raises:
@@ -169,7 +176,7 @@ class FabricClient(TransportClient):
         session, name = self._session, self._name
         watch = ProxyWatch(session, name, self._on_proxy_gone)
         self._held.append(watch.declare())
-        candidates = watch.find(find_s)
+        candidates = watch.find(find_s, list_s)
         mine = layout.to(name, self._id)
         self._held.append(session.zenoh.declare_subscriber(mine, session.callback(self._on_packet)))
         self._held.append(session.zenoh.liveliness().declare_token(layout.app(name, self._who, self._id)))

@@ -86,14 +86,26 @@ def runs(session: Session, name: str = "*") -> set[tuple[str, str]]:
 
     It takes as long as the linked nodes need to send what they know, at most :data:`SYNC_S`.
     """
+    return listed(session, name)[0]
+
+
+def listed(session: Session, name: str = "*", *, within_s: float = SYNC_S) -> tuple[set[tuple[str, str]], bool]:
+    """Return what :func:`runs` does, and whether the linked nodes have sent all that they know.
+
+    Args:
+        session: The Zenoh session.
+        name: The proxies' name.
+        within_s: How long to wait for the linked nodes [s].
+    """
     found = set()
-    for reply in session.zenoh.liveliness().get(layout.alive(name, "*"), timeout=SYNC_S):
+    deadline = time.monotonic() + within_s
+    for reply in session.zenoh.liveliness().get(layout.alive(name, "*"), timeout=within_s):
         if reply.ok is not None:
             try:
                 found.add(layout.parse_alive(str(reply.ok.key_expr)))
             except DecodeError:
                 continue
-    return found
+    return found, time.monotonic() < deadline
 
 
 def _settle(session: Session) -> None:

@@ -46,11 +46,12 @@ class ProxyWatch:
             layout.alive(self._name, "*"), self._session.callback(self._on_token), history=True
         )
 
-    def find(self, within_s: float) -> list[tuple[str, packets.ProxyInfo | None]]:
+    def find(self, within_s: float, list_s: float) -> list[tuple[str, packets.ProxyInfo | None]]:
         """Wait for a proxy with this name.
 
         Args:
             within_s: How long [s].
+            list_s: How long the linked nodes may take after that to list the proxies that they know [s].
 
         Returns:
             The run of each candidate with what it reports of itself, the best first. That is the oldest; with keys the
@@ -58,16 +59,20 @@ class ProxyWatch:
 
         Raises:
             UnknownNameError: None can be reached.
-            NoAnswerError: One was found and is gone again.
+            NoAnswerError: One was found and is gone again, or a linked node does not list what it knows.
         """
         with self._changed:
             found = self._changed.wait_for(lambda: bool(self._runs), within_s)
         if not found:
             # A node that is flooded with tokens may list many others before the proxy's: this waits for all of them.
-            known = discovery.runs(self._session)
+            known, complete = discovery.listed(self._session, within_s=list_s)
             with self._changed:
                 self._runs.update(run for other, run in known if other == self._name)
                 found = bool(self._runs)
+            if not found and not complete:
+                raise NoAnswerError(
+                    f"the network was reached, and within {list_s:g} s nobody said whether the proxy {self._name!r} is there"
+                )
             if not found:
                 others = {other for other, _ in known} - {self._name}
                 where = f"proxy on the network ({self._session.settings.reach})"
