@@ -10,13 +10,17 @@ from benchmarks import moving_scene, video_path
 from benchmarks.hosts import traces
 from benchmarks.hosts.impairments import Impairments, Way
 from benchmarks.hosts.traces import Modem, Trace
-from benchmarks.over_path import NO_VIDEO
+from benchmarks.over_path import FIXED_KBIT_S, NO_VIDEO
 from skyloop.bench.machine import Machine
 from skyloop.bench.schedule import COMMAND, FEEDBACK, SMALL, VIDEO, Size
 from skyloop.errors import UsageError
 
 MS = 1_000_000
 SECONDS = 15.0
+OUTAGE_MS = (3000, 5000)
+#: After an outage the first packet passes alone, and the next ones slowly: each answer waits for a while.
+SLOW = ((5000, 48), (5250, 8640), (5500, 3840), (5750, 3360), (6000, 4512), (6250, 6576), (6500, 2496), (6750, 4000))
+BACK_WITHIN_MS = 5000
 
 
 def test_packets_leave_with_the_opportunities_of_the_trace() -> None:
@@ -123,3 +127,25 @@ def test_on_a_bad_uplink_the_picture_stays_fresh_and_commands_are_not_held_up() 
     assert watched.pictures_per_s > 5
     assert watched.command.p95 < quiet.command.p95 + 150
     assert watched.commands_share > 0.7
+
+
+@pytest.mark.usefixtures("_possible")
+def test_after_an_outage_the_link_comes_back_under_a_stream_of_fixed_rate() -> None:
+    """One end has noticed that the links ended, and the other has not, or one has given up a link just made."""
+    pytest.importorskip("zenoh")
+    pytest.importorskip("av", reason="H.264 needs the extra 'video'")
+    begin_ms, end_ms = OUTAGE_MS
+    times = [*range(begin_ms), *(at for from_ms, kbit_s in SLOW for at in _spread(from_ms, kbit_s))]
+    trace = Trace("outage", (*times, *range(7000, 60_000, 3)))
+    [found] = video_path.measure(12.0, [trace], [f"H.264, {FIXED_KBIT_S} kbit/s"]).cases
+    back = [at for at, _ in found.shown if at > end_ms]
+    assert any(at < begin_ms for at, _ in found.shown)
+    assert back
+    assert back[0] < end_ms + BACK_WITHIN_MS
+    assert found.commands_share > 0.4
+
+
+def _spread(from_ms: int, kbit_s: int) -> list[int]:
+    """Return times for so many packets a second, evenly over 250 ms."""
+    count = round(kbit_s / (8e-3 * traces.OPPORTUNITY * 4))
+    return [from_ms + (250 * n + 125) // count for n in range(count)]

@@ -9,11 +9,13 @@ import pytest
 
 pytest.importorskip("zenoh", reason="needs the extra network: pip install 'skyloop[network]'")
 
-from skyloop.errors import LinkError, NoAnswerError
-from skyloop.transport.fabric import layout, packets
+from skyloop.errors import LinkError, NoAnswerError, UnknownNameError
+from skyloop.transport.fabric import client, discovery, layout, packets
 from skyloop.transport.fabric.admission import JoinRequest
-from skyloop.transport.fabric.joining import join
+from skyloop.transport.fabric.joining import ProxyWatch, join
 from skyloop.transport.fabric.session import Session
+from skyloop.transport.fabric.settings import FabricSettings
+from skyloop.transport.testing import ClientLog
 
 RUN, OTHER = "1" * 16, "2" * 16
 
@@ -56,3 +58,50 @@ def test_somebody_who_answers_in_its_place_is_named_as_that(monkeypatch: pytest.
     monkeypatch.setattr(JoinRequest, "accept", accept)
     with pytest.raises(LinkError, match="who answers as the proxy 'alpha' is not it: its proof is wrong"):
         join(session(welcome(RUN)), "alpha", RUN, layout.new_id())
+
+
+@pytest.mark.parametrize(("complete", "error"), [(True, UnknownNameError), (False, NoAnswerError)])
+def test_nobody_of_that_name_is_another_thing_than_no_list(
+    complete: bool, error: type[LinkError], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[float] = []
+
+    def listed(_session: Session, *, within_s: float) -> tuple[set[tuple[str, str]], bool]:
+        asked.append(within_s)
+        return {("bravo", OTHER)}, complete
+
+    monkeypatch.setattr(discovery, "listed", listed)
+    there = cast("Session", SimpleNamespace(settings=FabricSettings()))
+    with pytest.raises(error):
+        ProxyWatch(there, "alpha", lambda _: None).find(0.0, 0.5)
+    assert asked == [0.5]
+
+
+def test_who_tells_nothing_is_given_another_session_soon_and_more_time_each_turn(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    given: list[float] = []
+    retired: list[object] = []
+    reached = True
+
+    def connection(session: Session, _name: str, _handler: object, _find_s: float, list_s: float) -> Any:
+        given.append(list_s)
+        if not reached:
+            raise NoAnswerError("nobody said")
+        return SimpleNamespace(parted=True, session=session)
+
+    monkeypatch.setattr(client, "FabricClient", connection)
+    monkeypatch.setattr(client, "acquire", lambda *_: object())
+    monkeypatch.setattr(client, "release", lambda _: None)
+    monkeypatch.setattr(client, "retire", retired.append)
+    dialer = client.dial("alpha", FabricSettings(multicast=False))
+    dialer(ClientLog())
+    reached = False
+    for _ in range(4):
+        with pytest.raises(NoAnswerError):
+            dialer(ClientLog())
+    assert len(set(retired)) == 4
+    reached = True
+    dialer(ClientLog())
+    dialer(ClientLog())
+    assert given == [5.0, 1.0, 2.0, 4.0, 5.0, 5.0, 1.0]

@@ -261,6 +261,14 @@ def test_the_environment_may_ask(monkeypatch: pytest.MonkeyPatch) -> None:
         environment.choose("10.0.0.5:port")
 
 
+def test_an_address_that_was_given_is_waited_for_longer_than_one_that_was_found() -> None:
+    def open_ms(*connect: str) -> int:
+        made = config.make(FabricSettings(connect=connect), Part.APP)
+        return int(made["transport"]["unicast"]["open_timeout"])
+
+    assert open_ms("10.0.0.5") > open_ms()
+
+
 def test_others_wait_for_an_end_as_long_as_it_asks_for(monkeypatch: pytest.MonkeyPatch) -> None:
     def lease_ms() -> object:
         settings = environment.choose(network=True)

@@ -14,6 +14,10 @@ from skyloop.transport.fabric.settings import FabricSettings
 DEFAULT_PORT: Final = 7447  #: Zenoh's
 #: An address that does not answer for so long is given up, and the next one of the same peer is tried.
 OPEN_MS: Final = 800
+#: The same where addresses were given: all of them are tried at once, and a mobile network may be behind one. After an
+#: outage each answer waits there behind old video. Who gives up just before the last one comes has left a link at the
+#: other end, and Zenoh takes the next for one more beside it, by which nothing is told again.
+OPEN_GIVEN_MS: Final = 1500
 MAX_MESSAGE: Final = 1 << 27  #: bytes of one frame that are taken from others
 #: Bytes of one message that a proxy takes, as frames go the other way; more is dropped before it is put together.
 MAX_MESSAGE_UP: Final = 1 << 18
@@ -75,7 +79,7 @@ def make(settings: FabricSettings, part: Part, listen: Iterable[str] = ()) -> di
             "gossip": {"enabled": True, "autoconnect": found_by_search},
         },
         "transport": {
-            "unicast": {"max_links": 2, "open_timeout": OPEN_MS},
+            "unicast": {"max_links": 2, "open_timeout": OPEN_GIVEN_MS if connect else OPEN_MS},
             "link": {
                 "protocols": _protocols([*endpoints, *connect], settings),
                 "tx": {

@@ -71,7 +71,8 @@ class ProxyWatch:
                 found = bool(self._runs)
             if not found and not complete:
                 raise NoAnswerError(
-                    f"the network was reached, and within {list_s:g} s nobody said whether the proxy {self._name!r} is there"
+                    f"the network was reached, but within {list_s:g} s not all said whether they know the proxy "
+                    f"{self._name!r}"
                 )
             if not found:
                 others = {other for other, _ in known} - {self._name}
