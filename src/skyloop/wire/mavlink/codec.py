@@ -79,7 +79,7 @@ def _decode_plain(data: bytes) -> Message | None:
     checksum: int = data[end] | data[end + 1] << 8
     if dialect.x25crc(data[1:end] + kind.seed).crc != checksum:
         return None
-    message = kind.make.__new__(kind.make)
+    message: Message = object.__new__(kind.make)
     attributes = message.__dict__
     attributes.update(kind.common)
     attributes.update(zip(kind.fields, kind.unpack(data[begin:end].ljust(kind.size, b"\0")[: kind.size]), strict=True))
