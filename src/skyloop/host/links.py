@@ -132,7 +132,7 @@ class LinkThread:
             with self._lock:
                 turns = ready | self._due(now_ns)
             for link in turns:
-                self._serve(link)
+                self._serve(link, readable=link in ready)
             self.inside = None
         with self._lock:
             left = list(self._members)
@@ -142,20 +142,21 @@ class LinkThread:
         self._awake.close()
         self._waker.close()
 
-    def _serve(self, link: ServedLink) -> None:
+    def _serve(self, link: ServedLink, *, readable: bool) -> None:
         with self._lock:
             vehicle = self._members.get(link)
             if vehicle is None:
                 return  # it is another thread's meanwhile
             if link in self._paused:
                 self._paused.remove(link)
+                readable = True  # it may be: it was not waited for
                 self._selector.register(link, selectors.EVENT_READ, link)
         self.inside = vehicle
         self.entries += 1
         failed = False
         due_ns: int | None
         try:
-            due_ns = link.serve()
+            due_ns = link.serve(readable=readable)
         except Exception:  # noqa: BLE001  it has told; the links of all others go on
             failed, due_ns = True, time.monotonic_ns() + nanoseconds(PAUSE_S)
         with self._lock:

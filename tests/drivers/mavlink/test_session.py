@@ -11,10 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skyloop.drivers.mavlink.protocol import DEGRADED_NS, LOST_NS, REST_NS, TICK_NS, MavlinkSession
-from skyloop.drivers.mavlink.setpoints import Goal
+from skyloop.drivers.mavlink.setpoints import STEP_NS, Goal
 from skyloop.drivers.recording_sink import RecordingSink, implausible
 from skyloop.errors import DriverError
-from skyloop.messages import FlightState, Hover, Idle, Land, LinkState, Severity, Takeoff, Velocity
+from skyloop.messages import EmergencyStop, FlightState, Hover, Idle, Land, LinkState, Severity, Takeoff, Velocity
 from skyloop.wire.mavlink.codec import Codec
 from skyloop.wire.mavlink.codec import dialect as m
 from skyloop.wire.mavlink.texts import chunks_of
@@ -434,7 +434,11 @@ def test_a_vehicle_is_asked_after_as_often_as_something_is_under_way() -> None:
     bench.session.command(Land(), bench.clock())
     assert bench.session.setpoints is not None
     assert bench.session.setpoints.goal is Goal.LAND
-    assert next_ns() == TICK_NS, "a landing is followed step by step"
+    assert bench.session.due_ns <= bench.clock(), "it begins at once"
+    assert next_ns() == STEP_NS, "and is followed step by step"
+    bench.session.command(EmergencyStop(), bench.clock())
+    assert bench.session.due_ns <= bench.clock()
+    assert next_ns() == TICK_NS, "a stop is hurried"
 
 
 @AUTOPILOTS

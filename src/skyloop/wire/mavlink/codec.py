@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 import time
 from collections.abc import Callable
-from functools import cache
+from functools import lru_cache
 from typing import Any, Final, NamedTuple, TypeAlias
 
 from skyloop.errors import MissingExtraError, UsageError
@@ -48,7 +48,7 @@ class _Kind(NamedTuple):
     seed: bytes  #: what the checksum takes in besides the frame
 
 
-@cache
+@lru_cache(maxsize=512)  # anybody may send numbers of kinds that there are not
 def _kind_of(number: int) -> _Kind | None:
     """Return how messages of a kind are made; None for one that is not known or has strings or arrays."""
     made: Any = dialect.mavlink_map.get(number)
